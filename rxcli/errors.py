@@ -1,0 +1,65 @@
+"""Exit codes and the exceptions that carry them.
+
+An expected failure of reception (no screen, no signal) is a status in the result, never an exception. Exceptions are
+for input that cannot be read, for wrong configuration, and for wrong usage; `rxcli.cli.main` turns them into one line.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """Exit codes of every command."""
+
+    OK = 0
+    NOT_RECEIVED = 1
+    USAGE = 2
+    UNREADABLE = 3
+    INTERRUPTED = 130
+
+
+#: Where several codes hold, the first of these wins.
+_PRECEDENCE = (ExitCode.INTERRUPTED, ExitCode.USAGE, ExitCode.UNREADABLE, ExitCode.NOT_RECEIVED, ExitCode.OK)
+
+
+def worst(codes: list[ExitCode]) -> ExitCode:
+    """The exit code of a run in which each of `codes` occurred."""
+    return next((code for code in _PRECEDENCE if code in codes), ExitCode.OK)
+
+
+class ReceiverError(Exception):
+    """An error the user can act on: what, why, and the next step, in one line.
+
+    Args:
+        message: the thing concerned, the constraint and the value.
+        hint: the next step, as a sentence.
+    """
+
+    exit_code = ExitCode.NOT_RECEIVED
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return f"{self.message}; {self.hint}" if self.hint else self.message
+
+
+class InputError(ReceiverError):
+    """A file or device that cannot be read."""
+
+    exit_code = ExitCode.UNREADABLE
+
+
+class ProfileError(ReceiverError):
+    """A profile that is missing, malformed, or holds an impossible value."""
+
+    exit_code = ExitCode.USAGE
+
+
+class UsageError(ReceiverError):
+    """A combination of options that makes no sense."""
+
+    exit_code = ExitCode.USAGE

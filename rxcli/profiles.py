@@ -1,0 +1,226 @@
+"""Screen and camera profiles: versioned TOML, strictly checked.
+
+An unknown key, a missing one or an impossible value is a `ProfileError` that names file, key, bound and value.
+Times in seconds, lengths in pixels of the stored picture (integer coordinates are pixel centres).
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta
+
+from rxcli.errors import ProfileError
+from rxcli.protocol import packet_slots
+from rxcli.resources import data_dir
+
+FORMAT_VERSION = 1
+
+PositiveInt = Annotated[int, Meta(gt=0, le=1_000_000)]
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+Seconds = Annotated[float, Meta(gt=0, lt=1)]
+#: Names of the tone curves that `rxcli.tone` can undo.
+ToneName = Literal["linear", "srgb", "bt709", "auto"]
+Triple = tuple[float, float, float]
+
+
+class ScreenProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A screen and what it sends (air interface, section 3)."""
+
+    format: Literal[1]
+    kind: Literal["screen"]
+    name: Name
+    columns: Annotated[int, Meta(ge=1, le=1000)]
+    slot_rate_hz: Annotated[float, Meta(gt=0, le=1e6)]
+    payload_symbols: Annotated[int, Meta(ge=1, le=1000)]
+    repeats: Annotated[int, Meta(ge=1, le=1000)] = 3
+    width_mm: Annotated[float, Meta(gt=0, le=1e5)] = 309.4
+    height_mm: Annotated[float, Meta(gt=0, le=1e5)] = 173.95
+    width_px: PositiveInt = 1366
+    height_px: PositiveInt = 768
+    segment_rows: Annotated[int, Meta(ge=1, le=1000)] = 8
+    #: Sigma of the Gaussian light spread, in segment pitches.
+    light_spread: Annotated[float, Meta(ge=0, le=10)] = 0.45
+    description: str = ""
+
+    @property
+    def packet_slots(self) -> int:
+        """Slots of one packet."""
+        return packet_slots(self.payload_symbols)
+
+    @property
+    def packet_s(self) -> float:
+        """Duration of one packet in seconds."""
+        return self.packet_slots / self.slot_rate_hz
+
+    @property
+    def aspect(self) -> float:
+        """Width over height of the active area."""
+        return self.width_mm / self.height_mm
+
+
+class ReadoutMode(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How one picture format of a camera is read out."""
+
+    name: Name
+    width: PositiveInt
+    height: PositiveInt
+    #: Time between the exposure starts of two adjacent rows.
+    line_delay_s: Seconds
+    #: Exposure, where the files of this mode do not tell it.
+    exposure_s: Seconds | None = None
+    frame_rate_hz: Annotated[float, Meta(gt=0, le=1e5)] | None = None
+
+
+class LensModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """OpenCV's pinhole model with radial and tangential distortion, for pictures of `width` x `height`."""
+
+    width: PositiveInt
+    height: PositiveInt
+    camera_matrix: tuple[Triple, Triple, Triple]
+    #: k1 k2 p1 p2 k3, then up to k6, s1..s4, tx ty as OpenCV orders them.
+    dist_coeffs: Annotated[tuple[float, ...], Meta(min_length=4, max_length=14)]
+    #: True where the camera has already taken the distortion out of its pictures.
+    distortion_already_corrected: bool = False
+
+
+class CameraProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A camera body (its readout modes), a lens, or both."""
+
+    format: Literal[1]
+    kind: Literal["camera"]
+    name: Name
+    #: Matched against the file's make, and its model, without regard to case; empty matches any.
+    make: str = ""
+    models: tuple[str, ...] = ()
+    lens_models: tuple[str, ...] = ()
+    modes: tuple[ReadoutMode, ...] = ()
+    lens: LensModel | None = None
+    tone: ToneName = "auto"
+    description: str = ""
+
+    def mode_for(self, width: int, height: int) -> ReadoutMode | None:
+        """The readout mode of a picture of `width` x `height`, None where this profile has none."""
+        return next((mode for mode in self.modes if (mode.width, mode.height) == (width, height)), None)
+
+    def matches(self, make: str | None, model: str | None) -> bool:
+        """Whether a file of camera `make` `model` (None: not told) is of this camera."""
+        if model is None or not self.models:
+            return False
+        if self.make and make and self.make.casefold() not in make.casefold():
+            return False
+        return model.strip().casefold() in {name.casefold() for name in self.models}
+
+
+_Profile = TypeVar("_Profile", ScreenProfile, CameraProfile)
+_KINDS: dict[type[Any], str] = {ScreenProfile: "screens", CameraProfile: "cameras"}
+
+
+def parse_profile(text: str, kind: type[_Profile], source: str) -> _Profile:
+    """Parse and check one profile; `source` names it in messages.
+
+    Raises:
+        ProfileError: no TOML, an unknown key, or an impossible value.
+    """
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ProfileError(f"{source}: not valid TOML ({error})", "correct the file, or name a shipped profile") from None
+    return check_profile(raw, kind, source)
+
+
+def check_profile(raw: dict[str, Any], kind: type[_Profile], source: str) -> _Profile:
+    """Check a profile that is already parsed.
+
+    Raises:
+        ProfileError: an unknown or missing key, or an impossible value.
+    """
+    try:
+        profile = msgspec.convert(raw, kind, strict=True)
+    except msgspec.ValidationError as error:
+        raise ProfileError(f"{source}: {_explain(str(error), raw)}", "correct the file") from None
+    if isinstance(profile, CameraProfile):
+        _check_lens(profile.lens, source)
+    return profile
+
+
+def _check_lens(lens: LensModel | None, source: str) -> None:
+    if lens is None:
+        return
+    (fx, _, _), (_, fy, _), last = lens.camera_matrix
+    if fx <= 0 or fy <= 0 or last != (0.0, 0.0, 1.0):
+        raise ProfileError(
+            f"{source}: lens.camera_matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy "
+            f"(got {[list(row) for row in lens.camera_matrix]})",
+            "correct the file",
+        )
+
+
+def _explain(message: str, raw: dict[str, Any]) -> str:
+    """msgspec's message with the value that it speaks of."""
+    found = re.search(r" - at `\$\.?(.*)`$", message)
+    if not found or not found.group(1):
+        return message
+    path = found.group(1)
+    value: Any = raw
+    for part in re.findall(r"[^.\[\]]+", path):
+        try:
+            value = value[int(part)] if isinstance(value, list) else value[part]
+        except (KeyError, IndexError, ValueError, TypeError):
+            return f"{path}: {message[: found.start()]}"
+    return f"{path}: {message[: found.start()]} (got {value!r})"
+
+
+def load_profile(name_or_path: str, kind: type[_Profile]) -> _Profile:
+    """Load a shipped profile by name, or a TOML file by path.
+
+    Raises:
+        ProfileError: no such profile, unreadable, or malformed.
+    """
+    shipped = data_dir("calibration") / _KINDS[kind]
+    by_name = shipped / f"{name_or_path}.toml"
+    is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name_or_path) is not None
+    path = by_name if is_name and by_name.is_file() else Path(name_or_path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        known = ", ".join(sorted(p.stem for p in shipped.glob("*.toml")))
+        raise ProfileError(
+            f"no profile {name_or_path!r} among {_KINDS[kind]}", f"name a TOML file or one of: {known}"
+        ) from None
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise ProfileError(f"{name_or_path}: cannot be read as a profile ({error})", "name a TOML file") from None
+    return parse_profile(text, kind, name_or_path)
+
+
+def shipped_profiles(kind: type[_Profile]) -> list[_Profile]:
+    """All shipped profiles of one kind, by name."""
+    folder = data_dir("calibration") / _KINDS[kind]
+    return [load_profile(path.stem, kind) for path in sorted(folder.glob("*.toml"))]
+
+
+def dump_profile(profile: ScreenProfile | CameraProfile) -> str:
+    """The profile as TOML text that `parse_profile` reads back."""
+    import tomli_w
+
+    return tomli_w.dumps(_without_none(msgspec.to_builtins(profile)))
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    if isinstance(value, (list, tuple)):
+        return [_without_none(item) for item in value]
+    return value
+
+
+def match_camera(
+    cameras: Iterable[CameraProfile], make: str | None, model: str | None, width: int, height: int
+) -> CameraProfile | None:
+    """The first camera that matches make and model and has a readout mode for the size; None where none does."""
+    return next((c for c in cameras if c.matches(make, model) and c.mode_for(width, height)), None)

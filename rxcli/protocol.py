@@ -1,0 +1,95 @@
+"""The air interface: MPPM codebook, packet layout, bit order. Pure; imported by receiver and simulator alike.
+
+A *slot* is the shortest on/off interval, a *symbol* is ten slots of which `w` are lit, a *packet* is header, dimming
+symbol and payload symbols, a *burst* is one packet sent several times back to back.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+SLOTS_PER_SYMBOL = 10
+WEIGHTS = range(1, SLOTS_PER_SYMBOL)
+HEADER: tuple[int, ...] = (0, 0, 1, 1, 1, 0, 0, 0, 1, 1)
+#: Header and dimming symbol: the slots of a packet that carry no payload.
+PREAMBLE_SLOTS = 2 * SLOTS_PER_SYMBOL
+
+
+def bits_per_symbol(w: int) -> int:
+    """Bits that one symbol of weight `w` carries: floor(log2 C(10, w)).
+
+    Raises:
+        ValueError: `w` is not in 1..9.
+    """
+    if w not in WEIGHTS:
+        raise ValueError(f"w must be in 1..9 (got {w})")
+    return comb(SLOTS_PER_SYMBOL, w).bit_length() - 1
+
+
+@lru_cache(maxsize=None)
+def codebook(w: int) -> NDArray[np.uint8]:
+    """Codewords of weight `w`, (2**k, 10) uint8 of 0/1, first-sent slot first, in order of index; read-only."""
+    n_words = 1 << bits_per_symbol(w)
+    values = np.arange(1 << SLOTS_PER_SYMBOL)
+    shifts = np.arange(SLOTS_PER_SYMBOL - 1, -1, -1)
+    slots = ((values[:, None] >> shifts) & 1).astype(np.uint8)
+    words = slots[slots.sum(axis=1) == w][:n_words]
+    words.flags.writeable = False
+    return words
+
+
+def dimming_symbol(w: int) -> NDArray[np.uint8]:
+    """The symbol after the header: `w` lit slots, then dark ones; (10,) uint8."""
+    bits_per_symbol(w)
+    return (np.arange(SLOTS_PER_SYMBOL) < w).astype(np.uint8)
+
+
+def packet_slots(payload_symbols: int) -> int:
+    """Slots of one packet with `payload_symbols` payload symbols."""
+    return PREAMBLE_SLOTS + SLOTS_PER_SYMBOL * payload_symbols
+
+
+def payload_bits(w: int, payload_symbols: int) -> int:
+    """Payload bits of one packet of one column."""
+    return bits_per_symbol(w) * payload_symbols
+
+
+def bits_to_indices(bits: NDArray[np.uint8], w: int) -> NDArray[np.int64]:
+    """Codebook indices of payload `bits` (multiple of k, first bit most significant)."""
+    k = bits_per_symbol(w)
+    if bits.size % k:
+        raise ValueError(f"the number of payload bits must be a multiple of {k} for w={w} (got {bits.size})")
+    return bits.reshape(-1, k).astype(np.int64) @ (1 << np.arange(k - 1, -1, -1))
+
+
+def indices_to_bits(indices: NDArray[np.int64], w: int) -> NDArray[np.uint8]:
+    """Payload bits of codebook `indices`, first bit most significant; the inverse of `bits_to_indices`."""
+    k = bits_per_symbol(w)
+    return ((indices[:, None] >> np.arange(k - 1, -1, -1)) & 1).astype(np.uint8).ravel()
+
+
+def encode_packet(bits: NDArray[np.uint8], w: int) -> NDArray[np.uint8]:
+    """Slots of one packet carrying payload `bits`; (20 + 10 N,) uint8 of 0/1."""
+    payload = codebook(w)[bits_to_indices(bits, w)].ravel()
+    return np.concatenate([np.array(HEADER, np.uint8), dimming_symbol(w), payload])
+
+
+def bits_to_hex(bits: NDArray[np.uint8]) -> str:
+    """Hex of `bits`, first bit most significant, zero-padded to whole bytes."""
+    return np.packbits(bits).tobytes().hex()
+
+
+def hex_to_bits(text: str, n_bits: int) -> NDArray[np.uint8]:
+    """The first `n_bits` bits of `text`; the inverse of `bits_to_hex`.
+
+    Raises:
+        ValueError: `text` is no hex or too short.
+    """
+    bits = np.unpackbits(np.frombuffer(bytes.fromhex(text), np.uint8))
+    if bits.size < n_bits:
+        raise ValueError(f"payload must hold at least {n_bits} bits (got {bits.size})")
+    return bits[:n_bits]
