@@ -1,0 +1,285 @@
+"""Results as JSON lines for programs and as tables for people."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator
+from itertools import groupby
+from typing import Any
+
+from rxcli.errors import UsageError
+from rxcli.types import ColumnResult, FrameResult, PacketResult
+
+#: Hex digits of a payload that a table shows.
+_SHOWN_DIGITS = 24
+
+
+def to_record(result: FrameResult) -> dict[str, Any]:
+    """The result as plain data in the order of the documented JSON shape; unknown or non-finite values are None."""
+    record: dict[str, Any] = {
+        "source": result.source,
+        "frame": int(result.frame),
+        "time_s": _rounded(result.time_s, 6),
+        "status": result.status,
+    }
+    if result.message is not None:
+        record["message"] = result.message
+    record["screen"] = {"profile": result.screen_profile, "corners": _corners(result)}
+    record["camera"] = {
+        "profile": result.camera_profile,
+        "line_delay_s": _significant(result.line_delay_s),
+        "exposure_s": _significant(result.exposure_s),
+    }
+    record["columns"] = [_column_record(column) for column in result.columns]
+    record["timing_ms"] = {stage: _rounded(value, 2) for stage, value in result.timing_ms.items()}
+    return record | _details(result)
+
+
+def _details(result: FrameResult) -> dict[str, Any]:
+    """The parts of a record that stand only where there is something to say."""
+    details: dict[str, Any] = {}
+    if result.estimated:
+        details["estimated"] = {
+            name: [_significant(value), _significant(sigma)] for name, (value, sigma) in result.estimated.items()
+        }
+    if result.skipped:
+        details["skipped"] = _plain(result.skipped)
+    if result.denoiser is not None:
+        details["denoiser"] = _plain(result.denoiser)
+    return details
+
+
+def _corners(result: FrameResult) -> list[list[float | None]] | None:
+    if result.corners is None:
+        return None
+    return [[_rounded(float(x), 2), _rounded(float(y), 2)] for x, y in result.corners]
+
+
+def _column_record(column: ColumnResult) -> dict[str, Any]:
+    record: dict[str, Any] = {
+        "column": int(column.column),
+        "status": column.status,
+        "w": None if column.w is None else int(column.w),
+        "snr_db": _rounded(column.snr_db, 2),
+        "denoised": bool(column.denoised),
+        "delay_slots": _rounded(column.delay_slots, 3),
+        "packets": [_packet_record(packet) for packet in column.packets],
+    }
+    if column.message is not None:
+        record["message"] = column.message
+    return record
+
+
+def _packet_record(packet: PacketResult) -> dict[str, Any]:
+    record: dict[str, Any] = {
+        "first_row": _rounded(packet.first_row, 2),
+        "copies": _rounded(packet.copies, 3),
+        "payload_bits": int(packet.payload_bits),
+        "payload": packet.payload,
+        "confidence": _rounded(packet.confidence, 6),
+        "bit_errors": None if packet.bit_errors is None else int(packet.bit_errors),
+        "ber_hat": _significant(packet.ber_hat),
+    }
+    if packet.burst is not None:
+        record["burst"] = int(packet.burst)
+    if packet.frames is not None:
+        record["frames"] = [int(frame) for frame in packet.frames]
+    return record
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    if value is None or not math.isfinite(value):
+        return None
+    return round(float(value), digits) + 0.0  # no negative zero
+
+
+def _significant(value: float | None) -> float | None:
+    if value is None or not math.isfinite(value):
+        return None
+    return float(f"{value:.7g}")
+
+
+def _plain(value: Any) -> Any:
+    """`value` with numpy's scalars and arrays as Python's, and what is not finite as None."""
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return _significant(value)
+    return value
+
+
+def to_json_line(result: FrameResult) -> str:
+    """The result as one line of JSON, without the line's end; ASCII, so that any file name survives."""
+    return json.dumps(to_record(result), allow_nan=False, separators=(", ", ": "))
+
+
+def from_record(record: dict[str, Any]) -> FrameResult:
+    """The result that `to_record` wrote, as far as its rounding goes.
+
+    Raises:
+        UsageError: `record` is not of the documented shape.
+    """
+    import numpy as np
+
+    try:
+        corners, camera = record["screen"]["corners"], record["camera"]
+        return FrameResult(
+            source=str(record["source"]),
+            frame=int(record["frame"]),
+            time_s=_number(record["time_s"]),
+            status=record["status"],
+            message=record.get("message"),
+            screen_profile=record["screen"]["profile"],
+            corners=None if corners is None else np.array(corners, dtype=np.float64).reshape(4, 2),
+            camera_profile=camera["profile"],
+            line_delay_s=camera["line_delay_s"],
+            exposure_s=camera["exposure_s"],
+            estimated={name: (_number(v), _number(s)) for name, (v, s) in record.get("estimated", {}).items()},
+            columns=tuple(_column_from(column) for column in record["columns"]),
+            timing_ms={stage: _number(value) for stage, value in record["timing_ms"].items()},
+            skipped=record.get("skipped", {}),
+            denoiser=record.get("denoiser"),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UsageError(f"not a result line of `vlc-rx decode --json` ({error!r})", "name another file") from None
+
+
+def _column_from(record: dict[str, Any]) -> ColumnResult:
+    fields = {key: record[key] for key in ("column", "status", "w", "snr_db", "denoised", "delay_slots")}
+    packets = tuple(_packet_from(packet) for packet in record["packets"])
+    return ColumnResult(**fields, packets=packets, message=record.get("message"))
+
+
+def _packet_from(record: dict[str, Any]) -> PacketResult:
+    frames = record.get("frames")
+    return PacketResult(
+        first_row=_number(record["first_row"]),
+        copies=_number(record["copies"]),
+        payload_bits=int(record["payload_bits"]),
+        payload=str(record["payload"]),
+        confidence=_number(record["confidence"]),
+        ber_hat=_number(record["ber_hat"]),
+        bit_errors=record["bit_errors"],
+        burst=record.get("burst"),
+        frames=None if frames is None else tuple(frames),
+    )
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def printable(text: str) -> str:
+    """`text` as any terminal takes it: bytes of a file name that are no UTF-8, and line ends, become marks."""
+    text = text.encode(errors="surrogateescape").decode(errors="replace")
+    return "".join(character if character.isprintable() else "�" for character in text)
+
+
+_HEADER = "      col  status     w  snr dB  confidence  copies  errors  payload"
+
+
+def format_frame(result: FrameResult) -> str:
+    """A heading and one row per packet; columns without packets are put together where they tell the same."""
+    lines = [format_heading(result)]
+    if result.message:
+        lines.append(f"  {result.message}")
+    rows = list(_rows(result))
+    if rows:
+        lines += [_HEADER, *rows]
+    return "\n".join(lines)
+
+
+def format_heading(result: FrameResult) -> str:
+    """Source, screen, camera, status and counts in one line."""
+    parts = [printable(result.source)]
+    if result.frame or _is_clip(result):
+        parts.append(f"frame {result.frame} at {result.time_s:.3f} s")
+    parts.append(result.status)
+    if result.screen_profile:
+        parts.append(f"screen {result.screen_profile}")
+    if result.status != "unreadable":
+        parts.append(f"camera {result.camera_profile or 'unknown'}")
+    if result.columns:
+        parts.append(_counts(result))
+    if "total" in result.timing_ms:
+        parts.append(f"{result.timing_ms['total']:.0f} ms")
+    return " | ".join(parts)
+
+
+def _counts(result: FrameResult) -> str:
+    with_packets = sum(bool(column.packets) for column in result.columns)
+    n_packets = sum(len(column.packets) for column in result.columns)
+    return f"{n_packets} packets in {with_packets} of {len(result.columns)} columns"
+
+
+def _is_clip(result: FrameResult) -> bool:
+    return any(packet.burst is not None for column in result.columns for packet in column.packets)
+
+
+def _rows(result: FrameResult) -> Iterator[str]:
+    """Rows of the table. A clip's frames leave out columns in which no packet ended: most frames have some."""
+    clip = result.frame > 0 or _is_clip(result)
+    for key, group in groupby(result.columns, key=_alike):
+        columns = list(group)
+        if isinstance(key, tuple):
+            if not clip:
+                yield _empty_row(columns)
+            continue
+        for column in columns:
+            yield from _packet_rows(column)
+
+
+def _alike(column: ColumnResult) -> tuple[str, str | None] | int:
+    """What two columns must share to stand in one row; the number of one that has packets, and so a row of its own."""
+    return column.column if column.packets else (column.status, column.message)
+
+
+def _empty_row(columns: list[ColumnResult]) -> str:
+    first, last = columns[0].column, columns[-1].column
+    span = str(first) if first == last else f"{first}-{last}"
+    return f"  {span:>7}  {columns[0].status:<9}  {columns[0].message or ''}".rstrip()
+
+
+def _packet_rows(column: ColumnResult) -> Iterator[str]:
+    status = column.status + ("*" if column.denoised else "")
+    lead = f"  {column.column:>7}  {status:<9}  {_cell(column.w, 'd'):>1}  {_cell(column.snr_db, '.1f'):>6}"
+    for packet in column.packets:
+        yield (
+            f"{lead}  {_confidence(packet.confidence):>10}  {_cell(packet.copies, '.2f'):>6}"
+            f"  {_cell(packet.bit_errors, 'd'):>6}  {shorten(packet.payload)}"
+        )
+        lead = " " * len(lead)
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None or not math.isfinite(value) else format(value, form)
+
+
+def _confidence(value: float) -> str:
+    """Rounded downwards, so that only certainty reads 1.0000."""
+    return _cell(math.floor(value * 1e4) / 1e4 if math.isfinite(value) else None, ".4f")
+
+
+def shorten(payload: str, digits: int = _SHOWN_DIGITS) -> str:
+    """The payload's first and last digits where it is longer than `digits`."""
+    if len(payload) <= digits:
+        return payload
+    tail = 4
+    return f"{payload[: digits - tail - 1]}…{payload[-tail:]}"
+
+
+def format_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Text columns under a header: the first and the last one flush left, the others flush right."""
+    cells = [list(header), *(list(row) for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    last = len(widths) - 1
+    pad = [str.ljust if i in (0, last) else str.rjust for i in range(len(widths))]
+    return "\n".join(
+        "  ".join(justify(cell, width) for justify, cell, width in zip(pad, row, widths, strict=True)).rstrip()
+        for row in cells
+    )
