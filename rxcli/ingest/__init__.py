@@ -1,0 +1,60 @@
+"""Files and cameras -> frames: luma or sensor mosaic as stored, with what the file says of it.
+
+Readers are imported when a file of their kind comes, because each brings a heavy library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from rxcli.errors import InputError
+from rxcli.ingest.sniff import HEAD_BYTES, KNOWN_SUFFIXES, Kind, check_file, is_raw_tiff, read_bytes, sniff
+from rxcli.types import Frame
+
+__all__ = ["KNOWN_SUFFIXES", "open_source"]
+
+
+def open_source(path: str | Path) -> Iterator[Frame]:
+    """The frames of a photo, RAW file, clip or V4L2 device, in order; opened when the first one is asked for.
+
+    Args:
+        path: any file; its content decides what it is, so that a wrong suffix does no harm.
+
+    Yields:
+        One frame of a still, every whole frame of a clip, frames without end of a device.
+
+    Raises:
+        InputError: it cannot be read, or, after the frames before the break, it breaks off.
+    """
+    path = Path(path)
+    kind = check_file(path) or _kind(path)
+    if kind is None:
+        known = "JPEG, PNG, TIFF, HEIC, camera RAW, MP4, MOV, MKV or AVI"
+        raise InputError(f"{path}: neither a picture nor a clip", f"{known} can be read")
+    yield from _read(path, kind)
+
+
+def _kind(path: Path) -> Kind | None:
+    kind = sniff(read_bytes(path, HEAD_BYTES), path.suffix.lower())
+    return "raw" if kind == "tiff" and is_raw_tiff(path) else kind
+
+
+def _read(path: Path, kind: Kind) -> Iterator[Frame]:
+    if kind == "video":
+        from rxcli.ingest.video import read_video
+
+        yield from read_video(path)
+    elif kind == "device":
+        from rxcli.ingest.v4l2 import open_camera
+
+        with open_camera(path) as camera:
+            yield from camera
+    elif kind == "raw":
+        from rxcli.ingest.raw import read_raw
+
+        yield read_raw(path)
+    else:
+        from rxcli.ingest.image import read_image
+
+        yield read_image(path, kind)

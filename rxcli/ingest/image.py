@@ -1,0 +1,193 @@
+"""Developed pictures -> luma as stored: JPEG, PNG, TIFF, HEIC, and what else Pillow reads.
+
+Colour is reduced to BT.601 luma, which is what a JPEG of the same picture would hold.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.errors import InputError
+from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
+from rxcli.ingest.sniff import Kind, check_size, read_bytes
+from rxcli.types import Frame, Metadata
+
+Luma = NDArray[np.uint8] | NDArray[np.uint16]
+
+#: Luma weights of red, green, blue (ITU-R BT.601 and BT.709).
+BT601 = (0.299, 0.587, 0.114)
+BT709 = (0.2126, 0.7152, 0.0722)
+
+
+def read_image(path: Path, kind: Kind) -> Frame:
+    """The one frame of a developed picture; `kind` as `rxcli.ingest.sniff` tells it.
+
+    Raises:
+        InputError: cut, damaged, too large, of a kind that needs an extra, or no picture.
+    """
+    if kind == "tiff":
+        return _read_tiff(path)
+    data = read_bytes(path)
+    if kind == "jpeg":
+        return _frame(path, _read_jpeg(data, path), jpeg_metadata(data))
+    if kind == "png":
+        return _read_png(data, path)
+    if kind == "heif":
+        from rxcli.ingest.heif import read_heif
+
+        return _frame(path, *read_heif(data, path))
+    return _frame(path, _read_with_pillow(data, path), Metadata())
+
+
+def luma_of(pixels: NDArray[Any], weights: tuple[float, float, float] = BT601) -> NDArray[Any]:
+    """Luma (height, width) of grey or RGB(A) `pixels` of uint8, uint16 or float32; alpha is left out."""
+    if pixels.ndim == 2:
+        return pixels
+    if pixels.shape[2] < 3:
+        return np.ascontiguousarray(pixels[:, :, 0])
+    import cv2
+
+    rgb = np.ascontiguousarray(pixels[:, :, :3])
+    if weights == BT601:
+        return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
+    return np.asarray(cv2.transform(rgb, np.array([weights], np.float32)))
+
+
+def _frame(path: Path, luma: Luma, metadata: Metadata, linear: bool = False) -> Frame:
+    white = float(np.iinfo(luma.dtype).max)
+    return Frame(pixels=luma, source=str(path), metadata=metadata, white=white, linear=linear)
+
+
+def _read_jpeg(data: bytes, path: Path) -> NDArray[np.uint8]:
+    from rxcli.ingest.jpeg import decode_luma
+
+    return decode_luma(data, path)
+
+
+def _read_png(data: bytes, path: Path) -> Frame:
+    """By OpenCV, which keeps 16-bit colour; checked before, because libpng writes complaints to stderr."""
+    import cv2
+
+    chunks = dict(_png_chunks(data, path))
+    header = chunks.get(b"IHDR", b"")
+    check_size(path, int.from_bytes(header[:4]), int.from_bytes(header[4:8]))
+    try:
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        bgr = None
+    if bgr is None:
+        raise InputError(f"{path}: the PNG is damaged", "copy the file again")
+    rgb = bgr if bgr.ndim == 2 else bgr[:, :, 2::-1]
+    return _frame(path, luma_of(rgb), exif_metadata(chunks.get(b"eXIf", b"")))
+
+
+def _png_chunks(data: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
+    """Name and content of the chunks of a PNG (ISO 15948, section 5.3), checked; image data without its content."""
+    at = 8
+    while True:
+        length, name = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
+        end = at + 8 + length
+        if end + 4 > len(data):
+            raise InputError(f"{path}: the PNG is cut after {len(data)} bytes", "copy the file again")
+        if zlib.crc32(memoryview(data)[at + 4 : end]) != int.from_bytes(data[end : end + 4]):
+            raise InputError(f"{path}: the PNG is damaged at byte {at}", "copy the file again")
+        yield name, b"" if name == b"IDAT" else data[at + 8 : end]
+        if name == b"IEND":
+            return
+        at = end + 4
+
+
+def _read_tiff(path: Path) -> Frame:
+    import tifffile
+
+    with path.open("rb") as file:
+        metadata = tiff_metadata(file)
+    try:
+        with tifffile.TiffFile(path) as tiff:
+            page = tiff.pages[0]
+            check_size(path, page.imagewidth, page.imagelength)
+            pixels, min_is_white = _tiff_pixels(page, path), page.photometric == tifffile.PHOTOMETRIC.MINISWHITE
+    except InputError:
+        raise
+    except Exception as error:  # tifffile raises whatever a broken directory leads it to
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(
+            f"{path}: the TIFF cannot be read ({reason})", "save it uncompressed, or copy it again"
+        ) from None
+    luma, linear = _tiff_luma(pixels, path)
+    return _frame(path, np.iinfo(luma.dtype).max - luma if min_is_white else luma, metadata, linear)
+
+
+def _tiff_pixels(page: Any, path: Path) -> NDArray[Any]:
+    """Pixels (height, width[, samples]) of a TIFF page, by Pillow where tifffile has no codec; neither turns them."""
+    if page.axes == "SYX":
+        return np.moveaxis(page.asarray(), 0, -1)
+    if page.axes not in ("YX", "YXS"):
+        raise InputError(f"{path}: the TIFF's axes are {page.axes}", "save one plain picture")
+    if page.compression in (5, 6, 7) or page.colormap is not None:  # LZW, JPEG: tifffile needs imagecodecs for them
+        return _pillow_tiff(path, page)
+    return np.asarray(page.asarray())
+
+
+def _pillow_tiff(path: Path, page: Any) -> NDArray[Any]:
+    from PIL import Image
+
+    from rxcli.ingest.orientation import as_stored
+
+    tag = page.tags.get("Orientation")
+    orientation = int(tag.value) if tag is not None and tag.value in range(1, 9) else 1
+    with _quiet(), Image.open(path, formats=("TIFF",)) as image:
+        return as_stored(_pillow_pixels(image), orientation)  # Pillow turns TIFFs for viewing
+
+
+def _tiff_luma(pixels: NDArray[Any], path: Path) -> tuple[Luma, bool]:
+    """Luma of TIFF samples, and whether it is linear; float samples are light, scaled to 16 bits."""
+    if pixels.dtype == bool:
+        pixels = pixels.view(np.uint8) * np.uint8(255)
+    if pixels.dtype in (np.uint8, np.uint16):
+        return luma_of(pixels), False
+    if pixels.dtype == np.uint32:
+        return luma_of((pixels >> 16).astype(np.uint16)), False
+    if pixels.dtype.kind != "f":
+        raise InputError(f"{path}: TIFF samples of type {pixels.dtype}", "save it with 8 or 16 bits a sample")
+    light = luma_of(np.nan_to_num(pixels.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0))
+    top = float(light.max(initial=0.0)) or 1.0
+    return np.rint(np.clip(light / top, 0, 1) * 65535).astype(np.uint16), True
+
+
+def _read_with_pillow(data: bytes, path: Path) -> NDArray[np.uint8]:
+    """BMP, WebP: rare for a camera, but messengers send them."""
+    from PIL import Image
+
+    try:
+        with _quiet(), Image.open(io.BytesIO(data), formats=("BMP", "WEBP")) as image:
+            check_size(path, *image.size)
+            return np.asarray(luma_of(_pillow_pixels(image)), np.uint8)
+    except InputError:
+        raise
+    except Exception as error:  # Pillow raises some ten unrelated types on damaged files
+        raise InputError(f"{path}: the picture is damaged ({error})", "copy the file again") from None
+
+
+def _pillow_pixels(image: Any) -> NDArray[Any]:
+    """Grey or RGB pixels of a Pillow image; 16 bits stay 16."""
+    plain = image.mode in ("L", "RGB", "I;16", "I;16B", "F")
+    pixels = np.asarray(image if plain else image.convert("RGB"))
+    return pixels.astype(pixels.dtype.newbyteorder("="))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Pillow's warnings: sizes are checked here, and broken directories do no harm."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

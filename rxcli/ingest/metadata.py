@@ -1,0 +1,152 @@
+"""What files say of their pictures: exposure, ISO, make, model, lens, focal length, orientation.
+
+Pillow parses EXIF from bytes found without opening the picture (0.2 ms; RAF included, whose EXIF is that of the JPEG
+inside). Nothing here ever fails a frame: what is missing, broken or absurd is None.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import struct
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from rxcli.types import Metadata
+
+# EXIF 2.32, tables 3 to 8.
+_MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
+_EXPOSURE, _SENSITIVITY, _RECOMMENDED_INDEX, _ISO_SPEED = 0x829A, 0x8827, 0x8832, 0x8833
+_FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
+#: The 16-bit sensitivity tag says this where the ISO does not fit; the longer tags then have it.
+_ISO_OVERFLOW = 65535
+#: Enough of a file for its directories, where they must be copied.
+_HEADER_BYTES = 1 << 20
+
+Tags = Mapping[int, Any]
+
+
+def jpeg_metadata(data: bytes) -> Metadata:
+    """Metadata of a JPEG file's bytes."""
+    return exif_metadata(next(_exif_segments(data), b""))
+
+
+def exif_metadata(exif: bytes) -> Metadata:
+    """Metadata of an EXIF block: a TIFF header and its directories, with or without `Exif\\0\\0` before it."""
+    return tiff_metadata(io.BytesIO(exif.removeprefix(b"Exif\0\0")))
+
+
+def tiff_metadata(stream: BinaryIO) -> Metadata:
+    """Metadata of a TIFF or TIFF-like RAW file; only its directories are read."""
+    return _from_tags(*_load_directories(stream))
+
+
+def tiff_tags(path: Path) -> Tags:
+    """Tags of a TIFF file's first directory; none where it is broken."""
+    try:
+        with path.open("rb") as file:
+            return _load_directories(file)[0]
+    except OSError:
+        return {}
+
+
+def raw_metadata(path: Path) -> Metadata:
+    """Metadata of a RAW file, from its own directories or the JPEG inside."""
+    try:
+        with path.open("rb") as file:
+            return _raw_metadata(file)
+    except (OSError, struct.error):
+        return Metadata()
+
+
+def merge(first: Metadata, second: Metadata) -> Metadata:
+    """`first`, with its unknown fields taken from `second`."""
+    unknown = {field.name: getattr(second, field.name) for field in fields(first) if getattr(first, field.name) is None}
+    return replace(first, **unknown)
+
+
+def _raw_metadata(file: BinaryIO) -> Metadata:
+    head = file.read(HEAD := 128)
+    if head.startswith(b"FUJIFILMCCD-RAW"):
+        offset, length = struct.unpack_from(">II", head, 84)
+        file.seek(offset)
+        return jpeg_metadata(file.read(min(length, _HEADER_BYTES)))
+    if head[4:8] == b"ftyp":
+        return _canon_metadata(head + file.read(_HEADER_BYTES - HEAD))
+    if head[:4] in (b"IIRO", b"IIRS", b"IIU\0"):  # TIFF but for the magic number
+        return tiff_metadata(io.BytesIO(b"II*\0" + head[4:] + file.read(_HEADER_BYTES - HEAD)))
+    return tiff_metadata(file)
+
+
+def _canon_metadata(head: bytes) -> Metadata:
+    """CR3 keeps IFD0 and the EXIF directory as two TIFF blocks in boxes of their own."""
+    main, exif = (head[at + 4 :] if (at := head.find(name)) >= 0 else b"" for name in (b"CMT1", b"CMT2"))
+    return merge(exif_metadata(main), exif_metadata(exif))
+
+
+def _exif_segments(data: bytes) -> Iterator[bytes]:
+    """EXIF blocks in the header of a JPEG file."""
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        segment = data[at + 4 : at + 2 + length]
+        if data[at + 1] == 0xE1 and segment.startswith(b"Exif\0\0"):
+            yield segment
+        at += 2 + max(length, 2)
+
+
+def _load_directories(stream: BinaryIO) -> tuple[Tags, Tags]:
+    """First and EXIF directory as plain dictionaries, empty where they are broken."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            stream.seek(0)
+            exif = Image.Exif()
+            exif.load_from_fp(stream)
+            return dict(exif), dict(exif.get_ifd(_EXIF_IFD))
+    except Exception:  # Pillow raises some ten unrelated types on broken directories
+        return {}, {}
+
+
+def _from_tags(main: Tags, exif: Tags) -> Metadata:
+    def number(*tags: int) -> float | None:
+        values = (_positive(directory.get(tag)) for tag in tags for directory in (exif, main))
+        return next((value for value in values if value is not None), None)
+
+    iso = number(_SENSITIVITY)
+    return Metadata(
+        make=_text(main.get(_MAKE)),
+        model=_text(main.get(_MODEL)),
+        lens=_text(exif.get(_LENS_MODEL)),
+        exposure_s=number(_EXPOSURE),
+        iso=number(_ISO_SPEED, _RECOMMENDED_INDEX, _SENSITIVITY) if iso == _ISO_OVERFLOW else iso,
+        focal_length_mm=number(_FOCAL_LENGTH),
+        focal_length_35mm=number(_FOCAL_LENGTH_35MM),
+        orientation=_orientation(main.get(_ORIENTATION)),
+    )
+
+
+def _text(value: Any) -> str | None:
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    text = value.split("\0")[0].strip() if isinstance(value, str) else ""
+    return "".join(c for c in text if c.isprintable()) or None
+
+
+def _positive(value: Any) -> float | None:
+    if isinstance(value, tuple):
+        value = value[0] if value else None
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
+
+
+def _orientation(value: Any) -> int:
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1

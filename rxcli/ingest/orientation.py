@@ -1,0 +1,52 @@
+"""The eight ways in which a stored picture is turned for viewing (EXIF 2.32, tag 0x0112).
+
+Pixels stay in readout order throughout the receiver; this exists for readers that turn them unasked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+_T = TypeVar("_T", bound=np.generic)
+Transform = Callable[[NDArray[_T]], NDArray[_T]]
+
+#: Orientation -> (quarter turns counter-clockwise, then mirrored left to right).
+_TURNS = {
+    1: (0, False),
+    2: (0, True),
+    3: (2, False),
+    4: (2, True),
+    5: (3, True),
+    6: (3, False),
+    7: (1, True),
+    8: (1, False),
+}
+
+
+def as_viewed(stored: NDArray[_T], orientation: int) -> NDArray[_T]:
+    """A view of `stored` (height, width, ...) as a viewer sees it."""
+    turns, mirrored = _TURNS[orientation]
+    turned = np.rot90(stored, turns)
+    return turned[:, ::-1] if mirrored else turned
+
+
+def as_stored(viewed: NDArray[_T], orientation: int) -> NDArray[_T]:
+    """The inverse of `as_viewed`."""
+    turns, mirrored = _TURNS[orientation]
+    return np.rot90(viewed[:, ::-1] if mirrored else viewed, -turns)
+
+
+def orientation_of(transform: Callable[[NDArray[np.int64]], NDArray[np.int64]]) -> int:
+    """The orientation that turns pictures as `transform` (a composition of turns and mirrors) does."""
+    probe = np.arange(6).reshape(2, 3)
+    seen = transform(probe)
+    return next(o for o in _TURNS if np.array_equal(as_viewed(probe, o), seen))
+
+
+def orientation_of_turn(degrees_ccw: float) -> int:
+    """The orientation of a display matrix that turns counter-clockwise by a multiple of 90 degrees; 1 for others."""
+    return {0: 1, 90: 8, 180: 3, 270: 6}.get(round(degrees_ccw) % 360, 1)

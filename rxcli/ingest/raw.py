@@ -1,0 +1,152 @@
+"""RAW files -> the sensor's mosaic, through LibRaw, without demosaicing and without a copy.
+
+Frames are views into LibRaw's memory, which lives as long as an array of it does (rawpy keeps the decoder alive);
+so the decoder is never closed here. Pixels are those of the default crop and are never turned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.errors import InputError
+from rxcli.ingest.extent import bytes_claimed
+from rxcli.ingest.metadata import merge, raw_metadata
+from rxcli.ingest.sniff import check_size
+from rxcli.types import Frame, Metadata, Mosaic
+
+#: LibRaw's turns for viewing -> EXIF orientation.
+_FLIP_ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}
+#: Colour filter arrays repeat with one of these periods: Bayer, X-Trans, and what LibRaw calls 16 x 16.
+_PERIODS = (2, 4, 6, 8, 16)
+
+Window = tuple[int, int, int, int]
+
+
+def read_raw(path: Path) -> Frame:
+    """The mosaic of a RAW file; a RAW that is no mosaic gives its green channel as linear light.
+
+    Raises:
+        InputError: damaged, cut, of an unknown camera, or without sensor values.
+    """
+    import rawpy
+
+    _check_whole(path)
+    try:
+        raw = rawpy.imread(str(path))
+        image = raw.raw_image
+    except rawpy.LibRawFileUnsupportedError:
+        raise InputError(f"{path}: no RAW format that LibRaw knows", "convert it to DNG, or use the JPEG") from None
+    except (rawpy.LibRawError, RuntimeError, OSError, MemoryError, ValueError) as error:
+        raise InputError(f"{path}: the RAW file is damaged or cut ({_reason(error)})", "copy the file again") from None
+    check_size(path, raw.sizes.width, raw.sizes.height)
+    top, left, height, width = default_crop(raw.sizes)
+    pixels = image[top : top + height, left : left + width]
+    metadata = _metadata(path, raw)
+    if pixels.ndim != 2 or raw.num_colors == 1:
+        return _linear_frame(path, pixels, raw, metadata)
+    pixels.flags.writeable = False
+    return Frame(pixels=pixels, source=str(path), metadata=metadata, mosaic=_mosaic(raw, top, left, path))
+
+
+def default_crop(sizes: Any) -> Window:
+    """Top, left, height and width, on the whole sensor, of the picture that the camera means to show.
+
+    Args:
+        sizes: rawpy's ImageSizes. Where its crop is absent or reaches out of the active area, that area is taken.
+    """
+    top, left, height, width = sizes.top_margin, sizes.left_margin, sizes.height, sizes.width
+    crop = (sizes.crop_top_margin, sizes.crop_left_margin, sizes.crop_height, sizes.crop_width)
+    inside_rows = top <= crop[0] and crop[0] + crop[2] <= top + height
+    inside_columns = left <= crop[1] and crop[1] + crop[3] <= left + width
+    if crop[2] > 0 and crop[3] > 0 and inside_rows and inside_columns:
+        return crop
+    return top, left, height, width
+
+
+def _check_whole(path: Path) -> None:
+    with path.open("rb") as file:
+        size, claimed = path.stat().st_size, bytes_claimed(file)
+    if size < claimed:
+        reason = f"{path}: the RAW file is cut: {size} of at least {claimed} bytes are there"
+        raise InputError(reason, "copy it from the camera again")
+
+
+def _mosaic(raw: Any, top: int, left: int, path: Path) -> Mosaic:
+    colours = _channel_colours(raw, path)
+    black = _black_per_colour(raw, colours)
+    return Mosaic(_pattern(raw, colours, top, left), _gains(raw), black, _white(raw, max(black)))
+
+
+def _channel_colours(raw: Any, path: Path) -> NDArray[np.uint8]:
+    """(4,) colour (0 red, 1 green, 2 blue) of LibRaw's channels, two of which are green in a Bayer mosaic."""
+    colours = ["RGB".find(chr(letter)) for letter in raw.color_desc[:4]]
+    if min(colours) < 0:
+        reason = (
+            f"{path}: the sensor's colours are {raw.color_desc.decode('ascii', 'replace')}, not red, green and blue"
+        )
+        raise InputError(reason, "use the JPEG")
+    return np.array(colours, np.uint8)
+
+
+def _pattern(raw: Any, colours: NDArray[np.uint8], top: int, left: int) -> NDArray[np.uint8]:
+    """The smallest tile whose repetition gives the colours from sensor pixel (top, left) on."""
+    side = range(2 * _PERIODS[-1])
+    probe = np.array([[colours[raw.raw_color(top + y, left + x)] for x in side] for y in side], np.uint8)
+    for period in _PERIODS:
+        if (probe[period:] == probe[:-period]).all() and (probe[:, period:] == probe[:, :-period]).all():
+            return probe[:period, :period].copy()
+    return probe
+
+
+def _black_per_colour(raw: Any, colours: NDArray[np.uint8]) -> tuple[float, float, float]:
+    levels = np.array(raw.black_level_per_channel, np.float64)
+    red, green, blue = (float(levels[colours == colour].mean()) for colour in range(3))
+    return red, green, blue
+
+
+def _gains(raw: Any) -> tuple[float, float, float]:
+    """The camera's white balance, else daylight's, else none."""
+    for balance in (raw.camera_whitebalance, raw.daylight_whitebalance):
+        gains = np.array(balance[:3], np.float64)
+        if np.isfinite(gains).all() and (gains > 0).all():
+            red, blue = gains[0] / gains[1], gains[2] / gains[1]
+            return float(red), 1.0, float(blue)
+    return 1.0, 1.0, 1.0
+
+
+def _white(raw: Any, black: float) -> float:
+    """The lowest level at which a channel saturates, as far as the file tells."""
+    levels = [float(level) for level in raw.camera_white_level_per_channel or () if level > black]
+    return min([*levels, float(raw.white_level) if raw.white_level > black else float(np.iinfo(np.uint16).max)])
+
+
+def _linear_frame(path: Path, pixels: NDArray[np.uint16], raw: Any, metadata: Metadata) -> Frame:
+    """A RAW without colour filters (monochrome sensor) or with all colours at each pixel (sRAW, linear DNG)."""
+    plane = pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[:, :, 1 if pixels.shape[2] >= 3 else 0])
+    plane.flags.writeable = False
+    black = float(raw.black_level_per_channel[1 if pixels.ndim == 3 else 0])
+    white = _white(raw, black)
+    return Frame(pixels=plane, source=str(path), metadata=metadata, black=black, white=white, linear=True)
+
+
+def _metadata(path: Path, raw: Any) -> Metadata:
+    """What the file's EXIF says, completed by what LibRaw knows."""
+    exif, other = raw_metadata(path), raw.other
+    libraw = Metadata(
+        lens=raw.lens.model.strip() or None,
+        exposure_s=other.shutter_speed if other.shutter_speed > 0 else None,
+        iso=other.iso_speed if other.iso_speed > 0 else None,
+        focal_length_mm=other.focal_length if other.focal_length > 0 else None,
+    )
+    orientation = exif.orientation if exif.orientation != 1 else _FLIP_ORIENTATION.get(raw.sizes.flip, 1)
+    return replace(merge(exif, libraw), orientation=orientation)
+
+
+def _reason(error: BaseException) -> str:
+    detail = error.args[0] if error.args else ""
+    return detail.decode("ascii", "replace") if isinstance(detail, bytes) else str(error) or type(error).__name__

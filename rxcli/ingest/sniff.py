@@ -1,0 +1,143 @@
+"""What a file is, from its first bytes; its name only decides where the bytes leave it open."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+from typing import Literal
+
+from rxcli.errors import InputError
+
+Kind = Literal["jpeg", "png", "tiff", "heif", "other_image", "raw", "video", "device"]
+
+IMAGE_SUFFIXES = frozenset(
+    {".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".bmp", ".webp"}
+)
+# fmt: off
+RAW_SUFFIXES = frozenset({
+    ".raf", ".dng", ".arw", ".sr2", ".srf", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".orf", ".rw2", ".raw", ".pef",
+    ".srw", ".x3f", ".3fr", ".fff", ".iiq", ".erf", ".mef", ".mos", ".mrw", ".kdc", ".dcr", ".rwl", ".gpr",
+})
+# fmt: on
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".3gp"})
+#: Suffixes, lower case with their dot, of the files that are looked at in folders.
+KNOWN_SUFFIXES = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
+
+#: Bytes that `sniff` wants to see: enough for the file type box of ISO media.
+HEAD_BYTES = 64
+#: No camera makes larger pictures; what claims to be larger is damaged or a decompression bomb.
+MAX_PIXELS = 400_000_000
+
+_TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_RAW_MAGIC = (b"FUJIFILMCCD-RAW", b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FOVb", b"\0MRM", b"II\x1a\0\0\0HEAPCCDR")
+_SUBFILE_TYPE, _PHOTOMETRIC, _MAKE, _DNG_VERSION = 0x00FE, 0x0106, 0x010F, 0xC612
+#: Colour filter array, and linear RAW.
+_RAW_PHOTOMETRICS = (32803, 34892)
+_HEIF_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1", b"hevc", b"hevx", b"msf1"})
+_ISO_BOXES = frozenset({b"moov", b"mdat", b"wide", b"free", b"skip", b"moof", b"pnot"})
+
+
+def check_file(path: Path) -> Kind | None:
+    """Refuse what can be no input at all; "device" for a character device, else None.
+
+    Raises:
+        InputError: nothing is there, or a folder, a pipe, an empty file.
+    """
+    try:
+        info = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{path}: no such file", "check the name") from None
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be looked at ({_reason(error)})", "check the name and the permissions"
+        ) from None
+    if stat.S_ISCHR(info.st_mode):
+        return "device"
+    if stat.S_ISDIR(info.st_mode):
+        raise InputError(f"{path}: is a folder, not a file", "name the files in it, or let `vlc-rx decode` walk it")
+    if not stat.S_ISREG(info.st_mode):
+        raise InputError(f"{path}: is not a regular file", "copy the data to a file first")
+    if info.st_size == 0:
+        raise InputError(f"{path}: the file is empty (0 bytes)", "copy it from the camera again")
+    return None
+
+
+def read_bytes(path: Path, size: int = -1) -> bytes:
+    """The first `size` bytes of a file, all of it by default.
+
+    Raises:
+        InputError: the system refuses.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(size)
+    except (OSError, MemoryError) as error:
+        raise InputError(f"{path}: cannot be read ({_reason(error)})", "check permissions and disk") from None
+
+
+def sniff(head: bytes, suffix: str) -> Kind | None:
+    """The kind of a file that starts with `head`; None where neither bytes nor `suffix` tell."""
+    return _by_magic(head) or _by_suffix(suffix)
+
+
+def is_raw_tiff(path: Path) -> bool:
+    """Whether a TIFF file is a camera's RAW in TIFF clothes: a DNG, a mosaic, or a preview with its RAW further on."""
+    from rxcli.ingest.metadata import tiff_tags
+
+    tags = tiff_tags(path)
+    if _DNG_VERSION in tags or tags.get(_PHOTOMETRIC) in _RAW_PHOTOMETRICS:
+        return True
+    preview = tags.get(_SUBFILE_TYPE) == 1
+    return _MAKE in tags and (preview or path.suffix.lower() in RAW_SUFFIXES)
+
+
+def check_size(source: object, width: int, height: int) -> None:
+    """Refuse a picture that no camera can have made.
+
+    Raises:
+        InputError: no pixels, or more than `MAX_PIXELS`.
+    """
+    if width < 1 or height < 1:
+        raise InputError(f"{source}: the picture is {width} x {height} pixels", "the file is damaged; copy it again")
+    if width * height > MAX_PIXELS:
+        reason = f"{source}: claims {width} x {height} pixels, more than {MAX_PIXELS // 1_000_000} million"
+        raise InputError(reason, "the file is damaged or no photo")
+
+
+def _by_magic(head: bytes) -> Kind | None:
+    if head.startswith(b"\xff\xd8\xff"):
+        return "jpeg"
+    if head.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "png"
+    if head.startswith(_RAW_MAGIC) or head[8:10] == b"CR":
+        return "raw"
+    if head.startswith(_TIFF_MAGIC):
+        return "tiff"
+    if head.startswith(b"BM") or (head.startswith(b"RIFF") and head[8:12] == b"WEBP"):
+        return "other_image"
+    return _iso_media(head) or _other_container(head)
+
+
+def _iso_media(head: bytes) -> Kind | None:
+    box, brand = head[4:8], head[8:12]
+    if box == b"ftyp":
+        if brand == b"crx ":
+            return "raw"
+        return "heif" if brand in _HEIF_BRANDS else "video"
+    return "video" if box in _ISO_BOXES else None
+
+
+def _other_container(head: bytes) -> Kind | None:
+    matroska = head.startswith(b"\x1a\x45\xdf\xa3")
+    avi = head.startswith(b"RIFF") and head[8:11] == b"AVI"
+    return "video" if matroska or avi else None
+
+
+def _by_suffix(suffix: str) -> Kind | None:
+    if suffix in RAW_SUFFIXES:
+        return "raw"
+    return "video" if suffix in VIDEO_SUFFIXES else None
+
+
+def _reason(error: BaseException) -> str:
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
