@@ -1,0 +1,276 @@
+"""`vlc-rx simulate`: captures with truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rxcli.errors import UsageError
+
+if TYPE_CHECKING:
+    from rxcli.simulate.capture import Take
+    from rxcli.simulate.scenes import Scene
+    from rxcli.simulate.transmitter import Weights
+
+_STILLS = ("jpeg", "dng", "dng14", "png", "png16", "tiff", "tiff16")
+_CODECS = ("h264", "h264-10", "hevc", "hevc-10", "mjpeg")
+_SUFFIXES = {".jpg": "jpeg", ".jpeg": "jpeg", ".dng": "dng", ".png": "png", ".tif": "tiff", ".tiff": "tiff"}
+_VIDEO_SUFFIXES = {".mp4": "h264", ".mov": "h264", ".mkv": "h264", ".avi": "mjpeg"}
+_PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-plain")
+
+
+@click.command()
+@click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
+@click.option("--preset", type=click.Choice(_PRESETS), default="xs10-still", show_default=True, help="Kind of camera.")
+@click.option("--screen", default="paper-34k6", show_default=True, help="Screen profile: a name or a TOML file.")
+@click.option("--picture", default="coffee", show_default=True, help="Picture shown: a file, or a name (see --list).")
+@click.option("--payload", default="random", show_default=True, help="'random', 'hex:...', or a file; sent over and over.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Same seed, same pixels.")
+@click.option(
+    "--format",
+    "file_format",
+    type=click.Choice((*_STILLS, *_CODECS)),
+    help="Format of OUT; by its suffix where not given.",
+)
+@click.option("--w", "weights", default="5", show_default=True, help="Lit slots of ten: N, a list N,N,..., or 'dimming'.")
+@click.option("--dimming", type=click.Choice(["max", "none"]), default="max", show_default=True, help="Local dimming.")
+@click.option("--exposure", "exposure_s", help="Exposure in seconds, or as 1/32000.  [default: the preset's]")
+@click.option("--electrons", type=float, help="Electrons of a green pixel that sees white, in one exposure.")
+@click.option("--iso", type=click.IntRange(1), help="ISO written to the file; has no effect on the pixels.")
+@click.option("--roll", type=float, help="Degrees about the line of sight; 180 for a camera upside down.")
+@click.option("--yaw", type=float, help="Degrees about the vertical.")
+@click.option("--pitch", type=float, help="Degrees about the horizontal.")
+@click.option("--distance", "distance_mm", type=float, help="Distance of the screen in millimetres.")
+@click.option("--fill", type=float, help="Share of the picture's width that the screen fills, instead of a distance.")
+@click.option("--focal", "focal_widths", type=float, help="Focal length in picture widths.")
+@click.option("--distortion", help="Lens distortion k1,k2,p1,p2,k3.")
+@click.option("--corners", help="The screen's corners x,y,x,y,x,y,x,y on the sensor, instead of a pose.")
+@click.option("--orientation", type=click.IntRange(1, 8), help="EXIF orientation.  [default: 1, or 3 for a roll of 180]")
+@click.option("--blur", "blur_px", type=float, help="Focus blur, standard deviation in pixels.")
+@click.option("--lcd-grid", type=click.FloatRange(0, 1), help="Depth of the panel's pixel structure.")
+@click.option("--room-light", "room_e", type=float, help="Electrons of a green pixel that sees white paper by the room's light.")
+@click.option("--flicker", "flicker_hz", type=float, help="Flicker of the room's light in Hz (100 or 120).")
+@click.option("--reflection", type=float, help="A lamp mirrored in the panel, against white paper.")
+@click.option("--scale", type=click.FloatRange(0.02, 4), help="Scale the sensor; rows and time shown scale with it.")
+@click.option("--keep-readout/--keep-line-delay", default=False, help="With --scale: keep the time of the whole readout.")
+@click.option("--cfa", type=click.Choice(["bayer", "xtrans", "rgb"]), help="Colour filter array.")
+@click.option("--tone", type=click.Choice(["srgb", "bt709", "gamma", "linear"]), help="Tone curve of developed pictures.")
+@click.option("--quality", type=click.IntRange(1, 100), help="JPEG quality.")
+@click.option("--subsampling", type=click.Choice(["444", "422", "420"]), help="JPEG colour subsampling.")
+@click.option("--sharpen", type=click.FloatRange(0, 5), help="Strength of sharpening.")
+@click.option("--denoise", "denoise_px", type=click.FloatRange(0, 10), help="Noise reduction, pixels.")
+@click.option("--correct/--no-correct", "correct", default=None, help="Take the lens's distortion out in the camera.")
+@click.option("--frames", "n_frames", type=click.IntRange(1), help="Frames of a clip.")
+@click.option("--frame-rate", "frame_rate_hz", type=float, help="Frames per second of a clip.")
+@click.option("--bit-rate", type=click.IntRange(1), help="Bits per second of a clip.  [default: constant quality]")
+@click.option("--shake", "shake_px", type=float, help="Hand shake, pixels.")
+@click.option("--clock-error", "slot_rate_error_ppm", type=float, help="Error of the slot rate, ppm.")
+@click.option("--column-delays", help="Delays of the columns in slots: one number each, or one for the largest random delay.")
+@click.option("--start-slot", type=float, help="Slot of the link at which row 0 starts.  [default: random]")
+@click.option("--make", help="Camera make written to the file.")
+@click.option("--model", help="Camera model written to the file.")
+@click.option("--waveforms", type=click.Path(file_okay=False, path_type=Path), help="Also write what drives a real screen.")
+@click.option("--list", "list_names", is_flag=True, is_eager=True, expose_value=False, callback=lambda c, p, v: _list(c, v))
+def simulate(out: Path, **options: Any) -> None:
+    """Simulate a capture of a mini-LED screen and write it to OUT, with OUT's name .truth.json beside it."""
+    from rxcli.simulate.capture import prepare
+
+    if not out.parent.is_dir():
+        raise UsageError(f"{out.parent}: no such folder", "create it first")
+    file_format = options["file_format"] or _format_of(out)
+    scene = _scene(options, file_format)
+    take = prepare(scene, options["seed"])
+    truth = _write(take, out, file_format, options["bit_rate"])
+    click.echo(f"{out} and {truth.name}: {_summary(take)}", err=True)
+    if options["waveforms"] is not None:
+        from rxcli.simulate.transmitter import export_waveforms
+
+        n_bursts = 1 + int(take.exposure(scene.n_frames - 1).row_start_slots[-1] // take.link.burst_slots)
+        written = export_waveforms(take.drive, take.link, n_bursts, options["waveforms"])
+        click.echo(f"{options['waveforms']}: {', '.join(path.name for path in written)} ({n_bursts} bursts)", err=True)
+
+
+def _list(context: click.Context, wanted: bool) -> None:
+    """Print the names of pictures and end."""
+    if wanted:
+        from rxcli.simulate.pictures import picture_names
+
+        click.echo("\n".join(picture_names()))
+        context.exit()
+
+
+def _format_of(out: Path) -> str:
+    known = _SUFFIXES | _VIDEO_SUFFIXES
+    if out.suffix.lower() not in known:
+        raise UsageError(f"{out}: no format goes with this suffix", f"use one of {', '.join(known)}, or --format")
+    return known[out.suffix.lower()]
+
+
+def _scene(options: dict[str, Any], file_format: str) -> Scene:
+    """The preset with what the options change."""
+    from rxcli.simulate.scenes import preset
+
+    scene = preset(options["preset"], options["screen"])
+    direct = ("n_frames", "frame_rate_hz", "blur_px", "lcd_grid", "shake_px", "iso", "make", "model", "orientation")
+    direct += ("start_slot", "slot_rate_error_ppm")
+    scene = replace(scene, picture=options["picture"], dimming=options["dimming"], **_given(options, direct))
+    scene = replace(scene, w=_weights(options["weights"]), payload=_payload(options["payload"]))
+    scene = _with_light(_with_pose(scene, options), options)
+    isp = _given(options, ("tone", "quality", "subsampling", "sharpen", "denoise_px"))
+    if options["correct"] is not None:
+        isp["correct_distortion"] = options["correct"]
+    sensor = _given(options, ("cfa",))
+    scene = replace(scene, isp=replace(scene.isp, **isp), sensor=replace(scene.sensor, **sensor))
+    if options["column_delays"] is not None:
+        delays = _numbers(options["column_delays"], "--column-delays", (1, scene.screen.columns))
+        scene = replace(scene, column_delay_slots=delays if len(delays) > 1 else delays[0])
+    if options["scale"] is not None:
+        scene = scene.scaled(options["scale"], keep_readout=options["keep_readout"])
+    return _for_format(scene, file_format, options)
+
+
+def _for_format(scene: Scene, file_format: str, options: dict[str, Any]) -> Scene:
+    if file_format.startswith("dng"):
+        if scene.sensor.cfa == "rgb":
+            raise UsageError("a DNG holds a mosaic, this sensor has none", "add --cfa bayer or --cfa xtrans")
+        # LibRaw crops a known Fujifilm model to the area it knows; a synthetic make keeps every pixel.
+        scene = replace(scene, output="raw", make=options["make"] or "Synthetic", model=options["model"] or scene.camera_name)
+    if file_format in _STILLS:
+        scene = replace(scene, n_frames=1)
+    return scene
+
+
+def _given(options: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: options[name] for name in names if options[name] is not None}
+
+
+def _with_pose(scene: Scene, options: dict[str, Any]) -> Scene:
+    lens, pose = scene.lens, scene.pose
+    if options["focal_widths"] is not None:
+        lens = replace(lens, focal_widths=options["focal_widths"])
+    if options["distortion"] is not None:
+        k1, k2, p1, p2, k3 = _numbers(options["distortion"], "--distortion", (5,))
+        lens = replace(lens, distortion=(k1, k2, p1, p2, k3))
+    angles = {"roll_deg": options["roll"], "yaw_deg": options["yaw"], "pitch_deg": options["pitch"], "fill": options["fill"]}
+    pose = replace(pose, **{name: value for name, value in angles.items() if value is not None})
+    if options["distance_mm"] is not None:
+        pose = replace(pose, fill=lens.focal_widths * scene.screen.width_mm / options["distance_mm"])
+    if pose.fill <= 0 or lens.focal_widths <= 0:
+        raise UsageError("--fill, --distance and --focal must be positive", "give positive numbers")
+    if options["corners"] is not None:
+        values = _numbers(options["corners"], "--corners", (8,))
+        pose = replace(pose, corners=tuple(zip(values[::2], values[1::2], strict=True)))
+    turned = abs((pose.roll_deg + 180) % 360 - 180) > 90
+    orientation = options["orientation"] or (3 if turned else 1)
+    return replace(scene, lens=lens, pose=pose, orientation=orientation)
+
+
+def _with_light(scene: Scene, options: dict[str, Any]) -> Scene:
+    if options["exposure_s"] is not None:
+        scene = replace(scene, exposure_s=_seconds(options["exposure_s"]))
+    if options["electrons"] is not None:
+        scene = replace(scene, light_e_per_s=options["electrons"] / scene.exposure_s)
+    room = {"flicker_hz": options["flicker_hz"], "lamp": options["reflection"]}
+    if options["room_e"] is not None:
+        room["light_e_per_s"] = options["room_e"] / scene.exposure_s
+    return replace(scene, room=replace(scene.room, **{k: v for k, v in room.items() if v is not None}))
+
+
+def _seconds(text: str) -> float:
+    numerator, _, denominator = text.partition("/")
+    try:
+        value = float(numerator) / float(denominator or 1)
+    except (ValueError, ZeroDivisionError):
+        raise UsageError(f"--exposure: {text!r} is no time", "give seconds, or a fraction such as 1/32000") from None
+    return value
+
+
+def _numbers(text: str, option: str, counts: tuple[int, ...]) -> tuple[float, ...]:
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"{option}: {text!r} is no list of numbers", "separate numbers by commas") from None
+    if len(values) not in counts:
+        wanted = " or ".join(str(count) for count in counts)
+        raise UsageError(f"{option} takes {wanted} numbers (got {len(values)})", "separate numbers by commas")
+    return values
+
+
+def _weights(text: str) -> Weights:
+    if text == "dimming":
+        return "dimming"
+    try:
+        values = tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(f"--w: {text!r} is no weight", "give 1..9, a list of them, or 'dimming'") from None
+    return values[0] if len(values) == 1 else values
+
+
+def _payload(text: str) -> bytes | None:
+    if text == "random":
+        return None
+    try:
+        data = bytes.fromhex(text[4:]) if text.startswith("hex:") else Path(text).read_bytes()
+    except ValueError:
+        raise UsageError(f"--payload: {text!r} holds no hex", "give an even number of hex digits") from None
+    except OSError as error:
+        raise UsageError(
+            f"--payload: {text}: cannot be read ({error.strerror})", "give 'random', 'hex:...' or a file"
+        ) from None
+    if not data:
+        raise UsageError(f"--payload: {text!r} is empty", "give at least one byte")
+    return data
+
+
+def _write(take: Take, out: Path, file_format: str, bit_rate: int | None) -> Path:
+    """Write the capture and its truth; returns the truth's path."""
+    from rxcli.simulate.truth import write_truth
+
+    try:
+        if file_format in _CODECS:
+            _write_clip(take, out, file_format, bit_rate)
+        else:
+            _write_still(take, out, file_format)
+        return write_truth(take.truth(out.name), out)
+    except OSError as error:
+        raise UsageError(f"{out}: cannot be written ({error.strerror or error})", "choose another place") from None
+
+
+def _write_still(take: Take, out: Path, file_format: str) -> None:
+    from rxcli.simulate.files import write_png
+    from rxcli.simulate.isp import develop
+    from rxcli.simulate.tiff import write_dng, write_tiff
+
+    capture = take.frame(0)
+    if file_format == "jpeg":
+        out.write_bytes(capture.jpeg)
+    elif file_format.startswith("dng"):
+        write_dng(capture.raw, take.scene, out, 14 if file_format == "dng14" else 16)
+    else:
+        bits = 16 if file_format.endswith("16") else 8
+        rgb = develop(capture.raw, take.scene.sensor, take.scene.isp, capture.exposure.view, bits)
+        write_png(rgb, out) if file_format.startswith("png") else write_tiff(rgb, take.scene, out)
+
+
+def _write_clip(take: Take, out: Path, codec: str, bit_rate: int | None) -> None:
+    from tqdm import tqdm
+
+    from rxcli.simulate.isp import develop
+    from rxcli.simulate.video import CODECS, write_video
+
+    scene, bits = take.scene, 16 if CODECS[codec].bits > 8 else 8
+    numbers = tqdm(range(scene.n_frames), desc=out.name, unit="frame", leave=False, disable=None)
+    captures = (take.frame(number) for number in numbers)
+    frames = (develop(c.raw, scene.sensor, scene.isp, c.exposure.view, bits) for c in captures)
+    write_video(frames, out, codec, scene.frame_rate_hz, bit_rate)
+
+
+def _summary(take: Take) -> str:
+    scene, first = take.scene, take.exposure(0)
+    return (
+        f"{scene.sensor.width} x {scene.sensor.height}, {scene.rows_per_slot:.2f} rows per slot, "
+        f"exposure {first.exposure_slots:.2f} slots, {scene.n_frames} frame{'s' * (scene.n_frames > 1)}"
+    )

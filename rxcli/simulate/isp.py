@@ -1,0 +1,174 @@
+"""A fast image signal processor of our own: from the sensor's numbers to a developed picture.
+
+Like a camera's, it is not linear and not reversible: cheap demosaicing, white balance, noise reduction, distortion
+correction, tone curve, sharpening, eight bits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.simulate.optics import View
+from rxcli.simulate.sensor import PATTERNS, Sensor
+
+Float32Array = NDArray[np.float32]
+Tone = Literal["srgb", "bt709", "gamma", "linear"]
+Subsampling = Literal["444", "422", "420"]
+
+#: Weights of red, green and blue in luma: JPEG (BT.601) and video (BT.709).
+LUMA_BT601 = (0.299, 0.587, 0.114)
+LUMA_BT709 = (0.2126, 0.7152, 0.0722)
+_TABLE_SIZE = 4096
+
+
+@dataclass(frozen=True)
+class Isp:
+    """Settings of the development."""
+
+    tone: Tone = "srgb"
+    #: Light that comes out as white is the sensor's full scale over this.
+    gain: float = 1.5
+    #: Strength and radius (pixels) of unsharp masking on luma.
+    sharpen: float = 0.0
+    sharpen_px: float = 1.2
+    #: Standard deviation of the smoothing of luma and of colour, pixels.
+    denoise_px: float = 0.0
+    denoise_colour_px: float = 2.0
+    #: Take the lens's distortion out; the camera matrix stays.
+    correct_distortion: bool = False
+    quality: int = 92
+    subsampling: Subsampling = "420"
+
+
+def tone_curve(light: NDArray[np.floating], tone: Tone) -> NDArray[np.float64]:
+    """Picture values 0..1 of linear light 0..1."""
+    x = np.clip(np.asarray(light, np.float64), 0, 1)
+    if tone == "srgb":
+        return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+    if tone == "bt709":
+        return np.where(x < 0.018, 4.5 * x, 1.099 * np.maximum(x, 1e-9) ** 0.45 - 0.099)
+    return x ** (1 / 2.2) if tone == "gamma" else x
+
+
+def demosaic(raw: NDArray[np.uint16], sensor: Sensor) -> Float32Array:
+    """Full-colour light from the sensor's numbers, black at 0 and white level at 1; (height, width, 3) float32.
+
+    Bayer is bilinear; X-Trans is a normalised convolution, each colour a weighted mean of its nearest samples.
+    """
+    scale = np.float32(1 / (sensor.white_level - sensor.black_level))
+    if sensor.cfa == "bayer":
+        import cv2
+
+        planes = cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2RGB).astype(np.float32)
+    elif sensor.cfa == "xtrans":
+        planes = _demosaic_xtrans(raw)
+    else:
+        planes = raw.astype(np.float32)
+    planes -= np.float32(sensor.black_level)
+    planes *= scale
+    return planes
+
+
+def _demosaic_xtrans(raw: NDArray[np.uint16]) -> Float32Array:
+    import cv2
+
+    pattern = PATTERNS["xtrans"]
+    values = raw.astype(np.float32)
+    planes = np.empty((*raw.shape, 3), np.float32)
+    tiles = (-(-raw.shape[0] // 6), -(-raw.shape[1] // 6))
+    for colour in range(3):
+        mask = np.tile((pattern == colour).astype(np.float32), tiles)[: raw.shape[0], : raw.shape[1]]
+        size, sigma = (3, 0.7) if colour == 1 else (5, 1.1)
+        total = cv2.GaussianBlur(values * mask, (size, size), sigma, borderType=cv2.BORDER_REFLECT_101)
+        total /= cv2.GaussianBlur(mask, (size, size), sigma, borderType=cv2.BORDER_REFLECT_101)
+        planes[..., colour] = total
+    return planes
+
+
+def develop(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp, view: View, bits: int = 8) -> NDArray[np.generic]:
+    """Develop a picture.
+
+    Args:
+        raw: (height, width) uint16 mosaic, or (height, width, 3).
+        sensor: that made it.
+        isp: settings.
+        view: lens whose distortion is corrected, where the settings ask for it.
+        bits: 8 or 16.
+
+    Returns:
+        (height, width, 3) uint8 or uint16, red first, full range.
+    """
+    import cv2
+
+    planes = demosaic(raw, sensor)
+    to_panel = np.linalg.inv(sensor.colour_matrix) * isp.gain
+    planes = cv2.transform(planes, to_panel.astype(np.float32))
+    planes = _reduce_noise(planes, isp)
+    if isp.correct_distortion:
+        planes = correct_distortion(planes, view)
+    planes = _apply_tone(planes, isp.tone)
+    if isp.sharpen > 0:
+        luma = cv2.transform(planes, np.array([LUMA_BT601], np.float32))
+        detail = luma - cv2.GaussianBlur(luma, (0, 0), isp.sharpen_px)
+        planes += (np.float32(isp.sharpen) * detail)[..., None]
+    top = (1 << bits) - 1
+    planes *= np.float32(top)
+    planes += np.float32(0.5)
+    return np.clip(planes, 0, top + 0.5, out=planes).astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def _reduce_noise(planes: Float32Array, isp: Isp) -> Float32Array:
+    import cv2
+
+    if isp.denoise_colour_px <= 0 and isp.denoise_px <= 0:
+        return planes
+    luma = cv2.transform(planes, np.array([LUMA_BT601], np.float32))
+    colour = planes - luma[..., None]
+    if isp.denoise_colour_px > 0:
+        colour = cv2.blur(colour, (2 * round(isp.denoise_colour_px) + 1,) * 2)
+    if isp.denoise_px > 0:
+        luma = cv2.GaussianBlur(luma, (0, 0), isp.denoise_px)
+    colour += luma[..., None]
+    return np.asarray(colour, np.float32)
+
+
+def _apply_tone(planes: Float32Array, tone: Tone) -> Float32Array:
+    # The table's steps follow the square root of light, so that shadows keep their gradation.
+    steps = np.linspace(0, 1, _TABLE_SIZE)
+    table = tone_curve(steps**2, tone).astype(np.float32)
+    root = np.sqrt(np.clip(planes, 0, 1))
+    return np.take(table, (root * np.float32(_TABLE_SIZE - 1) + np.float32(0.5)).astype(np.uint16))
+
+
+def correction_map(view: View) -> tuple[Float32Array, Float32Array]:
+    """Sensor places (x, y) that the pixels of a corrected picture are taken from; each (height, width) float32."""
+    import cv2
+
+    pitch = 16
+    nx, ny = -(-view.width // pitch) + 2, -(-view.height // pitch) + 2
+    x = np.arange(-1, nx - 1) * float(pitch) + (pitch - 1) / 2
+    y = np.arange(-1, ny - 1) * float(pitch) + (pitch - 1) / 2
+    matrix = view.camera_matrix
+    ideal = (np.stack(np.meshgrid(x, y), axis=-1) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    nodes = view.ideal_to_pixels(ideal).astype(np.float32)
+    full = cv2.resize(nodes, (nx * pitch, ny * pitch), interpolation=cv2.INTER_LINEAR)
+    inner = full[pitch : pitch + view.height, pitch : pitch + view.width]
+    return np.ascontiguousarray(inner[..., 0]), np.ascontiguousarray(inner[..., 1])
+
+
+def correct_distortion(planes: Float32Array, view: View) -> Float32Array:
+    """A picture without the lens's distortion, on the same camera matrix."""
+    import cv2
+
+    return np.asarray(cv2.remap(planes, *correction_map(view), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+
+
+def luma(rgb: NDArray[np.generic], weights: tuple[float, float, float] = LUMA_BT601) -> Float32Array:
+    """(height, width) float32 luma of a picture (height, width, 3), red first."""
+    import cv2
+
+    return np.asarray(cv2.transform(rgb.astype(np.float32), np.array([weights], np.float32)))

@@ -1,0 +1,212 @@
+"""The screen: local dimming, light spread, compensated picture, and the slots of every column.
+
+Everything here is written from the air interface (sections 2 to 4) and shares only the codebook and the packet layout
+with the receiver.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.errors import UsageError
+from rxcli.profiles import ScreenProfile
+from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS, bits_to_hex, encode_packet, payload_bits
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+
+#: Exponent of the panel: light = (grey / 255) ** PANEL_GAMMA.
+PANEL_GAMMA = 2.2
+#: What a black pixel of the panel still lets through (contrast 1000 : 1).
+PANEL_LEAKAGE = 1e-3
+
+Weights = int | tuple[int, ...] | Literal["dimming"]
+Dimming = Literal["max", "none"]
+
+
+def light_spread(positions: FloatArray, n_segments: int, sigma: float) -> FloatArray:
+    """Light that unit segments throw on places along one axis of the screen.
+
+    A segment's light integrates to one segment pitch, so equal drive gives a mean of one far from the edges.
+
+    Args:
+        positions: (n,) places in 0..1 across the screen; the spread goes on outside.
+        n_segments: segments along the axis.
+        sigma: of the Gaussian, in segment pitches; 0 for a sharp segment.
+
+    Returns:
+        (n, n_segments) float64.
+    """
+    offset = np.asarray(positions)[..., None] * n_segments - (np.arange(n_segments) + 0.5)
+    if sigma == 0:
+        return np.asarray((offset >= -0.5) & (offset < 0.5), np.float64)
+    return np.asarray(np.exp(-0.5 * (offset / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)))
+
+
+def dimming_levels(picture: FloatArray, rows: int, columns: int) -> FloatArray:
+    """Local dimming by the "max" rule: the brightest subpixel under each segment.
+
+    Args:
+        picture: (height, width, 3) light of the picture, 0..1.
+        rows: segments along the height.
+        columns: segments across.
+
+    Returns:
+        (rows, columns) float64, average light of each segment, 0..1.
+    """
+    brightest = picture.max(axis=2)
+    tops = np.arange(rows) * brightest.shape[0] // rows
+    lefts = np.arange(columns) * brightest.shape[1] // columns
+    return np.asarray(np.maximum.reduceat(np.maximum.reduceat(brightest, tops, axis=0), lefts, axis=1), np.float64)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What the screen is driven with for one picture."""
+
+    screen: ScreenProfile
+    #: (height_px, width_px, 3) uint8, compensated grey levels.
+    grey: NDArray[np.uint8]
+    #: (segment rows, columns) average light of each segment, 0..1.
+    levels: FloatArray
+    #: (columns,) lit slots per symbol.
+    weights: NDArray[np.int64]
+
+    @cached_property
+    def transmittance(self) -> Float32Array:
+        """(height_px, width_px, 3) what the panel lets through, per colour."""
+        table = (np.arange(256) / 255.0) ** PANEL_GAMMA
+        return (PANEL_LEAKAGE + (1 - PANEL_LEAKAGE) * table).astype(np.float32)[self.grey]
+
+    @cached_property
+    def lit_light(self) -> FloatArray:
+        """(segment rows, columns) light of each segment while lit; its average is `levels`."""
+        return self.levels * (SLOTS_PER_SYMBOL / self.weights)
+
+
+def choose_weights(weights: Weights, levels: FloatArray) -> NDArray[np.int64]:
+    """Lit slots per symbol of every column.
+
+    Args:
+        weights: one for all, one per column, or "dimming": each column follows its brightest segment.
+        levels: (segment rows, columns) average light, 0..1.
+
+    Raises:
+        UsageError: a weight outside 1..9, or a wrong number of them.
+    """
+    columns = levels.shape[1]
+    if weights == "dimming":
+        return np.clip(np.rint(levels.max(axis=0) * SLOTS_PER_SYMBOL), WEIGHTS[0], WEIGHTS[-1]).astype(np.int64)
+    values = np.atleast_1d(np.asarray(weights, np.int64))
+    if values.size not in (1, columns):
+        raise UsageError(
+            f"w must be one number or one for each of {columns} columns (got {values.size})",
+            "give one number, a list as long as the screen has columns, or 'dimming'",
+        )
+    if values.min() < WEIGHTS[0] or values.max() > WEIGHTS[-1]:
+        raise UsageError(f"w must be in 1..9 (got {values.tolist()})", "choose from 1..9")
+    return np.broadcast_to(values, columns).copy()
+
+
+def drive_screen(screen: ScreenProfile, picture: NDArray[np.uint8], weights: Weights, dimming: Dimming = "max") -> Drive:
+    """Local dimming, weights and compensated grey levels for a picture.
+
+    Args:
+        screen: what is driven.
+        picture: (height_px, width_px, 3) uint8 grey levels as they should appear.
+        weights: see `choose_weights`.
+        dimming: "max", or "none" for a backlight that is fully on everywhere.
+    """
+    light = (picture / 255.0) ** PANEL_GAMMA
+    shape = (screen.segment_rows, screen.columns)
+    levels = dimming_levels(light, *shape) if dimming == "max" else np.ones(shape)
+    backlight = backlight_average(levels, screen, picture.shape[0], picture.shape[1])
+    needed = light / np.maximum(backlight, 1e-6)[..., None]
+    grey = np.rint(255 * np.clip(needed, 0, 1) ** (1 / PANEL_GAMMA)).astype(np.uint8)
+    return Drive(screen, grey, levels, choose_weights(weights, levels))
+
+
+def backlight_average(levels: FloatArray, screen: ScreenProfile, height: int, width: int) -> FloatArray:
+    """(height, width) average light behind every pixel of the panel."""
+    across = light_spread((np.arange(width) + 0.5) / width, screen.columns, screen.light_spread)
+    along = light_spread((np.arange(height) + 0.5) / height, screen.segment_rows, screen.light_spread)
+    return np.asarray(along @ levels @ across.T)
+
+
+@dataclass(frozen=True)
+class Link:
+    """The endless stream of bursts that the columns send; burst 0 starts at slot 0, before it all is dark."""
+
+    screen: ScreenProfile
+    #: (columns,) lit slots per symbol.
+    weights: NDArray[np.int64]
+    #: Seed of random payloads.
+    seed: int
+    #: Sent over and over, burst by burst and column by column; None for random bits.
+    message: bytes | None = None
+
+    @property
+    def burst_slots(self) -> int:
+        """Slots of one burst."""
+        return self.screen.packet_slots * self.screen.repeats
+
+    @cached_property
+    def bits_per_column(self) -> list[int]:
+        """Payload bits of a packet of every column."""
+        return [payload_bits(int(w), self.screen.payload_symbols) for w in self.weights]
+
+    def payload(self, burst: int) -> list[NDArray[np.uint8]]:
+        """Payload bits of one burst, per column."""
+        total = sum(self.bits_per_column)
+        if self.message is None:
+            rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, burst])))
+            bits = rng.integers(0, 2, total, dtype=np.uint8)
+        else:
+            message = np.unpackbits(np.frombuffer(self.message, np.uint8))
+            bits = np.take(message, np.arange(burst * total, (burst + 1) * total), mode="wrap")
+        return np.split(bits, np.cumsum(self.bits_per_column)[:-1])
+
+    def payload_hex(self, burst: int) -> list[str]:
+        """Payload of one burst as hex, per column."""
+        return [bits_to_hex(bits) for bits in self.payload(burst)]
+
+    def packets(self, burst: int) -> NDArray[np.uint8]:
+        """(columns, packet slots) 0/1, one packet of `burst`."""
+        bits = self.payload(burst)
+        return np.stack([encode_packet(b, int(w)) for b, w in zip(bits, self.weights, strict=True)])
+
+    def slots(self, first: int, stop: int) -> NDArray[np.uint8]:
+        """(columns, stop - first) 0/1 slots from `first` on; dark before slot 0."""
+        bursts = range(max(first, 0) // self.burst_slots, max(stop - 1, 0) // self.burst_slots + 1)
+        sent = np.concatenate([np.tile(self.packets(b), self.screen.repeats) for b in bursts], axis=1)
+        origin = bursts[0] * self.burst_slots
+        dark = np.zeros((sent.shape[0], max(0, min(-first, stop - first))), np.uint8)
+        return np.concatenate([dark, sent[:, max(first, 0) - origin : max(stop, 0) - origin]], axis=1)
+
+
+def export_waveforms(drive: Drive, link: Link, n_bursts: int, folder: Path) -> list[Path]:
+    """Write what a laboratory needs to drive a real backlight.
+
+    `slots.npy` and `slots.csv` hold one line per slot and one value per column; `levels.csv` the average light of every
+    segment, `lit_light.csv` its light while lit (1 is the full average); `picture.png` the compensated picture.
+
+    Returns:
+        The files written.
+    """
+    import cv2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    slots = link.slots(0, n_bursts * link.burst_slots).T
+    names = ",".join(f"column_{c}" for c in range(slots.shape[1]))
+    np.save(folder / "slots.npy", slots)
+    np.savetxt(folder / "slots.csv", slots, fmt="%d", delimiter=",", header=names, comments="")
+    np.savetxt(folder / "levels.csv", drive.levels, fmt="%.6f", delimiter=",", header=names, comments="")
+    np.savetxt(folder / "lit_light.csv", drive.lit_light, fmt="%.6f", delimiter=",", header=names, comments="")
+    (folder / "picture.png").write_bytes(cv2.imencode(".png", drive.grey[..., ::-1])[1].tobytes())
+    return [folder / name for name in ("slots.npy", "slots.csv", "levels.csv", "lit_light.csv", "picture.png")]
