@@ -62,6 +62,19 @@ def raw_metadata(path: Path) -> Metadata:
         return Metadata()
 
 
+def clip_metadata(tags: Mapping[str, str]) -> Metadata:
+    """Metadata of a clip from the tags of its container, which tell the camera but not the exposure."""
+    lower = {name.lower(): value for name, value in tags.items()}
+
+    def text(*names: str) -> str | None:
+        return next((found for name in names if (found := _text(lower.get(name)))), None)
+
+    return Metadata(
+        make=text("make", "com.apple.quicktime.make", "com.android.manufacturer"),
+        model=text("model", "com.apple.quicktime.model", "com.android.model"),
+    )
+
+
 def merge(first: Metadata, second: Metadata) -> Metadata:
     """`first`, with its unknown fields taken from `second`."""
     unknown = {field.name: getattr(second, field.name) for field in fields(first) if getattr(first, field.name) is None}
