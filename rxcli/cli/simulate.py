@@ -27,7 +27,9 @@ _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-p
 @click.option("--preset", type=click.Choice(_PRESETS), default="xs10-still", show_default=True, help="Kind of camera.")
 @click.option("--screen", default="paper-34k6", show_default=True, help="Screen profile: a name or a TOML file.")
 @click.option("--picture", default="coffee", show_default=True, help="Picture shown: a file, or a name (see --list).")
-@click.option("--payload", default="random", show_default=True, help="'random', 'hex:...', or a file; sent over and over.")
+@click.option(
+    "--payload", default="random", show_default=True, help="'random', 'hex:...', or a file; sent over and over."
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Same seed, same pixels.")
 @click.option(
     "--format",
@@ -35,7 +37,9 @@ _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-p
     type=click.Choice((*_STILLS, *_CODECS)),
     help="Format of OUT; by its suffix where not given.",
 )
-@click.option("--w", "weights", default="5", show_default=True, help="Lit slots of ten: N, a list N,N,..., or 'dimming'.")
+@click.option(
+    "--w", "weights", default="5", show_default=True, help="Lit slots of ten: N, a list N,N,..., or 'dimming'."
+)
 @click.option("--dimming", type=click.Choice(["max", "none"]), default="max", show_default=True, help="Local dimming.")
 @click.option("--exposure", "exposure_s", help="Exposure in seconds, or as 1/32000.  [default: the preset's]")
 @click.option("--electrons", type=float, help="Electrons of a green pixel that sees white, in one exposure.")
@@ -48,16 +52,24 @@ _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-p
 @click.option("--focal", "focal_widths", type=float, help="Focal length in picture widths.")
 @click.option("--distortion", help="Lens distortion k1,k2,p1,p2,k3.")
 @click.option("--corners", help="The screen's corners x,y,x,y,x,y,x,y on the sensor, instead of a pose.")
-@click.option("--orientation", type=click.IntRange(1, 8), help="EXIF orientation.  [default: 1, or 3 for a roll of 180]")
+@click.option(
+    "--orientation", type=click.IntRange(1, 8), help="EXIF orientation.  [default: 1, or 3 for a roll of 180]"
+)
 @click.option("--blur", "blur_px", type=float, help="Focus blur, standard deviation in pixels.")
 @click.option("--lcd-grid", type=click.FloatRange(0, 1), help="Depth of the panel's pixel structure.")
-@click.option("--room-light", "room_e", type=float, help="Electrons of a green pixel that sees white paper by the room's light.")
+@click.option(
+    "--room-light", "room_e", type=float, help="Electrons of a green pixel that sees white paper by the room's light."
+)
 @click.option("--flicker", "flicker_hz", type=float, help="Flicker of the room's light in Hz (100 or 120).")
 @click.option("--reflection", type=float, help="A lamp mirrored in the panel, against white paper.")
 @click.option("--scale", type=click.FloatRange(0.02, 4), help="Scale the sensor; rows and time shown scale with it.")
-@click.option("--keep-readout/--keep-line-delay", default=False, help="With --scale: keep the time of the whole readout.")
+@click.option(
+    "--keep-readout/--keep-line-delay", default=False, help="With --scale: keep the time of the whole readout."
+)
 @click.option("--cfa", type=click.Choice(["bayer", "xtrans", "rgb"]), help="Colour filter array.")
-@click.option("--tone", type=click.Choice(["srgb", "bt709", "gamma", "linear"]), help="Tone curve of developed pictures.")
+@click.option(
+    "--tone", type=click.Choice(["srgb", "bt709", "gamma", "linear"]), help="Tone curve of developed pictures."
+)
 @click.option("--quality", type=click.IntRange(1, 100), help="JPEG quality.")
 @click.option("--subsampling", type=click.Choice(["444", "422", "420"]), help="JPEG colour subsampling.")
 @click.option("--sharpen", type=click.FloatRange(0, 5), help="Strength of sharpening.")
@@ -68,12 +80,18 @@ _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-p
 @click.option("--bit-rate", type=click.IntRange(1), help="Bits per second of a clip.  [default: constant quality]")
 @click.option("--shake", "shake_px", type=float, help="Hand shake, pixels.")
 @click.option("--clock-error", "slot_rate_error_ppm", type=float, help="Error of the slot rate, ppm.")
-@click.option("--column-delays", help="Delays of the columns in slots: one number each, or one for the largest random delay.")
+@click.option(
+    "--column-delays", help="Delays of the columns in slots: one number each, or one for the largest random delay."
+)
 @click.option("--start-slot", type=float, help="Slot of the link at which row 0 starts.  [default: random]")
 @click.option("--make", help="Camera make written to the file.")
 @click.option("--model", help="Camera model written to the file.")
-@click.option("--waveforms", type=click.Path(file_okay=False, path_type=Path), help="Also write what drives a real screen.")
-@click.option("--list", "list_names", is_flag=True, is_eager=True, expose_value=False, callback=lambda c, p, v: _list(c, v))
+@click.option(
+    "--waveforms", type=click.Path(file_okay=False, path_type=Path), help="Also write what drives a real screen."
+)
+@click.option(
+    "--list", "list_names", is_flag=True, is_eager=True, expose_value=False, callback=lambda c, p, v: _list(c, v)
+)
 def simulate(out: Path, **options: Any) -> None:
     """Simulate a capture of a mini-LED screen and write it to OUT, with OUT's name .truth.json beside it."""
     from rxcli.simulate.capture import prepare
@@ -114,8 +132,18 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     from rxcli.simulate.scenes import preset
 
     scene = preset(options["preset"], options["screen"])
-    direct = ("n_frames", "frame_rate_hz", "blur_px", "lcd_grid", "shake_px", "iso", "make", "model", "orientation")
-    direct += ("start_slot", "slot_rate_error_ppm")
+    direct: tuple[str, ...] = (
+        "n_frames",
+        "frame_rate_hz",
+        "blur_px",
+        "lcd_grid",
+        "shake_px",
+        "iso",
+        "make",
+        "model",
+        "start_slot",
+    )
+    direct += ("slot_rate_error_ppm",)
     scene = replace(scene, picture=options["picture"], dimming=options["dimming"], **_given(options, direct))
     scene = replace(scene, w=_weights(options["weights"]), payload=_payload(options["payload"]))
     scene = _with_light(_with_pose(scene, options), options)
@@ -137,7 +165,9 @@ def _for_format(scene: Scene, file_format: str, options: dict[str, Any]) -> Scen
         if scene.sensor.cfa == "rgb":
             raise UsageError("a DNG holds a mosaic, this sensor has none", "add --cfa bayer or --cfa xtrans")
         # LibRaw crops a known Fujifilm model to the area it knows; a synthetic make keeps every pixel.
-        scene = replace(scene, output="raw", make=options["make"] or "Synthetic", model=options["model"] or scene.camera_name)
+        scene = replace(
+            scene, output="raw", make=options["make"] or "Synthetic", model=options["model"] or scene.camera_name
+        )
     if file_format in _STILLS:
         scene = replace(scene, n_frames=1)
     return scene
@@ -154,7 +184,12 @@ def _with_pose(scene: Scene, options: dict[str, Any]) -> Scene:
     if options["distortion"] is not None:
         k1, k2, p1, p2, k3 = _numbers(options["distortion"], "--distortion", (5,))
         lens = replace(lens, distortion=(k1, k2, p1, p2, k3))
-    angles = {"roll_deg": options["roll"], "yaw_deg": options["yaw"], "pitch_deg": options["pitch"], "fill": options["fill"]}
+    angles = {
+        "roll_deg": options["roll"],
+        "yaw_deg": options["yaw"],
+        "pitch_deg": options["pitch"],
+        "fill": options["fill"],
+    }
     pose = replace(pose, **{name: value for name, value in angles.items() if value is not None})
     if options["distance_mm"] is not None:
         pose = replace(pose, fill=lens.focal_widths * scene.screen.width_mm / options["distance_mm"])

@@ -1,8 +1,8 @@
 """The camera: what light reaches every pixel during its row's exposure.
 
-Electrons of a pixel are `T(u, v) * sum over columns c of K_c(u, v) * m_c(row) + room`. `T` is the picture (sharp), `K_c`
-the light of column `c` (smooth, so it is evaluated on a coarse grid), `m_c` the share of the row's exposure in which the
-column was lit (exact). Focus blur is applied to `T`: it mixes places, and one row remains one instant.
+Electrons of a pixel are `T(u, v) * sum over columns c of K_c(u, v) * m_c(row) + room`. `T` is the picture (sharp),
+`K_c` the light of column `c` (smooth, so it is evaluated on a coarse grid), `m_c` the share of the row's exposure in
+which the column was lit (exact). Focus blur is applied to `T`: it mixes places, and one row remains one instant.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Room:
     flicker_hz: float = 100.0
     flicker_depth: float = 0.3
     #: Share of the room's light that the dark panel throws back.
-    panel_reflectance: float = 0.02
-    wall_reflectance: float = 0.4
+    panel_reflectance: float = 0.12
+    wall_reflectance: float = 0.3
     bezel_reflectance: float = 0.03
     #: A lamp mirrored in the panel: its strength against white paper, and its place (u, v) and size (in screen widths).
     lamp: float = 0.0
@@ -78,7 +78,8 @@ class Exposure:
     @cached_property
     def row_start_slots(self) -> FloatArray:
         """(height,) slot of the common clock at which every row starts to integrate."""
-        return self.start_slot + np.arange(self.sensor.height) * (self.sensor.line_delay_s * self.slot_rate_hz)
+        rows = np.arange(self.sensor.height, dtype=np.float64)
+        return np.asarray(self.start_slot + rows * (self.sensor.line_delay_s * self.slot_rate_hz))
 
     @property
     def exposure_slots(self) -> float:
@@ -93,14 +94,15 @@ class Exposure:
         last = int(np.ceil(starts[-1] + self.exposure_slots - self.delays.min())) + 1
         slots = self.link.slots(first, last)
         shares = [
-            lit_share(s, starts - delay - first, self.exposure_slots) for s, delay in zip(slots, self.delays, strict=True)
+            lit_share(s, starts - delay - first, self.exposure_slots)
+            for s, delay in zip(slots, self.delays, strict=True)
         ]
         return np.stack(shares, axis=1)
 
     @cached_property
     def room_rows(self) -> FloatArray:
         """(height,) electrons of a green pixel that sees white paper in the room's light."""
-        starts = self.start_s + np.arange(self.sensor.height) * self.sensor.line_delay_s
+        starts = self.start_s + np.arange(self.sensor.height, dtype=np.float64) * self.sensor.line_delay_s
         wave = flicker(starts, self.exposure_s, self.room.flicker_hz, self.room.flicker_depth, 0.0)
         return wave * (self.room.light_e_per_s * self.exposure_s)
 
@@ -143,7 +145,8 @@ def panel_texture(exposure: Exposure) -> Float32Array:
     if across > 1:
         _draw_pixel_structure(fine, exposure.lcd_grid)
     sensed = cv2.transform(fine, exposure.sensor.colour_matrix.astype(np.float32))
-    sensed = cv2.copyMakeBorder(sensed, *[_TEXTURE_MARGIN] * 4, cv2.BORDER_CONSTANT, value=0)
+    m = _TEXTURE_MARGIN
+    sensed = cv2.copyMakeBorder(sensed, m, m, m, m, cv2.BORDER_CONSTANT, value=0)
     # A sensor pixel is a box of side 1, whose variance 1/12 the Gaussian takes along.
     sigma_px = np.sqrt(exposure.blur_px**2 + 1 / 12)
     per_pixel = (
@@ -217,7 +220,7 @@ class Band:
 
 def grid_nodes(width: int, pitch: int) -> FloatArray:
     """Nodes that `cv2.resize` by `pitch` lays on pixel centres, with one cell to spare on either side."""
-    return np.arange(-1, -(-width // pitch) + 1) * float(pitch) + (pitch - 1) / 2
+    return np.arange(-1, -(-width // pitch) + 1, dtype=np.float64) * pitch + (pitch - 1) / 2
 
 
 def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
@@ -259,13 +262,14 @@ def _backlight_nodes(exposure: Exposure, x: FloatArray, top: int, bottom: int) -
     pitch = exposure.grid_rows
     n_cells = -(-(bottom - top) // pitch)
     light = column_light(exposure, x, top + pitch * np.arange(n_cells + 1.0))
-    lit = np.zeros((n_cells * pitch, exposure.lit.shape[1]), np.float32)
-    lit[: bottom - top] = exposure.lit[top:bottom]
-    lit = lit.reshape(n_cells, pitch, -1)
+    padded = np.zeros((n_cells * pitch, exposure.lit.shape[1]), np.float32)
+    padded[: bottom - top] = exposure.lit[top:bottom]
+    lit = padded.reshape(n_cells, pitch, -1)
     share = (np.arange(pitch, dtype=np.float32) / pitch)[None, :, None]
     both = np.concatenate([lit * (1 - share), lit * share], axis=2)
     pairs = np.concatenate([light[:-1], light[1:]], axis=1)
-    return (both @ pairs).reshape(n_cells * pitch, -1)[: bottom - top]
+    nodes: Float32Array = np.matmul(both, pairs).reshape(n_cells * pitch, -1)
+    return nodes[: bottom - top]
 
 
 def _enlarge_across(nodes: Float32Array, pitch: int, out: Float32Array) -> None:
@@ -306,7 +310,9 @@ def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:
 BandVisitor = Callable[[Band, Float32Array], None]
 
 
-def take_picture(exposure: Exposure, seed: int, threads: int = 2, visit: BandVisitor | None = None) -> NDArray[np.uint16]:
+def take_picture(
+    exposure: Exposure, seed: int, threads: int = 2, visit: BandVisitor | None = None
+) -> NDArray[np.uint16]:
     """Expose and read out one picture.
 
     Args:

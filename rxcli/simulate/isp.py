@@ -46,12 +46,12 @@ class Isp:
 
 def tone_curve(light: NDArray[np.floating], tone: Tone) -> NDArray[np.float64]:
     """Picture values 0..1 of linear light 0..1."""
-    x = np.clip(np.asarray(light, np.float64), 0, 1)
+    x: NDArray[np.float64] = np.clip(np.asarray(light, np.float64), 0, 1)
     if tone == "srgb":
         return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
     if tone == "bt709":
         return np.where(x < 0.018, 4.5 * x, 1.099 * np.maximum(x, 1e-9) ** 0.45 - 0.099)
-    return x ** (1 / 2.2) if tone == "gamma" else x
+    return np.asarray(x ** (1 / 2.2)) if tone == "gamma" else x
 
 
 def demosaic(raw: NDArray[np.uint16], sensor: Sensor) -> Float32Array:

@@ -61,10 +61,11 @@ def undistort(points: FloatArray, coefficients: FloatArray, iterations: int = 12
     if not np.any(coefficients):
         return guess
     step = 1e-6
+    along_x, along_y = np.array([step, 0.0]), np.array([0.0, step])
     for _ in range(iterations):
         here = distort(guess, coefficients)
-        jx = (distort(guess + [step, 0.0], coefficients) - here) / step
-        jy = (distort(guess + [0.0, step], coefficients) - here) / step
+        jx = (distort(guess + along_x, coefficients) - here) / step
+        jy = (distort(guess + along_y, coefficients) - here) / step
         missing = points - here
         det = jx[..., 0] * jy[..., 1] - jx[..., 1] * jy[..., 0]
         det = np.where(np.abs(det) < 0.05, 0.05, det)
@@ -76,9 +77,7 @@ def undistort(points: FloatArray, coefficients: FloatArray, iterations: int = 12
 
 def rotation(roll_deg: float, yaw_deg: float, pitch_deg: float) -> FloatArray:
     """Rotation matrix: yaw about the vertical, then pitch about the horizontal, then roll about the line of sight."""
-    (cr, sr), (cy, sy), (cp, sp) = (
-        (np.cos(a), np.sin(a)) for a in np.deg2rad([roll_deg, yaw_deg, pitch_deg])
-    )
+    (cr, sr), (cy, sy), (cp, sp) = ((np.cos(a), np.sin(a)) for a in np.deg2rad([roll_deg, yaw_deg, pitch_deg]))
     about_z = np.array([[cr, -sr, 0], [sr, cr, 0], [0, 0, 1]])
     about_x = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -134,7 +133,9 @@ class View:
         size = np.array([self.screen.width_mm, self.screen.height_mm])
         matrix = self.camera_matrix
         distance = matrix[0, 0] * size[0] / (self.pose.fill * self.width)
-        shift = np.array([self.pose.shift_x * self.width / matrix[0, 0], self.pose.shift_y * self.height / matrix[1, 1]])
+        shift = np.array(
+            [self.pose.shift_x * self.width / matrix[0, 0], self.pose.shift_y * self.height / matrix[1, 1]]
+        )
         axes = rotation(self.pose.roll_deg, self.pose.yaw_deg, self.pose.pitch_deg)[:, :2] * size
         centre = np.append(shift * distance, distance) - axes.sum(axis=1) / 2
         return np.column_stack([axes, centre])
@@ -155,7 +156,8 @@ class View:
 
     def pixels_to_screen(self, pixels: FloatArray) -> FloatArray:
         """Screen places (u, v) of sensor places (..., 2); the inverse of `screen_to_pixels`."""
-        return project(np.linalg.inv(self.to_normalised), self.pixels_to_ideal(pixels))
+        inverse = np.asarray(np.linalg.inv(self.to_normalised), np.float64)
+        return project(inverse, self.pixels_to_ideal(pixels))
 
     @cached_property
     def corners(self) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +57,10 @@ def _photo_path(name: str) -> Path:
     from importlib.util import find_spec
 
     spec = find_spec("skimage")
-    assert spec is not None and spec.origin is not None, "scikit-image is a dependency"
+    if spec is None or spec.origin is None:
+        raise InputError(
+            f"picture {name!r} comes with scikit-image, which is not installed", "install it, or give a file"
+        )
     return Path(spec.origin).parent / "data" / PHOTOS[name]
 
 
@@ -87,22 +91,26 @@ def _fill(picture: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uin
 
 def _generate(name: str, width: int, height: int) -> NDArray[np.uint8]:
     y, x = np.mgrid[0:height, 0:width]
-    u, v = (x + 0.5) / width, (y + 0.5) / height
-    drawn = {
-        "white": lambda: np.full((height, width), 1.0),
-        "grey": lambda: np.full((height, width), 0.5),
-        "black": lambda: np.zeros((height, width)),
+    drawn = _draw(name, (x + 0.5) / width, (y + 0.5) / height)
+    rgb = drawn if drawn.ndim == 3 else np.repeat(drawn[..., None], 3, axis=2)
+    return np.asarray(np.rint(255 * np.clip(rgb, 0, 1)), np.uint8)
+
+
+def _draw(name: str, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Grey or coloured picture values 0..1 at the places (u, v) of all pixels."""
+    height, width = u.shape
+    flat = {"white": 1.0, "grey": 0.5, "black": 0.0}
+    drawers: dict[str, Callable[[], NDArray[np.float64]]] = {
         "sky": lambda: _sky(u, v),
-        "gradient": lambda: 0.1 + 0.9 * (0.5 * u + 0.5 * v),
+        "gradient": lambda: 0.1 + 0.45 * (u + v),
         "bars": lambda: _bars(u),
         "noise": lambda: np.random.default_rng(7).uniform(0, 1, (height, width, 3)),
-        "checker": lambda: 0.15 + 0.8 * ((x // 48 + y // 48) % 2),
+        "checker": lambda: 0.15 + 0.8 * ((np.floor(28 * u) + np.floor(16 * v)) % 2),
         "text": lambda: _text(width, height),
         "flower": lambda: _flower(u * width / height, v, width / height),
         "night": lambda: _night(u, v),
-    }[name]()
-    rgb = drawn if drawn.ndim == 3 else np.repeat(drawn[..., None], 3, axis=2)
-    return np.rint(255 * np.clip(rgb, 0, 1)).astype(np.uint8)
+    }
+    return np.full(u.shape, flat[name]) if name in flat else drawers[name]()
 
 
 def _sky(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -120,7 +128,10 @@ def _text(width: int, height: int) -> NDArray[np.float64]:
     import cv2
 
     page = np.full((height, width), 238, np.uint8)
-    lines = ("The quick brown fox jumps over the lazy dog 0123456789", "Light is sent by columns, time is told by rows.")
+    lines = (
+        "The quick brown fox jumps over the lazy dog 0123456789",
+        "Light is sent by columns, time is told by rows.",
+    )
     for i, top in enumerate(range(30, height, 28)):
         cv2.putText(page, f"{i:02d} {lines[i % 2]} {lines[(i + 1) % 2]}", (16, top), 0, 0.62, 25, 1, cv2.LINE_AA)
     return page / 255.0
@@ -134,7 +145,9 @@ def _flower(x: NDArray[np.float64], y: NDArray[np.float64], aspect: float) -> ND
     shade = inside * (0.35 + 0.65 * np.clip(radius / 0.4, 0, 1))
     heart = np.exp(-((radius / 0.09) ** 2))
     leaves = 0.12 * np.clip(np.sin(9 * dx + 4 * dy) * np.sin(5 * dy - 3 * dx), 0, 1) + 0.02
-    return np.stack([0.95 * shade + 0.4 * heart + leaves * 0.3, 0.35 * shade + 0.5 * heart + leaves, 0.6 * shade], axis=-1)
+    return np.stack(
+        [0.95 * shade + 0.4 * heart + leaves * 0.3, 0.35 * shade + 0.5 * heart + leaves, 0.6 * shade], axis=-1
+    )
 
 
 def _night(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:

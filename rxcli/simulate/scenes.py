@@ -112,7 +112,7 @@ def _xs10_still(screen: ScreenProfile) -> Scene:
         lens=Lens(19000 / 6240, (-0.06, 0.02, 0.0005, -0.0003, 0.0)),
         pose=Pose(fill=0.965, roll_deg=0.35, yaw_deg=2.0, pitch_deg=-1.0),
         room=Room(light_e_per_s=8e4),
-        isp=Isp(tone="srgb", gain=1.6, denoise_px=0.6, subsampling="422", quality=92),
+        isp=Isp(tone="srgb", gain=1.6, denoise_px=0.35, denoise_colour_px=1.0, subsampling="422", quality=93),
         camera_name="xs10",
         make="FUJIFILM",
         model="X-S10",
@@ -146,13 +146,15 @@ def _video_1080p(screen: ScreenProfile) -> Scene:
 def _phone_corrected(screen: ScreenProfile) -> Scene:
     return Scene(
         screen,
-        sensor=Sensor(4032, 3024, 5.6e-6, "bayer", full_scale_e=260.0, read_noise_e=2.0, black_level=64, white_level=1023),
+        sensor=Sensor(
+            4032, 3024, 5.6e-6, "bayer", full_scale_e=260.0, read_noise_e=2.0, black_level=64, white_level=1023
+        ),
         lens=Lens(0.78, (0.07, -0.09, 0.0004, 0.0006, 0.0)),
         pose=Pose(fill=0.92, roll_deg=1.2, yaw_deg=3.0, pitch_deg=-2.0),
-        room=Room(light_e_per_s=6e4),
-        isp=Isp(tone="bt709", gain=2.0, sharpen=0.8, denoise_px=0.5, correct_distortion=True, quality=90),
+        room=Room(light_e_per_s=1.2e5),
+        isp=Isp(tone="bt709", gain=2.4, sharpen=0.8, denoise_px=0.5, correct_distortion=True, quality=90),
         exposure_s=1 / 24000,
-        light_e_per_s=1.2e6,
+        light_e_per_s=1.4e6,
         camera_name="phone12",
         model="Phone 12MP",
     )
@@ -161,7 +163,9 @@ def _phone_corrected(screen: ScreenProfile) -> Scene:
 def _phone_plain(screen: ScreenProfile) -> Scene:
     return replace(
         _phone_corrected(screen),
-        sensor=Sensor(4000, 3000, 7.1e-6, "bayer", full_scale_e=220.0, read_noise_e=2.4, black_level=256, white_level=4095),
+        sensor=Sensor(
+            4000, 3000, 7.1e-6, "bayer", full_scale_e=220.0, read_noise_e=2.4, black_level=256, white_level=4095
+        ),
         lens=Lens(0.82, (-0.03, 0.01, 0.0, 0.0, 0.0)),
         isp=Isp(tone="srgb", gain=1.8, sharpen=0.5, denoise_px=0.4, quality=93),
         exposure_s=1 / 20000,

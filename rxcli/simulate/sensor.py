@@ -15,7 +15,14 @@ Cfa = Literal["bayer", "xtrans", "rgb"]
 PATTERNS: dict[str, NDArray[np.uint8]] = {
     "bayer": np.array([[0, 1], [1, 2]], np.uint8),
     "xtrans": np.array(
-        [[1, 1, 0, 1, 1, 2], [1, 1, 2, 1, 1, 0], [2, 0, 1, 0, 2, 1], [1, 1, 2, 1, 1, 0], [1, 1, 0, 1, 1, 2], [0, 2, 1, 2, 0, 1]],
+        [
+            [1, 1, 0, 1, 1, 2],
+            [1, 1, 2, 1, 1, 0],
+            [2, 0, 1, 0, 2, 1],
+            [1, 1, 2, 1, 1, 0],
+            [1, 1, 0, 1, 1, 2],
+            [0, 2, 1, 2, 0, 1],
+        ],
         np.uint8,
     ),
 }
@@ -60,7 +67,7 @@ class Sensor:
     def colour_matrix(self) -> NDArray[np.float64]:
         """(3, 3) electrons of the sensor's colours from light of the panel's; its rows sum to `response`."""
         mixing = np.full((3, 3), self.colour_mixing) + np.eye(3) * (1 - 3 * self.colour_mixing)
-        return mixing * np.array(self.response)[:, None]
+        return np.asarray(mixing * np.array(self.response)[:, None], np.float64)
 
     @property
     def pattern(self) -> NDArray[np.uint8] | None:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.errors import UsageError
 from rxcli.simulate.scenes import Scene
 
 _BYTE, _ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 5, 7, 10
@@ -31,9 +32,8 @@ class _Tag:
         if isinstance(self.values, bytes):
             return self.values
         if self.kind in (_RATIONAL, _SRATIONAL):
-            return b"".join(
-                struct.pack("<" + _FORMATS[self.kind], Fraction(v).numerator, Fraction(v).denominator) for v in self.values
-            )
+            pairs = (Fraction(value).as_integer_ratio() for value in self.values)
+            return b"".join(struct.pack("<" + _FORMATS[self.kind], *pair) for pair in pairs)
         return b"".join(struct.pack("<" + _FORMATS[self.kind], int(v)) for v in self.values)
 
 
@@ -104,7 +104,7 @@ def pack_14bit(values: NDArray[np.uint16]) -> bytes:
     word = (quads[..., 0] << np.uint64(42)) | (quads[..., 1] << np.uint64(28)) | (quads[..., 2] << np.uint64(14))
     word |= quads[..., 3]
     packed = word.astype(">u8").view(np.uint8).reshape(height, -1, 8)[..., 1:].reshape(height, -1)
-    return packed[:, : -(-width * 14 // 8)].tobytes()
+    return bytes(packed[:, : -(-width * 14 // 8)].tobytes())
 
 
 def write_dng(raw: NDArray[np.uint16], scene: Scene, path: Path, bits: int = 16) -> None:
@@ -117,7 +117,8 @@ def write_dng(raw: NDArray[np.uint16], scene: Scene, path: Path, bits: int = 16)
         bits: 16, or 14 for packed numbers.
     """
     pattern = scene.sensor.pattern
-    assert pattern is not None and raw.ndim == 2, "a DNG holds a mosaic"
+    if pattern is None:
+        raise UsageError("a DNG holds a mosaic, this sensor has none", "use a Bayer or X-Trans sensor")
     data = raw.astype("<u2").tobytes() if bits == 16 else pack_14bit(raw)
     # The matrix from XYZ to the sensor's colours, for the panel's primaries taken as sRGB's.
     from_xyz = scene.sensor.colour_matrix @ np.array(

@@ -102,7 +102,8 @@ def choose_weights(weights: Weights, levels: FloatArray) -> NDArray[np.int64]:
     """
     columns = levels.shape[1]
     if weights == "dimming":
-        return np.clip(np.rint(levels.max(axis=0) * SLOTS_PER_SYMBOL), WEIGHTS[0], WEIGHTS[-1]).astype(np.int64)
+        wanted = np.rint(levels.max(axis=0) * SLOTS_PER_SYMBOL)
+        return np.asarray(np.clip(wanted, WEIGHTS[0], WEIGHTS[-1]), np.int64)
     values = np.atleast_1d(np.asarray(weights, np.int64))
     if values.size not in (1, columns):
         raise UsageError(
@@ -111,10 +112,12 @@ def choose_weights(weights: Weights, levels: FloatArray) -> NDArray[np.int64]:
         )
     if values.min() < WEIGHTS[0] or values.max() > WEIGHTS[-1]:
         raise UsageError(f"w must be in 1..9 (got {values.tolist()})", "choose from 1..9")
-    return np.broadcast_to(values, columns).copy()
+    return np.array(np.broadcast_to(values, columns))
 
 
-def drive_screen(screen: ScreenProfile, picture: NDArray[np.uint8], weights: Weights, dimming: Dimming = "max") -> Drive:
+def drive_screen(
+    screen: ScreenProfile, picture: NDArray[np.uint8], weights: Weights, dimming: Dimming = "max"
+) -> Drive:
     """Local dimming, weights and compensated grey levels for a picture.
 
     Args:

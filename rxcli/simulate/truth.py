@@ -86,6 +86,6 @@ def _frame_truth(number: int, exposure: Exposure) -> dict[str, Any]:
 
 def write_truth(truth: dict[str, Any], path: Path) -> Path:
     """Write the truth beside the capture `path`, as `NAME.truth.json`; returns where."""
-    target = path.with_suffix("").with_suffix(".truth.json") if path.suffix else path.with_name(path.name + ".truth.json")
+    target = path.with_name(path.stem + ".truth.json")
     target.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
     return target

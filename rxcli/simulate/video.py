@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,10 +66,15 @@ def write_video(
         for rgb in frames:
             if stream is None:
                 stream = _add_stream(container, settings, rate, rgb.shape, bit_rate)
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), "rgb24" if rgb.dtype == np.uint8 else "rgb48le")
+            frame = av.VideoFrame.from_ndarray(
+                np.ascontiguousarray(rgb), "rgb24" if rgb.dtype == np.uint8 else "rgb48le"
+            )
             target_range = _JPEG_RANGE if settings.full_range else _MPEG_RANGE
             converted = frame.reformat(
-                format=settings.pixel_format, dst_colorspace=_BT709, src_color_range=_JPEG_RANGE, dst_color_range=target_range
+                format=settings.pixel_format,
+                dst_colorspace=_BT709,
+                src_color_range=_JPEG_RANGE,
+                dst_color_range=target_range,
             )
             converted.pts = None
             container.mux(stream.encode(converted))
@@ -76,13 +82,15 @@ def write_video(
             container.mux(stream.encode(None))
 
 
-def _add_stream(container, settings, rate, shape, bit_rate):  # type: ignore[no-untyped-def]
+def _add_stream(container: Any, settings: Codec, rate: Fraction, shape: tuple[int, ...], bit_rate: int | None) -> Any:
     import av
 
     try:
         stream = container.add_stream(settings.encoder, rate=rate)
     except (av.error.FFmpegError, ValueError) as error:
-        raise UsageError(f"{settings.encoder}: this FFmpeg cannot encode it ({error})", "choose another codec") from None
+        raise UsageError(
+            f"{settings.encoder}: this FFmpeg cannot encode it ({error})", "choose another codec"
+        ) from None
     stream.height, stream.width = shape[:2]
     stream.pix_fmt = settings.pixel_format
     context = stream.codec_context
