@@ -79,6 +79,113 @@ class Frame:
         return int(self.pixels.shape[1])
 
 
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """OpenCV's lens model of one picture, in its own pixels."""
+
+    #: (3, 3) float64.
+    camera_matrix: FloatArray
+    #: (n,) float64: k1 k2 p1 p2 k3, then as OpenCV orders them.
+    dist_coeffs: FloatArray
+    #: True where the picture was already corrected: straight lines are straight, stripes are bent.
+    corrected: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Outlines:
+    """Where each strip of each column lies on the picture, row by row. C columns of S strips, R picture rows."""
+
+    #: (R,) int: picture rows that the screen touches, adjacent and ascending.
+    rows: NDArray[np.int64]
+    #: (C*S + 1, R) float64: x of the strips' edges, pixels; column 0 is the viewer's leftmost.
+    edges_x: FloatArray
+    #: (C, S, R) bool: the strip's middle is on the screen and in the picture.
+    inside: BoolArray
+    #: (C, S, R) float64: sensor row at the strip's middle; None where it is the picture row itself.
+    sensor_row: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True)
+class RowProfiles:
+    """Linear light of every strip on every row: all that the later stages see of the picture."""
+
+    #: (C, S, R) float32: mean light, 1 is white; 0 outside the screen.
+    light: Float32Array
+    #: (C, S, R) bool: the strip is on the screen there.
+    inside: BoolArray
+    #: (R,) int: picture rows.
+    rows: NDArray[np.int64]
+    #: (C, S, R) float64: sensor rows, None where they are `rows`.
+    sensor_row: FloatArray | None
+    #: (C, S) float32: pixels behind each mean, median over the rows.
+    count: Float32Array
+    #: A pixel of light x has variance noise_floor + noise_slope * x.
+    noise_floor: float
+    noise_slope: float
+
+    def variance(self) -> Float32Array:
+        """(C, S, R) variance of `light` by the noise model."""
+        pixel = self.noise_floor + self.noise_slope * np.maximum(self.light, 0)
+        return np.asarray(pixel / np.maximum(self.count, 1.0)[:, :, None], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """The link's time on the sensor. Grid slot `n` of column `c` is position `(n + first_slot) % packet_slots` of copy
+    `(n + first_slot) // packet_slots`; a copy is one sending of a packet."""
+
+    rows_per_slot: float
+    #: Exposure in slots.
+    exposure_slots: float
+    packet_slots: int
+    #: Sensor row whose exposure's centre is the start of grid slot 0 of a column without delay.
+    row0: float
+    #: Slots of the grid.
+    n_slots: int
+    #: Position of grid slot 0 in its packet; grid slot 0 belongs to copy 0.
+    first_slot: int
+    #: (n_copies,) int: burst of each copy, from 0 in time order.
+    burst: NDArray[np.int64]
+    #: (C,) float64: delay of each column, slots.
+    delay_slots: FloatArray
+    #: Height of the header peak over the strongest one elsewhere.
+    lock: float
+
+    @property
+    def n_copies(self) -> int:
+        """Copies that the grid touches."""
+        return int(self.burst.size)
+
+
+@dataclass(frozen=True, slots=True)
+class SlotSamples:
+    """Row profiles resampled to Q samples a slot: C columns, S strips, N slots."""
+
+    #: (C, S, N * Q) float32: light, sample i covers (i .. i + 1) / Q slots of exposure centre; 0 where not valid.
+    light: Float32Array
+    #: (C, S, N * Q) float32: 1 where the sample lies on the screen, else 0.
+    valid: Float32Array
+    samples_per_slot: int
+
+
+@dataclass(frozen=True, slots=True)
+class BurstPosteriors:
+    """What the detector knows of B bursts of C columns; N payload symbols of up to K bits."""
+
+    #: (C,) int: weight of each column.
+    w: NDArray[np.int64]
+    #: (C, 9) float64: log evidence of w = 1..9, normalised to a sum of 1 in probability.
+    w_log_prob: FloatArray
+    #: (B, C, 20 + 10 N) float32: probability that the slot is lit.
+    lit: Float32Array
+    #: (B, C, N) int64: most probable codebook index of every symbol.
+    index: NDArray[np.int64]
+    #: (B, C, N) float64: log probability of that index.
+    log_prob: FloatArray
+    #: (B, C, N, 7) float64: ln p(1)/p(0) of the symbol's bits, first bit first; nan where w has fewer bits.
+    bit_llr: FloatArray
+
+
 FrameStatus = Literal["ok", "partial", "no_screen", "no_signal", "unreadable"]
 ColumnStatus = Literal["ok", "weak", "dark", "no_packet"]
 

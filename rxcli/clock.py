@@ -1,0 +1,298 @@
+"""Slot clock, copies and bursts, from the header and the repeats, jointly over the columns.
+
+Model: all columns send the header 0011100011 at the same instants, so the mean over columns of the light, each strip
+normalised to its local extremes, shows the header at full contrast wherever a packet starts, while payloads average out.
+The clock is the start and, where the camera is unknown, the period that collects most of that correlation over all
+visible copies. Copies of one burst are alike, copies of different bursts are not; that finds the burst boundaries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
+from rxcli.types import Clock, Float32Array, FloatArray, RowProfiles, SlotSamples
+
+#: Samples a slot while the clock is sought.
+_SEARCH_SAMPLES = 4
+#: Any window of this many slots holds a lit and a dark one (two symbols meet dark-to-dark or lit-to-lit at worst).
+_EXTREMES_SLOTS = 19
+#: Contrast that half-convinces, over the noise of a sample.
+_CONTRAST_SIGMAS = 8.0
+_MAX_DELAY_SLOTS = 2.0
+
+
+def resample(profiles: RowProfiles, row0: float, rows_per_sample: float, n_samples: int) -> tuple[Float32Array, Float32Array]:
+    """Mean light over equal steps of sensor rows.
+
+    Args:
+        profiles: C columns, S strips, R rows.
+        row0: sensor row at which sample 0 starts; row r covers r - 0.5 .. r + 0.5.
+        rows_per_sample: length of a sample.
+        n_samples: samples.
+
+    Returns:
+        (C, S, n_samples) float32 light, 0 where not valid; and 1 where a sample lies on the screen altogether, else 0.
+    """
+    borders = row0 + rows_per_sample * np.arange(n_samples + 1)
+    light = profiles.light.reshape(-1, profiles.light.shape[-1])
+    inside = profiles.inside.reshape(light.shape)
+    positions = _row_positions(profiles, borders)
+    sums = _integrate(light, positions)
+    covered = _integrate(inside.astype(np.float32), positions)
+    widths = np.diff(positions, axis=-1)
+    valid = (covered > 0.99 * widths) & (widths > 1e-6)
+    mean = np.divide(sums, widths, out=np.zeros_like(sums), where=valid)
+    shape = (*profiles.light.shape[:2], n_samples)
+    return mean.astype(np.float32).reshape(shape), valid.astype(np.float32).reshape(shape)
+
+
+def _row_positions(profiles: RowProfiles, borders: FloatArray) -> FloatArray:
+    """Sensor rows as positions in the strips' row arrays, (1 or C*S, n) float64; position 0 is the top of row 0."""
+    n_rows = profiles.rows.size
+    if profiles.sensor_row is None:
+        return np.clip(borders - profiles.rows[0] + 0.5, 0, n_rows)[None]
+    strips = profiles.sensor_row.reshape(-1, n_rows)
+    index = np.arange(n_rows) + 0.5
+    return np.stack([np.clip(np.interp(borders, strip, index, left=0, right=n_rows), 0, n_rows) for strip in strips])
+
+
+def _integrate(values: Float32Array, positions: FloatArray) -> FloatArray:
+    """Integral of piecewise constant `values` (n, R) between neighbouring `positions`; (n, positions - 1) float64."""
+    n, n_rows = values.shape
+    total = np.zeros((n, n_rows + 1))
+    np.cumsum(values, axis=1, out=total[:, 1:])
+    left = np.minimum(positions.astype(np.int64), n_rows - 1)
+    part = positions - left
+    if positions.shape[0] == 1:
+        below, above = total[:, left[0]], total[:, left[0] + 1]
+    else:
+        below, above = np.take_along_axis(total, left, 1), np.take_along_axis(total, left + 1, 1)
+    return np.diff(below + (above - below) * part, axis=1)
+
+
+def contrast(light: Float32Array, valid: Float32Array, samples_per_slot: int, sigma: float) -> tuple[Float32Array, Float32Array]:
+    """Light of each strip between its local extremes, -1 dark to 1 lit, pooled over the strips of a column.
+
+    Args:
+        light: (C, S, n).
+        valid: (C, S, n) 1 or 0.
+        samples_per_slot: samples a slot.
+        sigma: standard deviation of a sample of no light.
+
+    Returns:
+        (C, n) float32: pooled value; and the weight behind it, in strips of full contrast.
+    """
+    import cv2
+
+    window = np.ones((1, _EXTREMES_SLOTS * samples_per_slot), np.uint8)
+    flat = light.reshape(-1, light.shape[-1])
+    smooth = cv2.blur(flat, (samples_per_slot, 1)) if samples_per_slot > 1 else flat
+    high = cv2.dilate(smooth, window).reshape(light.shape)
+    low = cv2.erode(smooth, window).reshape(light.shape)
+    span = high - low
+    value = (2 * smooth.reshape(light.shape) - high - low) / (span + 3 * sigma)
+    square = span * span
+    weight = square / (square + (_CONTRAST_SIGMAS * sigma) ** 2) * valid
+    total = weight.sum(axis=1)
+    return (value * weight).sum(axis=1) / (total + 1e-2), total
+
+
+def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot: int) -> FloatArray:
+    """Correlation of the columns' mean with the header, for a header that starts at each sample; (n,) float64.
+
+    A start may lie up to a header before the first sample's end; what is not seen counts as nothing.
+    """
+    share = weight / (weight + 1.0)
+    mean = (pooled * share).sum(axis=0) / max(pooled.shape[0], 1)
+    template = np.repeat(2.0 * np.array(HEADER) - 1, samples_per_slot) / (SLOTS_PER_SYMBOL * samples_per_slot)
+    padded = np.concatenate([np.asarray(mean, np.float64), np.zeros(template.size - 1)])
+    return np.correlate(padded, template, "valid")
+
+
+def find_clock(
+    profiles: RowProfiles, rows_per_slot: float, exposure_slots: float, packet_slots: int, repeats: int, sigma: float
+) -> Clock | None:
+    """The clock of a picture whose rows per slot are known; None where it shows no signal.
+
+    Args:
+        profiles: row profiles of the screen.
+        rows_per_slot: sensor rows a slot.
+        exposure_slots: exposure in slots.
+        packet_slots: slots of a packet.
+        repeats: copies of a burst.
+        sigma: standard deviation of a strip's row of no light.
+    """
+    top, bottom = _row_span(profiles)
+    step = rows_per_slot / _SEARCH_SAMPLES
+    n = int((bottom - top) / step)
+    if n < SLOTS_PER_SYMBOL * _SEARCH_SAMPLES:
+        return None
+    light, valid = resample(profiles, top, step, n)
+    pooled, weight = contrast(light, valid, _SEARCH_SAMPLES, sigma / np.sqrt(max(step, 1.0)))
+    response = header_response(pooled, weight, _SEARCH_SAMPLES)
+    start, lock = _comb(response, packet_slots * _SEARCH_SAMPLES)
+    if not np.isfinite(start):
+        return None
+    row0 = top + start * step
+    before = int(np.ceil((row0 - top) / rows_per_slot))
+    n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))
+    first_slot = -before % packet_slots
+    n_copies = -(-(first_slot + n_slots) // packet_slots)
+    clock = Clock(
+        rows_per_slot=rows_per_slot,
+        exposure_slots=exposure_slots,
+        packet_slots=packet_slots,
+        row0=row0 - before * rows_per_slot,
+        n_slots=n_slots,
+        first_slot=first_slot,
+        burst=np.zeros(n_copies, np.int64),
+        delay_slots=_delays(pooled, weight, start, packet_slots),
+        lock=lock,
+    )
+    return assign_bursts(clock, profiles, repeats, sigma)
+
+
+def _row_span(profiles: RowProfiles) -> tuple[float, float]:
+    """First and last sensor row that any strip shows, as borders."""
+    seen = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
+    if seen.size == 0:
+        return 0.0, 0.0
+    first, last = int(seen[0]), int(seen[-1])
+    if profiles.sensor_row is None:
+        return float(profiles.rows[first]) - 0.5, float(profiles.rows[last]) + 0.5
+    rows = profiles.sensor_row[:, :, first : last + 1]
+    shown = profiles.inside[:, :, first : last + 1]
+    return float(rows[shown].min()) - 0.5, float(rows[shown].max()) + 0.5
+
+
+def _comb(response: FloatArray, period: int) -> tuple[float, float]:
+    """Start (in samples, 0 <= start < period) that collects most header correlation, and its lead over the others."""
+    folded = np.zeros(-(-response.size // period) * period)
+    folded[: response.size] = np.maximum(response, 0) ** 2
+    score = folded.reshape(-1, period).sum(axis=0)
+    best = int(score.argmax())
+    if score[best] <= 0:
+        return float("nan"), 0.0
+    left, middle, right = score[best - 1], score[best], score[(best + 1) % period]
+    bend = left - 2 * middle + right
+    offset = 0.5 * (left - right) / bend if bend < 0 else 0.0
+    away = np.abs((np.arange(period) - best + period // 2) % period - period // 2) > SLOTS_PER_SYMBOL * _SEARCH_SAMPLES // 4
+    rival = float(score[away].max(initial=0.0))
+    return best + float(np.clip(offset, -0.5, 0.5)), float(middle / max(rival, 1e-12))
+
+
+def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slots: int) -> FloatArray:
+    """Delay of each column against the common clock, slots; 0 where it cannot be told from none."""
+    reach = int(_MAX_DELAY_SLOTS * _SEARCH_SAMPLES) + 2
+    template = np.repeat(2.0 * np.array(HEADER) - 1, _SEARCH_SAMPLES) / (SLOTS_PER_SYMBOL * _SEARCH_SAMPLES)
+    share = weight / (weight + 1.0)
+    n = pooled.shape[1]
+    starts = np.arange(round(start), n, packet_slots * _SEARCH_SAMPLES)
+    index = starts[:, None, None] + np.arange(-reach, reach + 1)[:, None] + np.arange(template.size)
+    seen = (index >= 0) & (index < n)
+    signal = (pooled * share)[:, np.clip(index, 0, n - 1)] * seen
+    score = (signal * template).sum(axis=(1, 3))
+    best = score.argmax(axis=1)
+    lead = score[np.arange(best.size), best] - score[:, reach]
+    moved = (lead > 0.3) & (best > 0) & (best < 2 * reach)
+    fine = best + _parabola(score, best)
+    return np.where(moved, (fine - reach - (start - round(start))) / _SEARCH_SAMPLES, 0.0)
+
+
+def _parabola(score: FloatArray, best: NDArray[np.int64]) -> FloatArray:
+    rows = np.arange(best.size)
+    inner = np.clip(best, 1, score.shape[1] - 2)
+    left, middle, right = (score[rows, inner + k] for k in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    return np.clip(np.divide(0.5 * (left - right), bend, out=np.zeros_like(bend), where=bend < 0), -0.5, 0.5)
+
+
+def sample_slots(profiles: RowProfiles, clock: Clock, samples_per_slot: int) -> SlotSamples:
+    """Row profiles on the slot grid of `clock`, each column at its own delay.
+
+    Args:
+        profiles: row profiles.
+        clock: the clock.
+        samples_per_slot: samples a slot, Q.
+    """
+    step = clock.rows_per_slot / samples_per_slot
+    n = clock.n_slots * samples_per_slot
+    if not clock.delay_slots.any():
+        light, valid = resample(profiles, clock.row0, step, n)
+        return SlotSamples(light, valid, samples_per_slot)
+    parts = []
+    for column, delay in enumerate(clock.delay_slots):
+        one = replace(
+            profiles,
+            light=profiles.light[column : column + 1],
+            inside=profiles.inside[column : column + 1],
+            sensor_row=None if profiles.sensor_row is None else profiles.sensor_row[column : column + 1],
+        )
+        parts.append(resample(one, clock.row0 + delay * clock.rows_per_slot, step, n))
+    return SlotSamples(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), samples_per_slot)
+
+
+def assign_bursts(clock: Clock, profiles: RowProfiles, repeats: int, sigma: float) -> Clock:
+    """The clock with its copies assigned to bursts of `repeats` copies, by the likeness of adjacent copies.
+
+    Args:
+        clock: the clock, bursts unknown.
+        profiles: row profiles.
+        repeats: copies of a burst.
+        sigma: standard deviation of a strip's row of no light.
+    """
+    samples = sample_slots(profiles, clock, _SEARCH_SAMPLES)
+    noise = sigma / np.sqrt(max(clock.rows_per_slot / _SEARCH_SAMPLES, 1.0))
+    pooled, weight = contrast(samples.light, samples.valid, _SEARCH_SAMPLES, noise)
+    likeness = copy_likeness(slot_means(pooled), slot_means(weight), clock)
+    copies = np.arange(clock.n_copies)
+    scores = []
+    for phase in range(repeats):
+        burst = (copies + phase) // repeats
+        scores.append(float(np.where(burst[1:] == burst[:-1], likeness, -likeness).sum()))
+    burst = (copies + int(np.argmax(scores))) // repeats
+    return replace(clock, burst=burst - burst[0])
+
+
+def slot_means(samples: Float32Array) -> Float32Array:
+    """(C, N * Q) samples at the search rate to slot means (C, N)."""
+    return np.asarray(samples.reshape(samples.shape[0], -1, _SEARCH_SAMPLES).mean(axis=2), np.float32)
+
+
+def copy_likeness(pooled: Float32Array, weight: Float32Array, clock: Clock) -> FloatArray:
+    """Log-likelihood ratio of each copy being the same packet as the next, against another one; (n_copies - 1,).
+
+    Two slots that are lit with probabilities p and q are alike with likelihood p q / r + (1 - p)(1 - q) / (1 - r)
+    against two independent ones, r being the column's share of lit slots.
+
+    Args:
+        pooled: (C, N) slot values, -1 dark to 1 lit.
+        weight: (C, N) their weights.
+        clock: the clock.
+    """
+    llr = 4 * np.clip(pooled, -1, 1) * np.minimum(weight, 3.0) / 3
+    lit = to_copies(1 / (1 + np.exp(-llr)) - 0.5, clock) + 0.5
+    seen = to_copies((weight > 0).astype(np.float32), clock)
+    seen[..., :SLOTS_PER_SYMBOL] = 0
+    share = np.clip((lit * seen).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1), 0.1, 0.9)[:, None, None]
+    first, second = lit[:, :-1], lit[:, 1:]
+    alike = first * second / share + (1 - first) * (1 - second) / (1 - share)
+    both = seen[:, :-1] * seen[:, 1:]
+    return np.asarray((np.log(alike) * both).sum(axis=(0, 2)), np.float64)
+
+
+def to_copies(slots: Float32Array, clock: Clock) -> Float32Array:
+    """(..., N) slot values of the grid as (..., n_copies, packet_slots), 0 where the grid does not reach."""
+    out = np.zeros((*slots.shape[:-1], clock.n_copies * clock.packet_slots), slots.dtype)
+    out[..., clock.first_slot : clock.first_slot + clock.n_slots] = slots
+    return out.reshape(*slots.shape[:-1], clock.n_copies, clock.packet_slots)
+
+
+def from_copies(copies: Float32Array, clock: Clock) -> Float32Array:
+    """The inverse of `to_copies`."""
+    flat = copies.reshape(*copies.shape[:-2], -1)
+    return flat[..., clock.first_slot : clock.first_slot + clock.n_slots]

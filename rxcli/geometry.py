@@ -1,0 +1,158 @@
+"""Geometry on points: lens model, screen plane, column outlines on the picture, row-time map.
+
+No pixel is warped. The screen's corners give a homography from the screen plane to the undistorted picture, the lens
+model carries points on to the stored picture, and each strip's edges become x as a function of the picture row.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.profiles import LensModel
+from rxcli.types import BoolArray, FloatArray, Lens, Outlines
+
+#: Rows of a picture for the viewer start at this stored corner: EXIF orientation -> order of the stored corners
+#: (top-left, top-right, bottom-right, bottom-left of the stored picture) as the viewer meets them.
+_VIEWER_CORNERS = {1: (0, 1, 2, 3), 2: (1, 0, 3, 2), 3: (2, 3, 0, 1), 4: (3, 2, 1, 0)}
+#: Share of the screen's height beyond its corners that outlines reach, so that no edge row is lost.
+_OVERHANG = 0.02
+_OUTLINE_POINTS = 65
+
+
+def viewer_order(corners: FloatArray, orientation: int) -> FloatArray:
+    """Corners of the stored picture (top-left first, clockwise) in the viewer's order.
+
+    Args:
+        corners: (4, 2) pixels.
+        orientation: EXIF orientation 1..8; for 5..8 the readout runs across the columns and 1..4 is taken.
+    """
+    return corners[list(_VIEWER_CORNERS.get(orientation, (0, 1, 2, 3)))]
+
+
+def lens_for(model: LensModel, width: int, height: int) -> Lens:
+    """The lens model of a profile, scaled to a picture of `width` x `height`."""
+    sx, sy = width / model.width, height / model.height
+    matrix = np.array(model.camera_matrix, np.float64)
+    matrix[0] *= sx
+    matrix[1] *= sy
+    matrix[0, 2] += (sx - 1) / 2
+    matrix[1, 2] += (sy - 1) / 2
+    return Lens(matrix, np.array(model.dist_coeffs, np.float64), model.distortion_already_corrected)
+
+
+def distort(points: FloatArray, lens: Lens) -> FloatArray:
+    """Undistorted pixels to distorted ones: K distort(K^-1 p), OpenCV's forward polynomial.
+
+    Args:
+        points: (..., 2) pixels.
+        lens: the lens model.
+
+    Returns:
+        (..., 2) pixels.
+    """
+    k = np.zeros(8)
+    k[: min(lens.dist_coeffs.size, 8)] = lens.dist_coeffs[:8]
+    k1, k2, p1, p2, k3, k4, k5, k6 = k
+    (fx, _, cx), (_, fy, cy), _ = lens.camera_matrix
+    x, y = (points[..., 0] - cx) / fx, (points[..., 1] - cy) / fy
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([fx * xd + cx, fy * yd + cy], axis=-1)
+
+
+def undistort(points: FloatArray, lens: Lens, iterations: int = 20) -> FloatArray:
+    """Distorted pixels to undistorted ones: the inverse of `distort`, by fixed-point iteration.
+
+    Args:
+        points: (..., 2) pixels.
+        lens: the lens model.
+        iterations: steps; 20 reach 1e-6 px for the distortion of ordinary lenses.
+    """
+    found = points.copy()
+    for _ in range(iterations):
+        found += points - distort(found, lens)
+    return found
+
+
+def homography(corners: FloatArray) -> FloatArray:
+    """(3, 3) map of screen points (u to the right, v down, both 0..1) to pixels, from the (4, 2) corners."""
+    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    rows = []
+    for (u, v), (x, y) in zip(square, corners, strict=True):
+        rows.append([u, v, 1, 0, 0, 0, -x * u, -x * v])
+        rows.append([0, 0, 0, u, v, 1, -y * u, -y * v])
+    solution = np.linalg.solve(np.array(rows), corners.ravel())
+    return np.append(solution, 1.0).reshape(3, 3)
+
+
+def screen_to_picture(points: FloatArray, corners: FloatArray, lens: Lens | None) -> FloatArray:
+    """Screen points (u, v in 0..1) to pixels of the stored picture.
+
+    Args:
+        points: (..., 2).
+        corners: (4, 2) pixels of the stored picture, the viewer's top-left first.
+        lens: lens model of the picture; None or corrected: the screen's sides are straight.
+    """
+    bent = lens is not None and not lens.corrected
+    plane = undistort(corners, lens) if bent and lens is not None else corners
+    projected = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ homography(plane).T
+    pixels = projected[..., :2] / projected[..., 2:]
+    return distort(pixels, lens) if bent and lens is not None else pixels
+
+
+def column_outlines(
+    corners: FloatArray, n_columns: int, n_strips: int, width: int, height: int, lens: Lens | None = None
+) -> Outlines:
+    """Outlines of `n_columns` columns of `n_strips` strips on a picture of `width` x `height`.
+
+    Args:
+        corners: (4, 2) pixels of the stored picture, the viewer's top-left first.
+        n_columns: columns of the screen.
+        n_strips: strips of each column.
+        width: pixels a row.
+        height: rows.
+        lens: lens model of the picture.
+    """
+    u = np.linspace(0, 1, n_columns * n_strips + 1)
+    v = np.linspace(-_OVERHANG, 1 + _OVERHANG, _OUTLINE_POINTS)
+    points = screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens)
+    first, last = _row_range(corners, height)
+    rows = np.arange(first, last + 1)
+    edges_x, edges_v = _edges_by_row(points, v, rows)
+    middle_v = (edges_v[1:] + edges_v[:-1]) / 2
+    in_picture = (edges_x >= 0) & (edges_x <= width - 1)
+    inside = (middle_v > 0) & (middle_v < 1) & in_picture[1:] & in_picture[:-1]
+    shape = (n_columns, n_strips, rows.size)
+    return Outlines(rows, edges_x, inside.reshape(shape), _sensor_rows(edges_x, rows, shape, lens))
+
+
+def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:
+    first = int(np.clip(np.floor(corners[:, 1].min()), 0, height - 1))
+    last = int(np.clip(np.ceil(corners[:, 1].max()), first, height - 1))
+    return first, last
+
+
+def _edges_by_row(points: FloatArray, v: FloatArray, rows: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """x and v of every edge (n_edges, n_points, 2) on every row; a screen upside down has y falling with v."""
+    step = 1 if points[0, -1, 1] > points[0, 0, 1] else -1
+    x = np.stack([np.interp(rows, edge[::step, 1], edge[::step, 0]) for edge in points])
+    along = np.stack([np.interp(rows, edge[::step, 1], v[::step]) for edge in points])
+    return x, along
+
+
+def _sensor_rows(
+    edges_x: FloatArray, rows: NDArray[np.int64], shape: tuple[int, ...], lens: Lens | None
+) -> FloatArray | None:
+    if lens is None or not lens.corrected:
+        return None
+    middle_x = ((edges_x[1:] + edges_x[:-1]) / 2).reshape(shape)
+    pixels = np.stack([middle_x, np.broadcast_to(rows.astype(np.float64), shape)], axis=-1)
+    return distort(pixels, lens)[..., 1]
+
+
+def screen_rows(inside: BoolArray) -> int:
+    """Rows of the tallest strip: what the picture shows of the screen."""
+    return int(inside.sum(axis=-1).max(initial=0))
