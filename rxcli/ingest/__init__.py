@@ -46,10 +46,9 @@ def _read(path: Path, kind: Kind) -> Iterator[Frame]:
 
         yield from read_video(path)
     elif kind == "device":
-        from rxcli.ingest.v4l2 import open_camera
+        from rxcli.ingest.v4l2 import LiveSource
 
-        with open_camera(path) as camera:
-            yield from camera
+        yield from LiveSource(path)
     elif kind == "raw":
         from rxcli.ingest.raw import read_raw
 

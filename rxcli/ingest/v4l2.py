@@ -1,0 +1,578 @@
+"""A live V4L2 camera in its own pixel formats, always the newest frame.
+
+The kernel interface is used directly: unlike OpenCV it tells why a camera cannot be opened, counts the frames that the
+driver dropped, gives the time of each, refuses a pixel format instead of silently taking another, and sets exposure.
+"""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+import select
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.errors import InputError
+from rxcli.ingest import v4l2_abi as abi
+from rxcli.types import Frame, Metadata
+
+Luma = NDArray[np.uint8] | NDArray[np.uint16]
+
+_N_BUFFERS = 4
+#: Where the rate is not asked for: at least this, so that an aimed camera answers at once.
+_USUAL_FPS = 24.0
+_POLL_S = 0.1
+_RETRY_S = 0.5
+_NO_DATA_SLEEP_S = 0.002
+
+
+@dataclass(frozen=True, slots=True)
+class PixelFormat:
+    """How luma lies in a buffer of one pixel format."""
+
+    dtype: type[np.uint8] | type[np.uint16] = np.uint8
+    #: Samples from one luma sample to the next, and before the first.
+    step: int = 1
+    start: int = 0
+    white: int = 255
+    #: Whether the samples are luma of YCbCr, whose levels the driver tells.
+    ycbcr: bool = False
+
+
+#: In the order of preference, at equal size and sufficient rate: more bits first, compressed last.
+PIXEL_FORMATS = {
+    "Y16": PixelFormat(np.uint16, white=65535),
+    "Y12": PixelFormat(np.uint16, white=4095),
+    "Y10": PixelFormat(np.uint16, white=1023),
+    "GREY": PixelFormat(),
+    "NV12": PixelFormat(ycbcr=True),
+    "YUYV": PixelFormat(step=2, ycbcr=True),
+    "UYVY": PixelFormat(step=2, start=1, ycbcr=True),
+    "MJPG": PixelFormat(),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSettings:
+    """What is asked of a camera; None: the best it has."""
+
+    width: int | None = None
+    height: int | None = None
+    fps: float | None = None
+    #: One of `PIXEL_FORMATS`.
+    pixel_format: str | None = None
+    #: None: as short as the camera can.
+    exposure_s: float | None = None
+    #: In the driver's units.
+    gain: int | None = None
+    #: Wait for a camera that is missing, busy or unplugged, instead of giving up.
+    wait: bool = False
+    #: A camera that is silent for so long is taken for lost.
+    stall_s: float = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """One way in which a camera delivers frames."""
+
+    pixel_format: str
+    width: int
+    height: int
+    #: Highest rate, 0 where the driver does not tell.
+    fps: float
+
+    def __str__(self) -> str:
+        rate = f" at {self.fps:g} frames/s" if self.fps else ""
+        return f"{self.pixel_format} {self.width} x {self.height}{rate}"
+
+
+@dataclass(slots=True)
+class CameraCounts:
+    """What became of the frames that the sensor took, over all connections."""
+
+    delivered: int = 0
+    #: Passed over because the receiver was still busy, here or in the driver.
+    dropped: int = 0
+    damaged: int = 0
+    connections: int = 0
+
+
+class CameraLost(InputError):
+    """A camera that is missing, busy, silent or unplugged: it may come back."""
+
+
+class LiveSource:
+    """Frames of a camera, over as many connections as it takes; iterate over it once.
+
+    Args:
+        path: the device, `/dev/video0`.
+        settings: what is asked of it.
+        on_lost: told the reason when waiting begins.
+    """
+
+    def __init__(
+        self, path: Path, settings: CameraSettings | None = None, on_lost: Callable[[str], None] | None = None
+    ) -> None:
+        self.settings = settings or CameraSettings()
+        self.counts = CameraCounts()
+        #: How the camera is driven, None before it answers.
+        self.mode: Mode | None = None
+        self._path = path
+        self._on_lost = on_lost or (lambda reason: None)
+
+    def __iter__(self) -> Iterator[Frame]:
+        waiting = False
+        while True:
+            try:
+                with Camera(self._path, self.settings, self.counts) as camera:
+                    self.mode, waiting = camera.mode, False
+                    yield from camera
+            except CameraLost as error:
+                if not self.settings.wait:
+                    raise
+                if not waiting:
+                    self._on_lost(str(error))
+                waiting = True
+                time.sleep(_RETRY_S)
+
+
+class Camera:
+    """One connection to a camera: a context manager and an iterator over its newest frames.
+
+    A thread takes frames from the driver as they come; of those that nobody asked for in time only the last is kept.
+
+    Raises:
+        CameraLost: missing, busy, silent or unplugged.
+        InputError: no camera, or not in the mode that is asked for.
+    """
+
+    def __init__(self, path: Path, settings: CameraSettings, counts: CameraCounts | None = None) -> None:
+        self.counts = counts or CameraCounts()
+        self._path, self._settings = path, settings
+        self._descriptor = _open(path)
+        self._maps: list[mmap.mmap] = []
+        self._fresh = threading.Condition()
+        self._newest: _Capture | None = None
+        self._failure: InputError | None = None
+        self._running = False
+        self._start_s: float | None = None
+        self._grabber = threading.Thread(target=self._grab, name=f"grab {path}", daemon=True)
+        try:
+            self._configure()
+        except OSError as error:
+            self.close()
+            raise _failure(path, error) from None
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Camera:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Frame]:
+        while True:
+            capture = self._take()
+            luma = self._luma(capture)
+            if luma is None:
+                self.counts.damaged += 1
+                continue
+            self.counts.delivered += 1
+            yield self._frame(luma, capture.time_s)
+
+    def close(self) -> None:
+        """Stop the stream and hand the device back; may be called again."""
+        self._running = False
+        if self._grabber.is_alive():
+            self._grabber.join()
+        if self._descriptor < 0:
+            return
+        for view in self._maps:
+            view.close()
+        os.close(self._descriptor)  # stops the stream and frees its buffers, whatever state it is in
+        self._descriptor = -1
+
+    # -- setting up ---------------------------------------------------------------------------------------------------
+
+    def _configure(self) -> None:
+        self._card = _check_capture(self._descriptor, self._path)
+        wanted = _choose(_modes(self._descriptor), self._settings, self._path)
+        self._layout = _set_format(self._descriptor, wanted, self._path)
+        fps = _set_rate(self._descriptor, self._settings.fps or wanted.fps)
+        self.mode = Mode(wanted.pixel_format, self._layout.width, self._layout.height, fps)
+        self.exposure_s = _set_exposure(self._descriptor, self._settings.exposure_s, self._path)
+        _set_gain(self._descriptor, self._settings.gain, self._path)
+        self._map_buffers()
+        abi.ioctl(self._descriptor, abi.STREAMON, abi.BufferType(abi.BUF_TYPE_VIDEO_CAPTURE))
+        self.counts.connections += 1
+        self._running = True
+        self._grabber.start()
+
+    def _map_buffers(self) -> None:
+        request = abi.RequestBuffers(count=_N_BUFFERS, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+        abi.ioctl(self._descriptor, abi.REQBUFS, request)
+        for index in range(request.count):
+            buffer = _buffer(index)
+            abi.ioctl(self._descriptor, abi.QUERYBUF, buffer)
+            self._maps.append(mmap.mmap(self._descriptor, buffer.length, offset=buffer.offset))
+            abi.ioctl(self._descriptor, abi.QBUF, _buffer(index))
+
+    # -- taking frames ------------------------------------------------------------------------------------------------
+
+    def _grab(self) -> None:
+        """Body of the thread."""
+        try:
+            self._grab_until_stopped()
+        except OSError as error:
+            self._fail(_failure(self._path, error))
+        except CameraLost as error:
+            self._fail(error)
+
+    def _grab_until_stopped(self) -> None:
+        heard_s, sequence = time.monotonic(), None
+        while self._running:
+            buffer = self._dequeue()
+            if buffer is None:
+                if time.monotonic() - heard_s > self._settings.stall_s:
+                    reason = f"{self._path}: the camera sent nothing for {self._settings.stall_s:g} s"
+                    raise CameraLost(reason, "check its cable, or lower size and rate")
+                continue
+            heard_s = time.monotonic()
+            if sequence is not None:
+                self.counts.dropped += max(0, buffer.sequence - sequence - 1)
+            sequence = buffer.sequence
+            self._offer(buffer)
+
+    def _dequeue(self) -> abi.Buffer | None:
+        """A filled buffer, None where there is none yet."""
+        if not select.select([self._descriptor], [], [], _POLL_S)[0]:
+            return None
+        buffer = _buffer(0)
+        try:
+            abi.ioctl(self._descriptor, abi.DQBUF, buffer)
+        except BlockingIOError:
+            time.sleep(_NO_DATA_SLEEP_S)
+            return None
+        return buffer
+
+    def _offer(self, buffer: abi.Buffer) -> None:
+        """Make a capture the newest; the one that it replaces goes back to the driver unseen."""
+        if buffer.flags & abi.BUF_FLAG_ERROR:
+            self.counts.damaged += 1
+            self._give_back(buffer.index)
+            return
+        time_s = buffer.seconds + buffer.microseconds * 1e-6
+        with self._fresh:
+            passed_over, self._newest = self._newest, _Capture(buffer.index, buffer.bytesused, time_s)
+            self._fresh.notify()
+        if passed_over is not None:
+            self.counts.dropped += 1
+            self._give_back(passed_over.index)
+
+    def _take(self) -> _Capture:
+        """The newest capture, waited for; it stays ours until it is given back."""
+        with self._fresh:
+            while self._newest is None:
+                if self._failure is not None:
+                    raise self._failure
+                self._fresh.wait(_POLL_S)
+            capture, self._newest = self._newest, None
+        return capture
+
+    def _fail(self, error: InputError) -> None:
+        with self._fresh:
+            self._failure = error
+            self._fresh.notify()
+
+    def _give_back(self, index: int) -> None:
+        abi.ioctl(self._descriptor, abi.QBUF, _buffer(index))
+
+    def _luma(self, capture: _Capture) -> Luma | None:
+        """A copy of the luma of a capture, whose buffer then goes back to the driver; None where it is damaged."""
+        data = self._maps[capture.index][: capture.bytesused] if self.mode.pixel_format == "MJPG" else None
+        luma = self._layout.luma(self._maps[capture.index]) if data is None else None
+        try:
+            self._give_back(capture.index)
+        except OSError as error:
+            raise _failure(self._path, error) from None
+        return luma if data is None else _decode_jpeg(data, self._path)
+
+    def _frame(self, luma: Luma, time_s: float) -> Frame:
+        if self._start_s is None:
+            self._start_s = time_s
+        return Frame(
+            pixels=luma,
+            source=str(self._path),
+            index=self.counts.delivered - 1,
+            time_s=time_s - self._start_s,
+            metadata=Metadata(model=self._card, exposure_s=self.exposure_s),
+            black=self._layout.black,
+            white=self._layout.white,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Capture:
+    """A filled buffer that is ours."""
+
+    index: int
+    bytesused: int
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """Where luma lies in a buffer, and its levels."""
+
+    form: PixelFormat
+    width: int
+    height: int
+    #: Bytes from one row to the next.
+    pitch: int
+    black: float = field(default=0.0)
+    white: float = field(default=255.0)
+
+    def luma(self, data: Any) -> Luma:
+        """A copy (height, width) of the luma in a buffer."""
+        dtype = np.dtype(self.form.dtype)
+        samples: NDArray[Any] = np.frombuffer(data, dtype, count=self.pitch * self.height // dtype.itemsize)
+        rows = samples.reshape(self.height, -1)
+        stop = self.form.start + self.width * self.form.step
+        return rows[:, self.form.start : stop : self.form.step].copy()
+
+
+def list_modes(path: Path) -> list[Mode]:
+    """The modes of a camera that the receiver can use, best first.
+
+    Raises:
+        InputError: no camera, missing or busy.
+    """
+    descriptor = _open(path)
+    try:
+        _check_capture(descriptor, path)
+        return sorted(_modes(descriptor), key=_merit(None), reverse=True)
+    except OSError as error:
+        raise _failure(path, error) from None
+    finally:
+        os.close(descriptor)
+
+
+def _open(path: Path) -> int:
+    try:
+        return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        raise _failure(path, error) from None
+
+
+def _failure(path: Path, error: OSError) -> InputError:
+    """What a system call's error means to a user."""
+    if error.errno in (errno.ENOENT, errno.ENXIO):
+        return CameraLost(
+            f"{path}: no such camera", "plug it in, or see `v4l2-ctl --list-devices`; --wait waits for it"
+        )
+    if error.errno == errno.ENODEV:
+        return CameraLost(f"{path}: the camera was unplugged", "plug it in again; --wait waits for it")
+    if error.errno == errno.EBUSY:
+        return CameraLost(f"{path}: another program uses the camera", f"close it (`fuser -v {path}` names it)")
+    if error.errno == errno.EACCES:
+        return InputError(f"{path}: permission denied", "add yourself to the group `video` and log in again")
+    if error.errno in (errno.ENOTTY, errno.EINVAL):
+        return InputError(f"{path}: no V4L2 camera, or one that refuses its own mode", "name another /dev/video device")
+    return CameraLost(f"{path}: the camera failed ({error.strerror})", "plug it in again; --wait waits for it")
+
+
+def _check_capture(descriptor: int, path: Path) -> str:
+    """The camera's name.
+
+    Raises:
+        InputError: the device is none that streams pictures.
+    """
+    capability = abi.Capability()
+    try:
+        abi.ioctl(descriptor, abi.QUERYCAP, capability)
+    except OSError as error:
+        if error.errno in (errno.ENOTTY, errno.EINVAL):
+            raise InputError(f"{path}: is no V4L2 device", "name a camera, such as /dev/video0") from None
+        raise
+    has_own = capability.capabilities & abi.CAP_DEVICE_CAPS
+    able = capability.device_caps if has_own else capability.capabilities
+    needed = abi.CAP_VIDEO_CAPTURE | abi.CAP_STREAMING
+    if able & needed != needed:
+        raise InputError(f"{path}: does not stream pictures", "name the camera's other /dev/video device")
+    return bytes(capability.card).decode("utf-8", "replace")
+
+
+def _modes(descriptor: int) -> list[Mode]:
+    return [
+        Mode(name, width, height, _top_rate(descriptor, code, width, height))
+        for code, name in _formats(descriptor)
+        for width, height in _sizes(descriptor, code)
+    ]
+
+
+def _formats(descriptor: int) -> Iterator[tuple[int, str]]:
+    for description in _enumerate(
+        descriptor, abi.ENUM_FMT, lambda i: abi.FormatDescription(i, abi.BUF_TYPE_VIDEO_CAPTURE)
+    ):
+        name = abi.fourcc_name(description.pixelformat)
+        if name in PIXEL_FORMATS:
+            yield description.pixelformat, name
+
+
+def _sizes(descriptor: int, code: int) -> Iterator[tuple[int, int]]:
+    """Discrete sizes, or the largest of a range."""
+    for found in _enumerate(descriptor, abi.ENUM_FRAMESIZES, lambda i: abi.FrameSize(i, code)):
+        if found.type == abi.FRAME_SIZE_DISCRETE:
+            yield found.size[0], found.size[1]
+        else:
+            yield found.size[1], found.size[4]
+            return
+
+
+def _top_rate(descriptor: int, code: int, width: int, height: int) -> float:
+    shortest = 0.0
+    for found in _enumerate(descriptor, abi.ENUM_FRAMEINTERVALS, lambda i: abi.FrameInterval(i, code, width, height)):
+        numerator, denominator = found.interval[0], found.interval[1]  # of a range: its minimum
+        if numerator and denominator:
+            shortest = max(shortest, denominator / numerator)
+        if found.type != abi.FRAME_INTERVAL_DISCRETE:
+            break
+    return shortest
+
+
+def _enumerate(descriptor: int, request: int, structure: Callable[[int], Any]) -> Iterator[Any]:
+    """What the driver lists, until it says EINVAL; nothing where it cannot list at all."""
+    for index in range(1000):
+        item = structure(index)
+        try:
+            abi.ioctl(descriptor, request, item)
+        except OSError as error:
+            if error.errno in (errno.EINVAL, errno.ENOTTY):
+                return
+            raise
+        yield item
+
+
+def _merit(fps: float | None) -> Callable[[Mode], tuple[bool, int, int]]:
+    """Order of modes: fast enough, then large, then by pixel format."""
+    order = list(PIXEL_FORMATS)
+
+    def merit(mode: Mode) -> tuple[bool, int, int]:
+        fast = mode.fps == 0 or mode.fps >= (fps or _USUAL_FPS) * 0.98
+        return fast, mode.width * mode.height, -order.index(mode.pixel_format)
+
+    return merit
+
+
+def _choose(modes: list[Mode], settings: CameraSettings, path: Path) -> Mode:
+    """The best mode that fulfils what is asked for.
+
+    Raises:
+        InputError: there is none; says which there are.
+    """
+    fitting = [mode for mode in modes if settings.pixel_format in (None, mode.pixel_format)]
+    fitting = [mode for mode in fitting if settings.width in (None, mode.width)]
+    fitting = [mode for mode in fitting if settings.height in (None, mode.height)]
+    if fitting:
+        return max(fitting, key=_merit(settings.fps))
+    if not modes:
+        raise InputError(f"{path}: none of its pixel formats can be read", f"known are {', '.join(PIXEL_FORMATS)}")
+    asked = f"{settings.pixel_format or 'any format'} {settings.width or 'any'} x {settings.height or 'any'}"
+    raise InputError(f"{path}: does not offer {asked}", f"it offers {', '.join(str(mode) for mode in modes)}")
+
+
+def _set_format(descriptor: int, mode: Mode, path: Path) -> _Layout:
+    code = abi.fourcc(mode.pixel_format)
+    form = abi.Format(
+        type=abi.BUF_TYPE_VIDEO_CAPTURE, width=mode.width, height=mode.height, pixelformat=code, field=abi.FIELD_NONE
+    )
+    abi.ioctl(descriptor, abi.S_FMT, form)
+    if form.pixelformat != code:  # a driver may answer with the nearest that it has
+        got = abi.fourcc_name(form.pixelformat)
+        raise InputError(f"{path}: gives {got} instead of {mode.pixel_format}", "ask for another --format")
+    pixels = PIXEL_FORMATS[mode.pixel_format]
+    sample = np.dtype(pixels.dtype).itemsize
+    pitch = form.bytesperline or form.width * pixels.step * sample
+    full = form.quantization == abi.QUANTIZATION_FULL_RANGE or form.colorspace == abi.COLORSPACE_JPEG
+    black, white = (16, 235) if pixels.ycbcr and not full else (0, pixels.white)
+    return _Layout(pixels, form.width, form.height, pitch, black, white)
+
+
+def _set_rate(descriptor: int, fps: float) -> float:
+    """Ask for a frame rate; the one that the camera takes, 0 where it does not tell."""
+    parameters = abi.StreamParameters(type=abi.BUF_TYPE_VIDEO_CAPTURE)
+    if fps > 0:
+        parameters.numerator, parameters.denominator = 1000, round(1000 * fps)
+    try:
+        abi.ioctl(descriptor, abi.S_PARM, parameters)
+    except OSError as error:
+        if error.errno in (errno.EINVAL, errno.ENOTTY):
+            return 0.0
+        raise
+    return parameters.denominator / parameters.numerator if parameters.numerator else 0.0
+
+
+def _set_exposure(descriptor: int, exposure_s: float | None, path: Path) -> float | None:
+    """Fix the exposure, as short as it can be where none is asked for; the one in effect, None where it is unknown.
+
+    Raises:
+        InputError: one is asked for and the camera has no such control.
+    """
+    _set(descriptor, abi.CID_EXPOSURE_AUTO, abi.EXPOSURE_MANUAL)
+    _set(descriptor, abi.CID_EXPOSURE_AUTO_PRIORITY, 0)  # else the camera lowers its rate in the dark
+    units = 0 if exposure_s is None else round(exposure_s / abi.EXPOSURE_UNIT_S)
+    taken = _set(descriptor, abi.CID_EXPOSURE_ABSOLUTE, units)
+    if taken is None and exposure_s is not None:
+        raise InputError(f"{path}: the camera has no exposure control", "leave --exposure out")
+    return None if taken is None else taken * abi.EXPOSURE_UNIT_S
+
+
+def _set_gain(descriptor: int, gain: int | None, path: Path) -> None:
+    if gain is None:
+        return
+    _set(descriptor, abi.CID_AUTOGAIN, 0)
+    if _set(descriptor, abi.CID_GAIN, gain) is None:
+        raise InputError(f"{path}: the camera has no gain control", "leave --gain out")
+
+
+def _set(descriptor: int, control: int, value: int) -> int | None:
+    """Set a control to the nearest value that it can have; the value in effect, None where there is no such control."""
+    try:
+        limits = abi.ControlRange(id=control)
+        abi.ioctl(descriptor, abi.QUERYCTRL, limits)
+        if limits.flags & (abi.CTRL_FLAG_DISABLED | abi.CTRL_FLAG_READ_ONLY):
+            return None
+        state = abi.Control(control, min(max(value, limits.minimum), limits.maximum))
+        abi.ioctl(descriptor, abi.S_CTRL, state)
+        abi.ioctl(descriptor, abi.G_CTRL, state)
+    except OSError as error:
+        if error.errno in (errno.EINVAL, errno.ENOTTY, errno.EACCES, errno.ERANGE):
+            return None
+        raise
+    return int(state.value)
+
+
+def _buffer(index: int) -> abi.Buffer:
+    return abi.Buffer(index=index, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+
+
+def _decode_jpeg(data: bytes, path: Path) -> NDArray[np.uint8] | None:
+    from rxcli.ingest.jpeg import decode_luma
+
+    try:
+        return decode_luma(data, path)
+    except InputError:
+        return None
