@@ -21,6 +21,12 @@ _SUFFIXES = {".jpg": "jpeg", ".jpeg": "jpeg", ".dng": "dng", ".png": "png", ".ti
 _VIDEO_SUFFIXES = {".mp4": "h264", ".mov": "h264", ".mkv": "h264", ".avi": "mjpeg"}
 _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-plain")
 
+#: Options that are fields of the scene by the same name.
+_SCENE_OPTIONS = (
+    *("n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm"),
+    *("blur_px", "lcd_grid", "shake_px", "iso", "make", "model"),
+)
+
 
 @click.command()
 @click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
@@ -132,19 +138,7 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     from rxcli.simulate.scenes import preset
 
     scene = preset(options["preset"], options["screen"])
-    direct: tuple[str, ...] = (
-        "n_frames",
-        "frame_rate_hz",
-        "blur_px",
-        "lcd_grid",
-        "shake_px",
-        "iso",
-        "make",
-        "model",
-        "start_slot",
-    )
-    direct += ("slot_rate_error_ppm",)
-    scene = replace(scene, picture=options["picture"], dimming=options["dimming"], **_given(options, direct))
+    scene = replace(scene, picture=options["picture"], dimming=options["dimming"], **_given(options, _SCENE_OPTIONS))
     scene = replace(scene, w=_weights(options["weights"]), payload=_payload(options["payload"]))
     scene = _with_light(_with_pose(scene, options), options)
     isp = _given(options, ("tone", "quality", "subsampling", "sharpen", "denoise_px"))

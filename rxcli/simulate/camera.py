@@ -281,12 +281,14 @@ def _enlarge_across(nodes: Float32Array, pitch: int, out: Float32Array) -> None:
 
 def _room_light(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     """Electrons of the room's light, from walls, bezel, panel and a mirrored lamp."""
-    shape = (bottom - top, exposure.sensor.width)
-    response = np.array(exposure.sensor.response, np.float32)
-    if exposure.room.light_e_per_s == 0:
-        return np.zeros(shape if exposure.sensor.pattern is not None else (*shape, 3), np.float32)
     seen = _room_seen(exposure, top, bottom) * exposure.room_rows[top:bottom, None].astype(np.float32)
-    return pick_colours(seen[..., None] * response, exposure.sensor.pattern, top)
+    response = np.array(exposure.sensor.response, np.float32)
+    pattern = exposure.sensor.pattern
+    if pattern is None:
+        return np.asarray(seen[..., None] * response)
+    cell = response[pattern][:, np.arange(seen.shape[1]) % pattern.shape[1]]
+    seen *= cell[np.arange(top, bottom) % pattern.shape[0]]
+    return seen
 
 
 def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:

@@ -6,8 +6,10 @@ correction, tone curve, sharpening, eight bits.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +24,14 @@ Subsampling = Literal["444", "422", "420"]
 #: Weights of red, green and blue in luma: JPEG (BT.601) and video (BT.709).
 LUMA_BT601 = (0.299, 0.587, 0.114)
 LUMA_BT709 = (0.2126, 0.7152, 0.0722)
-_TABLE_SIZE = 4096
+#: Tone curves: exponent, gain (offset gain - 1), end and slope of the straight toe.
+_TONES = {
+    "srgb": (1 / 2.4, 1.055, 0.0031308, 12.92),
+    "bt709": (0.45, 1.099, 0.018, 4.5),
+    "gamma": (1 / 2.2, 1.0, 0.0, 0.0),
+}
+#: Rows of a band of work and of its overlap: multiples of the mosaics' unit cells, so that all bands start alike.
+_BAND_ROWS, _HALO_ROWS = 384, 12
 
 
 @dataclass(frozen=True)
@@ -44,14 +53,19 @@ class Isp:
     subsampling: Subsampling = "420"
 
 
-def tone_curve(light: NDArray[np.floating], tone: Tone) -> NDArray[np.float64]:
-    """Picture values 0..1 of linear light 0..1."""
-    x: NDArray[np.float64] = np.clip(np.asarray(light, np.float64), 0, 1)
-    if tone == "srgb":
-        return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
-    if tone == "bt709":
-        return np.where(x < 0.018, 4.5 * x, 1.099 * np.maximum(x, 1e-9) ** 0.45 - 0.099)
-    return np.asarray(x ** (1 / 2.2)) if tone == "gamma" else x
+def tone_curve(light: Float32Array, tone: Tone) -> Float32Array:
+    """Picture values 0..1 of linear light 0..1, any shape."""
+    import cv2
+
+    x: Float32Array = np.clip(light, np.float32(0), np.float32(1))
+    if tone == "linear":
+        return x
+    exponent, gain, toe, slope = _TONES[tone]
+    curve = np.asarray(cv2.pow(np.atleast_2d(x), exponent), np.float32).reshape(x.shape)
+    curve *= np.float32(gain)
+    curve -= np.float32(gain - 1)
+    np.copyto(curve, x * np.float32(slope), where=x < np.float32(toe))
+    return curve
 
 
 def demosaic(raw: NDArray[np.uint16], sensor: Sensor) -> Float32Array:
@@ -89,7 +103,7 @@ def _demosaic_xtrans(raw: NDArray[np.uint16]) -> Float32Array:
     return planes
 
 
-def develop(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp, view: View, bits: int = 8) -> NDArray[np.generic]:
+def develop(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp, view: View, bits: int = 8) -> NDArray[Any]:
     """Develop a picture.
 
     Args:
@@ -102,23 +116,47 @@ def develop(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp, view: View, bits:
     Returns:
         (height, width, 3) uint8 or uint16, red first, full range.
     """
-    import cv2
-
-    planes = demosaic(raw, sensor)
-    to_panel = np.linalg.inv(sensor.colour_matrix) * isp.gain
-    planes = cv2.transform(planes, to_panel.astype(np.float32))
-    planes = _reduce_noise(planes, isp)
+    planes = np.empty((*raw.shape[:2], 3), np.float32)
+    _in_bands(raw, lambda part: _panel_light(part, sensor, isp), planes)
     if isp.correct_distortion:
         planes = correct_distortion(planes, view)
-    planes = _apply_tone(planes, isp.tone)
+    picture = np.empty(planes.shape, np.uint8 if bits == 8 else np.uint16)
+    _in_bands(planes, lambda part: _finish(part, isp, bits), picture)
+    return picture
+
+
+def _in_bands(source: NDArray[Any], work: Callable[[NDArray[Any]], NDArray[Any]], out: NDArray[Any]) -> None:
+    """Fill `out` with `work` of overlapping bands of rows of `source`, two at a time."""
+
+    def one(top: int) -> None:
+        begin = max(top - _HALO_ROWS, 0)
+        bottom = min(top + _BAND_ROWS, source.shape[0])
+        out[top:bottom] = work(source[begin : bottom + _HALO_ROWS])[top - begin : bottom - begin]
+
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        list(pool.map(one, range(0, source.shape[0], _BAND_ROWS)))
+
+
+def _panel_light(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp) -> Float32Array:
+    """Linear light in the panel's colours, white balanced, noise reduced."""
+    import cv2
+
+    to_panel = np.linalg.inv(sensor.colour_matrix) * isp.gain
+    return _reduce_noise(cv2.transform(demosaic(raw, sensor), to_panel.astype(np.float32)), isp)
+
+
+def _finish(planes: Float32Array, isp: Isp, bits: int) -> NDArray[Any]:
+    """Tone curve, sharpening, rounding."""
+    import cv2
+
+    planes = tone_curve(planes, isp.tone)
     if isp.sharpen > 0:
-        luma = cv2.transform(planes, np.array([LUMA_BT601], np.float32))
-        detail = luma - cv2.GaussianBlur(luma, (0, 0), isp.sharpen_px)
-        planes += (np.float32(isp.sharpen) * detail)[..., None]
+        grey = luma(planes)
+        planes += (np.float32(isp.sharpen) * (grey - cv2.GaussianBlur(grey, (0, 0), isp.sharpen_px)))[..., None]
     top = (1 << bits) - 1
     planes *= np.float32(top)
     planes += np.float32(0.5)
-    return np.clip(planes, 0, top + 0.5, out=planes).astype(np.uint8 if bits == 8 else np.uint16)
+    return np.clip(planes, 0, top, out=planes).astype(np.uint8 if bits == 8 else np.uint16)
 
 
 def _reduce_noise(planes: Float32Array, isp: Isp) -> Float32Array:
@@ -134,14 +172,6 @@ def _reduce_noise(planes: Float32Array, isp: Isp) -> Float32Array:
         luma = cv2.GaussianBlur(luma, (0, 0), isp.denoise_px)
     colour += luma[..., None]
     return np.asarray(colour, np.float32)
-
-
-def _apply_tone(planes: Float32Array, tone: Tone) -> Float32Array:
-    # The table's steps follow the square root of light, so that shadows keep their gradation.
-    steps = np.linspace(0, 1, _TABLE_SIZE)
-    table = tone_curve(steps**2, tone).astype(np.float32)
-    root = np.sqrt(np.clip(planes, 0, 1))
-    return np.take(table, (root * np.float32(_TABLE_SIZE - 1) + np.float32(0.5)).astype(np.uint16))
 
 
 def correction_map(view: View) -> tuple[Float32Array, Float32Array]:
@@ -167,7 +197,7 @@ def correct_distortion(planes: Float32Array, view: View) -> Float32Array:
     return np.asarray(cv2.remap(planes, *correction_map(view), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
 
-def luma(rgb: NDArray[np.generic], weights: tuple[float, float, float] = LUMA_BT601) -> Float32Array:
+def luma(rgb: NDArray[Any], weights: tuple[float, float, float] = LUMA_BT601) -> Float32Array:
     """(height, width) float32 luma of a picture (height, width, 3), red first."""
     import cv2
 

@@ -67,6 +67,8 @@ def undistort(points: FloatArray, coefficients: FloatArray, iterations: int = 12
         jx = (distort(guess + along_x, coefficients) - here) / step
         jy = (distort(guess + along_y, coefficients) - here) / step
         missing = points - here
+        if np.abs(missing).max() < 1e-13:
+            break
         det = jx[..., 0] * jy[..., 1] - jx[..., 1] * jy[..., 0]
         det = np.where(np.abs(det) < 0.05, 0.05, det)
         dx = (missing[..., 0] * jy[..., 1] - missing[..., 1] * jy[..., 0]) / det
