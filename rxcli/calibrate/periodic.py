@@ -1,0 +1,367 @@
+"""A periodic signal of unknown frequency and waveform in one profile: search, maximum-likelihood fit, uncertainty.
+
+The model of a profile is `y(r) = m(r) + e(r) * w(f * r) + noise`: `m` and `e` are slow (light fall-off, vignetting, the
+scene), `w` is a harmonic series of the fundamental `f` in cycles per row. All harmonics are fitted jointly, so a
+harmonic is no rival of its fundamental, and a sub-harmonic has to explain something that the fundamental does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rxcli.types import BoolArray, FloatArray
+
+#: Oversampling of the spectrum in the search.
+_PAD = 8
+#: Harmonics looked at in the search, and numbers of them tried in the fit.
+_SEARCH_HARMONICS = 12
+_HARMONICS = (1, 2, 3, 5, 7, 10, 14, 20, 28)
+#: Highest frequency searched, cycles per row: beyond it a period has too few rows to be told from its alias.
+MAX_FREQUENCY = 0.45
+#: Share of the variance that a harmonic must explain to pay for itself in the search.
+_PRICE = 0.01
+#: Power over the continuum from which a line counts: chance reaches it once in e^25 bins.
+_LINE_POWER = 25.0
+#: Periods below which lines of a spectrum run into each other, and the score that so few must reach.
+_FEW_PERIODS = 6
+_FEW_SCORE = 0.6
+#: Share of the stripes' power that a sub-harmonic must add to be taken for the fundamental.
+_SUBHARMONIC_SHARE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class PeriodicFit:
+    """A fitted profile."""
+
+    #: Cycles per row, and its standard deviation.
+    frequency: float
+    frequency_sd: float
+    #: (H,) cosine and sine amplitudes of harmonics 1..H at row `origin`.
+    cosines: FloatArray
+    sines: FloatArray
+    origin: float
+    #: First row and number of rows fitted.
+    first_row: int
+    n_rows: int
+    #: Share of the variance about the slow part that the stripes explain.
+    explained: float
+    #: Bayesian information criterion of the fit; lower is better.
+    bic: float
+    #: (n_rows,) slow mean and envelope of the stripes, profile units.
+    mean: FloatArray
+    envelope: FloatArray
+    #: (n_rows,) profile minus model.
+    residual: FloatArray
+
+    @property
+    def periods(self) -> float:
+        """Periods in the rows fitted."""
+        return self.frequency * self.n_rows
+
+    def waveform(self, rows: FloatArray) -> FloatArray:
+        """The periodic part at `rows`, in units of the profile where the envelope is 1."""
+        return harmonic_series(self.frequency * (rows - self.origin), self.cosines, self.sines)
+
+
+def harmonic_series(phase: FloatArray, cosines: FloatArray, sines: FloatArray) -> FloatArray:
+    """Sum of harmonics at `phase` (cycles)."""
+    angle = 2 * np.pi * np.multiply.outer(phase, np.arange(1, cosines.size + 1))
+    return np.asarray(np.cos(angle) @ cosines + np.sin(angle) @ sines)
+
+
+def whitened_power(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Power spectra over their continuum.
+
+    Args:
+        profiles: (k, n) profiles.
+
+    Returns:
+        (F,) frequencies in cycles per row, and (k, F) power relative to a continuum `a + b / f^2` (white noise and the
+        spectrum of natural scenes), about 1 where there is nothing periodic.
+    """
+    n = profiles.shape[1]
+    taper = np.hanning(n)
+    power = np.abs(np.fft.rfft(_detrend(profiles) * taper, _PAD * n)) ** 2
+    frequency = np.fft.rfftfreq(_PAD * n)
+    low, high = (frequency > 3 / n) & (frequency < 0.1), frequency > 0.3
+    scene = np.median(power[:, low] * frequency[low] ** 2, axis=1, keepdims=True) / np.log(2)
+    white = np.median(power[:, high], axis=1, keepdims=True) / np.log(2)
+    floor = np.finfo(float).eps * power.max(axis=1, keepdims=True) + 1e-300
+    continuum = white + scene / np.maximum(frequency, 1 / n) ** 2 + floor
+    return frequency, power / continuum
+
+
+def _detrend(profiles: FloatArray) -> FloatArray:
+    """Profiles less their least-squares cubic."""
+    basis, _ = np.linalg.qr(np.polynomial.chebyshev.chebvander(np.linspace(-1, 1, profiles.shape[1]), 3))
+    return np.asarray(profiles - (profiles @ basis) @ basis.T)
+
+
+def search(profiles: FloatArray, min_periods: float = 2.0) -> tuple[FloatArray, FloatArray]:
+    """The most likely fundamental of each profile.
+
+    Many periods are found as lines of a spectrum, few by least squares, because their lines run into each other.
+
+    Args:
+        profiles: (k, n) profiles of at least 24 rows.
+        min_periods: fewest periods in the profile.
+
+    Returns:
+        (k,) frequencies in cycles per row, and (k,) scores: about the share of the variance explained, less one per
+        cent a harmonic; zero where nothing stands above the continuum.
+    """
+    fast, fast_score = _search_lines(profiles)
+    slow, slow_score = _search_few(profiles, min_periods)
+    pick = slow_score > fast_score
+    return np.where(pick, slow, fast), np.where(pick, slow_score, fast_score)
+
+
+def _search_lines(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Fundamentals of `_FEW_PERIODS` periods and more."""
+    frequency, power = whitened_power(profiles)
+    lines = np.where(power > _LINE_POWER, power, 0)
+    # A Hann line has an equivalent width of 1.5 bins before the oversampling.
+    share = lines / (lines.sum(axis=1, keepdims=True) / (1.5 * _PAD) + _LINE_POWER)
+    first, last = _FEW_PERIODS * _PAD, int(MAX_FREQUENCY * _PAD * profiles.shape[1])
+    grid = np.arange(first, max(last, first) + 1)
+    grid = grid[grid < frequency.size]
+    total, best = np.zeros((len(profiles), grid.size)), np.zeros((len(profiles), grid.size))
+    for harmonic in range(1, _SEARCH_HARMONICS + 1):
+        inside = grid * harmonic < frequency.size
+        total[:, inside] += share[:, grid[inside] * harmonic] - _PRICE
+        best[:, inside] = np.maximum(best[:, inside], total[:, inside])
+    at = np.argmax(best, axis=1)
+    return frequency[grid[at]], best[np.arange(len(profiles)), at]
+
+
+def _search_few(profiles: FloatArray, min_periods: float) -> tuple[FloatArray, FloatArray]:
+    """Fundamentals of fewer periods, by joint least squares of trend and harmonics on thinned profiles."""
+    thin = max(profiles.shape[1] // 256, 1)
+    n = profiles.shape[1] // thin
+    values = _detrend(profiles[:, : n * thin].reshape(len(profiles), n, thin).mean(axis=2))
+    energy = np.sum(values**2, axis=1) + 1e-300
+    rows = np.arange(n) - (n - 1) / 2
+    slow = np.polynomial.chebyshev.chebvander(2 * rows / n, 3)
+    best, chosen = np.zeros(len(profiles)), np.full(len(profiles), min_periods / profiles.shape[1])
+    for periods in np.arange(min_periods, _FEW_PERIODS + 1, 0.125):
+        for n_harmonics in (1, 3, 5):
+            angle = 2 * np.pi * periods / n * np.multiply.outer(rows, np.arange(1, n_harmonics + 1))
+            basis, _ = np.linalg.qr(np.hstack([slow, np.cos(angle), np.sin(angle)]))
+            score = np.sum((values @ basis) ** 2, axis=1) / energy - _PRICE * n_harmonics
+            chosen = np.where(score > best, periods / (n * thin), chosen)
+            best = np.maximum(best, score)
+    return chosen, np.where(best > _FEW_SCORE, best, 0)
+
+
+def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -> PeriodicFit | None:
+    """Fit a profile at the fundamental nearest to `frequency`, its multiples or its parts, whichever explains it.
+
+    Returns:
+        The fit of the highest frequency that no lower one betters by more than one per cent of the stripes' power;
+        None where nothing fits.
+    """
+    n = profile.size
+    candidates = sorted((frequency * ratio for ratio in (3, 2, 1, 1 / 2, 1 / 3)), reverse=True)
+    fits = [fit_periodic(profile, f, first_row) for f in candidates if 1.5 / n <= f <= MAX_FREQUENCY]
+    best: PeriodicFit | None = None
+    for fit in fits:
+        if fit is None:
+            continue
+        if best is None or (fit.bic < best.bic and fit.explained > best.explained + _SUBHARMONIC_SHARE):
+            best = fit
+    return best
+
+
+def fit_periodic(profile: FloatArray, frequency: float, first_row: int = 0) -> PeriodicFit | None:
+    """Maximum-likelihood fit near `frequency`; the numbers of harmonics and of slow terms by information criterion.
+
+    Args:
+        profile: (n,) values.
+        frequency: cycles per row, right to about a third of a cycle over the profile.
+        first_row: row of the profile's first value.
+    """
+    n_slow, *more_slow = _slow_terms(frequency * profile.size)
+    best: PeriodicFit | None = None
+    worse = 0
+    for n_harmonics in _HARMONICS:
+        # One harmonic of a pulse may vanish, two in a row say that there are no more.
+        if worse == 2 or (n_harmonics > 1 and n_harmonics * frequency >= 0.5):
+            break
+        fit = _fit_near(profile, frequency, n_harmonics, n_slow, first_row)
+        better = fit is not None and (best is None or fit.bic < best.bic)
+        worse = 0 if better else worse + 1
+        if better:
+            best = fit
+    for n_slow in more_slow if best else []:
+        fit = _fit_near(profile, best.frequency, best.cosines.size, n_slow, first_row)
+        if fit is not None and fit.bic < best.bic:
+            best = fit
+    return best
+
+
+def _slow_terms(periods: float) -> list[int]:
+    """Numbers of Chebyshev terms to try; at two a period the envelope could imitate the stripes."""
+    return [terms for terms in (2, 3, 4, 6, 8, 11, 16) if terms <= max(1.5 * periods, 2)]
+
+
+def _fit_near(
+    profile: FloatArray, frequency: float, n_harmonics: int, n_slow: int, first_row: int
+) -> PeriodicFit | None:
+    """Gauss-Newton on slow mean, envelope, harmonics and frequency together."""
+    n = profile.size
+    rows = np.arange(n, dtype=np.float64) - (n - 1) / 2
+    slow = np.polynomial.chebyshev.chebvander(rows / max(n / 2, 1), n_slow - 1)
+    state = _initial(profile, slow, rows, frequency, n_harmonics)
+    model, jacobian = _model(slow, rows, state, n_slow, n_harmonics)
+    rss = float(np.sum((profile - model) ** 2))
+    for _ in range(12):
+        step = np.linalg.lstsq(jacobian, profile - model, rcond=1e-9)[0]
+        state, model, jacobian, new_rss = _descend(profile, slow, rows, state, step, rss, n_slow, n_harmonics)
+        converged = rss - new_rss <= 1e-9 * rss
+        rss = new_rss
+        if converged:
+            break
+    if abs(state[-1] - frequency) > 0.6 / n:
+        return None
+    residual = profile - model
+    trend = slow @ np.linalg.lstsq(slow, profile, rcond=None)[0]
+    mean, envelope, cosines, sines = _unpack(slow, state, n_slow, n_harmonics)
+    return PeriodicFit(
+        frequency=float(state[-1]),
+        frequency_sd=_frequency_sd(jacobian, residual),
+        cosines=cosines,
+        sines=sines,
+        origin=first_row + (n - 1) / 2,
+        first_row=first_row,
+        n_rows=n,
+        explained=1 - rss / max(float(np.sum((profile - trend) ** 2)), 1e-300),
+        bic=n * float(np.log(max(rss, 1e-300) / n)) + state.size * float(np.log(n)),
+        mean=mean,
+        envelope=envelope,
+        residual=residual,
+    )
+
+
+def _initial(
+    profile: FloatArray, slow: FloatArray, rows: FloatArray, frequency: float, n_harmonics: int
+) -> FloatArray:
+    """Least squares with a constant envelope: (mean, envelope but its constant 1, cosines, sines, frequency)."""
+    angle = 2 * np.pi * frequency * np.multiply.outer(rows, np.arange(1, n_harmonics + 1))
+    design = np.hstack([slow, np.cos(angle), np.sin(angle)])
+    linear = np.linalg.lstsq(design, profile, rcond=1e-9)[0]
+    n_slow = slow.shape[1]
+    return np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
+
+
+def _unpack(
+    slow: FloatArray, state: FloatArray, n_slow: int, n_harmonics: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    mean = slow @ state[:n_slow]
+    envelope = 1 + slow[:, 1:] @ state[n_slow : 2 * n_slow - 1]
+    waves = state[2 * n_slow - 1 : -1]
+    return mean, envelope, waves[:n_harmonics], waves[n_harmonics:]
+
+
+def _model(
+    slow: FloatArray, rows: FloatArray, state: FloatArray, n_slow: int, n_harmonics: int
+) -> tuple[FloatArray, FloatArray]:
+    """The model's values (n,) and its Jacobian (n, parameters)."""
+    mean, envelope, a, b = _unpack(slow, state, n_slow, n_harmonics)
+    order = np.arange(1, n_harmonics + 1)
+    angle = 2 * np.pi * state[-1] * np.multiply.outer(rows, order)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    wave = cosine @ a + sine @ b
+    slope = 2 * np.pi * rows * (cosine @ (order * b) - sine @ (order * a))
+    scale = envelope[:, None]
+    jacobian = np.hstack([slow, slow[:, 1:] * wave[:, None], cosine * scale, sine * scale, (envelope * slope)[:, None]])
+    return mean + envelope * wave, jacobian
+
+
+def _descend(
+    profile: FloatArray,
+    slow: FloatArray,
+    rows: FloatArray,
+    state: FloatArray,
+    step: FloatArray,
+    rss: float,
+    n_slow: int,
+    n_harmonics: int,
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """The Gauss-Newton step, halved until it does not make things worse; stays where it is otherwise."""
+    for scale in (1.0, 0.5, 0.25, 0.1, 0.0):
+        trial = state + scale * step
+        model, jacobian = _model(slow, rows, trial, n_slow, n_harmonics)
+        new_rss = float(np.sum((profile - model) ** 2))
+        if new_rss <= rss or scale == 0.0:
+            break
+    return trial, model, jacobian, new_rss
+
+
+def _frequency_sd(jacobian: FloatArray, residual: FloatArray) -> float:
+    """Standard deviation of the frequency (last parameter) under coloured noise.
+
+    The estimate is linear in the noise, `df = g . noise`, with `g` a row of the Jacobian's pseudo-inverse; its variance
+    is the integral of the noise's power spectrum over that of `g`.
+    """
+    scale = np.linalg.norm(jacobian, axis=0) + 1e-300
+    influence = np.linalg.pinv(jacobian / scale, rcond=1e-9)[-1] / scale[-1]
+    n_fft = 4 * residual.size
+    degrees = max(residual.size - jacobian.shape[1], 1)
+    spectrum = noise_spectrum(residual, n_fft) * residual.size / degrees
+    weight = np.abs(np.fft.fft(influence, n_fft)) ** 2
+    return float(np.sqrt(np.sum(spectrum * weight) / n_fft))
+
+
+def noise_spectrum(residual: FloatArray, n_fft: int) -> FloatArray:
+    """(n_fft,) power spectrum of the autoregressive process that fits `residual` (Yule-Walker)."""
+    order = int(np.clip(residual.size // 20, 1, 12))
+    lags = np.array([residual[: residual.size - k] @ residual[k:] for k in range(order + 1)]) / residual.size
+    if lags[0] <= 0:
+        return np.zeros(n_fft)
+    toeplitz = lags[np.abs(np.subtract.outer(np.arange(order), np.arange(order)))]
+    coefficients = np.linalg.lstsq(toeplitz, lags[1:], rcond=1e-9)[0]
+    innovation = max(lags[0] - coefficients @ lags[1:], 1e-12 * lags[0])
+    response = np.fft.fft(np.concatenate([[1.0], -coefficients]), n_fft)
+    return np.asarray(innovation / np.abs(response) ** 2)
+
+
+def explained_share(profiles: FloatArray, template: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How much of each profile a template explains, beyond a straight line.
+
+    Args:
+        profiles: (k, n) profiles.
+        template: (n,) wave.
+
+    Returns:
+        (k,) share of the variance, negative where the template fits upside down; (k,) amplitude.
+    """
+    basis, _ = np.linalg.qr(np.polynomial.polynomial.polyvander(np.linspace(-1, 1, template.size), 1))
+    flat = profiles - (profiles @ basis) @ basis.T
+    wave = template - basis @ (basis.T @ template)
+    power = float(wave @ wave) + 1e-300
+    amplitude = flat @ wave / power
+    variance = np.sum(flat**2, axis=1) + 1e-300
+    return np.sign(amplitude) * amplitude**2 * power / variance, amplitude
+
+
+def significant(fit: PeriodicFit) -> bool:
+    """Whether a fit is stripes and not a scene: a few waves that fit badly are found in any picture."""
+    return fit.explained > (0.3 if fit.periods >= _FEW_PERIODS else 0.85)
+
+
+def longest_block(members: BoolArray) -> tuple[int, int]:
+    """The block range [b0, b1) and so the columns of `members` (strips, blocks) with the most information.
+
+    Information on a frequency grows with the number of strips and the cube of the length.
+    """
+    n_blocks = members.shape[1]
+    run = np.concatenate([np.zeros((len(members), 1), int), np.cumsum(members, axis=1)], axis=1)
+    best, found = 0.0, (0, 0)
+    for b0 in range(n_blocks):
+        for b1 in range(b0 + 1, n_blocks + 1):
+            strips = int(np.sum(run[:, b1] - run[:, b0] == b1 - b0))
+            if strips * (b1 - b0) ** 3 > best:
+                best, found = strips * (b1 - b0) ** 3, (b0, b1)
+    return found

@@ -1,0 +1,371 @@
+"""Line delay and readout of a rolling shutter from pictures of lamps that blink at known frequencies.
+
+One lamp lights all its rows at once, so wherever it shines the stripes have one period and one phase. The picture is
+cut into cells; the clearest stripes give a template, every cell that follows it belongs to that lamp, and the search
+goes on among the rest. Each lamp's region is then summed to one profile and fitted (`rxcli.calibrate.periodic`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from rxcli.calibrate.exposure import estimate_exposure
+from rxcli.calibrate.periodic import (
+    PeriodicFit,
+    explained_share,
+    fit_fundamental,
+    longest_block,
+    search,
+    significant,
+)
+from rxcli.errors import ReceiverError
+from rxcli.types import BoolArray, FloatArray
+
+Axis = Literal["rows", "columns"]
+#: Two-sided 95 % quantile of the normal distribution.
+_Z95 = 1.959964
+_STRIPS = 32
+_MAX_LAMPS = 8
+#: Fewest periods that a period is measured from.
+MIN_PERIODS = 2.0
+_HINT = (
+    "let the lamp fill more of the frame, shorten the exposure to well below half a period, and use the electronic "
+    "shutter with HDR and flicker reduction off"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Stripes:
+    """The region of one lamp in one picture."""
+
+    #: Left, top, right, bottom of the region, stored pixels; right and bottom are outside.
+    bounds: tuple[int, int, int, int]
+    #: Rows (or columns, along a columns axis) of one period, and its standard deviation.
+    period_px: float
+    period_sd_px: float
+    periods: float
+    #: Share of the profile's variance that the stripes explain.
+    explained: float
+    fit: PeriodicFit
+    #: (n,) summed profile, picture units.
+    profile: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class LampReading:
+    """One lamp in one picture with the line delay that it gives."""
+
+    picture: int
+    stripes: Stripes
+    #: None where no given frequency fits the common line delay.
+    frequency_hz: float | None
+    line_delay_s: float | None
+    line_delay_sd_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class ShutterCalibration:
+    """What the stripes say of the shutter."""
+
+    axis: Axis
+    #: Size of the pictures.
+    width: int
+    height: int
+    line_delay_s: float
+    #: 95 % confidence interval.
+    line_delay_interval_s: tuple[float, float]
+    readout_s: float
+    readout_interval_s: tuple[float, float]
+    #: Most periods seen in one region.
+    periods: float
+    exposure_s: float | None
+    exposure_interval_s: tuple[float, float] | None
+    #: Why there is no exposure, or what it rests on.
+    exposure_note: str
+    lamps: tuple[LampReading, ...]
+    warnings: tuple[str, ...]
+
+
+def find_stripes(picture: FloatArray, axis: Axis | None = None) -> tuple[Axis, list[Stripes]]:
+    """Regions lit by blinking lamps.
+
+    Args:
+        picture: (height, width) brightness, any scale.
+        axis: the readout axis; None: the one along which the stripes are clearer.
+
+    Returns:
+        The axis and one region a lamp, clearest first; none where there are no stripes.
+    """
+    if axis is not None:
+        return axis, _find_along(picture if axis == "rows" else picture.T, axis)
+    by_rows, by_columns = _find_along(picture, "rows"), _find_along(picture.T, "columns")
+    return ("columns", by_columns) if _evidence(by_columns) > _evidence(by_rows) else ("rows", by_rows)
+
+
+def _evidence(found: list[Stripes]) -> float:
+    """Light that the stripes explain, summed over their regions."""
+    return sum(_area(s) * s.explained * float(np.std(s.profile)) for s in found)
+
+
+def _area(stripes: Stripes) -> int:
+    x0, y0, x1, y1 = stripes.bounds
+    return (x1 - x0) * (y1 - y0)
+
+
+def _find_along(picture: FloatArray, axis: Axis) -> list[Stripes]:
+    """Peel off lamp after lamp; time runs along the first dimension."""
+    edges = np.linspace(0, picture.shape[1], min(_STRIPS, picture.shape[1]) + 1).astype(int)
+    strips = np.add.reduceat(np.asarray(picture, np.float64), edges[:-1], axis=1).T / np.diff(edges)[:, None]
+    free = np.ones(strips.shape, dtype=bool)
+    found: list[Stripes] = []
+    for _ in range(_MAX_LAMPS):
+        lamp = _clearest_lamp(strips, free)
+        if lamp is None:
+            break
+        members, rows, fit, profile, taken = lamp
+        free &= ~taken
+        found.append(_stripes(members, rows, fit, profile, edges, axis))
+    return found
+
+
+def _stripes(
+    members: BoolArray, rows: slice, fit: PeriodicFit, profile: FloatArray, edges: np.ndarray, axis: Axis
+) -> Stripes:
+    across = np.flatnonzero(members)
+    left, right = int(edges[across[0]]), int(edges[across[-1] + 1])
+    bounds = (left, rows.start, right, rows.stop) if axis == "rows" else (rows.start, left, rows.stop, right)
+    period = 1 / fit.frequency
+    return Stripes(bounds, period, fit.frequency_sd * period**2, fit.periods, fit.explained, fit, profile)
+
+
+def _clearest_lamp(
+    strips: FloatArray, free: BoolArray
+) -> tuple[BoolArray, slice, PeriodicFit, FloatArray, BoolArray] | None:
+    """The lamp with the clearest stripes among the free cells, or None.
+
+    Returns:
+        Member strips, row range, fit, profile, and (strips, rows) all cells that follow this lamp.
+    """
+    fit = _seed(strips, free)
+    if fit is None:
+        return None
+    for _ in range(2):
+        blocks, shares = _follow(strips, free, fit)
+        members = shares >= max(0.3, 0.75 * float(np.quantile(shares, 0.95)))
+        b0, b1 = longest_block(members)
+        if b1 == b0:
+            return None
+        chosen = members[:, b0:b1].all(axis=1)
+        rows = slice(int(blocks[b0]), int(blocks[b1]))
+        profile = strips[chosen, rows].mean(axis=0)
+        grown = fit_fundamental(profile, fit.frequency, rows.start)
+        if grown is None or grown.periods < MIN_PERIODS or not significant(grown):
+            return None
+        fit = grown
+    taken = np.repeat(shares > 0.15, np.diff(blocks), axis=1)
+    taken[chosen, rows] = True
+    return chosen, rows, fit, profile, taken
+
+
+def _seed(strips: FloatArray, free: BoolArray) -> PeriodicFit | None:
+    """The best fit of the best-scoring windows: groups of neighbouring strips by spans of rows."""
+    candidates: list[tuple[float, float, FloatArray, int]] = []
+    for first, length in _windows(strips.shape[1]):
+        rows = slice(first, first + length)
+        groups = _groups(strips[:, rows], free[:, rows].all(axis=1))
+        if not len(groups):
+            continue
+        frequencies, scores = search(groups, MIN_PERIODS)
+        at = int(np.argmax(scores))
+        # Among equally clear windows the longer one tells the frequency better.
+        candidates.append((float(scores[at]) * np.log(length), float(frequencies[at]), groups[at], first))
+    for score, frequency, profile, first in sorted(candidates, key=lambda c: -c[0])[:3]:
+        fit = fit_fundamental(profile, frequency, first) if score > 0 else None
+        if fit is not None and fit.periods >= MIN_PERIODS and significant(fit):
+            return fit
+    return None
+
+
+def _windows(n: int) -> list[tuple[int, int]]:
+    """Spans of rows: the whole, halves and quarters, half overlapping."""
+    spans = []
+    for parts in (1, 2, 4):
+        length = n // parts
+        if length >= 24:
+            spans += [(first, length) for first in range(0, n - length + 1, max(length // 2, 1))]
+    return spans
+
+
+def _groups(strips: FloatArray, usable: BoolArray) -> FloatArray:
+    """Means over runs of 1, 4 and all strips, where all of a run is usable and not flat."""
+    means = []
+    for size in sorted({1, 4, len(strips)}):
+        for first in range(0, len(strips) - size + 1, max(size // 2, 1)):
+            if usable[first : first + size].all():
+                means.append(strips[first : first + size].mean(axis=0))
+    groups = np.array(means).reshape(len(means), strips.shape[1])
+    return groups[np.ptp(groups, axis=1) > 1e-9]
+
+
+def _follow(strips: FloatArray, free: BoolArray, fit: PeriodicFit) -> tuple[np.ndarray, FloatArray]:
+    """How well each cell follows a lamp's template.
+
+    Returns:
+        (blocks + 1,) row edges of the blocks, (strips, blocks) explained shares; zero where a cell is not free.
+    """
+    n = strips.shape[1]
+    length = max(2.5 / fit.frequency, n / 32, 16.0)
+    blocks = np.linspace(0, n, max(int(n / length), 1) + 1).astype(int)
+    template = fit.waveform(np.arange(n, dtype=np.float64))
+    shares = np.zeros((len(strips), blocks.size - 1))
+    for block in range(blocks.size - 1):
+        rows = slice(int(blocks[block]), int(blocks[block + 1]))
+        share, _ = explained_share(strips[:, rows], template[rows])
+        shares[:, block] = np.where(free[:, rows].all(axis=1), share, 0)
+    return blocks, shares
+
+
+def calibrate_shutter(
+    pictures: Sequence[FloatArray],
+    frequencies_hz: Sequence[float],
+    axis: Axis | None = None,
+    exif_exposure_s: float | None = None,
+    linear: bool = False,
+) -> ShutterCalibration:
+    """Line delay from pictures (or frames of a clip) of lamps of known frequency.
+
+    Args:
+        pictures: (height, width) each, all of one size and readout mode.
+        frequencies_hz: what the lamps blink at; more than one where lamps differ.
+        axis: the readout axis, None to find it.
+        exif_exposure_s: exposure as the file says, which decides between exposure and flash length.
+        linear: whether the values are proportional to light.
+
+    Raises:
+        ReceiverError: no stripes, or too few periods.
+    """
+    found = [find_stripes(np.asarray(p, np.float64), axis) for p in pictures]
+    axis = _common_axis(found)
+    seen = [(i, s) for i, (of, regions) in enumerate(found) if of == axis for s in regions]
+    if not seen:
+        raise ReceiverError(f"no stripes of a blinking lamp in {_pictures(len(pictures))}", _HINT)
+    line_delay = _common_line_delay([s for _, s in seen], frequencies_hz)
+    lamps = [_reading(i, s, frequencies_hz, line_delay) for i, s in seen]
+    return _combine(lamps, pictures, axis, frequencies_hz, exif_exposure_s, linear)
+
+
+def _pictures(n: int) -> str:
+    return "the picture" if n == 1 else f"any of {n} pictures"
+
+
+def _common_axis(found: list[tuple[Axis, list[Stripes]]]) -> Axis:
+    """The axis with most evidence over all pictures."""
+    weight = {"rows": 0.0, "columns": 0.0}
+    for axis, regions in found:
+        weight[axis] += _evidence(regions)
+    return "columns" if weight["columns"] > weight["rows"] else "rows"
+
+
+def _tolerance(stripes: Stripes) -> float:
+    """Relative deviation at which a region still agrees with a line delay."""
+    return max(4 * stripes.period_sd_px / stripes.period_px, 3e-3)
+
+
+def _common_line_delay(seen: list[Stripes], frequencies_hz: Sequence[float]) -> float:
+    """The line delay under which most of the light is of a given frequency.
+
+    Every pairing of a region with a frequency proposes one; a proposal is worth the regions that agree with it, and,
+    so that several lamps are told apart, the number of given frequencies that it accounts for.
+    """
+    best, chosen = (-1, -1.0), 0.0
+    for proposer in seen:
+        for proposed in frequencies_hz:
+            line_delay = 1 / (proposed * proposer.period_px)
+            used, weight = set(), 0.0
+            for stripes in seen:
+                match = _match(stripes, frequencies_hz, line_delay)
+                if match is not None:
+                    used.add(match)
+                    weight += _area(stripes) * stripes.explained
+            if (len(used), weight) > best:
+                best, chosen = (len(used), weight), line_delay
+    return chosen
+
+
+def _match(stripes: Stripes, frequencies_hz: Sequence[float], line_delay: float) -> float | None:
+    """The given frequency that explains a region under a line delay."""
+    seen_hz = 1 / (stripes.period_px * line_delay)
+    nearest = min(frequencies_hz, key=lambda f: abs(np.log(f / seen_hz)))
+    return nearest if abs(nearest / seen_hz - 1) <= _tolerance(stripes) else None
+
+
+def _reading(picture: int, stripes: Stripes, frequencies_hz: Sequence[float], line_delay: float) -> LampReading:
+    frequency = _match(stripes, frequencies_hz, line_delay)
+    if frequency is None:
+        return LampReading(picture, stripes, None, None, None)
+    value = stripes.fit.frequency / frequency
+    return LampReading(picture, stripes, frequency, value, stripes.fit.frequency_sd / frequency)
+
+
+def _weighted(values: FloatArray, sds: FloatArray) -> tuple[float, float]:
+    """Inverse-variance mean and its standard deviation, enlarged where the values scatter more than they say."""
+    weights = 1 / np.maximum(sds, 1e-12 * np.abs(values)) ** 2
+    mean = float(weights @ values / weights.sum())
+    scatter = float(weights @ (values - mean) ** 2) / max(values.size - 1, 1)
+    return mean, float(np.sqrt(max(scatter, 1.0) / weights.sum()))
+
+
+def _combine(
+    lamps: list[LampReading],
+    pictures: Sequence[FloatArray],
+    axis: Axis,
+    frequencies_hz: Sequence[float],
+    exif_exposure_s: float | None,
+    linear: bool,
+) -> ShutterCalibration:
+    used = [lamp for lamp in lamps if lamp.line_delay_s is not None]
+    value, sd = _weighted(
+        np.array([lamp.line_delay_s for lamp in used]), np.array([lamp.line_delay_sd_s for lamp in used])
+    )
+    height, width = pictures[0].shape
+    n_rows = height if axis == "rows" else width
+    low, high = value - _Z95 * sd, value + _Z95 * sd
+    clearest = max(used, key=lambda lamp: lamp.stripes.explained * np.sqrt(_area(lamp.stripes)))
+    exposure = estimate_exposure(
+        clearest.stripes.fit, clearest.stripes.profile, value, clearest.frequency_hz or 0.0, exif_exposure_s, linear
+    )
+    return ShutterCalibration(
+        axis=axis,
+        width=width,
+        height=height,
+        line_delay_s=value,
+        line_delay_interval_s=(low, high),
+        readout_s=value * n_rows,
+        readout_interval_s=(low * n_rows, high * n_rows),
+        periods=max(lamp.stripes.periods for lamp in used),
+        exposure_s=exposure.exposure_s,
+        exposure_interval_s=exposure.interval_s,
+        exposure_note=exposure.note,
+        lamps=tuple(lamps),
+        warnings=tuple(_warnings(lamps, frequencies_hz, value)),
+    )
+
+
+def _warnings(lamps: list[LampReading], frequencies_hz: Sequence[float], line_delay_s: float) -> list[str]:
+    """What a user should know before trusting the figures."""
+    notes = []
+    strange = [lamp for lamp in lamps if lamp.frequency_hz is None]
+    for lamp in strange:
+        seen_hz = 1 / (lamp.stripes.period_px * line_delay_s)
+        notes.append(f"a lamp at {lamp.stripes.bounds} blinks at about {seen_hz:.4g} Hz, which was not given")
+    missing = set(frequencies_hz) - {lamp.frequency_hz for lamp in lamps}
+    if missing:
+        notes.append("no lamp of " + ", ".join(f"{f:g} Hz" for f in sorted(missing)) + " was seen")
+    periods = max(lamp.stripes.periods for lamp in lamps if lamp.frequency_hz)
+    if periods < 4:
+        notes.append(f"only {periods:.1f} periods seen; a faster lamp gives a narrower interval")
+    return notes
