@@ -28,6 +28,8 @@ _GRID_ROWS = 32
 _BAND_ROWS = 256
 #: Texture pixels of black around the panel, so that blur can run out of it.
 _TEXTURE_MARGIN = 12
+#: Breadth of the dark frame around the panel, in screen widths.
+_BEZEL_WIDTHS = 0.035
 
 
 @dataclass(frozen=True)
@@ -298,13 +300,14 @@ def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     pitch, room, screen = 8, exposure.room, exposure.link.screen
     x, y = grid_nodes(exposure.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
     place = exposure.view.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
-    # Distance outside the screen's edge, in screen widths: negative inside.
-    beyond = (np.abs(place - 0.5) - 0.5) * [1.0, 1 / screen.aspect]
-    outside = beyond.max(axis=-1)
-    lamp_at = (place - np.array(room.lamp_place)) * [1.0, 1 / screen.aspect]
-    lamp = room.lamp * np.exp(-0.5 * (lamp_at**2).sum(axis=-1) / room.lamp_size**2)
-    seen = np.where(outside > 0.035, room.wall_reflectance, room.bezel_reflectance)
-    seen = np.where(outside <= 0, room.panel_reflectance + lamp, seen).astype(np.float32)
+    # Pixels outside the screen's edge, negative inside; edges are ramps two nodes wide, as the grid can carry them.
+    beyond = ((np.abs(place - 0.5) - 0.5) * [1.0, 1 / screen.aspect]).max(axis=-1) * exposure.view.pixels_per_width
+    bezel_px = _BEZEL_WIDTHS * exposure.view.pixels_per_width
+    on_wall, off_panel = (np.clip((beyond - edge) / (2 * pitch) + 0.5, 0, 1) for edge in (bezel_px, 0.0))
+    from_lamp = (place - np.array(room.lamp_place)) * [1.0, 1 / screen.aspect]
+    panel = room.panel_reflectance + room.lamp * np.exp(-0.5 * (from_lamp**2).sum(axis=-1) / room.lamp_size**2)
+    frame = room.bezel_reflectance + (room.wall_reflectance - room.bezel_reflectance) * on_wall
+    seen = (panel + (frame - panel) * off_panel).astype(np.float32)
     full = cv2.resize(seen, (x.size * pitch, y.size * pitch), interpolation=cv2.INTER_LINEAR)
     return np.asarray(full[pitch : pitch + bottom - top, pitch : pitch + exposure.sensor.width])
 

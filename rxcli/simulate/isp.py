@@ -84,7 +84,7 @@ def demosaic(raw: NDArray[np.uint16], sensor: Sensor) -> Float32Array:
         planes = raw.astype(np.float32)
     planes -= np.float32(sensor.black_level)
     planes *= scale
-    return planes
+    return np.asarray(planes, np.float32)
 
 
 def _demosaic_xtrans(raw: NDArray[np.uint16]) -> Float32Array:
@@ -156,7 +156,8 @@ def _finish(planes: Float32Array, isp: Isp, bits: int) -> NDArray[Any]:
     top = (1 << bits) - 1
     planes *= np.float32(top)
     planes += np.float32(0.5)
-    return np.clip(planes, 0, top, out=planes).astype(np.uint8 if bits == 8 else np.uint16)
+    np.clip(planes, 0, top, out=planes)
+    return planes.astype(np.uint8 if bits == 8 else np.uint16)
 
 
 def _reduce_noise(planes: Float32Array, isp: Isp) -> Float32Array:

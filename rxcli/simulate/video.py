@@ -99,7 +99,7 @@ def _add_stream(container: Any, settings: Codec, rate: Fraction, shape: tuple[in
     if bit_rate is not None:
         stream.bit_rate = bit_rate
     if settings.encoder != "mjpeg":
-        stream.options = {"preset": "veryfast"} | ({} if bit_rate else {"crf": "20"})
+        stream.options = {"preset": "veryfast"} | ({} if bit_rate else {"crf": "23"})
         if settings.encoder == "libx265":
             stream.options = stream.options | {"x265-params": "log-level=error"}
     return stream
