@@ -18,7 +18,7 @@ from rxcli.errors import InputError
 from rxcli.ingest.image import BT601, BT709, Luma, luma_of
 from rxcli.ingest.metadata import exif_metadata
 from rxcli.ingest.orientation import as_stored, orientation_of
-from rxcli.ingest.sniff import check_size
+from rxcli.ingest.sniff import check_size, reason_of
 from rxcli.types import Metadata
 
 #: `matrix_coefficients` of ITU-T H.273 that means BT.709.
@@ -42,7 +42,7 @@ def read_heif(data: bytes, path: Path) -> tuple[Luma, Metadata]:
     except InputError:
         raise
     except Exception as error:  # libheif's errors come as some five unrelated types
-        raise InputError(f"{path}: the HEIC picture is damaged ({error})", "copy the file again") from None
+        raise InputError(f"{path}: the HEIC picture is damaged ({reason_of(error)})", "copy the file again") from None
     matrix = (file.info.get("nclx_profile") or {}).get("matrix_coefficients")
     luma = luma_of(pixels, BT709 if matrix == _MATRIX_BT709 else BT601)
     metadata = exif_metadata(file.info.get("exif") or b"")

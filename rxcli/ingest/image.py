@@ -6,6 +6,7 @@ Colour is reduced to BT.601 luma, which is what a JPEG of the same picture would
 from __future__ import annotations
 
 import io
+import logging
 import warnings
 import zlib
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from rxcli.errors import InputError
 from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
-from rxcli.ingest.sniff import Kind, check_size, read_bytes
+from rxcli.ingest.sniff import Kind, check_size, read_bytes, reason_of
 from rxcli.types import Frame, Metadata
 
 Luma = NDArray[np.uint8] | NDArray[np.uint16]
@@ -109,6 +110,7 @@ def _png_chunks(data: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
 def _read_tiff(path: Path) -> Frame:
     import tifffile
 
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)  # what matters comes as an exception
     with path.open("rb") as file:
         metadata = tiff_metadata(file)
     try:
@@ -119,9 +121,8 @@ def _read_tiff(path: Path) -> Frame:
     except InputError:
         raise
     except Exception as error:  # tifffile raises whatever a broken directory leads it to
-        reason = " ".join(str(error).split())[:120]
         raise InputError(
-            f"{path}: the TIFF cannot be read ({reason})", "save it uncompressed, or copy it again"
+            f"{path}: the TIFF cannot be read ({reason_of(error)})", "save it uncompressed, or copy it again"
         ) from None
     luma, linear = _tiff_luma(pixels, path)
     return _frame(path, np.iinfo(luma.dtype).max - luma if min_is_white else luma, metadata, linear)
@@ -175,7 +176,7 @@ def _read_with_pillow(data: bytes, path: Path) -> NDArray[np.uint8]:
     except InputError:
         raise
     except Exception as error:  # Pillow raises some ten unrelated types on damaged files
-        raise InputError(f"{path}: the picture is damaged ({error})", "copy the file again") from None
+        raise InputError(f"{path}: the picture is damaged ({reason_of(error)})", "copy the file again") from None
 
 
 def _pillow_pixels(image: Any) -> NDArray[Any]:

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError
-from rxcli.ingest.sniff import check_size
+from rxcli.ingest.sniff import check_size, reason_of
 
+#: What simplejpeg raises; KeyError for a subsampling that it does not know.
+_FAULTS = (ValueError, KeyError, MemoryError, OverflowError)
 _PADDING = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
 
 
@@ -28,13 +30,13 @@ def decode_luma(data: Any, source: object) -> NDArray[np.uint8]:
 
     try:
         height, width, _, _ = simplejpeg.decode_jpeg_header(data, strict=False)
-    except ValueError as error:
-        raise InputError(f"{source}: the JPEG header is damaged or cut ({error})", "copy the file again") from None
+    except _FAULTS:
+        raise InputError(f"{source}: the JPEG header is damaged or cut", "copy the file again") from None
     check_size(source, width, height)
     try:
         return _gray(data)
-    except ValueError as error:
-        return _second_look(data, str(error), source)
+    except _FAULTS as error:
+        return _second_look(data, reason_of(error), source)
 
 
 def _gray(data: Any, strict: bool = True) -> NDArray[np.uint8]:
@@ -48,7 +50,7 @@ def _second_look(data: Any, reason: str, source: object) -> NDArray[np.uint8]:
     """Accept harmless padding; say of anything else what is left of the picture."""
     try:
         luma = _gray(data, strict=False)
-    except (ValueError, MemoryError):
+    except _FAULTS:
         raise InputError(f"{source}: cannot be decoded as JPEG ({reason})", "copy the file again") from None
     if _is_padding(bytes(data), reason):
         return luma

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rxcli.errors import InputError
 from rxcli.ingest.extent import bytes_claimed
 from rxcli.ingest.metadata import merge, raw_metadata
-from rxcli.ingest.sniff import check_size
+from rxcli.ingest.sniff import check_size, reason_of
 from rxcli.types import Frame, Metadata, Mosaic
 
 #: LibRaw's turns for viewing -> EXIF orientation.
@@ -42,7 +42,9 @@ def read_raw(path: Path) -> Frame:
     except rawpy.LibRawFileUnsupportedError:
         raise InputError(f"{path}: no RAW format that LibRaw knows", "convert it to DNG, or use the JPEG") from None
     except (rawpy.LibRawError, RuntimeError, OSError, MemoryError, ValueError) as error:
-        raise InputError(f"{path}: the RAW file is damaged or cut ({_reason(error)})", "copy the file again") from None
+        raise InputError(
+            f"{path}: the RAW file is damaged or cut ({_libraw_reason(error)})", "copy the file again"
+        ) from None
     check_size(path, raw.sizes.width, raw.sizes.height)
     top, left, height, width = default_crop(raw.sizes)
     pixels = image[top : top + height, left : left + width]
@@ -147,6 +149,7 @@ def _metadata(path: Path, raw: Any) -> Metadata:
     return replace(merge(exif, libraw), orientation=orientation)
 
 
-def _reason(error: BaseException) -> str:
+def _libraw_reason(error: BaseException) -> str:
+    """LibRaw's own words, which come as bytes."""
     detail = error.args[0] if error.args else ""
-    return detail.decode("ascii", "replace") if isinstance(detail, bytes) else str(error) or type(error).__name__
+    return detail.decode("ascii", "replace") if isinstance(detail, bytes) else reason_of(error)

@@ -49,7 +49,7 @@ def check_file(path: Path) -> Kind | None:
         raise InputError(f"{path}: no such file", "check the name") from None
     except (OSError, ValueError) as error:
         raise InputError(
-            f"{path}: cannot be looked at ({_reason(error)})", "check the name and the permissions"
+            f"{path}: cannot be looked at ({reason_of(error)})", "check the name and the permissions"
         ) from None
     if stat.S_ISCHR(info.st_mode):
         return "device"
@@ -72,7 +72,7 @@ def read_bytes(path: Path, size: int = -1) -> bytes:
         with path.open("rb") as file:
             return file.read(size)
     except (OSError, MemoryError) as error:
-        raise InputError(f"{path}: cannot be read ({_reason(error)})", "check permissions and disk") from None
+        raise InputError(f"{path}: cannot be read ({reason_of(error)})", "check permissions and disk") from None
 
 
 def sniff(head: bytes, suffix: str) -> Kind | None:
@@ -139,5 +139,7 @@ def _by_suffix(suffix: str) -> Kind | None:
     return "video" if suffix in VIDEO_SUFFIXES else None
 
 
-def _reason(error: BaseException) -> str:
-    return getattr(error, "strerror", None) or str(error) or type(error).__name__
+def reason_of(error: BaseException) -> str:
+    """What an exception says, in one short line."""
+    text = getattr(error, "strerror", None) or " ".join(str(part) for part in error.args) or type(error).__name__
+    return " ".join(str(text).split())[:160]

@@ -104,6 +104,8 @@ class CameraCounts:
     dropped: int = 0
     damaged: int = 0
     connections: int = 0
+    #: Time of the first frame on the driver's clock, which goes on through connections.
+    start_s: float | None = None
 
 
 class CameraLost(InputError):
@@ -164,7 +166,6 @@ class Camera:
         self._newest: _Capture | None = None
         self._failure: InputError | None = None
         self._running = False
-        self._start_s: float | None = None
         self._grabber = threading.Thread(target=self._grab, name=f"grab {path}", daemon=True)
         try:
             self._configure()
@@ -311,13 +312,13 @@ class Camera:
         return luma if data is None else _decode_jpeg(data, self._path)
 
     def _frame(self, luma: Luma, time_s: float) -> Frame:
-        if self._start_s is None:
-            self._start_s = time_s
+        if self.counts.start_s is None:
+            self.counts.start_s = time_s
         return Frame(
             pixels=luma,
             source=str(self._path),
             index=self.counts.delivered - 1,
-            time_s=time_s - self._start_s,
+            time_s=time_s - self.counts.start_s,
             metadata=Metadata(model=self._card, exposure_s=self.exposure_s),
             black=self._layout.black,
             white=self._layout.white,

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rxcli.errors import InputError
 from rxcli.ingest.metadata import clip_metadata
 from rxcli.ingest.orientation import orientation_of_turn
-from rxcli.ingest.sniff import check_size
+from rxcli.ingest.sniff import check_size, reason_of
 from rxcli.types import Frame
 
 #: ITU-T H.273: samples use 16..235 of 8 bits, or all of them (FFmpeg's AVCOL_RANGE_JPEG).
@@ -197,7 +197,7 @@ def _plane(plane: Any, width: int, height: int, dtype: type[np.uint8] | type[np.
 
 def _check_whole(path: Path, container: Any, stream: Any, progress: _Progress) -> None:
     """Raise where the clip ended before it should, or frames of it were left out."""
-    if progress.cut or _ends_early(container, stream, progress):
+    if progress.cut or _ends_early(path, container, stream, progress):
         reason = f"{path}: the clip breaks off at {progress.last_time_s:.3f} s"
         raise InputError(reason, "the frames before were read; copy the file from the camera again")
     if progress.n_damaged:
@@ -205,15 +205,29 @@ def _check_whole(path: Path, container: Any, stream: Any, progress: _Progress) -
         raise InputError(f"{path}: {progress.n_damaged} frames are damaged, {after}", "copy the file again")
 
 
-def _ends_early(container: Any, stream: Any, progress: _Progress) -> bool:
+def _ends_early(path: Path, container: Any, stream: Any, progress: _Progress) -> bool:
     """Whether the container's own index, frame count or duration asks for more than there was."""
     if container.format.name == "avi":
         return bool(stream.frames > progress.n_packets)
     entries = stream.index_entries
     if "mp4" in container.format.name:
-        return any(entry.pos + entry.size > container.size for entry in entries)
+        return _boxes_end(path) > container.size or any(entry.pos + entry.size > container.size for entry in entries)
     frame_s = 1 / float(stream.average_rate or 30)
     return progress.last_time_s + _END_TOLERANCE * frame_s < _stated_end_s(container, stream)
+
+
+def _boxes_end(path: Path) -> int:
+    """Where the last top-level box of an MP4 or MOV file ends by its own size (ISO/IEC 14496-12, section 4.2)."""
+    end = 0
+    with path.open("rb") as file:
+        while len(head := file.read(16)) >= 8:
+            size = int.from_bytes(head[:4])
+            size = int.from_bytes(head[8:]) if size == 1 else size
+            if size < 8 or not head[4:8].isalnum():  # 0: to the end of the file; no name: some camera's trailer
+                break
+            end += size
+            file.seek(end)
+    return end
 
 
 def _stated_end_s(container: Any, stream: Any) -> float:
@@ -227,4 +241,4 @@ def _stated_end_s(container: Any, stream: Any) -> float:
 def _open_failure(path: Path, error: Exception) -> tuple[str, str]:
     if "Invalid data" in str(error):
         return f"{path}: no clip, or its index is missing because it is cut", "copy the file from the camera again"
-    return f"{path}: cannot be opened as a clip ({error})", "copy the file from the camera again"
+    return f"{path}: cannot be opened as a clip ({reason_of(error)})", "copy the file from the camera again"

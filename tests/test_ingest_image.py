@@ -1,0 +1,214 @@
+"""Pictures of every kind: luma as stored, levels, metadata, orientation."""
+
+from __future__ import annotations
+
+import io
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import simplejpeg
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
+
+from rxcli.errors import InputError
+from rxcli.ingest import KNOWN_SUFFIXES, open_source
+from rxcli.ingest.metadata import jpeg_metadata
+from rxcli.ingest.orientation import as_stored, as_viewed, orientation_of, orientation_of_turn
+from rxcli.types import Frame, Metadata
+
+HEIGHT, WIDTH = 48, 80
+
+
+@pytest.fixture
+def grey() -> NDArray[np.uint8]:
+    """A smooth picture without any symmetry."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    return (3 * y + x + 20 * (y < 10) * (x > 60)).astype(np.uint8)
+
+
+def one_frame(path: Path) -> Frame:
+    frames = list(open_source(path))
+    assert len(frames) == 1
+    assert frames[0].source == str(path)
+    return frames[0]
+
+
+def exif_bytes(orientation: int = 1) -> bytes:
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110], exif[0x0112] = "FUJIFILM", "X-S10\0", orientation
+    inner = exif.get_ifd(0x8769)
+    inner[0x829A], inner[0x8827], inner[0x920A], inner[0xA405] = 1 / 32000, 3200, 35.0, 53
+    inner[0xA434] = "XF35mmF1.4 R"
+    return exif.tobytes()
+
+
+EXPECTED = Metadata("FUJIFILM", "X-S10", "XF35mmF1.4 R", 1 / 32000, 3200.0, 35.0, 53.0, 3)
+
+
+class TestJpeg:
+    def test_luma_is_that_of_the_file(self, tmp_path: Path, grey: NDArray[np.uint8]) -> None:
+        rgb = np.stack([grey, 255 - grey, grey // 2], axis=2)
+        data = simplejpeg.encode_jpeg(rgb, quality=95, colorsubsampling="422")
+        (tmp_path / "a.jpg").write_bytes(data)
+        frame = one_frame(tmp_path / "a.jpg")
+        reference = Image.open(io.BytesIO(data))
+        reference.draft("L", None)
+        np.testing.assert_array_equal(frame.pixels, np.asarray(reference))
+        assert (frame.black, frame.white, frame.linear, frame.mosaic) == (0, 255, False, None)
+
+    def test_exif_is_read_and_never_applied(self, tmp_path: Path, grey: NDArray[np.uint8]) -> None:
+        Image.fromarray(grey).save(tmp_path / "a.jpg", quality=98, exif=exif_bytes(orientation=3))
+        frame = one_frame(tmp_path / "a.jpg")
+        assert np.abs(frame.pixels.astype(int) - grey).max() < 8
+        assert frame.metadata.exposure_s == pytest.approx(1 / 32000)
+        assert frame.metadata == EXPECTED
+
+    def test_name_does_not_matter(self, tmp_path: Path, grey: NDArray[np.uint8]) -> None:
+        Image.fromarray(grey).save(tmp_path / "a.png")
+        (tmp_path / "a.png").rename(tmp_path / "a.jpg")
+        np.testing.assert_array_equal(one_frame(tmp_path / "a.jpg").pixels, grey)
+
+    def test_without_huffman_tables(self, tmp_path: Path, grey: NDArray[np.uint8]) -> None:
+        """Motion-JPEG cameras leave the standard tables out."""
+        data = simplejpeg.encode_jpeg(grey[:, :, None].copy(), quality=95, colorspace="GRAY", colorsubsampling="Gray")
+        at = data.index(b"\xff\xc4")
+        while data[at : at + 2] == b"\xff\xc4":
+            data = data[:at] + data[at + 2 + struct.unpack_from(">H", data, at + 2)[0] :]
+        (tmp_path / "a.jpg").write_bytes(data)
+        assert np.abs(one_frame(tmp_path / "a.jpg").pixels.astype(int) - grey).max() < 12
+
+    def test_padding_before_the_end_is_harmless(self, tmp_path: Path, grey: NDArray[np.uint8]) -> None:
+        data = simplejpeg.encode_jpeg(grey[:, :, None].copy(), colorspace="GRAY", colorsubsampling="Gray")
+        (tmp_path / "a.jpg").write_bytes(data[:-2] + b"\0" * 40 + data[-2:] + b"trailer of some phone")
+        assert one_frame(tmp_path / "a.jpg").pixels.shape == (HEIGHT, WIDTH)
+
+    def test_cut_file_says_how_many_rows_are_there(self, tmp_path: Path) -> None:
+        noise = np.random.default_rng(1).integers(0, 255, (160, 64, 1), dtype=np.uint8)
+        data = simplejpeg.encode_jpeg(noise, colorspace="GRAY", colorsubsampling="Gray")
+        (tmp_path / "cut.jpg").write_bytes(data[: len(data) // 2])
+        with pytest.raises(InputError, match=r"cut\.jpg: the JPEG is cut: (72|80|88) of 160 rows are there"):
+            one_frame(tmp_path / "cut.jpg")
+
+
+class TestPngAndTiff:
+    @pytest.mark.parametrize("suffix", ["png", "tif"])
+    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+    @pytest.mark.parametrize("colour", [False, True])
+    def test_depths_and_colours(
+        self, tmp_path: Path, grey: NDArray[np.uint8], suffix: str, dtype: type, colour: bool
+    ) -> None:
+        scale = 257 if dtype == np.uint16 else 1
+        pixels = grey.astype(dtype) * dtype(scale)
+        if colour:
+            pixels = np.stack([pixels, pixels // 2, pixels // 4], axis=2)
+        path = tmp_path / f"a.{suffix}"
+        _write(path, pixels)
+        frame = one_frame(path)
+        expected = pixels @ np.array([0.299, 0.587, 0.114]) if colour else pixels
+        assert frame.pixels.dtype == dtype
+        assert frame.white == np.iinfo(dtype).max
+        np.testing.assert_allclose(frame.pixels, expected, rtol=0, atol=2)
+
+    @pytest.mark.parametrize("compression", [None, "tiff_lzw", "tiff_adobe_deflate"])
+    @pytest.mark.parametrize("orientation", [1, 3, 6])
+    def test_tiff_is_never_turned(
+        self, tmp_path: Path, grey: NDArray[np.uint8], compression: str | None, orientation: int
+    ) -> None:
+        Image.fromarray(grey).save(tmp_path / "a.tif", compression=compression, tiffinfo={274: orientation})
+        frame = one_frame(tmp_path / "a.tif")
+        np.testing.assert_array_equal(frame.pixels, grey)
+        assert frame.metadata.orientation == orientation
+
+    def test_float_tiff_is_linear_light(self, tmp_path: Path, grey: NDArray[np.uint8]) -> None:
+        light = grey.astype(np.float32) / 1000
+        light[0, 0] = np.nan
+        tifffile.imwrite(tmp_path / "a.tif", light)
+        frame = one_frame(tmp_path / "a.tif")
+        assert frame.linear
+        assert frame.pixels[0, 0] == 0
+        np.testing.assert_allclose(frame.pixels[1:] / 65535, light[1:] / light[1:].max(), atol=1e-5)
+
+    def test_png_exif(self, tmp_path: Path, grey: NDArray[np.uint8]) -> None:
+        Image.fromarray(grey).save(tmp_path / "a.png", exif=exif_bytes(orientation=3))
+        assert one_frame(tmp_path / "a.png").metadata == EXPECTED
+
+    def test_palette_and_alpha(self, tmp_path: Path, grey: NDArray[np.uint8]) -> None:
+        image = Image.fromarray(grey)
+        for name, mode in (("p.png", "P"), ("a.png", "RGBA")):
+            image.convert(mode).save(tmp_path / name)
+            np.testing.assert_array_equal(one_frame(tmp_path / name).pixels, grey)
+
+    @pytest.mark.parametrize("suffix", ["bmp", "webp"])
+    def test_what_messengers_send(self, tmp_path: Path, grey: NDArray[np.uint8], suffix: str) -> None:
+        Image.fromarray(grey).convert("RGB").save(tmp_path / f"a.{suffix}", lossless=True)
+        np.testing.assert_array_equal(one_frame(tmp_path / f"a.{suffix}").pixels, grey)
+
+
+class TestHeif:
+    @pytest.mark.parametrize("orientation", range(1, 9))
+    def test_turn_is_undone(self, tmp_path: Path, grey: NDArray[np.uint8], orientation: int) -> None:
+        pillow_heif = pytest.importorskip("pillow_heif", reason="needs the extra `heic`")
+        exif = exif_bytes(orientation)
+        pillow_heif.from_pillow(Image.fromarray(grey).convert("RGB")).save(tmp_path / "a.heic", exif=exif, quality=99)
+        frame = one_frame(tmp_path / "a.heic")
+        assert frame.pixels.shape == grey.shape
+        assert np.abs(frame.pixels.astype(int) - grey).mean() < 3
+        assert frame.metadata.orientation == orientation
+        assert frame.metadata.model == "X-S10"
+
+    def test_missing_extra(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(__import__("sys").modules, "pillow_heif", None)
+        (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic" + b"\0" * 40)
+        with pytest.raises(InputError, match=r"a\.heic: HEIC needs an extra; run `pip install 'vlc-rx\[heic\]'`"):
+            one_frame(tmp_path / "a.heic")
+
+
+class TestOrientation:
+    @pytest.mark.parametrize("orientation", range(1, 9))
+    def test_agrees_with_pillow(self, grey: NDArray[np.uint8], orientation: int) -> None:
+        from PIL import ImageOps
+
+        image = Image.fromarray(grey)
+        image.getexif()[0x0112] = orientation
+        np.testing.assert_array_equal(as_viewed(grey, orientation), np.asarray(ImageOps.exif_transpose(image)))
+        np.testing.assert_array_equal(as_stored(as_viewed(grey, orientation), orientation), grey)
+        assert orientation_of(lambda probe: as_viewed(probe, orientation)) == orientation
+
+    def test_turns_of_clips(self) -> None:
+        assert [orientation_of_turn(degrees) for degrees in (0, 90, 180, -180, -90, 270, 45)] == [1, 8, 3, 3, 6, 6, 1]
+
+
+class TestMetadata:
+    def test_nonsense_is_unknown(self) -> None:
+        exif = Image.Exif()
+        exif[0x0112], exif[0x010F] = 77, "\0\0"
+        inner = exif.get_ifd(0x8769)
+        inner[0x829A], inner[0x8827] = (0, 0), 0
+        block = exif.tobytes()
+        data = b"\xff\xd8\xff\xe1" + struct.pack(">H", len(block) + 2) + block + b"\xff\xda"
+        assert jpeg_metadata(data) == Metadata()
+
+    def test_iso_beyond_sixteen_bits(self) -> None:
+        exif = Image.Exif()
+        inner = exif.get_ifd(0x8769)
+        inner[0x8827], inner[0x8832] = 65535, 102400
+        block = exif.tobytes()
+        data = b"\xff\xd8\xff\xe1" + struct.pack(">H", len(block) + 2) + block + b"\xff\xda"
+        assert jpeg_metadata(data).iso == 102400
+
+
+def test_known_suffixes_are_lower_case() -> None:
+    assert {".jpg", ".raf", ".dng", ".mp4", ".heic", ".avi"} <= KNOWN_SUFFIXES
+    assert all(suffix == suffix.lower() and suffix.startswith(".") for suffix in KNOWN_SUFFIXES)
+
+
+def _write(path: Path, pixels: NDArray[np.generic]) -> None:
+    if path.suffix == ".tif":
+        tifffile.imwrite(path, pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack")
+        return
+    import cv2
+
+    cv2.imwrite(str(path), pixels[:, :, ::-1] if pixels.ndim == 3 else pixels)

@@ -1,0 +1,148 @@
+"""Clips: luma planes, levels, times, orientation, and what is left of a clip that breaks off."""
+
+from __future__ import annotations
+
+import gc
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from ingest_files import HEIGHT, N_FRAMES, RATE, WIDTH, write_clip
+
+from rxcli.errors import ExitCode, InputError
+from rxcli.ingest import open_source
+from rxcli.types import Frame
+
+
+def read(path: Path) -> tuple[list[Frame], InputError | None]:
+    """The frames of a clip, and the error that it ended with."""
+    frames = []
+    try:
+        for frame in open_source(path):
+            frames.append(frame)  # noqa: PERF402 - what came before an error counts
+    except InputError as error:
+        return frames, error
+    return frames, None
+
+
+CODECS = [
+    ("libx264", "yuv420p", 16, 235),
+    ("libx264", "yuvj420p", 0, 255),
+    ("libx264", "yuv422p10le", 64, 940),
+    ("libx265", "yuv420p", 16, 235),
+    ("libx265", "yuv420p10le", 64, 940),
+    ("mjpeg", "yuvj422p", 0, 255),
+]
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv", "avi"])
+@pytest.mark.parametrize(("codec", "form", "black", "white"), CODECS, ids=lambda value: str(value))
+def test_luma_levels_and_times(tmp_path: Path, suffix: str, codec: str, form: str, black: int, white: int) -> None:
+    if suffix == "avi" and codec == "libx265":
+        pytest.skip("AVI holds no HEVC")
+    planes = write_clip(tmp_path / f"a.{suffix}", codec, form, encoder={"bf": "0"})
+    frames, error = read(tmp_path / f"a.{suffix}")
+    assert error is None
+    assert [frame.index for frame in frames] == list(range(N_FRAMES))
+    steps = np.diff([frame.time_s for frame in frames])
+    np.testing.assert_allclose(steps, 1 / RATE, atol=1.1e-3)  # Matroska rounds to milliseconds
+    assert {(frame.black, frame.white) for frame in frames} == {(black, white)}
+    for frame, plane in zip(frames, planes, strict=True):
+        assert frame.pixels.shape == (HEIGHT, WIDTH)
+        assert frame.pixels.dtype == (np.uint16 if "10" in form else np.uint8)
+        assert np.abs(frame.pixels.astype(float) - plane).mean() < 0.03 * (white - black)
+
+
+def test_pixels_are_views_that_stay(tmp_path: Path) -> None:
+    """The decoder's pool must not reuse a plane that is still looked at."""
+    planes = write_clip(tmp_path / "a.mp4", encoder={"qp": "0"})
+    frames = [frame.pixels for frame in open_source(tmp_path / "a.mp4")]
+    gc.collect()
+    assert not any(pixels.flags.owndata or pixels.flags.writeable for pixels in frames)
+    for pixels, plane in zip(frames, planes, strict=True):
+        np.testing.assert_array_equal(pixels, plane)
+
+
+@pytest.mark.parametrize(("degrees", "orientation"), [(0, 1), (180, 3), (90, 8), (-90, 6)])
+def test_rotation_is_noted_not_applied(tmp_path: Path, degrees: int, orientation: int) -> None:
+    write_clip(tmp_path / "a.mp4", rotation=degrees)
+    frames, _ = read(tmp_path / "a.mp4")
+    assert {frame.metadata.orientation for frame in frames} == {orientation}
+    assert frames[0].pixels.shape == (HEIGHT, WIDTH)
+
+
+def test_camera_from_tags(tmp_path: Path) -> None:
+    write_clip(tmp_path / "a.mkv", tags={"MAKE": "FUJIFILM", "MODEL": "X-S10"})
+    frames, _ = read(tmp_path / "a.mkv")
+    assert (frames[0].metadata.make, frames[0].metadata.model) == ("FUJIFILM", "X-S10")
+
+
+LAYOUTS = [
+    ("mp4", {"movflags": "faststart"}),
+    ("mp4", {"movflags": "frag_keyframe+empty_moov"}),
+    ("mov", {"movflags": "faststart"}),
+    ("mkv", {}),
+    ("avi", {}),
+]
+
+
+@pytest.mark.parametrize("codec", ["libx264", "mjpeg"])
+@pytest.mark.parametrize(("suffix", "container"), LAYOUTS, ids=["mp4", "fragments", "mov", "mkv", "avi"])
+@pytest.mark.parametrize("share", [0.5, 0.8])
+def test_cut_clip_gives_what_is_there(
+    tmp_path: Path, suffix: str, container: dict[str, str], codec: str, share: float
+) -> None:
+    form = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    path = tmp_path / f"a.{suffix}"
+    write_clip(path, codec, form, container=container, encoder={"bf": "0", "g": "4"}, noise=True)
+    whole, error = read(path)
+    assert error is None
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    frames, error = read(path)
+    assert error is not None
+    assert error.exit_code == ExitCode.UNREADABLE
+    assert f"breaks off at {frames[-1].time_s:.3f} s" in str(error)
+    assert 0.3 * share * N_FRAMES < len(frames) < N_FRAMES
+    for frame, original in zip(frames, whole, strict=False):
+        np.testing.assert_array_equal(frame.pixels, original.pixels)
+
+
+def test_clip_without_its_index(tmp_path: Path) -> None:
+    write_clip(tmp_path / "a.mp4")
+    data = (tmp_path / "a.mp4").read_bytes()
+    (tmp_path / "a.mp4").write_bytes(data[: len(data) // 2])
+    frames, error = read(tmp_path / "a.mp4")
+    assert not frames
+    assert "its index is missing" in str(error)
+
+
+def test_damaged_frame_is_left_out_and_told(tmp_path: Path) -> None:
+    write_clip(tmp_path / "a.avi", "mjpeg", "yuvj420p")
+    data = bytearray((tmp_path / "a.avi").read_bytes())
+    at = [i for i in range(len(data)) if data[i : i + 3] == b"\xff\xd8\xff"][N_FRAMES // 2]
+    data[at + 2 : at + 40] = bytes(38)
+    (tmp_path / "a.avi").write_bytes(data)
+    frames, error = read(tmp_path / "a.avi")
+    assert len(frames) == N_FRAMES - 1
+    assert "1 frames are damaged, the first after 0.367 s" in str(error)
+
+
+def test_stopping_early_is_clean(tmp_path: Path) -> None:
+    write_clip(tmp_path / "a.avi", "mjpeg", "yuvj420p")
+    frames = open_source(tmp_path / "a.avi")
+    next(frames)
+    frames.close()  # type: ignore[attr-defined]
+
+
+def test_sound_without_pictures(tmp_path: Path) -> None:
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("aac", rate=44100)
+        for _ in range(10):
+            frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+            frame.sample_rate = 44100
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    _, error = read(tmp_path / "a.mp4")
+    assert "a.mp4: no video in it" in str(error)
