@@ -20,8 +20,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rxcli.detect import patterns
+from rxcli.protocol import slot_patterns as patterns
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 #: Scales, in slots, over which the picture is predicted: fine texture to plain sky.
@@ -163,7 +164,19 @@ def by_burst(metrics: FloatArray, clock: Clock, memory: int) -> FloatArray:
     return out
 
 
-def slot_metrics(samples: SlotSamples, clock: Clock, model: LightModel, lit: Float32Array) -> FloatArray:
+@dataclass(frozen=True, slots=True)
+class SlotLikelihoods:
+    """What the light says of the slots of some columns."""
+
+    #: (C, N + memory, patterns) float64: log-likelihood of every pattern of slots n - memory .. n.
+    metrics: FloatArray
+    #: (C, N) float32: (lit minus dark) squared over the noise's variance, of a slot.
+    snr: Float32Array
+
+
+def slot_likelihoods(
+    samples: SlotSamples, clock: Clock, model: LightModel, lit: Float32Array, columns: NDArray[np.int64]
+) -> SlotLikelihoods:
     """Log-likelihood of every slot pattern at every slot, given the present idea of all slots.
 
     Args:
@@ -171,17 +184,25 @@ def slot_metrics(samples: SlotSamples, clock: Clock, model: LightModel, lit: Flo
         clock: the clock.
         model: the light model.
         lit: (C, N) probability that each slot is lit.
-
-    Returns:
-        (C, N + memory, patterns) float64.
+        columns: columns to look at; the result has these alone.
     """
+    q = samples.samples_per_slot
     shape = _shape_on_grid(lit, model)
     own = model.spread[None, :, 1, None].astype(np.float32)
-    others = _from_neighbours(shape, model, clock, samples.samples_per_slot)
-    light = (samples.light - np.float32(model.floor)) * samples.valid
-    expected = others + own * shape[:, None]
-    picture, variance = predict_picture(light, expected, samples.valid, model.sigma, samples.samples_per_slot)
-    return _pattern_metrics(light, samples.valid, picture, variance, others, own, model)
+    others = _from_neighbours(shape, model, clock, q)[columns]
+    valid = samples.valid[columns]
+    light = (samples.light[columns] - np.float32(model.floor)) * valid
+    expected = others + own * shape[columns, None]
+    picture, variance = predict_picture(light, expected, valid, model.sigma, q)
+    metrics = _pattern_metrics(light, valid, picture, variance, others, own, model)
+    return SlotLikelihoods(metrics, _slot_snr(valid, picture * own, variance * own * own, model))
+
+
+def _slot_snr(valid: Float32Array, contrast: Float32Array, variance: Float32Array, model: LightModel) -> Float32Array:
+    """(C, N) squared contrast over variance, summed over the strips and samples of a slot as far as they are independent."""
+    noise = np.float32(model.sigma**2) + np.float32(model.shot) * contrast + variance
+    ratio = (contrast * contrast / noise * valid).sum(axis=1) * np.float32(_TEMPER)
+    return np.asarray(ratio.reshape(ratio.shape[0], -1, model.taps.shape[0]).sum(axis=2), np.float32)
 
 
 def _shape_on_grid(lit: Float32Array, model: LightModel) -> Float32Array:

@@ -90,7 +90,8 @@ def contrast(light: Float32Array, valid: Float32Array, samples_per_slot: int, si
 
     window = np.ones((1, _EXTREMES_SLOTS * samples_per_slot), np.uint8)
     flat = light.reshape(-1, light.shape[-1])
-    smooth = cv2.blur(flat, (samples_per_slot, 1)) if samples_per_slot > 1 else flat
+    # An odd length, lest everything move by half a sample.
+    smooth = cv2.blur(flat, (samples_per_slot // 2 * 2 + 1, 1)) if samples_per_slot > 1 else flat
     high = cv2.dilate(smooth, window).reshape(light.shape)
     low = cv2.erode(smooth, window).reshape(light.shape)
     span = high - low

@@ -37,12 +37,6 @@ class _Branches:
     into: FloatArray
 
 
-def patterns(memory: int) -> NDArray[np.uint8]:
-    """All slot patterns of a metric, (2**(memory+1), memory+1): oldest slot first, the slot itself last."""
-    values = np.arange(1 << (memory + 1))
-    return ((values[:, None] >> np.arange(memory, -1, -1)) & 1).astype(np.uint8)
-
-
 def _pattern_index(slots: NDArray[np.integer], memory: int) -> NDArray[np.int64]:
     """Index of the pattern at every slot that has `memory` predecessors; (..., n) to (..., n - memory)."""
     windows = np.lib.stride_tricks.sliding_window_view(slots.astype(np.int64), memory + 1, axis=-1)
@@ -139,7 +133,7 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
 
     Args:
         metrics: (B, C, packet + memory, 2**(memory+1)) natural log-likelihoods, copies added: entry i, j is the
-            log-likelihood of what was seen at slot i given pattern j of `patterns`. The first `memory` slots are not
+            log-likelihood of what was seen at slot i given pattern j of `protocol.slot_patterns`. The first `memory` slots are not
             used; the last `memory` entries are the first slots of the header that follows.
         candidates: (C, 9) weights to consider, all by default.
 

@@ -1,18 +1,38 @@
-"""The wiring of the receiver."""
+"""The wiring of the receiver: `_receive_frame` reads as the block diagram."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from rxcli.profiles import CameraProfile, ScreenProfile
-from rxcli.types import FloatArray, Frame, FrameResult
+import numpy as np
+
+from rxcli import assemble, channel, clock, detect, geometry, sampling
+from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, match_camera
+from rxcli.protocol import WEIGHTS
+from rxcli.types import BurstPosteriors, Clock, FloatArray, Frame, FrameResult, Lens, RowProfiles, SlotSamples
 
 CaeMode = Literal["auto", "always", "never"]
 #: Names of the shortcuts that `ReceiverOptions.skip` may hold; every one is counted in the report.
 SKIPS = ("no_screen", "dark_columns", "certain_columns", "tracking")
+
+_DEFAULT_TONE = "srgb"
+_SAMPLES_PER_SLOT = 4
+_MAX_ITERATIONS = 6
+#: A column all of whose symbols are at least this sure is not looked at again.
+_CERTAIN = float(np.log(0.9999))
+#: Weights this much less likely than the best one are dropped, nats.
+_HOPELESS_WEIGHT = 25.0
+#: Iterations before a weight may be dropped: the first ones know the picture too little.
+_SETTLED = 2
+#: A header peak less than this times the strongest rival is no lock.
+_MIN_LOCK = 1.6
+#: Orientations in which the readout runs along the columns' width.
+_PORTRAIT = (5, 6, 7, 8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,9 +56,224 @@ class ReceiverOptions:
     dump_dir: Path | None = None
 
 
+class _Failure(Exception):
+    """Reception ends here, with a status and a message; never leaves this module."""
+
+    def __init__(self, status: Literal["no_screen", "no_signal"], message: str) -> None:
+        super().__init__(message)
+        self.status = status
+        self.message = message
+
+
+class _Stages:
+    """Wall time by stage."""
+
+    def __init__(self) -> None:
+        self.timing_ms: dict[str, float] = {}
+        self._start = time.perf_counter()
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            elapsed = 1e3 * (time.perf_counter() - start)
+            self.timing_ms[name] = self.timing_ms.get(name, 0.0) + elapsed
+
+    def total(self) -> dict[str, float]:
+        return {**self.timing_ms, "total": 1e3 * (time.perf_counter() - self._start)}
+
+
+@dataclass(frozen=True, slots=True)
+class _Camera:
+    """What is known of the camera that took a frame."""
+
+    profile: str
+    line_delay_s: float
+    exposure_s: float
+    lens: Lens | None
+    tone: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Lock:
+    """A screen whose clock was found."""
+
+    screen: ScreenProfile
+    profiles: RowProfiles
+    clock: Clock
+
+
 def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
     """Receive the frames of one source, in order; one result a frame, in order.
 
     A clip's result may come some frames later than the frame, because a packet stands in the last frame that shows it.
     """
-    raise NotImplementedError
+    for frame in frames:
+        yield _receive_frame(frame, options)
+
+
+def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
+    stages = _Stages()
+    result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
+    try:
+        camera = _camera_of(frame, options)
+        result = replace(
+            result, camera_profile=camera.profile, line_delay_s=camera.line_delay_s, exposure_s=camera.exposure_s
+        )
+        with stages("geometry"):
+            corners = _find_corners(frame, options)
+        result = replace(result, corners=corners)
+        lock = _find_lock(frame, corners, camera, options, stages)
+        result = replace(result, screen_profile=lock.screen.name)
+        with stages("detect"):
+            reception = _decode(lock)
+        columns = assemble.column_results(lock.clock, *reception, options.min_confidence)
+        result = replace(result, columns=columns, status=assemble.frame_status(columns))
+    except _Failure as failure:
+        result = replace(result, status=failure.status, message=failure.message)
+    return replace(result, timing_ms=stages.total())
+
+
+def _camera_of(frame: Frame, options: ReceiverOptions) -> _Camera:
+    meta = frame.metadata
+    profile = (
+        options.cameras[0]
+        if options.force_camera
+        else match_camera(options.cameras, meta.make, meta.model, frame.width, frame.height)
+    )
+    mode = profile.mode_for(frame.width, frame.height) if profile else None
+    if profile is None or mode is None:
+        raise _Failure(
+            "no_signal",
+            f"no camera profile fits {meta.make or 'unknown make'} {meta.model or 'unknown model'} at "
+            f"{frame.width} x {frame.height}; name one with --camera, or make one with vlc-rx calibrate shutter",
+        )
+    lens = geometry.lens_for(profile.lens, frame.width, frame.height) if profile.lens else None
+    tone = _DEFAULT_TONE if profile.tone == "auto" else profile.tone
+    return _Camera(profile.name, mode.line_delay_s, _exposure_of(frame, mode), lens, tone)
+
+
+def _exposure_of(frame: Frame, mode: ReadoutMode) -> float:
+    exposure = frame.metadata.exposure_s or mode.exposure_s
+    return exposure if exposure else 5 * mode.line_delay_s
+
+
+def _find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
+    orientation = frame.metadata.orientation
+    if orientation in _PORTRAIT:
+        raise _Failure(
+            "no_signal",
+            f"the picture was taken in portrait (EXIF orientation {orientation}): the sensor reads along the width of "
+            "the columns, so that they cannot be told apart; hold the camera in landscape",
+        )
+    if options.corners is not None:
+        return options.corners
+    from rxcli.find_screen import find_screen
+
+    levels = frame.mosaic
+    black, white = (float(np.mean(levels.black)), levels.white) if levels else (frame.black, frame.white)
+    period = levels.pattern.shape[1] if levels else 1
+    found = find_screen(frame.pixels, black=black, white=white, mosaic_period=period)
+    if found.corners is None:
+        raise _Failure("no_screen", f"no screen found: {found.reason}; give its place with --corners")
+    return geometry.viewer_order(found.corners, orientation)
+
+
+def _find_lock(
+    frame: Frame, corners: FloatArray, camera: _Camera, options: ReceiverOptions, stages: _Stages
+) -> _Lock:
+    """The screen profile whose clock fits best, with the row profiles of its columns."""
+    best: _Lock | None = None
+    for n_columns in sorted({screen.columns for screen in options.screens}):
+        with stages("sampling"):
+            profiles = _sample(frame, corners, camera, n_columns)
+        with stages("clock"):
+            for screen in (s for s in options.screens if s.columns == n_columns):
+                found = _clock_of(screen, profiles, camera)
+                if found and (best is None or found.lock > best.clock.lock):
+                    best = _Lock(screen, profiles, found)
+    if best is None or best.clock.lock < _MIN_LOCK:
+        raise _Failure("no_signal", _why_no_signal(corners, camera, options))
+    return best
+
+
+def _sample(frame: Frame, corners: FloatArray, camera: _Camera, n_columns: int) -> RowProfiles:
+    column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
+    n_strips = sampling.strips_per_column(column_px)
+    outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, camera.lens)
+    return sampling.sample_rows(frame, outlines, camera.tone)
+
+
+def _noise_of(profiles: RowProfiles) -> float:
+    """Standard deviation of a strip's row of no light."""
+    return float(np.sqrt(profiles.noise_floor / max(float(np.median(profiles.count)), 1.0)))
+
+
+def _clock_of(screen: ScreenProfile, profiles: RowProfiles, camera: _Camera) -> Clock | None:
+    rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
+    exposure_slots = camera.exposure_s * screen.slot_rate_hz
+    return clock.find_clock(
+        profiles, rows_per_slot, exposure_slots, screen.packet_slots, screen.repeats, _noise_of(profiles)
+    )
+
+
+def _why_no_signal(corners: FloatArray, camera: _Camera, options: ReceiverOptions) -> str:
+    visible_s = float(np.ptp(corners[:, 1])) * camera.line_delay_s
+    shortest = min(options.screens, key=lambda screen: screen.packet_s)
+    if visible_s < shortest.packet_s:
+        return (
+            f"the screen's {np.ptp(corners[:, 1]):.0f} rows show {1e3 * visible_s:.2f} ms of the link, less than one "
+            f"packet of {shortest.name} ({1e3 * shortest.packet_s:.2f} ms); move closer or use a faster slot rate"
+        )
+    return "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
+
+
+def _decode(lock: _Lock) -> tuple[BurstPosteriors, FloatArray, SlotSamples]:
+    """Slots, light model and detection, iterated until they agree.
+
+    Returns:
+        Posteriors, signal-to-noise ratio of the slots (C, N), and the samples.
+    """
+    now = lock.clock
+    samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
+    model = _light_model(lock, samples)
+    metrics = _first_guess(samples, now, model)
+    snr = np.zeros((samples.light.shape[0], now.n_slots), np.float32)
+    candidates = np.ones((samples.light.shape[0], len(WEIGHTS)), bool)
+    columns = np.arange(samples.light.shape[0])
+    posteriors = detect.detect(channel.by_burst(metrics, now, model.memory), candidates)
+    for iteration in range(_MAX_ITERATIONS):
+        likelihoods = channel.slot_likelihoods(samples, now, model, channel.lit_on_grid(posteriors, now), columns)
+        metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
+        before = posteriors
+        posteriors = detect.detect(channel.by_burst(metrics, now, model.memory), candidates)
+        log_prob = posteriors.w_log_prob
+        if iteration >= _SETTLED:
+            candidates = log_prob > log_prob.max(axis=1, keepdims=True) - _HOPELESS_WEIGHT
+        certain = (posteriors.log_prob.min(axis=(0, 2)) > _CERTAIN) & (before.index == posteriors.index).all(axis=(0, 2))
+        columns = np.flatnonzero(~certain)
+        if columns.size == 0:
+            break
+    return posteriors, snr, samples
+
+
+def _light_model(lock: _Lock, samples: SlotSamples) -> channel.LightModel:
+    now, profiles = lock.clock, lock.profiles
+    memory = channel.memory_for(now.exposure_slots)
+    rows_per_sample = max(now.rows_per_slot / _SAMPLES_PER_SLOT, 1.0)
+    floor = channel.estimate_floor(samples, now)
+    least = _noise_of(profiles) / np.sqrt(rows_per_sample)
+    return channel.LightModel(
+        floor=floor,
+        sigma=channel.estimate_sigma(samples, floor, 0.5 * float(least)),
+        shot=profiles.noise_slope / max(float(np.median(profiles.count)), 1.0) / rows_per_sample,
+        spread=channel.spread_matrix(samples.light.shape[1], lock.screen.light_spread),
+        taps=channel.exposure_taps(now.exposure_slots, 1 / _SAMPLES_PER_SLOT, memory, _SAMPLES_PER_SLOT),
+    )
+
+
+def _first_guess(samples: SlotSamples, now: Clock, model: channel.LightModel) -> FloatArray:
+    pooled, weight = clock.contrast(samples.light, samples.valid, samples.samples_per_slot, model.sigma)
+    return channel.first_metrics(clock.slot_means(pooled), clock.slot_means(weight), model.memory)

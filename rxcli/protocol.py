@@ -42,6 +42,12 @@ def codebook(w: int) -> NDArray[np.uint8]:
     return words
 
 
+def slot_patterns(memory: int) -> NDArray[np.uint8]:
+    """All patterns of a slot and its `memory` predecessors, (2**(memory+1), memory+1) uint8, the slot itself last."""
+    values = np.arange(1 << (memory + 1))
+    return ((values[:, None] >> np.arange(memory, -1, -1)) & 1).astype(np.uint8)
+
+
 def dimming_symbol(w: int) -> NDArray[np.uint8]:
     """The symbol after the header: `w` lit slots, then dark ones; (10,) uint8."""
     bits_per_symbol(w)

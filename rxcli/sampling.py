@@ -121,18 +121,19 @@ def _mosaic_cells(frame: Frame, mosaic: Mosaic, first: int, last: int) -> tuple[
 
 
 def _mosaic_weights(mosaic: Mosaic) -> tuple[Float32Array, Float32Array, bool]:
-    """Weights (period_y, cell_px) and offsets (period_y,) that make each row measure the mean of the three colours.
+    """Weights (period_y, cell_px) and offsets (period_y,) that make each row measure the same mix of the colours.
 
-    A row that lacks a colour (Bayer) cannot: its mean is taken as it is, and rows are then smoothed so that each holds
-    both kinds, at the price of one row of blur.
+    Green counts most, red and blue by the inverse square of their gains, which is near the best signal to noise. A row
+    that lacks a colour (Bayer) cannot measure the mix: its mean is taken as it is, and rows are then smoothed so that
+    each holds both kinds, at the price of one row of blur.
     """
     pattern = mosaic.pattern
     present = np.stack([(pattern == colour).sum(axis=1) for colour in range(3)], axis=1)
     complete = bool((present > 0).all())
-    share = 1 / np.where(present > 0, present, 1) if complete else np.full(present.shape, 1 / pattern.shape[1])
+    mix = 1 / np.maximum(np.array(mosaic.gains), 1.0) ** 2
+    share = mix / mix.sum() / np.maximum(present, 1) if complete else np.full(present.shape, 1 / pattern.shape[1])
     black = np.array(mosaic.black)
-    scale = (3 if complete else 1) * (mosaic.white - black.mean())
-    weights = share[np.arange(pattern.shape[0])[:, None], pattern] / scale
+    weights = share[np.arange(pattern.shape[0])[:, None], pattern] / (mosaic.white - black.mean())
     offsets = (weights * black[pattern]).sum(axis=1)
     return weights.astype(np.float32), offsets.astype(np.float32), not complete
 

@@ -1,0 +1,137 @@
+"""Posteriors to results: packets with confidence, column status, frame status."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, bits_per_symbol, bits_to_hex, indices_to_bits
+from rxcli.types import (
+    BoolArray,
+    BurstPosteriors,
+    Clock,
+    ColumnResult,
+    ColumnStatus,
+    Float32Array,
+    FrameStatus,
+    PacketResult,
+    SlotSamples,
+)
+
+#: A packet is reported up to this expected share of wrong bits.
+MAX_BER_HAT = 0.2
+#: A column with a packet below this confidence is weak.
+_WEAK_CONFIDENCE = 0.5
+#: A weight is reported from this probability on.
+_MIN_WEIGHT_PROBABILITY = 0.99
+#: A column below this signal-to-noise ratio is too dark to try.
+_DARK_SNR_DB = 0.0
+#: A slot counts as seen when at least this share of its samples lies on the screen in at least one strip.
+_SEEN_SHARE = 0.5
+
+
+def column_results(
+    clock: Clock, posteriors: BurstPosteriors, snr: Float32Array, samples: SlotSamples, min_confidence: float
+) -> tuple[ColumnResult, ...]:
+    """Results of every column.
+
+    Args:
+        clock: the clock.
+        posteriors: of B bursts and C columns.
+        snr: (C, N) squared contrast over variance of every slot of the grid.
+        samples: the samples, for what was visible.
+        min_confidence: packets below it are left out.
+    """
+    seen = _seen_slots(samples)
+    return tuple(
+        _column_result(column, clock, posteriors, snr[column], seen[column], min_confidence)
+        for column in range(snr.shape[0])
+    )
+
+
+def frame_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
+    """`ok` when every lit column gave a packet, `partial` when some did, `no_signal` when none did."""
+    lit = [column for column in columns if column.status != "dark"]
+    with_packet = [column for column in columns if column.packets]
+    if not with_packet:
+        return "no_signal"
+    return "ok" if all(column.packets for column in lit) else "partial"
+
+
+def _seen_slots(samples: SlotSamples) -> BoolArray:
+    """(C, N) whether any strip shows the slot."""
+    q = samples.samples_per_slot
+    share = samples.valid.reshape(*samples.valid.shape[:2], -1, q).mean(axis=3)
+    return np.asarray(share.max(axis=1) >= _SEEN_SHARE)
+
+
+def _column_result(
+    column: int, clock: Clock, posteriors: BurstPosteriors, snr: Float32Array, seen: BoolArray, min_confidence: float
+) -> ColumnResult:
+    packets = [
+        packet
+        for burst in range(posteriors.index.shape[0])
+        if (packet := _packet(burst, column, clock, posteriors, seen)) and packet.confidence >= min_confidence
+    ]
+    visible = snr[seen]
+    snr_db = float(10 * np.log10(max(float(np.median(visible)), 1e-6))) if visible.size else None
+    w_log_prob = posteriors.w_log_prob[column]
+    sure_of_w = w_log_prob.max() > np.log(_MIN_WEIGHT_PROBABILITY)
+    status = _column_status(packets, snr_db)
+    return ColumnResult(
+        column=column,
+        status=status,
+        w=int(posteriors.w[column]) if packets or sure_of_w else None,
+        snr_db=snr_db,
+        delay_slots=float(clock.delay_slots[column]),
+        packets=tuple(packets),
+        message=None if packets else _why_none(status, snr_db, seen, clock),
+    )
+
+
+def _column_status(packets: list[PacketResult], snr_db: float | None) -> ColumnStatus:
+    if packets:
+        return "ok" if max(p.confidence for p in packets) >= _WEAK_CONFIDENCE else "weak"
+    return "dark" if snr_db is None or snr_db < _DARK_SNR_DB else "no_packet"
+
+
+def _why_none(status: ColumnStatus, snr_db: float | None, seen: BoolArray, clock: Clock) -> str:
+    if seen.sum() < clock.packet_slots - SLOTS_PER_SYMBOL:
+        return (
+            f"{int(seen.sum())} slots of the column are visible, a packet has {clock.packet_slots}; "
+            "move closer so that the screen fills more of the height"
+        )
+    if status == "dark" or snr_db is None:
+        return "too little light under this column; show a brighter picture or raise the exposure"
+    return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
+
+
+def _packet(burst: int, column: int, clock: Clock, posteriors: BurstPosteriors, seen: BoolArray) -> PacketResult | None:
+    """The packet of one burst, None where some payload symbol was not seen or too many bits are uncertain."""
+    copies = np.flatnonzero(clock.burst == burst)
+    position = (np.arange(clock.n_slots) + clock.first_slot) % clock.packet_slots
+    copy = (np.arange(clock.n_slots) + clock.first_slot) // clock.packet_slots
+    mine = seen & np.isin(copy, copies)
+    times_seen = np.bincount(position[mine], minlength=clock.packet_slots)
+    if not mine.any() or (times_seen[PREAMBLE_SLOTS:] == 0).any():
+        return None
+    w = int(posteriors.w[column])
+    k = bits_per_symbol(w)
+    llr = posteriors.bit_llr[burst, column, :, :k]
+    ber_hat = float(np.mean(1 / (1 + np.exp(np.abs(llr)))))
+    if ber_hat > MAX_BER_HAT:
+        return None
+    bits = indices_to_bits(posteriors.index[burst, column], w)
+    return PacketResult(
+        first_row=_header_row(int(copy[mine].min()), column, clock),
+        copies=float(mine.sum() / clock.packet_slots),
+        payload_bits=int(bits.size),
+        payload=bits_to_hex(bits),
+        confidence=float(np.exp(posteriors.log_prob[burst, column].sum())),
+        ber_hat=ber_hat,
+    )
+
+
+def _header_row(copy: int, column: int, clock: Clock) -> float:
+    """Sensor row whose exposure starts with the header of `copy`."""
+    slots = copy * clock.packet_slots - clock.first_slot + clock.delay_slots[column] + clock.exposure_slots / 2
+    return float(clock.row0 + slots * clock.rows_per_slot)
