@@ -127,34 +127,38 @@ def test_the_bound_decides_bright_symbols_and_guesses_dark_ones(small: Scene) ->
     assert errors[1e-4] == pytest.approx(127 / 128, abs=0.05)
 
 
+def symbol_error_rate(energy: np.ndarray, rng: np.random.Generator) -> float:
+    """Monte Carlo of maximum likelihood over the codebook, slots of given energies (n, 10) in white Gaussian noise."""
+    words = codebook(5).astype(float)
+    sent = rng.integers(0, len(words), len(energy))
+    matched = energy * words[sent] + np.sqrt(energy) * rng.standard_normal(energy.shape)
+    score = matched @ words.T - 0.5 * energy @ words.T
+    return float((np.argmax(score, axis=1) != sent).mean())
+
+
 def test_the_bound_meets_theory_at_moderate_light() -> None:
-    """With slots that do not overlap, the genie's symbol errors are those of ten Gaussian slots of the same energy."""
+    """With slots that do not overlap and noise that is not the light's own, errors are those of ten Gaussian slots."""
     base = preset("xs10-still", "paper-34k6").scaled(0.02, 0.25)
-    scene = replace(
-        base,
-        picture="white",
-        start_slot=20.0,
-        exposure_s=0.05 / 34600,
-        light_e_per_s=0.6 * base.light_e_per_s,
-        vignetting=0.0,
-    )
-    rng, words = np.random.default_rng(1), codebook(5).astype(float)
+    sensor = replace(base.sensor, read_noise_e=40.0, row_noise_e=0.0, prnu=0.0, full_scale_e=4000.0)
+    scene = replace(base, sensor=sensor, picture="white", start_slot=20.0, exposure_s=0.02 / 34600, light_e_per_s=3.2e7)
+    rng = np.random.default_rng(1)
     wrong = total = 0
     expected = []
-    for seed in range(8):
+    for seed in range(5):
         oracle = simulate_frame(scene, seed, oracle=True).oracle
         assert oracle is not None
         for column in range(20):
             decided, sent, seen = oracle.decide(column, 0)
             wrong, total = wrong + int((decided != sent)[seen].sum()), total + int(seen.sum())
-            _, _, shared = oracle.slot_statistics(column)
-            energy = np.median(shared[60:-60, 0])
-            word = rng.integers(0, 128, 400)
-            matched = energy * words[word] + np.sqrt(energy) * rng.standard_normal((400, 10))
-            expected.append((np.argmax(matched @ words.T, axis=1) != word).mean())
+            origin, _, shared = oracle.slot_statistics(column)
+            # Every payload symbol that the frame sees whole stands for itself, many times.
+            starts = np.arange(40, 260, 10) - origin
+            starts = starts[(starts >= 0) & (starts + 10 <= len(shared))]
+            energy = shared[starts[:, None] + np.arange(10), 0]
+            expected.append(symbol_error_rate(np.tile(energy, (20, 1)), rng))
     rate, theory = wrong / total, float(np.mean(expected))
     assert 0.1 < theory < 0.9
-    assert rate == pytest.approx(theory, abs=4 * np.sqrt(theory * (1 - theory) / total) + 0.02)
+    assert rate == pytest.approx(theory, abs=5 * np.sqrt(theory * (1 - theory) / total) + 0.01)
 
 
 def test_command_writes_capture_and_truth(tmp_path: Path) -> None:
