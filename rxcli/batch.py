@@ -101,6 +101,8 @@ class Decoder:
     options: Any
     open_source: OpenSource
     receive: Receive
+    #: Sees every frame before it is received.
+    tap: Callable[[Frame], None] | None = None
 
     def results(self, source: Source) -> Iterator[FrameResult]:
         """The results of all frames of `source`, at least one; an input that fails ends in an `unreadable` one.
@@ -114,7 +116,7 @@ class Decoder:
         try:
             if source.problem:
                 raise InputError(source.problem)
-            for result in self.receive(failure.guard(self.open_source(source.path)), self.options):
+            for result in self.receive(failure.guard(self._frames(source)), self.options):
                 yield replace(result, source=source.name)
                 count += 1
         except (UsageError, ProfileError):
@@ -123,6 +125,12 @@ class Decoder:
             failure.note(error)
         if failure.message or not count:
             yield unreadable(source, count, failure.message or f"{source.name}: holds no picture; name another file")
+
+    def _frames(self, source: Source) -> Iterator[Frame]:
+        for frame in self.open_source(source.path):
+            if self.tap is not None:
+                self.tap(frame)
+            yield frame
 
 
 class _Failure:
@@ -154,12 +162,12 @@ def unreadable(source: Source, frame: int, message: str) -> FrameResult:
     return FrameResult(source=source.name, frame=frame, time_s=0.0, status="unreadable", message=message)
 
 
-def standard_decoder(options: ReceiverOptions) -> Decoder:
+def standard_decoder(options: ReceiverOptions, tap: Callable[[Frame], None] | None = None) -> Decoder:
     """The decoder that reads files and receives them."""
     from rxcli.ingest import open_source
     from rxcli.pipeline import receive
 
-    return Decoder(options, open_source, receive)
+    return Decoder(options, open_source, receive, tap)
 
 
 def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded]:

@@ -1,0 +1,277 @@
+"""`vlc-rx decode`: photos, RAW files, clips and folders."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import click
+
+from rxcli.cli.common import receiver_arguments, receiver_options
+from rxcli.errors import ExitCode, InputError, UsageError
+
+if TYPE_CHECKING:
+    from rxcli.batch import Decoded, Decoder, Source
+    from rxcli.summary import SourceSummary
+    from rxcli.truth import Scorer
+    from rxcli.types import FrameResult
+
+_FILE = click.Path(dir_okay=False, path_type=Path, allow_dash=False)
+_FOLDER = click.Path(file_okay=False, path_type=Path)
+
+
+@click.command()
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...")
+@receiver_arguments
+@click.option("--json", "json_path", metavar="FILE|-", help="Write one JSON object a frame, instead of the table.")
+@click.option("--truth", metavar="FILE|auto", help="Score against this truth, or the NAME.truth.json beside each file.")
+@click.option(
+    "--max-ber", type=click.FloatRange(0, 1), help="Fail a file whose bit error rate is above (needs --truth)."
+)
+@click.option("--min-packets", type=click.IntRange(1), default=1, help="Fail a file with fewer packets.")
+@click.option("--junit", type=_FILE, help="Write one JUnit test case per file.")
+@click.option("--summary", type=_FILE, help="Write one row per file, as .csv or .parquet.")
+@click.option("--resume", is_flag=True, help="Go on with the run that wrote the file of --json.")
+@click.option("--workers", type=click.IntRange(1), default=1, help="Decode in this many processes.")
+@click.option("--cluster", metavar="ADDRESS", help="Decode on the Dask cluster whose scheduler is at this address.")
+@click.option("--dump-dir", type=_FOLDER, help="Write the arrays of every stage boundary into this folder.")
+@click.option(
+    "--save-undistorted", type=_FOLDER, help="Write every frame without its lens distortion into this folder."
+)
+@click.option("--quiet", is_flag=True, help="No table, no summary, no progress.")
+def decode(paths: tuple[str, ...], **options: Any) -> int:
+    """Decode photos, RAW files and clips; PATH may be a folder, or - for one picture on stdin."""
+    _check(paths, options)
+    receiver = {
+        name: options[name]
+        for name in ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip", "dump_dir")
+    }
+    from rxcli.batch import standard_decoder
+
+    configured = receiver_options(**receiver)
+    _make_folders(options)
+    tap = None
+    if options["save_undistorted"]:
+        from rxcli.undistort import UndistortedWriter
+
+        tap = UndistortedWriter(options["save_undistorted"], configured.cameras, configured.force_camera)
+    with _stdin_as_file(paths) as sources:
+        return _Run(standard_decoder(configured, tap), options).run(sources)
+
+
+def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
+    """Refuse what makes no sense before the long work starts."""
+    from rxcli.summary import check_summary_path
+
+    json_file = options["json_path"] not in (None, "-")
+    if options["resume"] and not json_file:
+        raise UsageError("--resume needs the file that --json wrote", "give --json FILE")
+    if options["max_ber"] is not None and not options["truth"]:
+        raise UsageError("--max-ber needs the truth", "give --truth FILE, or --truth auto")
+    if options["cluster"] and options["workers"] > 1:
+        raise UsageError("--workers and --cluster exclude each other", "give one of them")
+    if options["cluster"] and "-" in paths:
+        raise UsageError("stdin cannot be sent to a cluster", "name a file that its workers see")
+    if options["summary"]:
+        check_summary_path(options["summary"])
+    for name in ("summary", "junit"):
+        if options[name] is not None and not options[name].parent.is_dir():
+            raise UsageError(f"--{name} {options[name]}: there is no such folder", "make it, or name another")
+
+
+def _make_folders(options: dict[str, Any]) -> None:
+    for name in ("dump_dir", "save_undistorted"):
+        if options[name] is not None:
+            try:
+                options[name].mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                option = name.replace("_", "-")
+                raise UsageError(f"--{option} {options[name]}: {error.strerror}", "name another folder") from None
+
+
+@contextmanager
+def _stdin_as_file(paths: tuple[str, ...]) -> Iterator[list[Source]]:
+    """The sources that `paths` name, with what comes from stdin put into a file for as long as it is needed."""
+    from tempfile import NamedTemporaryFile
+
+    from rxcli.batch import Source, collect_sources
+    from rxcli.ingest import KNOWN_SUFFIXES
+
+    with ExitStack() as stack:
+        sources = collect_sources([path for path in paths if path != "-"], frozenset(KNOWN_SUFFIXES))
+        if "-" in paths:
+            file = stack.enter_context(NamedTemporaryFile(prefix="vlc-rx-"))
+            file.write(sys.stdin.buffer.read())
+            file.flush()
+            sources.insert(min(paths.index("-"), len(sources)), Source("-", file.name))
+        yield sources
+
+
+class _Run:
+    """One run over many sources: where results go, and what is kept for the summary."""
+
+    def __init__(self, decoder: Decoder, options: dict[str, Any]) -> None:
+        from rxcli.summary import Limits
+
+        self._decoder = decoder
+        self._options = options
+        self._limits = Limits(options["max_ber"], options["min_packets"])
+        self._summaries: list[SourceSummary] = []
+        self._to_stdout = options["json_path"] == "-"
+
+    def run(self, sources: list[Source]) -> ExitCode:
+        from rxcli.summary import exit_code
+
+        if self._options["truth"] not in (None, "auto") and len(sources) != 1:
+            raise UsageError(
+                f"--truth {self._options['truth']} is the truth of one file ({len(sources)} were given)",
+                "give --truth auto, which takes the NAME.truth.json beside each file",
+            )
+        done = self._recover() if self._options["resume"] else set()
+        try:
+            with ExitStack() as stack:
+                write = self._writer(stack)
+                self._decode([source for source in sources if source.name not in done], write, len(sources))
+        finally:
+            self._summaries.sort(key=_order([source.name for source in sources]))
+            self._conclude()
+        return exit_code(self._summaries, self._limits)
+
+    def _recover(self) -> set[str]:
+        """Take the results of an earlier run into the summary; returns the names of its complete sources."""
+        from rxcli.batch import recover
+
+        done = set()
+        for name, results in recover(Path(self._options["json_path"])):
+            summary, scorer = self._begin(name)
+            for result in results:
+                summary.add(scorer.add(result) if scorer else result)
+            self._end(summary, scorer)
+            done.add(name)
+        return done
+
+    def _writer(self, stack: ExitStack) -> Any:
+        """The function that takes each result."""
+        if self._to_stdout:
+            return _print_json
+        if self._options["json_path"]:
+            from rxcli.batch import Journal
+
+            journal = Journal(Path(self._options["json_path"]), self._options["resume"])
+            stack.callback(journal.close)
+            return journal.write
+        return (lambda result: None) if self._options["quiet"] else _print_table
+
+    def _decode(self, sources: list[Source], write: Any, n_total: int) -> None:
+        with _progress(n_total, n_total - len(sources), self._options["quiet"]) as progress:
+            for source, results in self._decoded(sources):
+                summary, scorer = self._begin(source.name)
+                try:
+                    for result in results:
+                        result = scorer.add(result) if scorer else result
+                        summary.add(result)
+                        with progress.paused():
+                            write(result)
+                finally:
+                    self._end(summary, scorer)
+                progress.finished(summary.n_frames)
+
+    def _decoded(self, sources: list[Source]) -> Iterator[Decoded]:
+        from rxcli.batch import decode_here, decode_in_processes
+
+        if self._options["cluster"]:
+            from rxcli.cluster import decode_on_cluster
+
+            return decode_on_cluster(sources, self._decoder, self._options["cluster"])
+        if self._options["workers"] > 1 and len(sources) > 1:
+            return decode_in_processes(sources, self._decoder, self._options["workers"])
+        return decode_here(sources, self._decoder)
+
+    def _begin(self, name: str) -> tuple[SourceSummary, Scorer | None]:
+        from rxcli.summary import SourceSummary
+        from rxcli.truth import Scorer, find_truth, load_truth
+
+        summary = SourceSummary(name)
+        truth = self._options["truth"]
+        path = find_truth(name) if truth == "auto" else truth
+        if path is None:
+            return summary, None
+        try:
+            return summary, Scorer(load_truth(path))
+        except InputError as error:
+            if truth != "auto":
+                raise
+            summary.truth_problem = str(error)
+            return summary, None
+
+    def _end(self, summary: SourceSummary, scorer: Scorer | None) -> None:
+        if summary.n_frames:  # none: interrupted before the first
+            summary.score = scorer.score() if scorer else None
+            self._summaries.append(summary)
+
+    def _conclude(self) -> None:
+        from rxcli.summary import format_summary, write_junit, write_summary
+
+        if self._summaries and not self._options["quiet"]:
+            click.echo(format_summary(self._summaries, self._limits), err=self._to_stdout)
+        if self._options["summary"]:
+            write_summary(self._options["summary"], self._summaries, self._limits)
+        if self._options["junit"]:
+            write_junit(self._options["junit"], self._summaries, self._limits)
+
+
+def _order(names: list[str]) -> Any:
+    places = {name: place for place, name in enumerate(names)}
+    return lambda summary: places.get(summary.source, len(places))
+
+
+def _print_json(result: FrameResult) -> None:
+    from rxcli.report import to_json_line
+
+    sys.stdout.write(to_json_line(result) + "\n")
+    sys.stdout.flush()
+
+
+def _print_table(result: FrameResult) -> None:
+    from rxcli.report import format_frame
+
+    click.echo(format_frame(result) + "\n")
+
+
+class _Progress:
+    """A bar on stderr where people look at it: files, frames, rate, time left."""
+
+    def __init__(self, bar: Any) -> None:
+        self._bar = bar
+        self._frames = 0
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Out of the way of what is printed meanwhile."""
+        if not self._bar.disable:
+            self._bar.clear()
+        yield
+        if not self._bar.disable:
+            self._bar.refresh()
+
+    def finished(self, n_frames: int) -> None:
+        """One more source with `n_frames` frames."""
+        self._frames += n_frames
+        self._bar.set_postfix_str(f"{self._frames} frames", refresh=False)
+        self._bar.update()
+
+
+@contextmanager
+def _progress(n_total: int, n_done: int, quiet: bool) -> Iterator[_Progress]:
+    from tqdm import tqdm
+
+    hidden = quiet or n_total < 2 or not _is_terminal(sys.stderr)
+    with tqdm(total=n_total, initial=n_done, unit="file", disable=hidden, file=sys.stderr, leave=False) as bar:
+        yield _Progress(bar)
+
+
+def _is_terminal(stream: TextIO) -> bool:
+    return stream is not None and stream.isatty()

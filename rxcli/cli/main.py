@@ -1,0 +1,166 @@
+"""`vlc-rx`: the group of commands, and the one place that turns errors into a line and an exit code.
+
+Nothing heavy is imported before a command runs, so that `vlc-rx --help` is quick; short help texts stand here for the
+same reason.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import click
+
+from rxcli import __version__
+from rxcli.errors import ExitCode, ReceiverError
+
+_COMMANDS = {
+    "decode": "Payloads of photos, RAW files, clips and folders.",
+    "live": "Payloads of a V4L2 camera as they come.",
+    "inspect": "Pictures of every stage for one photo.",
+    "calibrate": "Measure a lens or a shutter; writes a camera profile.",
+    "simulate": "Captures with known truth, from a picture and a payload.",
+    "benchmark": "Run time against error; stability.",
+    "train": "Train the auto-encoder.",
+    "profiles": "Known screens and cameras, and which one a file gets.",
+}
+
+
+def _set_verbose(context: click.Context, _parameter: click.Parameter, verbose: bool) -> None:
+    if verbose:
+        logging.getLogger("rxcli").setLevel(logging.DEBUG)
+
+
+_VERBOSE = click.Option(
+    ["-v", "--verbose"],
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_set_verbose,
+    help="Log what is done to stderr; show the traceback of an internal error.",
+)
+
+
+class _PipeClosedError(Exception):
+    """The reader of our output has gone."""
+
+
+class _LazyGroup(click.Group):
+    """A group whose commands are modules of `rxcli.cli`, imported when they are run."""
+
+    def list_commands(self, _context: click.Context) -> list[str]:
+        return [name for name in _COMMANDS if find_spec(f"rxcli.cli.{name}") is not None]
+
+    def get_command(self, context: click.Context, name: str) -> click.Command | None:
+        if name not in self.list_commands(context):
+            return None
+        command = getattr(import_module(f"rxcli.cli.{name}"), name)
+        assert isinstance(command, click.Command)
+        if _VERBOSE not in command.params:
+            command.params.append(_VERBOSE)
+        return command
+
+    def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, _COMMANDS[name]) for name in self.list_commands(context)])
+
+    def invoke(self, context: click.Context) -> Any:
+        try:
+            result = super().invoke(context)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            raise _PipeClosedError from None  # before click makes an exit code of its own of it
+        return result
+
+
+@click.group(
+    name="vlc-rx",
+    cls=_LazyGroup,
+    params=[_VERBOSE],
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
+)
+@click.version_option(__version__, prog_name="vlc-rx", message="%(prog)s %(version)s")
+def cli() -> None:
+    """Receive data that the mini-LED backlight of a display sends to rolling-shutter cameras.
+
+    stdout carries data only; logs and progress go to stderr. Exit codes: 0 every input gave a packet, 1 some input gave
+    none, 2 bad usage or profile, 3 an input could not be read, 130 interrupted.
+    """
+
+
+def main() -> None:
+    """Entry point of `vlc-rx`."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run `vlc-rx` with `arguments`; errors become one line on stderr. Returns the exit code."""
+    _log_to_stderr()
+    try:
+        code = cli.main(args=list(arguments), prog_name="vlc-rx", standalone_mode=False)
+    except click.ClickException as error:
+        return _say_usage(error)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("vlc-rx: interrupted", err=True)
+        return ExitCode.INTERRUPTED
+    except _PipeClosedError:
+        return _leave_closed_pipe()
+    except ReceiverError as error:
+        click.echo(f"vlc-rx: {error}", err=True)
+        return error.exit_code
+    except Exception as error:
+        return _say_internal(error)
+    return int(code or ExitCode.OK)
+
+
+def _log_to_stderr() -> None:
+    log = logging.getLogger("rxcli")
+    log.setLevel(logging.WARNING)
+    if not log.handlers:
+        log.addHandler(_StderrHandler())
+
+
+class _StderrHandler(logging.Handler):
+    """Writes to what stderr is at the time, around a progress bar if there is one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setFormatter(logging.Formatter("vlc-rx: %(levelname)s: %(message)s"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        click.echo(self.format(record), err=True)
+
+
+def _say_usage(error: click.ClickException) -> int:
+    """Click's message in one line, with the command whose help tells more."""
+    context = getattr(error, "ctx", None)
+    path = context.command_path if context is not None else "vlc-rx"
+    message = error.format_message().rstrip(".").replace("\n", " ")
+    click.echo(f"vlc-rx: {message}; see `{path} --help`", err=True)
+    return ExitCode.USAGE
+
+
+def _leave_closed_pipe() -> int:
+    """The run was cut short by its reader: nothing to say, and nobody to say it to at exit."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return ExitCode.INTERRUPTED
+
+
+def _say_internal(error: Exception) -> int:
+    log = logging.getLogger("rxcli")
+    if log.isEnabledFor(logging.DEBUG):
+        log.debug("internal error", exc_info=error)
+    click.echo(
+        f"vlc-rx: internal error ({type(error).__name__}: {error}); run again with --verbose and report what it says",
+        err=True,
+    )
+    return ExitCode.NOT_RECEIVED
+
+
+if __name__ == "__main__":
+    main()
