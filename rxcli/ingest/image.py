@@ -124,6 +124,8 @@ def _read_tiff(path: Path) -> Frame:
         raise InputError(
             f"{path}: the TIFF cannot be read ({reason_of(error)})", "save it uncompressed, or copy it again"
         ) from None
+    if pixels.ndim not in (2, 3):
+        raise InputError(f"{path}: the TIFF is damaged", "copy it again")
     luma, linear = _tiff_luma(pixels, path)
     return _frame(path, np.iinfo(luma.dtype).max - luma if min_is_white else luma, metadata, linear)
 

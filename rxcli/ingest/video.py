@@ -77,6 +77,8 @@ def read_video(path: Path) -> Iterator[Frame]:
         if not container.streams.video:
             raise InputError(f"{path}: no video in it", "name a clip with pictures")
         stream = container.streams.video[0]
+        if stream.codec_context is None:
+            raise InputError(f"{path}: its codec is unknown", "save it as H.264, HEVC or MJPEG")
         check_size(path, stream.codec_context.width, stream.codec_context.height)
         yield from _frames(path, container, stream, progress)
         _check_whole(path, container, stream, progress)
