@@ -24,7 +24,7 @@ _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-p
 #: Options that are fields of the scene by the same name.
 _SCENE_OPTIONS = (
     *("n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm"),
-    *("blur_px", "lcd_grid", "shake_px", "iso", "make", "model"),
+    *("blur_px", "lcd_grid", "shake_px", "iso", "make", "model", "camera_name"),
 )
 
 
@@ -95,8 +95,19 @@ _SCENE_OPTIONS = (
 @click.option(
     "--waveforms", type=click.Path(file_okay=False, path_type=Path), help="Also write what drives a real screen."
 )
+@click.option("--camera-name", help="Name of the camera in truth and camera profile.")
 @click.option(
-    "--list", "list_names", is_flag=True, is_eager=True, expose_value=False, callback=lambda c, p, v: _list(c, v)
+    "--camera-profile",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Also write a camera profile (TOML) that fits the capture.",
+)
+@click.option(
+    "--list",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=lambda context, _parameter, wanted: _list(context, wanted),
+    help="Print the names of pictures and exit.",
 )
 def simulate(out: Path, **options: Any) -> None:
     """Simulate a capture of a mini-LED screen and write it to OUT, with OUT's name .truth.json beside it."""
@@ -107,14 +118,13 @@ def simulate(out: Path, **options: Any) -> None:
     file_format = options["file_format"] or _format_of(out)
     scene = _scene(options, file_format)
     take = prepare(scene, options["seed"])
-    truth = _write(take, out, file_format, options["bit_rate"])
+    try:
+        truth = _write(take, out, file_format, options["bit_rate"])
+        _write_extras(take, options)
+    except OSError as error:
+        where = error.filename or out
+        raise UsageError(f"{where}: cannot be written ({error.strerror or error})", "choose another place") from None
     click.echo(f"{out} and {truth.name}: {_summary(take)}", err=True)
-    if options["waveforms"] is not None:
-        from rxcli.simulate.transmitter import export_waveforms
-
-        n_bursts = 1 + int(take.exposure(scene.n_frames - 1).row_start_slots[-1] // take.link.burst_slots)
-        written = export_waveforms(take.drive, take.link, n_bursts, options["waveforms"])
-        click.echo(f"{options['waveforms']}: {', '.join(path.name for path in written)} ({n_bursts} bursts)", err=True)
 
 
 def _list(context: click.Context, wanted: bool) -> None:
@@ -258,14 +268,25 @@ def _write(take: Take, out: Path, file_format: str, bit_rate: int | None) -> Pat
     """Write the capture and its truth; returns the truth's path."""
     from rxcli.simulate.truth import write_truth
 
-    try:
-        if file_format in _CODECS:
-            _write_clip(take, out, file_format, bit_rate)
-        else:
-            _write_still(take, out, file_format)
-        return write_truth(take.truth(out.name), out)
-    except OSError as error:
-        raise UsageError(f"{out}: cannot be written ({error.strerror or error})", "choose another place") from None
+    if file_format in _CODECS:
+        _write_clip(take, out, file_format, bit_rate)
+    else:
+        _write_still(take, out, file_format)
+    return write_truth(take.truth(out.name), out)
+
+
+def _write_extras(take: Take, options: dict[str, Any]) -> None:
+    """Camera profile and waveforms, where they are asked for."""
+    from rxcli.profiles import dump_profile
+    from rxcli.simulate.transmitter import export_waveforms
+    from rxcli.simulate.truth import build_camera_profile
+
+    last = take.exposure(take.scene.n_frames - 1)
+    if options["camera_profile"] is not None:
+        options["camera_profile"].write_text(dump_profile(build_camera_profile(take.scene, last)), encoding="utf-8")
+    if options["waveforms"] is not None:
+        n_bursts = 1 + int(last.row_start_slots[-1] // take.link.burst_slots)
+        export_waveforms(take.drive, take.link, n_bursts, options["waveforms"])
 
 
 def _write_still(take: Take, out: Path, file_format: str) -> None:

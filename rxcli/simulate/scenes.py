@@ -126,7 +126,7 @@ def _xs10_video(screen: ScreenProfile, width: int, height: int, readout_s: float
         lens=Lens(2.5, (-0.05, 0.02, 0.0, 0.0002, 0.0)),
         pose=Pose(fill=0.86, roll_deg=0.3, yaw_deg=1.0, pitch_deg=0.5),
         room=Room(light_e_per_s=3e5),
-        isp=Isp(tone="bt709", gain=1.6, sharpen=0.3, denoise_px=0.6),
+        isp=Isp(tone="bt709", gain=1.3, sharpen=0.3, denoise_px=0.6),
         blur_px=0.7,
         camera_name=name,
     )

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
+
 if TYPE_CHECKING:
     from rxcli.simulate.camera import Exposure
     from rxcli.simulate.scenes import Scene
@@ -59,6 +61,37 @@ def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[s
         "slot_rate_error_ppm": scene.slot_rate_error_ppm,
         "column_delay_slots": first.delays.tolist(),
     }
+
+
+def build_camera_profile(scene: Scene, exposure: Exposure) -> CameraProfile:
+    """A camera profile that fits the captures of a scene: what a calibration would find, without its errors."""
+    sensor, developed = scene.sensor, scene.output == "developed"
+    top, middle, bottom = (tuple(row) for row in exposure.view.camera_matrix.tolist())
+    mode = ReadoutMode(
+        name="simulated",
+        width=sensor.width,
+        height=sensor.height,
+        line_delay_s=sensor.line_delay_s,
+        exposure_s=scene.exposure_s,
+        frame_rate_hz=scene.frame_rate_hz,
+    )
+    lens = LensModel(
+        width=sensor.width,
+        height=sensor.height,
+        camera_matrix=(top, middle, bottom),
+        dist_coeffs=scene.lens.distortion,
+        distortion_already_corrected=scene.isp.correct_distortion and developed,
+    )
+    return CameraProfile(
+        format=1,
+        kind="camera",
+        name=scene.camera_name,
+        make=scene.make,
+        models=(scene.model,),
+        modes=(mode,),
+        lens=lens,
+        description="written by vlc-rx simulate",
+    )
 
 
 def _camera_truth(scene: Scene, exposure: Exposure) -> dict[str, Any]:
