@@ -38,6 +38,8 @@ Decoded = tuple["Source", Iterator[FrameResult]]
 
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
 _AHEAD = 32
+#: What every line of results starts with, so that half of one is told from a foreign file.
+_LINE_START = b'{"source": "'
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -435,7 +437,7 @@ def _complete_sources(file: BinaryIO, path: Path) -> Generator[tuple[str, list[F
     start = offset = 0
     results: list[FrameResult] = []
     for number, line in enumerate(file, start=1):
-        if not line.endswith(b"\n"):
+        if not line.endswith(b"\n") and line[: len(_LINE_START)] == _LINE_START[: len(line)]:
             break
         result = _parse_line(line, f"{path} line {number}")
         if results and result.source != results[0].source:

@@ -187,7 +187,7 @@ def format_frame(result: FrameResult) -> str:
     """A heading and one row per packet; columns without packets are put together where they tell the same."""
     lines = [format_heading(result)]
     if result.message:
-        lines.append(f"  {result.message}")
+        lines.append(f"  {printable(result.message.removeprefix(result.source + ': '))}")
     rows = list(_rows(result))
     if rows:
         lines += [_HEADER, *rows]

@@ -115,7 +115,7 @@ class SourceSummary:
             "wrong_w": score.wrong_w if score else None,
             "ber": score.ber if score else None,
             "time_ms": round(self.time_ms, 1),
-            "reason": failures[0][1] if failures else self.reason,
+            "reason": (failures[0][1] if failures else self.reason).removeprefix(f"{self.source}: "),
         }
 
 

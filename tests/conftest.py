@@ -1,0 +1,27 @@
+"""Fixtures that several test files share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+_SHARED = Path(__file__).resolve().parents[1].parent / "shared"
+
+
+@pytest.fixture(scope="session")
+def shared_captures() -> Path:
+    """The folder of reference captures beside the checkout, which is no part of the project."""
+    folder = _SHARED / "captures"
+    if not folder.is_dir():
+        pytest.skip(f"no reference captures at {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def shared_real() -> Path:
+    """The folder of real pictures beside the checkout, which is no part of the project."""
+    folder = _SHARED / "real"
+    if not folder.is_dir():
+        pytest.skip(f"no real pictures at {folder}")
+    return folder

@@ -1,0 +1,68 @@
+"""A receiver without pictures: text files say what becomes of them. Its own module, so that workers import it."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rxcli.batch import Decoder
+from rxcli.errors import InputError, UsageError
+from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
+
+N_COLUMNS = 3
+
+
+def open_fake(path: str) -> Iterator[Frame]:
+    """Frames as the JSON file `path` orders them; it fails, dies or waits where the file says so."""
+    try:
+        order: dict[str, Any] = json.loads(Path(path).read_text())
+    except (OSError, ValueError):
+        raise InputError(f"{path}: no picture", "name another file") from None
+    for index in range(order.get("frames", 1)):
+        time.sleep(order.get("sleep_s", 0.0))
+        if order.get("fail_at") == index:
+            raise InputError(f"{path}: breaks off in frame {index}", "copy it again")
+        if order.get("bug_at") == index:
+            raise ZeroDivisionError("a bug")
+        if order.get("kill_at") == index:
+            os.kill(os.getpid(), signal.SIGKILL)
+        yield Frame(np.zeros((1, 1), np.uint8), source=path, index=index, time_s=index / 30)
+
+
+def receive_fake(frames: Iterable[Frame], options: Any) -> Iterator[FrameResult]:
+    """One result a frame, one frame late; the payloads follow from the name of the source."""
+    if options == "wrong":
+        raise UsageError("the options make no sense", "give others")
+    held: FrameResult | None = None
+    for frame in frames:
+        if held is not None:
+            yield held
+        held = _result(frame)
+    if held is not None:
+        yield held
+
+
+def _result(frame: Frame) -> FrameResult:
+    generator = random.Random(f"{Path(frame.source).name} {frame.index}")
+    columns = tuple(
+        ColumnResult(column, "ok", w=5, snr_db=20.0, packets=(_packet(generator),)) for column in range(N_COLUMNS)
+    )
+    return FrameResult(frame.source, frame.index, frame.time_s, "ok", columns=columns, timing_ms={"total": 1.0})
+
+
+def _packet(generator: random.Random) -> PacketResult:
+    payload = generator.randbytes(5).hex()
+    return PacketResult(10.0, 2.0, 40, payload, confidence=0.99, ber_hat=1e-4)
+
+
+def fake_decoder(options: Any = None) -> Decoder:
+    """The decoder to inject."""
+    return Decoder(options, open_fake, receive_fake)
