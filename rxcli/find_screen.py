@@ -39,13 +39,18 @@ _CELL_ROWS, _CELL_STRIPS = 16, 4
 _BANDS = 40
 #: Sides in the order of `ScreenSearch.corners`: side i goes from corner i to corner i + 1.
 _TOP, _RIGHT, _BOTTOM, _LEFT = range(4)
+#: Direction in which x or y grows from each side into the screen; and sign of its slope in depth for a positive roll.
+_INWARD = (1, -1, -1, 1)
+_TURN = (1, 1, -1, -1)
 _SIDE_NAMES = ("top", "right", "bottom", "left")
 #: Least share of a side's segments that must agree on a line.
 _MIN_SUPPORT = 0.06
-#: A segment that begins outside a line counts this often against it: a line with a sixth of the support wins if outermost.
+#: A segment that begins outside a line counts this often against it: the outermost line wins with a sixth of the support.
 _OUTSIDE_COST = 6.0
-#: A line that follows one picture row may be a slot's end instead of the screen's; its support counts this much.
-_ROW_LINE_TRUST = 0.4
+#: Strips that begin on one and the same row may show a slot's end; together they count as this share of the side.
+_ROW_TRUST = 0.12
+#: Largest slope of a side, and its largest deviation from the others' when they are turned onto it.
+_MAX_SLOPE, _MAX_SKEW = 0.25, 0.1
 #: Focal length that the perspective of an invisible side assumes, picture widths.
 _FOCAL_WIDTHS = 1.2
 #: Smallest picture that is searched, pixels each way.
@@ -111,7 +116,7 @@ class _Side:
 
     def at(self, t: FloatArray) -> FloatArray:
         """Place of the side at `t`."""
-        return np.polyval(self.coefficients, (t - self.middle) / self.half)
+        return np.asarray(np.polyval(self.coefficients, (t - self.middle) / self.half), np.float64)
 
     @property
     def slope(self) -> float:
@@ -286,32 +291,46 @@ def _coarse_sides(plane: _Plane, stripes: _Stripes) -> list[_Side] | None:
     step_y, step_x = _CELL_ROWS * plane.fy, _CELL_STRIPS * stripes.strip * plane.fx
     y = (np.arange(rows) + 0.5) * step_y + plane.fy * (_LAG - 1) / 2
     x = (np.arange(columns) + 0.5) * step_x + plane.fx * stripes.strip / 2 - 0.5
+    onsets = [_cell_onsets(stripes.striped, x, y, side) for side in range(4)]
+    lines = [
+        _outermost_line(*o, 1.2 * step, 0.0, _MAX_SLOPE) for o, step in zip(onsets, (step_y, step_x) * 2, strict=True)
+    ]
+    if any(line is None for line in lines):
+        return None
+    # A side that is half black can be led astray; turned by a right angle the four slopes are nearly one.
+    turned = np.array([_TURN[side] * line[1] for side, line in enumerate(lines) if line is not None])
+    roll = float(np.median(turned))
     sides = []
-    for side in range(4):
-        mask = stripes.striped.T if side in (_TOP, _BOTTOM) else stripes.striped
-        t, place, step = (x, y, step_y) if side in (_TOP, _BOTTOM) else (y, x, step_x)
-        inward = 1 if side in (_TOP, _LEFT) else -1
-        mask = mask[:, ::inward]
-        following = np.pad(mask, ((0, 0), (0, 3)))
-        lasting = mask & (following[:, 1:-2].astype(int) + following[:, 2:-1] + following[:, 3:] >= 2)
-        seen = lasting.any(axis=1)
-        depth = inward * place[::inward][lasting.argmax(axis=1)] - step / 2
-        line = _outermost_line(t, depth, seen, seen, 1.2 * step, 0.0, 0.25)
+    for side, (places, step) in enumerate(zip(onsets, (step_y, step_x) * 2, strict=True)):
+        line = _outermost_line(*places, 1.2 * step, _TURN[side] * roll, _MAX_SKEW)
         if line is None:
             return None
-        sides.append(_Side(inward * np.array(line[:2])[::-1], 0.0, 1.0, line[2]))
+        sides.append(_Side(_INWARD[side] * np.array(line[1::-1]), 0.0, 1.0, line[2]))
     return sides
 
 
+def _cell_onsets(
+    striped: BoolArray, x: FloatArray, y: FloatArray, side: int
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Across a side: place along it, depth where striped cells begin and last, its weight, and where there are any."""
+    mask, t, place = (striped.T, x, y) if side in (_TOP, _BOTTOM) else (striped, y, x)
+    mask = mask[:, :: _INWARD[side]]
+    following = np.pad(mask, ((0, 0), (0, 3))).astype(np.int64)
+    lasting = mask & (following[:, 1:-2] + following[:, 2:-1] + following[:, 3:] >= 2)
+    seen = lasting.any(axis=1)
+    depth = _INWARD[side] * place[:: _INWARD[side]][lasting.argmax(axis=1)] - (place[1] - place[0]) / 2
+    return t, depth, seen.astype(np.float64), seen
+
+
 def _outermost_line(
-    t: FloatArray, depth: FloatArray, usable: BoolArray, seen: BoolArray, tolerance: float, slope: float, spread: float
+    t: FloatArray, depth: FloatArray, weight: FloatArray, seen: BoolArray, tolerance: float, slope: float, spread: float
 ) -> tuple[float, float, float] | None:
     """The best supported line with little beyond it, by trying lines through pairs of places.
 
     Args:
         t: (n,) place along the side.
         depth: (n,) where energy begins, growing inwards.
-        usable: (n,) places that may support a line.
+        weight: (n,) support that a place may give, 0..1.
         seen: (n,) places that may speak against one.
         tolerance: distance at which support ends.
         slope: expected slope.
@@ -320,7 +339,7 @@ def _outermost_line(
     Returns:
         Depth at t = 0, slope, and support as a share of the n places; None where there is too little.
     """
-    candidates = np.flatnonzero(usable)
+    candidates = np.flatnonzero(weight)
     if candidates.size < 5:
         return None
     rng = np.random.default_rng(1)
@@ -334,10 +353,9 @@ def _outermost_line(
         return None
     starts = depth[i] - slopes * t[i]
     beyond = (depth[seen] - starts[:, None] - slopes[:, None] * t[seen]) / tolerance
-    support = np.maximum(1 - beyond**2, 0) @ usable[seen].astype(np.float64)
+    support = np.maximum(1 - beyond**2, 0) @ weight[seen]
     against = np.clip(-beyond - 1, 0, 1).sum(axis=1)
-    along_row = np.abs(slopes) * np.ptp(t) < tolerance
-    score = support * np.where(along_row, _ROW_LINE_TRUST, 1.0) - _OUTSIDE_COST * against
+    score = support - _OUTSIDE_COST * against
     best = int(score.argmax())
     return float(starts[best]), float(slopes[best]), float(support[best] / t.size)
 
@@ -430,7 +448,7 @@ def _window(
     before, after = (guess[_LEFT], guess[_RIGHT]) if side in (_TOP, _BOTTOM) else (guess[_TOP], guess[_BOTTOM])
     middle = guess[side].at(np.array(t.mean()))
     between = (t > before.at(middle) + margin) & (t < after.at(middle) - margin)
-    sign = 1 if side in (_TOP, _LEFT) else -1
+    sign = _INWARD[side]
     centre = np.round((guess[side].at(t[between]) - origin) / step).astype(np.int64)
     outer = max(int(out / step), 2)
     index = centre[:, None] + sign * np.arange(-outer, max(int(inward / step), 8))
@@ -446,16 +464,29 @@ def _fit_side(
         onsets = _strip_onsets(plane, stripes, guess, side, out, inward, margin)
     else:
         onsets = _band_onsets(plane, stripes, guess, side, out, inward, margin)
-    sign = 1 if side in (_TOP, _LEFT) else -1
+    sign = _INWARD[side]
     tolerance = max(1.5 * onsets.step, 0.0012 * size)
-    depth = sign * onsets.place
-    line = _outermost_line(onsets.t, depth, onsets.usable, onsets.seen, tolerance, sign * guess[side].slope, 0.1)
-    if line is None:
+    # Where the picture ends before the screen does, a line must pass well outside.
+    depth = sign * onsets.place - np.where(onsets.usable, 0, 3 * tolerance)
+    weight = onsets.usable * (_row_trust(onsets) if side in (_TOP, _BOTTOM) else 1.0)
+    line = _outermost_line(onsets.t, depth, weight, onsets.seen, tolerance, sign * guess[side].slope, _MAX_SKEW)
+    cut = onsets.seen & ~onsets.usable
+    if line is None or line[2] < cut.mean():
         return _Side(guess[side].coefficients, guess[side].middle, guess[side].half, 0.0)
-    return _bend(onsets, np.array(line[1::-1]), depth, tolerance, sign)
+    return _bend(onsets, np.array(line[1::-1]), depth, weight, tolerance, sign)
 
 
-def _bend(onsets: _Onsets, line: FloatArray, depth: FloatArray, tolerance: float, sign: int) -> _Side:
+def _row_trust(onsets: _Onsets) -> FloatArray:
+    """(K,) weight of every strip: many that begin on one row are one observation, a slot's end perhaps."""
+    row = np.round(onsets.place / onsets.step - 0.25).astype(np.int64)
+    row -= row.min(initial=0)
+    count = np.convolve(np.bincount(row[onsets.usable], minlength=int(row.max(initial=0)) + 1), np.ones(3), "same")
+    return np.minimum(1.0, _ROW_TRUST * row.size / np.maximum(count[row], 1))
+
+
+def _bend(
+    onsets: _Onsets, line: FloatArray, depth: FloatArray, weight: FloatArray, tolerance: float, sign: int
+) -> _Side:
     """Let a line bend as a lens bends it, where its places cover most of the side."""
     middle, half = float(onsets.t.mean()), max(float(np.ptp(onsets.t)) / 2, 1.0)
     along = (onsets.t - middle) / half
@@ -466,7 +497,8 @@ def _bend(onsets: _Onsets, line: FloatArray, depth: FloatArray, tolerance: float
         covered = np.unique((along[near] * 3).round()).size
         if near.sum() < 5 or covered < 2:
             break
-        fit = np.polyfit(along[near], depth[near], 2 if covered >= 5 and near.sum() >= 10 else 1)
+        degree = 2 if covered >= 6 and near.sum() >= 10 else 1
+        fit = np.polyfit(along[near], depth[near], degree, w=np.sqrt(weight[near]))
     return _Side(sign * fit, middle, half, float(near.mean()))
 
 
@@ -512,7 +544,7 @@ def _band_onsets(
 ) -> _Onsets:
     """Left and right: where the energy of bands of rows begins and stays."""
     rows = (plane.light.shape[0] - _LAG) // _BANDS
-    t = ((np.arange(_BANDS) + 0.5) * rows + (_LAG - 1) / 2) * plane.fy
+    t = ((np.arange(_BANDS) + 0.5) * rows + (_LAG - 1) / 2) * float(plane.fy)
     # A product needs light on both its columns: the outermost one says where light begins.
     origin = -0.5 if side == _LEFT else plane.fx * (_APART + 1) - 0.5
     window, between = _window(guess, side, t, origin, plane.fx, out, inward, margin)
