@@ -45,7 +45,7 @@ _TURN = (1, 1, -1, -1)
 _SIDE_NAMES = ("top", "right", "bottom", "left")
 #: Least share of a side's segments that must agree on a line.
 _MIN_SUPPORT = 0.06
-#: A segment that begins outside a line counts this often against it: the outermost line wins with a sixth of the support.
+#: A segment that begins outside a line counts this often against it, so that the outermost line wins with a sixth.
 _OUTSIDE_COST = 6.0
 #: Strips that begin on one and the same row may show a slot's end; together they count as this share of the side.
 _ROW_TRUST = 0.12
