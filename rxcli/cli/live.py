@@ -202,10 +202,11 @@ def format_status(recent: list[_Moment], counts: CameraCounts) -> str:
     last = recent[-1]
     span_s = max(last.time_s - recent[0].time_s, 1e-3)
     bits = sum(moment.bits for moment in recent)
+    new_bits = sum(moment.bits for moment in recent[1:])  # those of the span; the first frame only starts it
     lock = "LOCKED" if last.status in _LOCKED else last.status.replace("_", " ")
     parts = [f"{lock:<9}", f"columns {last.n_alive}/{last.n_columns}"]
     if len(recent) > 1:
-        parts += [f"{(len(recent) - 1) / span_s:.1f} frames/s", f"{bits / span_s / 1e3:.1f} kb/s"]
+        parts += [f"{(len(recent) - 1) / span_s:.1f} frames/s", f"{new_bits / span_s / 1e3:.1f} kb/s"]
     if bits:
         parts.append(f"BER about {sum(moment.wrong_bits for moment in recent) / bits:.1e}")
     parts += [f"dropped {counts.dropped}", f"damaged {counts.damaged}"]

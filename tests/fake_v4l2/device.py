@@ -27,6 +27,14 @@ FORMATS = {
     "MJPG": (0, 0),
 }
 _SHIFTS = {"Y10 ": 2, "Y12 ": 4, "Y16 ": 8}
+#: Controls: id -> type, name, least and greatest value.
+_LIMITS = {
+    0x009A0901: (3, b"Auto Exposure", 0, 3),
+    0x009A0902: (1, b"Exposure Time, Absolute", 1, 5000),
+    0x009A0903: (2, b"Exposure, Dynamic Framerate", 0, 1),
+    0x00980913: (1, b"Gain", 0, 255),
+    0x00980912: (2, b"Gain, Automatic", 0, 1),
+}
 _CAPABILITIES = 0x04200001  # streaming, extended pixel format, video capture
 _TIMESTAMP_MONOTONIC, _BUFFER_ERROR = 0x2000, 0x40
 
@@ -157,19 +165,11 @@ class FakeCamera:
         if struct.unpack_from("<i", a)[0]:
             raise DriverError(errno.EINVAL)
 
-    _LIMITS = {
-        0x009A0901: (3, b"Auto Exposure", 0, 3),
-        0x009A0902: (1, b"Exposure Time, Absolute", 1, 5000),
-        0x009A0903: (2, b"Exposure, Dynamic Framerate", 0, 1),
-        0x00980913: (1, b"Gain", 0, 255),
-        0x00980912: (2, b"Gain, Automatic", 0, 1),
-    }
-
     def _limits(self, a: bytearray) -> tuple[int, int, bytes, int, int]:
         (control,) = struct.unpack_from("<I", a)
-        if control not in self._LIMITS:
+        if control not in _LIMITS:
             raise DriverError(errno.EINVAL)
-        return (control, *self._LIMITS[control])
+        return (control, *_LIMITS[control])
 
     def _query_control(self, a: bytearray) -> None:
         control, kind, name, low, high = self._limits(a)

@@ -1,8 +1,9 @@
 """Run a command that finds the fake camera at /dev/video0: `serve.py SCENE.json COMMAND...`.
 
 For the distribution's python3 with umockdev (Debian: umockdev, gir1.2-umockdev-1.0, python3-gi). SCENE.json holds
-`width`, `height`, `luma` (a file of frames), `jpegs` (files), and whatever else `FakeCamera` and `Faults` take. When the
-command ends, its exit status is passed on and the camera's last state is written beside the scene, as SCENE.state.json.
+`width`, `height`, `luma` (a file of frames), `jpegs` (files), and whatever else `FakeCamera` and `Faults` take. When
+the command ends, its exit status is passed on and the camera's last state is written beside the scene
+(SCENE.state.json).
 """
 
 from __future__ import annotations
