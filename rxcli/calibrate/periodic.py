@@ -7,7 +7,7 @@ harmonic is no rival of its fundamental, and a sub-harmonic has to explain somet
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,11 +24,13 @@ MAX_FREQUENCY = 0.45
 _PRICE = 0.01
 #: Power over the continuum from which a line counts: chance reaches it once in e^25 bins.
 _LINE_POWER = 25.0
-#: Periods below which lines of a spectrum run into each other, and the score that so few must reach.
-_FEW_PERIODS = 6
+#: Fewest periods that a period is measured from, and where the lines of a spectrum stop running into each other.
+MIN_PERIODS = 2.0
+FEW_PERIODS = 6
+#: Score that so few must reach.
 _FEW_SCORE = 0.6
-#: Share of the stripes' power that a sub-harmonic must add to be taken for the fundamental.
-_SUBHARMONIC_SHARE = 0.01
+#: What a sub-harmonic must add to the share explained, relative to it, to be taken for the fundamental.
+_SUBHARMONIC_SHARE = 0.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,32 +101,21 @@ def _detrend(profiles: FloatArray) -> FloatArray:
     return np.asarray(profiles - (profiles @ basis) @ basis.T)
 
 
-def search(profiles: FloatArray, min_periods: float = 2.0) -> tuple[FloatArray, FloatArray]:
-    """The most likely fundamental of each profile.
-
-    Many periods are found as lines of a spectrum, few by least squares, because their lines run into each other.
+def search_many(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The most likely fundamental of each profile, of `FEW_PERIODS` periods or more, from the lines of its spectrum.
 
     Args:
         profiles: (k, n) profiles of at least 24 rows.
-        min_periods: fewest periods in the profile.
 
     Returns:
-        (k,) frequencies in cycles per row, and (k,) scores: about the share of the variance explained, less one per
-        cent a harmonic; zero where nothing stands above the continuum.
+        (k,) frequencies in cycles per row, and (k,) scores: the share of the lines' power, less one per cent a
+        harmonic; zero where no line stands above the continuum.
     """
-    fast, fast_score = _search_lines(profiles)
-    slow, slow_score = _search_few(profiles, min_periods)
-    pick = slow_score > fast_score
-    return np.where(pick, slow, fast), np.where(pick, slow_score, fast_score)
-
-
-def _search_lines(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Fundamentals of `_FEW_PERIODS` periods and more."""
     frequency, power = whitened_power(profiles)
     lines = np.where(power > _LINE_POWER, power, 0)
     # A Hann line has an equivalent width of 1.5 bins before the oversampling.
     share = lines / (lines.sum(axis=1, keepdims=True) / (1.5 * _PAD) + _LINE_POWER)
-    first, last = _FEW_PERIODS * _PAD, int(MAX_FREQUENCY * _PAD * profiles.shape[1])
+    first, last = FEW_PERIODS * _PAD, int(MAX_FREQUENCY * _PAD * profiles.shape[1])
     grid = np.arange(first, max(last, first) + 1)
     grid = grid[grid < frequency.size]
     total, best = np.zeros((len(profiles), grid.size)), np.zeros((len(profiles), grid.size))
@@ -136,16 +127,19 @@ def _search_lines(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
     return frequency[grid[at]], best[np.arange(len(profiles)), at]
 
 
-def _search_few(profiles: FloatArray, min_periods: float) -> tuple[FloatArray, FloatArray]:
-    """Fundamentals of fewer periods, by joint least squares of trend and harmonics on thinned profiles."""
+def search_few(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The same for `MIN_PERIODS` to `FEW_PERIODS` periods, whose lines run into each other.
+
+    Trend and harmonics are fitted jointly, by least squares, to the thinned profiles.
+    """
     thin = max(profiles.shape[1] // 256, 1)
     n = profiles.shape[1] // thin
     values = _detrend(profiles[:, : n * thin].reshape(len(profiles), n, thin).mean(axis=2))
     energy = np.sum(values**2, axis=1) + 1e-300
     rows = np.arange(n) - (n - 1) / 2
     slow = np.polynomial.chebyshev.chebvander(2 * rows / n, 3)
-    best, chosen = np.zeros(len(profiles)), np.full(len(profiles), min_periods / profiles.shape[1])
-    for periods in np.arange(min_periods, _FEW_PERIODS + 1, 0.125):
+    best, chosen = np.zeros(len(profiles)), np.full(len(profiles), MIN_PERIODS / profiles.shape[1])
+    for periods in np.arange(MIN_PERIODS, FEW_PERIODS + 1, 0.125):
         for n_harmonics in (1, 3, 5):
             angle = 2 * np.pi * periods / n * np.multiply.outer(rows, np.arange(1, n_harmonics + 1))
             basis, _ = np.linalg.qr(np.hstack([slow, np.cos(angle), np.sin(angle)]))
@@ -159,8 +153,7 @@ def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -
     """Fit a profile at the fundamental nearest to `frequency`, its multiples or its parts, whichever explains it.
 
     Returns:
-        The fit of the highest frequency that no lower one betters by more than one per cent of the stripes' power;
-        None where nothing fits.
+        The fit of the highest frequency that no lower one betters by much; None where nothing fits.
     """
     n = profile.size
     candidates = sorted((frequency * ratio for ratio in (3, 2, 1, 1 / 2, 1 / 3)), reverse=True)
@@ -169,7 +162,7 @@ def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -
     for fit in fits:
         if fit is None:
             continue
-        if best is None or (fit.bic < best.bic and fit.explained > best.explained + _SUBHARMONIC_SHARE):
+        if best is None or (fit.bic < best.bic and fit.explained > best.explained * (1 + _SUBHARMONIC_SHARE)):
             best = fit
     return best
 
@@ -194,11 +187,27 @@ def fit_periodic(profile: FloatArray, frequency: float, first_row: int = 0) -> P
         worse = 0 if better else worse + 1
         if better:
             best = fit
-    for n_slow in more_slow if best else []:
+    if best is None:
+        return None
+    fits = [best]
+    for n_slow in more_slow:
         fit = _fit_near(profile, best.frequency, best.cosines.size, n_slow, first_row)
-        if fit is not None and fit.bic < best.bic:
-            best = fit
-    return best
+        fits += [] if fit is None else [fit]
+    return _choose_slow(fits)
+
+
+def _choose_slow(fits: list[PeriodicFit]) -> PeriodicFit:
+    """The fit with the best number of slow terms (fewest first); what richer ones say adds to its uncertainty.
+
+    Over a few periods the envelope trades against the frequency, and the choice between envelopes is an error that
+    the residual does not show.
+    """
+    at = min(range(len(fits)), key=lambda i: fits[i].bic)
+    best = fits[at]
+    if best.periods >= FEW_PERIODS:
+        return best
+    spread = max(abs(fit.frequency - best.frequency) for fit in fits[at:])
+    return replace(best, frequency_sd=float(np.hypot(best.frequency_sd, spread)))
 
 
 def _slow_terms(periods: float) -> list[int]:
@@ -303,7 +312,8 @@ def _frequency_sd(jacobian: FloatArray, residual: FloatArray) -> float:
     """Standard deviation of the frequency (last parameter) under coloured noise.
 
     The estimate is linear in the noise, `df = g . noise`, with `g` a row of the Jacobian's pseudo-inverse; its variance
-    is the integral of the noise's power spectrum over that of `g`.
+    is the integral of the noise's power spectrum over that of `g`. Where the noise is not stationary (a scene lit by
+    the stripes is multiplied by them), the sum of `g * residual` over its own neighbourhood may say more.
     """
     scale = np.linalg.norm(jacobian, axis=0) + 1e-300
     influence = np.linalg.pinv(jacobian / scale, rcond=1e-9)[-1] / scale[-1]
@@ -311,7 +321,11 @@ def _frequency_sd(jacobian: FloatArray, residual: FloatArray) -> float:
     degrees = max(residual.size - jacobian.shape[1], 1)
     spectrum = noise_spectrum(residual, n_fft) * residual.size / degrees
     weight = np.abs(np.fft.fft(influence, n_fft)) ** 2
-    return float(np.sqrt(np.sum(spectrum * weight) / n_fft))
+    stationary = float(np.sum(spectrum * weight)) / n_fft
+    score = influence * residual
+    lag = max(int(4 * (residual.size / 100) ** (2 / 9)), 1)
+    local = float(np.sum(np.convolve(score, np.bartlett(2 * lag + 3)[1:-1], "same") * score))
+    return float(np.sqrt(max(stationary, local * residual.size / degrees)))
 
 
 def noise_spectrum(residual: FloatArray, n_fft: int) -> FloatArray:
@@ -348,7 +362,7 @@ def explained_share(profiles: FloatArray, template: FloatArray) -> tuple[FloatAr
 
 def significant(fit: PeriodicFit) -> bool:
     """Whether a fit is stripes and not a scene: a few waves that fit badly are found in any picture."""
-    return fit.explained > (0.3 if fit.periods >= _FEW_PERIODS else 0.85)
+    return fit.explained > float(np.interp(fit.periods, [FEW_PERIODS, 2 * FEW_PERIODS], [0.9, 0.5]))
 
 
 def longest_block(members: BoolArray) -> tuple[int, int]:

@@ -7,7 +7,7 @@ goes on among the rest. Each lamp's region is then summed to one profile and fit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,11 +15,14 @@ import numpy as np
 
 from rxcli.calibrate.exposure import estimate_exposure
 from rxcli.calibrate.periodic import (
+    FEW_PERIODS,
+    MIN_PERIODS,
     PeriodicFit,
     explained_share,
     fit_fundamental,
     longest_block,
-    search,
+    search_few,
+    search_many,
     significant,
 )
 from rxcli.errors import ReceiverError
@@ -30,8 +33,8 @@ Axis = Literal["rows", "columns"]
 _Z95 = 1.959964
 _STRIPS = 32
 _MAX_LAMPS = 8
-#: Fewest periods that a period is measured from.
-MIN_PERIODS = 2.0
+#: Smallest region of a lamp, as a share of the picture, with many periods and with few.
+_MIN_AREA, _MIN_AREA_FEW = 0.003, 0.015
 _HINT = (
     "let the lamp fill more of the frame, shorten the exposure to well below half a period, and use the electronic "
     "shutter with HDR and flicker reduction off"
@@ -165,29 +168,56 @@ def _clearest_lamp(
         grown = fit_fundamental(profile, fit.frequency, rows.start)
         if grown is None or grown.periods < MIN_PERIODS or not significant(grown):
             return None
+        if not _one_lamp(shares, members, float(np.mean(chosen)) * profile.size / strips.shape[1], grown):
+            return None
         fit = grown
     taken = np.repeat(shares > 0.15, np.diff(blocks), axis=1)
     taken[chosen, rows] = True
     return chosen, rows, fit, profile, taken
 
 
+def _one_lamp(shares: FloatArray, members: BoolArray, area: float, fit: PeriodicFit) -> bool:
+    """Whether a region can be a lamp's: large enough, and nowhere upside down.
+
+    A lamp lights its rows at once, while tiles, windows and chessboards stand beside their own negatives.
+    """
+    few = fit.periods < 2 * FEW_PERIODS
+    upside_down = int(np.sum(shares < -0.3))
+    return area >= (_MIN_AREA_FEW if few else _MIN_AREA) and not (few and 8 * upside_down > int(members.sum()))
+
+
 def _seed(strips: FloatArray, free: BoolArray) -> PeriodicFit | None:
-    """The best fit of the best-scoring windows: groups of neighbouring strips by spans of rows."""
-    candidates: list[tuple[float, float, FloatArray, int]] = []
+    """The best fit of the best-scoring windows: groups of neighbouring strips by spans of rows.
+
+    A few waves are looked for only where there are not many: the fall-off of a spot passes for a wave or two.
+    """
+    windows = []
     for first, length in _windows(strips.shape[1]):
         rows = slice(first, first + length)
         groups = _groups(strips[:, rows], free[:, rows].all(axis=1))
-        if not len(groups):
-            continue
-        frequencies, scores = search(groups, MIN_PERIODS)
-        at = int(np.argmax(scores))
-        # Among equally clear windows the longer one tells the frequency better.
-        candidates.append((float(scores[at]) * np.log(length), float(frequencies[at]), groups[at], first))
-    for score, frequency, profile, first in sorted(candidates, key=lambda c: -c[0])[:3]:
-        fit = fit_fundamental(profile, frequency, first) if score > 0 else None
-        if fit is not None and fit.periods >= MIN_PERIODS and significant(fit):
-            return fit
+        if len(groups):
+            windows.append((first, groups))
+    for search in (search_many, search_few):
+        for frequency, profile, first in _best_windows(windows, search):
+            fit = fit_fundamental(profile, frequency, first)
+            if fit is not None and fit.periods >= MIN_PERIODS and significant(fit):
+                return fit
     return None
+
+
+def _best_windows(
+    windows: list[tuple[int, FloatArray]], search: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+) -> list[tuple[float, FloatArray, int]]:
+    """Frequency, profile and first row of the three clearest windows."""
+    candidates = []
+    for first, groups in windows:
+        frequencies, scores = search(groups)
+        at = int(np.argmax(scores))
+        if scores[at] > 0:
+            # Among equally clear windows the longer one tells the frequency better.
+            worth = float(scores[at] * np.log(groups.shape[1]))
+            candidates.append((worth, float(frequencies[at]), groups[at], first))
+    return [candidate[1:] for candidate in sorted(candidates, key=lambda c: -c[0])[:3]]
 
 
 def _windows(n: int) -> list[tuple[int, int]]:
