@@ -6,10 +6,11 @@ What strip s of column c sees at exposure centre g (in slots) is
 
 with T the picture there (textured, different in every strip), K the light spread from column c + k into the strip
 (smooth, known from the screen), h a slot seen through the exposure (a trapezoid) and m the same for all strips. The
-picture is predicted at every sample from the samples around it, but not from the slot itself, on several scales at
-once; the scale that has predicted best thereabouts is taken, and its error is the variance of the prediction. The
-metric of a slot pattern is then the sum over strips and samples of a Student-t log-likelihood: pictures have edges, and
-an edge in one strip must not outweigh seven others.
+picture is predicted at every sample from the samples before it, from those after it and from both, never from the slot
+itself. Each prediction is made on several scales at once; the scale that has predicted best thereabouts is taken, and
+its error is the variance of the prediction. The likelihood of a sample is the mixture over the three predictions
+(where the picture has an edge, one side alone tells) of a Student-t density (an edge in one strip must not outweigh
+seven others). The metric of a slot pattern is the sum of its logarithm over strips and samples.
 
 The slots themselves are needed to predict the picture, so model and detection are iterated, from a first guess that
 compares every sample to the extremes around it.
@@ -17,16 +18,19 @@ compares every sample to the extremes around it.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.protocol import slot_patterns as patterns
+from rxcli.protocol import slot_patterns
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 #: Scales, in slots, over which the picture is predicted: fine texture to plain sky.
-PICTURE_SCALES = (0.6, 1.2, 2.5, 6.0)
+PICTURE_SCALES = (0.3, 0.6, 1.2, 2.5, 6.0)
+#: Prior of the predictions from both sides, from before, from after.
+_SIDES = (0.5, 0.25, 0.25)
 #: Samples closer than this many slots to a sample say nothing of its picture: they show the same slot.
 _HOLE_SLOTS = 0.7
 #: The error of the prediction is averaged over this many slots.
@@ -45,6 +49,11 @@ _FIRST_GUESS_STRIPS = 3.0
 _DARK_FROM, _DARK_TO = 5.9, 7.1
 #: Light over the floor up to which a sample counts as dark.
 _DARK_MARGIN = 0.002
+
+#: Columns worked on at a time: what fits the cache.
+_COLUMNS_AT_A_TIME = 5
+#: NumPy works outside the interpreter's lock; more threads than this gain nothing on a few columns.
+_THREADS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +145,7 @@ def first_metrics(pooled: Float32Array, weight: Float32Array, memory: int) -> Fl
     """
     llr = _FIRST_GUESS_LLR * np.clip(pooled, -1.5, 1.5) * np.minimum(weight, _FIRST_GUESS_STRIPS) / _FIRST_GUESS_STRIPS
     llr = np.pad(llr, ((0, 0), (0, memory)))
-    return np.asarray(llr[..., None] / 2 * (2.0 * patterns(memory)[:, -1] - 1))
+    return np.asarray(llr[..., None] / 2 * (2.0 * slot_patterns(memory)[:, -1] - 1))
 
 
 def lit_on_grid(posteriors: BurstPosteriors, clock: Clock) -> Float32Array:
@@ -165,6 +174,14 @@ def by_burst(metrics: FloatArray, clock: Clock, memory: int) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
+class Prediction:
+    """The picture at every sample from other samples, (C, S, n) float32 each."""
+
+    picture: Float32Array
+    variance: Float32Array
+
+
+@dataclass(frozen=True, slots=True)
 class SlotLikelihoods:
     """What the light says of the slots of some columns."""
 
@@ -172,6 +189,25 @@ class SlotLikelihoods:
     metrics: FloatArray
     #: (C, N) float32: (lit minus dark) squared over the noise's variance, of a slot.
     snr: Float32Array
+    #: (C, 2) float64: correlation of the residual with its change by the clock, and that change's power; their ratio is
+    #: how many slots the column's clock is late.
+    timing: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Expected:
+    """What C columns should show, per unit of picture; arrays (C, S, n) or broadcasting to it."""
+
+    others: Float32Array
+    own: Float32Array
+    #: (C, 1, n): exposure over the expected slots of the column itself.
+    shape: Float32Array
+    #: Change of the whole by a slot of time.
+    slope: Float32Array
+
+    @property
+    def whole(self) -> Float32Array:
+        return self.others + self.own * self.shape
 
 
 def slot_likelihoods(
@@ -186,23 +222,56 @@ def slot_likelihoods(
         lit: (C, N) probability that each slot is lit.
         columns: columns to look at; the result has these alone.
     """
-    q = samples.samples_per_slot
     shape = _shape_on_grid(lit, model)
+    slope = np.zeros_like(shape)
+    slope[:, 1:-1] = (shape[:, 2:] - shape[:, :-2]) * np.float32(samples.samples_per_slot / 2)
+    others = _from_neighbours(shape, model, clock)
+    others_slope = _from_neighbours(slope, model, clock)
     own = model.spread[None, :, 1, None].astype(np.float32)
-    others = _from_neighbours(shape, model, clock, q)[columns]
-    valid = samples.valid[columns]
-    light = (samples.light[columns] - np.float32(model.floor)) * valid
-    expected = others + own * shape[columns, None]
-    picture, variance = predict_picture(light, expected, valid, model.sigma, q)
-    metrics = _pattern_metrics(light, valid, picture, variance, others, own, model)
-    return SlotLikelihoods(metrics, _slot_snr(valid, picture * own, variance * own * own, model))
+
+    def of_columns(part: NDArray[np.int64]) -> SlotLikelihoods:
+        expected = _Expected(others[part], own, shape[part, None], others_slope[part] + own * slope[part, None])
+        return _likelihoods(samples.light[part], samples.valid[part], expected, model)
+
+    parts = np.array_split(columns, -(-columns.size // _COLUMNS_AT_A_TIME))
+    with ThreadPoolExecutor(_THREADS) as pool:
+        done = list(pool.map(of_columns, parts))
+    return SlotLikelihoods(
+        np.concatenate([d.metrics for d in done]),
+        np.concatenate([d.snr for d in done]),
+        np.concatenate([d.timing for d in done]),
+    )
 
 
-def _slot_snr(valid: Float32Array, contrast: Float32Array, variance: Float32Array, model: LightModel) -> Float32Array:
-    """(C, N) squared contrast over variance, summed over the strips and samples of a slot as far as they are independent."""
-    noise = np.float32(model.sigma**2) + np.float32(model.shot) * contrast + variance
+def _likelihoods(
+    light: Float32Array, valid: Float32Array, expected: _Expected, model: LightModel
+) -> SlotLikelihoods:
+    light = (light - np.float32(model.floor)) * valid
+    predictions = predict_picture(light, expected.whole, valid, model.sigma, model.taps.shape[0])
+    metrics = _pattern_metrics(light, valid, predictions, expected, model)
+    timing = _timing(light, valid, predictions[0], expected, model)
+    return SlotLikelihoods(metrics, _slot_snr(valid, predictions[0], expected.own, model), timing)
+
+
+def _slot_snr(valid: Float32Array, prediction: Prediction, own: Float32Array, model: LightModel) -> Float32Array:
+    """(C, N) squared contrast over variance of a slot, as far as strips and samples are independent."""
+    contrast = prediction.picture * own
+    noise = np.float32(model.sigma**2) + np.float32(model.shot) * contrast + prediction.variance * own * own
     ratio = (contrast * contrast / noise * valid).sum(axis=1) * np.float32(_TEMPER)
     return np.asarray(ratio.reshape(ratio.shape[0], -1, model.taps.shape[0]).sum(axis=2), np.float32)
+
+
+def _timing(
+    light: Float32Array, valid: Float32Array, prediction: Prediction, expected: _Expected, model: LightModel
+) -> FloatArray:
+    """(C, 2) numerator and denominator of each column's lateness: one Gauss-Newton step, samples weighted robustly."""
+    whole = prediction.picture * expected.whole
+    change = prediction.picture * expected.slope
+    spread = np.float32(model.sigma**2) + np.float32(model.shot) * whole + prediction.variance * expected.whole**2
+    residual = light - whole
+    weight = valid / (spread + residual * residual / np.float32(_DEGREES))
+    numerator = (weight * residual * change).sum(axis=(1, 2), dtype=np.float64)
+    return np.stack([numerator, (weight * change * change).sum(axis=(1, 2), dtype=np.float64)], axis=1)
 
 
 def _shape_on_grid(lit: Float32Array, model: LightModel) -> Float32Array:
@@ -215,12 +284,12 @@ def _shape_on_grid(lit: Float32Array, model: LightModel) -> Float32Array:
     return np.ascontiguousarray(shape[:, skip : skip + lit.shape[1] * q])
 
 
-def _from_neighbours(shape: Float32Array, model: LightModel, clock: Clock, q: int) -> Float32Array:
+def _from_neighbours(shape: Float32Array, model: LightModel, clock: Clock) -> Float32Array:
     """(C, S, N * Q) light that the adjacent columns shed into each strip, per unit of picture."""
     left, right = np.zeros_like(shape), np.zeros_like(shape)
     left[1:], right[:-1] = shape[:-1], shape[1:]
     if clock.delay_slots.any():
-        ahead = np.diff(clock.delay_slots) * q
+        ahead = np.diff(clock.delay_slots) * model.taps.shape[0]
         left[1:] = _shifted(left[1:], ahead)
         right[:-1] = _shifted(right[:-1], -ahead)
     spread = model.spread.astype(np.float32)
@@ -244,8 +313,8 @@ def _box(values: Float32Array, half: int) -> Float32Array:
 
 def predict_picture(
     light: Float32Array, expected: Float32Array, valid: Float32Array, sigma: float, samples_per_slot: int
-) -> tuple[Float32Array, Float32Array]:
-    """The picture at every sample from the samples around it, and the variance of that prediction.
+) -> tuple[Prediction, Prediction, Prediction]:
+    """The picture at every sample from both sides, from before and from after; on each the best of all scales.
 
     Args:
         light: (C, S, n) light over the floor, 0 where not valid.
@@ -253,67 +322,109 @@ def predict_picture(
         valid: (C, S, n) 1 or 0.
         sigma: standard deviation of a sample of no light.
         samples_per_slot: samples a slot.
-
-    Returns:
-        (C, S, n) float32 each.
     """
     weighted = expected * valid
     numerator, denominator = weighted * light, weighted * expected
     hole = max(int(np.ceil(_HOLE_SLOTS * samples_per_slot)) - 1, 0)
-    near_numerator, near_denominator = _box(numerator, hole), _box(denominator, hole)
-    picture = variance = None
+    texture = _Texture(light, expected, valid, sigma, samples_per_slot)
+    best: list[Prediction] = []
     for scale in PICTURE_SCALES:
-        half = hole + max(round(2 * scale * samples_per_slot), 1)
-        seen = np.maximum(_box(denominator, half) - near_denominator, 0)
-        guess = np.maximum(_box(numerator, half) - near_numerator, 0) / (seen + np.float32(1e-4))
-        spread = guess * guess * _texture(light, guess * expected, valid, sigma, samples_per_slot)
-        spread += np.float32(sigma * sigma) / (seen + np.float32(1e-6))
-        if picture is None or variance is None:
-            picture, variance = guess, spread
-        else:
-            better = spread < variance
-            np.copyto(picture, guess, where=better)
-            np.copyto(variance, spread, where=better)
-    assert picture is not None
-    assert variance is not None
-    return picture, variance
+        half = max(int(scale * samples_per_slot), 1)
+        sums = zip(_sides(_box(numerator, half), half, hole), _sides(_box(denominator, half), half, hole), strict=True)
+        for side, (light_seen, seen) in enumerate(sums):
+            guess = np.maximum(light_seen, 0) / (seen + np.float32(1e-4))
+            variance = guess * guess * texture.of(guess) + np.float32(sigma * sigma) / (seen + np.float32(1e-6))
+            if len(best) <= side:
+                best.append(Prediction(guess, variance))
+                continue
+            better = variance < best[side].variance
+            np.copyto(best[side].picture, guess, where=better)
+            np.copyto(best[side].variance, variance, where=better)
+    return best[0], best[1], best[2]
 
 
-def _texture(light: Float32Array, predicted: Float32Array, valid: Float32Array, sigma: float, q: int) -> Float32Array:
-    """Relative variance of the predictions thereabouts, beyond the noise."""
-    residual = (light - predicted) * valid
-    half = _ERROR_SLOTS * q // 2
-    error = _box(residual * residual - np.float32(sigma * sigma) * valid, half)
-    power = _box(predicted * predicted * valid, half) + np.float32(1e-5) * _box(valid, half) + np.float32(1e-9)
-    return np.clip(error / power, *map(np.float32, _TEXTURE_BOUNDS))
+def _sides(boxes: Float32Array, half: int, hole: int) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Sums over both sides of a hole, over the side before it, over the side after, from sums centred on samples."""
+    away = hole + half + 1
+    before, after = np.zeros_like(boxes), np.zeros_like(boxes)
+    before[..., away:] = boxes[..., :-away]
+    after[..., :-away] = boxes[..., away:]
+    return before + after, before, after
+
+
+class _Texture:
+    """Relative variance of a prediction thereabouts, beyond the noise; averaged slot by slot, which is fine enough."""
+
+    def __init__(
+        self, light: Float32Array, expected: Float32Array, valid: Float32Array, sigma: float, samples_per_slot: int
+    ) -> None:
+        self._light, self._expected, self._q = light, expected * valid, samples_per_slot
+        count = self._around(valid)
+        self._noise = np.float32(sigma * sigma) * count
+        self._least = np.float32(1e-5) * count + np.float32(1e-9)
+
+    def of(self, picture: Float32Array) -> Float32Array:
+        """(C, S, n) relative variance of `picture`."""
+        predicted = picture * self._expected
+        residual = self._light - predicted
+        error = self._around(np.square(residual, out=residual)) - self._noise
+        power = self._around(np.square(predicted, out=predicted)) + self._least
+        low, high = _TEXTURE_BOUNDS
+        return np.repeat(np.clip(error / power, np.float32(low), np.float32(high)), self._q, axis=-1)
+
+    def _around(self, values: Float32Array) -> Float32Array:
+        slots = values.reshape(*values.shape[:-1], -1, self._q).sum(axis=-1)
+        return _box(slots, _ERROR_SLOTS // 2)
 
 
 def _pattern_metrics(
     light: Float32Array,
     valid: Float32Array,
-    picture: Float32Array,
-    variance: Float32Array,
-    others: Float32Array,
-    own: Float32Array,
+    predictions: tuple[Prediction, ...],
+    expected: _Expected,
     model: LightModel,
 ) -> FloatArray:
-    """Student-t log-likelihoods summed over strips and the samples of a metric; (C, N + memory, patterns)."""
+    """Mixture log-likelihoods summed over strips and the samples of a metric; (C, N + memory, patterns)."""
     q, memory = model.taps.shape[0], model.memory
     n_columns, _, n = light.shape
     lead = memory * q // 2
     out = np.zeros((n_columns, n // q + memory, 1 << (memory + 1)))
-    noise = np.float32(model.sigma**2)
-    shot = np.float32(model.shot) * picture
     weight = np.float32(_TEMPER) * valid
-    for number, levels in enumerate(patterns(memory) @ model.taps.T):
+    for number, levels in enumerate(slot_patterns(memory) @ model.taps.T):
         # Sample i belongs to metric (i + lead) // q.
         mine = np.resize(np.roll(levels, -(lead % q)), n).astype(np.float32)
-        shape = others + own * mine
-        spread = noise + shape * (shot + variance * shape)
-        residual = light - picture * shape
-        log_likelihood = -0.5 * (_DEGREES + 1) * np.log1p(residual * residual / (spread * np.float32(_DEGREES)))
-        log_likelihood -= 0.5 * np.log(spread)
-        summed = (log_likelihood * weight).sum(axis=1)
+        whole = expected.others + expected.own * mine
+        parts = [
+            _log_likelihood(light, whole, prediction, model) + np.float32(np.log(prior))
+            for prediction, prior in zip(predictions, _SIDES, strict=True)
+        ]
+        summed = (_log_sum(parts) * weight).sum(axis=1)
         padded = np.pad(summed, ((0, 0), (lead, memory * q - lead)))
         out[:, :, number] = padded.reshape(n_columns, -1, q).sum(axis=2)
     return out
+
+
+def _log_likelihood(light: Float32Array, whole: Float32Array, prediction: Prediction, model: LightModel) -> Float32Array:
+    """Student-t log-density of the light, up to a constant."""
+    spread = prediction.variance * whole
+    spread += np.float32(model.shot) * prediction.picture
+    spread *= whole
+    spread += np.float32(model.sigma**2)
+    residual = light - prediction.picture * whole
+    np.square(residual, out=residual)
+    residual /= spread
+    residual *= np.float32(1 / _DEGREES)
+    np.log1p(residual, out=residual)
+    residual *= np.float32(-0.5 * (_DEGREES + 1))
+    np.log(spread, out=spread)
+    spread *= np.float32(0.5)
+    residual -= spread
+    return residual
+
+
+def _log_sum(parts: list[Float32Array]) -> Float32Array:
+    top = np.maximum.reduce(parts)
+    total = np.zeros_like(top)
+    for part in parts:
+        total += np.exp(part - top)
+    return np.asarray(top + np.log(total))

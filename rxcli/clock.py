@@ -23,6 +23,8 @@ _EXTREMES_SLOTS = 19
 #: Contrast that half-convinces, over the noise of a sample.
 _CONTRAST_SIGMAS = 8.0
 _MAX_DELAY_SLOTS = 2.0
+#: Largest correction of the clock at a time, slots.
+_MAX_CORRECTION = 0.25
 
 
 def resample(profiles: RowProfiles, row0: float, rows_per_sample: float, n_samples: int) -> tuple[Float32Array, Float32Array]:
@@ -210,6 +212,18 @@ def _parabola(score: FloatArray, best: NDArray[np.int64]) -> FloatArray:
     left, middle, right = (score[rows, inner + k] for k in (-1, 0, 1))
     bend = left - 2 * middle + right
     return np.clip(np.divide(0.5 * (left - right), bend, out=np.zeros_like(bend), where=bend < 0), -0.5, 0.5)
+
+
+def corrected(clock: Clock, timing: FloatArray) -> Clock:
+    """The clock moved by what the columns together say of its lateness.
+
+    Args:
+        clock: the clock.
+        timing: (C, 2) numerators and denominators of each column's lateness in slots.
+    """
+    numerator, denominator = timing.sum(axis=0)
+    late = float(np.clip(numerator / denominator, -_MAX_CORRECTION, _MAX_CORRECTION)) if denominator > 0 else 0.0
+    return replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
 
 
 def sample_slots(profiles: RowProfiles, clock: Clock, samples_per_slot: int) -> SlotSamples:

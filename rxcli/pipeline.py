@@ -14,7 +14,7 @@ import numpy as np
 from rxcli import assemble, channel, clock, detect, geometry, sampling
 from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, match_camera
 from rxcli.protocol import WEIGHTS
-from rxcli.types import BurstPosteriors, Clock, FloatArray, Frame, FrameResult, Lens, RowProfiles, SlotSamples
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameResult, Lens, RowProfiles, SlotSamples
 
 CaeMode = Literal["auto", "always", "never"]
 #: Names of the shortcuts that `ReceiverOptions.skip` may hold; every one is counted in the report.
@@ -29,6 +29,8 @@ _CERTAIN = float(np.log(0.9999))
 _HOPELESS_WEIGHT = 25.0
 #: Iterations before a weight may be dropped: the first ones know the picture too little.
 _SETTLED = 2
+#: Iterations after which the clock is corrected: the first one trusts its slots too little.
+_CLOCK_ITERATIONS = (1, 2)
 #: A header peak less than this times the strongest rival is no lock.
 _MIN_LOCK = 1.6
 #: Orientations in which the readout runs along the columns' width.
@@ -129,7 +131,7 @@ def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
         result = replace(result, screen_profile=lock.screen.name)
         with stages("detect"):
             reception = _decode(lock)
-        columns = assemble.column_results(lock.clock, *reception, options.min_confidence)
+        columns = assemble.column_results(*reception, options.min_confidence)
         result = replace(result, columns=columns, status=assemble.frame_status(columns))
     except _Failure as failure:
         result = replace(result, status=failure.status, message=failure.message)
@@ -230,11 +232,11 @@ def _why_no_signal(corners: FloatArray, camera: _Camera, options: ReceiverOption
     return "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
 
 
-def _decode(lock: _Lock) -> tuple[BurstPosteriors, FloatArray, SlotSamples]:
+def _decode(lock: _Lock) -> tuple[Clock, BurstPosteriors, Float32Array, SlotSamples]:
     """Slots, light model and detection, iterated until they agree.
 
     Returns:
-        Posteriors, signal-to-noise ratio of the slots (C, N), and the samples.
+        The clock, posteriors, signal-to-noise ratio of the slots (C, N), and the samples.
     """
     now = lock.clock
     samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
@@ -246,6 +248,10 @@ def _decode(lock: _Lock) -> tuple[BurstPosteriors, FloatArray, SlotSamples]:
     posteriors = detect.detect(channel.by_burst(metrics, now, model.memory), candidates)
     for iteration in range(_MAX_ITERATIONS):
         likelihoods = channel.slot_likelihoods(samples, now, model, channel.lit_on_grid(posteriors, now), columns)
+        if iteration in _CLOCK_ITERATIONS:
+            now = clock.corrected(now, likelihoods.timing)
+            samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
+            likelihoods = channel.slot_likelihoods(samples, now, model, channel.lit_on_grid(posteriors, now), columns)
         metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
         before = posteriors
         posteriors = detect.detect(channel.by_burst(metrics, now, model.memory), candidates)
@@ -256,7 +262,7 @@ def _decode(lock: _Lock) -> tuple[BurstPosteriors, FloatArray, SlotSamples]:
         columns = np.flatnonzero(~certain)
         if columns.size == 0:
             break
-    return posteriors, snr, samples
+    return now, posteriors, snr, samples
 
 
 def _light_model(lock: _Lock, samples: SlotSamples) -> channel.LightModel:
