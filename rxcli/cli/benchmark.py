@@ -1,0 +1,99 @@
+"""`vlc-rx benchmark`: run time against error, time per stage, stability, calibration of the confidence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from rxcli.benchmark.confidence import Calibration
+    from rxcli.benchmark.journal import Journal
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+_COMMON = (
+    click.option(
+        "--out",
+        type=click.Path(file_okay=False, path_type=Path),
+        default=Path("benchmark-results"),
+        show_default=True,
+        help="Folder of journals, CSV, JSON and plots.",
+    ),
+    click.option("--seed", type=click.IntRange(0, 10**6), default=0, show_default=True, help="Of all random scenes."),
+    click.option("--fresh", is_flag=True, help="Forget what an earlier run has left in the journal."),
+    click.option("--quiet", is_flag=True, help="No progress bar."),
+)
+_JOBS = click.option(
+    "--jobs", type=click.IntRange(1, 256), default=1, show_default=True, help="Processes, one thread each."
+)
+
+
+def _common(command: _F) -> _F:
+    for option in reversed(_COMMON):
+        command = option(command)
+    return command
+
+
+def _journal(out: Path, name: str, fresh: bool) -> Journal:
+    from rxcli.benchmark.journal import Journal
+
+    path = out / f"{name}.journal.jsonl"
+    if fresh:
+        path.unlink(missing_ok=True)
+    return Journal(path)
+
+
+@click.group(invoke_without_command=False)
+def benchmark() -> None:
+    """Run time against error; stability.
+
+    Every run keeps a journal in the folder --out and goes on where it was interrupted.
+    """
+
+
+@benchmark.command()
+@click.option(
+    "--frames", type=click.IntRange(1), default=600, show_default=True, help="Random frames, some 20 packets each."
+)
+@click.option("--cae", type=click.Choice(["auto", "always", "never"]), default="auto", show_default=True)
+@_JOBS
+@_common
+def confidence(frames: int, cae: str, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
+    """Share of error-free packets in ten bins of reported confidence."""
+    from rxcli.benchmark import confidence as work
+    from rxcli.benchmark import plots
+    from rxcli.benchmark.tables import format_table, write_outputs
+
+    records = work.run(frames, _journal(out, "confidence", fresh), seed=seed, cae=cae, jobs=jobs, quiet=quiet)
+    result = work.calibration(records)
+    rows = work.rows(result)
+    click.echo(format_table(rows))
+    click.echo("\n".join(_calibration_notes(result)))
+    paths = write_outputs(out, "confidence", rows, work.details(result))
+    if plots.available():
+        paths.append(out / "confidence.png")
+        plots.plot_confidence(result.bins, paths[-1])
+    _say_written(paths)
+
+
+def _calibration_notes(result: Calibration) -> list[str]:
+    from rxcli.benchmark.tables import format_value
+
+    lines = [
+        f"{result.n_packets} packets of {result.n_frames} frames; calibration error {format_value(result.error)}, "
+        f"Brier score {format_value(result.brier)}"
+    ]
+    if result.scaling and result.exponent:
+        lines.append(
+            f"likeliest scaling: logistic({result.scaling.offset:+.3f} {result.scaling.slope:+.3f} * "
+            f"logit(confidence)), Brier score {format_value(result.brier_scaled)}; as one temperature of the "
+            f"log-probabilities: {1 / result.exponent:.2f}"
+        )
+    return lines
+
+
+def _say_written(paths: Sequence[Path]) -> None:
+    click.echo("written: " + ", ".join(str(path) for path in paths), err=True)
