@@ -17,6 +17,7 @@ A side that shows nothing (black, or outside the picture) is put where a flat sc
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,14 +30,14 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _PLANE = 1040
 #: Rows of the reduced plane between the two lights of a change: two slots at the top rate, a good part of a long one.
 _LAG = 3
-#: Columns of the reduced plane between the two changes of a product, so that smoothed noise does not repeat.
-_APART = 2
+#: Picture pixels between the two changes of a product: further than demosaicing, denoising and coding spread noise.
+_APART_PX = 7
 #: Strips that the plane's width is summed into for the coarse map and for the top and bottom sides.
 _STRIPS = 340
 #: Rows and strips of the reduced plane in one coarse cell.
 _CELL_ROWS, _CELL_STRIPS = 16, 4
-#: Bands of rows for the left and right sides.
-_BANDS = 40
+#: Bands of rows for the left and right sides, at most, and rows of one band, at least.
+_BANDS, _BAND_ROWS = 40, 26
 #: Sides in the order of `ScreenSearch.corners`: side i goes from corner i to corner i + 1.
 _TOP, _RIGHT, _BOTTOM, _LEFT = range(4)
 #: Direction in which x or y grows from each side into the screen; and sign of its slope in depth for a positive roll.
@@ -85,6 +86,10 @@ class _Plane:
     width: int
     height: int
 
+    def apart(self, columns: int) -> int:
+        """Steps between the two changes of a product, where one step is some columns of the plane."""
+        return max(1, -(-_APART_PX // (columns * self.fx)))
+
 
 @dataclass(frozen=True, slots=True)
 class _Stripes:
@@ -92,10 +97,10 @@ class _Stripes:
 
     #: (R - lag, strips - 1) product of changes of neighbouring strips.
     products: Float32Array
-    #: Plane pixels of one strip.
+    #: Plane pixels of one strip, and strips between the changes of a product.
     strip: int
-    #: (rows, columns) of coarse cells.
-    cells: Float32Array
+    apart: int
+    #: (rows, columns) of coarse cells that have stripes.
     striped: BoolArray
     #: Energy that the whole picture has: row noise of the sensor.
     floor: float
@@ -215,7 +220,7 @@ def _wedge(light: Float32Array) -> BoolArray | None:
     import cv2
 
     mask = np.zeros(light.shape, np.uint8)
-    depth = max(int(0.025 * light.shape[1]), 2)
+    depth = max(int(0.05 * light.shape[1]), 2)
     for turns in range(4):
         dark = np.rot90(light, turns)[:, :depth] <= 0.008
         if not dark[:, 0].any():
@@ -254,20 +259,25 @@ def _find_stripes(plane: _Plane) -> _Stripes:
     n = width // strip
     light = _area(plane.light[:, : n * strip], n, height)
     wedge = None if plane.wedge is None else _area(plane.wedge[:, : n * strip].astype(np.float32), n, height) > 0
-    products = _products(light, 1, wedge)
+    apart = plane.apart(strip)
+    products = _products(light, apart, wedge)
     shape = (products.shape[1] // _CELL_STRIPS, products.shape[0] // _CELL_ROWS)
     inner = (slice(shape[1] * _CELL_ROWS), slice(shape[0] * _CELL_STRIPS))
     cells = _area(products[inner], *shape)
     smooth = cv2.blur(cells, (3, 3))
     spread = cv2.blur(_area(products[inner] ** 2, *shape), (3, 3))
-    floor = max(float(np.percentile(smooth, 5)), 0.0)
+    strong = float(np.percentile(smooth, 92))
+    # Row noise is alike along a row: what even the stillest tenth of a row of cells has, within its limits.
+    still = np.maximum(np.percentile(smooth, 10, axis=1), 0)
+    floor = min(float(np.percentile(still, 10)), 0.1 * strong)
+    smooth = smooth - np.minimum(still, 3 * floor)[:, None].astype(np.float32)
     noise = float(np.sqrt(max(np.percentile(spread, 10), 0) / 3))
-    threshold = max(0.02 * float(np.percentile(smooth, 92)), 1e-4)
-    significant = smooth > np.sqrt(spread / (_CELL_ROWS * _CELL_STRIPS))
+    significant = smooth > 1.5 * np.sqrt(spread / (_CELL_ROWS * _CELL_STRIPS))
+    threshold = max(0.02 * strong, floor, 1e-4)
     across = light[:, 1:] - light[:, :-1]
     upright = _area((across[_LAG:] * across[:-_LAG])[inner], *shape)
     striped = _large_areas((smooth > threshold) & significant, cells, upright)
-    return _Stripes(products, strip, cells, striped, floor, noise)
+    return _Stripes(products, strip, apart, striped, floor, noise)
 
 
 def _large_areas(mask: BoolArray, lying: Float32Array, upright: Float32Array) -> BoolArray:
@@ -276,9 +286,8 @@ def _large_areas(mask: BoolArray, lying: Float32Array, upright: Float32Array) ->
 
     _, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     count = np.bincount(label.ravel())
-    good = (count >= 12) & (
-        np.bincount(label.ravel(), lying.ravel()) > np.bincount(label.ravel(), upright.ravel(), count.size)
-    )
+    down, along = (np.bincount(label.ravel(), energy.ravel(), count.size) for energy in (lying, upright))
+    good = (count >= max(12, 0.03 * count[1:].max(initial=0))) & (down > along)
     good[0] = False
     return np.asarray(good[label], np.bool_)
 
@@ -290,7 +299,7 @@ def _coarse_sides(plane: _Plane, stripes: _Stripes) -> list[_Side] | None:
         return None
     step_y, step_x = _CELL_ROWS * plane.fy, _CELL_STRIPS * stripes.strip * plane.fx
     y = (np.arange(rows) + 0.5) * step_y + plane.fy * (_LAG - 1) / 2
-    x = (np.arange(columns) + 0.5) * step_x + plane.fx * stripes.strip / 2 - 0.5
+    x = (np.arange(columns) + 0.5) * step_x + plane.fx * stripes.strip * stripes.apart / 2 - 0.5
     onsets = [_cell_onsets(stripes.striped, x, y, side) for side in range(4)]
     lines = [
         _outermost_line(*o, 1.2 * step, 0.0, _MAX_SLOPE) for o, step in zip(onsets, (step_y, step_x) * 2, strict=True)
@@ -429,7 +438,7 @@ class _Window:
 
     t: FloatArray
     #: (K, N) index of each place across the side.
-    index: NDArray[np.int64]
+    index: NDArray[Any]
     #: Places before the guess.
     outer: int
     origin: float
@@ -445,14 +454,18 @@ def _window(
     guess: list[_Side], side: int, t: FloatArray, origin: float, step: float, out: float, inward: float, margin: float
 ) -> tuple[_Window, BoolArray]:
     """The window of a side and the (K,) segments of `t` that lie between the neighbouring sides."""
-    before, after = (guess[_LEFT], guess[_RIGHT]) if side in (_TOP, _BOTTOM) else (guess[_TOP], guess[_BOTTOM])
-    middle = guess[side].at(np.array(t.mean()))
-    between = (t > before.at(middle) + margin) & (t < after.at(middle) - margin)
-    sign = _INWARD[side]
+    between = _between(guess, side, t, margin)
     centre = np.round((guess[side].at(t[between]) - origin) / step).astype(np.int64)
     outer = max(int(out / step), 2)
-    index = centre[:, None] + sign * np.arange(-outer, max(int(inward / step), 8))
-    return _Window(t[between], index, outer, origin, step, sign), between
+    index = centre[:, None] + _INWARD[side] * np.arange(-outer, max(int(inward / step), 8))
+    return _Window(t[between], index, outer, origin, step, _INWARD[side]), between
+
+
+def _between(guess: list[_Side], side: int, t: FloatArray, margin: float) -> BoolArray:
+    """(K,) places along a side that lie between the neighbouring sides, by a margin."""
+    before, after = (guess[_LEFT], guess[_RIGHT]) if side in (_TOP, _BOTTOM) else (guess[_TOP], guess[_BOTTOM])
+    middle = guess[side].at(np.array(t.mean()))
+    return np.asarray((t > before.at(middle) + margin) & (t < after.at(middle) - margin), np.bool_)
 
 
 def _fit_side(
@@ -465,7 +478,7 @@ def _fit_side(
     else:
         onsets = _band_onsets(plane, stripes, guess, side, out, inward, margin)
     sign = _INWARD[side]
-    tolerance = max(1.5 * onsets.step, 0.0012 * size)
+    tolerance = max(1.5 * onsets.step, (0.0012 if side in (_TOP, _BOTTOM) else 0.002) * size)
     # Where the picture ends before the screen does, a line must pass well outside.
     depth = sign * onsets.place - np.where(onsets.usable, 0, 3 * tolerance)
     weight = onsets.usable * (_row_trust(onsets) if side in (_TOP, _BOTTOM) else 1.0)
@@ -509,7 +522,7 @@ def _strip_onsets(
     import cv2
 
     rows, n = stripes.products.shape
-    t = (np.arange(n) + 1.0) * (stripes.strip * plane.fx) - 0.5
+    t = (np.arange(n) + (1 + stripes.apart) / 2) * (stripes.strip * plane.fx) - 0.5
     # A change spans the lag; from outside, the lit row comes last at the top and first at the bottom.
     origin = plane.fy * ((_LAG - 0.5) if side == _TOP else 0.5)
     window, between = _window(guess, side, t, origin, plane.fy, out, inward, margin)
@@ -522,7 +535,7 @@ def _strip_onsets(
         valid, smooth[np.clip(window.index, first, last - 1) - first, np.flatnonzero(between)[:, None]], 0
     )
     plateau = np.percentile(energy[:, window.outer :], 90, axis=1)
-    level = np.maximum(np.maximum(8 * stripes.noise, 0.06 * plateau), 2e-5)
+    level = np.maximum(max(8 * stripes.noise, 16 * stripes.floor, 2e-5), 0.06 * plateau)
     active = energy > level[:, None]
     depth = active.argmax(axis=1)
     place = window.place(depth.astype(np.float64))
@@ -543,34 +556,41 @@ def _band_onsets(
     plane: _Plane, stripes: _Stripes, guess: list[_Side], side: int, out: float, inward: float, margin: float
 ) -> _Onsets:
     """Left and right: where the energy of bands of rows begins and stays."""
-    rows = (plane.light.shape[0] - _LAG) // _BANDS
-    t = ((np.arange(_BANDS) + 0.5) * rows + (_LAG - 1) / 2) * float(plane.fy)
+    n_rows, apart = plane.light.shape[0] - _LAG, plane.apart(1)
+    n_bands = int(np.clip(n_rows // _BAND_ROWS, 1, _BANDS))
+    rows = n_rows // n_bands
+    y = (np.arange(rows * n_bands) + (_LAG - 1) / 2) * float(plane.fy)
     # A product needs light on both its columns: the outermost one says where light begins.
-    origin = -0.5 if side == _LEFT else plane.fx * (_APART + 1) - 0.5
-    window, between = _window(guess, side, t, origin, plane.fx, out, inward, margin)
-    n_columns = plane.light.shape[1] - _APART
-    if not window.t.size or window.index.max() < 0 or window.index.min() >= n_columns:
+    origin = -0.5 if side == _LEFT else plane.fx * (apart + 1) - 0.5
+    window, between = _window(guess, side, y, origin, plane.fx, out, inward, -np.inf)
+    n_columns = plane.light.shape[1] - apart
+    if window.index.max() < 0 or window.index.min() >= n_columns:
         return _no_onsets(plane.fx)
     first, last = _span(window.index, n_columns)
-    part = slice(first, last + _APART)
-    wedge = None if plane.wedge is None else plane.wedge[:, part]
-    product = _products(plane.light[:, part], _APART, wedge)[: rows * _BANDS]
-    mean = _area(product, last - first, _BANDS)[between] - np.float32(stripes.floor)
-    spread = _area(product**2, last - first, _BANDS)[between] / np.float32(rows)
+    part = slice(first, last + apart)
+    product = _products(plane.light[:, part], apart, None if plane.wedge is None else plane.wedge[:, part])
+    # Every row is taken along the slanted side, then bands of rows are summed.
     valid = (window.index >= first) & (window.index < last)
     column = np.clip(window.index, first, last - 1) - first
-    band = np.arange(window.t.size)[:, None]
-    valid &= spread[band, column] > 0
-    energy, variance = np.where(valid, mean[band, column], 0), np.where(valid, spread[band, column], 0)
-    return _lasting_steps(energy, variance, valid, window)
+    values = np.where(valid, np.take_along_axis(product[: y.size], column, axis=1), 0).reshape(n_bands, rows, -1)
+    energy, spread = values.mean(axis=1, dtype=np.float64), (values**2).mean(axis=1, dtype=np.float64)
+    t = y.reshape(n_bands, rows).mean(axis=1)
+    between = _between(guess, side, t, margin)
+    bands = _Window(
+        t, window.index.reshape(n_bands, rows, -1).mean(axis=1), window.outer, origin, plane.fx, window.sign
+    )
+    return _lasting_steps(energy, spread / rows, spread > 0, bands, between)
 
 
-def _lasting_steps(energy: FloatArray, variance: FloatArray, valid: BoolArray, window: _Window) -> _Onsets:
+def _lasting_steps(
+    energy: FloatArray, variance: FloatArray, valid: BoolArray, window: _Window, between: BoolArray
+) -> _Onsets:
     """The first step of each segment's energy that is significant over some places."""
     box = 5
     n = energy.shape[1]
-    ahead, ahead_variance = _ahead(energy, box), _ahead(variance, box)
     plateau = np.percentile(energy[:, window.outer :], 90, axis=1)
+    energy = energy - _row_noise(energy[:, : window.outer], 0.3 * plateau)[:, None]
+    ahead, ahead_variance = _ahead(energy, box), _ahead(variance, box)
     least = np.maximum(0.05 * plateau, 2e-5)[:, None]
     rising = (ahead[:, :n] > least) & (ahead[:, :n] > 4.5 * np.sqrt(np.maximum(ahead_variance[:, :n], 0) / box))
     k, start = np.arange(len(energy)), rising.argmax(axis=1)
@@ -582,7 +602,12 @@ def _lasting_steps(energy: FloatArray, variance: FloatArray, valid: BoolArray, w
     covered = np.clip(energy[k, depth] / scale, 0, 1) + np.clip(energy[k, np.maximum(depth - 1, 0)] / scale, 0, 1)
     place = window.place(depth + 1 - covered)
     usable = seen & (depth > valid.argmax(axis=1) + 1)
-    return _Onsets(window.t, place, seen, usable, window.step)
+    return _Onsets(window.t[between], place[between], seen[between], usable[between], window.step)
+
+
+def _row_noise(outside: FloatArray, limit: FloatArray) -> FloatArray:
+    """(K,) energy of the rows themselves: the median of what lies well outside, up to a limit."""
+    return np.clip(np.median(outside[:, : max(outside.shape[1] // 2, 2)], axis=1), 0, np.maximum(limit, 0))
 
 
 def _ahead(values: FloatArray, box: int) -> FloatArray:
