@@ -23,10 +23,11 @@ log = logging.getLogger(__name__)
 _RETRIES = 3
 #: Tasks in the scheduler's hands at a time: enough for a large cluster, few enough that results do not pile up.
 _IN_FLIGHT = 1024
-_CONNECT_S = 10.0
 
 
-def decode_on_cluster(sources: Sequence[Source], decoder: Decoder, address: str) -> Iterator[Decoded]:
+def decode_on_cluster(
+    sources: Sequence[Source], decoder: Decoder, address: str, connect_s: float = 10.0
+) -> Iterator[Decoded]:
     """Decode sources on a Dask cluster; results as from `rxcli.batch.decode_here`, in the same order.
 
     The workers must see the sources under the same absolute paths, and have `vlc-rx` installed.
@@ -35,12 +36,13 @@ def decode_on_cluster(sources: Sequence[Source], decoder: Decoder, address: str)
         sources: what to decode.
         decoder: how; must be picklable.
         address: the scheduler's, such as `tcp://host:8786`.
+        connect_s: how long to wait for the scheduler, seconds.
 
     Raises:
         UsageError: the extra is missing, or no scheduler answers.
         InputError: the scheduler went away; what was taken till then is complete.
     """
-    with _connect(address) as client:
+    with _connect(address, connect_s) as client:
         waiting = iter(sources)
         flying = deque((source, _submit(client, decoder, source)) for source in islice(waiting, _IN_FLIGHT))
         while flying:
@@ -49,13 +51,13 @@ def decode_on_cluster(sources: Sequence[Source], decoder: Decoder, address: str)
             flying.extend((following, _submit(client, decoder, following)) for following in islice(waiting, 1))
 
 
-def _connect(address: str) -> Client:
+def _connect(address: str, connect_s: float) -> Client:
     try:
         from distributed import Client
     except ImportError:
         raise UsageError("--cluster needs the package distributed", "pip install 'vlc-rx[cluster]'") from None
     try:
-        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+        client = Client(address, timeout=connect_s, set_as_default=False)
     except (OSError, ValueError) as error:
         raise UsageError(
             f"--cluster: no Dask scheduler answers at {address!r} ({type(error).__name__})",

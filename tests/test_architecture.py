@@ -1,0 +1,153 @@
+"""The directions in which modules may import one another, held by walking the source."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import rxcli
+
+ROOT = Path(rxcli.__file__).parent
+#: What everything may import.
+BASE = {"rxcli", "rxcli.errors", "rxcli.resources"}
+DATA = BASE | {"rxcli.types", "rxcli.protocol", "rxcli.profiles"}
+PIPELINE_STAGES = ("ingest", "find_screen", "geometry", "sampling", "clock", "channel", "denoise", "detect", "assemble")
+#: Too heavy to be loaded by a module that does not need it at once (milliseconds each on import: 70 to 1000).
+HEAVY = {"cv2", "rawpy", "av", "onnxruntime", "matplotlib", "scipy", "skimage", "simplejpeg", "tifffile"}
+HEAVY |= {"distributed", "dask", "pyarrow", "torch", "onnx", "lensfunpy", "pillow_heif", "tqdm"}
+
+
+def module_name(path: Path) -> str:
+    parts = ("rxcli", *path.relative_to(ROOT).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path): ast.parse(path.read_text(encoding="utf-8")) for path in ROOT.rglob("*.py")}
+
+
+def imports(tree: ast.AST) -> set[str]:
+    """Modules that `tree` imports, wherever in it: `from rxcli import x` counts as rxcli.x where that is a module."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            assert node.module is not None
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= (names & MODULES.keys()) or {node.module}
+    return found
+
+
+def imports_at_load(tree: ast.Module) -> set[str]:
+    """Modules that are imported when the module is: not inside functions, not for type checkers alone."""
+    found: set[str] = set()
+    for node in tree.body:
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            found |= imports(ast.Module([node], []))
+        elif isinstance(node, ast.ClassDef):
+            found |= imports_at_load(ast.Module(node.body, []))
+        elif isinstance(node, ast.Try):
+            found |= imports_at_load(ast.Module([*node.body, *node.orelse], []))
+    return found
+
+
+def own(names: set[str]) -> set[str]:
+    return {name for name in names if name.split(".")[0] == "rxcli"}
+
+
+def part_of(name: str) -> str:
+    """The part of the house that a module belongs to: its first name below rxcli."""
+    return name.split(".")[1] if "." in name else ""
+
+
+def modules_of(part: str) -> list[str]:
+    return sorted(name for name in MODULES if part_of(name) == part)
+
+
+def test_the_walk_sees_imports_of_every_form() -> None:
+    tree = ast.parse(
+        "import rxcli.clock\nfrom rxcli import detect\ndef f():\n    from rxcli.types import Frame\n    import cv2"
+    )
+    known = {"rxcli.clock", "rxcli.types", "cv2"} | ({"rxcli.detect"} if "rxcli.detect" in MODULES else {"rxcli"})
+    assert imports(tree) == known
+    assert imports_at_load(tree) == known - {"rxcli.types", "cv2"}
+
+
+@pytest.mark.parametrize("part", PIPELINE_STAGES)
+def test_stages_import_the_data_model_and_never_each_other(part: str) -> None:
+    for name in modules_of(part):
+        allowed = DATA | {other for other in MODULES if part_of(other) == part}
+        assert own(imports(MODULES[name])) <= allowed, name
+
+
+@pytest.mark.parametrize("name", ["rxcli.protocol", "rxcli.types", "rxcli.errors", "rxcli.resources"])
+def test_the_base_stands_on_nothing(name: str) -> None:
+    assert own(imports(MODULES[name])) <= BASE - {name}
+
+
+def test_protocol_is_pure() -> None:
+    assert {found.split(".")[0] for found in imports(MODULES["rxcli.protocol"])} <= {
+        *("__future__", "collections", "functools", "itertools", "math", "typing", "numpy", "rxcli")
+    }
+
+
+def test_the_simulator_shares_only_protocol_and_profiles_with_the_receiver() -> None:
+    """A wrong equation shared by both would cancel in every round trip."""
+    allowed = BASE | {"rxcli.protocol", "rxcli.profiles"}
+    for name in modules_of("simulate"):
+        found = {other for other in own(imports(MODULES[name])) if part_of(other) != "simulate"}
+        assert found <= allowed, name
+
+
+def test_only_training_imports_torch() -> None:
+    for name, tree in MODULES.items():
+        if part_of(name) != "training":
+            assert not {found for found in imports(tree) if found.split(".")[0] == "torch"}, name
+
+
+def test_nothing_below_imports_the_command_line() -> None:
+    for name, tree in MODULES.items():
+        if part_of(name) != "cli":
+            found = {part_of(other) for other in own(imports(tree))}
+            assert "cli" not in found, name
+            assert "click" not in imports(tree), name
+
+
+@pytest.mark.parametrize("part", ["report", "truth"])
+def test_reports_know_results_only(part: str) -> None:
+    assert own(imports(MODULES[f"rxcli.{part}"])) <= DATA
+
+
+def test_only_those_above_it_call_the_pipeline() -> None:
+    callers = {part_of(name) for name, tree in MODULES.items() if "rxcli.pipeline" in imports(tree)}
+    assert callers <= {"cli", "benchmark", "batch", "training", "pipeline"}
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_heavy_libraries_are_imported_where_they_are_used(name: str) -> None:
+    if part_of(name) == "training":
+        pytest.skip("training is loaded by `vlc-rx train` alone")
+    found = {other.split(".")[0] for other in imports_at_load(MODULES[name])} & HEAVY
+    readers = {"rxcli.ingest.jpeg", "rxcli.ingest.raw", "rxcli.ingest.video"}  # loaded when a file of their kind comes
+    assert not found or name in readers, found
+
+
+@pytest.mark.parametrize("name", [name for name in sorted(MODULES) if part_of(name) == "cli"])
+def test_commands_load_quickly(name: str) -> None:
+    """numpy, and what brings it, would more than double the time of `vlc-rx --help`."""
+    found = imports_at_load(MODULES[name])
+    assert not {other for other in found if other.split(".")[0] == "numpy"}
+    assert own(found) <= {"rxcli", "rxcli.errors", *modules_of("cli")}
+
+
+def test_there_is_no_import_cycle() -> None:
+    graph = {name: own(imports_at_load(tree)) & MODULES.keys() for name, tree in MODULES.items()}
+    remaining = dict(graph)
+    while remaining:
+        free = [name for name, needs in remaining.items() if not needs & remaining.keys() - {name}]
+        assert free, f"cycle among {sorted(remaining)}"
+        for name in free:
+            del remaining[name]
