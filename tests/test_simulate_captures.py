@@ -14,6 +14,7 @@ from click.testing import CliRunner
 
 from rxcli.cli.simulate import simulate
 from rxcli.errors import ReceiverError, UsageError
+from rxcli.profiles import CameraProfile, load_profile
 from rxcli.protocol import codebook
 from rxcli.simulate.capture import prepare, simulate_frame
 from rxcli.simulate.scenes import PRESETS, Scene, preset
@@ -242,3 +243,44 @@ def test_scenes_refuse_nonsense(small: Scene) -> None:
         replace(small, exposure_s=0)
     with pytest.raises(UsageError, match="no preset 'x'"):
         preset("x")
+
+
+def test_sample_frames_are_what_their_readme_makes(tmp_path: Path) -> None:
+    import shlex
+
+    import rawpy
+
+    from rxcli.resources import data_dir
+
+    samples = data_dir("sample_frames")
+    commands = (samples / "README.md").read_text().replace("\\\n", " ").splitlines()
+    line = next(line for line in commands if line.startswith("vlc-rx simulate") and ".dng" in line)
+    args = shlex.split(line)[2:]
+    profile = args.index("--camera-profile") + 1
+    name, toml = args[0], args[profile]
+    args[0], args[profile] = str(tmp_path / name), str(tmp_path / toml)
+    result = run(*args)
+    assert result.exit_code == 0, result.output
+    with rawpy.imread(str(samples / name)) as kept, rawpy.imread(str(tmp_path / name)) as made:
+        # Another processor may round an exponential otherwise, and with it a few pixels.
+        assert (kept.raw_image_visible == made.raw_image_visible).mean() > 0.99
+    truth = name.replace(".dng", ".truth.json")
+    kept_truth, made_truth = (json.loads((folder / truth).read_text()) for folder in (samples, tmp_path))
+    assert made_truth["payload"] == kept_truth["payload"]
+    assert made_truth["frames"][0]["bursts"] == kept_truth["frames"][0]["bursts"]
+    assert (tmp_path / toml).read_text() == (samples / toml).read_text()
+
+
+def test_camera_profile_fits_the_capture(tmp_path: Path) -> None:
+    profile = tmp_path / "camera.toml"
+    result = run(str(tmp_path / "a.jpg"), *SMALL, "--preset", "phone-corrected", "--camera-profile", str(profile))
+    assert result.exit_code == 0, result.output
+    camera = load_profile(str(profile), CameraProfile)
+    truth = json.loads((tmp_path / "a.truth.json").read_text())["camera"]
+    assert camera.matches("Example", "Phone 12MP")
+    mode = camera.mode_for(truth["width"], truth["height"])
+    assert mode is not None
+    assert mode.line_delay_s == truth["line_delay_s"]
+    assert camera.lens is not None
+    assert camera.lens.distortion_already_corrected
+    assert [list(row) for row in camera.lens.camera_matrix] == truth["camera_matrix"]

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.profiles import ScreenProfile
 from rxcli.simulate.bound import Oracle, OracleRecorder
 from rxcli.simulate.camera import Exposure, take_picture
 from rxcli.simulate.isp import develop
 from rxcli.simulate.optics import Pose, View
-from rxcli.simulate.pictures import load_picture
+from rxcli.simulate.pictures import load_picture, picture_names
 from rxcli.simulate.scenes import Scene
-from rxcli.simulate.transmitter import Drive, Link, drive_screen
+from rxcli.simulate.transmitter import Dimming, Drive, Link, Weights, drive_screen
 from rxcli.simulate.truth import build_truth
 
 FloatArray = NDArray[np.float64]
@@ -53,7 +54,7 @@ class Capture:
     @cached_property
     def pixels(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """(height, width) what a receiver is given: luma of the JPEG, or the mosaic of a raw scene."""
-        if self.scene.output == "raw" and self.raw.ndim == 2:
+        if self.is_mosaic:
             return self.raw
         import simplejpeg
 
@@ -62,7 +63,7 @@ class Capture:
     @property
     def is_mosaic(self) -> bool:
         """Whether `pixels` is the sensor's mosaic."""
-        return self.scene.output == "raw" and self.raw.ndim == 2
+        return self.scene.is_mosaic
 
     @cached_property
     def truth(self) -> dict[str, Any]:
@@ -150,13 +151,23 @@ def prepare(scene: Scene, rng: np.random.Generator | int) -> Take:
     """
     rng = np.random.default_rng(rng)
     link_seed, noise_seed = (int(s) for s in rng.integers(0, 2**62, 2))
-    picture = scene.picture
-    if isinstance(picture, str):
-        picture = load_picture(picture, scene.screen.width_px, scene.screen.height_px)
-    drive = drive_screen(scene.screen, picture, scene.w, scene.dimming)
+    drive = _drive(scene)
     link = Link(scene.screen, drive.weights, link_seed, scene.payload)
     start = rng.uniform(_LEAD_SLOTS, link.burst_slots) if scene.start_slot is None else scene.start_slot
     return Take(scene, drive, link, noise_seed, float(start), _delays(scene, rng))
+
+
+def _drive(scene: Scene) -> Drive:
+    if not isinstance(scene.picture, str):
+        return drive_screen(scene.screen, scene.picture, scene.w, scene.dimming)
+    drive = _drive_named if scene.picture in picture_names() else _drive_named.__wrapped__
+    return drive(scene.screen, scene.picture, scene.w, scene.dimming)
+
+
+@lru_cache(maxsize=8)
+def _drive_named(screen: ScreenProfile, name: str, weights: Weights, dimming: Dimming) -> Drive:
+    """Kept for sweeps, which show the same few pictures over and over."""
+    return drive_screen(screen, load_picture(name, screen.width_px, screen.height_px), weights, dimming)
 
 
 def _delays(scene: Scene, rng: np.random.Generator) -> FloatArray:

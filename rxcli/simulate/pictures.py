@@ -65,18 +65,15 @@ def _photo_path(name: str) -> Path:
 
 
 def _read(path: Path) -> NDArray[np.uint8]:
-    import cv2
+    from PIL import Image, ImageOps, UnidentifiedImageError
 
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise UsageError(
-            f"{path}: no such picture ({error.strerror})", f"name a file or one of: {', '.join(picture_names())}"
-        ) from None
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if picture is None:
-        raise InputError(f"{path}: not a picture that can be read", "give a PNG or JPEG")
-    return np.asarray(picture[..., ::-1], np.uint8)
+        with Image.open(path) as picture:
+            return np.asarray(ImageOps.exif_transpose(picture).convert("RGB"), np.uint8)
+    except FileNotFoundError:
+        raise UsageError(f"{path}: no such picture", f"name a file or one of: {', '.join(picture_names())}") from None
+    except (UnidentifiedImageError, OSError, ValueError) as error:
+        raise InputError(f"{path}: not a picture that can be read ({error})", "give a PNG or JPEG") from None
 
 
 def _fill(picture: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

@@ -73,6 +73,11 @@ class Scene:
             raise UsageError(f"n_frames must be at least 1 (got {self.n_frames})", "ask for one frame or more")
 
     @property
+    def is_mosaic(self) -> bool:
+        """Whether a frame in memory is the sensor's mosaic; a sensor without filter array is always developed."""
+        return self.output == "raw" and self.sensor.cfa != "rgb"
+
+    @property
     def rows_per_slot(self) -> float:
         """Sensor rows read during one slot."""
         return 1 / (self.sensor.line_delay_s * self.screen.slot_rate_hz)

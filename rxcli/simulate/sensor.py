@@ -29,7 +29,7 @@ PATTERNS: dict[str, NDArray[np.uint8]] = {
 
 #: Below this mean, shot noise is drawn from the Poisson distribution itself; above, a Gaussian differs from it by less
 #: than the read noise.
-POISSON_BELOW_E = 24.0
+POISSON_BELOW_E = 16.0
 #: Side of the tile of pixel gains that is repeated over the sensor; prime, so that it meets no other period.
 _GAIN_TILE = 1021
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,21 +49,21 @@ def light_spread(positions: FloatArray, n_segments: int, sigma: float) -> FloatA
     return np.asarray(np.exp(-0.5 * (offset / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)))
 
 
-def dimming_levels(picture: FloatArray, rows: int, columns: int) -> FloatArray:
+def dimming_levels(picture: NDArray[Any], rows: int, columns: int) -> NDArray[Any]:
     """Local dimming by the "max" rule: the brightest subpixel under each segment.
 
     Args:
-        picture: (height, width, 3) light of the picture, 0..1.
+        picture: (height, width, 3) grey levels or light.
         rows: segments along the height.
         columns: segments across.
 
     Returns:
-        (rows, columns) float64, average light of each segment, 0..1.
+        (rows, columns), of the picture's type and unit.
     """
-    brightest = picture.max(axis=2)
-    tops = np.arange(rows) * brightest.shape[0] // rows
-    lefts = np.arange(columns) * brightest.shape[1] // columns
-    return np.asarray(np.maximum.reduceat(np.maximum.reduceat(brightest, tops, axis=0), lefts, axis=1), np.float64)
+    tops = np.arange(rows) * picture.shape[0] // rows
+    lefts = np.arange(columns) * picture.shape[1] // columns
+    by_rows = np.maximum.reduceat(picture, tops, axis=0)
+    return np.asarray(np.maximum.reduceat(by_rows, lefts, axis=1).max(axis=2))
 
 
 @dataclass(frozen=True)
@@ -126,12 +126,13 @@ def drive_screen(
         weights: see `choose_weights`.
         dimming: "max", or "none" for a backlight that is fully on everywhere.
     """
-    light = (picture / 255.0) ** PANEL_GAMMA
+    table = (np.arange(256) / 255.0) ** PANEL_GAMMA
     shape = (screen.segment_rows, screen.columns)
-    levels = dimming_levels(light, *shape) if dimming == "max" else np.ones(shape)
+    # The brightest grey level is the brightest light: the picture itself can be searched.
+    levels = table[dimming_levels(picture, *shape)] if dimming == "max" else np.ones(shape)
     backlight = backlight_average(levels, screen, picture.shape[0], picture.shape[1])
-    needed = light / np.maximum(backlight, 1e-6)[..., None]
-    grey = np.rint(255 * np.clip(needed, 0, 1) ** (1 / PANEL_GAMMA)).astype(np.uint8)
+    needed = table.astype(np.float32)[picture] / np.maximum(backlight, 1e-6)[..., None].astype(np.float32)
+    grey = np.rint(255 * np.clip(needed, 0, 1) ** np.float32(1 / PANEL_GAMMA)).astype(np.uint8)
     return Drive(screen, grey, levels, choose_weights(weights, levels))
 
 

@@ -57,7 +57,7 @@ def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[s
         "frames": frames,
         "payload": {str(burst): first.link.payload_hex(burst) for burst in bursts},
         "orientation": scene.orientation,
-        "tone_curve": scene.isp.tone if scene.output == "developed" else "linear",
+        "tone_curve": "linear" if scene.is_mosaic else scene.isp.tone,
         "slot_rate_error_ppm": scene.slot_rate_error_ppm,
         "column_delay_slots": first.delays.tolist(),
     }
@@ -65,7 +65,7 @@ def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[s
 
 def build_camera_profile(scene: Scene, exposure: Exposure) -> CameraProfile:
     """A camera profile that fits the captures of a scene: what a calibration would find, without its errors."""
-    sensor, developed = scene.sensor, scene.output == "developed"
+    sensor = scene.sensor
     top, middle, bottom = (tuple(row) for row in exposure.view.camera_matrix.tolist())
     mode = ReadoutMode(
         name="simulated",
@@ -80,7 +80,7 @@ def build_camera_profile(scene: Scene, exposure: Exposure) -> CameraProfile:
         height=sensor.height,
         camera_matrix=(top, middle, bottom),
         dist_coeffs=scene.lens.distortion,
-        distortion_already_corrected=scene.isp.correct_distortion and developed,
+        distortion_already_corrected=scene.isp.correct_distortion and not scene.is_mosaic,
     )
     return CameraProfile(
         format=1,
@@ -104,7 +104,7 @@ def _camera_truth(scene: Scene, exposure: Exposure) -> dict[str, Any]:
         "frame_rate_hz": scene.frame_rate_hz,
         "camera_matrix": exposure.view.camera_matrix.tolist(),
         "dist_coeffs": exposure.view.coefficients.tolist(),
-        "distortion_already_corrected": scene.isp.correct_distortion and scene.output == "developed",
+        "distortion_already_corrected": scene.isp.correct_distortion and not scene.is_mosaic,
     }
 
 
