@@ -88,7 +88,7 @@ def test_a_run_is_complete_and_in_order_though_a_worker_is_killed(tmp_path: Path
 
 def test_a_scheduler_that_is_not_there(tmp_path: Path) -> None:
     sources = write_orders(tmp_path)
-    with pytest.raises(UsageError, match="no Dask scheduler answers at 'tcp://127.0.0.1:1'"):
+    with pytest.raises(UsageError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:1'"):
         next(decode_on_cluster(sources, fake_decoder(), "tcp://127.0.0.1:1", connect_s=0.5))
     with pytest.raises(UsageError, match="no Dask scheduler answers at 'nonsense://x'"):
         next(decode_on_cluster(sources, fake_decoder(), "nonsense://x", connect_s=0.5))
