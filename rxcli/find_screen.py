@@ -46,6 +46,8 @@ _TURN = (1, 1, -1, -1)
 _SIDE_NAMES = ("top", "right", "bottom", "left")
 #: Least share of a side's segments that must agree on a line.
 _MIN_SUPPORT = 0.06
+#: Least score of a screen; photographs without one stay below 0.15.
+_MIN_SCORE = 0.2
 #: A segment that begins outside a line counts this often against it, so that the outermost line wins with a sixth.
 _OUTSIDE_COST = 6.0
 #: Strips that begin on one and the same row may show a slot's end; together they count as this share of the side.
@@ -265,7 +267,7 @@ def _find_stripes(plane: _Plane) -> _Stripes:
     inner = (slice(shape[1] * _CELL_ROWS), slice(shape[0] * _CELL_STRIPS))
     cells = _area(products[inner], *shape)
     smooth = cv2.blur(cells, (3, 3))
-    spread = cv2.blur(_area(products[inner] ** 2, *shape), (3, 3))
+    spread = np.maximum(cv2.blur(_area(products[inner] ** 2, *shape), (3, 3)), 0)
     strong = float(np.percentile(smooth, 92))
     # Row noise is alike along a row: what even the stillest tenth of a row of cells has, within its limits.
     still = np.maximum(np.percentile(smooth, 10, axis=1), 0)
@@ -298,8 +300,8 @@ def _coarse_sides(plane: _Plane, stripes: _Stripes) -> list[_Side] | None:
     if stripes.striped.mean() < 0.02:
         return None
     step_y, step_x = _CELL_ROWS * plane.fy, _CELL_STRIPS * stripes.strip * plane.fx
-    y = (np.arange(rows) + 0.5) * step_y + plane.fy * (_LAG - 1) / 2
-    x = (np.arange(columns) + 0.5) * step_x + plane.fx * stripes.strip * stripes.apart / 2 - 0.5
+    y = (np.arange(rows, dtype=np.float64) + 0.5) * step_y + plane.fy * (_LAG - 1) / 2
+    x = (np.arange(columns, dtype=np.float64) + 0.5) * step_x + plane.fx * stripes.strip * stripes.apart / 2 - 0.5
     onsets = [_cell_onsets(stripes.striped, x, y, side) for side in range(4)]
     lines = [
         _outermost_line(*o, 1.2 * step, 0.0, _MAX_SLOPE) for o, step in zip(onsets, (step_y, step_x) * 2, strict=True)
@@ -326,8 +328,9 @@ def _cell_onsets(
     mask = mask[:, :: _INWARD[side]]
     following = np.pad(mask, ((0, 0), (0, 3))).astype(np.int64)
     lasting = mask & (following[:, 1:-2] + following[:, 2:-1] + following[:, 3:] >= 2)
-    seen = lasting.any(axis=1)
-    depth = _INWARD[side] * place[:: _INWARD[side]][lasting.argmax(axis=1)] - (place[1] - place[0]) / 2
+    seen: BoolArray = np.any(lasting, axis=1)
+    first = place[:: _INWARD[side]][lasting.argmax(axis=1)]
+    depth: FloatArray = _INWARD[side] * first - (place[1] - place[0]) / 2
     return t, depth, seen.astype(np.float64), seen
 
 
@@ -404,6 +407,8 @@ def _refine(
         return ScreenSearch(None, 0.0, "the stripes in the picture do not have the shape of a screen")
     sides = [_fit_side(plane, stripes, guess, side, out, inward, size) for side in range(4)]
     missing = [side for side in range(4) if sides[side].support < _MIN_SUPPORT]
+    if len(missing) > 2:
+        return ScreenSearch(None, 0.0, "what looks like stripes in the picture has no clear outline of a screen")
     if len(missing) > 1:
         names = " and ".join(_SIDE_NAMES[side] for side in missing)
         return ScreenSearch(None, 0.0, f"stripes were found, but the {names} sides of the screen do not show")
@@ -415,6 +420,8 @@ def _refine(
     if trouble:
         return ScreenSearch(None, 0.0, trouble)
     score = float(np.mean([side.support for side in sides])) ** 0.5 * _striped_share(stripes, corners, plane)
+    if score < _MIN_SCORE:
+        return ScreenSearch(None, score, "what looks like stripes in the picture has no clear outline of a screen")
     return ScreenSearch(np.roll(corners, -start, axis=0), min(score, 1.0), "", tuple(_SIDE_NAMES[s] for s in missing))
 
 
@@ -480,8 +487,10 @@ def _fit_side(
     sign = _INWARD[side]
     tolerance = max(1.5 * onsets.step, (0.0012 if side in (_TOP, _BOTTOM) else 0.002) * size)
     # Where the picture ends before the screen does, a line must pass well outside.
-    depth = sign * onsets.place - np.where(onsets.usable, 0, 3 * tolerance)
-    weight = onsets.usable * (_row_trust(onsets) if side in (_TOP, _BOTTOM) else 1.0)
+    depth: FloatArray = sign * onsets.place - np.where(onsets.usable, 0, 3 * tolerance)
+    weight: FloatArray = onsets.usable.astype(np.float64)
+    if side in (_TOP, _BOTTOM):
+        weight *= _row_trust(onsets)
     line = _outermost_line(onsets.t, depth, weight, onsets.seen, tolerance, sign * guess[side].slope, _MAX_SKEW)
     cut = onsets.seen & ~onsets.usable
     if line is None or line[2] < cut.mean():
@@ -494,7 +503,7 @@ def _row_trust(onsets: _Onsets) -> FloatArray:
     row = np.round(onsets.place / onsets.step - 0.25).astype(np.int64)
     row -= row.min(initial=0)
     count = np.convolve(np.bincount(row[onsets.usable], minlength=int(row.max(initial=0)) + 1), np.ones(3), "same")
-    return np.minimum(1.0, _ROW_TRUST * row.size / np.maximum(count[row], 1))
+    return np.asarray(np.minimum(1.0, _ROW_TRUST * row.size / np.maximum(count[row], 1)), np.float64)
 
 
 def _bend(
@@ -522,7 +531,7 @@ def _strip_onsets(
     import cv2
 
     rows, n = stripes.products.shape
-    t = (np.arange(n) + (1 + stripes.apart) / 2) * (stripes.strip * plane.fx) - 0.5
+    t = (np.arange(n, dtype=np.float64) + (1 + stripes.apart) / 2) * (stripes.strip * plane.fx) - 0.5
     # A change spans the lag; from outside, the lit row comes last at the top and first at the bottom.
     origin = plane.fy * ((_LAG - 0.5) if side == _TOP else 0.5)
     window, between = _window(guess, side, t, origin, plane.fy, out, inward, margin)
