@@ -264,16 +264,14 @@ def calibrate_shutter(
     frequencies_hz: Sequence[float],
     axis: Axis | None = None,
     exif_exposure_s: float | None = None,
-    linear: bool = False,
 ) -> ShutterCalibration:
     """Line delay from pictures (or frames of a clip) of lamps of known frequency.
 
     Args:
-        pictures: (height, width) each, all of one size and readout mode.
+        pictures: (height, width) each, all of one size and readout mode; best proportional to light, for the exposure.
         frequencies_hz: what the lamps blink at; more than one where lamps differ.
         axis: the readout axis, None to find it.
         exif_exposure_s: exposure as the file says, which decides between exposure and flash length.
-        linear: whether the values are proportional to light.
 
     Raises:
         ReceiverError: no stripes, or too few periods.
@@ -285,7 +283,7 @@ def calibrate_shutter(
         raise ReceiverError(f"no stripes of a blinking lamp in {_pictures(len(pictures))}", _HINT)
     line_delay = _common_line_delay([s for _, s in seen], frequencies_hz)
     lamps = [_reading(i, s, frequencies_hz, line_delay) for i, s in seen]
-    return _combine(lamps, pictures, axis, frequencies_hz, exif_exposure_s, linear)
+    return _combine(lamps, pictures, axis, frequencies_hz, exif_exposure_s)
 
 
 def _pictures(n: int) -> str:
@@ -355,7 +353,6 @@ def _combine(
     axis: Axis,
     frequencies_hz: Sequence[float],
     exif_exposure_s: float | None,
-    linear: bool,
 ) -> ShutterCalibration:
     used = [lamp for lamp in lamps if lamp.line_delay_s is not None]
     value, sd = _weighted(
@@ -366,7 +363,7 @@ def _combine(
     low, high = value - _Z95 * sd, value + _Z95 * sd
     clearest = max(used, key=lambda lamp: lamp.stripes.explained * np.sqrt(_area(lamp.stripes)))
     exposure = estimate_exposure(
-        clearest.stripes.fit, clearest.stripes.profile, value, clearest.frequency_hz or 0.0, exif_exposure_s, linear
+        clearest.stripes.fit, clearest.stripes.profile, value, exif_exposure_s
     )
     return ShutterCalibration(
         axis=axis,
