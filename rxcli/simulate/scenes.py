@@ -158,9 +158,9 @@ def _phone_corrected(screen: ScreenProfile) -> Scene:
         lens=Lens(0.78, (0.07, -0.09, 0.0004, 0.0006, 0.0)),
         pose=Pose(fill=0.92, roll_deg=1.2, yaw_deg=3.0, pitch_deg=-2.0),
         room=Room(light_e_per_s=1.2e5),
-        isp=Isp(tone="bt709", gain=2.4, sharpen=0.8, denoise_px=0.5, correct_distortion=True, quality=90),
+        isp=Isp(tone="bt709", gain=2.0, sharpen=0.8, denoise_px=0.5, correct_distortion=True, quality=90),
         exposure_s=1 / 24000,
-        light_e_per_s=1.4e6,
+        light_e_per_s=1.7e6,
         camera_name="phone12",
         model="Phone 12MP",
     )
