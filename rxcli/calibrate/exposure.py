@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.calibrate.periodic import PeriodicFit
+from rxcli.calibrate.periodic import PeriodicFit, fit_periodic
 from rxcli.types import FloatArray
 
 #: What a trapezoid must explain, how long its edges may be and its plateaus must be (cycles), to be one: a sine is
@@ -41,7 +41,11 @@ class _Trapezoid:
 
 
 def estimate_exposure(
-    fit: PeriodicFit, profile: FloatArray, line_delay_s: float, exif_exposure_s: float | None = None
+    fit: PeriodicFit,
+    profile: FloatArray,
+    line_delay_s: float,
+    exif_exposure_s: float | None = None,
+    tone_known: bool = True,
 ) -> ExposureEstimate:
     """Exposure from the rise and fall of a switched lamp's stripes.
 
@@ -54,7 +58,24 @@ def estimate_exposure(
         profile: (n,) the values fitted, proportional to light.
         line_delay_s: time between rows.
         exif_exposure_s: exposure as the file says.
+        tone_known: whether the profile is surely proportional to light; if not, the interval is widened to what a
+            display's tone curve, left in, would give.
     """
+    found = _from_wave(fit, profile, line_delay_s, exif_exposure_s)
+    if tone_known or found.exposure_s is None or found.interval_s is None:
+        return found
+    encoded = np.clip(profile, 0, None) ** (1 / 2.2)
+    other_fit = fit_periodic(encoded, fit.frequency, fit.first_row)
+    other = _from_wave(other_fit, encoded, line_delay_s, exif_exposure_s) if other_fit else found
+    low, high = other.interval_s or found.interval_s
+    widened = (min(low, found.interval_s[0]), max(high, found.interval_s[1]))
+    return ExposureEstimate(found.exposure_s, widened, f"{found.note}; the picture's tone curve is not known")
+
+
+def _from_wave(
+    fit: PeriodicFit, profile: FloatArray, line_delay_s: float, exif_exposure_s: float | None
+) -> ExposureEstimate:
+    """Exposure from values taken to be light."""
     rows = fit.first_row + np.arange(profile.size) - fit.origin
     usable = fit.envelope > 0.2 * fit.envelope.max()
     wave = ((profile - fit.mean) / np.where(usable, fit.envelope, 1))[usable]

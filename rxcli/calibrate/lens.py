@@ -21,6 +21,8 @@ MIN_BOARDS = 3
 _BLUR_SQUARES, _BLUR_PX = 0.2, 2.0
 #: A board is an outlier when its RMS is this many times the median and at least this many pixels above it.
 _OUTLIER_RATIO, _OUTLIER_PX = 2.5, 0.1
+#: Longest side in which a chessboard is looked for; its corners are then refined in the whole picture.
+_DETECTION_SIDE = 2000
 #: Fewest ChArUco corners of a usable picture.
 _MIN_CORNERS = 8
 
@@ -153,22 +155,43 @@ def _same_view(a: Sighting, b: Sighting, width: int) -> bool:
 
 def _find_chessboard(image: GrayImage, board: Board) -> Corners:
     """Classic corners refined to sub-pixels, and the sector-based detector's own."""
+    shrink = max(image.shape) // _DETECTION_SIDE + 1
+    small = _shrunk(image, shrink)
+    classic, sector = _classic_corners(small, board), _sector_corners(small, board)
+    found: Corners = {}
+    for rough in (classic, sector):
+        if rough is not None and "classic" not in found:
+            found["classic"] = (board.points(), _refine(image, (rough + 0.5) * shrink - 0.5, board))
+    if sector is not None and shrink == 1:
+        found["sector"] = (board.points(), sector)
+    return found
+
+
+def _shrunk(image: GrayImage, factor: int) -> GrayImage:
+    """Means of `factor` x `factor` pixels."""
     import cv2
 
-    size, points = (board.columns, board.rows), board.points()
-    found: Corners = {}
-    ok, corners = cv2.findChessboardCorners(
-        image, size, flags=cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    )
-    if ok:
-        found["classic"] = (points, _refine(image, corners.reshape(-1, 2), board))
+    if factor == 1:
+        return image
+    height, width = (side // factor * factor for side in image.shape)
+    size = (width // factor, height // factor)
+    return np.asarray(cv2.resize(image[:height, :width], size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _classic_corners(image: GrayImage, board: Board) -> NDArray[np.float32] | None:
+    import cv2
+
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    ok, corners = cv2.findChessboardCorners(image, (board.columns, board.rows), flags=flags)
+    return np.asarray(corners, np.float32).reshape(-1, 2) if ok else None
+
+
+def _sector_corners(image: GrayImage, board: Board) -> NDArray[np.float32] | None:
+    import cv2
+
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    ok, corners = cv2.findChessboardCornersSB(image, size, flags=flags)
-    if ok:
-        corners = corners.reshape(-1, 2).astype(np.float32)
-        found["sector"] = (points, corners)
-        found.setdefault("classic", (points, _refine(image, corners, board)))
-    return found
+    ok, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags)
+    return np.asarray(corners, np.float32).reshape(-1, 2) if ok else None
 
 
 def _refine(image: GrayImage, corners: NDArray[np.float32], board: Board) -> NDArray[np.float32]:

@@ -54,8 +54,8 @@ class PeriodicFit:
     #: (n_rows,) slow mean and envelope of the stripes, profile units.
     mean: FloatArray
     envelope: FloatArray
-    #: (n_rows,) profile minus model.
-    residual: FloatArray
+    #: (n_rows,) derivative of the frequency by the profile's values.
+    influence: FloatArray
 
     @property
     def periods(self) -> float:
@@ -92,7 +92,7 @@ def whitened_power(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
     white = np.median(power[:, high], axis=1, keepdims=True) / np.log(2)
     floor = np.finfo(float).eps * power.max(axis=1, keepdims=True) + 1e-300
     continuum = white + scene / np.maximum(frequency, 1 / n) ** 2 + floor
-    return frequency, power / continuum
+    return np.asarray(frequency, np.float64), power / continuum
 
 
 def _detrend(profiles: FloatArray) -> FloatArray:
@@ -218,28 +218,27 @@ def _slow_terms(periods: float) -> list[int]:
 def _fit_near(
     profile: FloatArray, frequency: float, n_harmonics: int, n_slow: int, first_row: int
 ) -> PeriodicFit | None:
-    """Gauss-Newton on slow mean, envelope, harmonics and frequency together."""
+    """Gauss-Newton on slow mean, envelope, harmonics and frequency together; None where it runs off."""
     n = profile.size
-    rows = np.arange(n, dtype=np.float64) - (n - 1) / 2
-    slow = np.polynomial.chebyshev.chebvander(rows / max(n / 2, 1), n_slow - 1)
-    state = _initial(profile, slow, rows, frequency, n_harmonics)
-    model, jacobian = _model(slow, rows, state, n_slow, n_harmonics)
+    series = _Series.make(n, n_slow, n_harmonics)
+    state = series.start(profile, frequency)
+    model, jacobian = series.evaluate(state)
     rss = float(np.sum((profile - model) ** 2))
     for _ in range(12):
-        step = np.linalg.lstsq(jacobian, profile - model, rcond=1e-9)[0]
-        state, model, jacobian, new_rss = _descend(profile, slow, rows, state, step, rss, n_slow, n_harmonics)
+        step = np.asarray(np.linalg.lstsq(jacobian, profile - model, rcond=1e-9)[0])
+        state, model, jacobian, new_rss = series.descend(profile, state, step, rss)
         converged = rss - new_rss <= 1e-9 * rss
         rss = new_rss
         if converged:
             break
     if abs(state[-1] - frequency) > 0.6 / n:
         return None
-    residual = profile - model
-    trend = slow @ np.linalg.lstsq(slow, profile, rcond=None)[0]
-    mean, envelope, cosines, sines = _unpack(slow, state, n_slow, n_harmonics)
+    trend = series.slow @ np.linalg.lstsq(series.slow, profile, rcond=None)[0]
+    mean, envelope, cosines, sines = series.unpack(state)
+    influence = _influence(jacobian)
     return PeriodicFit(
         frequency=float(state[-1]),
-        frequency_sd=_frequency_sd(jacobian, residual),
+        frequency_sd=_noise_sd(influence, profile - model, state.size),
         cosines=cosines,
         sines=sines,
         origin=first_row + (n - 1) / 2,
@@ -249,83 +248,110 @@ def _fit_near(
         bic=n * float(np.log(max(rss, 1e-300) / n)) + state.size * float(np.log(n)),
         mean=mean,
         envelope=envelope,
-        residual=residual,
+        influence=influence,
     )
 
 
-def _initial(
-    profile: FloatArray, slow: FloatArray, rows: FloatArray, frequency: float, n_harmonics: int
-) -> FloatArray:
-    """Least squares with a constant envelope: (mean, envelope but its constant 1, cosines, sines, frequency)."""
-    angle = 2 * np.pi * frequency * np.multiply.outer(rows, np.arange(1, n_harmonics + 1))
-    design = np.hstack([slow, np.cos(angle), np.sin(angle)])
-    linear = np.linalg.lstsq(design, profile, rcond=1e-9)[0]
-    n_slow = slow.shape[1]
-    return np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
+@dataclass(frozen=True, slots=True)
+class _Series:
+    """The model `slow mean + envelope * harmonics`; its state is (mean, envelope less its constant 1, cosines, sines,
+    frequency)."""
+
+    #: (n,) rows about the middle, (n, K) slow functions, (H,) harmonic numbers.
+    rows: FloatArray
+    slow: FloatArray
+    order: FloatArray
+
+    @staticmethod
+    def make(n: int, n_slow: int, n_harmonics: int) -> _Series:
+        rows = np.arange(n, dtype=np.float64) - (n - 1) / 2
+        slow = np.asarray(np.polynomial.chebyshev.chebvander(2 * rows / n, n_slow - 1), np.float64)
+        return _Series(rows, slow, np.arange(1, n_harmonics + 1, dtype=np.float64))
+
+    def start(self, profile: FloatArray, frequency: float) -> FloatArray:
+        """Least squares with a constant envelope."""
+        cosine, sine = self._waves(frequency)
+        linear = np.linalg.lstsq(np.hstack([self.slow, cosine, sine]), profile, rcond=1e-9)[0]
+        n_slow = self.slow.shape[1]
+        return np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
+
+    def _waves(self, frequency: float) -> tuple[FloatArray, FloatArray]:
+        angle = 2 * np.pi * frequency * np.multiply.outer(self.rows, self.order)
+        return np.cos(angle), np.sin(angle)
+
+    def unpack(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Mean (n,), envelope (n,), cosines (H,), sines (H,)."""
+        n_slow = self.slow.shape[1]
+        envelope = 1 + self.slow[:, 1:] @ state[n_slow : 2 * n_slow - 1]
+        cosines, sines = np.split(state[2 * n_slow - 1 : -1], 2)
+        return self.slow @ state[:n_slow], envelope, cosines, sines
+
+    def evaluate(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The model (n,) and its Jacobian (n, parameters)."""
+        mean, envelope, a, b = self.unpack(state)
+        cosine, sine = self._waves(state[-1])
+        wave = cosine @ a + sine @ b
+        slope = 2 * np.pi * self.rows * (cosine @ (self.order * b) - sine @ (self.order * a))
+        e = envelope[:, None]
+        by_envelope, by_frequency = self.slow[:, 1:] * wave[:, None], (envelope * slope)[:, None]
+        return mean + envelope * wave, np.hstack([self.slow, by_envelope, cosine * e, sine * e, by_frequency])
+
+    def descend(
+        self, profile: FloatArray, state: FloatArray, step: FloatArray, rss: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """The step, halved until it does not make things worse; none otherwise. State, model, Jacobian, new RSS."""
+        for scale in (1.0, 0.5, 0.25, 0.1, 0.0):
+            trial = state + scale * step
+            model, jacobian = self.evaluate(trial)
+            new_rss = float(np.sum((profile - model) ** 2))
+            if new_rss <= rss:
+                break
+        return trial, model, jacobian, new_rss
 
 
-def _unpack(
-    slow: FloatArray, state: FloatArray, n_slow: int, n_harmonics: int
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    mean = slow @ state[:n_slow]
-    envelope = 1 + slow[:, 1:] @ state[n_slow : 2 * n_slow - 1]
-    waves = state[2 * n_slow - 1 : -1]
-    return mean, envelope, waves[:n_harmonics], waves[n_harmonics:]
-
-
-def _model(
-    slow: FloatArray, rows: FloatArray, state: FloatArray, n_slow: int, n_harmonics: int
-) -> tuple[FloatArray, FloatArray]:
-    """The model's values (n,) and its Jacobian (n, parameters)."""
-    mean, envelope, a, b = _unpack(slow, state, n_slow, n_harmonics)
-    order = np.arange(1, n_harmonics + 1)
-    angle = 2 * np.pi * state[-1] * np.multiply.outer(rows, order)
-    cosine, sine = np.cos(angle), np.sin(angle)
-    wave = cosine @ a + sine @ b
-    slope = 2 * np.pi * rows * (cosine @ (order * b) - sine @ (order * a))
-    scale = envelope[:, None]
-    jacobian = np.hstack([slow, slow[:, 1:] * wave[:, None], cosine * scale, sine * scale, (envelope * slope)[:, None]])
-    return mean + envelope * wave, jacobian
-
-
-def _descend(
-    profile: FloatArray,
-    slow: FloatArray,
-    rows: FloatArray,
-    state: FloatArray,
-    step: FloatArray,
-    rss: float,
-    n_slow: int,
-    n_harmonics: int,
-) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """The Gauss-Newton step, halved until it does not make things worse; stays where it is otherwise."""
-    for scale in (1.0, 0.5, 0.25, 0.1, 0.0):
-        trial = state + scale * step
-        model, jacobian = _model(slow, rows, trial, n_slow, n_harmonics)
-        new_rss = float(np.sum((profile - model) ** 2))
-        if new_rss <= rss or scale == 0.0:
-            break
-    return trial, model, jacobian, new_rss
-
-
-def _frequency_sd(jacobian: FloatArray, residual: FloatArray) -> float:
-    """Standard deviation of the frequency (last parameter) under coloured noise.
-
-    The estimate is linear in the noise, `df = g . noise`, with `g` a row of the Jacobian's pseudo-inverse; its variance
-    is the integral of the noise's power spectrum over that of `g`. Where the noise is not stationary (a scene lit by
-    the stripes is multiplied by them), the sum of `g * residual` over its own neighbourhood may say more.
-    """
+def _influence(jacobian: FloatArray) -> FloatArray:
+    """(n,) what a unit of noise in each row does to the frequency (the last parameter)."""
     scale = np.linalg.norm(jacobian, axis=0) + 1e-300
-    influence = np.linalg.pinv(jacobian / scale, rcond=1e-9)[-1] / scale[-1]
+    return np.asarray(np.linalg.pinv(jacobian / scale, rcond=1e-9)[-1] / scale[-1])
+
+
+def _noise_sd(influence: FloatArray, residual: FloatArray, n_parameters: int) -> float:
+    """Standard deviation of the frequency under coloured noise.
+
+    The estimate is linear in the noise, so its variance is the integral of the noise's power spectrum over that of the
+    influence. Where the noise is not stationary (a scene lit by the stripes is multiplied by them), the sum of
+    `influence * residual` over its own neighbourhood may say more.
+    """
     n_fft = 4 * residual.size
-    degrees = max(residual.size - jacobian.shape[1], 1)
-    spectrum = noise_spectrum(residual, n_fft) * residual.size / degrees
+    freedom = residual.size / max(residual.size - n_parameters, 1)
     weight = np.abs(np.fft.fft(influence, n_fft)) ** 2
-    stationary = float(np.sum(spectrum * weight)) / n_fft
+    stationary = float(np.sum(noise_spectrum(residual, n_fft) * weight)) / n_fft
     score = influence * residual
     lag = max(int(4 * (residual.size / 100) ** (2 / 9)), 1)
     local = float(np.sum(np.convolve(score, np.bartlett(2 * lag + 3)[1:-1], "same") * score))
-    return float(np.sqrt(max(stationary, local * residual.size / degrees)))
+    return float(np.sqrt(max(stationary, local) * freedom))
+
+
+def scatter_sd(influence: FloatArray, profiles: FloatArray) -> float:
+    """Standard deviation of the frequency by what parts of a region say one by one.
+
+    The influence is blind to the slow part and to the stripes' own shape, so each part's product with it is that part's
+    deviation from the common frequency. Parts see different texture, which the residual's spectrum may not show.
+
+    Args:
+        influence: (n,) of the fit of the region's mean profile.
+        profiles: (k, n) profiles of its strips, in order across.
+
+    Returns:
+        The standard deviation, widened for the few parts that it rests on; zero for fewer than four strips.
+    """
+    if len(profiles) < 4:
+        return 0.0
+    parts = np.array([part.mean(axis=0) @ influence for part in np.array_split(profiles, min(8, len(profiles)))])
+    sizes = parts.size
+    # Student's 97.5 % quantile over the normal one, nearly.
+    widening = 1 + 1.5 / (sizes - 2)
+    return float(np.std(parts, ddof=1) / np.sqrt(sizes) * widening)
 
 
 def noise_spectrum(residual: FloatArray, n_fft: int) -> FloatArray:

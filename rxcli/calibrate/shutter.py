@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rxcli.calibrate.exposure import estimate_exposure
 from rxcli.calibrate.periodic import (
@@ -21,17 +22,21 @@ from rxcli.calibrate.periodic import (
     explained_share,
     fit_fundamental,
     longest_block,
+    scatter_sd,
     search_few,
     search_many,
     significant,
 )
-from rxcli.errors import ReceiverError
+from rxcli.errors import ReceiverError, UsageError
 from rxcli.types import BoolArray, FloatArray
 
 Axis = Literal["rows", "columns"]
+Picture = NDArray[np.float32] | NDArray[np.float64]
 #: Two-sided 95 % quantile of the normal distribution.
 _Z95 = 1.959964
 _STRIPS = 32
+#: Shortest side of a picture that is looked at, pixels.
+_MIN_SIDE = 24
 _MAX_LAMPS = 8
 #: Smallest region of a lamp, as a share of the picture, with many periods and with few.
 _MIN_AREA, _MIN_AREA_FEW = 0.003, 0.015
@@ -93,7 +98,7 @@ class ShutterCalibration:
     warnings: tuple[str, ...]
 
 
-def find_stripes(picture: FloatArray, axis: Axis | None = None) -> tuple[Axis, list[Stripes]]:
+def find_stripes(picture: Picture, axis: Axis | None = None) -> tuple[Axis, list[Stripes]]:
     """Regions lit by blinking lamps.
 
     Args:
@@ -119,10 +124,10 @@ def _area(stripes: Stripes) -> int:
     return (x1 - x0) * (y1 - y0)
 
 
-def _find_along(picture: FloatArray, axis: Axis) -> list[Stripes]:
+def _find_along(picture: Picture, axis: Axis) -> list[Stripes]:
     """Peel off lamp after lamp; time runs along the first dimension."""
     edges = np.linspace(0, picture.shape[1], min(_STRIPS, picture.shape[1]) + 1).astype(int)
-    strips = np.add.reduceat(np.asarray(picture, np.float64), edges[:-1], axis=1).T / np.diff(edges)[:, None]
+    strips = np.add.reduceat(picture, edges[:-1], axis=1, dtype=np.float64).T / np.diff(edges)[:, None]
     free = np.ones(strips.shape, dtype=bool)
     found: list[Stripes] = []
     for _ in range(_MAX_LAMPS):
@@ -162,15 +167,17 @@ def _clearest_lamp(
         b0, b1 = longest_block(members)
         if b1 == b0:
             return None
-        chosen = members[:, b0:b1].all(axis=1)
+        chosen = np.asarray(members[:, b0:b1].all(axis=1), np.bool_)
         rows = slice(int(blocks[b0]), int(blocks[b1]))
-        profile = strips[chosen, rows].mean(axis=0)
+        profile = np.asarray(strips[chosen, rows].mean(axis=0))
         grown = fit_fundamental(profile, fit.frequency, rows.start)
         if grown is None or grown.periods < MIN_PERIODS or not significant(grown):
             return None
         if not _one_lamp(shares, members, float(np.mean(chosen)) * profile.size / strips.shape[1], grown):
             return None
         fit = grown
+    sd = max(fit.frequency_sd, scatter_sd(fit.influence, strips[chosen, rows]))
+    fit = replace(fit, frequency_sd=sd)
     taken = np.repeat(shares > 0.15, np.diff(blocks), axis=1)
     taken[chosen, rows] = True
     return chosen, rows, fit, profile, taken
@@ -194,7 +201,7 @@ def _seed(strips: FloatArray, free: BoolArray) -> PeriodicFit | None:
     windows = []
     for first, length in _windows(strips.shape[1]):
         rows = slice(first, first + length)
-        groups = _groups(strips[:, rows], free[:, rows].all(axis=1))
+        groups = _groups(strips[:, rows], np.asarray(free[:, rows].all(axis=1)))
         if len(groups):
             windows.append((first, groups))
     for search in (search_many, search_few):
@@ -232,12 +239,13 @@ def _windows(n: int) -> list[tuple[int, int]]:
 
 def _groups(strips: FloatArray, usable: BoolArray) -> FloatArray:
     """Means over runs of 1, 4 and all strips, where all of a run is usable and not flat."""
-    means = []
-    for size in sorted({1, 4, len(strips)}):
-        for first in range(0, len(strips) - size + 1, max(size // 2, 1)):
-            if usable[first : first + size].all():
-                means.append(strips[first : first + size].mean(axis=0))
-    groups = np.array(means).reshape(len(means), strips.shape[1])
+    runs = [
+        slice(first, first + size)
+        for size in sorted({1, 4, len(strips)})
+        for first in range(0, len(strips) - size + 1, max(size // 2, 1))
+    ]
+    means = [strips[run].mean(axis=0) for run in runs if usable[run].all()]
+    groups: FloatArray = np.array(means, np.float64).reshape(len(means), strips.shape[1])
     return groups[np.ptp(groups, axis=1) > 1e-9]
 
 
@@ -260,10 +268,12 @@ def _follow(strips: FloatArray, free: BoolArray, fit: PeriodicFit) -> tuple[np.n
 
 
 def calibrate_shutter(
-    pictures: Sequence[FloatArray],
+    pictures: Sequence[Picture],
     frequencies_hz: Sequence[float],
     axis: Axis | None = None,
     exif_exposure_s: float | None = None,
+    window: tuple[int, int, int, int] | None = None,
+    tone_known: bool = True,
 ) -> ShutterCalibration:
     """Line delay from pictures (or frames of a clip) of lamps of known frequency.
 
@@ -272,18 +282,41 @@ def calibrate_shutter(
         frequencies_hz: what the lamps blink at; more than one where lamps differ.
         axis: the readout axis, None to find it.
         exif_exposure_s: exposure as the file says, which decides between exposure and flash length.
+        window: left, top, width, height of the part to look at; None: all.
+        tone_known: whether the values are surely proportional to light; if not, the exposure's interval says so.
 
     Raises:
         ReceiverError: no stripes, or too few periods.
     """
-    found = [find_stripes(np.asarray(p, np.float64), axis) for p in pictures]
+    found = [_found_in(picture, axis, window) for picture in pictures]
     axis = _common_axis(found)
     seen = [(i, s) for i, (of, regions) in enumerate(found) if of == axis for s in regions]
     if not seen:
         raise ReceiverError(f"no stripes of a blinking lamp in {_pictures(len(pictures))}", _HINT)
-    line_delay = _common_line_delay([s for _, s in seen], frequencies_hz)
-    lamps = [_reading(i, s, frequencies_hz, line_delay) for i, s in seen]
-    return _combine(lamps, pictures, axis, frequencies_hz, exif_exposure_s)
+    reference = _common_line_delay([s for _, s in seen], frequencies_hz)
+    lamps = [_reading(i, s, frequencies_hz, reference) for i, s in seen]
+    return _combine(lamps, pictures[0].shape, axis, frequencies_hz, exif_exposure_s, tone_known)
+
+
+def _found_in(
+    picture: Picture, axis: Axis | None, window: tuple[int, int, int, int] | None
+) -> tuple[Axis, list[Stripes]]:
+    """Stripes in the window, placed in the whole picture."""
+    if window is None:
+        return find_stripes(picture, axis)
+    x, y, width, height = window
+    part = picture[y : y + height, x : x + width]
+    if min(part.shape) < _MIN_SIDE:
+        raise UsageError(
+            f"region {x},{y},{width},{height} lies outside the picture of {picture.shape[1]}x{picture.shape[0]}",
+            "give it in stored pixels",
+        )
+    axis, regions = find_stripes(part, axis)
+    return axis, [replace(s, bounds=_shifted(s.bounds, x, y)) for s in regions]
+
+
+def _shifted(bounds: tuple[int, int, int, int], x: int, y: int) -> tuple[int, int, int, int]:
+    return bounds[0] + x, bounds[1] + y, bounds[2] + x, bounds[3] + y
 
 
 def _pictures(n: int) -> str:
@@ -349,22 +382,21 @@ def _weighted(values: FloatArray, sds: FloatArray) -> tuple[float, float]:
 
 def _combine(
     lamps: list[LampReading],
-    pictures: Sequence[FloatArray],
+    shape: tuple[int, ...],
     axis: Axis,
     frequencies_hz: Sequence[float],
     exif_exposure_s: float | None,
+    tone_known: bool,
 ) -> ShutterCalibration:
     used = [lamp for lamp in lamps if lamp.line_delay_s is not None]
     value, sd = _weighted(
         np.array([lamp.line_delay_s for lamp in used]), np.array([lamp.line_delay_sd_s for lamp in used])
     )
-    height, width = pictures[0].shape
+    height, width = shape
     n_rows = height if axis == "rows" else width
     low, high = value - _Z95 * sd, value + _Z95 * sd
     clearest = max(used, key=lambda lamp: lamp.stripes.explained * np.sqrt(_area(lamp.stripes)))
-    exposure = estimate_exposure(
-        clearest.stripes.fit, clearest.stripes.profile, value, exif_exposure_s
-    )
+    exposure = estimate_exposure(clearest.stripes.fit, clearest.stripes.profile, value, exif_exposure_s, tone_known)
     return ShutterCalibration(
         axis=axis,
         width=width,

@@ -1,0 +1,68 @@
+"""What a calibration found, put into a camera profile on disk."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+
+from rxcli.errors import InputError, UsageError
+from rxcli.profiles import CameraProfile, LensModel, ReadoutMode, dump_profile, load_profile
+from rxcli.types import Metadata
+
+
+def profile_to_extend(path: Path, metadata: Metadata | None = None) -> CameraProfile:
+    """The profile at `path`, or an empty one named after it, for the camera that `metadata` tells.
+
+    Raises:
+        ProfileError: there is a file, but no camera profile in it.
+        UsageError: the file's name makes no profile name.
+    """
+    if path.exists():
+        return load_profile(str(path), CameraProfile)
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", path.stem):
+        raise UsageError(
+            f"{path}: {path.stem!r} cannot name a profile", "use letters, digits, dots, dashes and underscores"
+        )
+    metadata = metadata or Metadata()
+    models = (metadata.model.strip(),) if metadata.model else ()
+    return CameraProfile(format=1, kind="camera", name=path.stem, make=(metadata.make or "").strip(), models=models)
+
+
+def with_lens(profile: CameraProfile, lens: LensModel, lens_name: str | None = None) -> CameraProfile:
+    """The profile with its lens replaced; `lens_name`, as files tell it, is added to its names."""
+    names = profile.lens_models
+    if lens_name and lens_name not in names:
+        names = (*names, lens_name)
+    return msgspec.structs.replace(profile, lens=lens, lens_models=names)
+
+
+def with_mode(profile: CameraProfile, mode: ReadoutMode) -> CameraProfile:
+    """The profile with `mode` in place of one of the same name or size, or added.
+
+    What the old mode knows and the new one does not (exposure, frame rate) is kept.
+    """
+    same = [
+        old for old in profile.modes if old.name == mode.name or (old.width, old.height) == (mode.width, mode.height)
+    ]
+    for old in same:
+        mode = msgspec.structs.replace(
+            mode,
+            exposure_s=mode.exposure_s if mode.exposure_s is not None else old.exposure_s,
+            frame_rate_hz=mode.frame_rate_hz if mode.frame_rate_hz is not None else old.frame_rate_hz,
+        )
+    return msgspec.structs.replace(profile, modes=(*(old for old in profile.modes if old not in same), mode))
+
+
+def write_profile(profile: CameraProfile, path: Path) -> None:
+    """Write the profile as TOML, its folder too where it is missing.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(dump_profile(profile), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})", "name another file") from None

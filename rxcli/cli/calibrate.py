@@ -1,0 +1,367 @@
+"""`vlc-rx calibrate`: lens and shutter of a camera, into a camera profile."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rxcli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from rxcli.calibrate.lens import Board, GrayImage, LensCalibration, Rejected
+    from rxcli.calibrate.shutter import ShutterCalibration
+    from rxcli.profiles import ReadoutMode
+    from rxcli.types import Frame, Metadata
+
+_PROFILES = Path("calibration") / "cameras"
+_NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]*"
+_SAVE = click.option(
+    "--save", type=click.Path(dir_okay=False, path_type=Path), help="Camera profile to write, or to add to."
+)
+_NAME = click.option("--name", help=f"The same as --save {_PROFILES}/NAME.toml.")
+_JSON = click.option(
+    "--json", "json_path", type=click.Path(allow_dash=True), metavar="FILE|-", help="Write the result as JSON."
+)
+_PATHS = click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
+
+
+@click.group()
+def calibrate() -> None:
+    """Measure a camera's lens or shutter and keep it in a camera profile."""
+
+
+@calibrate.command()
+@_PATHS
+@click.option("--board", "board_size", default="9x6", show_default=True, help="Inner corners, across x down.")
+@click.option("--square", "square_mm", type=float, default=25.0, show_default=True, help="Side of a square, mm.")
+@click.option("--charuco", "dictionary", metavar="DICT", help="ChArUco board of this dictionary (DICT_5X5_100, ...).")
+@click.option("--marker", "marker_ratio", type=float, default=0.75, show_default=True, help="Marker over square side.")
+@click.option("--every", type=click.IntRange(1), default=10, show_default=True, help="Use every Nth frame of a clip.")
+@click.option("--picture", type=click.Path(dir_okay=False, path_type=Path), help="Draw the residuals into this PNG.")
+@_SAVE
+@_NAME
+@_JSON
+def lens(
+    paths: tuple[Path, ...],
+    board_size: str,
+    square_mm: float,
+    dictionary: str | None,
+    marker_ratio: float,
+    every: int,
+    picture: Path | None,
+    save: Path | None,
+    name: str | None,
+    json_path: str | None,
+) -> None:
+    """Lens model from PATHS: pictures of a chessboard or ChArUco board, folders of them, or clips.
+
+    Pictures are taken as stored, never rotated. Fill the field out to its corners and tilt the board both ways.
+    """
+    from rxcli.calibrate.lens import calibrate_lens, find_boards
+    from rxcli.calibrate.saving import profile_to_extend, with_lens, write_profile
+
+    board = _board(board_size, square_mm, dictionary, marker_ratio)
+    target = _target(save, name)
+    reader = _BoardReader(every)
+    results, width, height = find_boards(reader.read(paths), board)
+    result = calibrate_lens([*reader.unreadable, *results], width, height)
+    if picture is not None:
+        from rxcli.calibrate.picture import write_residuals
+
+        write_residuals(result, picture)
+    if target is not None:
+        profile = profile_to_extend(target, reader.metadata)
+        write_profile(with_lens(profile, result.model, reader.metadata.lens if reader.metadata else None), target)
+    _say_lens(result, json_path, target)
+
+
+def _board(size: str, square_mm: float, dictionary: str | None, marker_ratio: float) -> Board:
+    from rxcli.calibrate.lens import Board
+
+    found = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", size)
+    if not found:
+        raise UsageError(f"--board {size!r} is not COLUMNSxROWS of inner corners", "write it as 9x6")
+    return Board(int(found[1]), int(found[2]), square_mm, dictionary, marker_ratio)
+
+
+def _target(save: Path | None, name: str | None) -> Path | None:
+    """The profile to write."""
+    if name is None:
+        return save
+    if save is not None:
+        raise UsageError("--save and --name both say where the profile goes", "give one of them")
+    if not re.fullmatch(_NAME_PATTERN, name):
+        raise UsageError(f"--name {name!r} cannot name a profile", "use letters, digits, dots, dashes and underscores")
+    return _PROFILES / f"{name}.toml"
+
+
+class _BoardReader:
+    """Reads board pictures one by one; remembers what could not be read and the first camera's metadata."""
+
+    def __init__(self, every: int) -> None:
+        self._every = every
+        self.unreadable: list[Rejected] = []
+        self.metadata: Metadata | None = None
+
+    def read(self, paths: tuple[Path, ...]) -> Iterator[tuple[str, GrayImage]]:
+        from rxcli.calibrate.frames import gray_of
+        from rxcli.calibrate.lens import Rejected
+        from rxcli.ingest import open_source
+
+        for path in _files(paths):
+            try:
+                for frame in islice(open_source(path), 0, None, self._every):
+                    self.metadata = self.metadata or frame.metadata
+                    yield (f"{path}#{frame.index}" if frame.index else str(path)), gray_of(frame)
+            except InputError as error:
+                self.unreadable.append(Rejected(str(path), error.message.removeprefix(f"{path}: ")))
+
+
+def _files(paths: tuple[Path, ...]) -> list[Path]:
+    """The files named, and those of known suffix in the folders named."""
+    from rxcli.ingest import KNOWN_SUFFIXES
+
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            files += sorted(p for p in path.rglob("*") if p.is_file() and p.suffix.lower() in KNOWN_SUFFIXES)
+        else:
+            files.append(path)
+    if not files:
+        raise InputError(f"{', '.join(map(str, paths))}: no pictures or clips", "name files or another folder")
+    return files
+
+
+def _say_lens(result: LensCalibration, json_path: str | None, target: Path | None) -> None:
+    if json_path is not None:
+        _write_json(_lens_record(result, target), json_path)
+    if json_path == "-":
+        return
+    matrix = result.model.camera_matrix
+    click.echo(f"RMS         {result.rms_px:.3f} px ({result.detector} corners of {len(result.accepted)} boards)")
+    click.echo(f"fx fy       {matrix[0][0]:.2f} {matrix[1][1]:.2f} px (+- {result.intrinsic_sd_px[0]:.2f})")
+    click.echo(f"cx cy       {matrix[0][2]:.2f} {matrix[1][2]:.2f} px (+- {result.intrinsic_sd_px[2]:.2f})")
+    click.echo("distortion  " + " ".join(f"{value:.5f}" for value in result.model.dist_coeffs) + "  (k1 k2 p1 p2 k3)")
+    for rejected in result.rejected:
+        click.echo(f"rejected    {rejected.name}: {rejected.reason}")
+    if result.uncovered:
+        click.echo(f"no corners  {', '.join(result.uncovered)}")
+    if target is not None:
+        click.echo(f"written     {target}")
+
+
+def _lens_record(result: LensCalibration, target: Path | None) -> dict[str, Any]:
+    return {
+        "rms_px": result.rms_px,
+        "camera_matrix": [list(row) for row in result.model.camera_matrix],
+        "dist_coeffs": list(result.model.dist_coeffs),
+        "width": result.model.width,
+        "height": result.model.height,
+        "detector": result.detector,
+        "accepted": [{"name": name, "rms_px": rms} for name, rms in result.accepted.items()],
+        "rejected": [{"name": r.name, "reason": r.reason} for r in result.rejected],
+        "uncovered": list(result.uncovered),
+        "intrinsic_sd_px": list(result.intrinsic_sd_px),
+        "profile": str(target) if target is not None else None,
+    }
+
+
+@calibrate.command()
+@_PATHS
+@click.option("--frequency", "frequencies", type=float, multiple=True, metavar="HZ", help="Lamp; may be repeated.")
+@click.option("--screen", metavar="NAME|FILE", help="Screen profile, whose slot rate is known, instead of a lamp.")
+@click.option(
+    "--axis", type=click.Choice(["auto", "rows", "columns"]), default="auto", show_default=True, help="Readout axis."
+)
+@click.option("--region", metavar="X,Y,W,H", help="Look at this part of the pictures only, stored pixels.")
+@click.option("--exposure", "exposure_s", type=float, help="Exposure in seconds, where the files do not tell it.")
+@click.option("--frames", type=click.IntRange(1), default=8, show_default=True, help="Frames used of a clip.")
+@click.option("--mode", "mode_name", help="Name of the readout mode to save.  [default: by the size, as 1920x1080]")
+@_SAVE
+@_NAME
+@_JSON
+def shutter(
+    paths: tuple[Path, ...],
+    frequencies: tuple[float, ...],
+    screen: str | None,
+    axis: str,
+    region: str | None,
+    exposure_s: float | None,
+    frames: int,
+    mode_name: str | None,
+    save: Path | None,
+    name: str | None,
+    json_path: str | None,
+) -> None:
+    """Line delay and readout from PATHS: pictures or clips, of one readout mode, of blinking lamps.
+
+    Let the lamp fill much of the frame, out of focus, with an exposure well below half a period.
+    """
+    from rxcli.calibrate.saving import profile_to_extend, with_mode, write_profile
+
+    if bool(frequencies) == bool(screen):
+        raise UsageError("either --frequency or --screen is needed", "say what the lamp blinks at, as --frequency 1000")
+    _check_positive(frequencies, exposure_s)
+    target, window = _target(save, name), _window(region)
+    chosen = [frame for path in _files(paths) for frame in _some_frames(path, frames)]
+    result = _measure(chosen, frequencies, screen, axis, window, exposure_s)
+    if target is not None:
+        mode = _mode(result, mode_name)
+        write_profile(with_mode(profile_to_extend(target, chosen[0].metadata), mode), target)
+    _say_shutter(result, json_path, target)
+
+
+def _check_positive(frequencies: tuple[float, ...], exposure_s: float | None) -> None:
+    for frequency in frequencies:
+        if not (0 < frequency < 1e7):
+            raise UsageError(f"--frequency must be above 0 and below 1e7 Hz (got {frequency:g})", "give it in hertz")
+    if exposure_s is not None and not (0 < exposure_s < 1):
+        raise UsageError(f"--exposure must be above 0 and below 1 s (got {exposure_s:g})", "give it in seconds")
+
+
+def _window(region: str | None) -> tuple[int, int, int, int] | None:
+    """X, Y, W, H of the part looked at."""
+    if region is None:
+        return None
+    found = re.fullmatch(r"(\d{1,6}),(\d{1,6}),(\d{1,6}),(\d{1,6})", region)
+    if not found or min(int(found[3]), int(found[4])) < 24:
+        raise UsageError(f"--region {region!r} is not X,Y,W,H of at least 24 x 24 pixels", "write it as 100,80,640,400")
+    return int(found[1]), int(found[2]), int(found[3]), int(found[4])
+
+
+def _some_frames(path: Path, n: int) -> list[Frame]:
+    """A still's frame, or up to `n` frames of a clip, five apart, so that each shows the lamp anew."""
+    from rxcli.ingest import open_source
+
+    return list(islice(open_source(path), 0, 5 * n, 5))
+
+
+def _measure(
+    frames: list[Frame],
+    frequencies: tuple[float, ...],
+    screen: str | None,
+    axis: str,
+    window: tuple[int, int, int, int] | None,
+    exposure_s: float | None,
+) -> ShutterCalibration:
+    from rxcli.calibrate.frames import light_of
+    from rxcli.calibrate.shutter import calibrate_shutter
+
+    sizes = {(frame.width, frame.height) for frame in frames}
+    if len(sizes) > 1:
+        shown = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+        raise UsageError(f"the pictures are of different sizes ({shown})", "calibrate one readout mode at a time")
+    known = exposure_s if exposure_s is not None else frames[0].metadata.exposure_s
+    along = None if axis == "auto" else axis
+    if frames[0].mosaic is not None:
+        along = "rows"  # a RAW file's rows are the sensor's
+    return calibrate_shutter(
+        [light_of(frame) for frame in frames],
+        frequencies,
+        axis=along,  # type: ignore[arg-type]  # one of the choices
+        exif_exposure_s=known,
+        window=window,
+        tone_known=frames[0].mosaic is not None or frames[0].linear,
+    )
+
+
+def _mode(result: ShutterCalibration, name: str | None) -> ReadoutMode:
+    """The readout mode that was measured."""
+    from rxcli.profiles import ReadoutMode
+
+    if result.axis == "columns":
+        raise UsageError(
+            "the readout runs along the columns: the stored picture was rotated, and profiles hold stored rows",
+            "calibrate with an unrotated picture",
+        )
+    if name is not None and not re.fullmatch(_NAME_PATTERN, name):
+        raise UsageError(f"--mode {name!r} cannot name a mode", "use letters, digits, dots, dashes and underscores")
+    return ReadoutMode(
+        name=name or f"{result.width}x{result.height}",
+        width=result.width,
+        height=result.height,
+        line_delay_s=result.line_delay_s,
+    )
+
+
+def _say_shutter(result: ShutterCalibration, json_path: str | None, target: Path | None) -> None:
+    for warning in result.warnings:
+        click.echo(f"vlc-rx: {warning}", err=True)
+    if json_path is not None:
+        _write_json(_shutter_record(result, target), json_path)
+    if json_path == "-":
+        return
+    low, high = result.readout_interval_s
+    n_lines = result.height if result.axis == "rows" else result.width
+    click.echo(
+        f"readout     {result.readout_s * 1e3:.4f} ms over {n_lines} {result.axis} "
+        f"(95 %: {low * 1e3:.4f} to {high * 1e3:.4f})"
+    )
+    low, high = result.line_delay_interval_s
+    click.echo(f"line delay  {result.line_delay_s * 1e6:.5f} us (95 %: {low * 1e6:.5f} to {high * 1e6:.5f})")
+    click.echo(f"periods     {result.periods:.2f}")
+    exposure = "unknown" if result.exposure_s is None else f"{result.exposure_s * 1e6:.1f} us"
+    click.echo(f"exposure    {exposure} ({result.exposure_note})")
+    for lamp in result.lamps:
+        frequency = "unknown frequency" if lamp.frequency_hz is None else f"{lamp.frequency_hz:g} Hz"
+        click.echo(f"lamp        {frequency} at {lamp.stripes.bounds}, period {lamp.stripes.period_px:.3f} px")
+    if target is not None:
+        click.echo(f"written     {target}")
+
+
+def _shutter_record(result: ShutterCalibration, target: Path | None) -> dict[str, Any]:
+    return {
+        "readout_s": result.readout_s,
+        "readout_interval_s": list(result.readout_interval_s),
+        "line_delay_s": result.line_delay_s,
+        "line_delay_interval_s": list(result.line_delay_interval_s),
+        "periods": result.periods,
+        "axis": result.axis,
+        "width": result.width,
+        "height": result.height,
+        "exposure_s": result.exposure_s,
+        "exposure_interval_s": list(result.exposure_interval_s) if result.exposure_interval_s else None,
+        "exposure_note": result.exposure_note,
+        "lamps": [
+            {
+                "picture": lamp.picture,
+                "bounds": list(lamp.stripes.bounds),
+                "frequency_hz": lamp.frequency_hz,
+                "period_px": lamp.stripes.period_px,
+                "period_sd_px": lamp.stripes.period_sd_px,
+                "periods": lamp.stripes.periods,
+                "line_delay_s": lamp.line_delay_s,
+                "explained": lamp.stripes.explained,
+            }
+            for lamp in result.lamps
+        ],
+        "warnings": list(result.warnings),
+        "profile": str(target) if target is not None else None,
+    }
+
+
+def _write_json(record: dict[str, Any], path: str) -> None:
+    text = json.dumps(_finite(record), indent=2)
+    if path == "-":
+        click.echo(text)
+        return
+    try:
+        Path(path).write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})", "name another file") from None
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows no NaN and no infinity."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
