@@ -56,7 +56,9 @@ def _dominates(other: tuple[float, float], point: tuple[float, float]) -> bool:
     return other[0] <= point[0] and other[1] <= point[1] and other != point
 
 
-def cluster_interval(errors: Sequence[float], sizes: Sequence[float], z: float = Z95) -> tuple[float, float]:
+def cluster_interval(
+    errors: Sequence[float], sizes: Sequence[float], units: float, z: float = Z95
+) -> tuple[float, float]:
     """Wilson interval of a rate whose events come in clusters, such as the wrong bits of lost packets.
 
     The number of trials is divided by the design effect: the variance between clusters over the binomial one.
@@ -64,6 +66,7 @@ def cluster_interval(errors: Sequence[float], sizes: Sequence[float], z: float =
     Args:
         errors: events of each cluster.
         sizes: trials of each cluster.
+        units: trials to count where the clusters do not differ, and so tell nothing of how their events hang together.
         z: normal quantile of the wanted coverage.
     """
     k, n = np.asarray(errors, np.float64), np.asarray(sizes, np.float64)
@@ -72,9 +75,8 @@ def cluster_interval(errors: Sequence[float], sizes: Sequence[float], z: float =
     if total <= 0:
         return 0.0, 1.0
     rate = float(k.sum()) / total
-    if k.size < 2 or rate in (0.0, 1.0):
-        # All clusters alike: nothing tells how their trials hang together, so each cluster counts as one.
-        return wilson(rate * k.size, k.size, z)
-    between = k.size / (k.size - 1) * float(((k - rate * n) ** 2).sum())
+    between = k.size / max(k.size - 1, 1) * float(((k - rate * n) ** 2).sum())
+    if between <= 0:
+        return wilson(rate * units, units, z)
     effect = max(between / (total * rate * (1 - rate)), 1.0)
     return wilson(rate * total / effect, total / effect, z)

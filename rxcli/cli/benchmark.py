@@ -11,6 +11,7 @@ import click
 if TYPE_CHECKING:
     from rxcli.benchmark.confidence import Calibration
     from rxcli.benchmark.journal import Journal
+    from rxcli.benchmark.sweeps import Summary
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -44,6 +45,15 @@ def _journal(out: Path, name: str, fresh: bool) -> Journal:
     if fresh:
         path.unlink(missing_ok=True)
     return Journal(path)
+
+
+def _check_sweeps(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
+    from rxcli.benchmark.sweeps import SWEEPS
+
+    for name in names:
+        if name not in SWEEPS:
+            raise click.BadParameter(f"{name!r} is not one of {', '.join(SWEEPS)}")
+    return names
 
 
 @click.group(invoke_without_command=False)
@@ -97,3 +107,40 @@ def _calibration_notes(result: Calibration) -> list[str]:
 
 def _say_written(paths: Sequence[Path]) -> None:
     click.echo("written: " + ", ".join(str(path) for path in paths), err=True)
+
+
+@benchmark.command()
+@click.option(
+    "--only", multiple=True, metavar="NAME", callback=_check_sweeps, help="A sweep; may be given several times."
+)
+@click.option("--frames", type=click.IntRange(1), default=12, show_default=True, help="Frames of each point.")
+@_JOBS
+@_common
+def sweep(only: tuple[str, ...], frames: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
+    """Error and run time over slot rate, light, exposure, picture, tilt, camera, and the receiver's variants."""
+    from rxcli.benchmark import sweeps
+    from rxcli.benchmark.tables import format_table, write_outputs
+
+    names = only or tuple(sweeps.SWEEPS)
+    journal = _journal(out, "sweep", fresh)
+    summaries = sweeps.run(sweeps.points_of(names), frames, journal, seed=seed, jobs=jobs, quiet=quiet)
+    rows = [summary.as_row() for summary in summaries]
+    click.echo(format_table(rows))
+    paths = write_outputs(out, "sweep", rows, [summary.details() for summary in summaries])
+    _say_written([*paths, *_plot_sweeps(summaries, out)])
+
+
+def _plot_sweeps(summaries: Sequence[Summary], out: Path) -> list[Path]:
+    from rxcli.benchmark import plots, sweeps
+
+    if not plots.available():
+        return []
+    paths = []
+    for name in dict.fromkeys(summary.point.sweep for summary in summaries):
+        mine = [summary for summary in summaries if summary.point.sweep == name]
+        paths.append(out / f"sweep-{name}.png")
+        plots.plot_rates(mine, paths[-1]) if name == "rate" else plots.plot_sweep(mine, paths[-1])
+        if name == "variants":
+            paths.append(out / "plane.png")
+            plots.plot_plane(sweeps.run_time_plane(mine), paths[-1])
+    return paths
