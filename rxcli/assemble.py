@@ -13,12 +13,13 @@ from rxcli.types import (
     ColumnStatus,
     Float32Array,
     FrameStatus,
+    IntArray,
     PacketResult,
     SlotSamples,
 )
 
-#: A packet is reported up to this expected share of wrong bits.
-MAX_BER_HAT = 0.2
+#: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
+MAX_BER_HAT = 0.1
 #: A column with a packet below this confidence is weak.
 _WEAK_CONFIDENCE = 0.5
 #: A weight is reported from this probability on.
@@ -41,9 +42,9 @@ def column_results(
         samples: the samples, for what was visible.
         min_confidence: packets below it are left out.
     """
-    seen = _seen_slots(samples)
+    seen = slots_seen(samples, clock)
     return tuple(
-        _column_result(column, clock, posteriors, snr[column], seen[column], min_confidence)
+        _column_result(column, clock, posteriors, snr[column], seen[:, column], min_confidence)
         for column in range(snr.shape[0])
     )
 
@@ -57,25 +58,36 @@ def frame_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
     return "ok" if all(column.packets for column in lit) else "partial"
 
 
-def _seen_slots(samples: SlotSamples) -> BoolArray:
-    """(C, N) whether any strip shows the slot."""
+def slots_seen(samples: SlotSamples, clock: Clock) -> IntArray:
+    """How often each slot of each burst's packet is on the screen and in the picture, (B, C, packet)."""
     q = samples.samples_per_slot
-    share = samples.valid.reshape(*samples.valid.shape[:2], -1, q).mean(axis=3)
-    return np.asarray(share.max(axis=1) >= _SEEN_SHARE)
+    shown = np.add.reduce([samples.valid[..., k::q] for k in range(q)]).max(axis=1) >= _SEEN_SHARE * q
+    copies = np.zeros((shown.shape[0], clock.n_copies * clock.packet_slots), np.int64)
+    copies[:, clock.first_slot : clock.first_slot + clock.n_slots] = shown
+    by_copy = copies.reshape(shown.shape[0], clock.n_copies, clock.packet_slots)
+    return np.stack([by_copy[:, clock.burst == burst].sum(axis=1) for burst in range(int(clock.burst.max()) + 1)])
+
+
+def complete(seen: IntArray) -> BoolArray:
+    """(B, C) whether every payload slot was seen, so that the packet can be reported.
+
+    Args:
+        seen: (B, C, packet) from `slots_seen`.
+    """
+    return np.asarray((seen[:, :, PREAMBLE_SLOTS:] > 0).all(axis=2))
 
 
 def _column_result(
-    column: int, clock: Clock, posteriors: BurstPosteriors, snr: Float32Array, seen: BoolArray, min_confidence: float
+    column: int, clock: Clock, posteriors: BurstPosteriors, snr: Float32Array, seen: IntArray, min_confidence: float
 ) -> ColumnResult:
-    packets = [
-        packet
-        for burst in range(posteriors.index.shape[0])
-        if (packet := _packet(burst, column, clock, posteriors, seen)) and packet.confidence >= min_confidence
+    found = [
+        _packet(int(burst), column, clock, posteriors, seen[burst])
+        for burst in np.flatnonzero(complete(seen[:, None])[:, 0])
     ]
-    visible = snr[seen]
-    snr_db = float(10 * np.log10(max(float(np.median(visible)), 1e-6))) if visible.size else None
-    w_log_prob = posteriors.w_log_prob[column]
-    sure_of_w = w_log_prob.max() > np.log(_MIN_WEIGHT_PROBABILITY)
+    packets = tuple(packet for packet in found if packet and packet.confidence >= min_confidence)
+    lit = snr[snr > 0]
+    snr_db = float(10 * np.log10(max(float(np.median(lit)), 1e-6))) if lit.size else None
+    sure_of_w = posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
     return ColumnResult(
         column=column,
@@ -83,21 +95,21 @@ def _column_result(
         w=int(posteriors.w[column]) if packets or sure_of_w else None,
         snr_db=snr_db,
         delay_slots=float(clock.delay_slots[column]),
-        packets=tuple(packets),
-        message=None if packets else _why_none(status, snr_db, seen, clock),
+        packets=packets,
+        message=None if packets else _why_none(status, snr_db, int(seen.sum()), clock),
     )
 
 
-def _column_status(packets: list[PacketResult], snr_db: float | None) -> ColumnStatus:
+def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:
     if packets:
         return "ok" if max(p.confidence for p in packets) >= _WEAK_CONFIDENCE else "weak"
     return "dark" if snr_db is None or snr_db < _DARK_SNR_DB else "no_packet"
 
 
-def _why_none(status: ColumnStatus, snr_db: float | None, seen: BoolArray, clock: Clock) -> str:
-    if seen.sum() < clock.packet_slots - SLOTS_PER_SYMBOL:
+def _why_none(status: ColumnStatus, snr_db: float | None, n_seen: int, clock: Clock) -> str:
+    if n_seen < clock.packet_slots - SLOTS_PER_SYMBOL:
         return (
-            f"{int(seen.sum())} slots of the column are visible, a packet has {clock.packet_slots}; "
+            f"{n_seen} slots of the column are visible, a packet has {clock.packet_slots}; "
             "move closer so that the screen fills more of the height"
         )
     if status == "dark" or snr_db is None:
@@ -105,25 +117,17 @@ def _why_none(status: ColumnStatus, snr_db: float | None, seen: BoolArray, clock
     return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
 
 
-def _packet(burst: int, column: int, clock: Clock, posteriors: BurstPosteriors, seen: BoolArray) -> PacketResult | None:
-    """The packet of one burst, None where some payload symbol was not seen or too many bits are uncertain."""
-    copies = np.flatnonzero(clock.burst == burst)
-    position = (np.arange(clock.n_slots) + clock.first_slot) % clock.packet_slots
-    copy = (np.arange(clock.n_slots) + clock.first_slot) // clock.packet_slots
-    mine = seen & np.isin(copy, copies)
-    times_seen = np.bincount(position[mine], minlength=clock.packet_slots)
-    if not mine.any() or (times_seen[PREAMBLE_SLOTS:] == 0).any():
-        return None
+def _packet(burst: int, column: int, clock: Clock, posteriors: BurstPosteriors, seen: IntArray) -> PacketResult | None:
+    """The packet of one burst, None where too many bits are uncertain; `seen` is (packet,)."""
     w = int(posteriors.w[column])
-    k = bits_per_symbol(w)
-    llr = posteriors.bit_llr[burst, column, :, :k]
+    llr = posteriors.bit_llr[burst, column, :, : bits_per_symbol(w)]
     ber_hat = float(np.mean(1 / (1 + np.exp(np.abs(llr)))))
     if ber_hat > MAX_BER_HAT:
         return None
     bits = indices_to_bits(posteriors.index[burst, column], w)
     return PacketResult(
-        first_row=_header_row(int(copy[mine].min()), column, clock),
-        copies=float(mine.sum() / clock.packet_slots),
+        first_row=_header_row(int(np.flatnonzero(clock.burst == burst)[0]), column, clock),
+        copies=float(seen.sum() / clock.packet_slots),
         payload_bits=int(bits.size),
         payload=bits_to_hex(bits),
         confidence=float(np.exp(posteriors.log_prob[burst, column].sum())),

@@ -29,6 +29,7 @@ from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSa
 
 #: Scales, in slots, over which the picture is predicted: fine texture to plain sky.
 PICTURE_SCALES = (0.3, 0.6, 1.2, 2.5, 6.0)
+_QUICK_SCALES = (0.6, 1.2, 2.5)
 #: Prior of the predictions from both sides, from before, from after.
 _SIDES = (0.5, 0.25, 0.25)
 #: Samples closer than this many slots to a sample say nothing of its picture: they show the same slot.
@@ -38,7 +39,7 @@ _ERROR_SLOTS = 28
 #: Degrees of freedom of the Student-t likelihood.
 _DEGREES = 4.0
 #: Samples of one slot and strips of one column err alike; their summed log-likelihood counts this much.
-_TEMPER = 0.5
+_TEMPER = 0.16
 #: Bounds on the relative variance of a predicted picture.
 _TEXTURE_BOUNDS = (0.003, 2.0)
 #: Log-likelihood ratio of a slot that the first guess sees at full contrast in all strips.
@@ -129,7 +130,7 @@ def estimate_sigma(samples: SlotSamples, floor: float, least: float) -> float:
     bend = (light[..., 2:] - 2 * light[..., 1:-1] + light[..., :-2])[dark]
     if bend.size < 50:
         return least
-    return max(float(np.median(np.abs(bend))) / (0.6745 * np.sqrt(6.0)), least)
+    return max(float(np.median(np.abs(bend))) / (0.6745 * 6.0**0.5), least)
 
 
 def first_metrics(pooled: Float32Array, weight: Float32Array, memory: int) -> FloatArray:
@@ -211,7 +212,12 @@ class _Expected:
 
 
 def slot_likelihoods(
-    samples: SlotSamples, clock: Clock, model: LightModel, lit: Float32Array, columns: NDArray[np.int64]
+    samples: SlotSamples,
+    clock: Clock,
+    model: LightModel,
+    lit: Float32Array,
+    columns: NDArray[np.int64],
+    thorough: bool = True,
 ) -> SlotLikelihoods:
     """Log-likelihood of every slot pattern at every slot, given the present idea of all slots.
 
@@ -221,6 +227,8 @@ def slot_likelihoods(
         model: the light model.
         lit: (C, N) probability that each slot is lit.
         columns: columns to look at; the result has these alone.
+        thorough: predict the picture from each side too, and on all scales; else from both sides together, on the
+            middle scales, which is several times quicker and enough for a plain picture.
     """
     shape = _shape_on_grid(lit, model)
     slope = np.zeros_like(shape)
@@ -231,7 +239,7 @@ def slot_likelihoods(
 
     def of_columns(part: NDArray[np.int64]) -> SlotLikelihoods:
         expected = _Expected(others[part], own, shape[part, None], others_slope[part] + own * slope[part, None])
-        return _likelihoods(samples.light[part], samples.valid[part], expected, model)
+        return _likelihoods(samples.light[part], samples.valid[part], expected, model, thorough)
 
     parts = np.array_split(columns, -(-columns.size // _COLUMNS_AT_A_TIME))
     with ThreadPoolExecutor(_THREADS) as pool:
@@ -244,10 +252,10 @@ def slot_likelihoods(
 
 
 def _likelihoods(
-    light: Float32Array, valid: Float32Array, expected: _Expected, model: LightModel
+    light: Float32Array, valid: Float32Array, expected: _Expected, model: LightModel, thorough: bool
 ) -> SlotLikelihoods:
     light = (light - np.float32(model.floor)) * valid
-    predictions = predict_picture(light, expected.whole, valid, model.sigma, model.taps.shape[0])
+    predictions = predict_picture(light, expected.whole, valid, model.sigma, model.taps.shape[0], thorough)
     metrics = _pattern_metrics(light, valid, predictions, expected, model)
     timing = _timing(light, valid, predictions[0], expected, model)
     return SlotLikelihoods(metrics, _slot_snr(valid, predictions[0], expected.own, model), timing)
@@ -258,7 +266,7 @@ def _slot_snr(valid: Float32Array, prediction: Prediction, own: Float32Array, mo
     contrast = prediction.picture * own
     noise = np.float32(model.sigma**2) + np.float32(model.shot) * contrast + prediction.variance * own * own
     ratio = (contrast * contrast / noise * valid).sum(axis=1) * np.float32(_TEMPER)
-    return np.asarray(ratio.reshape(ratio.shape[0], -1, model.taps.shape[0]).sum(axis=2), np.float32)
+    return _by_slot(ratio, model.taps.shape[0])
 
 
 def _timing(
@@ -312,8 +320,13 @@ def _box(values: Float32Array, half: int) -> Float32Array:
 
 
 def predict_picture(
-    light: Float32Array, expected: Float32Array, valid: Float32Array, sigma: float, samples_per_slot: int
-) -> tuple[Prediction, Prediction, Prediction]:
+    light: Float32Array,
+    expected: Float32Array,
+    valid: Float32Array,
+    sigma: float,
+    samples_per_slot: int,
+    thorough: bool = True,
+) -> list[Prediction]:
     """The picture at every sample from both sides, from before and from after; on each the best of all scales.
 
     Args:
@@ -322,15 +335,17 @@ def predict_picture(
         valid: (C, S, n) 1 or 0.
         sigma: standard deviation of a sample of no light.
         samples_per_slot: samples a slot.
+        thorough: else from both sides alone, on the middle scales.
     """
     weighted = expected * valid
     numerator, denominator = weighted * light, weighted * expected
     hole = max(int(np.ceil(_HOLE_SLOTS * samples_per_slot)) - 1, 0)
     texture = _Texture(light, expected, valid, sigma, samples_per_slot)
     best: list[Prediction] = []
-    for scale in PICTURE_SCALES:
+    for scale in PICTURE_SCALES if thorough else _QUICK_SCALES:
         half = max(int(scale * samples_per_slot), 1)
-        sums = zip(_sides(_box(numerator, half), half, hole), _sides(_box(denominator, half), half, hole), strict=True)
+        sides = _sides if thorough else _both_sides
+        sums = zip(sides(_box(numerator, half), half, hole), sides(_box(denominator, half), half, hole), strict=True)
         for side, (light_seen, seen) in enumerate(sums):
             guess = np.maximum(light_seen, 0) / (seen + np.float32(1e-4))
             variance = guess * guess * texture.of(guess) + np.float32(sigma * sigma) / (seen + np.float32(1e-6))
@@ -340,7 +355,16 @@ def predict_picture(
             better = variance < best[side].variance
             np.copyto(best[side].picture, guess, where=better)
             np.copyto(best[side].variance, variance, where=better)
-    return best[0], best[1], best[2]
+    return best
+
+
+def _both_sides(boxes: Float32Array, half: int, hole: int) -> tuple[Float32Array]:
+    """Sums over both sides of a hole, from sums centred on samples."""
+    away = hole + half + 1
+    both = np.zeros_like(boxes)
+    both[..., away:] = boxes[..., :-away]
+    both[..., :-away] += boxes[..., away:]
+    return (both,)
 
 
 def _sides(boxes: Float32Array, half: int, hole: int) -> tuple[Float32Array, Float32Array, Float32Array]:
@@ -373,14 +397,21 @@ class _Texture:
         return np.repeat(np.clip(error / power, np.float32(low), np.float32(high)), self._q, axis=-1)
 
     def _around(self, values: Float32Array) -> Float32Array:
-        slots = values.reshape(*values.shape[:-1], -1, self._q).sum(axis=-1)
-        return _box(slots, _ERROR_SLOTS // 2)
+        return _box(_by_slot(values, self._q), _ERROR_SLOTS // 2)
+
+
+def _by_slot(values: Float32Array, samples_per_slot: int) -> Float32Array:
+    """Sums over the samples of each slot, last axis; adding slices is far quicker than a sum over a short axis."""
+    total = values[..., ::samples_per_slot].copy()
+    for offset in range(1, samples_per_slot):
+        total += values[..., offset::samples_per_slot]
+    return total
 
 
 def _pattern_metrics(
     light: Float32Array,
     valid: Float32Array,
-    predictions: tuple[Prediction, ...],
+    predictions: list[Prediction],
     expected: _Expected,
     model: LightModel,
 ) -> FloatArray:
@@ -396,15 +427,17 @@ def _pattern_metrics(
         whole = expected.others + expected.own * mine
         parts = [
             _log_likelihood(light, whole, prediction, model) + np.float32(np.log(prior))
-            for prediction, prior in zip(predictions, _SIDES, strict=True)
+            for prediction, prior in zip(predictions, _SIDES, strict=False)
         ]
         summed = (_log_sum(parts) * weight).sum(axis=1)
         padded = np.pad(summed, ((0, 0), (lead, memory * q - lead)))
-        out[:, :, number] = padded.reshape(n_columns, -1, q).sum(axis=2)
+        out[:, :, number] = _by_slot(padded, q)
     return out
 
 
-def _log_likelihood(light: Float32Array, whole: Float32Array, prediction: Prediction, model: LightModel) -> Float32Array:
+def _log_likelihood(
+    light: Float32Array, whole: Float32Array, prediction: Prediction, model: LightModel
+) -> Float32Array:
     """Student-t log-density of the light, up to a constant."""
     spread = prediction.variance * whole
     spread += np.float32(model.shot) * prediction.picture
@@ -423,6 +456,8 @@ def _log_likelihood(light: Float32Array, whole: Float32Array, prediction: Predic
 
 
 def _log_sum(parts: list[Float32Array]) -> Float32Array:
+    if len(parts) == 1:
+        return parts[0]
     top = np.maximum.reduce(parts)
     total = np.zeros_like(top)
     for part in parts:

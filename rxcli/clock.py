@@ -27,7 +27,9 @@ _MAX_DELAY_SLOTS = 2.0
 _MAX_CORRECTION = 0.25
 
 
-def resample(profiles: RowProfiles, row0: float, rows_per_sample: float, n_samples: int) -> tuple[Float32Array, Float32Array]:
+def resample(
+    profiles: RowProfiles, row0: float, rows_per_sample: float, n_samples: int
+) -> tuple[Float32Array, Float32Array]:
     """Mean light over equal steps of sensor rows.
 
     Args:
@@ -76,7 +78,9 @@ def _integrate(values: Float32Array, positions: FloatArray) -> FloatArray:
     return np.diff(below + (above - below) * part, axis=1)
 
 
-def contrast(light: Float32Array, valid: Float32Array, samples_per_slot: int, sigma: float) -> tuple[Float32Array, Float32Array]:
+def contrast(
+    light: Float32Array, valid: Float32Array, samples_per_slot: int, sigma: float
+) -> tuple[Float32Array, Float32Array]:
     """Light of each strip between its local extremes, -1 dark to 1 lit, pooled over the strips of a column.
 
     Args:
@@ -183,7 +187,10 @@ def _comb(response: FloatArray, period: int) -> tuple[float, float]:
     left, middle, right = score[best - 1], score[best], score[(best + 1) % period]
     bend = left - 2 * middle + right
     offset = 0.5 * (left - right) / bend if bend < 0 else 0.0
-    away = np.abs((np.arange(period) - best + period // 2) % period - period // 2) > SLOTS_PER_SYMBOL * _SEARCH_SAMPLES // 4
+    away = (
+        np.abs((np.arange(period) - best + period // 2) % period - period // 2)
+        > SLOTS_PER_SYMBOL * _SEARCH_SAMPLES // 4
+    )
     rival = float(score[away].max(initial=0.0))
     return best + float(np.clip(offset, -0.5, 0.5)), float(middle / max(rival, 1e-12))
 

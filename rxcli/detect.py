@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,10 @@ from rxcli.types import BurstPosteriors, FloatArray
 #: Longest memory of the trellis; five slots cover an exposure of four.
 MAX_MEMORY = 5
 _NEVER = -1e9
+#: Slots are taken to be at most this sure when weights are compared: one bad slot must not decide.
+_SURE_LLR = 12.0
+#: Probabilities below this are not told apart.
+_TINY = 1e-30
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +36,8 @@ class _Branches:
     words: NDArray[np.uint8]
     #: (10 * 2**(memory+1), states * words) float32: which metrics a branch adds up.
     features: NDArray[np.float32]
-    #: (words,) state after the word.
-    end: NDArray[np.int64]
-    #: (words, states) float64: 0 where the word ends in the state, else never.
-    into: FloatArray
+    #: (words, states) float32: 1 where the word ends in the state, else 0.
+    into: NDArray[np.float32]
 
 
 def _pattern_index(slots: NDArray[np.integer], memory: int) -> NDArray[np.int64]:
@@ -54,8 +57,8 @@ def _branches(w: int, memory: int) -> _Branches:
     index = _pattern_index(slots, memory)
     features = (index[..., None] == np.arange(1 << (memory + 1))).reshape(n_states * n_words, -1)
     end = words[:, SLOTS_PER_SYMBOL - memory :] @ (1 << np.arange(memory - 1, -1, -1))
-    into = np.where(end[:, None] == np.arange(n_states), 0.0, _NEVER)
-    return _Branches(words, np.ascontiguousarray(features.T, np.float32), end.astype(np.int64), into)
+    into = (end[:, None] == np.arange(n_states)).astype(np.float32)
+    return _Branches(words, np.ascontiguousarray(features.T, np.float32), into)
 
 
 def _log_sum(values: FloatArray, axis: int) -> FloatArray:
@@ -68,7 +71,7 @@ class _Packets:
     """Posterior of n packets of one weight."""
 
     evidence: FloatArray  # (n,)
-    word: FloatArray  # (n, N, words) log posterior
+    word: FloatArray  # (n, N, words) probability
 
 
 def _forward_backward(metrics: FloatArray, w: int, memory: int) -> _Packets:
@@ -78,24 +81,41 @@ def _forward_backward(metrics: FloatArray, w: int, memory: int) -> _Packets:
     n_symbols = (length - memory - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL
     n_states, n_words = 1 << memory, len(branches.words)
     preamble = np.concatenate([np.array(HEADER, np.int64), dimming_symbol(w)])
-    known = _pattern_index(preamble, memory)
-    evidence = metrics[:, np.arange(memory, PREAMBLE_SLOTS), known].sum(axis=1)
-    payload = metrics[:, PREAMBLE_SLOTS : length - memory].reshape(n * n_symbols, -1).astype(np.float32)
-    branch = (payload @ branches.features).astype(np.float64).reshape(n, n_symbols, n_states, n_words)
+    known = metrics[:, np.arange(memory, PREAMBLE_SLOTS), _pattern_index(preamble, memory)].sum(axis=1)
+    payload = metrics[:, PREAMBLE_SLOTS : length - memory].reshape(n * n_symbols, -1)
+    # Only differences matter; what is left fits float32 with room to spare.
+    offset = payload.max(axis=1)
+    payload = (payload - offset[:, None]).astype(np.float32)
+    branch = (payload @ branches.features).reshape(n, n_symbols, n_states, n_words)
+    top = branch.max(axis=3, keepdims=True)
+    branch -= top
+    likelihood = np.exp(branch, out=branch)
+    step = np.log(np.maximum(likelihood @ branches.into, _TINY)) + top
     start = np.full((n, n_states), _NEVER)
-    start[:, _pattern_index(preamble[PREAMBLE_SLOTS - memory :], memory - 1)[0] if memory else 0] = 0.0
-    forward, backward = [start], [_tail(metrics[:, length - memory :], memory)]
-    for symbol in range(n_symbols):
-        word = _log_sum(forward[-1][:, :, None] + branch[:, symbol], axis=1)
-        forward.append(_log_sum(word[:, :, None] + branches.into, axis=1))
-    for symbol in range(n_symbols - 1, -1, -1):
-        backward.append(_log_sum(branch[:, symbol] + backward[-1][:, None, branches.end], axis=2))
-    before = np.stack(forward[:-1], axis=1)
-    after = np.stack(backward[-2::-1], axis=1)
-    joint = _log_sum(before[..., None] + branch, axis=2) + after[:, :, branches.end]
-    total = _log_sum(joint, axis=2)
-    evidence = evidence + total[:, 0] - n_symbols * np.log(n_words)
-    return _Packets(evidence, joint - total[..., None])
+    start[:, _pattern_index(preamble[PREAMBLE_SLOTS - memory :], memory - 1)[0]] = 0.0
+    before, after = _recursions(step, start, _tail(metrics[:, length - memory :], memory))
+    joint = _scaled(before + top[..., 0])[:, :, None, :] @ likelihood
+    joint = joint[:, :, 0] * (_scaled(after) @ branches.into.T)
+    total = joint.sum(axis=2, keepdims=True)
+    last = _log_sum(before[:, -1, :, None] + step[:, -1], axis=1) + after[:, -1]
+    offset = SLOTS_PER_SYMBOL * offset.reshape(n, n_symbols).sum(axis=1)
+    evidence = known + offset + _log_sum(last, axis=1) - n_symbols * np.log(n_words)
+    uniform = np.full_like(joint, 1 / n_words)
+    return _Packets(evidence, np.divide(joint, total, out=uniform, where=total > 0))
+
+
+def _recursions(step: FloatArray, start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Log-likelihood of each state before and after every symbol, (n, N, states), from the steps between states."""
+    before, after = [start], [end]
+    for symbol in range(step.shape[1] - 1):
+        before.append(_log_sum(before[-1][:, :, None] + step[:, symbol], axis=1))
+        after.append(_log_sum(step[:, -1 - symbol] + after[-1][:, None, :], axis=2))
+    return np.stack(before, axis=1), np.stack(after[::-1], axis=1)
+
+
+def _scaled(log_values: FloatArray) -> NDArray[np.float32]:
+    """Exponentials, the largest of each last axis being 1."""
+    return np.asarray(np.exp(log_values - log_values.max(axis=-1, keepdims=True)), np.float32)
 
 
 def _tail(metrics: FloatArray, memory: int) -> FloatArray:
@@ -104,6 +124,33 @@ def _tail(metrics: FloatArray, memory: int) -> FloatArray:
     header = np.broadcast_to(np.array(HEADER[:memory], np.int64), (len(states), memory))
     index = _pattern_index(np.concatenate([states, header], axis=1), memory)
     return metrics[:, np.arange(memory), index].sum(axis=2)
+
+
+def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
+    """Weights that stand up to a quick look, (C, 9): the best one and those within `margin` nats of it.
+
+    Slots are taken as independent, and a symbol of weight w as any of the C(10, w) words, so that the likelihoods of
+    all weights are the coefficients of a polynomial: the product over the symbol's slots of 1 + x exp(llr).
+
+    Args:
+        metrics: (B, C, packet + memory, patterns) log-likelihoods of B bursts.
+        margin: nats.
+    """
+    memory = _memory_of(metrics)
+    by_state = metrics.reshape(*metrics.shape[:3], -1, 2)[:, :, memory:]
+    llr = np.diff(_log_sum(by_state, axis=3), axis=-1)[..., 0]
+    llr = np.clip(llr[:, :, : metrics.shape[2] - 2 * memory], -_SURE_LLR, _SURE_LLR)
+    llr = np.concatenate([np.zeros((*llr.shape[:2], memory)), llr], axis=2)
+    symbols = llr.reshape(*llr.shape[:2], -1, SLOTS_PER_SYMBOL)
+    payload = symbols[:, :, 2:]
+    coefficients = np.zeros((*payload.shape[:3], SLOTS_PER_SYMBOL + 1))
+    coefficients[..., 0] = 1.0
+    for slot in np.moveaxis(np.exp(payload), 3, 0):
+        coefficients[..., 1:] += coefficients[..., :-1] * slot[..., None]
+    words = np.array([comb(SLOTS_PER_SYMBOL, w) for w in WEIGHTS])
+    score = np.log(coefficients[..., 1:SLOTS_PER_SYMBOL] / words).sum(axis=(0, 2))
+    score += np.cumsum(symbols[:, :, 1], axis=2)[..., : len(WEIGHTS)].sum(axis=0)
+    return np.asarray(score >= score.max(axis=1, keepdims=True) - margin)
 
 
 def weight_evidence(metrics: FloatArray, candidates: NDArray[np.bool_]) -> FloatArray:
@@ -144,7 +191,9 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
         ValueError: shapes do not fit.
     """
     if metrics.ndim != 4 or metrics.shape[-1] not in {1 << (m + 1) for m in range(1, MAX_MEMORY + 1)}:
-        raise ValueError(f"metrics must be (bursts, columns, slots, 2**(memory+1)) with memory 1..{MAX_MEMORY} (got {metrics.shape})")
+        raise ValueError(
+            f"metrics must be (bursts, columns, slots, 2**(memory+1)) with memory 1..{MAX_MEMORY} (got {metrics.shape})"
+        )
     if candidates is None:
         candidates = np.ones((metrics.shape[1], len(WEIGHTS)), bool)
     return _posteriors(metrics, _weights(metrics, candidates))
@@ -171,23 +220,28 @@ def _posteriors(metrics: FloatArray, w_log_prob: FloatArray) -> BurstPosteriors:
     for w in np.unique(weights):
         columns = np.flatnonzero(weights == w)
         chosen = metrics[:, columns].reshape(n_bursts * columns.size, *metrics.shape[2:])
-        word = _forward_backward(chosen, int(w), memory).word
+        posterior = _forward_backward(chosen, int(w), memory).word
         words = codebook(int(w))
-        posterior = np.exp(word)
         preamble = np.concatenate([np.array(HEADER), dimming_symbol(int(w))])
         lit[:, columns, :PREAMBLE_SLOTS] = preamble
         lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ words).reshape(n_bursts, columns.size, -1)
-        best = word.argmax(axis=2)
+        best = posterior.argmax(axis=2)
         index[:, columns] = best.reshape(n_bursts, columns.size, n_symbols)
-        log_prob[:, columns] = np.take_along_axis(word, best[..., None], 2).reshape(n_bursts, columns.size, n_symbols)
+        log_prob[:, columns] = _log_of_best(posterior, best).reshape(n_bursts, columns.size, n_symbols)
         k = bits_per_symbol(int(w))
         bit_llr[:, columns, :, :k] = _bit_llr(posterior, k).reshape(n_bursts, columns.size, n_symbols, k)
     return BurstPosteriors(weights, w_log_prob, lit, index, log_prob, bit_llr)
+
+
+def _log_of_best(posterior: FloatArray, best: NDArray[np.int64]) -> FloatArray:
+    """Log of the largest probability, from the sum of the others so that 1 - 1e-12 is told from 1."""
+    rest = posterior.astype(np.float64)
+    np.put_along_axis(rest, best[..., None], 0.0, 2)
+    return np.asarray(np.log1p(-np.minimum(rest.sum(axis=2), 1 - 1 / posterior.shape[2])))
 
 
 def _bit_llr(posterior: FloatArray, k: int) -> FloatArray:
     """(n, N, k) ln p(1)/p(0) from (n, N, 2**k) probabilities of the codebook indices."""
     bits = (np.arange(1 << k)[:, None] >> np.arange(k - 1, -1, -1)) & 1
     one, zero = posterior @ bits, posterior @ (1 - bits)
-    tiny = np.finfo(np.float64).tiny
-    return np.asarray(np.log(np.maximum(one, tiny)) - np.log(np.maximum(zero, tiny)))
+    return np.asarray(np.log(np.maximum(one, _TINY)) - np.log(np.maximum(zero, _TINY)))

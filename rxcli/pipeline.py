@@ -13,8 +13,17 @@ import numpy as np
 
 from rxcli import assemble, channel, clock, detect, geometry, sampling
 from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, match_camera
-from rxcli.protocol import WEIGHTS
-from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameResult, Lens, RowProfiles, SlotSamples
+from rxcli.types import (
+    BurstPosteriors,
+    Clock,
+    Float32Array,
+    FloatArray,
+    Frame,
+    FrameResult,
+    Lens,
+    RowProfiles,
+    SlotSamples,
+)
 
 CaeMode = Literal["auto", "always", "never"]
 #: Names of the shortcuts that `ReceiverOptions.skip` may hold; every one is counted in the report.
@@ -23,14 +32,14 @@ SKIPS = ("no_screen", "dark_columns", "certain_columns", "tracking")
 _DEFAULT_TONE = "srgb"
 _SAMPLES_PER_SLOT = 4
 _MAX_ITERATIONS = 6
-#: A column all of whose symbols are at least this sure is not looked at again.
-_CERTAIN = float(np.log(0.9999))
-#: Weights this much less likely than the best one are dropped, nats.
-_HOPELESS_WEIGHT = 25.0
-#: Iterations before a weight may be dropped: the first ones know the picture too little.
-_SETTLED = 2
-#: Iterations after which the clock is corrected: the first one trusts its slots too little.
-_CLOCK_ITERATIONS = (1, 2)
+#: A column all of whose symbols have at least this log probability is not looked at again.
+_CERTAIN = -1e-5
+#: The quick look at the picture is surer than it should be of textured ones: it must do for all columns, and clearly.
+_CERTAIN_AT_ONCE = -1e-6
+#: Weights that a quick look finds this much less likely than the best are dropped, nats.
+_HOPELESS_WEIGHT = 20.0
+#: Iterations after which the clock is corrected.
+_CLOCK_ITERATIONS = 2
 #: A header peak less than this times the strongest rival is no lock.
 _MIN_LOCK = 1.6
 #: Orientations in which the readout runs along the columns' width.
@@ -183,9 +192,7 @@ def _find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
     return geometry.viewer_order(found.corners, orientation)
 
 
-def _find_lock(
-    frame: Frame, corners: FloatArray, camera: _Camera, options: ReceiverOptions, stages: _Stages
-) -> _Lock:
+def _find_lock(frame: Frame, corners: FloatArray, camera: _Camera, options: ReceiverOptions, stages: _Stages) -> _Lock:
     """The screen profile whose clock fits best, with the row profiles of its columns."""
     best: _Lock | None = None
     for n_columns in sorted({screen.columns for screen in options.screens}):
@@ -243,26 +250,29 @@ def _decode(lock: _Lock) -> tuple[Clock, BurstPosteriors, Float32Array, SlotSamp
     model = _light_model(lock, samples)
     metrics = _first_guess(samples, now, model)
     snr = np.zeros((samples.light.shape[0], now.n_slots), np.float32)
-    candidates = np.ones((samples.light.shape[0], len(WEIGHTS)), bool)
     columns = np.arange(samples.light.shape[0])
-    posteriors = detect.detect(channel.by_burst(metrics, now, model.memory), candidates)
+    complete = assemble.complete(assemble.slots_seen(samples, now))
+    posteriors = _detect(metrics, now, model)
     for iteration in range(_MAX_ITERATIONS):
-        likelihoods = channel.slot_likelihoods(samples, now, model, channel.lit_on_grid(posteriors, now), columns)
-        if iteration in _CLOCK_ITERATIONS:
+        lit = channel.lit_on_grid(posteriors, now)
+        likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=iteration > 0)
+        metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
+        posteriors = _detect(metrics, now, model)
+        certain = _CERTAIN if iteration else _CERTAIN_AT_ONCE
+        doubtful = ((posteriors.log_prob.min(axis=2) < certain) & complete).any(axis=0)
+        if not doubtful.any():
+            break
+        if iteration:
+            columns = np.flatnonzero(doubtful)
+        if iteration < _CLOCK_ITERATIONS:
             now = clock.corrected(now, likelihoods.timing)
             samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
-            likelihoods = channel.slot_likelihoods(samples, now, model, channel.lit_on_grid(posteriors, now), columns)
-        metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
-        before = posteriors
-        posteriors = detect.detect(channel.by_burst(metrics, now, model.memory), candidates)
-        log_prob = posteriors.w_log_prob
-        if iteration >= _SETTLED:
-            candidates = log_prob > log_prob.max(axis=1, keepdims=True) - _HOPELESS_WEIGHT
-        certain = (posteriors.log_prob.min(axis=(0, 2)) > _CERTAIN) & (before.index == posteriors.index).all(axis=(0, 2))
-        columns = np.flatnonzero(~certain)
-        if columns.size == 0:
-            break
     return now, posteriors, snr, samples
+
+
+def _detect(metrics: FloatArray, now: Clock, model: channel.LightModel) -> BurstPosteriors:
+    bursts = channel.by_burst(metrics, now, model.memory)
+    return detect.detect(bursts, detect.plausible_weights(bursts, _HOPELESS_WEIGHT))
 
 
 def _light_model(lock: _Lock, samples: SlotSamples) -> channel.LightModel:

@@ -130,7 +130,9 @@ def parse_profile(text: str, kind: type[_Profile], source: str) -> _Profile:
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ProfileError(f"{source}: not valid TOML ({error})", "correct the file, or name a shipped profile") from None
+        raise ProfileError(
+            f"{source}: not valid TOML ({error})", "correct the file, or name a shipped profile"
+        ) from None
     return check_profile(raw, kind, source)
 
 

@@ -6,7 +6,7 @@ symbol and payload symbols, a *burst* is one packet sent several times back to b
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from math import comb
 
 import numpy as np
@@ -30,14 +30,14 @@ def bits_per_symbol(w: int) -> int:
     return comb(SLOTS_PER_SYMBOL, w).bit_length() - 1
 
 
-@lru_cache(maxsize=None)
+@cache
 def codebook(w: int) -> NDArray[np.uint8]:
     """Codewords of weight `w`, (2**k, 10) uint8 of 0/1, first-sent slot first, in order of index; read-only."""
     n_words = 1 << bits_per_symbol(w)
     values = np.arange(1 << SLOTS_PER_SYMBOL)
     shifts = np.arange(SLOTS_PER_SYMBOL - 1, -1, -1)
     slots = ((values[:, None] >> shifts) & 1).astype(np.uint8)
-    words = slots[slots.sum(axis=1) == w][:n_words]
+    words: NDArray[np.uint8] = slots[slots.sum(axis=1) == w][:n_words]
     words.flags.writeable = False
     return words
 

@@ -142,7 +142,9 @@ def _smooth_rows(values: Float32Array) -> Float32Array:
     import cv2
 
     kernel = np.array([0.25, 0.5, 0.25], np.float32)
-    return cast(Float32Array, cv2.sepFilter2D(values, -1, np.ones(1, np.float32), kernel, borderType=cv2.BORDER_REFLECT))
+    return cast(
+        Float32Array, cv2.sepFilter2D(values, -1, np.ones(1, np.float32), kernel, borderType=cv2.BORDER_REFLECT)
+    )
 
 
 def _between_edges(cells: Float32Array, edges: FloatArray) -> tuple[Float32Array, Float32Array]:
