@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.profiles import LensModel
-from rxcli.types import BoolArray, FloatArray, Lens, Outlines
+from rxcli.types import FloatArray, IntArray, Lens, Outlines
 
 #: Rows of a picture for the viewer start at this stored corner: EXIF orientation -> order of the stored corners
 #: (top-left, top-right, bottom-right, bottom-left of the stored picture) as the viewer meets them.
@@ -18,6 +18,8 @@ _VIEWER_CORNERS = {1: (0, 1, 2, 3), 2: (1, 0, 3, 2), 3: (2, 3, 0, 1), 4: (3, 2, 
 #: Share of the screen's height beyond its corners that outlines reach, so that no edge row is lost.
 _OVERHANG = 0.02
 _OUTLINE_POINTS = 65
+#: Edges are straight to a thousandth of a pixel over this many rows.
+_KNOT_ROWS = 32
 
 
 def viewer_order(corners: FloatArray, orientation: int) -> FloatArray:
@@ -138,9 +140,20 @@ def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:
 def _edges_by_row(points: FloatArray, v: FloatArray, rows: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
     """x and v of every edge (n_edges, n_points, 2) on every row; a screen upside down has y falling with v."""
     step = 1 if points[0, -1, 1] > points[0, 0, 1] else -1
-    x = np.stack([np.interp(rows, edge[::step, 1], edge[::step, 0]) for edge in points])
-    along = np.stack([np.interp(rows, edge[::step, 1], v[::step]) for edge in points])
-    return x, along
+    knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
+    x = np.stack([np.interp(knots, edge[::step, 1], edge[::step, 0]) for edge in points])
+    along = np.stack([np.interp(knots, edge[::step, 1], v[::step]) for edge in points])
+    left = np.minimum((rows - rows[0]) // _KNOT_ROWS, max(knots.size - 2, 0))
+    right = np.minimum(left + 1, knots.size - 1)
+    part = (rows - knots[left]) / np.maximum(knots[right] - knots[left], 1)
+    return _between(x, left, right, part), _between(along, left, right, part)
+
+
+def _between(values: FloatArray, left: IntArray, right: IntArray, part: FloatArray) -> FloatArray:
+    """(n, rows) linear interpolation of values (n, knots)."""
+    start = values[:, left]
+    start += (values[:, right] - start) * part
+    return start
 
 
 def _sensor_rows(
@@ -151,8 +164,3 @@ def _sensor_rows(
     middle_x = ((edges_x[1:] + edges_x[:-1]) / 2).reshape(shape)
     pixels = np.stack([middle_x, np.broadcast_to(rows.astype(np.float64), shape)], axis=-1)
     return distort(pixels, lens)[..., 1]
-
-
-def screen_rows(inside: BoolArray) -> int:
-    """Rows of the tallest strip: what the picture shows of the screen."""
-    return int(inside.sum(axis=-1).max(initial=0))

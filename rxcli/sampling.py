@@ -7,7 +7,8 @@ measures the same mix of red, green and blue.
 
 from __future__ import annotations
 
-from typing import cast
+from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,13 @@ _STRIP_PX = 12
 _MAX_STRIPS = 8
 #: Cells that a strip should have, so that the fractions at its slanted edges are fine.
 _CELLS_PER_STRIP = 4
-#: Rows converted at a time: what fits the cache.
+#: Rows read at a time: what fits the cache.
 _BAND_ROWS = 64
-#: One row in this many is read for the noise model.
+#: One row in this many is kept for the noise model, and of those as many as hold this many cells.
 _NOISE_ROW_STEP = 16
+_NOISE_CELLS = 30_000
+#: OpenCV and NumPy work outside the interpreter's lock.
+_THREADS = 2
 _NOISE_BINS = 24
 
 
@@ -59,44 +63,91 @@ def sample_rows(frame: Frame, outlines: Outlines, tone: str) -> RowProfiles:
     """
     edges = outlines.edges_x
     strip_px = float(np.median(np.abs(np.diff(edges[:, edges.shape[1] // 2]))))
-    first, last = int(outlines.rows[0]), int(outlines.rows[-1]) + 1
-    cells, cell_px = _cells(frame, first, last, strip_px, tone)
-    light, n_cells = _between_edges(cells, (edges + 0.5) / cell_px)
+    reader = _reader(frame, strip_px, tone)
+    n_rows = outlines.rows.size
+    light = np.empty((edges.shape[0] - 1, n_rows), np.float32)
+    enclosed = np.empty_like(light)
+
+    def read_band(start: int) -> Float32Array:
+        stop = min(start + _BAND_ROWS, n_rows)
+        cells = reader.read(int(outlines.rows[start]), int(outlines.rows[stop - 1]) + 1)
+        positions = (edges[:, start:stop] + 0.5) / reader.cell_px
+        light[:, start:stop], enclosed[:, start:stop] = _between_edges(cells, positions)
+        return cells[:: _NOISE_ROW_STEP].copy()
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        noise_cells = list(pool.map(read_band, range(0, n_rows, _BAND_ROWS)))
+    floor, slope = _noise_model(np.concatenate(noise_cells))
     inside = outlines.inside
-    light = light.reshape(inside.shape) * inside
-    n_cells = n_cells.reshape(inside.shape)
-    floor, slope = _noise_model(cells)
+    light = light.reshape(inside.shape)
+    light *= inside
+    count = np.median(enclosed[:, ::_NOISE_ROW_STEP], axis=1).reshape(inside.shape[:2]) * reader.cell_px
     return RowProfiles(
         light=light,
         inside=inside,
         rows=outlines.rows,
         sensor_row=outlines.sensor_row,
-        count=np.median(n_cells[:, :, ::_NOISE_ROW_STEP], axis=2) * cell_px,
-        noise_floor=floor * cell_px,
-        noise_slope=slope * cell_px,
+        count=count.astype(np.float32),
+        noise_floor=floor * reader.cell_px,
+        noise_slope=slope * reader.cell_px,
     )
 
 
-def _cells(frame: Frame, first: int, last: int, strip_px: float, tone: str) -> tuple[Float32Array, int]:
-    """Mean light of runs of `cell_px` pixels of the rows `first` to `last`; (rows, cells) float32."""
+class _Reader(Protocol):
+    """Reads rows of a frame as cells: mean light of runs of `cell_px` pixels."""
+
+    cell_px: int
+
+    def read(self, first: int, last: int) -> Float32Array:
+        """(last - first, cells) light of the rows `first` to `last`, not included."""
+
+
+def _reader(frame: Frame, strip_px: float, tone: str) -> _Reader:
     if frame.mosaic is not None:
-        return _mosaic_cells(frame, frame.mosaic, first, last)
-    cell_px = int(np.clip(strip_px // _CELLS_PER_STRIP, 1, 16))
-    return _developed_cells(frame, first, last, cell_px, tone), cell_px
+        return _MosaicReader(frame, frame.mosaic)
+    return _DevelopedReader(frame, int(np.clip(strip_px // _CELLS_PER_STRIP, 1, 16)), tone)
 
 
-def _developed_cells(frame: Frame, first: int, last: int, cell_px: int, tone: str) -> Float32Array:
-    import cv2
+class _DevelopedReader:
+    """Cells of a developed picture, its tone curve undone pixel by pixel."""
 
-    table = _light_table(frame, "linear" if frame.linear else tone)
-    width = frame.width // cell_px * cell_px
-    out = np.empty((last - first, width // cell_px), np.float32)
-    for top in range(first, last, _BAND_ROWS):
-        band = frame.pixels[top : min(top + _BAND_ROWS, last), :width]
-        light = cv2.LUT(band, table) if band.dtype == np.uint8 else table[band]
-        size = (out.shape[1], band.shape[0])
-        out[top - first : top - first + band.shape[0]] = cv2.resize(light, size, interpolation=cv2.INTER_AREA)
-    return out
+    def __init__(self, frame: Frame, cell_px: int, tone: str) -> None:
+        self.cell_px = cell_px
+        self._table = _light_table(frame, "linear" if frame.linear else tone)
+        self._pixels = frame.pixels[:, : frame.width // cell_px * cell_px]
+
+    def read(self, first: int, last: int) -> Float32Array:
+        import cv2
+
+        band = self._pixels[first:last]
+        light = cv2.LUT(band, self._table) if band.dtype == np.uint8 else self._table[band]
+        size = (band.shape[1] // self.cell_px, band.shape[0])
+        return np.asarray(cv2.resize(light, size, interpolation=cv2.INTER_AREA))
+
+
+class _MosaicReader:
+    """Cells of a mosaic, one period of the colour filter array long."""
+
+    def __init__(self, frame: Frame, mosaic: Mosaic) -> None:
+        self._weights, self._offsets, self._smooth = _mosaic_weights(mosaic)
+        self.cell_px = int(self._weights.shape[1])
+        self._pixels = frame.pixels[:, : frame.width // self.cell_px * self.cell_px]
+
+    def read(self, first: int, last: int) -> Float32Array:
+        if not self._smooth:
+            return self._rows(first, last)
+        top, bottom = max(first - 1, 0), min(last + 1, self._pixels.shape[0])
+        return _smooth_rows(self._rows(top, bottom))[first - top : last - top]
+
+    def _rows(self, first: int, last: int) -> Float32Array:
+        period = self._weights.shape[0]
+        n_cells = self._pixels.shape[1] // self.cell_px
+        out = np.empty((last - first, n_cells), np.float32)
+        for start in range(min(period, last - first)):
+            phase = (first + start) % period
+            runs = self._pixels[first + start : last : period].astype(np.float32).reshape(-1, self.cell_px)
+            out[start::period] = (runs @ self._weights[phase] - self._offsets[phase]).reshape(-1, n_cells)
+        return out
 
 
 def _light_table(frame: Frame, tone: str) -> Float32Array:
@@ -104,20 +155,6 @@ def _light_table(frame: Frame, tone: str) -> Float32Array:
     values = np.arange(np.iinfo(frame.pixels.dtype).max + 1, dtype=np.float64)
     encoded = np.clip((values - frame.black) / (frame.white - frame.black), 0, 1)
     return tone_to_light(tone, encoded).astype(np.float32)
-
-
-def _mosaic_cells(frame: Frame, mosaic: Mosaic, first: int, last: int) -> tuple[Float32Array, int]:
-    weights, offsets, smooth = _mosaic_weights(mosaic)
-    period_y, cell_px = weights.shape
-    n_cells = frame.width // cell_px
-    out = np.empty((last - first, n_cells), np.float32)
-    for phase in range(period_y):
-        start = (phase - first) % period_y
-        band = frame.pixels[first + start : last : period_y, : n_cells * cell_px]
-        if band.shape[0]:
-            runs = band.astype(np.float32).reshape(-1, cell_px)
-            out[start::period_y] = (runs @ weights[phase] - offsets[phase]).reshape(-1, n_cells)
-    return (_smooth_rows(out) if smooth else out), cell_px
 
 
 def _mosaic_weights(mosaic: Mosaic) -> tuple[Float32Array, Float32Array, bool]:
@@ -155,17 +192,21 @@ def _between_edges(cells: Float32Array, edges: FloatArray) -> tuple[Float32Array
     """
     n_rows, n = cells.shape
     total = np.zeros((n_rows, n + 1))
-    np.cumsum(cells, axis=1, out=total[:, 1:])
+    np.cumsum(cells, axis=1, dtype=np.float64, out=total[:, 1:])
     position = np.clip(edges, 0, n)
-    left = np.minimum(position.astype(np.int64), n - 1)
-    flat = left + np.arange(n_rows) * (n + 1)
-    below = total.ravel()[flat]
-    at_edge = below + (total.ravel()[flat + 1] - below) * (position - left)
+    left = position.astype(np.int32)
+    np.minimum(left, n - 1, out=left)
+    part = position - left
+    left += np.arange(0, n_rows * (n + 1), n + 1, dtype=np.int32)
+    flat = total.ravel()
+    at_edge = flat.take(left)
+    left += 1
+    at_edge += (flat.take(left) - at_edge) * part
     widths = np.diff(position, axis=0)
-    enclosed = np.abs(widths)
     sums = np.diff(at_edge, axis=0)
+    enclosed = np.abs(widths)
     light = np.divide(sums, widths, out=np.zeros_like(sums), where=enclosed > 0.1)
-    return light.astype(np.float32), enclosed.astype(np.float32)
+    return light, enclosed
 
 
 def _noise_model(cells: Float32Array) -> tuple[float, float]:
@@ -174,9 +215,9 @@ def _noise_model(cells: Float32Array) -> tuple[float, float]:
     Medians over bins of equal light ignore the picture's edges; a straight line through the bins with floor and slope
     not below zero.
     """
-    rows = cells[::_NOISE_ROW_STEP]
-    if rows.shape[1] < 2:
+    if cells.shape[1] < 2:
         return 1e-6, 0.0
+    rows = cells[:: max(1, cells.size // _NOISE_CELLS)]
     difference = np.abs(np.diff(rows, axis=1)).ravel()
     light = ((rows[:, 1:] + rows[:, :-1]) / 2).ravel()
     order = np.argsort(light)
@@ -193,8 +234,3 @@ def _floor_and_slope(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[
     excess = x - x[0]
     slope = float(np.median(np.divide(y - floor, excess, out=np.zeros_like(y), where=excess > 1e-4)))
     return floor, max(slope, 0.0)
-
-
-def lit_share(inside: BoolArray) -> float:
-    """Share of strip rows that lie on the screen and in the picture."""
-    return float(inside.mean()) if inside.size else 0.0
