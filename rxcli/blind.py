@@ -1,0 +1,887 @@
+"""What a picture says of the camera that took it: rows per slot, direction of readout, exposure, bend of the stripes.
+
+Four steps on the row profiles, none of which needs to know the camera.
+
+1. **Bend.** Neighbouring strips show the same slots, so the lag between them, over all of the picture, is the slope of
+   the stripes. Where a camera has taken the distortion out of its picture, the sensor row of a point p is the y of
+   K distort(K^-1 p); with any focal length in K the same map comes out for other coefficients, so that one width is
+   taken and k1 k2 p1 p2 are what is sought.
+2. **Scan.** Light between its local extremes, averaged over columns, shows the header wherever a packet starts; and a
+   packet sent again shows in every column's autocorrelation. Both are looked up over a grid of rows per slot for each
+   length of packet. The header read backwards, 1100011100, is its own complement, so the sign tells the direction.
+3. **Trial.** The best hypotheses are sliced into slots; header, dimming symbol and the constant weight of all symbols
+   decide between them: a wrong one may show a header by chance, but never twenty columns of constant weight.
+4. **Refinement.** The slots of the winner, seen through the exposure, predict the light of every strip on every row.
+   What is missing is the derivative with respect to time: least squares over all strips gives row and period of the
+   clock and the bend at once, with standard deviations from the spread between columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
+from rxcli.types import BoolArray, Float32Array, FloatArray, Lens, RowProfiles
+
+#: Rows per slot that are considered.
+MIN_ROWS_PER_SLOT, MAX_ROWS_PER_SLOT = 1.2, 60.0
+
+#: Scale of the coefficients k1 k2 p1 p2 for a focal length of one picture width, as a camera may have them.
+_BEND_SCALE = np.array([0.3, 0.6, 1.5e-3, 1.5e-3])
+#: Strips that a column keeps while its camera is unknown.
+_STRIPS = 4
+#: Distances of compared strips, in columns; a column's light reaches over its neighbours.
+_BEND_DISTANCES = (0.5, 1.0, 2.0)
+#: Lags looked at, rows; windows of rows; rows over which light is levelled.
+_BEND_LAGS, _BEND_WINDOWS, _BEND_LEVEL_ROWS = 24, 20, 100
+#: Samples a slot while the clock is sought.
+_SAMPLES = 4
+#: Rows per slot, at one octave's reduction, that its window of this many reduced rows serves.
+_OCTAVE, _OCTAVE_ROWS = (2.4, 4.8), 76
+#: Copies further apart than this many slots are not compared: the grid of rows per slot would have to be too fine.
+_SCAN_SLOTS = 700
+#: Hypotheses that are tried.
+_TRIALS = 24
+#: Any window of this many slots holds a lit and a dark one.
+_EXTREMES_SLOTS = 19
+#: Log-likelihood ratio of header and weights, over chance, that a clock must reach.
+MIN_EVIDENCE = 12.0
+
+
+@dataclass(frozen=True, slots=True)
+class Strips:
+    """Light of M strips on R rows in readout order; the columns' strips lie side by side."""
+
+    #: (M, R) float32: light; and 1 where it is on the screen, else 0.
+    light: Float32Array
+    inside: Float32Array
+    #: (M, R) float64: picture x of the strip's middle.
+    x: FloatArray
+    #: (R,) float64: rows counted in readout order from the picture's first one read.
+    rows: FloatArray
+    n_columns: int
+    #: Standard deviation of a strip's row of no light.
+    sigma: float
+    #: Size of the picture.
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A clock that a picture may show."""
+
+    rows_per_slot: float
+    packet_slots: int
+    #: Where a header starts: rows from the upper edge of the first of the strips' rows, in readout order.
+    start_row: float
+    #: True where the picture's rows run against the readout.
+    reversed: bool
+    #: Log-likelihood ratio of header and weights over chance; of the scan while it was not tried.
+    evidence: float
+
+
+@dataclass(frozen=True, slots=True)
+class BlindEstimate:
+    """What was estimated of a camera, with standard deviations."""
+
+    rows_per_slot: float
+    rows_per_slot_sd: float
+    packet_slots: int
+    reversed: bool
+    exposure_slots: float
+    exposure_slots_sd: float
+    #: (4,) k1 k2 p1 p2 for a focal length of one picture width, of a picture that was corrected in the camera.
+    bend: FloatArray
+    bend_sd: FloatArray
+    #: True where the stripes are bent beyond doubt.
+    corrected: bool
+    #: Log-likelihood ratio of header and weights over chance.
+    evidence: float
+
+
+def strips_of(profiles: RowProfiles, centre_x: FloatArray, width: int, height: int) -> Strips:
+    """Strips for the functions below, from row profiles that were sampled without a lens.
+
+    Args:
+        profiles: C columns, S strips, R rows; `sensor_row` None.
+        centre_x: (C*S, R) picture x of the strips' middles.
+        width: of the picture, pixels.
+        height: of the picture, rows.
+    """
+    n_columns, n_strips, n_rows = profiles.light.shape
+    join = n_strips // _STRIPS if n_strips % _STRIPS == 0 else 1
+    shape = (n_columns * n_strips // join, join, n_rows)
+    inside = profiles.inside.reshape(shape).astype(np.float32).min(axis=1)
+    sigma = np.sqrt(profiles.noise_floor / max(float(np.median(profiles.count)), 1.0) / join)
+    return Strips(
+        light=profiles.light.reshape(shape).mean(axis=1) * inside,
+        inside=inside,
+        x=centre_x.reshape(shape).mean(axis=1),
+        rows=profiles.rows.astype(np.float64),
+        n_columns=n_columns,
+        sigma=float(sigma),
+        width=width,
+        height=height,
+    )
+
+
+def in_readout_order(strips: Strips) -> Strips:
+    """The strips of a picture whose rows run against the readout, in readout order; its own inverse."""
+    return replace(
+        strips,
+        light=np.ascontiguousarray(strips.light[:, ::-1]),
+        inside=np.ascontiguousarray(strips.inside[:, ::-1]),
+        x=np.ascontiguousarray(strips.x[:, ::-1]),
+        rows=strips.height - 1 - strips.rows[::-1],
+    )
+
+
+def _reversed_bend(bend: FloatArray) -> FloatArray:
+    """The coefficients of the same bend with rows counted from the other end."""
+    return bend * np.array([1.0, 1.0, -1.0, 1.0])
+
+
+# Bend -----------------------------------------------------------------------------------------------------------------
+
+
+def bend_terms(x: FloatArray, rows: FloatArray, width: int, height: int) -> FloatArray:
+    """Rows that a unit of k1, k2, p1, p2 moves the sensor row of a point, for a focal length of one width.
+
+    Args:
+        x: (...) picture x.
+        rows: (...) picture rows, broadcast against `x`.
+        width: of the picture.
+        height: of the picture.
+
+    Returns:
+        (4, ...) float64.
+    """
+    across, down = np.broadcast_arrays((x - (width - 1) / 2) / width, (rows - (height - 1) / 2) / width)
+    square = across**2 + down**2
+    return width * np.stack([down * square, down * square**2, square + 2 * down**2, 2 * across * down])
+
+
+def estimate_bend(strips: Strips) -> FloatArray:
+    """k1 k2 p1 p2, for a focal length of one width, whose sensor rows make neighbouring strips most alike; (4,)."""
+    lags = [_lag_correlations(strips, distance) for distance in _distances(strips)]
+    total = sum(float(correlation[_BEND_LAGS].sum()) for correlation, _ in lags)
+    if not lags or total <= 0:
+        return np.zeros(4)
+    # The sum of correlations is worth about this many nats: rows times strips, many of which say the same.
+    weight = 4000.0 / total
+    k1, share = np.meshgrid(np.linspace(-0.4, 0.4, 33), [0.0, 0.7, 1.5, 2.5])
+    guesses = np.stack([k1.ravel(), (-share * k1).ravel(), 0 * k1.ravel(), 0 * k1.ravel()], axis=1)
+    scores = [_likeness(guess, lags, weight) for guess in guesses]
+    best = guesses[int(np.argmax(scores))]
+    return _climb(best, lags, weight)
+
+
+def _distances(strips: Strips) -> list[int]:
+    per_column = strips.light.shape[0] // strips.n_columns
+    steps = {max(1, round(distance * per_column)) for distance in _BEND_DISTANCES}
+    return sorted(step for step in steps if step < strips.light.shape[0])
+
+
+def _lag_correlations(strips: Strips, distance: int) -> tuple[Float32Array, FloatArray]:
+    """Correlation of strips `distance` apart by lag, strip and window of rows; and what lag a unit of bend makes.
+
+    Returns:
+        (lags, strips, windows) float32; (4, strips, windows) float64 rows.
+    """
+    n_rows = strips.light.shape[1]
+    level = _levelled(strips.light, strips.inside, _BEND_LEVEL_ROWS, strips.sigma)[0]
+    borders = np.linspace(_BEND_LAGS, n_rows - _BEND_LAGS, _BEND_WINDOWS + 1).astype(int)
+    middles = (borders[1:] + borders[:-1]) // 2
+    rows, x = strips.rows[middles], strips.x[:, middles]
+    terms = bend_terms(x, rows, strips.width, strips.height)
+    left, right = level[:-distance], level[distance:]
+    inner = left[:, _BEND_LAGS : n_rows - _BEND_LAGS]
+    out = np.empty((2 * _BEND_LAGS + 1, left.shape[0], _BEND_WINDOWS), np.float32)
+    for number, lag in enumerate(range(-_BEND_LAGS, _BEND_LAGS + 1)):
+        product = inner * right[:, _BEND_LAGS - lag : n_rows - _BEND_LAGS - lag]
+        out[number] = np.add.reduceat(product, borders[:-1] - _BEND_LAGS, axis=1)
+    return out, terms[:, distance:] - terms[:, :-distance]
+
+
+def _at_lag(correlation: Float32Array, lag: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Correlation at fractional lags with first and second derivative, by a cubic (Catmull-Rom) through the neighbours."""
+    place = np.clip(lag + (correlation.shape[0] - 1) / 2, 1, correlation.shape[0] - 2.001)
+    low = place.astype(np.int64)
+    f = place - low
+    a, b, c, d = (np.take_along_axis(correlation, (low + k)[None], 0)[0].astype(np.float64) for k in (-1, 0, 1, 2))
+    linear, square, cubic = (c - a) / 2, a - 2.5 * b + 2 * c - 0.5 * d, 1.5 * (b - c) + 0.5 * (d - a)
+    value = b + f * (linear + f * (square + f * cubic))
+    return value, linear + f * (2 * square + 3 * f * cubic), a - 2 * b + c
+
+
+def _likeness(bend: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float) -> float:
+    total = sum(float(_at_lag(c, np.tensordot(bend, terms, 1))[0].sum()) for c, terms in lags)
+    return weight * total - 0.5 * float(((bend / _BEND_SCALE) ** 2).sum())
+
+
+def _climb(bend: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float, steps: int = 8) -> FloatArray:
+    """Newton's method on the likeness, with the prior of `_BEND_SCALE`; never downhill."""
+    best, score = bend, _likeness(bend, lags, weight)
+    step = 1.0
+    for _ in range(steps):
+        gradient, hessian = -best / _BEND_SCALE**2, np.diag(1 / _BEND_SCALE**2)
+        for correlation, terms in lags:
+            _, slope, curvature = _at_lag(correlation, np.tensordot(best, terms, 1))
+            flat = terms.reshape(4, -1)
+            gradient = gradient + weight * flat @ slope.ravel()
+            hessian = hessian + weight * (flat * np.maximum(-curvature, 0).ravel()) @ flat.T
+        trial = best + step * np.linalg.solve(hessian, gradient)
+        trial_score = _likeness(trial, lags, weight)
+        if trial_score > score:
+            best, score = trial, trial_score
+        else:
+            step /= 2
+    return best
+
+
+def _levelled(
+    light: Float32Array, inside: Float32Array, window: int, sigma: float
+) -> tuple[Float32Array, Float32Array]:
+    """Light against mean and spread of the `window` rows around it; and the weight behind it, 0..1."""
+    import cv2
+
+    size = (window | 1, 1)
+    share = cv2.blur(inside, size) + np.float32(1e-3)
+    mean = cv2.blur(light, size) / share
+    variance = np.maximum(cv2.blur(light * light, size) / share - mean * mean, 0)
+    level = np.clip((light - mean) / np.sqrt(variance + np.float32(9 * sigma**2)), -3, 3) * inside
+    return level, variance / (variance + np.float32(16 * sigma**2)) * inside
+
+
+def straightened(strips: Strips, bend: FloatArray) -> Strips:
+    """The strips read along the bent stripes: every row of the result is one sensor row."""
+    if not bend.any():
+        return strips
+    moved = np.tensordot(bend, bend_terms(strips.x, strips.rows, strips.width, strips.height), 1)
+    index = np.arange(strips.rows.size)
+    # Row r shows sensor row r + moved(r); sensor row s is found at s - moved(s), to first order of a small slope.
+    back = np.take_along_axis(moved, np.clip(np.rint(index - moved), 0, index[-1]).astype(np.int64), 1)
+    place = np.clip(index - back, 0, index[-1] - 1e-6)
+    low = place.astype(np.int64)
+    f = (place - low).astype(np.float32)
+    light = _between(strips.light, low, f)
+    inside = (_between(strips.inside, low, f) > 0.99) & (np.abs(index - back - place) < 0.5)
+    return replace(strips, light=light * inside, inside=inside.astype(np.float32))
+
+
+def _between(values: Float32Array, low: NDArray[np.int64], f: Float32Array) -> Float32Array:
+    below, above = (
+        np.take_along_axis(values, low, 1),
+        np.take_along_axis(values, np.minimum(low + 1, values.shape[1] - 1), 1),
+    )
+    return np.asarray(below + (above - below) * f, np.float32)
+
+
+# Scan -----------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Octave:
+    """Columns between their local extremes, reduced by a power of two, for an octave of rows per slot."""
+
+    #: (C, R') float32.
+    columns: Float32Array
+    #: Rows of one reduced row.
+    rows: int
+    #: Rows per slot that it serves.
+    low: float
+    high: float
+    #: (R',) deviation of the autocorrelation at every lag from chance, in standard deviations.
+    repeats: FloatArray
+
+
+def _octaves(strips: Strips) -> list[_Octave]:
+    """All octaves whose slots, by the columns' autocorrelation at short lags, may be of its length."""
+    out = []
+    light, inside, rows = strips.light, strips.inside, 1
+    low, high = _OCTAVE
+    bounds = [(1, MIN_ROWS_PER_SLOT, low)]
+    while low * (1 << (len(bounds) - 1)) < MAX_ROWS_PER_SLOT:
+        reduce = 1 << (len(bounds) - 1)
+        bounds.append((reduce, low * reduce, min(high * reduce, MAX_ROWS_PER_SLOT)))
+    for reduce, least, most in bounds:
+        if reduce > rows:
+            light, inside, rows = _halved(light), _halved(inside), reduce
+        if light.shape[1] * rows < 2 * PREAMBLE_SLOTS * least:
+            break
+        window = round(_OCTAVE_ROWS * most / (_OCTAVE[1] * rows))
+        noise = strips.sigma / np.sqrt(rows)
+        columns = _pooled(light, (inside > 0.99).astype(np.float32), window, noise, strips.n_columns)
+        correlation = _autocorrelation(columns)
+        width = _half_width(correlation) * rows
+        if 0.3 * least <= width <= 2.0 * most:
+            out.append(
+                _Octave(columns, rows, least, most, _surprise(correlation, round(PREAMBLE_SLOTS * least / rows)))
+            )
+    return out
+
+
+def _halved(values: Float32Array) -> Float32Array:
+    even = values.shape[1] // 2 * 2
+    return np.asarray((values[:, 0:even:2] + values[:, 1:even:2]) / 2, np.float32)
+
+
+def _pooled(light: Float32Array, inside: Float32Array, window: int, sigma: float, n_columns: int) -> Float32Array:
+    """(C, R) mean of the levelled strips of each column, small where little light is behind it."""
+    level, weight = _levelled(light, inside, window, sigma)
+    total = weight.reshape(n_columns, -1, weight.shape[1]).sum(axis=1)
+    summed = (level * weight).reshape(n_columns, -1, weight.shape[1]).sum(axis=1)
+    return np.asarray(summed / (total + 0.01) * (total / (total + 1)), np.float32)
+
+
+def _autocorrelation(columns: Float32Array) -> FloatArray:
+    """(R,) sum over columns of the product with the same column later."""
+    n = columns.shape[1]
+    size = 1 << int(np.ceil(np.log2(2 * n)))
+    spectrum = np.fft.rfft(columns, size, axis=1)
+    return np.asarray(np.fft.irfft((spectrum * spectrum.conj()).real.sum(axis=0), size)[:n])
+
+
+def _half_width(correlation: FloatArray) -> float:
+    """Lag at which the correlation falls to half of that at the shortest lag."""
+    top = correlation[1] if correlation.size > 2 else 0.0
+    below = np.flatnonzero(correlation[1:] < top / 2)
+    if top <= 0 or below.size == 0:
+        return 0.0
+    lag = int(below[0]) + 1
+    return float(lag - (top / 2 - correlation[lag]) / max(correlation[lag - 1] - correlation[lag], 1e-12))
+
+
+def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:
+    n = correlation.size
+    scaled = correlation / np.sqrt(np.arange(n, 0, -1))
+    part = scaled[min(shortest, n // 2) : max(n - 10, n // 2 + 1)]
+    middle = float(np.median(part))
+    spread = 1.4826 * float(np.median(np.abs(part - middle))) + 1e-9
+    out = np.maximum(scaled - middle, 0) / spread
+    out[-10:] = 0
+    return np.asarray(out)
+
+
+def _header_response(mean: FloatArray, rows_per_slot: float) -> FloatArray:
+    """Correlation of (R,) levelled light with a header of either sign that starts at each sample of a slot's quarter.
+
+    Sample 0 is a header's length before row 0.
+    """
+    lead = SLOTS_PER_SYMBOL * _SAMPLES
+    n = int(mean.size / rows_per_slot * _SAMPLES)
+    total = np.concatenate([[0.0], np.cumsum(mean)])
+    grid = np.arange(-lead, n + lead + 1) * (rows_per_slot / _SAMPLES)
+    summed = np.interp(grid, np.arange(total.size), total)
+    starts = n + lead
+    signs = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
+    edges = np.flatnonzero(signs)
+    out = sum(-signs[e] * summed[e * _SAMPLES : e * _SAMPLES + starts] for e in edges)
+    return np.asarray(out / (SLOTS_PER_SYMBOL * rows_per_slot))
+
+
+def _comb(response: FloatArray, packet_slots: int) -> tuple[float, int]:
+    """Best sum of the response over copies of a packet, over the root of their number; and its sample."""
+    period, lead = packet_slots * _SAMPLES, SLOTS_PER_SYMBOL * _SAMPLES
+    n_copies = -(-response.size // period)
+    folded = np.zeros(n_copies * period)
+    whole = np.zeros(n_copies * period)
+    folded[lead : response.size - lead] = response[lead : response.size - lead]
+    whole[lead : response.size - lead] = 1
+    count = whole.reshape(n_copies, period).sum(axis=0)
+    score = folded.reshape(n_copies, period).sum(axis=0) / np.sqrt(np.maximum(count, 1))
+    best = int(score.argmax())
+    return float(score[best]), best
+
+
+def find_clocks(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesis]:
+    """Clocks that the picture may show, best first.
+
+    Args:
+        strips: straightened strips.
+        packet_lengths: slots of a packet, of every screen in question.
+    """
+    octaves = _octaves(strips)
+    found = [(h, o) for o in octaves for h in _scan_octave(o, strips.rows.size, packet_lengths)]
+    found.sort(key=lambda pair: -pair[0].evidence)
+    distinct: list[tuple[Hypothesis, _Octave]] = []
+    for one, octave in found:
+        if len(distinct) < _TRIALS and not any(_alike(one, other) for other, _ in distinct):
+            distinct.append((one, octave))
+    return sorted((_try(*pair) for pair in distinct), key=lambda hypothesis: -hypothesis.evidence)
+
+
+def _alike(one: Hypothesis, other: Hypothesis) -> bool:
+    same = one.packet_slots == other.packet_slots and one.reversed == other.reversed
+    return same and abs(np.log(one.rows_per_slot / other.rows_per_slot)) < 0.015
+
+
+def _scan_octave(octave: _Octave, n_rows: int, packet_lengths: Sequence[int]) -> list[Hypothesis]:
+    import cv2
+
+    out = []
+    mean = octave.columns.mean(axis=0).astype(np.float64)
+    rows_per_slot = octave.low
+    around = np.ones((1, 2 * _SAMPLES + 1), np.uint8)
+    while rows_per_slot < octave.high:
+        seen = n_rows / rows_per_slot
+        response = _header_response(mean, rows_per_slot / octave.rows)
+        spread = 1.4826 * float(np.median(np.abs(response))) + 1e-6
+        for sign in (1, -1):
+            # The largest response within a slot: the grid may then miss copies by a slot.
+            near = cv2.dilate((sign * response)[None], around)[0]
+            for packet_slots in packet_lengths:
+                score, sample = _comb(near, packet_slots)
+                repeats = _repeats_near(octave, rows_per_slot, packet_slots)
+                start = (sample / _SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
+                evidence = (score / spread) ** 2 + repeats**2
+                out.append(Hypothesis(rows_per_slot, packet_slots, start, sign < 0, evidence))
+        rows_per_slot *= 1 + 2.0 / min(seen, _SCAN_SLOTS)
+    return out
+
+
+def _repeats_near(octave: _Octave, rows_per_slot: float, packet_slots: int) -> float:
+    """Surprise of the autocorrelation at lags within a slot of one packet."""
+    lag, slot = rows_per_slot * packet_slots / octave.rows, max(rows_per_slot / octave.rows, 1.0)
+    return float(octave.repeats[int(lag - slot) : int(lag + slot) + 2].max(initial=0.0))
+
+
+# Trial ----------------------------------------------------------------------------------------------------------------
+
+
+def _try(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
+    """The hypothesis with the clock that fits best thereabouts, and the evidence of its slots."""
+    fine = _fine_clock(hypothesis, octave)
+    columns = octave.columns[:, ::-1] if fine.reversed else octave.columns
+    rows_per_slot = fine.rows_per_slot / octave.rows
+    start = fine.start_row / octave.rows
+    if fine.reversed:
+        start = columns.shape[1] - start - SLOTS_PER_SYMBOL * rows_per_slot
+    before = int(start // rows_per_slot)
+    first = start - before * rows_per_slot
+    borders = np.arange(first, columns.shape[1], rows_per_slot)
+    total = np.concatenate([np.zeros((columns.shape[0], 1)), np.cumsum(columns, axis=1)], axis=1)
+    evidence = structure_evidence(_slot_means(total, borders), -before % fine.packet_slots, fine.packet_slots)
+    return replace(fine, start_row=start * octave.rows, evidence=evidence)
+
+
+def _slot_means(total: FloatArray, borders: FloatArray) -> FloatArray:
+    """(C, N) means between borders, from (C, R + 1) running sums."""
+    place = np.clip(borders, 0, total.shape[1] - 1 - 1e-9)
+    low = place.astype(np.int64)
+    at = total[:, low] + (total[:, low + 1] - total[:, low]) * (place - low)
+    return np.asarray(np.diff(at, axis=1) / np.maximum(np.diff(place), 1e-6))
+
+
+def _fine_clock(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
+    """The clock near the hypothesis with the highest header peaks."""
+    mean = octave.columns.mean(axis=0).astype(np.float64)
+    if hypothesis.reversed:
+        mean = -mean
+    n_rows = mean.size * octave.rows
+    step = 0.3 / min(n_rows / hypothesis.rows_per_slot, _SCAN_SLOTS)
+    best, best_score = hypothesis, -np.inf
+    for rows_per_slot in hypothesis.rows_per_slot * (1 + step * np.arange(-8, 9)):
+        response = _header_response(mean, rows_per_slot / octave.rows)
+        score, sample = _comb(response, hypothesis.packet_slots)
+        score += 0.03 * _repeats_at(octave, rows_per_slot, hypothesis.packet_slots)
+        if score > best_score:
+            start = (sample / _SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
+            best = replace(hypothesis, rows_per_slot=float(rows_per_slot), start_row=float(start))
+            best_score = score
+    return best
+
+
+def _repeats_at(octave: _Octave, rows_per_slot: float, packet_slots: int) -> float:
+    lag = rows_per_slot * packet_slots / octave.rows
+    return float(np.interp(lag, np.arange(octave.repeats.size), octave.repeats, right=0.0))
+
+
+def structure_evidence(slots: FloatArray, first_slot: int, packet_slots: int) -> float:
+    """Log-likelihood ratio of slots being packets, over slots lit at random.
+
+    Headers must read 0011100011, and every other symbol of a column must have the same number of lit slots; a column
+    may be too dark to say anything.
+
+    Args:
+        slots: (C, N) light of every slot, any scale.
+        first_slot: position of slot 0 in its packet.
+        packet_slots: slots of a packet.
+    """
+    n_columns, n = slots.shape
+    if n < _EXTREMES_SLOTS:
+        return -np.inf
+    lit = _sliced(slots)
+    position = (np.arange(n) + first_slot) % packet_slots
+    in_header = position < SLOTS_PER_SYMBOL
+    agree = lit[:, in_header] == np.array(HEADER, bool)[position[in_header]]
+    header = np.where(agree, np.log(0.9 / 0.5), np.log(0.1 / 0.5)).sum(axis=1)
+    starts = np.flatnonzero((position % SLOTS_PER_SYMBOL == 0) & ~in_header)
+    starts = starts[starts + SLOTS_PER_SYMBOL <= n]
+    count = lit[:, starts[:, None] + np.arange(SLOTS_PER_SYMBOL)].sum(axis=2)
+    weight = _weight_evidence(count, lit.mean(axis=1))
+    dimming = _dimming_evidence(lit, position)
+    best = (weight + dimming).max(axis=1)
+    return float(np.logaddexp(header + best, 0.0).sum() - n_columns * np.log(2.0))
+
+
+def _sliced(slots: FloatArray) -> BoolArray:
+    """Whether every slot is nearer to the lightest or to the darkest of those around it."""
+    windows = np.pad(slots, ((0, 0), (_EXTREMES_SLOTS // 2, _EXTREMES_SLOTS // 2)), mode="edge")
+    around = np.lib.stride_tricks.sliding_window_view(windows, _EXTREMES_SLOTS, axis=1)
+    return np.asarray(slots > (around.max(axis=2) + around.min(axis=2)) / 2)
+
+
+def _weight_evidence(count: NDArray[np.int64], share: FloatArray) -> FloatArray:
+    """(C, 9) log-likelihood ratio of the symbols' (C, n) lit slots for every weight, over chance at the column's share."""
+    weights = np.arange(SLOTS_PER_SYMBOL + 1)
+    off = np.abs(weights[:, None] - np.array(WEIGHTS))
+    likely = np.select([off == 0, off == 1, off == 2], [0.72, 0.1, 0.02], 0.005)
+    p = np.clip(share, 0.1, 0.9)[:, None]
+    ways = np.array([1, 10, 45, 120, 210, 252, 210, 120, 45, 10, 1])
+    chance = ways * p**weights * (1 - p) ** (SLOTS_PER_SYMBOL - weights)
+    seen = (count[..., None] == weights).sum(axis=1)
+    return np.asarray(seen @ np.log(likely) - (seen * np.log(chance)).sum(axis=1, keepdims=True) - np.log(len(WEIGHTS)))
+
+
+def _dimming_evidence(lit: BoolArray, position: NDArray[np.int64]) -> FloatArray:
+    """(C, 9) log-likelihood ratio of the dimming symbols' slots for every weight, over chance."""
+    inside = (position >= SLOTS_PER_SYMBOL) & (position < PREAMBLE_SLOTS)
+    expected = position[inside] - SLOTS_PER_SYMBOL < np.array(WEIGHTS)[:, None]
+    agree = (lit[:, None, inside] == expected).sum(axis=2)
+    n = int(inside.sum())
+    return np.asarray(agree * np.log(0.9 / 0.5) + (n - agree) * np.log(0.1 / 0.5))
+
+
+# Refinement -----------------------------------------------------------------------------------------------------------
+
+#: Exposures that are compared, slots.
+_EXPOSURES = np.array([0.15, 0.3, 0.45, 0.6, 0.8, 1.0, 1.2, 1.4, 1.7, 2.0, 2.35, 2.7, 3.1])
+#: Slots over which the light of a strip may be taken as constant.
+_LOCAL_SLOTS = 15
+_REFINE_STEPS = 6
+#: Rows of one block of the normal equations; the bend does not change within.
+_BLOCK_ROWS = 32
+
+
+@dataclass(frozen=True, slots=True)
+class _Timing:
+    """Row-time map: slot position of row s is (s + bend - start) / rows_per_slot."""
+
+    #: start, rows_per_slot, k1, k2, p1, p2.
+    values: FloatArray
+    #: Covariance of the values.
+    covariance: FloatArray
+    #: (C, N) bool: lit slots.
+    lit: BoolArray
+    #: Position of slot 0 in its packet.
+    first_slot: int
+    packet_slots: int
+    exposure_slots: float
+    exposure_sd: float
+    #: Share of the strips' local variance that the slots explain.
+    explained: float
+
+
+def refine(
+    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None = None
+) -> BlindEstimate:
+    """The clock, the bend and the exposure that fit all light of the picture best.
+
+    Args:
+        strips: the strips as the picture has them, not straightened.
+        hypothesis: a clock found on the straightened strips.
+        bend: the bend they were straightened with.
+        exposure_slots: exposure, None to estimate it.
+    """
+    ordered, bend = (in_readout_order(strips), _reversed_bend(bend)) if hypothesis.reversed else (strips, bend)
+    ordered = _thinned(ordered, hypothesis.rows_per_slot)
+    timing = _fit_timing(ordered, hypothesis, bend, exposure_slots)
+    start, rows_per_slot = timing.values[:2]
+    found, sd = timing.values[2:], np.sqrt(np.diag(timing.covariance))
+    evidence = structure_evidence(2.0 * timing.lit - 1, timing.first_slot, hypothesis.packet_slots)
+    return BlindEstimate(
+        rows_per_slot=float(rows_per_slot),
+        rows_per_slot_sd=float(sd[1]),
+        packet_slots=hypothesis.packet_slots,
+        reversed=hypothesis.reversed,
+        exposure_slots=timing.exposure_slots,
+        exposure_slots_sd=timing.exposure_sd,
+        bend=_reversed_bend(found) if hypothesis.reversed else found,
+        bend_sd=sd[2:],
+        corrected=_is_bent(ordered, timing),
+        evidence=evidence,
+    )
+
+
+def _thinned(strips: Strips, rows_per_slot: float) -> Strips:
+    """Neighbouring rows averaged as far as a slot keeps at least four."""
+    join = max(1, int(rows_per_slot // 4))
+    if join == 1:
+        return strips
+    n = strips.rows.size // join
+
+    def mean(values: FloatArray | Float32Array) -> FloatArray:
+        return np.asarray(values[..., : n * join].reshape(*values.shape[:-1], n, join).mean(axis=-1))
+
+    inside = (mean(strips.inside) > 0.99).astype(np.float32)
+    return replace(
+        strips,
+        light=mean(strips.light).astype(np.float32),
+        inside=inside,
+        x=mean(strips.x),
+        rows=mean(strips.rows),
+        sigma=strips.sigma / np.sqrt(join),
+    )
+
+
+def _fit_timing(strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None) -> _Timing:
+    """Gauss-Newton on the row-time map, deciding the slots anew at every step."""
+    first_row = strips.rows[0] - 0.5 * (strips.rows[1] - strips.rows[0])
+    before = int(hypothesis.start_row // hypothesis.rows_per_slot) + 2
+    start = first_row + hypothesis.start_row - before * hypothesis.rows_per_slot
+    values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
+    terms = _time_terms(strips)
+    grid = _Grid(-before % hypothesis.packet_slots, hypothesis.packet_slots)
+    exposure, exposure_sd = exposure_slots or 1.0, 0.0
+    covariance = np.eye(6)
+    for step in range(_REFINE_STEPS):
+        time = _slot_time(strips, terms, values)
+        waves = _column_waves(strips, time, exposure)
+        if exposure_slots is None and step in (1, 3):
+            exposure, exposure_sd = _estimate_exposure(waves, grid)
+        lit = _decide(waves, exposure, grid)
+        change, covariance, explained = _gauss_newton(strips, terms, values, time, lit, exposure)
+        values = values + change
+    return _Timing(values, covariance, lit, grid.first_slot, grid.packet_slots, exposure, exposure_sd, explained)
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    first_slot: int
+    packet_slots: int
+
+    def header(self, n: int) -> tuple[NDArray[np.int64], BoolArray]:
+        """Slots of the headers among slots 0..n, and whether they are lit."""
+        position = (np.arange(n) + self.first_slot) % self.packet_slots
+        slots = np.flatnonzero(position < SLOTS_PER_SYMBOL)
+        return slots, np.array(HEADER, bool)[position[slots]]
+
+
+def _time_terms(strips: Strips) -> FloatArray:
+    """(4, M, blocks + 1) bend terms at the borders of blocks of rows."""
+    n = strips.rows.size
+    nodes = np.minimum(np.arange(-(-n // _BLOCK_ROWS) + 1) * _BLOCK_ROWS, n - 1)
+    return bend_terms(strips.x[:, nodes], strips.rows[nodes], strips.width, strips.height)
+
+
+def _slot_time(strips: Strips, terms: FloatArray, values: FloatArray) -> Float32Array:
+    """(M, R) slot position of every strip's row; the bend is interpolated between the blocks' borders."""
+    n = strips.rows.size
+    start, rows_per_slot = values[:2]
+    moved = np.tensordot(values[2:], terms, 1)
+    index = np.arange(n)
+    low = index // _BLOCK_ROWS
+    width = np.minimum((low + 1) * _BLOCK_ROWS, n - 1) - low * _BLOCK_ROWS
+    f = (index - low * _BLOCK_ROWS) / np.maximum(width, 1)
+    bent = moved[:, low] + (moved[:, low + 1] - moved[:, low]) * f
+    return ((strips.rows + bent - start) / rows_per_slot).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class _Waves:
+    """Light of the columns on a grid of _SAMPLES samples a slot."""
+
+    #: (C, n) float32: levelled light, and its weight.
+    value: Float32Array
+    weight: Float32Array
+
+
+def _column_waves(strips: Strips, time: Float32Array, exposure_slots: float) -> _Waves:
+    """Levelled light of every column by slot position."""
+    rows_per_slot = (strips.rows[-1] - strips.rows[0]) / max(float(time[0, -1] - time[0, 0]), 1.0)
+    rows_per_slot /= abs(strips.rows[1] - strips.rows[0])
+    level, weight = _levelled(strips.light, strips.inside, round(_EXTREMES_SLOTS * rows_per_slot), strips.sigma)
+    n = (int(time.max()) + 2) * _SAMPLES
+    per_column = strips.light.shape[0] // strips.n_columns
+    column = np.arange(strips.light.shape[0]) // per_column
+    place = np.clip((time * _SAMPLES).astype(np.int64), 0, n - 1) + (column * n)[:, None]
+    total = np.bincount(place.ravel(), weight.ravel(), strips.n_columns * n)
+    summed = np.bincount(place.ravel(), (level * weight).ravel(), strips.n_columns * n)
+    value = (summed / (total + 1e-3)).reshape(strips.n_columns, n)
+    return _Waves(value.astype(np.float32), total.reshape(value.shape).astype(np.float32))
+
+
+def _filled(waves: _Waves) -> tuple[Float32Array, Float32Array]:
+    """Slot means (C, N) and weights; where a slot has few rows its empty samples do not count."""
+    shape = (waves.value.shape[0], -1, _SAMPLES)
+    weight = waves.weight.reshape(shape)
+    total = weight.sum(axis=2)
+    return (waves.value.reshape(shape) * weight).sum(axis=2) / (total + np.float32(1e-3)), total
+
+
+def _decide(waves: _Waves, exposure_slots: float, grid: _Grid) -> BoolArray:
+    """(C, N) lit slots: the nearer of the extremes, then with the neighbours' share through the exposure taken off."""
+    mean, _ = _filled(waves)
+    n = mean.shape[1]
+    windows = np.pad(mean, ((0, 0), (_EXTREMES_SLOTS // 2, _EXTREMES_SLOTS // 2)), mode="edge")
+    around = np.lib.stride_tricks.sliding_window_view(windows, _EXTREMES_SLOTS, axis=1)
+    high, low = around.max(axis=2), around.min(axis=2)
+    value = (2 * mean - high - low) / (high - low + np.float32(1e-3))
+    header, lit_header = grid.header(n)
+    state = np.sign(value)
+    state[:, header] = np.where(lit_header, 1, -1)
+    taps = _slot_taps(exposure_slots)
+    reach = taps.size // 2
+    for _ in range(4):
+        for parity in (0, 1):
+            padded = np.pad(state, ((0, 0), (reach, reach)))
+            others = sum(taps[k] * padded[:, k : k + n] for k in range(taps.size) if k != reach)
+            state[:, parity::2] = np.where(value - others >= 0, 1, -1)[:, parity::2]
+            state[:, header] = np.where(lit_header, 1, -1)
+    return np.asarray(state > 0)
+
+
+def _slot_taps(exposure_slots: float) -> FloatArray:
+    """Share of each slot in the mean over a slot of the light seen through the exposure, odd length."""
+    fine = 40
+    box = np.ones(max(round(exposure_slots * fine), 1))
+    shape = np.convolve(np.convolve(box / box.size, np.ones(fine)), np.ones(fine) / fine)
+    reach = int(np.ceil((exposure_slots + 1) / 2))
+    lags = np.arange(-reach, reach + 1)
+    centre = (shape.size - 1) / 2
+    return np.asarray(np.interp(centre + lags * fine, np.arange(shape.size), shape, left=0, right=0))
+
+
+def _seen(
+    lit: BoolArray, time: FloatArray | Float32Array, column: NDArray[np.int64], exposure_slots: float
+) -> tuple[Float32Array, Float32Array]:
+    """Light 0..1 of the slots through the exposure at slot positions (n, m) of columns (n,); and its change per slot."""
+    n = lit.shape[1]
+    total = np.zeros((lit.shape[0], n + 2), np.float32)
+    np.cumsum(lit, axis=1, out=total[:, 1 : n + 1])
+    total[:, n + 1] = total[:, n]
+    flat, base = total.ravel(), (column * (n + 2))[:, None]
+    late, late_slope = _running(flat, base, time + np.float32(exposure_slots / 2), n)
+    early, early_slope = _running(flat, base, time - np.float32(exposure_slots / 2), n)
+    scale = np.float32(1 / exposure_slots)
+    return (late - early) * scale, (late_slope - early_slope) * scale
+
+
+def _running(
+    flat: Float32Array, base: NDArray[np.int64], time: FloatArray | Float32Array, n: int
+) -> tuple[Float32Array, Float32Array]:
+    place = np.clip(time, 0, n + 0.999)
+    low = place.astype(np.int64)
+    index = low + base
+    below = flat[index]
+    step = flat[index + 1] - below
+    return below + step * (place - low).astype(np.float32), step
+
+
+def _local(values: Float32Array, window: int) -> Float32Array:
+    import cv2
+
+    return np.asarray(cv2.blur(values, (window | 1, 1)))
+
+
+def _gauss_newton(
+    strips: Strips, terms: FloatArray, values: FloatArray, time: Float32Array, lit: BoolArray, exposure_slots: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Step of the row-time map, its covariance, and the share of variance explained before the step."""
+    per_column = strips.light.shape[0] // strips.n_columns
+    column = np.arange(strips.light.shape[0]) // per_column
+    wave, slope = _seen(lit, time, column, exposure_slots)
+    pitch = abs(float(strips.rows[1] - strips.rows[0]))
+    window = round(_LOCAL_SLOTS * values[1] / pitch)
+    inside = strips.inside
+    share = _local(inside, window) + np.float32(1e-3)
+    mean_light, mean_wave = _local(strips.light * inside, window) / share, _local(wave * inside, window) / share
+    covariance = _local(strips.light * wave * inside, window) / share - mean_light * mean_wave
+    variance = _local(wave * wave * inside, window) / share - mean_wave * mean_wave
+    gain = np.maximum(covariance, 0) / (variance + np.float32(0.02))
+    residual = (strips.light - mean_light - gain * (wave - mean_wave)) * inside
+    spread = _local(residual * residual, window) / share + np.float32(strips.sigma**2)
+    power = gain * slope
+    weight = inside / spread
+    fit = residual * weight * power
+    blocks = np.arange(0, strips.rows.size, _BLOCK_ROWS)
+    information = np.add.reduceat(weight * power * power, blocks, axis=1).astype(np.float64)
+    pull = np.add.reduceat(fit, blocks, axis=1).astype(np.float64)
+    jacobian = _jacobian(terms, values, time, blocks)
+    step, covariance_matrix = _solve(jacobian, information, pull, values, strips.n_columns)
+    light_power = float((gain * gain * variance * weight).sum())
+    left = float((residual * residual * weight).sum())
+    return step, covariance_matrix, light_power / max(light_power + left, 1e-9)
+
+
+def _jacobian(terms: FloatArray, values: FloatArray, time: Float32Array, blocks: NDArray[np.int64]) -> FloatArray:
+    """(6, M, blocks) change of the slot position with start, rows per slot and bend."""
+    rows_per_slot = values[1]
+    middle = np.minimum(blocks + _BLOCK_ROWS // 2, time.shape[1] - 1)
+    out = np.empty((6, terms.shape[1], blocks.size))
+    out[0] = -1 / rows_per_slot
+    out[1] = -time[:, middle] / rows_per_slot
+    out[2:] = (terms[:, :, :-1] + terms[:, :, 1:]) / 2 / rows_per_slot
+    return out
+
+
+def _solve(
+    jacobian: FloatArray, information: FloatArray, pull: FloatArray, values: FloatArray, n_columns: int
+) -> tuple[FloatArray, FloatArray]:
+    """Step and covariance; the spread of the columns' pulls stands for all that makes residuals alike."""
+    flat = jacobian.reshape(6, -1)
+    prior = np.concatenate([[0.0, 0.0], _BEND_SCALE**-2])
+    # Samples of a slot and strips of a column err alike: the prior weighs as if one in ten said something new.
+    hessian = (flat * information.ravel()) @ flat.T + np.diag(10 * prior)
+    gradient = flat @ pull.ravel() - 10 * prior * values
+    inverse = np.linalg.inv(hessian)
+    by_column = (jacobian * pull).reshape(6, n_columns, -1).sum(axis=2)
+    spread = by_column - by_column.mean(axis=1, keepdims=True)
+    covariance = inverse @ (spread @ spread.T) @ inverse * n_columns / max(n_columns - 1, 1)
+    return inverse @ gradient, covariance
+
+
+def _estimate_exposure(waves: _Waves, grid: _Grid) -> tuple[float, float]:
+    """Exposure in slots by the blur of the slots' edges, and its standard deviation."""
+    errors = np.array([_misfit(waves, exposure, _decide(waves, exposure, grid)) for exposure in _EXPOSURES])
+    best = int(np.clip(errors.argmin(), 1, _EXPOSURES.size - 2))
+    bend, slope, _ = np.polyfit(_EXPOSURES[best - 1 : best + 2], np.log(errors[best - 1 : best + 2]), 2)
+    if bend <= 0:
+        return float(_EXPOSURES[errors.argmin()]), 0.3
+    found = float(np.clip(-slope / (2 * bend), _EXPOSURES[0], _EXPOSURES[-1]))
+    independent = waves.value.size / _SAMPLES
+    return found, float(np.clip(np.sqrt(1 / (bend * independent)), 0.02, 0.5))
+
+
+def _misfit(waves: _Waves, exposure_slots: float, lit: BoolArray) -> float:
+    """Weighted square of what the slots through this exposure leave of the waves, as a share."""
+    centres = np.broadcast_to((np.arange(waves.value.shape[1]) + 0.5) / _SAMPLES, waves.value.shape)
+    wave, _ = _seen(lit, centres, np.arange(lit.shape[0]), exposure_slots)
+    window = _LOCAL_SLOTS * _SAMPLES
+    weight = waves.weight
+    share = _local(weight, window) + np.float32(1e-3)
+    mean_value, mean_wave = _local(waves.value * weight, window) / share, _local(wave * weight, window) / share
+    covariance = _local(waves.value * wave * weight, window) / share - mean_value * mean_wave
+    variance = _local(wave * wave * weight, window) / share - mean_wave * mean_wave
+    gain = np.maximum(covariance, 0) / (variance + np.float32(0.02))
+    residual = waves.value - mean_value - gain * (wave - mean_wave)
+    total = float((weight * (waves.value - mean_value) ** 2).sum())
+    return float((weight * residual * residual).sum()) / max(total, 1e-9)
+
+
+def _is_bent(strips: Strips, timing: _Timing) -> bool:
+    """Whether the bend is beyond doubt and moves rows by more than some hundredths of a slot."""
+    bend, covariance = timing.values[2:], timing.covariance[2:, 2:]
+    surprise = float(bend @ np.linalg.solve(covariance + 1e-4 * np.diag(_BEND_SCALE**2), bend))
+    rows = np.linspace(strips.rows[0], strips.rows[-1], 9)
+    x = np.linspace(strips.x.min(), strips.x.max(), 9)
+    moved = np.tensordot(bend, bend_terms(x[:, None], rows[None], strips.width, strips.height), 1)
+    across = moved - moved.mean(axis=0)
+    return surprise > 30 and float(across.std()) > 0.03 * float(timing.values[1])
