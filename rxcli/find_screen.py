@@ -34,7 +34,7 @@ _LAG = 3
 _APART_PX = 7
 #: Strips that the plane's width is summed into for the coarse map and for the top and bottom sides.
 _STRIPS = 340
-#: Rows and strips of the reduced plane in one coarse cell.
+#: Rows of the reduced plane in one coarse cell, at most, and strips.
 _CELL_ROWS, _CELL_STRIPS = 16, 4
 #: Bands of rows for the left and right sides, at most, and rows of one band, at least.
 _BANDS, _BAND_ROWS = 40, 26
@@ -89,6 +89,11 @@ class _Plane:
     wedge: BoolArray | None
     width: int
     height: int
+
+    @property
+    def cell_rows(self) -> int:
+        """Rows of the plane in one coarse cell."""
+        return int(np.clip(self.light.shape[0] // 60, 4, _CELL_ROWS))
 
     def apart(self, columns: int) -> int:
         """Steps between the two changes of a product, where one step is some columns of the plane."""
@@ -155,7 +160,8 @@ def find_screen(
     if guess is None:
         return ScreenSearch(None, 0.0, "no area with the stripes of a modulated backlight was found in the picture")
     size = _extent(guess, plane)
-    return _refine(plane, stripes, guess, out=0.025 * size, inward=0.06 * size, aspect=aspect)
+    out = max(0.025 * size, 1.5 * plane.cell_rows * plane.fy)
+    return _refine(plane, stripes, guess, out=out, inward=max(0.06 * size, 2 * out), aspect=aspect)
 
 
 def track_screen(
@@ -268,8 +274,8 @@ def _find_stripes(plane: _Plane) -> _Stripes:
     apart = plane.apart(strip)
     products, grows = _products(light, apart, wedge)
     growing = products * grows
-    shape = (products.shape[1] // _CELL_STRIPS, products.shape[0] // _CELL_ROWS)
-    inner = (slice(shape[1] * _CELL_ROWS), slice(shape[0] * _CELL_STRIPS))
+    shape = (products.shape[1] // _CELL_STRIPS, products.shape[0] // plane.cell_rows)
+    inner = (slice(shape[1] * plane.cell_rows), slice(shape[0] * _CELL_STRIPS))
     cells = _area(products[inner], *shape)
     smooth = cv2.blur(cells, (3, 3))
     smooth = smooth * _balance(cells, _area(growing[inner], *shape))
@@ -280,7 +286,7 @@ def _find_stripes(plane: _Plane) -> _Stripes:
     floor = min(float(np.percentile(still, 10)), 0.1 * strong)
     smooth = smooth - np.minimum(still, 3 * floor)[:, None].astype(np.float32)
     noise = float(np.sqrt(max(np.percentile(spread, 10), 0) / 3))
-    significant = smooth > 1.5 * np.sqrt(spread / (_CELL_ROWS * _CELL_STRIPS))
+    significant = smooth > 1.5 * np.sqrt(spread / (plane.cell_rows * _CELL_STRIPS))
     threshold = max(0.02 * strong, floor, 1e-4)
     across = light[:, 1:] - light[:, :-1]
     upright = _area((across[_LAG:] * across[:-_LAG])[inner], *shape)
@@ -314,7 +320,7 @@ def _coarse_sides(plane: _Plane, stripes: _Stripes) -> list[_Side] | None:
     rows, columns = stripes.striped.shape
     if stripes.striped.mean() < 0.02:
         return None
-    step_y, step_x = _CELL_ROWS * plane.fy, _CELL_STRIPS * stripes.strip * plane.fx
+    step_y, step_x = plane.cell_rows * plane.fy, _CELL_STRIPS * stripes.strip * plane.fx
     y = (np.arange(rows, dtype=np.float64) + 0.5) * step_y + plane.fy * (_LAG - 1) / 2
     x = (np.arange(columns, dtype=np.float64) + 0.5) * step_x + plane.fx * stripes.strip * stripes.apart / 2 - 0.5
     onsets = [_cell_onsets(stripes.striped, x, y, side) for side in range(4)]
@@ -577,7 +583,7 @@ def _half_way(energy: FloatArray, start: NDArray[np.int64]) -> NDArray[np.int64]
     """(K,) first place from `start` on where a change has half its later strength: the middle of a blurred edge."""
     ahead = start[:, None] + np.arange(2 * _LAG + 2)
     step = np.take_along_axis(energy, np.minimum(ahead, energy.shape[1] - 1), axis=1)
-    return start + (step >= 0.25 * step.max(axis=1, keepdims=True)).argmax(axis=1)
+    return np.asarray(start + (step >= 0.25 * step.max(axis=1, keepdims=True)).argmax(axis=1), np.int64)
 
 
 def _agrees(place: FloatArray, tolerance: float) -> BoolArray:
@@ -748,6 +754,6 @@ def _striped_share(stripes: _Stripes, corners: FloatArray, plane: _Plane) -> flo
     import cv2
 
     inside = np.zeros(stripes.striped.shape, np.uint8)
-    cell = np.array([_CELL_STRIPS * stripes.strip * plane.fx, _CELL_ROWS * plane.fy])
+    cell = np.array([_CELL_STRIPS * stripes.strip * plane.fx, plane.cell_rows * plane.fy])
     cv2.fillConvexPoly(inside, np.round(corners / cell - 0.5).astype(np.int32), 1)
     return float(stripes.striped[inside > 0].mean()) if inside.any() else 0.0
