@@ -1,7 +1,7 @@
 """Slot clock, copies and bursts, from the header and the repeats, jointly over the columns.
 
 Model: all columns send the header 0011100011 at the same instants, so the mean over columns of the light, each strip
-normalised to its local extremes, shows the header at full contrast wherever a packet starts, while payloads average out.
+normalised to its local extremes, shows the header at full contrast wherever a packet starts; payloads average out.
 The clock is the start and, where the camera is unknown, the period that collects most of that correlation over all
 visible copies. Copies of one burst are alike, copies of different bursts are not; that finds the burst boundaries.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
-from rxcli.types import Clock, Float32Array, FloatArray, RowProfiles, SlotSamples
+from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
 #: Samples a slot while the clock is sought.
 _SEARCH_SAMPLES = 4
@@ -43,15 +43,24 @@ def resample(
     """
     borders = row0 + rows_per_sample * np.arange(n_samples + 1)
     light = profiles.light.reshape(-1, profiles.light.shape[-1])
-    inside = profiles.inside.reshape(light.shape)
+    first, stop = _shown_rows(profiles.inside.reshape(light.shape))
     positions = _row_positions(profiles, borders)
-    sums = _integrate(light, positions)
-    covered = _integrate(inside.astype(np.float32), positions)
     widths = np.diff(positions, axis=-1)
-    valid = (covered > 0.99 * widths) & (widths > 1e-6)
-    mean = np.divide(sums, widths, out=np.zeros_like(sums), where=valid)
+    valid = (positions[:, :-1] >= first[:, None]) & (positions[:, 1:] <= stop[:, None]) & (widths > 1e-6)
+    mean = _integrate(light, positions)
+    mean /= np.maximum(widths, 1e-6)
+    mean *= valid
     shape = (*profiles.light.shape[:2], n_samples)
     return mean.astype(np.float32).reshape(shape), valid.astype(np.float32).reshape(shape)
+
+
+def _shown_rows(inside: BoolArray) -> tuple[IntArray, IntArray]:
+    """First row of each strip that is on the screen, and the one after the last; (n,) each, equal where there is none."""
+    n_rows = inside.shape[1]
+    any_row = inside.any(axis=1)
+    first = inside.argmax(axis=1)
+    stop = n_rows - inside[:, ::-1].argmax(axis=1)
+    return first, np.where(any_row, stop, first)
 
 
 def _row_positions(profiles: RowProfiles, borders: FloatArray) -> FloatArray:
@@ -100,12 +109,15 @@ def contrast(
     smooth = cv2.blur(flat, (samples_per_slot // 2 * 2 + 1, 1)) if samples_per_slot > 1 else flat
     high = cv2.dilate(smooth, window).reshape(light.shape)
     low = cv2.erode(smooth, window).reshape(light.shape)
+    smooth = smooth.reshape(light.shape)
     span = high - low
-    value = (2 * smooth.reshape(light.shape) - high - low) / (span + 3 * sigma)
-    square = span * span
-    weight = square / (square + (_CONTRAST_SIGMAS * sigma) ** 2) * valid
+    value = (2 * smooth - high - low) / (span + np.float32(3 * sigma))
+    np.square(span, out=span)
+    weight = span / (span + np.float32((_CONTRAST_SIGMAS * sigma) ** 2))
+    weight *= valid
     total = weight.sum(axis=1)
-    return (value * weight).sum(axis=1) / (total + 1e-2), total
+    value *= weight
+    return value.sum(axis=1) / (total + np.float32(1e-2)), total
 
 
 def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot: int) -> FloatArray:
@@ -121,16 +133,15 @@ def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot
 
 
 def find_clock(
-    profiles: RowProfiles, rows_per_slot: float, exposure_slots: float, packet_slots: int, repeats: int, sigma: float
+    profiles: RowProfiles, rows_per_slot: float, exposure_slots: float, packet_slots: int, sigma: float
 ) -> Clock | None:
-    """The clock of a picture whose rows per slot are known; None where it shows no signal.
+    """The clock of a picture whose rows per slot are known, bursts still unknown; None where too little is seen.
 
     Args:
         profiles: row profiles of the screen.
         rows_per_slot: sensor rows a slot.
         exposure_slots: exposure in slots.
         packet_slots: slots of a packet.
-        repeats: copies of a burst.
         sigma: standard deviation of a strip's row of no light.
     """
     top, bottom = _row_span(profiles)
@@ -149,7 +160,7 @@ def find_clock(
     n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))
     first_slot = -before % packet_slots
     n_copies = -(-(first_slot + n_slots) // packet_slots)
-    clock = Clock(
+    return Clock(
         rows_per_slot=rows_per_slot,
         exposure_slots=exposure_slots,
         packet_slots=packet_slots,
@@ -160,7 +171,6 @@ def find_clock(
         delay_slots=_delays(pooled, weight, start, packet_slots),
         lock=lock,
     )
-    return assign_bursts(clock, profiles, repeats, sigma)
 
 
 def _row_span(profiles: RowProfiles) -> tuple[float, float]:
@@ -258,19 +268,16 @@ def sample_slots(profiles: RowProfiles, clock: Clock, samples_per_slot: int) -> 
     return SlotSamples(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), samples_per_slot)
 
 
-def assign_bursts(clock: Clock, profiles: RowProfiles, repeats: int, sigma: float) -> Clock:
+def assign_bursts(clock: Clock, pooled: Float32Array, weight: Float32Array, repeats: int) -> Clock:
     """The clock with its copies assigned to bursts of `repeats` copies, by the likeness of adjacent copies.
 
     Args:
         clock: the clock, bursts unknown.
-        profiles: row profiles.
+        pooled: (C, N) slots between their local extremes, -1 dark to 1 lit.
+        weight: (C, N) their weights.
         repeats: copies of a burst.
-        sigma: standard deviation of a strip's row of no light.
     """
-    samples = sample_slots(profiles, clock, _SEARCH_SAMPLES)
-    noise = sigma / np.sqrt(max(clock.rows_per_slot / _SEARCH_SAMPLES, 1.0))
-    pooled, weight = contrast(samples.light, samples.valid, _SEARCH_SAMPLES, noise)
-    likeness = copy_likeness(slot_means(pooled), slot_means(weight), clock)
+    likeness = copy_likeness(pooled, weight, clock)
     copies = np.arange(clock.n_copies)
     scores = []
     for phase in range(repeats):
@@ -280,9 +287,23 @@ def assign_bursts(clock: Clock, profiles: RowProfiles, repeats: int, sigma: floa
     return replace(clock, burst=burst - burst[0])
 
 
-def slot_means(samples: Float32Array) -> Float32Array:
-    """(C, N * Q) samples at the search rate to slot means (C, N)."""
-    return np.asarray(samples.reshape(samples.shape[0], -1, _SEARCH_SAMPLES).mean(axis=2), np.float32)
+def slot_contrast(samples: SlotSamples, sigma: float) -> tuple[Float32Array, Float32Array]:
+    """Slots between their local extremes, -1 dark to 1 lit, and the strips of full contrast behind them; (C, N) each.
+
+    Args:
+        samples: samples on the slot grid.
+        sigma: standard deviation of a sample of no light.
+    """
+    q = samples.samples_per_slot
+    pooled, weight = contrast(samples.light, samples.valid, q, sigma)
+    return _slot_means(pooled, q), _slot_means(weight, q)
+
+
+def _slot_means(samples: Float32Array, samples_per_slot: int) -> Float32Array:
+    total = samples[:, ::samples_per_slot].copy()
+    for offset in range(1, samples_per_slot):
+        total += samples[:, offset::samples_per_slot]
+    return total / np.float32(samples_per_slot)
 
 
 def copy_likeness(pooled: Float32Array, weight: Float32Array, clock: Clock) -> FloatArray:
@@ -297,7 +318,7 @@ def copy_likeness(pooled: Float32Array, weight: Float32Array, clock: Clock) -> F
         clock: the clock.
     """
     llr = 4 * np.clip(pooled, -1, 1) * np.minimum(weight, 3.0) / 3
-    lit = to_copies(1 / (1 + np.exp(-llr)) - 0.5, clock) + 0.5
+    lit = to_copies((1 / (1 + np.exp(-llr)) - 0.5).astype(np.float32), clock) + np.float32(0.5)
     seen = to_copies((weight > 0).astype(np.float32), clock)
     seen[..., :SLOTS_PER_SYMBOL] = 0
     share = np.clip((lit * seen).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1), 0.1, 0.9)[:, None, None]

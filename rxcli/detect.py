@@ -180,8 +180,8 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
 
     Args:
         metrics: (B, C, packet + memory, 2**(memory+1)) natural log-likelihoods, copies added: entry i, j is the
-            log-likelihood of what was seen at slot i given pattern j of `protocol.slot_patterns`. The first `memory` slots are not
-            used; the last `memory` entries are the first slots of the header that follows.
+            log-likelihood of what was seen at slot i given pattern j of `protocol.slot_patterns`. The first
+            `memory` slots are not used; the last `memory` entries are the first slots of the header that follows.
         candidates: (C, 9) weights to consider, all by default.
 
     Returns:

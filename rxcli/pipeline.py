@@ -223,9 +223,7 @@ def _noise_of(profiles: RowProfiles) -> float:
 def _clock_of(screen: ScreenProfile, profiles: RowProfiles, camera: _Camera) -> Clock | None:
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
     exposure_slots = camera.exposure_s * screen.slot_rate_hz
-    return clock.find_clock(
-        profiles, rows_per_slot, exposure_slots, screen.packet_slots, screen.repeats, _noise_of(profiles)
-    )
+    return clock.find_clock(profiles, rows_per_slot, exposure_slots, screen.packet_slots, _noise_of(profiles))
 
 
 def _why_no_signal(corners: FloatArray, camera: _Camera, options: ReceiverOptions) -> str:
@@ -248,7 +246,9 @@ def _decode(lock: _Lock) -> tuple[Clock, BurstPosteriors, Float32Array, SlotSamp
     now = lock.clock
     samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
     model = _light_model(lock, samples)
-    metrics = _first_guess(samples, now, model)
+    pooled, weight = clock.slot_contrast(samples, model.sigma)
+    now = clock.assign_bursts(now, pooled, weight, lock.screen.repeats)
+    metrics = channel.first_metrics(pooled, weight, model.memory)
     snr = np.zeros((samples.light.shape[0], now.n_slots), np.float32)
     columns = np.arange(samples.light.shape[0])
     complete = assemble.complete(assemble.slots_seen(samples, now))
@@ -288,8 +288,3 @@ def _light_model(lock: _Lock, samples: SlotSamples) -> channel.LightModel:
         spread=channel.spread_matrix(samples.light.shape[1], lock.screen.light_spread),
         taps=channel.exposure_taps(now.exposure_slots, 1 / _SAMPLES_PER_SLOT, memory, _SAMPLES_PER_SLOT),
     )
-
-
-def _first_guess(samples: SlotSamples, now: Clock, model: channel.LightModel) -> FloatArray:
-    pooled, weight = clock.contrast(samples.light, samples.valid, samples.samples_per_slot, model.sigma)
-    return channel.first_metrics(clock.slot_means(pooled), clock.slot_means(weight), model.memory)

@@ -73,7 +73,7 @@ def sample_rows(frame: Frame, outlines: Outlines, tone: str) -> RowProfiles:
         cells = reader.read(int(outlines.rows[start]), int(outlines.rows[stop - 1]) + 1)
         positions = (edges[:, start:stop] + 0.5) / reader.cell_px
         light[:, start:stop], enclosed[:, start:stop] = _between_edges(cells, positions)
-        return cells[:: _NOISE_ROW_STEP].copy()
+        return cells[::_NOISE_ROW_STEP].copy()
 
     with ThreadPoolExecutor(_THREADS) as pool:
         noise_cells = list(pool.map(read_band, range(0, n_rows, _BAND_ROWS)))
