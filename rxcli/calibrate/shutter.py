@@ -246,7 +246,7 @@ def _groups(strips: FloatArray, usable: BoolArray) -> FloatArray:
     ]
     means = [strips[run].mean(axis=0) for run in runs if usable[run].all()]
     groups: FloatArray = np.array(means, np.float64).reshape(len(means), strips.shape[1])
-    return groups[np.ptp(groups, axis=1) > 1e-9]
+    return np.asarray(groups[np.ptp(groups, axis=1) > 1e-9])
 
 
 def _follow(strips: FloatArray, free: BoolArray, fit: PeriodicFit) -> tuple[np.ndarray, FloatArray]:

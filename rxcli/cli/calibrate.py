@@ -347,6 +347,67 @@ def _shutter_record(result: ShutterCalibration, target: Path | None) -> dict[str
     }
 
 
+@calibrate.command()
+@click.argument("path", type=click.Path(path_type=Path))
+@click.option("--make", help="Camera maker, where the file does not tell it.")
+@click.option("--camera-model", "model", help="Camera model, where the file does not tell it.")
+@click.option("--lens", "lens_name", help="Lens as lensfun names it, where the file does not tell it.")
+@click.option("--focal-length", "focal_mm", type=click.FloatRange(0, 5000, min_open=True), help="Millimetres.")
+@_SAVE
+@_NAME
+@_JSON
+def lensfun(
+    path: Path,
+    make: str | None,
+    model: str | None,
+    lens_name: str | None,
+    focal_mm: float | None,
+    save: Path | None,
+    name: str | None,
+    json_path: str | None,
+) -> None:
+    """Lens model of the picture PATH from the lensfun database, by camera, lens and focal length (extra [lensfun])."""
+    from dataclasses import replace
+
+    from rxcli.calibrate.lensfun import lens_from_database
+    from rxcli.calibrate.saving import profile_to_extend, with_lens, write_profile
+    from rxcli.ingest import open_source
+
+    target = _target(save, name)
+    frame = next(open_source(path))
+    told = frame.metadata
+    metadata = replace(
+        told,
+        make=make or told.make,
+        model=model or told.model,
+        lens=lens_name or told.lens,
+        focal_length_mm=focal_mm or told.focal_length_mm,
+    )
+    found = lens_from_database(metadata, frame.width, frame.height)
+    if target is not None:
+        write_profile(with_lens(profile_to_extend(target, metadata), found.lens, metadata.lens), target)
+    record = {
+        "camera": found.camera_name,
+        "lens": found.lens_name,
+        "camera_matrix": [list(row) for row in found.lens.camera_matrix],
+        "dist_coeffs": list(found.lens.dist_coeffs),
+        "width": found.lens.width,
+        "height": found.lens.height,
+        "worst_px": found.worst_px,
+        "profile": str(target) if target is not None else None,
+    }
+    if json_path is not None:
+        _write_json(record, json_path)
+    if json_path != "-":
+        click.echo(f"camera      {found.camera_name}")
+        click.echo(f"lens        {found.lens_name} at {metadata.focal_length_mm:g} mm")
+        click.echo(f"focal       {found.lens.camera_matrix[0][0]:.1f} px")
+        click.echo("distortion  " + " ".join(f"{v:.5f}" for v in found.lens.dist_coeffs) + "  (k1 k2 p1 p2 k3)")
+        click.echo(f"conversion  within {found.worst_px:.2f} px of lensfun's own")
+        if target is not None:
+            click.echo(f"written     {target}")
+
+
 def _write_json(record: dict[str, Any], path: str) -> None:
     text = json.dumps(_finite(record), indent=2)
     if path == "-":

@@ -1,0 +1,219 @@
+"""`vlc-rx profiles`: known screens and cameras, and which a file would get."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rxcli.errors import ExitCode, InputError, ProfileError, ReceiverError, UsageError, worst
+
+if TYPE_CHECKING:
+    from rxcli.profiles import CameraProfile, ScreenProfile
+    from rxcli.types import Frame
+
+_JSON = click.option("--json", "json_path", type=click.Path(allow_dash=True), metavar="FILE|-", help="Write JSON.")
+_CAMERAS = click.option(
+    "--camera",
+    "cameras",
+    multiple=True,
+    metavar="NAME|FILE",
+    help="Cameras to choose from; may be given several times. [default: all shipped ones]",
+)
+
+
+@click.group(invoke_without_command=True)
+@click.pass_context
+def profiles(context: click.Context) -> None:
+    """Screen and camera profiles: list, show, validate, and which one a file would get."""
+    if context.invoked_subcommand is None:
+        context.invoke(list_profiles, json_path=None)
+
+
+@profiles.command("list")
+@_JSON
+def list_profiles(json_path: str | None) -> None:
+    """List the shipped profiles."""
+    from rxcli.profiles import CameraProfile, ScreenProfile, shipped_profiles
+
+    screens, cameras = shipped_profiles(ScreenProfile), shipped_profiles(CameraProfile)
+    if json_path is not None:
+        _write({"screens": [_builtins(s) for s in screens], "cameras": [_builtins(c) for c in cameras]}, json_path)
+    if json_path == "-":
+        return
+    for screen in screens:
+        click.echo(
+            f"screen  {screen.name:<16} {screen.columns} columns, {screen.slot_rate_hz:g} Hz  {screen.description}"
+        )
+    for camera in cameras:
+        modes = ", ".join(f"{mode.name} {mode.width}x{mode.height}" for mode in camera.modes) or "no readout modes"
+        click.echo(f"camera  {camera.name:<16} {modes}{'; lens' if camera.lens else ''}  {camera.description}")
+
+
+@profiles.command()
+@click.argument("name")
+@_JSON
+def show(name: str, json_path: str | None) -> None:
+    """Show the profile NAME, a shipped one or a TOML file."""
+    from rxcli.profiles import dump_profile
+
+    profile = _load_any(name)
+    if json_path is not None:
+        _write(_builtins(profile), json_path)
+    if json_path != "-":
+        click.echo(dump_profile(profile), nl=False)
+
+
+@profiles.command()
+@click.argument("names", nargs=-1, metavar="[NAME|FILE]...")
+def validate(names: tuple[str, ...]) -> int:
+    """Check profiles: those named, or all shipped ones. Exit code 2 where one is wrong."""
+    codes = []
+    for name in names or _shipped_names():
+        try:
+            profile = _load_any(name)
+        except ReceiverError as error:
+            click.echo(f"vlc-rx: {error}", err=True)
+            codes.append(error.exit_code)
+        else:
+            click.echo(f"{name}: valid {profile.kind} profile {profile.name!r}")
+    return worst(codes)
+
+
+@profiles.command()
+@click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
+@_CAMERAS
+@_JSON
+def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | None) -> int:
+    """Say which camera profile each file would get, and why."""
+    known = _choices(cameras)
+    records, codes = [], [ExitCode.OK]
+    for path in paths:
+        try:
+            records.append(_choice(_first_frame(path), path, known))
+        except InputError as error:
+            click.echo(f"vlc-rx: {error}", err=True)
+            codes.append(error.exit_code)
+    if json_path is not None:
+        _write(records, json_path)
+    if json_path != "-":
+        for record in records:
+            click.echo(f"{record['source']}: {record['camera'] or 'no profile'} ({record['reason']})")
+    return worst(codes)
+
+
+def _builtins(profile: ScreenProfile | CameraProfile) -> Any:
+    import msgspec
+
+    return msgspec.to_builtins(profile)
+
+
+def _shipped_names() -> list[str]:
+    return [profile.name for profile in _shipped()]
+
+
+def _shipped() -> list[ScreenProfile | CameraProfile]:
+    from rxcli.profiles import CameraProfile, ScreenProfile, shipped_profiles
+
+    found: list[ScreenProfile | CameraProfile] = []
+    found += shipped_profiles(ScreenProfile)
+    found += shipped_profiles(CameraProfile)
+    return found
+
+
+def _load_any(name: str) -> ScreenProfile | CameraProfile:
+    """A screen or camera profile, by what the file says it is."""
+    from rxcli.profiles import CameraProfile, ScreenProfile, load_profile
+
+    if not Path(name).is_file():
+        return _load_shipped(name)
+    if _kind_in(Path(name)) == "camera":
+        return load_profile(name, CameraProfile)
+    return load_profile(name, ScreenProfile)
+
+
+def _load_shipped(name: str) -> ScreenProfile | CameraProfile:
+    known = _shipped()
+    found = next((profile for profile in known if profile.name == name), None)
+    if found is None:
+        names = ", ".join(profile.name for profile in known)
+        raise ProfileError(f"no profile {name!r}", f"name a TOML file or one of: {names}")
+    return found
+
+
+def _kind_in(path: Path) -> str:
+    """What a TOML file says it is; what else is wrong with it the loader tells."""
+    import tomllib
+
+    try:
+        kind = tomllib.loads(path.read_text(encoding="utf-8")).get("kind")
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        return ""
+    if kind not in ("screen", "camera"):
+        raise ProfileError(f"{path}: kind must be 'screen' or 'camera' (got {kind!r})", "correct the file")
+    return str(kind)
+
+
+def _choices(cameras: tuple[str, ...]) -> list[CameraProfile]:
+    from rxcli.profiles import CameraProfile, load_profile, shipped_profiles
+
+    return [load_profile(name, CameraProfile) for name in cameras] or shipped_profiles(CameraProfile)
+
+
+def _first_frame(path: Path) -> Frame:
+    from rxcli.ingest import open_source
+
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder", "name the files in it")
+    for frame in open_source(path):
+        return frame
+    raise InputError(f"{path}: no frame in it", "check the file")
+
+
+def _choice(frame: Frame, path: Path, cameras: list[CameraProfile]) -> dict[str, Any]:
+    """The profile that the file gets and the reason, with what decided it."""
+    from rxcli.profiles import match_camera
+
+    told = frame.metadata
+    found = match_camera(cameras, told.make, told.model, frame.width, frame.height)
+    mode = found.mode_for(frame.width, frame.height) if found else None
+    return {
+        "source": str(path),
+        "make": told.make,
+        "model": told.model,
+        "lens": told.lens,
+        "width": frame.width,
+        "height": frame.height,
+        "camera": found.name if found else None,
+        "mode": mode.name if mode else None,
+        "line_delay_s": mode.line_delay_s if mode else None,
+        "reason": _reason(frame, cameras, found.name if found else None),
+    }
+
+
+def _reason(frame: Frame, cameras: list[CameraProfile], found: str | None) -> str:
+    told = frame.metadata
+    size = f"{frame.width}x{frame.height}"
+    if told.model is None:
+        return "the file tells no camera model; name a profile with --camera, or all is estimated"
+    camera = " ".join(part for part in (told.make, told.model) if part)
+    if found is not None:
+        return f"{camera}, size {size}"
+    same = [c for c in cameras if c.matches(told.make, told.model)]
+    if not same:
+        return f"no profile of {camera}; all is estimated, or use `vlc-rx calibrate shutter`"
+    sizes = ", ".join(f"{mode.width}x{mode.height}" for c in same for mode in c.modes) or "none"
+    return f"{same[0].name} is this camera but has no readout mode of {size} (it has {sizes})"
+
+
+def _write(value: Any, path: str) -> None:
+    text = json.dumps(value, indent=2)
+    if path == "-":
+        click.echo(text)
+        return
+    try:
+        Path(path).write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})", "name another file") from None

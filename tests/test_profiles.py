@@ -1,0 +1,282 @@
+"""Profiles: shipped ones load, anything wrong is named, what is written is read back; `vlc-rx profiles`."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import tomli_w
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from rxcli.cli.main import run
+from rxcli.errors import ExitCode, ProfileError
+from rxcli.profiles import (
+    CameraProfile,
+    LensModel,
+    ReadoutMode,
+    ScreenProfile,
+    check_profile,
+    dump_profile,
+    load_profile,
+    match_camera,
+    parse_profile,
+    shipped_profiles,
+)
+from rxcli.resources import data_dir
+
+SCREEN: dict[str, Any] = {
+    "format": 1,
+    "kind": "screen",
+    "name": "s",
+    "columns": 20,
+    "slot_rate_hz": 8650.0,
+    "payload_symbols": 5,
+}
+CAMERA: dict[str, Any] = {
+    "format": 1,
+    "kind": "camera",
+    "name": "c",
+    "models": ["M 1"],
+    "modes": [{"name": "still", "width": 640, "height": 480, "line_delay_s": 1e-5}],
+    "lens": {
+        "width": 640,
+        "height": 480,
+        "camera_matrix": [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]],
+        "dist_coeffs": [0.1, 0.0, 0.0, 0.0],
+    },
+}
+
+
+def changed(raw: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
+    """A deep copy of `raw` with one value replaced, or, where it is None, removed."""
+    copy: dict[str, Any] = json.loads(json.dumps(raw))
+    *parents, last = path.split(".")
+    place: Any = copy
+    for part in parents:
+        place = place[int(part)] if isinstance(place, list) else place[part]
+    if value is None:
+        del place[last]
+    else:
+        place[int(last) if isinstance(place, list) else last] = value
+    return copy
+
+
+@pytest.mark.parametrize("kind", [ScreenProfile, CameraProfile])
+def test_every_shipped_file_loads_under_its_own_name(kind: Any) -> None:
+    folder = data_dir("calibration") / ("screens" if kind is ScreenProfile else "cameras")
+    stems = sorted(path.stem for path in folder.glob("*.toml"))
+    assert stems
+    assert [profile.name for profile in shipped_profiles(kind)] == stems
+
+
+def test_shipped_screens_are_those_of_the_air_interface() -> None:
+    packet_slots = {profile.name: profile.packet_slots for profile in shipped_profiles(ScreenProfile)}
+    assert packet_slots == {"paper-8k65": 70, "paper-17k3": 130, "paper-34k6": 260, "wide-100": 260}
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("slot_rate", 1.0, ["slot_rate"]),
+        ("slot_rate_hz", -1.0, ["slot_rate_hz", "-1.0"]),
+        ("slot_rate_hz", "fast", ["slot_rate_hz", "'fast'"]),
+        ("columns", 0, ["columns", ">= 1", "0"]),
+        ("columns", 2.5, ["columns", "2.5"]),
+        ("columns", True, ["columns", "True"]),
+        ("payload_symbols", None, ["payload_symbols"]),
+        ("format", 2, ["format", "2"]),
+        ("kind", "camera", ["kind", "camera"]),
+        ("name", "../etc", ["name", "../etc"]),
+        ("light_spread", float("nan"), ["light_spread"]),
+    ],
+)
+def test_a_wrong_screen_names_file_key_and_value(path: str, value: Any, words: list[str]) -> None:
+    text = tomli_w.dumps(changed(SCREEN, path, value))
+    with pytest.raises(ProfileError) as caught:
+        parse_profile(text, ScreenProfile, "mine.toml")
+    assert "\n" not in str(caught.value)
+    for word in ("mine.toml", *words):
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("modes.0.line_delay_s", 0.0, ["line_delay_s", "0.0"]),
+        ("modes.0.line_delay_s", 2.0, ["line_delay_s", "2.0"]),
+        ("modes.0.width", -5, ["width", "-5"]),
+        ("modes.0.exposure", 1e-4, ["exposure"]),
+        ("lens.dist_coeffs", [0.1], ["dist_coeffs"]),
+        ("lens.camera_matrix.0.0", -500.0, ["camera_matrix", "-500.0"]),
+        ("lens.camera_matrix.2.2", 2.0, ["camera_matrix", "2.0"]),
+        ("tone", "film", ["tone", "film"]),
+    ],
+)
+def test_a_wrong_camera_names_file_key_and_value(path: str, value: Any, words: list[str]) -> None:
+    with pytest.raises(ProfileError) as caught:
+        parse_profile(tomli_w.dumps(changed(CAMERA, path, value)), CameraProfile, "mine.toml")
+    for word in ("mine.toml", *words):
+        assert word in str(caught.value)
+
+
+def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"\xff\xfe\x00\x80")
+    for name in (str(binary), str(tmp_path), str(tmp_path / "absent.toml"), "no-such-profile", "a\0b"):
+        with pytest.raises(ProfileError):
+            load_profile(name, CameraProfile)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.text(max_size=200))
+def test_any_text_is_a_profile_or_a_profile_error(text: str) -> None:
+    with pytest.raises(ProfileError):  # no random text has all the keys
+        parse_profile(text, ScreenProfile, "fuzz.toml")
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.sampled_from(["modes", "lens", "models", "name", "tone", "make", "modes.0.width"]), json_values)
+def test_any_value_under_a_key_loads_or_is_a_profile_error(path: str, value: Any) -> None:
+    raw = json.loads(json.dumps(CAMERA))
+    if path == "modes.0.width":
+        raw["modes"][0]["width"] = value
+    else:
+        raw[path] = value
+    with contextlib.suppress(ProfileError):
+        assert isinstance(check_profile(raw, CameraProfile, "fuzz"), CameraProfile)
+
+
+names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,12}", fullmatch=True)
+sizes = st.integers(1, 100_000)
+numbers = st.floats(-1e3, 1e3)
+modes = st.builds(
+    ReadoutMode,
+    name=names,
+    width=sizes,
+    height=sizes,
+    line_delay_s=st.floats(1e-9, 0.9),
+    exposure_s=st.none() | st.floats(1e-7, 0.9),
+    frame_rate_hz=st.none() | st.floats(0.1, 1e4),
+)
+lenses = st.builds(
+    lambda f, c, d, w, h: LensModel(
+        width=w, height=h, camera_matrix=((f, 0.0, c), (0.0, f, c), (0.0, 0.0, 1.0)), dist_coeffs=tuple(d)
+    ),
+    st.floats(1, 1e5),
+    numbers,
+    st.lists(numbers, min_size=4, max_size=14),
+    sizes,
+    sizes,
+)
+cameras = st.builds(
+    CameraProfile,
+    format=st.just(1),
+    kind=st.just("camera"),
+    name=names,
+    make=st.text(max_size=10),
+    models=st.lists(st.text(max_size=10), max_size=3).map(tuple),
+    modes=st.lists(modes, max_size=3).map(tuple),
+    lens=st.none() | lenses,
+    description=st.text(max_size=30),
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(cameras)
+def test_a_written_profile_is_read_back_exactly(profile: CameraProfile) -> None:
+    assert parse_profile(dump_profile(profile), CameraProfile, "written") == profile
+
+
+def test_profiles_match_by_make_model_and_size() -> None:
+    camera = check_profile(CAMERA | {"make": "Maker"}, CameraProfile, "c")
+    assert match_camera([camera], "MAKER CORP.", "m 1", 640, 480) is camera
+    assert match_camera([camera], None, "M 1", 640, 480) is camera
+    assert match_camera([camera], "Other", "M 1", 640, 480) is None
+    assert match_camera([camera], "Maker", "M 2", 640, 480) is None
+    assert match_camera([camera], "Maker", None, 640, 480) is None
+    assert match_camera([camera], "Maker", "M 1", 480, 640) is None
+
+
+def test_list_and_show(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["profiles"]) == 0
+    listed = capsys.readouterr().out
+    assert "paper-34k6" in listed
+    assert "xs10" in listed
+    assert run(["profiles", "list", "--json", "-"]) == 0
+    assert {s["name"] for s in json.loads(capsys.readouterr().out)["screens"]} >= {"paper-8k65", "wide-100"}
+    assert run(["profiles", "show", "xs10"]) == 0
+    assert parse_profile(capsys.readouterr().out, CameraProfile, "shown") == load_profile("xs10", CameraProfile)
+    assert run(["profiles", "show", "no-such"]) == ExitCode.USAGE
+    assert "paper-34k6" in capsys.readouterr().err
+
+
+def test_validate_goes_on_after_a_bad_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good, bad, odd = tmp_path / "good.toml", tmp_path / "bad.toml", tmp_path / "odd.toml"
+    good.write_text(tomli_w.dumps(CAMERA))
+    bad.write_text(tomli_w.dumps(SCREEN | {"colums": 3}))
+    odd.write_text('kind = "teapot"')
+    assert run(["profiles", "validate"]) == 0
+    assert run(["profiles", "validate", str(bad), str(odd), str(good)]) == ExitCode.USAGE
+    out, err = capsys.readouterr()
+    assert f"{good}: valid camera profile 'c'" in out
+    assert "colums" in err
+    assert "teapot" in err
+    assert len(err.strip().splitlines()) == 2
+
+
+def picture(path: Path, size: tuple[int, int], make: str | None = None, model: str | None = None) -> str:
+    exif = Image.Exif()
+    if make:
+        exif[0x010F] = make
+    if model:
+        exif[0x0110] = model
+    Image.new("L", size, 90).save(path, exif=exif)
+    return str(path)
+
+
+def test_which_says_the_profile_and_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    profile = tmp_path / "c.toml"
+    profile.write_text(tomli_w.dumps(CAMERA))
+    files = [
+        picture(tmp_path / "a.jpg", (640, 480), "X", "M 1"),
+        picture(tmp_path / "b.jpg", (320, 240), "X", "M 1"),
+        picture(tmp_path / "c.jpg", (640, 480), "X", "M 9"),
+        picture(tmp_path / "d.jpg", (640, 480)),
+    ]
+    assert run(["profiles", "which", *files, "--camera", str(profile), "--json", "-"]) == 0
+    records = json.loads(capsys.readouterr().out)
+    assert [r["camera"] for r in records] == ["c", None, None, None]
+    assert records[0]["line_delay_s"] == 1e-5
+    assert "640x480" in records[1]["reason"]
+    assert "no profile of X M 9" in records[2]["reason"]
+    assert "no camera model" in records[3]["reason"]
+
+
+def test_which_goes_on_after_an_unreadable_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = picture(tmp_path / "a.jpg", (64, 48))
+    assert run(["profiles", "which", str(tmp_path / "absent.jpg"), good]) == ExitCode.UNREADABLE
+    out, err = capsys.readouterr()
+    assert good in out
+    assert "absent.jpg" in err
+
+
+def test_a_profile_knows_its_modes_by_size() -> None:
+    camera = check_profile(CAMERA, CameraProfile, "c")
+    mode = camera.mode_for(640, 480)
+    assert mode is not None
+    assert mode.name == "still"
+    assert camera.mode_for(480, 640) is None
+    assert msgspec.to_builtins(camera)["kind"] == "camera"
