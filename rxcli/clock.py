@@ -27,6 +27,21 @@ _MAX_DELAY_SLOTS = 2.0
 _MAX_CORRECTION = 0.25
 
 
+def halved_strips(profiles: RowProfiles) -> RowProfiles:
+    """Profiles with strips pooled in pairs, for a quick look; the same profiles where their number is odd."""
+    n_strips = profiles.light.shape[1]
+    if n_strips % 2:
+        return profiles
+    rows = profiles.sensor_row
+    return replace(
+        profiles,
+        light=(profiles.light[:, ::2] + profiles.light[:, 1::2]) / 2,
+        inside=profiles.inside[:, ::2] & profiles.inside[:, 1::2],
+        sensor_row=None if rows is None else (rows[:, ::2] + rows[:, 1::2]) / 2,
+        count=profiles.count[:, ::2] + profiles.count[:, 1::2],
+    )
+
+
 def resample(
     profiles: RowProfiles, row0: float, rows_per_sample: float, n_samples: int
 ) -> tuple[Float32Array, Float32Array]:

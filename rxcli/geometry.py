@@ -123,12 +123,17 @@ def column_outlines(
     points = screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens)
     first, last = _row_range(corners, height)
     rows = np.arange(first, last + 1)
-    edges_x, edges_v = _edges_by_row(points, v, rows)
-    middle_v = (edges_v[1:] + edges_v[:-1]) / 2
+    knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
+    knot_x, knot_v = _edges_at(points, v, knots)
+    edges_x = _between_knots(knot_x, knots, rows).astype(np.float32)
+    middle_v = _between_knots((knot_v[1:] + knot_v[:-1]) / 2, knots, rows)
     in_picture = (edges_x >= 0) & (edges_x <= width - 1)
     inside = (middle_v > 0) & (middle_v < 1) & in_picture[1:] & in_picture[:-1]
     shape = (n_columns, n_strips, rows.size)
-    return Outlines(rows, edges_x, inside.reshape(shape), _sensor_rows(edges_x, rows, shape, lens))
+    sensor_row = None
+    if lens is not None and lens.corrected:
+        sensor_row = _between_knots(_sensor_rows(knot_x, knots, lens), knots, rows).reshape(shape)
+    return Outlines(rows, edges_x, inside.reshape(shape), sensor_row)
 
 
 def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:
@@ -137,30 +142,26 @@ def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:
     return first, last
 
 
-def _edges_by_row(points: FloatArray, v: FloatArray, rows: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-    """x and v of every edge (n_edges, n_points, 2) on every row; a screen upside down has y falling with v."""
+def _edges_at(points: FloatArray, v: FloatArray, knots: IntArray) -> tuple[FloatArray, FloatArray]:
+    """x and v of every edge (n_edges, n_points, 2) on the rows `knots`; a screen upside down has y falling with v."""
     step = 1 if points[0, -1, 1] > points[0, 0, 1] else -1
-    knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
     x = np.stack([np.interp(knots, edge[::step, 1], edge[::step, 0]) for edge in points])
     along = np.stack([np.interp(knots, edge[::step, 1], v[::step]) for edge in points])
+    return x, along
+
+
+def _between_knots(values: FloatArray, knots: IntArray, rows: IntArray) -> FloatArray:
+    """(n, rows) linear interpolation of values (n, knots)."""
     left = np.minimum((rows - rows[0]) // _KNOT_ROWS, max(knots.size - 2, 0))
     right = np.minimum(left + 1, knots.size - 1)
     part = (rows - knots[left]) / np.maximum(knots[right] - knots[left], 1)
-    return _between(x, left, right, part), _between(along, left, right, part)
-
-
-def _between(values: FloatArray, left: IntArray, right: IntArray, part: FloatArray) -> FloatArray:
-    """(n, rows) linear interpolation of values (n, knots)."""
     start = values[:, left]
     start += (values[:, right] - start) * part
     return start
 
 
-def _sensor_rows(
-    edges_x: FloatArray, rows: NDArray[np.int64], shape: tuple[int, ...], lens: Lens | None
-) -> FloatArray | None:
-    if lens is None or not lens.corrected:
-        return None
-    middle_x = ((edges_x[1:] + edges_x[:-1]) / 2).reshape(shape)
-    pixels = np.stack([middle_x, np.broadcast_to(rows.astype(np.float64), shape)], axis=-1)
+def _sensor_rows(edges_x: FloatArray, knots: IntArray, lens: Lens) -> FloatArray:
+    """(n_edges - 1, knots) sensor row in the middle of each strip of a picture corrected in the camera."""
+    middle_x = (edges_x[1:] + edges_x[:-1]) / 2
+    pixels = np.stack([middle_x, np.broadcast_to(knots.astype(np.float64), middle_x.shape)], axis=-1)
     return distort(pixels, lens)[..., 1]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rxcli import assemble, channel, clock, detect, geometry, sampling
 from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, match_camera
@@ -31,15 +32,13 @@ SKIPS = ("no_screen", "dark_columns", "certain_columns", "tracking")
 
 _DEFAULT_TONE = "srgb"
 _SAMPLES_PER_SLOT = 4
-_MAX_ITERATIONS = 6
+_MAX_ITERATIONS = 5
 #: A column all of whose symbols have at least this log probability is not looked at again.
 _CERTAIN = -1e-5
 #: The quick look at the picture is surer than it should be of textured ones: it must do for all columns, and clearly.
 _CERTAIN_AT_ONCE = -1e-6
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
 _HOPELESS_WEIGHT = 20.0
-#: Iterations after which the clock is corrected.
-_CLOCK_ITERATIONS = 2
 #: A header peak less than this times the strongest rival is no lock.
 _MIN_LOCK = 1.6
 #: Orientations in which the readout runs along the columns' width.
@@ -139,8 +138,8 @@ def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
         lock = _find_lock(frame, corners, camera, options, stages)
         result = replace(result, screen_profile=lock.screen.name)
         with stages("detect"):
-            reception = _decode(lock)
-        columns = assemble.column_results(*reception, options.min_confidence)
+            seen = _decode(lock)
+        columns = assemble.column_results(seen.clock, seen.posteriors, seen.snr, seen.samples, options.min_confidence)
         result = replace(result, columns=columns, status=assemble.frame_status(columns))
     except _Failure as failure:
         result = replace(result, status=failure.status, message=failure.message)
@@ -199,8 +198,9 @@ def _find_lock(frame: Frame, corners: FloatArray, camera: _Camera, options: Rece
         with stages("sampling"):
             profiles = _sample(frame, corners, camera, n_columns)
         with stages("clock"):
+            quick = clock.halved_strips(profiles)
             for screen in (s for s in options.screens if s.columns == n_columns):
-                found = _clock_of(screen, profiles, camera)
+                found = _clock_of(screen, quick, camera)
                 if found and (best is None or found.lock > best.clock.lock):
                     best = _Lock(screen, profiles, found)
     if best is None or best.clock.lock < _MIN_LOCK:
@@ -237,37 +237,67 @@ def _why_no_signal(corners: FloatArray, camera: _Camera, options: ReceiverOption
     return "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
 
 
-def _decode(lock: _Lock) -> tuple[Clock, BurstPosteriors, Float32Array, SlotSamples]:
-    """Slots, light model and detection, iterated until they agree.
+@dataclass(frozen=True, slots=True)
+class _Reception:
+    """What was received of a frame."""
 
-    Returns:
-        The clock, posteriors, signal-to-noise ratio of the slots (C, N), and the samples.
-    """
+    clock: Clock
+    samples: SlotSamples
+    posteriors: BurstPosteriors
+    #: (C, N): squared contrast over variance of every slot.
+    snr: Float32Array
+
+
+def _decode(lock: _Lock) -> _Reception:
+    """A quick look first; where that leaves doubt, the light model in depth."""
+    seen = _quick_look(lock)
+    if not _doubtful(seen, _CERTAIN_AT_ONCE).any():
+        return seen
+    return _iterate(lock, seen)
+
+
+def _quick_look(lock: _Lock) -> _Reception:
+    """One pass over the strips pooled in pairs, from the first guess."""
+    profiles = clock.halved_strips(lock.profiles)
     now = lock.clock
-    samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
-    model = _light_model(lock, samples)
+    samples = clock.sample_slots(profiles, now, _SAMPLES_PER_SLOT)
+    model = _light_model(replace(lock, profiles=profiles), samples)
     pooled, weight = clock.slot_contrast(samples, model.sigma)
     now = clock.assign_bursts(now, pooled, weight, lock.screen.repeats)
-    metrics = channel.first_metrics(pooled, weight, model.memory)
-    snr = np.zeros((samples.light.shape[0], now.n_slots), np.float32)
+    posteriors = _detect(channel.first_metrics(pooled, weight, model.memory), now, model)
     columns = np.arange(samples.light.shape[0])
-    complete = assemble.complete(assemble.slots_seen(samples, now))
-    posteriors = _detect(metrics, now, model)
+    lit = channel.lit_on_grid(posteriors, now)
+    likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
+    now = clock.corrected(now, likelihoods.timing)
+    return _Reception(now, samples, _detect(likelihoods.metrics, now, model), likelihoods.snr)
+
+
+def _iterate(lock: _Lock, seen: _Reception) -> _Reception:
+    """Light model and detection in turn, until every column is certain or nothing more is to be expected."""
+    now = seen.clock
+    samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
+    model = _light_model(lock, samples)
+    columns = np.arange(samples.light.shape[0])
+    metrics = np.zeros((columns.size, now.n_slots + model.memory, 2 << model.memory))
+    snr = np.zeros((columns.size, now.n_slots), np.float32)
     for iteration in range(_MAX_ITERATIONS):
-        lit = channel.lit_on_grid(posteriors, now)
-        likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=iteration > 0)
+        lit = channel.lit_on_grid(seen.posteriors, now)
+        likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns)
         metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
-        posteriors = _detect(metrics, now, model)
-        certain = _CERTAIN if iteration else _CERTAIN_AT_ONCE
-        doubtful = ((posteriors.log_prob.min(axis=2) < certain) & complete).any(axis=0)
-        if not doubtful.any():
+        seen = _Reception(now, samples, _detect(metrics, now, model), snr)
+        columns = np.flatnonzero(_doubtful(seen, _CERTAIN))
+        if columns.size == 0:
             break
-        if iteration:
-            columns = np.flatnonzero(doubtful)
-        if iteration < _CLOCK_ITERATIONS:
+        if iteration == 0:
             now = clock.corrected(now, likelihoods.timing)
             samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
-    return now, posteriors, snr, samples
+    return seen
+
+
+def _doubtful(seen: _Reception, certain: float) -> NDArray[np.bool_]:
+    """(C,) whether a packet that could be reported has a symbol of less than the log probability `certain`."""
+    complete = assemble.complete(assemble.slots_seen(seen.samples, seen.clock))
+    return np.asarray(((seen.posteriors.log_prob.min(axis=2) < certain) & complete).any(axis=0))
 
 
 def _detect(metrics: FloatArray, now: Clock, model: channel.LightModel) -> BurstPosteriors:

@@ -98,8 +98,8 @@ class Outlines:
 
     #: (R,) int: picture rows that the screen touches, adjacent and ascending.
     rows: NDArray[np.int64]
-    #: (C*S + 1, R) float64: x of the strips' edges, pixels; column 0 is the viewer's leftmost.
-    edges_x: FloatArray
+    #: (C*S + 1, R) float32: x of the strips' edges, pixels; column 0 is the viewer's leftmost.
+    edges_x: Float32Array
     #: (C, S, R) bool: the strip's middle is on the screen and in the picture.
     inside: BoolArray
     #: (C, S, R) float64: sensor row at the strip's middle; None where it is the picture row itself.
