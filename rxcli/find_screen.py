@@ -56,6 +56,8 @@ _OUTSIDE_COST = 6.0
 _ROW_TRUST = 0.05
 #: Largest slope of a side, and its largest deviation from the others' when they are turned onto it.
 _MAX_SLOPE, _MAX_SKEW = 0.25, 0.07
+#: Times that the window of a side is moved outwards while stripes go on there.
+_MOVES_OUT = 4
 #: Focal length that the perspective of an invisible side assumes, picture widths.
 _FOCAL_WIDTHS = 1.2
 #: Smallest picture that is searched, pixels each way.
@@ -457,6 +459,8 @@ class _Onsets:
     #: (K,) energy was found; it begins inside the picture.
     seen: BoolArray
     usable: BoolArray
+    #: (K,) energy is there from the window's first place on, and the picture goes on beyond it.
+    earlier: BoolArray
     #: Resolution, picture pixels.
     step: float
 
@@ -501,11 +505,12 @@ def _fit_side(
     plane: _Plane, stripes: _Stripes, guess: list[_Side], side: int, out: float, inward: float, size: float
 ) -> _Side:
     """One side near its guess; support 0 where nothing shows."""
-    margin = 0.004 * size
-    if side in (_TOP, _BOTTOM):
-        onsets = _strip_onsets(plane, stripes, guess, side, out, inward, margin)
-    else:
-        onsets = _band_onsets(plane, stripes, guess, side, out, inward, margin)
+    find = _strip_onsets if side in (_TOP, _BOTTOM) else _band_onsets
+    for _ in range(_MOVES_OUT):
+        onsets = find(plane, stripes, guess, side, out, inward, 0.004 * size)
+        if not onsets.t.size or onsets.earlier.mean() < 0.1:
+            break
+        guess = [_moved(old, -0.8 * out * _INWARD[side]) if i == side else old for i, old in enumerate(guess)]
     sign = _INWARD[side]
     tolerance = max(1.5 * onsets.step, (0.0012 if side in (_TOP, _BOTTOM) else 0.002) * size)
     # Where the picture ends before the screen does, a line must pass well outside.
@@ -518,6 +523,13 @@ def _fit_side(
     if line is None or line[2] < cut.mean():
         return _Side(guess[side].coefficients, guess[side].middle, guess[side].half, 0.0)
     return _bend(onsets, np.array(line[1::-1]), depth, weight, tolerance, sign)
+
+
+def _moved(side: _Side, distance: float) -> _Side:
+    """The side, moved across itself."""
+    coefficients = side.coefficients.copy()
+    coefficients[-1] += distance
+    return _Side(coefficients, side.middle, side.half, side.support)
 
 
 def _row_trust(onsets: _Onsets) -> FloatArray:
@@ -576,7 +588,7 @@ def _strip_onsets(
     place = window.place(depth.astype(np.float64))
     seen = active.any(axis=1) & _agrees(place, 2.5 * plane.fy)
     usable = seen & (depth > valid.argmax(axis=1) + 1)
-    return _Onsets(window.t, place, seen, usable, plane.fy)
+    return _Onsets(window.t, place, seen, usable, seen & ~usable & valid[:, 0], plane.fy)
 
 
 def _half_way(energy: FloatArray, start: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -644,7 +656,8 @@ def _lasting_steps(
     covered = np.clip(energy[k, depth] / scale, 0, 1) + np.clip(energy[k, np.maximum(depth - 1, 0)] / scale, 0, 1)
     place = window.place(depth + 1 - covered)
     usable = seen & (depth > valid.argmax(axis=1) + 1)
-    return _Onsets(window.t[between], place[between], seen[between], usable[between], window.step)
+    earlier = seen & ~usable & valid[:, 0]
+    return _Onsets(window.t[between], place[between], seen[between], usable[between], earlier[between], window.step)
 
 
 def _row_noise(outside: FloatArray, limit: FloatArray) -> FloatArray:
@@ -667,7 +680,7 @@ def _span(index: NDArray[np.int64], n: int) -> tuple[int, int]:
 
 def _no_onsets(step: float) -> _Onsets:
     nothing = np.zeros(0)
-    return _Onsets(nothing, nothing, nothing > 0, nothing > 0, step)
+    return _Onsets(nothing, nothing, nothing > 0, nothing > 0, nothing > 0, step)
 
 
 def _infer_side(sides: list[_Side], missing: int, plane: _Plane, aspect: float) -> _Side:
