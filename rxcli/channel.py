@@ -130,7 +130,7 @@ def estimate_sigma(samples: SlotSamples, floor: float, least: float) -> float:
     bend = (light[..., 2:] - 2 * light[..., 1:-1] + light[..., :-2])[dark]
     if bend.size < 50:
         return least
-    return max(float(np.median(np.abs(bend))) / (0.6745 * 6.0**0.5), least)
+    return max(float(np.median(np.abs(bend)) / (0.6745 * np.sqrt(6.0))), least)
 
 
 def first_metrics(pooled: Float32Array, weight: Float32Array, memory: int) -> FloatArray:

@@ -35,7 +35,7 @@ def halved_strips(profiles: RowProfiles) -> RowProfiles:
     rows = profiles.sensor_row
     return replace(
         profiles,
-        light=(profiles.light[:, ::2] + profiles.light[:, 1::2]) / 2,
+        light=(profiles.light[:, ::2] + profiles.light[:, 1::2]) * np.float32(0.5),
         inside=profiles.inside[:, ::2] & profiles.inside[:, 1::2],
         sensor_row=None if rows is None else (rows[:, ::2] + rows[:, 1::2]) / 2,
         count=profiles.count[:, ::2] + profiles.count[:, 1::2],
@@ -56,7 +56,7 @@ def resample(
     Returns:
         (C, S, n_samples) float32 light, 0 where not valid; and 1 where a sample lies on the screen altogether, else 0.
     """
-    borders = row0 + rows_per_sample * np.arange(n_samples + 1)
+    borders = row0 + rows_per_sample * np.arange(n_samples + 1, dtype=np.float64)
     light = profiles.light.reshape(-1, profiles.light.shape[-1])
     first, stop = _shown_rows(profiles.inside.reshape(light.shape))
     positions = _row_positions(profiles, borders)
@@ -70,7 +70,7 @@ def resample(
 
 
 def _shown_rows(inside: BoolArray) -> tuple[IntArray, IntArray]:
-    """First row of each strip that is on the screen, and the one after the last; (n,) each, equal where there is none."""
+    """First row of each strip on the screen, and the one after the last; (n,) each, equal where there is none."""
     n_rows = inside.shape[1]
     any_row = inside.any(axis=1)
     first = inside.argmax(axis=1)
@@ -99,7 +99,7 @@ def _integrate(values: Float32Array, positions: FloatArray) -> FloatArray:
         below, above = total[:, left[0]], total[:, left[0] + 1]
     else:
         below, above = np.take_along_axis(total, left, 1), np.take_along_axis(total, left + 1, 1)
-    return np.diff(below + (above - below) * part, axis=1)
+    return np.asarray(np.diff(below + (above - below) * part, axis=1))
 
 
 def contrast(

@@ -123,7 +123,7 @@ def _tail(metrics: FloatArray, memory: int) -> FloatArray:
     states = (np.arange(1 << memory)[:, None] >> np.arange(memory - 1, -1, -1)) & 1
     header = np.broadcast_to(np.array(HEADER[:memory], np.int64), (len(states), memory))
     index = _pattern_index(np.concatenate([states, header], axis=1), memory)
-    return metrics[:, np.arange(memory), index].sum(axis=2)
+    return np.asarray(metrics[:, np.arange(memory), index].sum(axis=2))
 
 
 def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:

@@ -7,7 +7,6 @@ model carries points on to the stored picture, and each strip's edges become x a
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rxcli.profiles import LensModel
 from rxcli.types import FloatArray, IntArray, Lens, Outlines

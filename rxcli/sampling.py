@@ -13,7 +13,7 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.types import BoolArray, Float32Array, FloatArray, Frame, Mosaic, Outlines, RowProfiles
+from rxcli.types import Float32Array, FloatArray, Frame, Mosaic, Outlines, RowProfiles
 
 #: Scale of linear light in 16-bit cells; headroom is not needed, values are clipped at white.
 _FULL = 65535.0
