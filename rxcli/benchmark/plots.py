@@ -13,6 +13,7 @@ from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
     from rxcli.benchmark.confidence import Bin
+    from rxcli.benchmark.stages import Growth
     from rxcli.benchmark.sweeps import PlanePoint, Summary
 
 log = logging.getLogger(__name__)
@@ -110,4 +111,13 @@ def plot_plane(plane: Sequence[PlanePoint], path: Path) -> None:
         front = sorted((p.ms, max(p.ber, 1e-6)) for p in plane if p.on_front)
         axes.plot(*zip(*front, strict=True), color="C1", linewidth=1, label="Pareto front")
         axes.set(xlabel="run time, ms a frame", ylabel="bit error rate", xscale="log", yscale="log")
+        axes.legend()
+
+
+def plot_growth(growths: Sequence[Growth], path: Path) -> None:
+    """Run time over megapixels and columns, with the fitted exponents."""
+    with _figure(path) as axes:
+        for growth in growths:
+            axes.plot(growth.x, growth.ms, marker="o", label=f"{growth.axis}: exponent {growth.exponent:.2f}")
+        axes.set(xlabel="megapixels, columns", ylabel="run time after ingest, ms", xscale="log", yscale="log")
         axes.legend()

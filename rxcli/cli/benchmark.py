@@ -144,3 +144,55 @@ def _plot_sweeps(summaries: Sequence[Summary], out: Path) -> list[Path]:
             paths.append(out / "plane.png")
             plots.plot_plane(sweeps.run_time_plane(mine), paths[-1])
     return paths
+
+
+@benchmark.command()
+@click.option("--repeats", type=click.IntRange(1), default=5, show_default=True, help="Runs whose median counts.")
+@click.option("--medium", "only", multiple=True, metavar="NAME", help="A medium; may be given several times.")
+@click.option("--growth/--no-growth", default=True, help="Also measure growth with pixels and columns.")
+@_common
+def stages(repeats: int, only: tuple[str, ...], growth: bool, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
+    """Time per stage against the bare decode, peak memory, growth with pixels and columns."""
+    from tqdm import tqdm
+
+    from rxcli.benchmark import plots
+    from rxcli.benchmark import stages as work
+    from rxcli.benchmark.tables import format_table, write_outputs
+
+    media = [medium for medium in work.MEDIA if not only or medium.name in only]
+    if not media:
+        raise click.BadParameter(f"no medium of that name; choose from: {', '.join(m.name for m in work.MEDIA)}")
+    folder = out / "media"
+    steps = 4 * len(media) + 1 + growth * (len(work.MEGAPIXELS) + len(work.COLUMNS))
+    with tqdm(total=steps, desc="stages", leave=False, disable=quiet or None) as bar:
+        paths = {}
+        for medium in media:
+            if fresh:
+                (folder / f"{medium.name}{medium.suffix}").unlink(missing_ok=True)
+            paths[medium] = work.make_medium(medium, folder, seed)
+            bar.update()
+        timings = []
+        for threads in (1, 2):
+            for medium, path in paths.items():
+                timings.append(work.time_medium(medium, path, threads, repeats))
+                bar.update()
+        memory = []
+        for medium, path in paths.items():
+            memory.append({"medium": medium.name, **work.memory_of(medium, path)})
+            bar.update()
+        growths = [work.growth(axis, repeats, bar.update) for axis in ("megapixels", "columns")] if growth else []
+        start_up = work.help_times()
+        bar.update()
+    rows = work.timing_rows(timings)
+    click.echo("stages as ratios to the bare one-thread decode\n" + format_table(rows))
+    click.echo("\npeak memory\n" + format_table(memory))
+    for one in growths:
+        click.echo(f"\ngrowth with {one.axis}: exponent {one.exponent:.2f}")
+        click.echo(format_table([{one.axis: x, "ms": ms} for x, ms in zip(one.x, one.ms, strict=True)]))
+    click.echo("\n" + format_table([{"start": name, "ms": ms} for name, ms in start_up.items()]))
+    details = {"memory": memory, "start_ms": start_up, "growth": {g.axis: [g.x, g.ms, g.exponent] for g in growths}}
+    written = write_outputs(out, "stages", rows, details)
+    if growths and plots.available():
+        written.append(out / "growth.png")
+        plots.plot_growth(growths, written[-1])
+    _say_written(written)
