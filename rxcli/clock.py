@@ -82,7 +82,7 @@ def _row_positions(profiles: RowProfiles, borders: FloatArray) -> FloatArray:
     """Sensor rows as positions in the strips' row arrays, (1 or C*S, n) float64; position 0 is the top of row 0."""
     n_rows = profiles.rows.size
     if profiles.sensor_row is None:
-        return np.clip(borders - profiles.rows[0] + 0.5, 0, n_rows)[None]
+        return np.asarray(np.clip(borders - profiles.rows[0] + 0.5, 0, n_rows))[None]
     strips = profiles.sensor_row.reshape(-1, n_rows)
     index = np.arange(n_rows) + 0.5
     return np.stack([np.clip(np.interp(borders, strip, index, left=0, right=n_rows), 0, n_rows) for strip in strips])
