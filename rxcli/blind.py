@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
+from rxcli.profiles import CameraProfile, LensModel, ReadoutMode, ScreenProfile
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.types import BoolArray, Float32Array, FloatArray, Lens, RowProfiles
 
@@ -37,12 +37,17 @@ _BEND_SCALE = np.array([0.3, 0.6, 1.5e-3, 1.5e-3])
 _STRIPS = 4
 #: Distances of compared strips, in columns; a column's light reaches over its neighbours.
 _BEND_DISTANCES = (0.5, 1.0, 2.0)
+_BEND_PRECISION = np.concatenate([[0.0, 0.0], _BEND_SCALE**-2])
+#: Samples of a slot and strips of a column err alike: so many of them say what one would.
+_ALIKE = 10.0
 #: Lags looked at, rows; windows of rows; rows over which light is levelled.
 _BEND_LAGS, _BEND_WINDOWS, _BEND_LEVEL_ROWS = 24, 20, 100
 #: Samples a slot while the clock is sought.
 _SAMPLES = 4
 #: Rows per slot, at one octave's reduction, that its window of this many reduced rows serves.
 _OCTAVE, _OCTAVE_ROWS = (2.4, 4.8), 76
+#: Lag, in slots, at which a column is half as like itself: from short exposures to those of three slots.
+_HALF_WIDTH = (0.5, 1.8)
 #: Copies further apart than this many slots are not compared: the grid of rows per slot would have to be too fine.
 _SCAN_SLOTS = 700
 #: Hypotheses that are tried.
@@ -103,6 +108,8 @@ class BlindEstimate:
     corrected: bool
     #: Log-likelihood ratio of header and weights over chance.
     evidence: float
+    #: Share of the local variance of the light that the slots explain.
+    explained: float
 
 
 def strips_of(profiles: RowProfiles, centre_x: FloatArray, width: int, height: int) -> Strips:
@@ -144,7 +151,7 @@ def in_readout_order(strips: Strips) -> Strips:
 
 def _reversed_bend(bend: FloatArray) -> FloatArray:
     """The coefficients of the same bend with rows counted from the other end."""
-    return bend * np.array([1.0, 1.0, -1.0, 1.0])
+    return np.asarray(bend * np.array([1.0, 1.0, -1.0, 1.0]))
 
 
 # Bend -----------------------------------------------------------------------------------------------------------------
@@ -167,19 +174,23 @@ def bend_terms(x: FloatArray, rows: FloatArray, width: int, height: int) -> Floa
     return width * np.stack([down * square, down * square**2, square + 2 * down**2, 2 * across * down])
 
 
-def estimate_bend(strips: Strips) -> FloatArray:
-    """k1 k2 p1 p2, for a focal length of one width, whose sensor rows make neighbouring strips most alike; (4,)."""
+def estimate_bend(strips: Strips) -> tuple[FloatArray, float]:
+    """The bend whose sensor rows make neighbouring strips most alike.
+
+    Returns:
+        (4,) k1 k2 p1 p2 for a focal length of one width; and how much better it fits than none, nats.
+    """
     lags = [_lag_correlations(strips, distance) for distance in _distances(strips)]
     total = sum(float(correlation[_BEND_LAGS].sum()) for correlation, _ in lags)
     if not lags or total <= 0:
-        return np.zeros(4)
+        return np.zeros(4), 0.0
     # The sum of correlations is worth about this many nats: rows times strips, many of which say the same.
     weight = 4000.0 / total
-    k1, share = np.meshgrid(np.linspace(-0.4, 0.4, 33), [0.0, 0.7, 1.5, 2.5])
-    guesses = np.stack([k1.ravel(), (-share * k1).ravel(), 0 * k1.ravel(), 0 * k1.ravel()], axis=1)
-    scores = [_likeness(guess, lags, weight) for guess in guesses]
-    best = guesses[int(np.argmax(scores))]
-    return _climb(best, lags, weight)
+    k1, share = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.4, 0.4, 25), [0.0, 0.8, 1.8]))
+    guesses = np.stack([k1, -share * k1, 0 * k1, 0 * k1], axis=1)
+    scores = [_likeness(guess, lags[-1:], weight) for guess in guesses]
+    found = _climb(guesses[int(np.argmax(scores))], lags, weight)
+    return found, _likeness(found, lags, weight) - _likeness(np.zeros(4), lags, weight)
 
 
 def _distances(strips: Strips) -> list[int]:
@@ -283,6 +294,9 @@ def _between(values: Float32Array, low: NDArray[np.int64], f: Float32Array) -> F
     return np.asarray(below + (above - below) * f, np.float32)
 
 
+#: Steps of the header, dark before and after.
+_HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
+
 # Scan -----------------------------------------------------------------------------------------------------------------
 
 
@@ -320,7 +334,8 @@ def _octaves(strips: Strips) -> list[_Octave]:
         columns = _pooled(light, (inside > 0.99).astype(np.float32), window, noise, strips.n_columns)
         correlation = _autocorrelation(columns)
         width = _half_width(correlation) * rows
-        if 0.3 * least <= width <= 2.0 * most:
+        least, most = max(least, width / _HALF_WIDTH[1]), min(most, width / _HALF_WIDTH[0])
+        if least < most:
             out.append(
                 _Octave(columns, rows, least, most, _surprise(correlation, round(PREAMBLE_SLOTS * least / rows)))
             )
@@ -369,35 +384,38 @@ def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:
     return np.asarray(out)
 
 
-def _header_response(mean: FloatArray, rows_per_slot: float) -> FloatArray:
-    """Correlation of (R,) levelled light with a header of either sign that starts at each sample of a slot's quarter.
+def _header_response(total: FloatArray, rows_per_slot: float) -> FloatArray:
+    """Correlation with a header that starts at each quarter of a slot, the first one a header's length before row 0.
 
-    Sample 0 is a header's length before row 0.
+    Args:
+        total: (R + 1,) running sum of the columns' mean.
+        rows_per_slot: rows a slot.
+
+    Returns:
+        (2, n): of the light as it is, and of its negative, which shows the header read backwards.
     """
     lead = SLOTS_PER_SYMBOL * _SAMPLES
-    n = int(mean.size / rows_per_slot * _SAMPLES)
-    total = np.concatenate([[0.0], np.cumsum(mean)])
-    grid = np.arange(-lead, n + lead + 1) * (rows_per_slot / _SAMPLES)
+    starts = int((total.size - 1) / rows_per_slot * _SAMPLES) + lead
+    grid = np.arange(-lead, starts + 1) * (rows_per_slot / _SAMPLES)
     summed = np.interp(grid, np.arange(total.size), total)
-    starts = n + lead
-    signs = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
-    edges = np.flatnonzero(signs)
-    out = sum(-signs[e] * summed[e * _SAMPLES : e * _SAMPLES + starts] for e in edges)
-    return np.asarray(out / (SLOTS_PER_SYMBOL * rows_per_slot))
+    out = np.zeros(starts)
+    for edge in np.flatnonzero(_HEADER_STEPS):
+        out -= _HEADER_STEPS[edge] * summed[edge * _SAMPLES : edge * _SAMPLES + starts]
+    out /= SLOTS_PER_SYMBOL * rows_per_slot
+    return np.stack([out, -out])
 
 
-def _comb(response: FloatArray, packet_slots: int) -> tuple[float, int]:
-    """Best sum of the response over copies of a packet, over the root of their number; and its sample."""
+def _comb(response: FloatArray, packet_slots: int) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Best sums of responses (k, n) over copies of a packet, over the root of their number; and their samples, (k,)."""
+    n_signs, n = response.shape
     period, lead = packet_slots * _SAMPLES, SLOTS_PER_SYMBOL * _SAMPLES
-    n_copies = -(-response.size // period)
-    folded = np.zeros(n_copies * period)
-    whole = np.zeros(n_copies * period)
-    folded[lead : response.size - lead] = response[lead : response.size - lead]
-    whole[lead : response.size - lead] = 1
-    count = whole.reshape(n_copies, period).sum(axis=0)
-    score = folded.reshape(n_copies, period).sum(axis=0) / np.sqrt(np.maximum(count, 1))
-    best = int(score.argmax())
-    return float(score[best]), best
+    folded = np.zeros((n_signs, -(-n // period) * period))
+    folded[:, lead : n - lead] = response[:, lead : n - lead]
+    phase = np.arange(period)
+    count = (n - lead - 1 - phase) // period - (lead - 1 - phase) // period
+    score = folded.reshape(n_signs, -1, period).sum(axis=1) / np.sqrt(np.maximum(count, 1))
+    best = score.argmax(axis=1)
+    return score[np.arange(n_signs), best], best
 
 
 def find_clocks(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesis]:
@@ -426,24 +444,27 @@ def _scan_octave(octave: _Octave, n_rows: int, packet_lengths: Sequence[int]) ->
     import cv2
 
     out = []
-    mean = octave.columns.mean(axis=0).astype(np.float64)
+    total = _running_mean_sum(octave)
     rows_per_slot = octave.low
     around = np.ones((1, 2 * _SAMPLES + 1), np.uint8)
     while rows_per_slot < octave.high:
-        seen = n_rows / rows_per_slot
-        response = _header_response(mean, rows_per_slot / octave.rows)
-        spread = 1.4826 * float(np.median(np.abs(response))) + 1e-6
-        for sign in (1, -1):
-            # The largest response within a slot: the grid may then miss copies by a slot.
-            near = cv2.dilate((sign * response)[None], around)[0]
-            for packet_slots in packet_lengths:
-                score, sample = _comb(near, packet_slots)
-                repeats = _repeats_near(octave, rows_per_slot, packet_slots)
-                start = (sample / _SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
-                evidence = (score / spread) ** 2 + repeats**2
-                out.append(Hypothesis(rows_per_slot, packet_slots, start, sign < 0, evidence))
-        rows_per_slot *= 1 + 2.0 / min(seen, _SCAN_SLOTS)
+        response = _header_response(total, rows_per_slot / octave.rows)
+        spread = 1.4826 * float(np.median(np.abs(response[0]))) + 1e-6
+        # The largest response within a slot: the grid may then miss copies by a slot.
+        near = cv2.dilate(response, around)
+        for packet_slots in packet_lengths:
+            repeats = _repeats_near(octave, rows_per_slot, packet_slots)
+            for number, (score, sample) in enumerate(zip(*_comb(near, packet_slots), strict=True)):
+                start = (float(sample) / _SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
+                evidence = float(score / spread) ** 2 + repeats**2
+                out.append(Hypothesis(rows_per_slot, packet_slots, start, number == 1, evidence))
+        rows_per_slot *= 1 + 2.0 / min(n_rows / rows_per_slot, _SCAN_SLOTS)
     return out
+
+
+def _running_mean_sum(octave: _Octave) -> FloatArray:
+    mean = octave.columns.mean(axis=0).astype(np.float64)
+    return np.concatenate([[0.0], np.cumsum(mean)])
 
 
 def _repeats_near(octave: _Octave, rows_per_slot: float, packet_slots: int) -> float:
@@ -481,18 +502,17 @@ def _slot_means(total: FloatArray, borders: FloatArray) -> FloatArray:
 
 def _fine_clock(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
     """The clock near the hypothesis with the highest header peaks."""
-    mean = octave.columns.mean(axis=0).astype(np.float64)
-    if hypothesis.reversed:
-        mean = -mean
-    n_rows = mean.size * octave.rows
+    total = _running_mean_sum(octave)
+    sign = int(hypothesis.reversed)
+    n_rows = octave.columns.shape[1] * octave.rows
     step = 0.3 / min(n_rows / hypothesis.rows_per_slot, _SCAN_SLOTS)
     best, best_score = hypothesis, -np.inf
     for rows_per_slot in hypothesis.rows_per_slot * (1 + step * np.arange(-8, 9)):
-        response = _header_response(mean, rows_per_slot / octave.rows)
-        score, sample = _comb(response, hypothesis.packet_slots)
+        response = _header_response(total, rows_per_slot / octave.rows)[sign : sign + 1]
+        (score,), (sample,) = _comb(response, hypothesis.packet_slots)
         score += 0.03 * _repeats_at(octave, rows_per_slot, hypothesis.packet_slots)
         if score > best_score:
-            start = (sample / _SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
+            start = (float(sample) / _SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
             best = replace(hypothesis, rows_per_slot=float(rows_per_slot), start_row=float(start))
             best_score = score
     return best
@@ -522,9 +542,9 @@ def structure_evidence(slots: FloatArray, first_slot: int, packet_slots: int) ->
     in_header = position < SLOTS_PER_SYMBOL
     agree = lit[:, in_header] == np.array(HEADER, bool)[position[in_header]]
     header = np.where(agree, np.log(0.9 / 0.5), np.log(0.1 / 0.5)).sum(axis=1)
-    starts = np.flatnonzero((position % SLOTS_PER_SYMBOL == 0) & ~in_header)
+    starts: NDArray[np.int64] = np.flatnonzero((position % SLOTS_PER_SYMBOL == 0) & ~in_header)
     starts = starts[starts + SLOTS_PER_SYMBOL <= n]
-    count = lit[:, starts[:, None] + np.arange(SLOTS_PER_SYMBOL)].sum(axis=2)
+    count = np.asarray(lit[:, starts[:, None] + np.arange(SLOTS_PER_SYMBOL)]).sum(axis=2)
     weight = _weight_evidence(count, lit.mean(axis=1))
     dimming = _dimming_evidence(lit, position)
     best = (weight + dimming).max(axis=1)
@@ -565,9 +585,31 @@ def _dimming_evidence(lit: BoolArray, position: NDArray[np.int64]) -> FloatArray
 _EXPOSURES = np.array([0.15, 0.3, 0.45, 0.6, 0.8, 1.0, 1.2, 1.4, 1.7, 2.0, 2.35, 2.7, 3.1])
 #: Slots over which the light of a strip may be taken as constant.
 _LOCAL_SLOTS = 15
-_REFINE_STEPS = 6
+_REFINE_STEPS = 8
+#: Steps at which the exposure is estimated.
+_EXPOSURE_STEPS = (1, 3)
+#: The descent ends when no row moves by more slots than this.
+_CONVERGED = 0.003
+#: Chi-square of the four coefficients that a bend beyond doubt has; unbent pictures stay below 35.
+_BENT_CHI_SQUARE = 80.0
+#: Keeps the clock of a row-time map and drops its bend.
+_FLAT = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
 #: Rows of one block of the normal equations; the bend does not change within.
 _BLOCK_ROWS = 32
+
+
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """Where slot 0 stands in its packet."""
+
+    first_slot: int
+    packet_slots: int
+
+    def header(self, n: int) -> tuple[NDArray[np.int64], BoolArray]:
+        """Slots of the headers among slots 0..n, and whether they are lit."""
+        position = (np.arange(n) + self.first_slot) % self.packet_slots
+        slots = np.flatnonzero(position < SLOTS_PER_SYMBOL)
+        return slots, np.array(HEADER, bool)[position[slots]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -576,15 +618,12 @@ class _Timing:
 
     #: start, rows_per_slot, k1, k2, p1, p2.
     values: FloatArray
-    #: Covariance of the values.
+    #: (6, 6) covariance of the values.
     covariance: FloatArray
-    #: (C, N) bool: lit slots.
-    lit: BoolArray
-    #: Position of slot 0 in its packet.
-    first_slot: int
-    packet_slots: int
     exposure_slots: float
     exposure_sd: float
+    #: (C, N) bool: lit slots.
+    lit: BoolArray
     #: Share of the strips' local variance that the slots explain.
     explained: float
 
@@ -602,12 +641,11 @@ def refine(
     """
     ordered, bend = (in_readout_order(strips), _reversed_bend(bend)) if hypothesis.reversed else (strips, bend)
     ordered = _thinned(ordered, hypothesis.rows_per_slot)
-    timing = _fit_timing(ordered, hypothesis, bend, exposure_slots)
-    start, rows_per_slot = timing.values[:2]
+    timing, grid, corrected = _fit_timing(ordered, hypothesis, bend, exposure_slots)
     found, sd = timing.values[2:], np.sqrt(np.diag(timing.covariance))
-    evidence = structure_evidence(2.0 * timing.lit - 1, timing.first_slot, hypothesis.packet_slots)
+    evidence = structure_evidence(timing.lit.astype(np.float64), grid.first_slot, hypothesis.packet_slots)
     return BlindEstimate(
-        rows_per_slot=float(rows_per_slot),
+        rows_per_slot=float(timing.values[1]),
         rows_per_slot_sd=float(sd[1]),
         packet_slots=hypothesis.packet_slots,
         reversed=hypothesis.reversed,
@@ -615,8 +653,9 @@ def refine(
         exposure_slots_sd=timing.exposure_sd,
         bend=_reversed_bend(found) if hypothesis.reversed else found,
         bend_sd=sd[2:],
-        corrected=_is_bent(ordered, timing),
+        corrected=corrected,
         evidence=evidence,
+        explained=timing.explained,
     )
 
 
@@ -641,37 +680,39 @@ def _thinned(strips: Strips, rows_per_slot: float) -> Strips:
     )
 
 
-def _fit_timing(strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None) -> _Timing:
-    """Gauss-Newton on the row-time map, deciding the slots anew at every step."""
+def _fit_timing(
+    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None
+) -> tuple[_Timing, _Grid, bool]:
+    """The row-time map, with a bend only where it is beyond doubt: one that is free for nothing blurs the period."""
     first_row = strips.rows[0] - 0.5 * (strips.rows[1] - strips.rows[0])
     before = int(hypothesis.start_row // hypothesis.rows_per_slot) + 2
     start = first_row + hypothesis.start_row - before * hypothesis.rows_per_slot
-    values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
-    terms = _time_terms(strips)
     grid = _Grid(-before % hypothesis.packet_slots, hypothesis.packet_slots)
+    values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
+    bent = _descend(strips, grid, values, exposure_slots, n_free=6)
+    if _is_bent(bent):
+        return bent, grid, True
+    values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else bent.values * _FLAT
+    flat = _descend(strips, grid, values, bent.exposure_slots, n_free=2)
+    return replace(flat, exposure_sd=bent.exposure_sd), grid, False
+
+
+def _descend(strips: Strips, grid: _Grid, values: FloatArray, exposure_slots: float | None, n_free: int) -> _Timing:
+    """Gauss-Newton on the first `n_free` values of the row-time map, deciding the slots anew at every step."""
+    terms = _time_terms(strips)
     exposure, exposure_sd = exposure_slots or 1.0, 0.0
-    covariance = np.eye(6)
     for step in range(_REFINE_STEPS):
         time = _slot_time(strips, terms, values)
-        waves = _column_waves(strips, time, exposure)
-        if exposure_slots is None and step in (1, 3):
+        waves = _column_waves(strips, time, values[1])
+        if exposure_slots is None and step in _EXPOSURE_STEPS:
             exposure, exposure_sd = _estimate_exposure(waves, grid)
         lit = _decide(waves, exposure, grid)
-        change, covariance, explained = _gauss_newton(strips, terms, values, time, lit, exposure)
+        change, covariance, explained = _gauss_newton(strips, terms, values, time, lit, exposure, n_free)
         values = values + change
-    return _Timing(values, covariance, lit, grid.first_slot, grid.packet_slots, exposure, exposure_sd, explained)
-
-
-@dataclass(frozen=True, slots=True)
-class _Grid:
-    first_slot: int
-    packet_slots: int
-
-    def header(self, n: int) -> tuple[NDArray[np.int64], BoolArray]:
-        """Slots of the headers among slots 0..n, and whether they are lit."""
-        position = (np.arange(n) + self.first_slot) % self.packet_slots
-        slots = np.flatnonzero(position < SLOTS_PER_SYMBOL)
-        return slots, np.array(HEADER, bool)[position[slots]]
+        moved = float(np.abs(_slot_time(strips, terms, values)[:, ::_BLOCK_ROWS] - time[:, ::_BLOCK_ROWS]).max())
+        if moved < _CONVERGED and step >= max(_EXPOSURE_STEPS):
+            break
+    return _Timing(values, covariance, exposure, exposure_sd, lit, explained)
 
 
 def _time_terms(strips: Strips) -> FloatArray:
@@ -691,7 +732,7 @@ def _slot_time(strips: Strips, terms: FloatArray, values: FloatArray) -> Float32
     width = np.minimum((low + 1) * _BLOCK_ROWS, n - 1) - low * _BLOCK_ROWS
     f = (index - low * _BLOCK_ROWS) / np.maximum(width, 1)
     bent = moved[:, low] + (moved[:, low + 1] - moved[:, low]) * f
-    return ((strips.rows + bent - start) / rows_per_slot).astype(np.float32)
+    return np.asarray((strips.rows + bent - start) / rows_per_slot, np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -703,11 +744,10 @@ class _Waves:
     weight: Float32Array
 
 
-def _column_waves(strips: Strips, time: Float32Array, exposure_slots: float) -> _Waves:
+def _column_waves(strips: Strips, time: Float32Array, rows_per_slot: float) -> _Waves:
     """Levelled light of every column by slot position."""
-    rows_per_slot = (strips.rows[-1] - strips.rows[0]) / max(float(time[0, -1] - time[0, 0]), 1.0)
-    rows_per_slot /= abs(strips.rows[1] - strips.rows[0])
-    level, weight = _levelled(strips.light, strips.inside, round(_EXTREMES_SLOTS * rows_per_slot), strips.sigma)
+    window = round(_EXTREMES_SLOTS * rows_per_slot / (strips.rows[1] - strips.rows[0]))
+    level, weight = _levelled(strips.light, strips.inside, window, strips.sigma)
     n = (int(time.max()) + 2) * _SAMPLES
     per_column = strips.light.shape[0] // strips.n_columns
     column = np.arange(strips.light.shape[0]) // per_column
@@ -782,7 +822,7 @@ def _running(
     index = low + base
     below = flat[index]
     step = flat[index + 1] - below
-    return below + step * (place - low).astype(np.float32), step
+    return np.asarray(below + step * (place - low), np.float32), step
 
 
 def _local(values: Float32Array, window: int) -> Float32Array:
@@ -792,13 +832,19 @@ def _local(values: Float32Array, window: int) -> Float32Array:
 
 
 def _gauss_newton(
-    strips: Strips, terms: FloatArray, values: FloatArray, time: Float32Array, lit: BoolArray, exposure_slots: float
+    strips: Strips,
+    terms: FloatArray,
+    values: FloatArray,
+    time: Float32Array,
+    lit: BoolArray,
+    exposure_slots: float,
+    n_free: int,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Step of the row-time map, its covariance, and the share of variance explained before the step."""
     per_column = strips.light.shape[0] // strips.n_columns
     column = np.arange(strips.light.shape[0]) // per_column
     wave, slope = _seen(lit, time, column, exposure_slots)
-    pitch = abs(float(strips.rows[1] - strips.rows[0]))
+    pitch = float(strips.rows[1] - strips.rows[0])
     window = round(_LOCAL_SLOTS * values[1] / pitch)
     inside = strips.inside
     share = _local(inside, window) + np.float32(1e-3)
@@ -815,7 +861,7 @@ def _gauss_newton(
     information = np.add.reduceat(weight * power * power, blocks, axis=1).astype(np.float64)
     pull = np.add.reduceat(fit, blocks, axis=1).astype(np.float64)
     jacobian = _jacobian(terms, values, time, blocks)
-    step, covariance_matrix = _solve(jacobian, information, pull, values, strips.n_columns)
+    step, covariance_matrix = _solve(jacobian, information, pull, values, strips.n_columns, n_free)
     light_power = float((gain * gain * variance * weight).sum())
     left = float((residual * residual * weight).sum())
     return step, covariance_matrix, light_power / max(light_power + left, 1e-9)
@@ -833,19 +879,20 @@ def _jacobian(terms: FloatArray, values: FloatArray, time: Float32Array, blocks:
 
 
 def _solve(
-    jacobian: FloatArray, information: FloatArray, pull: FloatArray, values: FloatArray, n_columns: int
+    jacobian: FloatArray, information: FloatArray, pull: FloatArray, values: FloatArray, n_columns: int, n_free: int
 ) -> tuple[FloatArray, FloatArray]:
     """Step and covariance; the spread of the columns' pulls stands for all that makes residuals alike."""
-    flat = jacobian.reshape(6, -1)
-    prior = np.concatenate([[0.0, 0.0], _BEND_SCALE**-2])
-    # Samples of a slot and strips of a column err alike: the prior weighs as if one in ten said something new.
-    hessian = (flat * information.ravel()) @ flat.T + np.diag(10 * prior)
-    gradient = flat @ pull.ravel() - 10 * prior * values
+    free = jacobian[:n_free]
+    flat = free.reshape(n_free, -1)
+    prior = (_ALIKE * _BEND_PRECISION)[:n_free]
+    hessian = (flat * information.ravel()) @ flat.T + np.diag(prior)
     inverse = np.linalg.inv(hessian)
-    by_column = (jacobian * pull).reshape(6, n_columns, -1).sum(axis=2)
+    by_column = (free * pull).reshape(n_free, n_columns, -1).sum(axis=2)
     spread = by_column - by_column.mean(axis=1, keepdims=True)
-    covariance = inverse @ (spread @ spread.T) @ inverse * n_columns / max(n_columns - 1, 1)
-    return inverse @ gradient, covariance
+    step, covariance = np.zeros(6), np.zeros((6, 6))
+    step[:n_free] = inverse @ (flat @ pull.ravel() - prior * values[:n_free])
+    covariance[:n_free, :n_free] = inverse @ (spread @ spread.T) @ inverse * n_columns / max(n_columns - 1, 1)
+    return step, covariance
 
 
 def _estimate_exposure(waves: _Waves, grid: _Grid) -> tuple[float, float]:
@@ -876,12 +923,267 @@ def _misfit(waves: _Waves, exposure_slots: float, lit: BoolArray) -> float:
     return float((weight * residual * residual).sum()) / max(total, 1e-9)
 
 
-def _is_bent(strips: Strips, timing: _Timing) -> bool:
-    """Whether the bend is beyond doubt and moves rows by more than some hundredths of a slot."""
+def _is_bent(timing: _Timing) -> bool:
+    """Whether the bend is beyond doubt; columns share too much for its chi-square to be taken at its word."""
     bend, covariance = timing.values[2:], timing.covariance[2:, 2:]
-    surprise = float(bend @ np.linalg.solve(covariance + 1e-4 * np.diag(_BEND_SCALE**2), bend))
-    rows = np.linspace(strips.rows[0], strips.rows[-1], 9)
-    x = np.linspace(strips.x.min(), strips.x.max(), 9)
-    moved = np.tensordot(bend, bend_terms(x[:, None], rows[None], strips.width, strips.height), 1)
-    across = moved - moved.mean(axis=0)
-    return surprise > 30 and float(across.std()) > 0.03 * float(timing.values[1])
+    return float(bend @ np.linalg.solve(covariance + 1e-8 * np.diag(_BEND_SCALE**2), bend)) > _BENT_CHI_SQUARE
+
+
+# All together ---------------------------------------------------------------------------------------------------------
+
+#: A bend that fits this many nats better than none is tried; from the second on, it alone.
+_BEND_GAINS = (5.0, 25.0)
+#: Hypotheses that are refined, and the share of the best one's evidence that another needs.
+_REFINED, _CLOSE_EVIDENCE = 2, 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class BlindSearch:
+    """What was estimated, or why nothing was."""
+
+    estimate: BlindEstimate | None
+    #: Why not: thing, reason and next step. Empty where an estimate was found.
+    reason: str = ""
+
+
+def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None) -> BlindSearch:
+    """Estimate the camera from one picture of a sending screen.
+
+    Args:
+        strips: see `strips_of`.
+        screens: screens that it may be.
+        exposure_s: exposure, None where the file does not tell it.
+
+    Raises:
+        ValueError: no screens.
+    """
+    if not screens:
+        raise ValueError("screens must name at least one screen (got none)")
+    rates = {screen.packet_slots: screen.slot_rate_hz for screen in reversed(screens)}
+    bend, gain = estimate_bend(strips)
+    bends = [bend] if gain > _BEND_GAINS[1] else [np.zeros(4), bend] if gain > _BEND_GAINS[0] else [np.zeros(4)]
+    found = [(clock, b) for b in bends for clock in find_clocks(straightened(strips, b), sorted(rates))]
+    found.sort(key=lambda pair: -pair[0].evidence)
+    estimates: list[BlindEstimate] = []
+    for clock, b in found[:1] + [pair for pair in found[1:_REFINED] if _worth_refining(pair[0], found[0][0])]:
+        exposure = exposure_s * rates[clock.packet_slots] if exposure_s else None
+        estimates.append(refine(strips, clock, b, exposure))
+    best = max(estimates, key=lambda estimate: estimate.evidence, default=None)
+    if best is None or best.evidence < MIN_EVIDENCE:
+        return BlindSearch(None, why_not(strips))
+    return BlindSearch(best)
+
+
+def _worth_refining(clock: Hypothesis, best: Hypothesis) -> bool:
+    return clock.evidence > _CLOSE_EVIDENCE * best.evidence or best.evidence < 2 * MIN_EVIDENCE
+
+
+def lens_of(estimate: BlindEstimate, width: int, height: int) -> Lens | None:
+    """The lens model of a picture that was corrected in the camera; None where no bend was seen."""
+    if not estimate.corrected:
+        return None
+    matrix = np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1.0]])
+    return Lens(matrix, np.append(estimate.bend, 0.0), corrected=True)
+
+
+def in_time_order(profiles: RowProfiles, height: int) -> RowProfiles:
+    """Row profiles of a picture whose rows run against the readout, with rows counted from the first one read.
+
+    Args:
+        profiles: C columns, S strips, R rows.
+        height: rows of the picture.
+    """
+    sensor_row = None if profiles.sensor_row is None else height - 1 - profiles.sensor_row[..., ::-1]
+    return replace(
+        profiles,
+        light=np.ascontiguousarray(profiles.light[..., ::-1]),
+        inside=np.ascontiguousarray(profiles.inside[..., ::-1]),
+        rows=height - 1 - profiles.rows[::-1],
+        sensor_row=sensor_row,
+    )
+
+
+def summary(estimate: BlindEstimate, slot_rate_hz: float) -> dict[str, tuple[float, float]]:
+    """What was estimated: name -> (value, standard deviation)."""
+    line_delay_s = 1 / (estimate.rows_per_slot * slot_rate_hz)
+    relative = estimate.rows_per_slot_sd / estimate.rows_per_slot
+    out = {
+        "rows_per_slot": (estimate.rows_per_slot, estimate.rows_per_slot_sd),
+        "line_delay_s": (line_delay_s, line_delay_s * relative),
+        "readout_reversed": (float(estimate.reversed), 0.0),
+    }
+    if estimate.exposure_slots_sd > 0:
+        out["exposure_s"] = (estimate.exposure_slots / slot_rate_hz, estimate.exposure_slots_sd / slot_rate_hz)
+    if estimate.corrected:
+        names = ("k1", "k2", "p1", "p2")
+        out |= {n: (float(v), float(sd)) for n, v, sd in zip(names, estimate.bend, estimate.bend_sd, strict=True)}
+    return out
+
+
+def camera_profile(
+    estimated: dict[str, tuple[float, float]], name: str, make: str | None, model: str | None, width: int, height: int
+) -> CameraProfile:
+    """A camera profile of what was estimated, for the next pictures of this camera and size.
+
+    Args:
+        estimated: see `summary`; `FrameResult.estimated`.
+        name: of the profile.
+        make: of the camera, None where the file does not tell it.
+        model: of the camera, None where the file does not tell it.
+        width: of the picture.
+        height: of the picture.
+
+    Raises:
+        KeyError: no line delay among what was estimated.
+    """
+    lens = None
+    if "k1" in estimated:
+        k = tuple(estimated[key][0] for key in ("k1", "k2", "p1", "p2"))
+        centre_x, centre_y, focal = (width - 1) / 2, (height - 1) / 2, float(width)
+        matrix = ((focal, 0.0, centre_x), (0.0, focal, centre_y), (0.0, 0.0, 1.0))
+        lens = LensModel(
+            width=width,
+            height=height,
+            camera_matrix=matrix,
+            dist_coeffs=(*k, 0.0),
+            distortion_already_corrected=True,
+        )
+    line_delay_s, sd = estimated["line_delay_s"]
+    mode = ReadoutMode(
+        name=f"{width}x{height}",
+        width=width,
+        height=height,
+        line_delay_s=line_delay_s,
+        exposure_s=estimated["exposure_s"][0] if "exposure_s" in estimated else None,
+    )
+    return CameraProfile(
+        format=1,
+        kind="camera",
+        name=name,
+        make=make or "",
+        models=(model,) if model else (),
+        modes=(mode,),
+        lens=lens,
+        description=f"estimated from one picture; line delay to {100 * sd / line_delay_s:.2g} %",
+    )
+
+
+# What cannot work -----------------------------------------------------------------------------------------------------
+
+#: Likeness of neighbouring strips, over the light's own variance, below which a picture has no stripes.
+_STRIPED = 0.15
+#: Share of the screen's height that must be striped.
+_STRIPED_SHARE = 0.7
+_LIKENESS_BANDS = 16
+
+
+def why_not(strips: Strips) -> str:
+    """Why no clock was found: what the picture looks like, and the next step."""
+    likeness, lit = stripe_likeness(strips)
+    striped = lit & (likeness > _STRIPED)
+    if not lit.any():
+        return "the screen is dark; show a brighter picture or raise the exposure"
+    if not striped.any():
+        return (
+            "the screen shows no stripes; check that it sends, and take the picture with the electronic shutter, "
+            "HDR and night mode off (a mechanical or global shutter sees no slots)"
+        )
+    if striped[lit].mean() < _STRIPED_SHARE:
+        return (
+            "only a part of the screen's height shows stripes; the picture may be merged from several exposures or "
+            "taken with flash: switch HDR and flash off, or use a manual-camera app"
+        )
+    level, weight = _levelled(strips.light, strips.inside, 38, strips.sigma)
+    columns = (level * weight).reshape(strips.n_columns, -1, strips.rows.size).mean(axis=1)
+    width = _half_width(_autocorrelation(columns))
+    if width < _HALF_WIDTH[0] * MIN_ROWS_PER_SLOT:
+        return (
+            f"the stripes are about {width:.1f} rows wide, too few to tell slots apart (at least "
+            f"{MIN_ROWS_PER_SLOT} rows a slot); use the picture in its full size, or a slower slot rate"
+        )
+    return (
+        "there are stripes but no packet header among them; the screen may show less than one packet (move closer), "
+        "the picture may be merged from several exposures (switch HDR off), or the screen's profile is not among those tried"
+    )
+
+
+def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
+    """Correlation of neighbouring strips in bands of rows, 0..1, median over the strips; and whether a band is lit."""
+    level, weight = _levelled(strips.light, strips.inside, _BEND_LEVEL_ROWS, strips.sigma)
+    blocks = np.linspace(0, strips.rows.size, _LIKENESS_BANDS + 1).astype(int)[:-1]
+    step = _distances(strips)[0] if _distances(strips) else 1
+
+    def summed(values: Float32Array) -> FloatArray:
+        return np.asarray(np.add.reduceat(values, blocks, axis=1), np.float64)
+
+    product = summed(level[:-step] * level[step:])
+    power = np.sqrt(summed(level[:-step] ** 2) * summed(level[step:] ** 2))
+    likeness = np.median(product / np.maximum(power, 1e-9), axis=0)
+    lit = summed(weight).max(axis=0) > 0.05 * strips.rows.size / _LIKENESS_BANDS
+    lit |= summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / _LIKENESS_BANDS
+    return np.asarray(likeness), np.asarray(lit)
+
+
+# Columns --------------------------------------------------------------------------------------------------------------
+
+
+def likely_columns(profiles: RowProfiles, clock_rows: FloatArray, screens: Sequence[ScreenProfile]) -> ScreenProfile:
+    """The screen whose columns are as wide as the picture's, by how far strips are alike.
+
+    Two strips at u and v see the columns c with weights g(u - c) and g(v - c), so that their slots correlate by the
+    product of both, summed over c. Header and dimming symbol are the same everywhere and must be left out.
+
+    Args:
+        profiles: C columns of S strips, C any.
+        clock_rows: (n,) borders of payload slots on sensor rows, each slot from entry 2 i to 2 i + 1.
+        screens: screens that differ in their columns.
+    """
+    slots, seen = _strip_slots(profiles, clock_rows)
+    n_strips = slots.shape[0]
+    reach = max(2, min(n_strips - 1, round(1.5 * n_strips / min(screen.columns for screen in screens))))
+    measured = np.array([_mean_likeness(slots, seen, distance) for distance in range(1, reach)])
+    misfit = []
+    for screen in screens:
+        expected = _expected_likeness(n_strips, reach, screen)
+        scale = max(float(measured @ expected) / max(float(expected @ expected), 1e-12), 0.0)
+        misfit.append(float(((measured - scale * expected) ** 2).sum()))
+    return screens[int(np.argmin(misfit))]
+
+
+def _strip_slots(profiles: RowProfiles, borders: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """(M, n) mean light of slots in every strip, levelled over the slots around; and whether it is on the screen."""
+    n_rows = profiles.rows.size
+    light = profiles.light.reshape(-1, n_rows).astype(np.float64)
+    inside = profiles.inside.reshape(light.shape)
+    if profiles.sensor_row is None:
+        place = np.broadcast_to(np.clip(borders - profiles.rows[0] + 0.5, 0, n_rows), (light.shape[0], borders.size))
+    else:
+        index = np.arange(n_rows) + 0.5
+        rows = profiles.sensor_row.reshape(light.shape)
+        place = np.stack([np.interp(borders, row, index, left=0, right=n_rows) for row in rows])
+    low = np.minimum(place.astype(np.int64), n_rows - 1)
+
+    def integral(values: FloatArray) -> FloatArray:
+        total = np.concatenate([np.zeros((values.shape[0], 1)), np.cumsum(values, axis=1)], axis=1)
+        below = np.take_along_axis(total, low, 1)
+        at = below + (np.take_along_axis(total, low + 1, 1) - below) * (place - low)
+        return np.asarray((at[:, 1::2] - at[:, ::2]) / np.maximum(place[:, 1::2] - place[:, ::2], 1e-6))
+
+    seen = integral(inside.astype(np.float64)) > 0.99
+    means = (integral(light) * seen).astype(np.float32)
+    level, _ = _levelled(means, seen.astype(np.float32), _EXTREMES_SLOTS, 1e-4)
+    return level.astype(np.float64), seen
+
+
+def _mean_likeness(slots: FloatArray, seen: BoolArray, distance: int) -> float:
+    both = seen[:-distance] & seen[distance:]
+    return float((slots[:-distance] * slots[distance:] * both).sum() / max(int(both.sum()), 1))
+
+
+def _expected_likeness(n_strips: int, reach: int, screen: ScreenProfile) -> FloatArray:
+    """(reach - 1,) correlation of strips 1, 2, .. apart, averaged over the screen."""
+    u = (np.arange(n_strips) + 0.5) / n_strips * screen.columns
+    offset = u[:, None] - (np.arange(screen.columns) + 0.5)
+    light = np.exp(-(offset**2) / (2 * max(screen.light_spread, 1e-3) ** 2))
+    light /= np.linalg.norm(light, axis=1, keepdims=True)
+    return np.array([float((light[:-d] * light[d:]).sum(axis=1).mean()) for d in range(1, reach)])
