@@ -133,20 +133,30 @@ def estimate_sigma(samples: SlotSamples, floor: float, least: float) -> float:
     return max(float(np.median(np.abs(bend)) / (0.6745 * np.sqrt(6.0))), least)
 
 
-def first_metrics(pooled: Float32Array, weight: Float32Array, memory: int) -> FloatArray:
-    """Metrics of the first guess: every slot's contrast as a log-likelihood ratio, no memory.
+def first_llr(pooled: Float32Array, weight: Float32Array) -> Float32Array:
+    """First guess of every slot's log-likelihood ratio of being lit, from its contrast alone; (C, N).
 
     Args:
         pooled: (C, N) slots between their local extremes, -1 dark to 1 lit.
         weight: (C, N) strips of full contrast behind them.
-        memory: slots of memory, for the shape.
-
-    Returns:
-        (C, N + memory, patterns).
     """
-    llr = _FIRST_GUESS_LLR * np.clip(pooled, -1.5, 1.5) * np.minimum(weight, _FIRST_GUESS_STRIPS) / _FIRST_GUESS_STRIPS
-    llr = np.pad(llr, ((0, 0), (0, memory)))
-    return np.asarray(llr[..., None] / 2 * (2.0 * slot_patterns(memory)[:, -1] - 1))
+    share = np.minimum(weight, _FIRST_GUESS_STRIPS) / _FIRST_GUESS_STRIPS
+    return np.asarray(_FIRST_GUESS_LLR * np.clip(pooled, -1.5, 1.5) * share, np.float32)
+
+
+def metrics_of(llr: Float32Array, memory: int) -> FloatArray:
+    """Metrics (C, N + memory, patterns) of slots (C, N) that are independent, given their log-likelihood ratios."""
+    padded = np.pad(llr, ((0, 0), (0, memory)))
+    return np.asarray(padded[..., None] / 2 * (2.0 * slot_patterns(memory)[:, -1] - 1))
+
+
+def slot_llr(metrics: FloatArray) -> Float32Array:
+    """(C, N) log-likelihood ratio of every slot being lit, from metrics (C, N + memory, patterns), one at a time."""
+    memory = metrics.shape[-1].bit_length() - 2
+    by_slot = metrics.reshape(*metrics.shape[:2], -1, 2)
+    top = by_slot.max(axis=2, keepdims=True)
+    total = np.log(np.exp(by_slot - top).sum(axis=2)) + top[:, :, 0]
+    return np.asarray((total[..., 1] - total[..., 0])[:, : metrics.shape[1] - memory], np.float32)
 
 
 def lit_on_grid(posteriors: BurstPosteriors, clock: Clock) -> Float32Array:

@@ -11,19 +11,27 @@ multiples of the local level, strips are treated alike and pooled.
 
 from __future__ import annotations
 
+import hashlib
+import re
+import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Protocol
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from rxcli.errors import ProfileError
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
+from rxcli.resources import data_dir
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
 #: The model that is used unless another is named.
 DEFAULT_MODEL = "strips"
-#: Version of the input contract that `network_inputs` makes.
-CONTRACT = 1
 SAMPLES_PER_SLOT = 4
 #: Names of the features of a strip and of a column, in order; a name with `[4]` stands for one feature a sample.
 STRIP_FEATURES = ("light[4]", "log_light[4]", "neighbours[4]", "valid", "noise", "shot", "own", "exposure", "known")
@@ -31,7 +39,6 @@ COLUMN_FEATURES = ("known", "phase[10]")
 N_STRIP_FEATURES, N_COLUMN_FEATURES = 18, 11
 #: Slots on either side over which the local level is averaged.
 _LEVEL_SLOTS = 10
-_MODEL_FORMAT = 1
 _MAX_MODEL_BYTES = 2_000_000
 
 
@@ -108,7 +115,8 @@ def _local_level(light: Float32Array, valid: Float32Array, q: int) -> Float32Arr
     border = cv2.BORDER_CONSTANT
     total = cv2.boxFilter(light.reshape(flat), -1, size, normalize=False, borderType=border)
     count = cv2.boxFilter(valid.reshape(flat), -1, size, normalize=False, borderType=border)
-    return np.maximum(total / np.maximum(count, 1), 0).reshape(light.shape).astype(np.float32)
+    mean = np.maximum(total / np.maximum(count, 1), 0)
+    return np.asarray(mean.reshape(light.shape), np.float32)
 
 
 def _noise_features(level: Float32Array, sigma: np.float32, shot: np.float32) -> tuple[Float32Array, Float32Array]:
@@ -154,3 +162,135 @@ def _exposed(lit: Float32Array, centres: FloatArray, exposure_slots: float) -> F
     return np.asarray(
         (np.interp(centres + half, knots, integral) - np.interp(centres - half, knots, integral)) / (2 * half)
     )
+
+
+class Contract(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What a model's tensors mean."""
+
+    version: Literal[1]
+    samples_per_slot: Literal[4]
+    #: Names, in order; see `STRIP_FEATURES` and `COLUMN_FEATURES`.
+    strip_features: tuple[str, ...]
+    column_features: tuple[str, ...]
+    strips: str = "strips"
+    columns: str = "columns"
+    log_odds: str = "log_odds"
+
+
+class ModelCard(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """`model.toml`: what a model is, how it was made, and what it measured."""
+
+    format: Literal[1]
+    kind: Literal["denoiser"]
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    version: Annotated[int, Meta(ge=1)]
+    file: Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+    contract: Contract
+    description: str = ""
+    #: Data, steps, seeds, commit.
+    recipe: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
+
+
+def load_denoiser(name_or_path: str = DEFAULT_MODEL, threads: int = 1) -> OnnxDenoiser:
+    """A shipped model by name, or a model folder by path; the file is checked, the session is made when first needed.
+
+    Args:
+        name_or_path: name of a folder in `models`, or path of one.
+        threads: threads of the network.
+
+    Raises:
+        ProfileError: missing, malformed, cut, or made for another contract.
+    """
+    shipped = data_dir("models") / name_or_path
+    is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name_or_path) is not None
+    folder = shipped if is_name and shipped.is_dir() else Path(name_or_path)
+    card = _read_card(folder / "model.toml")
+    return OnnxDenoiser(card, _read_weights(folder / card.file, card), threads)
+
+
+def _read_card(path: Path) -> ModelCard:
+    hint = "install the package again, or name a folder made by vlc-rx train"
+    try:
+        card = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), ModelCard, strict=True)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not text"
+        raise ProfileError(f"{path}: no model can be read there ({reason})", hint) from None
+    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+        raise ProfileError(f"{path}: not a model card ({error})", hint) from None
+    wanted = (STRIP_FEATURES, COLUMN_FEATURES)
+    if (card.contract.strip_features, card.contract.column_features) != wanted:
+        raise ProfileError(f"{path}: the model wants other features than this receiver makes", hint)
+    return card
+
+
+def _read_weights(path: Path, card: ModelCard) -> bytes:
+    hint = "install the package again, or export the model again with vlc-rx train"
+    try:
+        if path.stat().st_size > _MAX_MODEL_BYTES:
+            raise ProfileError(f"{path}: larger than {_MAX_MODEL_BYTES} bytes", hint)
+        data = path.read_bytes()
+    except OSError as error:
+        raise ProfileError(f"{path}: cannot be read ({error.strerror})", hint) from None
+    if hashlib.sha256(data).hexdigest() != card.sha256:
+        raise ProfileError(f"{path}: does not match the checksum in model.toml; it is cut or of another model", hint)
+    return data
+
+
+class OnnxDenoiser:
+    """A network in ONNX Runtime; one call a frame."""
+
+    def __init__(self, card: ModelCard, weights: bytes, threads: int = 1) -> None:
+        self.card = card
+        self._weights = weights
+        self._threads = threads
+
+    @property
+    def name(self) -> str:
+        """Name and version, for reports."""
+        return f"{self.card.name}-{self.card.version}"
+
+    def slot_log_odds(self, scene: Scene, columns: NDArray[np.int64]) -> Float32Array:
+        """(len(columns), N) ln p(lit)/p(dark) of every slot of `columns`.
+
+        Raises:
+            ProfileError: the file is not the network that its card tells of.
+        """
+        strips, features = network_inputs(scene, columns)
+        contract = self.card.contract
+        fed = {contract.strips: strips, contract.columns: np.ascontiguousarray(features)}
+        return np.asarray(self._session.run([contract.log_odds], fed)[0], np.float32)
+
+    @cached_property
+    def _session(self) -> Any:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = self._threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        try:
+            session = onnxruntime.InferenceSession(self._weights, options, providers=["CPUExecutionProvider"])
+        except Exception as error:
+            reason = str(error).splitlines()[0]
+            raise ProfileError(f"model {self.name}: ONNX Runtime refuses it ({reason})", "export it again") from None
+        self._check_tensors(session.get_inputs(), session.get_outputs())
+        return session
+
+    def _check_tensors(self, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+        contract = self.card.contract
+        wanted = {contract.strips: (4, 2, N_STRIP_FEATURES), contract.columns: (3, 1, N_COLUMN_FEATURES)}
+        found = {tensor.name: tensor.shape for tensor in inputs}
+        fits = found.keys() == wanted.keys() and all(
+            len(found[name]) == rank and found[name][axis] == size for name, (rank, axis, size) in wanted.items()
+        )
+        if not fits or [tensor.name for tensor in outputs] != [contract.log_odds]:
+            raise ProfileError(
+                f"model {self.name}: its tensors {found} are not those of its contract {sorted(wanted)}",
+                "export it again with vlc-rx train",
+            )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Sessions do not travel to worker processes."""
+        return {"card": self.card, "_weights": self._weights, "_threads": self._threads}

@@ -6,13 +6,15 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli import assemble, channel, clock, detect, geometry, sampling
+from rxcli import assemble, channel, clock, denoise, detect, geometry, sampling
+from rxcli.errors import ReceiverError
 from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, match_camera
 from rxcli.types import (
     BurstPosteriors,
@@ -39,6 +41,8 @@ _CERTAIN = -1e-5
 _CERTAIN_AT_ONCE = -1e-6
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
 _HOPELESS_WEIGHT = 20.0
+#: Rounds of light model and detection from where the auto-encoder starts.
+_RESTART_ITERATIONS = 2
 #: A header peak less than this times the strongest rival is no lock.
 _MIN_LOCK = 1.6
 #: Orientations in which the readout runs along the columns' width.
@@ -139,7 +143,11 @@ def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
         result = replace(result, screen_profile=lock.screen.name)
         with stages("detect"):
             seen = _decode(lock)
+        with stages("denoise"):
+            seen, denoised, report = _second_opinion(lock, seen, options)
         columns = assemble.column_results(seen.clock, seen.posteriors, seen.snr, seen.samples, options.min_confidence)
+        columns = tuple(replace(column, denoised=column.column in denoised) for column in columns)
+        result = replace(result, denoiser=report)
         result = replace(result, columns=columns, status=assemble.frame_status(columns))
     except _Failure as failure:
         result = replace(result, status=failure.status, message=failure.message)
@@ -246,6 +254,9 @@ class _Reception:
     posteriors: BurstPosteriors
     #: (C, N): squared contrast over variance of every slot.
     snr: Float32Array
+    model: channel.LightModel
+    #: (C, N + memory, patterns).
+    metrics: FloatArray
 
 
 def _decode(lock: _Lock) -> _Reception:
@@ -262,12 +273,13 @@ def _quick_look(lock: _Lock) -> _Reception:
     now = lock.clock
     samples = clock.sample_slots(profiles, now, _SAMPLES_PER_SLOT)
     model = _light_model(replace(lock, profiles=profiles), samples)
-    pooled, weight = clock.slot_contrast(samples, model.sigma)
-    now = clock.assign_bursts(now, pooled, weight, lock.screen.repeats)
-    posteriors = _detect(channel.first_metrics(pooled, weight, model.memory), now, model)
+    llr = channel.first_llr(*clock.slot_contrast(samples, model.sigma))
+    now = clock.assign_bursts(now, llr, lock.screen.repeats)
+    posteriors = _detect(channel.metrics_of(llr, model.memory), now, model)
     columns = np.arange(samples.light.shape[0])
     lit = channel.lit_on_grid(posteriors, now)
     likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
+    now = clock.assign_bursts(now, channel.slot_llr(likelihoods.metrics), lock.screen.repeats)
     now = clock.corrected(now, likelihoods.timing)
     return _Reception(now, samples, _detect(likelihoods.metrics, now, model), likelihoods.snr)
 
@@ -284,14 +296,78 @@ def _iterate(lock: _Lock, seen: _Reception) -> _Reception:
         lit = channel.lit_on_grid(seen.posteriors, now)
         likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns)
         metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
-        seen = _Reception(now, samples, _detect(metrics, now, model), snr)
+        seen = _Reception(now, samples, _detect(metrics, now, model), snr, model, metrics)
         columns = np.flatnonzero(_doubtful(seen, _CERTAIN))
         if columns.size == 0:
             break
         if iteration == 0:
+            now = clock.assign_bursts(now, channel.slot_llr(metrics), lock.screen.repeats)
             now = clock.corrected(now, likelihoods.timing)
             samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
     return seen
+
+
+def _second_opinion(
+    lock: _Lock, seen: _Reception, options: ReceiverOptions
+) -> tuple[_Reception, frozenset[int], dict[str, Any] | None]:
+    """Doubtful columns once more from where the auto-encoder starts; whichever end is more plausible is kept.
+
+    Returns:
+        What is kept, the columns whose second end that is, and what to report; None where nothing was done.
+    """
+    if options.cae == "never":
+        return seen, frozenset(), None
+    if options.cae == "always" and seen.samples.light.shape[1] < lock.profiles.light.shape[1]:
+        seen = _iterate(lock, seen)
+    doubtful = np.ones(seen.snr.shape[0], bool) if options.cae == "always" else _doubtful(seen, _CERTAIN)
+    columns = np.flatnonzero(doubtful)
+    if columns.size == 0:
+        return seen, frozenset(), None
+    report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
+    try:
+        denoiser = _denoiser()
+        log_odds = denoiser.slot_log_odds(_scene_of(seen), columns)
+    except ReceiverError as error:
+        return seen, frozenset(), {**report, "columns": 0, "message": str(error)}
+    again = _restart(seen, log_odds, columns)
+    better = _evidence(again.metrics, seen) > _evidence(seen.metrics[columns], seen)
+    kept = columns[better]
+    if kept.size:
+        metrics, snr = seen.metrics.copy(), seen.snr.copy()
+        metrics[kept], snr[kept] = again.metrics[better], again.snr[better]
+        posteriors = _detect(metrics, seen.clock, seen.model)
+        seen = replace(seen, metrics=metrics, snr=snr, posteriors=posteriors)
+    return seen, frozenset(kept.tolist()), {**report, "model": denoiser.name, "kept": kept.size}
+
+
+@lru_cache(maxsize=1)
+def _denoiser() -> denoise.Denoiser:
+    return denoise.load_denoiser()
+
+
+def _scene_of(seen: _Reception) -> denoise.Scene:
+    model = seen.model
+    lit = channel.lit_on_grid(seen.posteriors, seen.clock)
+    return denoise.Scene(seen.samples, seen.clock, lit, model.floor, model.sigma, model.shot, model.spread)
+
+
+def _restart(seen: _Reception, log_odds: Float32Array, columns: NDArray[np.int64]) -> channel.SlotLikelihoods:
+    """Light model and detection of some columns from given log-odds of their slots; the other columns stay."""
+    lit = channel.lit_on_grid(seen.posteriors, seen.clock).copy()
+    metrics = channel.slot_metrics(log_odds, seen.model.memory)
+    for _ in range(_RESTART_ITERATIONS):
+        lit[columns] = channel.lit_on_grid(_detect(metrics, seen.clock, seen.model), seen.clock)
+        likelihoods = channel.slot_likelihoods(seen.samples, seen.clock, seen.model, lit, columns)
+        metrics = likelihoods.metrics
+    return likelihoods
+
+
+def _evidence(metrics: FloatArray, seen: _Reception) -> FloatArray:
+    """(C,) log evidence of columns, over all weights."""
+    bursts = channel.by_burst(metrics, seen.clock, seen.model.memory)
+    return np.asarray(
+        np.logaddexp.reduce(detect.weight_evidence(bursts, detect.plausible_weights(bursts, _HOPELESS_WEIGHT)), axis=1)
+    )
 
 
 def _doubtful(seen: _Reception, certain: float) -> NDArray[np.bool_]:

@@ -155,7 +155,7 @@ def _scene(
     sigma: float,
     slope: float,
 ) -> Scene:
-    """Resampled to the slot grid with a small error of the clock; floor and noise as roughly as a receiver knows them."""
+    """Resampled to the slot grid, with a small error of the clock; floor and noise as roughly as a receiver knows."""
     samples = _resampled(seen, rows_per_slot, rng.normal(0, 0.04))
     rows = max(rows_per_slot / SAMPLES_PER_SLOT, 1.0)
     scale = rng.uniform(0.05, 0.6)

@@ -1,0 +1,108 @@
+"""A fitted network as a model folder: ONNX file and card."""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import tomli_w
+import torch
+
+from rxcli.denoise import (
+    COLUMN_FEATURES,
+    N_COLUMN_FEATURES,
+    N_STRIP_FEATURES,
+    SAMPLES_PER_SLOT,
+    STRIP_FEATURES,
+    Contract,
+    ModelCard,
+)
+from rxcli.errors import ReceiverError
+from rxcli.training.network import StripNetwork
+
+_OPSET = 17
+#: Largest difference from torch that an exported network may show.
+PARITY = 1e-4
+
+
+def export_model(
+    network: StripNetwork, folder: Path, name: str, version: int, recipe: dict[str, Any], figures: dict[str, Any]
+) -> ModelCard:
+    """Write `model.onnx` and `model.toml`.
+
+    Args:
+        network: fitted.
+        folder: is made where it does not exist.
+        name: of the model.
+        version: of the model, from 1.
+        recipe: how it was fitted.
+        figures: what it measured.
+
+    Raises:
+        ReceiverError: the exported network computes something else than torch.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "model.onnx"
+    _write_onnx(network.eval(), file)
+    contract = Contract(
+        version=1,
+        samples_per_slot=SAMPLES_PER_SLOT,
+        strip_features=STRIP_FEATURES,
+        column_features=COLUMN_FEATURES,
+    )
+    card = ModelCard(
+        format=1,
+        kind="denoiser",
+        name=name,
+        version=version,
+        file=file.name,
+        sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
+        contract=contract,
+        description="Log-odds of slots from the lateral strips of a column",
+        recipe=recipe,
+        figures=figures,
+    )
+    difference = parity(network, file)
+    if not difference < PARITY:
+        raise ReceiverError(f"{file}: differs from torch by {difference:.1e}", "report this")
+    (folder / "model.toml").write_text(tomli_w.dumps(msgspec.to_builtins(card)), encoding="utf-8")
+    return card
+
+
+def _write_onnx(network: StripNetwork, file: Path) -> None:
+    example = (torch.zeros(2, 3, N_STRIP_FEATURES, 40), torch.zeros(2, N_COLUMN_FEATURES, 40))
+    with warnings.catch_warnings():
+        # The exporter that needs no further package is marked as the old one.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            network,
+            example,
+            str(file),
+            input_names=["strips", "columns"],
+            output_names=["log_odds"],
+            dynamic_axes={
+                "strips": {0: "batch", 1: "strip", 3: "slot"},
+                "columns": {0: "batch", 2: "slot"},
+                "log_odds": {0: "batch", 1: "slot"},
+            },
+            opset_version=_OPSET,
+            dynamo=False,
+        )
+
+
+def parity(network: StripNetwork, file: Path, seed: int = 0) -> float:
+    """Largest difference between torch and ONNX Runtime on random inputs of other sizes than exported with."""
+    import onnxruntime
+
+    rng = np.random.default_rng(seed)
+    strips = rng.standard_normal((3, 5, N_STRIP_FEATURES, 83), np.float32)
+    columns = rng.standard_normal((3, N_COLUMN_FEATURES, 83), np.float32)
+    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    found = session.run(["log_odds"], {"strips": strips, "columns": columns})[0]
+    with torch.no_grad():
+        wanted = network.eval()(torch.from_numpy(strips), torch.from_numpy(columns)).numpy()
+    return float(np.abs(found - wanted).max())
