@@ -196,3 +196,28 @@ def stages(repeats: int, only: tuple[str, ...], growth: bool, out: Path, seed: i
         written.append(out / "growth.png")
         plots.plot_growth(growths, written[-1])
     _say_written(written)
+
+
+@benchmark.command()
+@click.option("--scenes", type=click.IntRange(0), default=10_000, show_default=True, help="Random scenes.")
+@_JOBS
+@_common
+def stability(scenes: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> int:
+    """Hostile values and random scenes: no exception, no warning, no NaN, no confident nonsense.
+
+    Exit code 1 where something was found.
+    """
+    from rxcli.benchmark import stability as work
+    from rxcli.benchmark.tables import format_table, format_value, write_outputs
+    from rxcli.errors import ExitCode
+
+    verdict = work.run(scenes, _journal(out, "stability", fresh), seed=seed, jobs=jobs, quiet=quiet)
+    rows = work.rows(verdict)
+    click.echo(format_table(rows))
+    click.echo(
+        f"{verdict.wrong} of {verdict.confident} packets of confidence {work.CONFIDENT} or more are wrong "
+        f"({format_value(verdict.wrong_interval)}); scenes by status: {verdict.status}"
+    )
+    summary = {"confident": verdict.confident, "wrong": verdict.wrong, "status": verdict.status}
+    _say_written(write_outputs(out, "stability", rows, summary))
+    return ExitCode.OK if verdict.stable else ExitCode.NOT_RECEIVED
