@@ -23,6 +23,8 @@ _EXTREMES_SLOTS = 19
 #: Contrast that half-convinces, over the noise of a sample.
 _CONTRAST_SIGMAS = 8.0
 _MAX_DELAY_SLOTS = 2.0
+#: Slots are taken to be at most this sure when copies are compared.
+_SURE_LLR = 5.0
 #: Largest correction of the clock at a time, slots.
 _MAX_CORRECTION = 0.25
 
@@ -283,16 +285,15 @@ def sample_slots(profiles: RowProfiles, clock: Clock, samples_per_slot: int) -> 
     return SlotSamples(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), samples_per_slot)
 
 
-def assign_bursts(clock: Clock, pooled: Float32Array, weight: Float32Array, repeats: int) -> Clock:
+def assign_bursts(clock: Clock, llr: Float32Array, repeats: int) -> Clock:
     """The clock with its copies assigned to bursts of `repeats` copies, by the likeness of adjacent copies.
 
     Args:
-        clock: the clock, bursts unknown.
-        pooled: (C, N) slots between their local extremes, -1 dark to 1 lit.
-        weight: (C, N) their weights.
+        clock: the clock.
+        llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
         repeats: copies of a burst.
     """
-    likeness = copy_likeness(pooled, weight, clock)
+    likeness = copy_likeness(llr, clock)
     copies = np.arange(clock.n_copies)
     scores = []
     for phase in range(repeats):
@@ -321,25 +322,24 @@ def _slot_means(samples: Float32Array, samples_per_slot: int) -> Float32Array:
     return total / np.float32(samples_per_slot)
 
 
-def copy_likeness(pooled: Float32Array, weight: Float32Array, clock: Clock) -> FloatArray:
+def copy_likeness(llr: Float32Array, clock: Clock) -> FloatArray:
     """Log-likelihood ratio of each copy being the same packet as the next, against another one; (n_copies - 1,).
 
     Two slots that are lit with probabilities p and q are alike with likelihood p q / r + (1 - p)(1 - q) / (1 - r)
     against two independent ones, r being the column's share of lit slots.
 
     Args:
-        pooled: (C, N) slot values, -1 dark to 1 lit.
-        weight: (C, N) their weights.
+        llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
         clock: the clock.
     """
-    llr = 4 * np.clip(pooled, -1, 1) * np.minimum(weight, 3.0) / 3
-    lit = to_copies((1 / (1 + np.exp(-llr)) - 0.5).astype(np.float32), clock) + np.float32(0.5)
-    seen = to_copies((weight > 0).astype(np.float32), clock)
-    seen[..., :SLOTS_PER_SYMBOL] = 0
+    copies = to_copies(np.clip(llr, -_SURE_LLR, _SURE_LLR), clock)
+    seen = copies != 0
+    seen[..., :SLOTS_PER_SYMBOL] = False
+    lit = 1 / (1 + np.exp(-copies))
     share = np.clip((lit * seen).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1), 0.1, 0.9)[:, None, None]
     first, second = lit[:, :-1], lit[:, 1:]
     alike = first * second / share + (1 - first) * (1 - second) / (1 - share)
-    both = seen[:, :-1] * seen[:, 1:]
+    both = seen[:, :-1] & seen[:, 1:]
     return np.asarray((np.log(alike) * both).sum(axis=(0, 2)), np.float64)
 
 

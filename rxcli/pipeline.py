@@ -281,7 +281,8 @@ def _quick_look(lock: _Lock) -> _Reception:
     likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
     now = clock.assign_bursts(now, channel.slot_llr(likelihoods.metrics), lock.screen.repeats)
     now = clock.corrected(now, likelihoods.timing)
-    return _Reception(now, samples, _detect(likelihoods.metrics, now, model), likelihoods.snr)
+    metrics = likelihoods.metrics
+    return _Reception(now, samples, _detect(metrics, now, model), likelihoods.snr, model, metrics)
 
 
 def _iterate(lock: _Lock, seen: _Reception) -> _Reception:
@@ -354,7 +355,7 @@ def _scene_of(seen: _Reception) -> denoise.Scene:
 def _restart(seen: _Reception, log_odds: Float32Array, columns: NDArray[np.int64]) -> channel.SlotLikelihoods:
     """Light model and detection of some columns from given log-odds of their slots; the other columns stay."""
     lit = channel.lit_on_grid(seen.posteriors, seen.clock).copy()
-    metrics = channel.slot_metrics(log_odds, seen.model.memory)
+    metrics = channel.metrics_of(log_odds, seen.model.memory)
     for _ in range(_RESTART_ITERATIONS):
         lit[columns] = channel.lit_on_grid(_detect(metrics, seen.clock, seen.model), seen.clock)
         likelihoods = channel.slot_likelihoods(seen.samples, seen.clock, seen.model, lit, columns)
