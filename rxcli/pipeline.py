@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli import assemble, channel, clock, denoise, detect, geometry, sampling
+from rxcli.dump import dump_frame
 from rxcli.errors import ReceiverError
 from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, match_camera
 from rxcli.types import (
@@ -145,6 +146,10 @@ def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
             seen = _decode(lock)
         with stages("denoise"):
             seen, denoised, report = _second_opinion(lock, seen, options)
+        if options.dump_dir is not None:
+            dump_frame(
+                options.dump_dir, frame, corners, lock.profiles, seen.clock, seen.samples, seen.metrics, seen.posteriors
+            )
         columns = assemble.column_results(seen.clock, seen.posteriors, seen.snr, seen.samples, options.min_confidence)
         columns = tuple(replace(column, denoised=column.column in denoised) for column in columns)
         result = replace(result, denoiser=report)
