@@ -129,6 +129,16 @@ def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[Frame
         yield _receive_frame(frame, options)
 
 
+def denoiser_scene(frame: Frame, options: ReceiverOptions) -> denoise.Scene | None:
+    """What the auto-encoder is shown of a frame, None where no signal is found; for training."""
+    try:
+        camera, corners = _camera_of(frame, options), _find_corners(frame, options)
+        lock = _find_lock(frame, corners, camera, options, _Stages())
+    except _Failure:
+        return None
+    return _scene_of(_iterate(lock, _quick_look(lock)))
+
+
 def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     stages = _Stages()
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")

@@ -50,7 +50,7 @@ def export_model(
     _write_onnx(network.eval(), file)
     contract = Contract(
         version=1,
-        samples_per_slot=SAMPLES_PER_SLOT,
+        samples_per_slot=4,
         strip_features=STRIP_FEATURES,
         column_features=COLUMN_FEATURES,
     )

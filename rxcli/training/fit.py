@@ -137,7 +137,8 @@ def fit(
             history.append((step + 1, running, _mean_loss(network, held)))
             _save(folder / CHECKPOINT, recipe, step + 1, network, optimiser, schedule, history)
     plot_loss(history, folder / "loss.png")
-    return network.eval()
+    network.eval()
+    return network
 
 
 def _mean_loss(network: StripNetwork, batches: list[tuple[Tensor, ...]]) -> float:
@@ -188,6 +189,15 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     except Exception as error:
         raise InputError(f"{path}: not a checkpoint ({type(error).__name__})", "start without --resume") from None
     return dict(state)
+
+
+def final_losses(folder: Path) -> dict[str, float]:
+    """Cross-entropy of a slot at the end of the run in `folder`, nats; -1 where nothing was held out."""
+    _, training, validation = load_checkpoint(folder / CHECKPOINT)["history"][-1]
+    return {
+        "training_nats": round(training, 5),
+        "validation_nats": -1.0 if np.isnan(validation) else round(validation, 5),
+    }
 
 
 def plot_loss(history: Sequence[tuple[int, float, float]], path: Path) -> None:

@@ -22,7 +22,7 @@ class Shape:
     column_dilations: tuple[int, ...] = (1, 2, 4, 8)
 
 
-class _Residual(nn.Module):
+class _Residual(nn.Module):  # type: ignore[misc]
     def __init__(self, width: int, dilation: int) -> None:
         super().__init__()
         self.conv = nn.Conv1d(width, width, 3, padding=dilation, dilation=dilation)
@@ -31,7 +31,7 @@ class _Residual(nn.Module):
         return x + torch.relu(self.conv(x))
 
 
-class StripNetwork(nn.Module):
+class StripNetwork(nn.Module):  # type: ignore[misc]
     """Log-odds of slots from the features of `rxcli.denoise.network_inputs`; any number of strips and slots."""
 
     def __init__(self, shape: Shape) -> None:

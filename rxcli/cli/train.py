@@ -1,0 +1,81 @@
+"""`vlc-rx train`: fit the auto-encoder and export it."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+
+import click
+
+from rxcli.errors import UsageError
+
+
+@click.command()
+@click.argument("out", type=click.Path(file_okay=False, path_type=Path))
+@click.option("--name", default="strips", show_default=True, help="Name of the model.")
+@click.option("--version", "model_version", type=click.IntRange(1), default=1, show_default=True, help="Its version.")
+@click.option("--steps", type=click.IntRange(1), default=4500, show_default=True, help="Steps of the optimiser.")
+@click.option("--frames", type=click.IntRange(0), default=240, show_default=True, help="Whole frames to simulate.")
+@click.option("--pictures", type=click.IntRange(1), default=300, show_default=True, help="Pictures for small screens.")
+@click.option("--held-out", type=click.IntRange(0), default=12, show_default=True, help="Frames to validate on.")
+@click.option("--strip-width", type=click.IntRange(1), default=32, show_default=True, help="Channels of a strip.")
+@click.option("--column-width", type=click.IntRange(1), default=48, show_default=True, help="Channels of a column.")
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Same seed, same network.")
+@click.option(
+    "--cache", type=click.Path(file_okay=False, path_type=Path), help="Folder of the data sets.  [default: OUT/data]"
+)
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint in OUT.")
+@click.option("-q", "--quiet", is_flag=True, help="No progress bars.")
+def train(
+    out: Path,
+    name: str,
+    model_version: int,
+    steps: int,
+    frames: int,
+    pictures: int,
+    held_out: int,
+    strip_width: int,
+    column_width: int,
+    seed: int,
+    cache: Path | None,
+    resume: bool,
+    quiet: bool,
+) -> None:
+    """Fit the auto-encoder on simulated scenes and write a model folder to OUT.
+
+    Needs the extra `train` (PyTorch on the CPU is enough). The data sets are kept and used again; an interrupted run
+    goes on with --resume. OUT gets model.onnx, model.toml, loss.png and the checkpoint.
+    """
+    for package in ("torch", "onnx", "matplotlib"):
+        if find_spec(package) is None:
+            raise UsageError(f"training needs {package}, which is not installed", "run: pip install 'vlc-rx[train]'")
+    from rxcli.training import dataset, export, fit
+    from rxcli.training.network import Shape, n_parameters
+
+    data, progress = cache or out / "data", not quiet
+    recipe = fit.Recipe(shape=Shape(strip_width=strip_width, column_width=column_width), steps=steps, seed=seed)
+    network = fit.fit(
+        dataset.column_samples(pictures, seed, data, progress=progress),
+        dataset.frame_samples(frames, seed, data, progress=progress),
+        dataset.validation_samples(held_out, data, progress=progress),
+        recipe,
+        out,
+        resume=resume,
+        progress=progress,
+    )
+    described = {
+        **asdict(recipe),
+        "pictures": pictures,
+        "frames": frames,
+        "held_out": held_out,
+        "parameters": n_parameters(network),
+    }
+    losses = fit.final_losses(out)
+    card = export.export_model(network, out, name, model_version, described, losses)
+    click.echo(
+        f"{out / card.file}: {described['parameters']} parameters, cross-entropy {losses['training_nats']:.4f} nats a slot "
+        f"in training, {losses['validation_nats']:.4f} on held-out scenes",
+        file=sys.stderr,
+    )
