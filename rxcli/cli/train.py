@@ -75,7 +75,7 @@ def train(
     losses = fit.final_losses(out)
     card = export.export_model(network, out, name, model_version, described, losses)
     click.echo(
-        f"{out / card.file}: {described['parameters']} parameters, cross-entropy {losses['training_nats']:.4f} nats a slot "
-        f"in training, {losses['validation_nats']:.4f} on held-out scenes",
+        f"{out / card.file}: {described['parameters']} parameters, cross-entropy {losses['training_nats']:.4f} nats a "
+        f"slot in training, {losses['validation_nats']:.4f} on held-out scenes",
         file=sys.stderr,
     )

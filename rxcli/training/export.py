@@ -16,7 +16,6 @@ from rxcli.denoise import (
     COLUMN_FEATURES,
     N_COLUMN_FEATURES,
     N_STRIP_FEATURES,
-    SAMPLES_PER_SLOT,
     STRIP_FEATURES,
     Contract,
     ModelCard,
