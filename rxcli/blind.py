@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode, ScreenProfile
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
-from rxcli.types import BoolArray, Float32Array, FloatArray, Lens, RowProfiles
+from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Lens, RowProfiles
 
 #: Rows per slot that are considered.
 MIN_ROWS_PER_SLOT, MAX_ROWS_PER_SLOT = 1.2, 60.0
@@ -221,7 +221,7 @@ def _lag_correlations(strips: Strips, distance: int) -> tuple[Float32Array, Floa
 
 
 def _at_lag(correlation: Float32Array, lag: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Correlation at fractional lags with first and second derivative, by a cubic (Catmull-Rom) through the neighbours."""
+    """Correlation at fractional lags with first and second derivative, by a Catmull-Rom cubic."""
     place = np.clip(lag + (correlation.shape[0] - 1) / 2, 1, correlation.shape[0] - 2.001)
     low = place.astype(np.int64)
     f = place - low
@@ -541,10 +541,11 @@ def structure_evidence(slots: FloatArray, first_slot: int, packet_slots: int) ->
     position = (np.arange(n) + first_slot) % packet_slots
     in_header = position < SLOTS_PER_SYMBOL
     agree = lit[:, in_header] == np.array(HEADER, bool)[position[in_header]]
-    header = np.where(agree, np.log(0.9 / 0.5), np.log(0.1 / 0.5)).sum(axis=1)
+    header = agree.sum(axis=1) * np.log(0.9 / 0.1) + in_header.sum() * np.log(0.1 / 0.5)
     starts: NDArray[np.int64] = np.flatnonzero((position % SLOTS_PER_SYMBOL == 0) & ~in_header)
     starts = starts[starts + SLOTS_PER_SYMBOL <= n]
-    count = np.asarray(lit[:, starts[:, None] + np.arange(SLOTS_PER_SYMBOL)]).sum(axis=2)
+    symbols: BoolArray = lit[:, starts[:, None] + np.arange(SLOTS_PER_SYMBOL)]
+    count = np.count_nonzero(symbols, axis=2)
     weight = _weight_evidence(count, lit.mean(axis=1))
     dimming = _dimming_evidence(lit, position)
     best = (weight + dimming).max(axis=1)
@@ -559,7 +560,7 @@ def _sliced(slots: FloatArray) -> BoolArray:
 
 
 def _weight_evidence(count: NDArray[np.int64], share: FloatArray) -> FloatArray:
-    """(C, 9) log-likelihood ratio of the symbols' (C, n) lit slots for every weight, over chance at the column's share."""
+    """(C, 9) log-likelihood ratio of every weight for the lit slots (C, n) of symbols, over chance."""
     weights = np.arange(SLOTS_PER_SYMBOL + 1)
     off = np.abs(weights[:, None] - np.array(WEIGHTS))
     likely = np.select([off == 0, off == 1, off == 2], [0.72, 0.1, 0.02], 0.005)
@@ -802,7 +803,7 @@ def _slot_taps(exposure_slots: float) -> FloatArray:
 def _seen(
     lit: BoolArray, time: FloatArray | Float32Array, column: NDArray[np.int64], exposure_slots: float
 ) -> tuple[Float32Array, Float32Array]:
-    """Light 0..1 of the slots through the exposure at slot positions (n, m) of columns (n,); and its change per slot."""
+    """Light 0..1 of slots through the exposure at slot positions (n, m) of columns (n,); and its change per slot."""
     n = lit.shape[1]
     total = np.zeros((lit.shape[0], n + 2), np.float32)
     np.cumsum(lit, axis=1, out=total[:, 1 : n + 1])
@@ -817,11 +818,11 @@ def _seen(
 def _running(
     flat: Float32Array, base: NDArray[np.int64], time: FloatArray | Float32Array, n: int
 ) -> tuple[Float32Array, Float32Array]:
-    place = np.clip(time, 0, n + 0.999)
+    place: FloatArray = np.clip(np.asarray(time, np.float64), 0, n + 0.999)
     low = place.astype(np.int64)
     index = low + base
-    below = flat[index]
-    step = flat[index + 1] - below
+    below: Float32Array = np.asarray(flat.take(index), np.float32)
+    step: Float32Array = np.asarray(flat.take(index + 1), np.float32) - below
     return np.asarray(below + step * (place - low), np.float32), step
 
 
@@ -1103,7 +1104,7 @@ def why_not(strips: Strips) -> str:
         )
     return (
         "there are stripes but no packet header among them; the screen may show less than one packet (move closer), "
-        "the picture may be merged from several exposures (switch HDR off), or the screen's profile is not among those tried"
+        "the picture may be merged from several exposures (switch HDR off), or the screen is none of those tried"
     )
 
 
@@ -1127,26 +1128,30 @@ def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
 # Columns --------------------------------------------------------------------------------------------------------------
 
 
-def likely_columns(profiles: RowProfiles, clock_rows: FloatArray, screens: Sequence[ScreenProfile]) -> ScreenProfile:
+def likely_columns(profiles: RowProfiles, clock: Clock, screens: Sequence[ScreenProfile]) -> ScreenProfile:
     """The screen whose columns are as wide as the picture's, by how far strips are alike.
 
-    Two strips at u and v see the columns c with weights g(u - c) and g(v - c), so that their slots correlate by the
+    Strips at u and v see the columns c with weights g(u - c) and g(v - c), so that their slots correlate by the
     product of both, summed over c. Header and dimming symbol are the same everywhere and must be left out.
 
     Args:
-        profiles: C columns of S strips, C any.
-        clock_rows: (n,) borders of payload slots on sensor rows, each slot from entry 2 i to 2 i + 1.
+        profiles: C columns of S strips, C any; at least one strip a column of every screen.
+        clock: the clock that the screens share.
         screens: screens that differ in their columns.
     """
-    slots, seen = _strip_slots(profiles, clock_rows)
+    number = np.arange(clock.n_slots)
+    payload = number[(number + clock.first_slot) % clock.packet_slots >= PREAMBLE_SLOTS]
+    borders = clock.row0 + clock.rows_per_slot * np.stack([payload, payload + 1], axis=1).ravel()
+    slots, seen = _strip_slots(profiles, borders)
     n_strips = slots.shape[0]
     reach = max(2, min(n_strips - 1, round(1.5 * n_strips / min(screen.columns for screen in screens))))
     measured = np.array([_mean_likeness(slots, seen, distance) for distance in range(1, reach)])
     misfit = []
     for screen in screens:
-        expected = _expected_likeness(n_strips, reach, screen)
-        scale = max(float(measured @ expected) / max(float(expected @ expected), 1e-12), 0.0)
-        misfit.append(float(((measured - scale * expected) ** 2).sum()))
+        # Codewords are not quite random, so that strips far apart are a little alike too: a constant.
+        basis = np.stack([_expected_likeness(n_strips, reach, screen), np.ones(reach - 1)], axis=1)
+        fit, *_ = np.linalg.lstsq(basis, measured, rcond=None)
+        misfit.append(float(((measured - basis @ fit) ** 2).sum()) if fit[0] > 0 else np.inf)
     return screens[int(np.argmin(misfit))]
 
 

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli import assemble, channel, clock, denoise, detect, geometry, sampling
+from rxcli import assemble, blind, channel, clock, denoise, detect, geometry, sampling
 from rxcli.dump import dump_frame
 from rxcli.errors import ReceiverError
 from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, match_camera
@@ -25,6 +25,7 @@ from rxcli.types import (
     Frame,
     FrameResult,
     Lens,
+    Outlines,
     RowProfiles,
     SlotSamples,
 )
@@ -104,11 +105,16 @@ class _Stages:
 class _Camera:
     """What is known of the camera that took a frame."""
 
-    profile: str
+    #: None for a camera that was estimated from the frame itself.
+    profile: str | None
     line_delay_s: float
     exposure_s: float
     lens: Lens | None
     tone: str
+    #: True where the stored rows run against the readout.
+    reversed: bool = False
+    #: What was estimated: name -> (value, standard deviation).
+    estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,12 +150,18 @@ def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
     try:
         camera = _camera_of(frame, options)
-        result = replace(
-            result, camera_profile=camera.profile, line_delay_s=camera.line_delay_s, exposure_s=camera.exposure_s
-        )
         with stages("geometry"):
             corners = _find_corners(frame, options)
         result = replace(result, corners=corners)
+        if camera is None:
+            camera, options = _estimate_camera(frame, corners, options, stages)
+        result = replace(
+            result,
+            camera_profile=camera.profile,
+            line_delay_s=camera.line_delay_s,
+            exposure_s=camera.exposure_s,
+            estimated=camera.estimated,
+        )
         lock = _find_lock(frame, corners, camera, options, stages)
         result = replace(result, screen_profile=lock.screen.name)
         with stages("detect"):
@@ -169,7 +181,8 @@ def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     return replace(result, timing_ms=stages.total())
 
 
-def _camera_of(frame: Frame, options: ReceiverOptions) -> _Camera:
+def _camera_of(frame: Frame, options: ReceiverOptions) -> _Camera | None:
+    """What the profiles say of the frame's camera; None where none fits."""
     meta = frame.metadata
     profile = (
         options.cameras[0]
@@ -177,15 +190,46 @@ def _camera_of(frame: Frame, options: ReceiverOptions) -> _Camera:
         else match_camera(options.cameras, meta.make, meta.model, frame.width, frame.height)
     )
     mode = profile.mode_for(frame.width, frame.height) if profile else None
-    if profile is None or mode is None:
+    if profile is None:
+        return None
+    if mode is None:
         raise _Failure(
             "no_signal",
-            f"no camera profile fits {meta.make or 'unknown make'} {meta.model or 'unknown model'} at "
-            f"{frame.width} x {frame.height}; name one with --camera, or make one with vlc-rx calibrate shutter",
+            f"camera profile {profile.name} has no readout mode for {frame.width} x {frame.height}; add one with "
+            "vlc-rx calibrate shutter, or leave the camera to be estimated with --camera auto",
         )
     lens = geometry.lens_for(profile.lens, frame.width, frame.height) if profile.lens else None
     tone = _DEFAULT_TONE if profile.tone == "auto" else profile.tone
     return _Camera(profile.name, mode.line_delay_s, _exposure_of(frame, mode), lens, tone)
+
+
+def _estimate_camera(
+    frame: Frame, corners: FloatArray, options: ReceiverOptions, stages: _Stages
+) -> tuple[_Camera, ReceiverOptions]:
+    """A camera that no profile fits, estimated from the frame; and the options with the screens that remain."""
+    n_columns = min(screen.columns for screen in options.screens)
+    with stages("sampling"):
+        outlines = _outlines(frame, corners, None, n_columns)
+        profiles = sampling.sample_rows(frame, outlines, _DEFAULT_TONE)
+    with stages("blind"):
+        centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
+        strips = blind.strips_of(profiles, centre_x, frame.width, frame.height)
+        found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
+    estimate = found.estimate
+    if estimate is None:
+        raise _Failure("no_signal", found.reason)
+    screens = [screen for screen in options.screens if screen.packet_slots == estimate.packet_slots]
+    rate = screens[0].slot_rate_hz
+    camera = _Camera(
+        profile=None,
+        line_delay_s=1 / (estimate.rows_per_slot * rate),
+        exposure_s=estimate.exposure_slots / rate,
+        lens=blind.lens_of(estimate, frame.width, frame.height),
+        tone=_DEFAULT_TONE,
+        reversed=estimate.reversed,
+        estimated=blind.summary(estimate, rate),
+    )
+    return camera, replace(options, screens=tuple(screen for screen in screens if screen.slot_rate_hz == rate))
 
 
 def _exposure_of(frame: Frame, mode: ReadoutMode) -> float:
@@ -216,7 +260,7 @@ def _find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
 
 def _find_lock(frame: Frame, corners: FloatArray, camera: _Camera, options: ReceiverOptions, stages: _Stages) -> _Lock:
     """The screen profile whose clock fits best, with the row profiles of its columns."""
-    best: _Lock | None = None
+    locks: list[_Lock] = []
     for n_columns in sorted({screen.columns for screen in options.screens}):
         with stages("sampling"):
             profiles = _sample(frame, corners, camera, n_columns)
@@ -224,18 +268,35 @@ def _find_lock(frame: Frame, corners: FloatArray, camera: _Camera, options: Rece
             quick = clock.halved_strips(profiles)
             for screen in (s for s in options.screens if s.columns == n_columns):
                 found = _clock_of(screen, quick, camera)
-                if found and (best is None or found.lock > best.clock.lock):
-                    best = _Lock(screen, profiles, found)
+                if found:
+                    locks.append(_Lock(screen, profiles, found))
+    best = max(locks, key=lambda lock: lock.clock.lock, default=None)
     if best is None or best.clock.lock < _MIN_LOCK:
         raise _Failure("no_signal", _why_no_signal(corners, camera, options))
-    return best
+    with stages("clock"):
+        return _with_likely_columns(best, locks)
+
+
+def _with_likely_columns(best: _Lock, locks: list[_Lock]) -> _Lock:
+    """Among screens of the same clock, which fits all of them alike, the one whose columns are as wide as seen."""
+    rate, packet_slots = best.screen.slot_rate_hz, best.screen.packet_slots
+    alike = [k for k in locks if (k.screen.slot_rate_hz, k.screen.packet_slots) == (rate, packet_slots)]
+    if len({lock.screen.columns for lock in alike}) < 2:
+        return best
+    finest = max(alike, key=lambda lock: lock.profiles.light.shape[0] * lock.profiles.light.shape[1])
+    likely = blind.likely_columns(finest.profiles, best.clock, [lock.screen for lock in alike])
+    return next(lock for lock in alike if lock.screen is likely)
+
+
+def _outlines(frame: Frame, corners: FloatArray, lens: Lens | None, n_columns: int) -> Outlines:
+    column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
+    n_strips = sampling.strips_per_column(column_px)
+    return geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
 
 
 def _sample(frame: Frame, corners: FloatArray, camera: _Camera, n_columns: int) -> RowProfiles:
-    column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
-    n_strips = sampling.strips_per_column(column_px)
-    outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, camera.lens)
-    return sampling.sample_rows(frame, outlines, camera.tone)
+    profiles = sampling.sample_rows(frame, _outlines(frame, corners, camera.lens, n_columns), camera.tone)
+    return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
 
 
 def _noise_of(profiles: RowProfiles) -> float:
