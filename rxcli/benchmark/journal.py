@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +77,17 @@ def task_key(task: Task) -> str:
     return json.dumps(task, sort_keys=True, separators=(",", ":"))
 
 
+@lru_cache(maxsize=1)
+def code_fingerprint() -> str:
+    """Hash of the package's source: what an earlier version has found is not taken for what this one does."""
+    root = Path(__file__).resolve().parents[1]
+    digest = sha256()
+    for path in sorted(root.rglob("*.py")):
+        if path.parent.name != "cli":
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
 def run_tasks(
     tasks: Sequence[Task], work: Work, journal: Journal, *, jobs: int = 1, label: str = "", quiet: bool = False
 ) -> list[Record]:
@@ -90,7 +103,8 @@ def run_tasks(
     """
     from tqdm import tqdm
 
-    keys = [task_key(task) for task in tasks]
+    code = code_fingerprint()
+    keys = [task_key({**task, "code": code}) for task in tasks]
     missing = [(key, task) for key, task in zip(keys, tasks, strict=True) if key not in journal]
     bar = tqdm(total=len(tasks), initial=len(tasks) - len(missing), desc=label, disable=quiet or None, leave=False)
     with bar:

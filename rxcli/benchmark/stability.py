@@ -298,7 +298,7 @@ def _precision() -> Problems:
 def _depth() -> Problems:
     """The same picture in 8 and 16 bits: the same packets."""
     base = _base()
-    wide = replace(base.frame, pixels=base.frame.pixels.astype(np.uint16) * 257, white=65535.0)
+    wide = replace(base.frame, pixels=np.asarray(base.frame.pixels, np.uint16) * np.uint16(257), white=65535.0)
     (first, problems), (second, more) = (inspect_frame(f, base.options()) for f in (base.frame, wide))
     if first and second and _payloads(first) != _payloads(second):
         problems.append("8 and 16 bits of the same picture give different packets")
@@ -323,7 +323,7 @@ def _tiny_pictures() -> Problems:
     """Pictures of one row, one column, one pixel."""
     base, problems = _base(), []
     for height, width in ((1, 240), (300, 1), (1, 1), (2, 2), (40, 40)):
-        frame = replace(base.frame, pixels=np.ascontiguousarray(base.frame.pixels[:height, :width]))
+        frame = replace(base.frame, pixels=np.ascontiguousarray(base.frame.pixels[:height, :width], np.uint8))
         mode = msgspec.structs.replace(base.camera.modes[0], width=width, height=height)
         camera = msgspec.structs.replace(base.camera, modes=(mode,))
         problems += inspect_frame(frame, replace(base.options(), cameras=(camera,)))[1]
@@ -402,7 +402,7 @@ def scene_record(task: Task) -> Record:
     options = replace(options, screens=(*options.screens, *screens))
     result, problems = inspect_frame(trial.frame, options)
     if seed % _THREADS_EVERY == 0:
-        problems += thread_orders(trial.frame, options)
+        problems += _tried(lambda: thread_orders(trial.frame, options))
     if result is None:
         return {"problems": problems, "status": "exception", "confident": 0, "wrong": 0, "packets": 0, "false": 0}
     scored, score = score_result(result, trial.truth)
@@ -425,7 +425,14 @@ def _all_screens() -> tuple[ScreenProfile, ...]:
 
 def case_record(task: Task) -> Record:
     """Problems of one hostile case."""
-    return {"problems": unique(CASES[task["case"]]())}
+    return {"problems": unique(_tried(CASES[task["case"]]))}
+
+
+def _tried(case: Callable[[], Problems]) -> Problems:
+    try:
+        return case()
+    except Exception as error:  # whatever it is, it is what we look for
+        return [f"{type(error).__name__}: {error}"]
 
 
 @dataclass(frozen=True)
