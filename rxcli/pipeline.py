@@ -20,6 +20,7 @@ from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, match_came
 from rxcli.types import (
     BurstPosteriors,
     Clock,
+    ColumnResult,
     Float32Array,
     FloatArray,
     Frame,
@@ -149,12 +150,11 @@ def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     stages = _Stages()
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
     try:
-        camera = _camera_of(frame, options)
+        known = _camera_of(frame, options)
         with stages("geometry"):
             corners = _find_corners(frame, options)
         result = replace(result, corners=corners)
-        if camera is None:
-            camera, options = _estimate_camera(frame, corners, options, stages)
+        camera, options = (known, options) if known else _estimate_camera(frame, corners, options, stages)
         result = replace(
             result,
             camera_profile=camera.profile,
@@ -174,11 +174,19 @@ def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
             )
         columns = assemble.column_results(seen.clock, seen.posteriors, seen.snr, seen.samples, options.min_confidence)
         columns = tuple(replace(column, denoised=column.column in denoised) for column in columns)
+        if camera.reversed:
+            columns = tuple(_in_stored_rows(column, frame.height) for column in columns)
         result = replace(result, denoiser=report)
         result = replace(result, columns=columns, status=assemble.frame_status(columns))
     except _Failure as failure:
         result = replace(result, status=failure.status, message=failure.message)
     return replace(result, timing_ms=stages.total())
+
+
+def _in_stored_rows(column: ColumnResult, height: int) -> ColumnResult:
+    """The column with rows as stored, where they were counted in readout order."""
+    packets = (replace(packet, first_row=height - 1 - packet.first_row) for packet in column.packets)
+    return replace(column, packets=tuple(packets))
 
 
 def _camera_of(frame: Frame, options: ReceiverOptions) -> _Camera | None:
