@@ -194,6 +194,9 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
         raise ValueError(
             f"metrics must be (bursts, columns, slots, 2**(memory+1)) with memory 1..{MAX_MEMORY} (got {metrics.shape})"
         )
+    n_payload = metrics.shape[2] - _memory_of(metrics) - PREAMBLE_SLOTS
+    if n_payload <= 0 or n_payload % SLOTS_PER_SYMBOL:
+        raise ValueError(f"metrics must hold whole packets and memory slots after them (got {metrics.shape})")
     if candidates is None:
         candidates = np.ones((metrics.shape[1], len(WEIGHTS)), bool)
     return _posteriors(metrics, _weights(metrics, candidates))
