@@ -17,6 +17,8 @@ _VIEWER_CORNERS = {1: (0, 1, 2, 3), 2: (1, 0, 3, 2), 3: (2, 3, 0, 1), 4: (3, 2, 
 #: Share of the screen's height beyond its corners that outlines reach, so that no edge row is lost.
 _OVERHANG = 0.02
 _OUTLINE_POINTS = 65
+#: No lens moves a point of the picture by more than this many focal lengths.
+_LARGEST_MOVE = 10.0
 #: Edges are straight to a thousandth of a pixel over this many rows.
 _KNOT_ROWS = 32
 
@@ -67,14 +69,18 @@ def distort(points: FloatArray, lens: Lens) -> FloatArray:
 def undistort(points: FloatArray, lens: Lens, iterations: int = 20) -> FloatArray:
     """Distorted pixels to undistorted ones: the inverse of `distort`, by fixed-point iteration.
 
+    Far outside the picture the polynomial has no inverse and the iteration runs away: such points stay where they are.
+
     Args:
         points: (..., 2) pixels.
         lens: the lens model.
         iterations: steps; 20 reach 1e-6 px for the distortion of ordinary lenses.
     """
+    reach = _LARGEST_MOVE * np.abs(lens.camera_matrix[0, 0])
     found = points.copy()
     for _ in range(iterations):
-        found += points - distort(found, lens)
+        step = found + points - distort(found, lens)
+        found = np.where((np.abs(step - points) <= reach).all(axis=-1, keepdims=True), step, points)
     return found
 
 
