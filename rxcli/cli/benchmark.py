@@ -56,12 +56,31 @@ def _check_sweeps(_context: click.Context, _parameter: click.Parameter, names: t
     return names
 
 
-@click.group(invoke_without_command=False)
-def benchmark() -> None:
+@click.group(invoke_without_command=True)
+@click.option("--quick", is_flag=True, help="Print the headline table: under three minutes on two cores.")
+@click.option("--jobs", type=click.IntRange(1, 256), default=2, show_default=True, help="Processes of --quick.")
+@_common
+@click.pass_context
+def benchmark(context: click.Context, quick: bool, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
     """Run time against error; stability.
 
-    Every run keeps a journal in the folder --out and goes on where it was interrupted.
+    Every run keeps a journal in the folder --out and goes on where it was interrupted. Options given here belong to
+    --quick; each command below has its own.
     """
+    if context.invoked_subcommand is not None:
+        if quick:
+            raise click.UsageError("--quick stands alone, without a command", context)
+        return
+    if not quick:
+        click.echo(context.get_help())
+        return
+    from rxcli.benchmark import quick as work
+    from rxcli.benchmark.tables import titled, write_text
+
+    headline = work.run(out / "media", _journal(out, "quick", fresh), seed=seed, jobs=jobs, quiet=quiet)
+    text = titled(headline.sections)
+    click.echo(text)
+    _say_written([write_text(out / "quick.txt", text + "\n")])
 
 
 @benchmark.command()
