@@ -267,33 +267,46 @@ def _find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
 
 
 def _find_lock(frame: Frame, corners: FloatArray, camera: _Camera, options: ReceiverOptions, stages: _Stages) -> _Lock:
-    """The screen profile whose clock fits best, with the row profiles of its columns."""
-    locks: list[_Lock] = []
-    for n_columns in sorted({screen.columns for screen in options.screens}):
-        with stages("sampling"):
-            profiles = _sample(frame, corners, camera, n_columns)
-        with stages("clock"):
-            quick = clock.halved_strips(profiles)
-            for screen in (s for s in options.screens if s.columns == n_columns):
-                found = _clock_of(screen, quick, camera)
-                if found:
-                    locks.append(_Lock(screen, profiles, found))
-    best = max(locks, key=lambda lock: lock.clock.lock, default=None)
-    if best is None or best.clock.lock < _MIN_LOCK:
-        raise _Failure("no_signal", _why_no_signal(corners, camera, options))
+    """The screen profile that fits best, with the row profiles of its columns.
+
+    Screens that differ in nothing but their columns share a clock: which of them it is, is asked last.
+    """
+    n_columns = min(screen.columns for screen in options.screens)
+    with stages("sampling"):
+        profiles = _sample(frame, corners, camera, n_columns)
     with stages("clock"):
-        return _with_likely_columns(best, locks)
+        quick = clock.halved_strips(profiles)
+        rates = {(s.slot_rate_hz, s.packet_slots): s for s in options.screens}
+        clocks = {rate: found for rate, screen in rates.items() if (found := _clock_of(screen, quick, camera))}
+        clocks = {rate: found for rate, found in clocks.items() if found.lock >= _MIN_LOCK}
+        if not clocks:
+            raise _Failure("no_signal", _why_no_signal(corners, camera, options))
+        rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(quick, clocks[r]))
+    alike = [screen for screen in options.screens if (screen.slot_rate_hz, screen.packet_slots) == rate]
+    locks = [_Lock(alike[0], profiles, clocks[rate])] if alike[0].columns == n_columns else []
+    for screen in alike[len(locks) :]:
+        with stages("sampling"):
+            finer = _sample(frame, corners, camera, screen.columns)
+        with stages("clock"):
+            found = _clock_of(screen, clock.halved_strips(finer), camera)
+        if found:
+            locks.append(_Lock(screen, finer, found))
+    if not locks:
+        raise _Failure("no_signal", _why_no_signal(corners, camera, options))
+    return locks[0] if len(locks) == 1 else _with_likely_columns(locks)
 
 
-def _with_likely_columns(best: _Lock, locks: list[_Lock]) -> _Lock:
-    """Among screens of the same clock, which fits all of them alike, the one whose columns are as wide as seen."""
-    rate, packet_slots = best.screen.slot_rate_hz, best.screen.packet_slots
-    alike = [k for k in locks if (k.screen.slot_rate_hz, k.screen.packet_slots) == (rate, packet_slots)]
-    if len({lock.screen.columns for lock in alike}) < 2:
-        return best
-    finest = max(alike, key=lambda lock: lock.profiles.light.shape[0] * lock.profiles.light.shape[1])
-    likely = blind.likely_columns(finest.profiles, best.clock, [lock.screen for lock in alike])
-    return next(lock for lock in alike if lock.screen is likely)
+def _structure(profiles: RowProfiles, now: Clock) -> float:
+    """How much the strips, each on its own, look like packets on this clock."""
+    samples = clock.sample_slots(profiles, now, 1)
+    return blind.structure_evidence(samples.light.reshape(-1, now.n_slots), now.first_slot, now.packet_slots)
+
+
+def _with_likely_columns(locks: list[_Lock]) -> _Lock:
+    """Among screens of one clock, the one whose columns are as wide as seen."""
+    finest = max(locks, key=lambda lock: lock.profiles.light.shape[0] * lock.profiles.light.shape[1])
+    likely = blind.likely_columns(finest.profiles, finest.clock, [lock.screen for lock in locks])
+    return next(lock for lock in locks if lock.screen is likely)
 
 
 def _outlines(frame: Frame, corners: FloatArray, lens: Lens | None, n_columns: int) -> Outlines:
