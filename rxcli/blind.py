@@ -523,7 +523,7 @@ def _repeats_at(octave: _Octave, rows_per_slot: float, packet_slots: int) -> flo
     return float(np.interp(lag, np.arange(octave.repeats.size), octave.repeats, right=0.0))
 
 
-def structure_evidence(slots: FloatArray, first_slot: int, packet_slots: int) -> float:
+def structure_evidence(slots: FloatArray | Float32Array, first_slot: int, packet_slots: int) -> float:
     """Log-likelihood ratio of slots being packets, over slots lit at random.
 
     Headers must read 0011100011, and every other symbol of a column must have the same number of lit slots; a column
@@ -552,7 +552,7 @@ def structure_evidence(slots: FloatArray, first_slot: int, packet_slots: int) ->
     return float(np.logaddexp(header + best, 0.0).sum() - n_columns * np.log(2.0))
 
 
-def _sliced(slots: FloatArray) -> BoolArray:
+def _sliced(slots: FloatArray | Float32Array) -> BoolArray:
     """Whether every slot is nearer to the lightest or to the darkest of those around it."""
     windows = np.pad(slots, ((0, 0), (_EXTREMES_SLOTS // 2, _EXTREMES_SLOTS // 2)), mode="edge")
     around = np.lib.stride_tricks.sliding_window_view(windows, _EXTREMES_SLOTS, axis=1)

@@ -139,7 +139,8 @@ def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[Frame
 def denoiser_scene(frame: Frame, options: ReceiverOptions) -> denoise.Scene | None:
     """What the auto-encoder is shown of a frame, None where no signal is found; for training."""
     try:
-        camera, corners = _camera_of(frame, options), _find_corners(frame, options)
+        known, corners = _camera_of(frame, options), _find_corners(frame, options)
+        camera, options = (known, options) if known else _estimate_camera(frame, corners, options, _Stages())
         lock = _find_lock(frame, corners, camera, options, _Stages())
     except _Failure:
         return None
