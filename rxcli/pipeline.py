@@ -400,7 +400,10 @@ def _iterate(lock: _Lock, seen: _Reception) -> _Reception:
         if columns.size == 0:
             break
         if iteration == 0:
+            bursts = now.burst
             now = clock.assign_bursts(now, channel.slot_llr(metrics), lock.screen.repeats)
+            if not np.array_equal(now.burst, bursts):
+                seen = replace(seen, clock=now, posteriors=_detect(metrics, now, model))
             now = clock.corrected(now, likelihoods.timing)
             samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
     return seen
