@@ -139,8 +139,8 @@ def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[Frame
 def denoiser_scene(frame: Frame, options: ReceiverOptions) -> denoise.Scene | None:
     """What the auto-encoder is shown of a frame, None where no signal is found; for training."""
     try:
-        known, corners = _camera_of(frame, options), _find_corners(frame, options)
-        camera, options = (known, options) if known else _estimate_camera(frame, corners, options, _Stages())
+        corners = _find_corners(frame, options)
+        camera, options = _camera_and_screens(frame, corners, options, _Stages())
         lock = _find_lock(frame, corners, camera, options, _Stages())
     except _Failure:
         return None
@@ -151,11 +151,10 @@ def _receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     stages = _Stages()
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
     try:
-        known = _camera_of(frame, options)
         with stages("geometry"):
             corners = _find_corners(frame, options)
         result = replace(result, corners=corners)
-        camera, options = (known, options) if known else _estimate_camera(frame, corners, options, stages)
+        camera, options = _camera_and_screens(frame, corners, options, stages)
         result = replace(
             result,
             camera_profile=camera.profile,
@@ -210,6 +209,14 @@ def _camera_of(frame: Frame, options: ReceiverOptions) -> _Camera | None:
     lens = geometry.lens_for(profile.lens, frame.width, frame.height) if profile.lens else None
     tone = _DEFAULT_TONE if profile.tone == "auto" else profile.tone
     return _Camera(profile.name, mode.line_delay_s, _exposure_of(frame, mode), lens, tone)
+
+
+def _camera_and_screens(
+    frame: Frame, corners: FloatArray, options: ReceiverOptions, stages: _Stages
+) -> tuple[_Camera, ReceiverOptions]:
+    """The camera, from a profile or estimated, and the options with the screens that remain."""
+    known = _camera_of(frame, options)
+    return (known, options) if known is not None else _estimate_camera(frame, corners, options, stages)
 
 
 def _estimate_camera(
@@ -300,7 +307,8 @@ def _find_lock(frame: Frame, corners: FloatArray, camera: _Camera, options: Rece
 def _structure(profiles: RowProfiles, now: Clock) -> float:
     """How much the strips, each on its own, look like packets on this clock."""
     samples = clock.sample_slots(profiles, now, 1)
-    return blind.structure_evidence(samples.light.reshape(-1, now.n_slots), now.first_slot, now.packet_slots)
+    slots = samples.light.reshape(-1, now.n_slots).astype(np.float64)
+    return blind.structure_evidence(slots, now.first_slot, now.packet_slots)
 
 
 def _with_likely_columns(locks: list[_Lock]) -> _Lock:
