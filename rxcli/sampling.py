@@ -105,7 +105,7 @@ class _Reader(Protocol):
 def _reader(frame: Frame, strip_px: float, tone: str) -> _Reader:
     if frame.mosaic is not None:
         return _MosaicReader(frame, frame.mosaic)
-    return _DevelopedReader(frame, int(np.clip(strip_px // _CELLS_PER_STRIP, 1, 16)), tone)
+    return _DevelopedReader(frame, int(np.clip(strip_px // _CELLS_PER_STRIP, 1, min(16, frame.width))), tone)
 
 
 class _DevelopedReader:
@@ -180,7 +180,7 @@ def _smooth_rows(values: Float32Array) -> Float32Array:
 
     kernel = np.array([0.25, 0.5, 0.25], np.float32)
     return cast(
-        Float32Array, cv2.sepFilter2D(values, -1, np.ones(1, np.float32), kernel, borderType=cv2.BORDER_REFLECT)
+        Float32Array, cv2.sepFilter2D(values, -1, np.ones(1, np.float32), kernel, borderType=cv2.BORDER_REFLECT_101)
     )
 
 
