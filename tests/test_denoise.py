@@ -1,0 +1,245 @@
+"""The auto-encoder's input contract, the model folder, inference, and the gate in the receiver."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rxcli import denoise
+from rxcli.denoise import COLUMN_FEATURES, STRIP_FEATURES, Scene, load_denoiser, network_inputs
+from rxcli.errors import ProfileError
+from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
+from rxcli.resources import data_dir
+from rxcli.types import Clock, SlotSamples
+
+N_COLUMNS, N_STRIPS, Q = 3, 5, 4
+N_SYMBOLS, W = 5, 5
+PACKET = 20 + 10 * N_SYMBOLS
+EXPOSURE = 1.2
+
+
+def sent(rng: np.random.Generator) -> np.ndarray:
+    """(C, 2 packets) slots of two copies."""
+    bits = rng.integers(0, 2, (N_COLUMNS, N_SYMBOLS * bits_per_symbol(W)), dtype=np.uint8)
+    return np.stack([np.tile(encode_packet(b, W), 2) for b in bits])
+
+
+def through_exposure(slots: np.ndarray, exposure: float) -> np.ndarray:
+    """(C, N * Q) by brute force: 64 instants of every sample's exposure, half lit beyond the ends."""
+    n = slots.shape[1]
+    centres = (np.arange(n * Q) + 0.5) / Q
+    instants = centres[:, None] + ((np.arange(64) + 0.5) / 64 - 0.5) * exposure
+    index = np.floor(instants).astype(int)
+    values = slots[:, np.clip(index, 0, n - 1)].astype(float)
+    return np.where((index < 0) | (index >= n), 0.5, values).mean(axis=2)
+
+
+def scene_of(slots: np.ndarray, rng: np.random.Generator, *, noise: float = 0.005) -> Scene:
+    """Columns in front of a slowly changing picture."""
+    shape = through_exposure(slots, EXPOSURE)
+    place = (np.arange(N_STRIPS) + 0.5) / N_STRIPS - 0.5
+    spread = np.exp(-((place[:, None] - np.arange(-1, 2)) ** 2) / (2 * 0.45**2))
+    around = np.pad(shape, ((1, 1), (0, 0)))
+    light = sum(spread[None, :, k, None] * around[k : k + N_COLUMNS, None] for k in range(3))
+    picture = 0.3 + 0.1 * np.sin(np.arange(shape.shape[1]) / 90 + place[:, None] * 5)
+    light = 0.01 + light * picture + noise * rng.standard_normal(light.shape)
+    clock = Clock(5.0, EXPOSURE, PACKET, 0.0, slots.shape[1], 0, np.zeros(2, np.int64), np.zeros(N_COLUMNS), 9.0)
+    samples = SlotSamples(light.astype(np.float32), np.ones(light.shape, np.float32), Q)
+    return Scene(samples, clock, slots.astype(np.float32), 0.01, noise, 1e-6, spread)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    rng = np.random.default_rng(3)
+    return scene_of(sent(rng), rng)
+
+
+def feature(strips: np.ndarray, name: str) -> np.ndarray:
+    """(B, S, k, N) the features of one name."""
+    widths = [int(found.group(1)) if (found := re.search(r"\[(\d+)\]", n)) else 1 for n in STRIP_FEATURES]
+    start = sum(widths[: STRIP_FEATURES.index(name)])
+    return strips[:, :, start : start + widths[STRIP_FEATURES.index(name)]]
+
+
+def test_the_contract_names_every_feature(scene: Scene) -> None:
+    strips, columns = network_inputs(scene, np.array([0, 2]))
+    n_named = [sum(int(m.group(1)) if (m := re.search(r"\[(\d+)\]", n)) else 1 for n in names)
+               for names in (STRIP_FEATURES, COLUMN_FEATURES)]  # fmt: skip
+    assert strips.shape == (2, N_STRIPS, n_named[0], 2 * PACKET)
+    assert columns.shape == (2, n_named[1], 2 * PACKET)
+    assert strips.dtype == columns.dtype == np.float32
+    assert np.isfinite(strips).all()
+
+
+def test_headers_are_known_and_nothing_else(scene: Scene) -> None:
+    _, columns = network_inputs(scene, np.array([1]))
+    np.testing.assert_array_equal(columns[0, 0, :10], 2 * np.array(HEADER) - 1)
+    np.testing.assert_array_equal(columns[0, 0, PACKET : PACKET + 10], 2 * np.array(HEADER) - 1)
+    assert not columns[0, 0, 10:PACKET].any()
+    np.testing.assert_array_equal(columns[0, 1:].argmax(axis=0), np.arange(2 * PACKET) % 10)
+
+
+def test_neighbours_light_is_slots_through_the_exposure(scene: Scene) -> None:
+    strips, _ = network_inputs(scene, np.array([0, 1]))
+    shape = through_exposure(scene.lit, EXPOSURE).reshape(N_COLUMNS, -1, Q)
+    expected = scene.spread[:, 0, None, None] * shape[0] + scene.spread[:, 2, None, None] * shape[2]
+    np.testing.assert_allclose(np.moveaxis(feature(strips, "neighbours[4]")[1], 1, 2), expected, atol=0.02)
+    alone = scene.spread[:, 2, None, None] * shape[1]
+    np.testing.assert_allclose(np.moveaxis(feature(strips, "neighbours[4]")[0], 1, 2), alone, atol=0.02)
+
+
+def test_delayed_neighbours_move(scene: Scene) -> None:
+    delayed = replace(scene, clock=replace(scene.clock, delay_slots=np.array([1.0, 0.0, 1.0])))
+    on_time = feature(network_inputs(scene, np.array([1]))[0], "neighbours[4]")
+    late = feature(network_inputs(delayed, np.array([1]))[0], "neighbours[4]")
+    np.testing.assert_allclose(late[..., 1:], on_time[..., :-1], atol=1e-5)
+
+
+def test_the_columns_own_belief_is_not_looked_at(scene: Scene) -> None:
+    lit = scene.lit.copy()
+    lit[1] = 1 - lit[1]
+    same = network_inputs(replace(scene, lit=lit), np.array([1]))[0]
+    np.testing.assert_array_equal(same, network_inputs(scene, np.array([1]))[0])
+    other = network_inputs(replace(scene, lit=lit), np.array([0]))[0]
+    assert np.abs(other - network_inputs(scene, np.array([0]))[0]).max() > 0.1
+
+
+def test_brightness_does_not_matter(scene: Scene) -> None:
+    """Twice the light with twice the noise is the same scene."""
+    twice = replace(
+        scene,
+        samples=replace(scene.samples, light=2 * scene.samples.light),
+        floor=2 * scene.floor,
+        sigma=2 * scene.sigma,
+        shot=2 * scene.shot,
+    )
+    columns = np.arange(N_COLUMNS)
+    np.testing.assert_allclose(network_inputs(twice, columns)[0], network_inputs(scene, columns)[0], atol=1e-4)
+
+
+SHIPPED = sorted(path.parent.name for path in data_dir("models").glob("*/model.toml"))
+
+
+def test_a_model_is_shipped() -> None:
+    assert denoise.DEFAULT_MODEL in SHIPPED
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_are_small_and_explained(name: str) -> None:
+    folder = data_dir("models") / name
+    denoiser = load_denoiser(name)
+    assert denoiser.card.name == name
+    assert (folder / denoiser.card.file).stat().st_size <= 2_000_000
+    assert denoiser.card.recipe["steps"] > 0
+    assert (folder / "README.md").is_file()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_tell_lit_from_dark(name: str, scene: Scene) -> None:
+    log_odds = load_denoiser(name).slot_log_odds(scene, np.arange(N_COLUMNS))
+    assert log_odds.shape == scene.lit.shape
+    wrong = (log_odds > 0) != (scene.lit > 0.5)
+    assert wrong[:, 2:-2].mean() < 0.01
+
+
+def test_columns_and_the_order_of_strips_do_not_touch_each_other(scene: Scene) -> None:
+    denoiser = load_denoiser()
+    together = denoiser.slot_log_odds(scene, np.array([0, 1, 2]))
+    alone = denoiser.slot_log_odds(scene, np.array([2]))
+    np.testing.assert_allclose(together[2], alone[0], atol=1e-3)
+    order = np.array([3, 0, 4, 1, 2])
+    samples = SlotSamples(scene.samples.light[:, order], scene.samples.valid[:, order], Q)
+    mixed = denoiser.slot_log_odds(replace(scene, samples=samples, spread=scene.spread[order]), np.array([0, 1, 2]))
+    np.testing.assert_allclose(mixed, together, atol=1e-2)
+
+
+def test_the_session_is_made_when_first_needed_and_once(scene: Scene) -> None:
+    denoiser = load_denoiser()
+    assert "_session" not in vars(denoiser)
+    denoiser.slot_log_odds(scene, np.array([0]))
+    session = vars(denoiser)["_session"]
+    denoiser.slot_log_odds(scene, np.array([1]))
+    assert vars(denoiser)["_session"] is session
+    copy = pickle.loads(pickle.dumps(denoiser))
+    assert "_session" not in vars(copy)
+    np.testing.assert_array_equal(
+        copy.slot_log_odds(scene, np.array([1])), denoiser.slot_log_odds(scene, np.array([1]))
+    )
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    """A copy of the shipped model that may be damaged."""
+    return Path(shutil.copytree(data_dir("models") / denoise.DEFAULT_MODEL, tmp_path / "model"))
+
+
+def edit(model: Path, old: str, new: str) -> None:
+    text = (model / "model.toml").read_text()
+    assert old in text
+    (model / "model.toml").write_text(text.replace(old, new))
+
+
+def replace_weights(model: Path, data: bytes) -> None:
+    """Put other bytes in place of the weights, with their own checksum."""
+    before = load_denoiser(str(model)).card.sha256
+    (model / "model.onnx").write_bytes(data)
+    edit(model, before, hashlib.sha256(data).hexdigest())
+
+
+def test_a_missing_model_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ProfileError, match=r"nowhere.*no model can be read there.*vlc-rx train"):
+        load_denoiser(str(tmp_path / "nowhere"))
+
+
+def test_missing_weights_are_named(model: Path) -> None:
+    (model / "model.onnx").unlink()
+    with pytest.raises(ProfileError, match=r"model\.onnx: cannot be read"):
+        load_denoiser(str(model))
+
+
+def test_cut_weights_do_not_match_their_checksum(model: Path) -> None:
+    weights = model / "model.onnx"
+    weights.write_bytes(weights.read_bytes()[:-100])
+    with pytest.raises(ProfileError, match=r"does not match the checksum"):
+        load_denoiser(str(model))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('kind = "denoiser"', 'kind = "camera"'),
+        ("format = 1", "format = 2"),
+        ("format = 1", "format = 1\ncolour = 3"),
+        ("samples_per_slot = 4", "samples_per_slot = 8"),
+        ('"shot"', '"phase of the moon"'),
+        ("[contract]", "[contract"),
+    ],
+)
+def test_cards_are_strict(model: Path, old: str, new: str) -> None:
+    edit(model, old, new)
+    with pytest.raises(ProfileError, match=r"model\.toml"):
+        load_denoiser(str(model))
+
+
+def test_what_is_no_network_is_refused_when_it_is_needed(model: Path, scene: Scene) -> None:
+    replace_weights(model, b"not a network")
+    with pytest.raises(ProfileError, match="ONNX Runtime refuses it"):
+        load_denoiser(str(model)).slot_log_odds(scene, np.array([0]))
+
+
+def test_a_foreign_network_is_refused(model: Path, scene: Scene) -> None:
+    onnx = pytest.importorskip("onnx", reason="onnx (extra train) makes the foreign network")
+    tensor = onnx.helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, [1, 3, None, None])
+    out = onnx.helper.make_tensor_value_info("label", onnx.TensorProto.FLOAT, [1, 3, None, None])
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Relu", ["image"], ["label"])], "foreign", [tensor], [out])
+    made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    replace_weights(model, made.SerializeToString())
+    with pytest.raises(ProfileError, match=r"its tensors .*image.* are not those of its contract"):
+        load_denoiser(str(model)).slot_log_odds(scene, np.array([0]))
