@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, bits_per_symbol, bits_to_hex, indices_to_bits
@@ -49,6 +52,89 @@ def column_results(
     )
 
 
+@dataclass(frozen=True, slots=True)
+class BurstInClip:
+    """A burst of a clip, as the last frame that shows it reports it."""
+
+    #: Number in the clip, and in the clock of the frame.
+    number: int
+    index: int
+    #: Of this burst alone.
+    posteriors: BurstPosteriors
+    #: (C, packet) how often each slot was seen, over all frames.
+    seen: IntArray
+    frames: tuple[int, ...]
+
+
+def clip_results(
+    clock: Clock, bursts: Sequence[BurstInClip], going_on: Float32Array, snr: Float32Array, min_confidence: float
+) -> tuple[ColumnResult, ...]:
+    """Results of every column in a frame of a clip.
+
+    Args:
+        clock: the clock.
+        bursts: those that end in this frame, in time order.
+        going_on: (C,) confidence of the best packet that the next frame will report.
+        snr: (C, N) squared contrast over variance of every slot of the grid.
+        min_confidence: packets below it are left out.
+    """
+    return tuple(
+        _clip_column(column, clock, bursts, float(going_on[column]), snr[column], min_confidence)
+        for column in range(snr.shape[0])
+    )
+
+
+def _clip_column(
+    column: int, clock: Clock, bursts: Sequence[BurstInClip], going_on: float, snr: Float32Array, min_confidence: float
+) -> ColumnResult:
+    found = []
+    for burst in bursts:
+        own = replace(clock, burst=np.where(clock.burst == burst.index, 0, 1))
+        if (burst.seen[column, PREAMBLE_SLOTS:] > 0).all():
+            packet = _packet(0, column, own, burst.posteriors, burst.seen[column])
+            if packet and packet.confidence >= min_confidence:
+                found.append(replace(packet, burst=burst.number, frames=burst.frames))
+    snr_db = _snr_db(snr)
+    status = _column_status(tuple(found), snr_db)
+    if not found and going_on >= _WEAK_CONFIDENCE:
+        status = "ok"
+    n_seen = max((int(burst.seen[column].sum()) for burst in bursts), default=0)
+    return ColumnResult(
+        column=column,
+        status=status,
+        w=_sure_weight(column, [burst.posteriors for burst in bursts], bool(found)),
+        snr_db=snr_db,
+        delay_slots=float(clock.delay_slots[column]),
+        packets=tuple(found),
+        message=None if found else _why_none_here(status, snr_db, n_seen, clock, bool(bursts)),
+    )
+
+
+def _sure_weight(column: int, posteriors: Sequence[BurstPosteriors], found: bool) -> int | None:
+    """The weight of a column, where it is known."""
+    if not posteriors:
+        return None
+    best = max(posteriors, key=lambda p: float(p.w_log_prob[column].max()))
+    sure = found or best.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
+    return int(best.w[column]) if sure else None
+
+
+def _why_none_here(status: ColumnStatus, snr_db: float | None, n_seen: int, clock: Clock, any_burst: bool) -> str:
+    if status == "ok" or not any_burst:
+        return "its burst goes on in the next frame and is reported there"
+    return _why_none(status, snr_db, n_seen, clock)
+
+
+def _snr_db(snr: Float32Array) -> float | None:
+    lit = snr[snr > 0]
+    return float(10 * np.log10(max(float(np.median(lit)), 1e-6))) if lit.size else None
+
+
+def clip_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
+    """`ok` when every lit column has a packet, here or in a frame to come; `partial` when some have none."""
+    return "ok" if all(column.status in ("ok", "weak", "dark") for column in columns) else "partial"
+
+
 def frame_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
     """`ok` when every lit column gave a packet, `partial` when some did, `no_signal` when none did."""
     lit = [column for column in columns if column.status != "dark"]
@@ -85,8 +171,7 @@ def _column_result(
         for burst in np.flatnonzero(complete(seen[:, None])[:, 0])
     ]
     packets = tuple(packet for packet in found if packet and packet.confidence >= min_confidence)
-    lit = snr[snr > 0]
-    snr_db = float(10 * np.log10(max(float(np.median(lit)), 1e-6))) if lit.size else None
+    snr_db = _snr_db(snr)
     sure_of_w = posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
     return ColumnResult(

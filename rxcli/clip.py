@@ -1,0 +1,551 @@
+"""Wiring of clips: what one frame teaches is used on the next. The stages are those of `rxcli.pipeline`.
+
+The first frame is received like a photograph. From then on outline, clock, picture, light spread and weights are known:
+the strips are read where they were (`rxcli.strips`), the picture is taken out (`rxcli.known_picture`), the clock is
+foretold and checked against the header (`rxcli.tracking`). Where the check fails, the frame is received like a
+photograph again. What frames see of a burst is added up before it is detected; a packet stands in the last frame that
+shows its burst, so results come a frame late.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli import assemble, channel, clock, detect, geometry, known_picture, sampling, strips, tracking
+from rxcli.types import (
+    BurstPosteriors,
+    Clock,
+    ColumnResult,
+    Float32Array,
+    FloatArray,
+    Frame,
+    FrameResult,
+    IntArray,
+    RowProfiles,
+)
+
+if TYPE_CHECKING:
+    from rxcli.pipeline import ReceiverOptions, _Camera, _Lock, _Reception, _Stages
+
+#: Frames that may wait until it is clear which copies begin a burst.
+_MAX_WAITING = 8
+#: Frames whose corners are averaged at the start, and how often they are looked at from then on.
+_FIRST_LOOKS, _LOOK_EVERY = 4, 12
+#: Share of a new look in the corners.
+_CORNER_SHARE = 0.25
+#: Movement of a corner that is followed at once, and the one below which nothing is changed, in screen widths.
+_JUMP, _STILL = 0.012, 0.0004
+#: Frames from which the picture is learned one by one, and how often from then on.
+_FIRST_LESSONS, _LESSON_EVERY = 12, 6
+#: Columns decided worse than this many times the foreseen variance do not fit what is known.
+_MISFIT = 6.0
+#: A column's symbol of at least this log probability is certain.
+_CERTAIN = -1e-5
+#: Weights that a quick look finds this much less likely than the best are dropped, nats.
+_HOPELESS_WEIGHT = 20.0
+#: A header peak this much over the strongest rival is believed against what the frames before foretell.
+_OWN_LOCK = 3.0
+#: Slots that a clock may be off the foretold one.
+_SAME_TIME_SLOTS = 1.5
+
+
+def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
+    """Receive the frames of a clip; results come a frame or more late. An error of `frames` comes after all results."""
+    clip = _Clip(options)
+    try:
+        for frame in frames:
+            yield from clip.take(frame)
+    except Exception:
+        yield from clip.finish()
+        raise
+    yield from clip.finish()
+
+
+@dataclass(slots=True)
+class _View:
+    """A frame with a lock."""
+
+    camera: _Camera
+    lock: _Lock
+    bursts: tracking.FrameBursts
+    memory: int
+    height: int
+    snr: Float32Array
+    #: Columns that the auto-encoder changed.
+    denoised: frozenset[int] = frozenset()
+    #: (C, S, R) light of the strips as tracking samples them; None where that cannot be done.
+    light: Float32Array | None = None
+    flat: known_picture.ColumnLight | None = None
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """A frame whose result is held back."""
+
+    result: FrameResult
+    view: _View | None = None
+    #: (B,) numbers of the frame's bursts, once known.
+    numbers: IntArray | None = None
+
+
+@dataclass(slots=True)
+class _Place:
+    """Where the screen is, and how strips are read there."""
+
+    corners: FloatArray
+    map: strips.StripMap
+    light_of_value: Float32Array
+    n_looks: int = 0
+
+
+@dataclass(slots=True)
+class _Link:
+    """The link's time, as long as it is not lost."""
+
+    time: tracking.LinkTime
+    phase: tracking.BurstPhase
+    #: Number of burst 0 of this time in the clip.
+    offset: int = 0
+    last_time_s: float = 0.0
+
+
+class _Clip:
+    """What is known of a clip so far."""
+
+    def __init__(self, options: ReceiverOptions) -> None:
+        self._options = options
+        self._waiting: deque[_Waiting] = deque()
+        self._bursts = tracking.Bursts()
+        self._link: _Link | None = None
+        self._next_number = 0
+        #: The camera and the options with the screens that remain, and what they were found for.
+        self._camera: tuple[_Camera, ReceiverOptions] | None = None
+        self._taken_with: tuple[object, ...] = ()
+        self._corners: FloatArray | None = None
+        self._place: _Place | None = None
+        self._picture: known_picture.KnownPicture | None = None
+        self._n_lessons = 0
+        self._last: _View | None = None
+
+    # -- one frame ---------------------------------------------------------------------------------------------
+
+    def take(self, frame: Frame) -> list[FrameResult]:
+        """Receive the next frame; returns the results that are complete."""
+        from rxcli.pipeline import _Failure, _Stages
+
+        stages = _Stages()
+        waiting = _Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok"))
+        try:
+            view = self._known(frame, stages)
+            if view is not None:
+                self._skip(waiting, "tracking", 1)
+            else:
+                view, waiting.result = self._search(frame, waiting.result, stages)
+            waiting.view = view
+            waiting.result = replace(waiting.result, **_facts(view), corners=self._corners)
+            done = self._enter(waiting, frame, stages)
+        except _Failure as failure:
+            self._forget()
+            waiting.result = replace(waiting.result, status=failure.status, message=failure.message)
+            self._waiting.append(waiting)
+            done = self._ready()
+        waiting.result = replace(waiting.result, timing_ms=stages.total())
+        return done
+
+    def _skip(self, waiting: _Waiting, name: str, count: int) -> None:
+        if count:
+            skipped = waiting.result.skipped
+            waiting.result = replace(waiting.result, skipped={**skipped, name: skipped.get(name, 0) + count})
+
+    def finish(self) -> list[FrameResult]:
+        """The results still held back."""
+        done = self._settle()
+        done += [self._report(waiting, None) for waiting in self._waiting]
+        self._waiting.clear()
+        return done
+
+    def _forget(self) -> None:
+        self._place = self._picture = self._last = None
+
+    # -- a frame like a photograph ------------------------------------------------------------------------------
+
+    def _search(self, frame: Frame, result: FrameResult, stages: _Stages) -> tuple[_View, FrameResult]:
+        """Receive a frame like a photograph; only the camera is taken from the frames before."""
+        from rxcli.pipeline import _camera_and_screens, _decode, _find_corners, _find_lock, _second_opinion
+
+        self._forget()
+        with stages("geometry"):
+            corners = _find_corners(frame, self._options)
+        self._corners = corners
+        if self._camera is None or self._taken_with != _taken_with(frame) or "tracking" not in self._options.skip:
+            self._camera = _camera_and_screens(frame, corners, self._options, stages)
+            self._taken_with = _taken_with(frame)
+        camera, options = self._camera
+        lock = _find_lock(frame, corners, camera, options, stages)
+        with stages("detect"):
+            seen = _decode(lock)
+        with stages("denoise"):
+            seen, denoised, report = _second_opinion(lock, seen, options)
+        view = _View(camera, lock, _bursts_of(frame, seen), seen.model.memory, frame.height, seen.snr, denoised)
+        lit = channel.lit_on_grid(seen.posteriors, seen.clock)
+        if self._can_track(frame, camera, lock):
+            with stages("sampling"):
+                self._start_tracking(frame, corners, camera, lock, seen)
+                view.light = self._strips(frame)
+            self._learn(view, lit)
+        self._last = view
+        return view, replace(result, denoiser=report)
+
+    def _can_track(self, frame: Frame, camera: _Camera, lock: _Lock) -> bool:
+        """Whether a row of the picture is one instant, in the order of time."""
+        return (
+            "tracking" in self._options.skip
+            and frame.mosaic is None
+            and lock.profiles.sensor_row is None
+            and not camera.reversed
+        )
+
+    def _start_tracking(
+        self, frame: Frame, corners: FloatArray, camera: _Camera, lock: _Lock, seen: _Reception
+    ) -> None:
+        self._place = _Place(
+            corners,
+            _map(frame, corners, camera, lock),
+            strips.light_of_values(frame, lambda coded: sampling.tone_to_light(camera.tone, coded)),
+        )
+        profiles, n_strips = lock.profiles, self._place.map.inside.shape[1]
+        pixels = self._place.map.pixels
+        self._picture = known_picture.KnownPicture(
+            self._place.map.inside,
+            channel.spread_matrix(n_strips, lock.screen.light_spread),
+            seen.model.floor,
+            max(profiles.noise_floor / pixels, 1e-7),
+            profiles.noise_slope / pixels,
+        )
+        self._n_lessons = 0
+
+    # -- a frame whose place and picture are known -------------------------------------------------------------------
+
+    def _known(self, frame: Frame, stages: _Stages) -> _View | None:
+        """The view of a frame by what is known; None where that does not fit."""
+        last, place, picture = self._last, self._place, self._picture
+        if last is None or place is None or picture is None or self._link is None:
+            return None
+        if self._taken_with != _taken_with(frame):
+            return None
+        with stages("geometry"):
+            self._look(frame, last.camera, last.lock)
+        with stages("sampling"):
+            light = self._strips(frame)
+            flat = picture.solve(light)
+        with stages("clock"):
+            now = self._clock(frame, flat, last)
+            if now is None:
+                return None
+        with stages("detect"):
+            positions = known_picture.row_positions(self._rows, now)
+            metrics = known_picture.pattern_metrics(flat, positions, now, last.memory)
+            shown = _shown(place.map.inside, positions, now)
+            snr = _snr(flat, now)
+        bursts = tracking.FrameBursts(frame.index, 0, now, metrics, shown)
+        return _View(
+            last.camera, replace(last.lock, clock=now), bursts, last.memory, frame.height, snr, light=light, flat=flat
+        )
+
+    @property
+    def _rows(self) -> FloatArray:
+        assert self._place is not None
+        strip_map = self._place.map
+        return strip_map.first_row + np.arange(strip_map.inside.shape[2], dtype=np.float64)
+
+    def _strips(self, frame: Frame) -> Float32Array:
+        assert self._place is not None
+        return strips.sample_strips(frame, self._place.map, self._place.light_of_value)
+
+    def _look(self, frame: Frame, camera: _Camera, lock: _Lock) -> None:
+        """Look where the screen is, now and then."""
+        place = self._place
+        assert place is not None
+        place.n_looks += 1
+        if self._options.corners is not None or not (place.n_looks < _FIRST_LOOKS or place.n_looks % _LOOK_EVERY == 0):
+            return
+        from rxcli.find_screen import track_screen
+
+        stored, order = _stored_order(place.corners)
+        found = track_screen(frame.pixels, stored, black=frame.black, white=frame.white)
+        if found.corners is None:
+            return
+        seen = found.corners[order]
+        width = float(np.linalg.norm(place.corners[1] - place.corners[0]))
+        moved = float(np.abs(seen - place.corners).max()) / width
+        share = 1.0 if moved > _JUMP else max(_CORNER_SHARE, 1 / (1 + place.n_looks))
+        if moved > _STILL:
+            self._corners = place.corners + share * (seen - place.corners)
+            self._move(frame, camera, lock, self._corners)
+
+    def _move(self, frame: Frame, camera: _Camera, lock: _Lock, corners: FloatArray) -> None:
+        place, picture = self._place, self._picture
+        assert place is not None and picture is not None
+        before, rows_before = place.corners, place.map.first_row
+        place.map = _map(frame, corners, camera, lock)
+        place.corners = corners
+        picture.moved(_row_before(self._rows, corners, before, lock.screen.columns) - rows_before, place.map.inside)
+
+    def _clock(self, frame: Frame, flat: known_picture.ColumnLight, last: _View) -> Clock | None:
+        """The clock of the frame: what the header says, or where it is not seen well, what was foretold."""
+        assert self._place is not None and self._link is not None
+        lock = last.lock
+        rows = self._rows
+        profiles = RowProfiles(
+            light=flat.shrunk[:, None],
+            inside=self._place.map.inside.any(axis=1, keepdims=True),
+            rows=rows.astype(np.int64),
+            sensor_row=None,
+            count=np.ones((flat.shrunk.shape[0], 1), np.float32),
+            noise_floor=1e-4,
+            noise_slope=0.0,
+        )
+        old = lock.clock
+        found = clock.find_clock(profiles, old.rows_per_slot, old.exposure_slots, old.packet_slots, 0.03)
+        top = float(rows[0]) - 0.5
+        n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
+        foretold = self._link.time.clock_at(frame.index, frame.time_s, old, n_slots, top)
+        if found is not None and (foretold is None or _apart(found, foretold) < _SAME_TIME_SLOTS):
+            return replace(found, delay_slots=old.delay_slots)
+        if found is not None and found.lock > _OWN_LOCK:
+            return replace(found, delay_slots=old.delay_slots)
+        return foretold
+
+    # -- bursts ---------------------------------------------------------------------------------------------------
+
+    def _enter(self, waiting: _Waiting, frame: Frame, stages: _Stages) -> list[FrameResult]:
+        view = waiting.view
+        assert view is not None
+        done: list[FrameResult] = []
+        first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock) if self._link else None
+        if first_copy is None:
+            done = self.finish()
+            self._begin_link(view, frame)
+            assert self._link is not None
+            first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock)
+            assert first_copy is not None
+        assert self._link is not None
+        self._link.last_time_s = frame.time_s
+        view.bursts = replace(view.bursts, first_copy=first_copy)
+        self._waiting.append(waiting)
+        with stages("detect"):
+            if not self._link.phase.settled or any(w.view and w.numbers is None for w in self._waiting):
+                self._compare(view)
+            n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)
+            if self._link.phase.settled or n_unsettled > _MAX_WAITING:
+                self._settle_bursts()
+        return done + self._ready()
+
+    def _begin_link(self, view: _View, frame: Frame) -> None:
+        screen = view.lock.screen
+        offset = self._next_number
+        if self._link is not None and offset:
+            offset += int((frame.time_s - self._link.last_time_s) / (screen.packet_s * screen.repeats))
+        self._link = _Link(
+            tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz), tracking.BurstPhase(screen.repeats), offset
+        )
+        self._bursts = tracking.Bursts()
+
+    def _compare(self, view: _View) -> None:
+        """What the frame says of the phase of the bursts."""
+        assert self._link is not None
+        now = view.bursts.clock
+        llr = channel.slot_llr(view.bursts.metrics)
+        copies = clock.to_copies(llr, now).transpose(1, 0, 2) * (view.bursts.shown > 0)
+        self._link.phase.take(view.bursts.first_copy, np.asarray(copies, np.float64))
+
+    def _settle(self) -> list[FrameResult]:
+        if self._link is not None:
+            self._settle_bursts()
+        return self._ready()
+
+    def _settle_bursts(self) -> None:
+        """Enter all frames that waited for the phase of the bursts."""
+        for waiting in self._waiting:
+            if waiting.view is not None and waiting.numbers is None:
+                self._detect(waiting)
+
+    def _detect(self, waiting: _Waiting) -> None:
+        """Add a frame to its bursts, and detect them again."""
+        view, link = waiting.view, self._link
+        assert view is not None and link is not None
+        now = view.bursts.clock
+        copies = view.bursts.first_copy + np.arange(now.n_copies)
+        bursts = link.phase.burst_of(copies)
+        numbers = np.unique(bursts)
+        now = replace(now, burst=bursts - numbers[0])
+        view.bursts = replace(view.bursts, clock=now)
+        waiting.numbers = numbers + link.offset
+        self._next_number = max(self._next_number, int(waiting.numbers[-1]) + 1)
+        self._bursts.add(view.bursts, waiting.numbers, channel.by_burst(view.bursts.metrics, now, view.memory))
+        still_open = np.array([n for n in waiting.numbers if self._bursts.is_open(int(n))], np.int64)
+        if still_open.size == 0:
+            return
+        before = self._bursts.certain(still_open) if "certain_columns" in self._options.skip else None
+        posteriors, certain, n_skipped = self._detect_open(still_open, before)
+        self._bursts.note(still_open, posteriors, certain)
+        self._skip(waiting, "certain_columns", n_skipped)
+        if view.flat is not None:
+            self._confirm(view, waiting.numbers, still_open, posteriors)
+
+    def _detect_open(
+        self, numbers: IntArray, before: NDArray[np.bool_] | None
+    ) -> tuple[BurstPosteriors, NDArray[np.bool_], int]:
+        """Posteriors of bursts, (B, C) whether they are certain, and how many columns were known already."""
+        metrics = self._bursts.metrics(numbers)
+        posteriors = detect.detect(metrics, detect.plausible_weights(metrics, _HOPELESS_WEIGHT))
+        certain = posteriors.log_prob.min(axis=2) >= _CERTAIN
+        return posteriors, certain, 0
+
+    def _confirm(self, view: _View, numbers: IntArray, still_open: IntArray, posteriors: BurstPosteriors) -> None:
+        """Check what was known against what was decided, and learn."""
+        now = view.bursts.clock
+        lit = np.full((numbers.size, *posteriors.lit.shape[1:]), 0.5, np.float32)
+        lit[np.searchsorted(numbers, still_open)] = posteriors.lit
+        grid = channel.lit_on_grid(replace(posteriors, lit=lit), now)
+        self._learn(view, grid)
+        self._last = view
+
+    def _learn(self, view: _View, lit: Float32Array) -> None:
+        picture = self._picture
+        if picture is None or view.light is None or view.light.shape[2] != self._rows.size:
+            return
+        now = view.bursts.clock
+        positions = known_picture.row_positions(self._rows, now)
+        slots = known_picture.exposed(lit, positions, now.exposure_slots)
+        if view.flat is not None:
+            picture.judge(view.flat, slots, 0.2)
+        self._n_lessons += 1
+        if self._n_lessons <= _FIRST_LESSONS or self._n_lessons % _LESSON_EVERY == 0:
+            doubt = known_picture.exposed(lit * (1 - lit), positions, now.exposure_slots)
+            picture.learn(view.light, slots, np.clip(1 - 8 * doubt, 0, 1).astype(np.float32))
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    def _ready(self) -> list[FrameResult]:
+        """Results of the frames whose bursts all ended, oldest first."""
+        done = []
+        while self._waiting:
+            first = self._waiting[0]
+            if first.view is not None:
+                if first.numbers is None or len(self._waiting) < 2:
+                    break
+                if self._waiting[1].view is not None and self._waiting[1].numbers is None:
+                    break
+            self._waiting.popleft()
+            done.append(self._report(first, self._waiting[0] if self._waiting else None))
+        return done
+
+    def _report(self, waiting: _Waiting, following: _Waiting | None) -> FrameResult:
+        view = waiting.view
+        if view is None or waiting.numbers is None:
+            return waiting.result
+        going_on = waiting.numbers[:0]
+        if following is not None and following.numbers is not None:
+            going_on = np.intersect1d(waiting.numbers, following.numbers)
+        first = waiting.numbers[0]
+        ended = [
+            assemble.BurstInClip(b.number, int(b.number - first), b.posteriors, b.seen, b.frames)
+            for b in self._bursts.close(np.setdiff1d(waiting.numbers, going_on))
+        ]
+        known = [p for p in (self._bursts.known(int(n)) for n in going_on if self._bursts.is_open(int(n))) if p]
+        later = np.max([np.exp(p.log_prob.sum(axis=2)).max(axis=0) for p in known], axis=0) if known else None
+        sure = np.zeros(view.snr.shape[0], np.float32) if later is None else later.astype(np.float32)
+        columns = self._columns(view, ended, sure, view.height)
+        return replace(waiting.result, columns=columns, status=assemble.clip_status(columns))
+
+    def _columns(
+        self, view: _View, ended: list[assemble.BurstInClip], sure: Float32Array, height: int
+    ) -> tuple[ColumnResult, ...]:
+        from rxcli.pipeline import _in_stored_rows
+
+        columns = assemble.clip_results(view.bursts.clock, ended, sure, view.snr, self._options.min_confidence)
+        columns = tuple(replace(c, denoised=c.column in view.denoised) for c in columns)
+        return tuple(_in_stored_rows(c, height) for c in columns) if view.camera.reversed else columns
+
+
+def _taken_with(frame: Frame) -> tuple[object, ...]:
+    """What the camera and the place of the picture hang on."""
+    return frame.width, frame.height, frame.pixels.dtype.str, frame.black, frame.white, frame.metadata
+
+
+def _facts(view: _View) -> dict[str, Any]:
+    """What a result says of camera and screen."""
+    camera = view.camera
+    return {
+        "camera_profile": camera.profile,
+        "line_delay_s": camera.line_delay_s,
+        "exposure_s": camera.exposure_s,
+        "estimated": camera.estimated,
+        "screen_profile": view.lock.screen.name,
+    }
+
+
+def _map(frame: Frame, corners: FloatArray, camera: _Camera, lock: _Lock) -> strips.StripMap:
+    n_columns = lock.screen.columns
+    column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
+    n_strips = sampling.strips_per_column(column_px)
+    outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, camera.lens)
+    return strips.map_strips(outlines)
+
+
+def _bursts_of(frame: Frame, seen: _Reception) -> tracking.FrameBursts:
+    by_copy = replace(seen.clock, burst=np.arange(seen.clock.n_copies))
+    shown = np.minimum(assemble.slots_seen(seen.samples, by_copy), 1)
+    return tracking.FrameBursts(frame.index, 0, seen.clock, seen.metrics, shown)
+
+
+def _shown(inside: NDArray[np.bool_], positions: FloatArray, now: Clock) -> IntArray:
+    """(n_copies, C, packet) 1 where the middle of a slot is on the screen."""
+    on_screen = inside.any(axis=1)
+    middles = np.arange(now.n_slots) + 0.5
+    out = np.zeros((on_screen.shape[0], now.n_slots), np.int64)
+    for column, rows in enumerate(on_screen):
+        seen = positions[min(column, positions.shape[0] - 1), rows]
+        if seen.size:
+            out[column] = (middles >= seen[0]) & (middles <= seen[-1])
+    return np.asarray(clock.to_copies(out.astype(np.float32), now), np.int64).transpose(1, 0, 2)
+
+
+def _snr(flat: known_picture.ColumnLight, now: Clock) -> Float32Array:
+    """(C, N) squared contrast over variance of a slot: the mean of the rows around."""
+    mean = np.median(flat.precision, axis=1) * np.float32(now.rows_per_slot)
+    return np.repeat(mean[:, None], now.n_slots, axis=1).astype(np.float32)
+
+
+def _apart(first: Clock, second: Clock) -> float:
+    """Slots between two clocks, whole packets aside."""
+    length = first.packet_slots
+    difference = first.first_slot - second.first_slot - (first.row0 - second.row0) / first.rows_per_slot
+    return float(abs((difference + length / 2) % length - length / 2))
+
+
+def _stored_order(corners: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Corners clockwise from the one of smallest x + y, and the order that turns such ones back."""
+    following = np.roll(corners, -1, axis=0)
+    area = float((corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]).sum())
+    order = np.arange(4) if area > 0 else np.arange(4)[::-1]
+    order = np.roll(order, -int(corners[order].sum(axis=1).argmin()))
+    return corners[order], np.argsort(order)
+
+
+def _row_before(rows: FloatArray, corners: FloatArray, before: FloatArray, n_columns: int) -> FloatArray:
+    """(C, R) row that showed, before the screen moved, what `rows` show now; columns as straight lines."""
+    across = ((np.arange(n_columns) + 0.5) / n_columns)[:, None]
+
+    def ends(c: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return c[0, 1] + across * (c[1, 1] - c[0, 1]), c[3, 1] + across * (c[2, 1] - c[3, 1])
+
+    (top, bottom), (old_top, old_bottom) = ends(corners), ends(before)
+    return np.asarray(old_top + (rows - top) * (old_bottom - old_top) / (bottom - top))

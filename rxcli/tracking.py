@@ -1,0 +1,271 @@
+"""The link's time through the frames of a clip, and the bursts that go on from one frame to the next.
+
+Row r of frame f begins its exposure at t_f + r * line_delay, so a clock that is locked in one frame foretells the next:
+`LinkTime` counts slots from the clip's first lock. Every copy of a packet then has a number that goes on through the
+clip, and with the phase of the bursts (`BurstPhase`) every burst too, those in the gaps between frames included.
+`Bursts` adds up what the frames see of each burst.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from rxcli.protocol import PREAMBLE_SLOTS
+from rxcli.types import BoolArray, BurstPosteriors, Clock, FloatArray, IntArray
+
+#: A clock that is off by more than this many slots from where the frames before foretell it belongs to another time.
+_MAX_JUMP_SLOTS = 2.0
+#: Share of a new measurement in the length of a frame.
+_PERIOD_SHARE = 0.2
+#: Likelihood ratio, in nats, that settles the phase of the bursts.
+_SETTLED = 12.0
+#: Log-odds that a slot seen once is taken to be at most sure of: copies are compared with what may be wrong.
+_SURE = 3.0
+
+
+@dataclass(slots=True)
+class LinkTime:
+    """Slots since the start of the first copy seen, counted over the frames."""
+
+    packet_slots: int
+    slot_rate_hz: float
+    #: Frame number, time, and slot of sensor row 0 at the last lock.
+    _last: tuple[int, float, float] | None = None
+    #: Slots from frame to frame, as measured, and its spread.
+    _period: float | None = None
+    #: Least time between two frames so far.
+    _frame_s: float = float("inf")
+
+    def foretell(self, frame: int, time_s: float) -> float | None:
+        """Slot of sensor row 0 in a frame, from the locks before; None before the first."""
+        if self._last is None:
+            return None
+        number, at_s, slot = self._last
+        if self._period is not None:
+            return slot + self._period * self._frames_since(number, frame, time_s - at_s)
+        return slot + (time_s - at_s) * self.slot_rate_hz
+
+    def take(self, frame: int, time_s: float, clock: Clock) -> int | None:
+        """Enter a locked clock; returns the number of its copy 0, None where it is not of the time told so far."""
+        inside = clock.first_slot - clock.row0 / clock.rows_per_slot
+        foretold = self.foretell(frame, time_s)
+        if foretold is None:
+            first_copy, slot = 0, inside
+        else:
+            first_copy = round((foretold - inside) / self.packet_slots)
+            slot = inside + first_copy * self.packet_slots
+            if self._period is not None and abs(slot - foretold) > _MAX_JUMP_SLOTS:
+                return None
+            self._measure(frame, time_s, slot)
+        self._last = (frame, time_s, slot)
+        return first_copy
+
+    def clock_at(self, frame: int, time_s: float, like: Clock, n_slots: int, top_row: float) -> Clock | None:
+        """The clock that the frames before foretell.
+
+        Args:
+            frame: number of the frame.
+            time_s: its time.
+            like: a clock of an earlier frame.
+            n_slots: slots of the grid.
+            top_row: sensor row above which nothing is seen.
+        """
+        foretold = self.foretell(frame, time_s)
+        if foretold is None:
+            return None
+        slot = foretold + top_row / like.rows_per_slot
+        first_slot = int(np.floor(slot)) % self.packet_slots
+        return replace(
+            like,
+            row0=top_row - (slot - np.floor(slot)) * like.rows_per_slot,
+            n_slots=n_slots,
+            first_slot=first_slot,
+            burst=np.zeros(-(-(first_slot + n_slots) // self.packet_slots), np.int64),
+        )
+
+    def _frames_since(self, number: int, frame: int, elapsed_s: float) -> int:
+        """Frame lengths between two frames; frames that the camera dropped have no number, but take time."""
+        by_time = round(elapsed_s / self._frame_s) if np.isfinite(self._frame_s) and self._frame_s > 0 else 0
+        return max(by_time, frame - number)
+
+    def _measure(self, frame: int, time_s: float, slot: float) -> None:
+        assert self._last is not None
+        number, at_s, before = self._last
+        if frame - number == 1 and time_s > at_s:
+            self._frame_s = min(self._frame_s, time_s - at_s)
+        period = (slot - before) / max(self._frames_since(number, frame, time_s - at_s), 1)
+        self._period = period if self._period is None else self._period + _PERIOD_SHARE * (period - self._period)
+
+
+class BurstPhase:
+    """Which copies begin a burst: copies of one burst are alike, copies of different bursts are not.
+
+    Args:
+        repeats: copies of a burst.
+    """
+
+    def __init__(self, repeats: int) -> None:
+        self._repeats = repeats
+        self._score = np.zeros(repeats)
+        self._copies: dict[int, FloatArray] = {}
+
+    @property
+    def settled(self) -> bool:
+        """Whether the phase is beyond doubt."""
+        if self._repeats == 1:
+            return True
+        rival, best = np.sort(self._score)[-2:]
+        return bool(best - rival > _SETTLED)
+
+    def burst_of(self, copies: IntArray) -> IntArray:
+        """Number of the burst of each copy, by its number in the clip."""
+        return np.asarray((copies + int(self._score.argmax())) // self._repeats, np.int64)
+
+    def take(self, first_copy: int, llr: FloatArray) -> None:
+        """Compare the copies of a frame with one another and with those before.
+
+        Args:
+            first_copy: number of the first one.
+            llr: (n_copies, C, packet) log-odds of their slots, 0 where not seen.
+        """
+        llr = np.clip(llr, -_SURE, _SURE)
+        for copy, slots in enumerate(llr, first_copy):
+            for other in range(copy - self._repeats + 1, copy):
+                if other in self._copies:
+                    self._compare(other, copy, _alike(self._copies[other], slots))
+            self._copies[copy] = self._copies[copy] + slots if copy in self._copies else slots
+        self._copies = {c: s for c, s in self._copies.items() if c > first_copy + len(llr) - 1 - self._repeats}
+
+    def _compare(self, first: int, second: int, alike: float) -> None:
+        phases = np.arange(self._repeats)
+        same = (first + phases) // self._repeats == (second + phases) // self._repeats
+        self._score += np.where(same, alike / 2, -alike / 2)
+
+
+def _alike(first: FloatArray, second: FloatArray) -> float:
+    """Log-likelihood ratio of two copies (C, packet) being the same packet against different ones."""
+    payload = np.s_[:, PREAMBLE_SLOTS:]
+    first, second = first[payload], second[payload]
+    both = (first != 0) & (second != 0)
+    p, q = 1 / (1 + np.exp(-first)), 1 / (1 + np.exp(-second))
+    lit = np.clip((p * both).sum(axis=1) / np.maximum(both.sum(axis=1), 1), 0.1, 0.9)[:, None]
+    ratio = p * q / lit + (1 - p) * (1 - q) / (1 - lit)
+    return float((np.log(ratio) * both).sum())
+
+
+@dataclass(frozen=True, slots=True)
+class FrameBursts:
+    """What a frame sees of its bursts."""
+
+    frame: int
+    #: Number of the frame's copy 0 in the clip.
+    first_copy: int
+    clock: Clock
+    #: (C, N + memory, patterns).
+    metrics: FloatArray
+    #: (n_copies, C, packet) int: 1 where the slot is on the screen and in the picture.
+    shown: IntArray
+
+
+@dataclass(slots=True)
+class _Burst:
+    metrics: FloatArray
+    seen: IntArray
+    frames: list[int] = field(default_factory=list)
+    #: (C,) columns that need no further look, and all columns' posteriors, once detected.
+    certain: BoolArray | None = None
+    posteriors: BurstPosteriors | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ClosedBurst:
+    """A burst with all that the frames saw of it."""
+
+    #: Number in the clip.
+    number: int
+    #: Of this burst alone.
+    posteriors: BurstPosteriors
+    #: (C, packet) how often each slot was seen.
+    seen: IntArray
+    frames: tuple[int, ...]
+
+
+class Bursts:
+    """The bursts that are still going on, with what the frames saw of them added up."""
+
+    def __init__(self) -> None:
+        self._open: dict[int, _Burst] = {}
+        self._closed = -1
+
+    def add(self, view: FrameBursts, numbers: IntArray, metrics: FloatArray) -> None:
+        """Take what a frame sees.
+
+        Args:
+            view: the frame.
+            numbers: (B,) numbers of its bursts.
+            metrics: (B, C, packet + memory, patterns).
+        """
+        for burst, number in enumerate(numbers):
+            if number <= self._closed:
+                continue
+            seen = view.shown[view.clock.burst == burst].sum(axis=0)
+            have = self._open.get(int(number))
+            if have is None:
+                self._open[int(number)] = _Burst(metrics[burst].copy(), seen, [view.frame])
+                continue
+            have.metrics += metrics[burst]
+            have.seen = have.seen + seen
+            have.frames.append(view.frame)
+
+    def is_open(self, number: int) -> bool:
+        """Whether the burst can still be added to."""
+        return number in self._open
+
+    def metrics(self, numbers: IntArray) -> FloatArray:
+        """(B, C, packet + memory, patterns) of open bursts, all frames added."""
+        return np.stack([self._open[int(n)].metrics for n in numbers])
+
+    def seen(self, numbers: IntArray) -> IntArray:
+        """(B, C, packet) how often each slot was seen."""
+        return np.stack([self._open[int(n)].seen for n in numbers])
+
+    def certain(self, numbers: IntArray) -> BoolArray:
+        """(B, C) columns that were certain before this frame."""
+        none = np.zeros(next(iter(self._open.values())).seen.shape[0], bool)
+        known = [self._open[int(n)].certain for n in numbers]
+        return np.stack([none if k is None else k for k in known])
+
+    def note(self, numbers: IntArray, posteriors: BurstPosteriors, certain: BoolArray) -> None:
+        """Keep what was detected of open bursts; `certain` is (B, C)."""
+        for burst, number in enumerate(numbers):
+            entry = self._open[int(number)]
+            entry.posteriors = _one_burst(posteriors, burst)
+            entry.certain = certain[burst]
+
+    def known(self, number: int) -> BurstPosteriors | None:
+        """What was last detected of an open burst."""
+        return self._open[number].posteriors
+
+    def close(self, numbers: IntArray) -> list[ClosedBurst]:
+        """Take bursts out, in time order; nothing that comes later is added to them, nor to any before."""
+        if len(numbers):
+            self._closed = max(self._closed, int(numbers.max()))
+        entries = [(int(n), self._open.pop(int(n), None)) for n in np.sort(numbers)]
+        return [
+            ClosedBurst(number, entry.posteriors, entry.seen, tuple(entry.frames))
+            for number, entry in entries
+            if entry is not None and entry.posteriors is not None
+        ]
+
+
+def _one_burst(posteriors: BurstPosteriors, burst: int) -> BurstPosteriors:
+    part = slice(burst, burst + 1)
+    return replace(
+        posteriors,
+        lit=posteriors.lit[part],
+        index=posteriors.index[part],
+        log_prob=posteriors.log_prob[part],
+        bit_llr=posteriors.bit_llr[part],
+    )
