@@ -50,12 +50,14 @@ _OCTAVE, _OCTAVE_ROWS = (2.4, 4.8), 76
 _HALF_WIDTH = (0.5, 1.8)
 #: Copies further apart than this many slots are not compared: the grid of rows per slot would have to be too fine.
 _SCAN_SLOTS = 700
+#: Rows per slot this close, relative, are one hypothesis.
+_ALIKE_ROWS = 0.015
 #: Hypotheses that are tried.
 _TRIALS = 24
 #: Any window of this many slots holds a lit and a dark one.
 _EXTREMES_SLOTS = 19
 #: Log-likelihood ratio of header and weights, over chance, that a clock must reach.
-MIN_EVIDENCE = 12.0
+MIN_EVIDENCE = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -436,8 +438,7 @@ def find_clocks(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesi
 
 
 def _alike(one: Hypothesis, other: Hypothesis) -> bool:
-    same = one.packet_slots == other.packet_slots and one.reversed == other.reversed
-    return same and abs(np.log(one.rows_per_slot / other.rows_per_slot)) < 0.015
+    return one.packet_slots == other.packet_slots and _same_slots(one, other)
 
 
 def _scan_octave(octave: _Octave, n_rows: int, packet_lengths: Sequence[int]) -> list[Hypothesis]:
@@ -935,7 +936,9 @@ def _is_bent(timing: _Timing) -> bool:
 #: A bend that fits this many nats better than none is tried; from the second on, it alone.
 _BEND_GAINS = (5.0, 25.0)
 #: Hypotheses that are refined, and the share of the best one's evidence that another needs.
-_REFINED, _CLOSE_EVIDENCE = 2, 0.5
+_REFINED, _CLOSE_EVIDENCE = 3, 0.3
+#: Below this evidence, more of them.
+_WEAK_EVIDENCE, _REFINED_IF_WEAK = 120.0, 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -966,17 +969,37 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     found = [(clock, b) for b in bends for clock in find_clocks(straightened(strips, b), sorted(rates))]
     found.sort(key=lambda pair: -pair[0].evidence)
     estimates: list[BlindEstimate] = []
-    for clock, b in found[:1] + [pair for pair in found[1:_REFINED] if _worth_refining(pair[0], found[0][0])]:
+    for clock, b in _worth_refining(found):
         exposure = exposure_s * rates[clock.packet_slots] if exposure_s else None
         estimates.append(refine(strips, clock, b, exposure))
-    best = max(estimates, key=lambda estimate: estimate.evidence, default=None)
+    best = max(estimates, key=lambda estimate: _plausibility(estimate, strips, estimates[0]), default=None)
     if best is None or best.evidence < MIN_EVIDENCE:
         return BlindSearch(None, why_not(strips))
     return BlindSearch(best)
 
 
-def _worth_refining(clock: Hypothesis, best: Hypothesis) -> bool:
-    return clock.evidence > _CLOSE_EVIDENCE * best.evidence or best.evidence < 2 * MIN_EVIDENCE
+def _worth_refining(found: list[tuple[Hypothesis, FloatArray]]) -> list[tuple[Hypothesis, FloatArray]]:
+    """The best hypothesis, and others of another period, direction or bend that come close."""
+    chosen: list[tuple[Hypothesis, FloatArray]] = []
+    most = _REFINED_IF_WEAK if found and found[0][0].evidence < _WEAK_EVIDENCE else _REFINED
+    for clock, bend in found:
+        if len(chosen) == most or clock.evidence < _CLOSE_EVIDENCE * found[0][0].evidence:
+            break
+        # The same rows per slot with another length of packet: the one with more evidence is already there.
+        if not any(_same_slots(clock, other) and bend is b for other, b in chosen):
+            chosen.append((clock, bend))
+    return chosen or found[:1]
+
+
+def _same_slots(one: Hypothesis, other: Hypothesis) -> bool:
+    near = abs(np.log(one.rows_per_slot / other.rows_per_slot)) < _ALIKE_ROWS
+    return near and one.reversed == other.reversed
+
+
+def _plausibility(estimate: BlindEstimate, strips: Strips, first: BlindEstimate) -> float:
+    """Evidence of the slots' structure and of the light that they explain, nats."""
+    slots = strips.n_columns * strips.rows.size / first.rows_per_slot
+    return estimate.evidence - 0.5 * slots / _ALIKE * float(np.log(max(1 - estimate.explained, 1e-3)))
 
 
 def lens_of(estimate: BlindEstimate, width: int, height: int) -> Lens | None:
@@ -1120,7 +1143,7 @@ def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
     product = summed(level[:-step] * level[step:])
     power = np.sqrt(summed(level[:-step] ** 2) * summed(level[step:] ** 2))
     likeness = np.median(product / np.maximum(power, 1e-9), axis=0)
-    lit = summed(weight).max(axis=0) > 0.05 * strips.rows.size / _LIKENESS_BANDS
+    lit = summed(weight).max(axis=0) > 0.2 * strips.rows.size / _LIKENESS_BANDS
     lit |= summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / _LIKENESS_BANDS
     return np.asarray(likeness), np.asarray(lit)
 
