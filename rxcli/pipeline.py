@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -132,8 +133,26 @@ def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[Frame
 
     A clip's result may come some frames later than the frame, because a packet stands in the last frame that shows it.
     """
-    for frame in frames:
-        yield _receive_frame(frame, options)
+    with closing(_iterator(frames)) as source:
+        first = next(source, None)
+        if first is None:
+            return
+        try:
+            second = next(source, None)
+        except Exception:
+            yield _receive_frame(first, options)
+            raise
+        if second is None:
+            yield _receive_frame(first, options)
+            return
+        from rxcli.clip import receive_clip
+
+        yield from receive_clip(chain((first, second), source), options)
+
+
+def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
+    """The frames as a generator, whose end also ends theirs: a file is closed when reception is left early."""
+    yield from frames
 
 
 def denoiser_scene(frame: Frame, options: ReceiverOptions) -> denoise.Scene | None:
