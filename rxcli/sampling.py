@@ -231,7 +231,13 @@ def _noise_model(cells: Float32Array) -> tuple[float, float]:
 
 
 def _floor_and_slope(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[float, float]:
-    floor = float(max(y[: max(1, y.size // 4)].mean(), 1e-10))
-    excess = x - x[0]
-    slope = float(np.median(np.divide(y - floor, excess, out=np.zeros_like(y), where=excess > 1e-4)))
-    return floor, max(slope, 0.0)
+    """Line through bins of light and variance: slope by a median over pairs, weighted by their distance."""
+    run, rise = x[:, None] - x, y[:, None] - y
+    apart = run > 1e-4
+    slopes, weights = rise[apart] / run[apart], run[apart]
+    order = np.argsort(slopes)
+    reached = np.cumsum(weights[order])
+    slope = float(slopes[order[np.searchsorted(reached, reached[-1] / 2)]]) if order.size else 0.0
+    slope = max(slope, 0.0)
+    dark = slice(0, max(1, y.size // 4))
+    return float(max((y[dark] - slope * x[dark]).mean(), 1e-10)), slope
