@@ -1,4 +1,4 @@
-"""The headline table: error beside both yardsticks, run time beside the bare decode, and stability, in three minutes."""
+"""The headline: error beside both yardsticks, run time beside the bare decode, and stability, in three minutes."""
 
 from __future__ import annotations
 

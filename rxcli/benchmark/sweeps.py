@@ -262,6 +262,19 @@ def _reported(result: FrameResult) -> int:
     return sum(len(column.packets) for column in result.columns)
 
 
+def _packet_clusters(scores: Sequence[Score]) -> tuple[list[float], list[float]]:
+    """Wrong bits and bits of every packet, as far as scores tell: those that are neither lost nor right are alike."""
+    errors: list[float] = []
+    sizes: list[float] = []
+    for score in scores:
+        if score.expected:
+            wrong = score.expected - score.lost - score.error_free
+            errors += [score.lost_bits / 2 / max(score.lost, 1)] * score.lost + [0.0] * score.error_free
+            errors += [score.bit_errors / max(wrong, 1)] * wrong
+            sizes += [score.bits / score.expected] * score.expected
+    return errors, sizes
+
+
 @dataclass(frozen=True)
 class Summary:
     """What one method made of all frames of a point."""
@@ -277,9 +290,16 @@ class Summary:
 
     @property
     def ber_interval(self) -> tuple[float, float]:
-        """Wilson interval of the bit error rate; the bits of a frame hang together, so that frames are clusters."""
-        errors = [o.score.bit_errors + o.score.lost_bits / 2 for o in self.outcomes]
-        return cluster_interval(errors, [o.score.bits for o in self.outcomes], units=self.score.expected)
+        """Wilson interval of the bit error rate.
+
+        Bits of a packet hang together, and so may packets of a frame: the wider of the two intervals that take packets
+        and frames as clusters.
+        """
+        scores = [outcome.score for outcome in self.outcomes]
+        errors = [score.bit_errors + score.lost_bits / 2 for score in scores]
+        by_frame = cluster_interval(errors, [score.bits for score in scores], self.score.expected)
+        by_packet = cluster_interval(*_packet_clusters(scores), self.score.expected)
+        return min(by_frame[0], by_packet[0]), max(by_frame[1], by_packet[1])
 
     def median_ms(self, stage: str = "total") -> float | None:
         """Median over the frames of the wall time of one stage; None where no frame ran it."""
