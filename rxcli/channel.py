@@ -28,7 +28,7 @@ from rxcli.protocol import slot_patterns
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 #: Scales, in slots, over which the picture is predicted: fine texture to plain sky.
-PICTURE_SCALES = (0.3, 0.6, 1.2, 2.5, 6.0)
+PICTURE_SCALES = (0.3, 0.8, 2.5, 6.0)
 _QUICK_SCALES = (0.6, 1.2, 2.5)
 #: Prior of the predictions from both sides, from before, from after.
 _SIDES = (0.5, 0.25, 0.25)

@@ -422,8 +422,13 @@ def _iterate(lock: _Lock, seen: _Reception) -> _Reception:
         lit = channel.lit_on_grid(seen.posteriors, now)
         likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns)
         metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
+        before = seen.posteriors.index
         seen = _Reception(now, samples, _detect(metrics, now, model), snr, model, metrics)
-        columns = np.flatnonzero(_doubtful(seen, _CERTAIN))
+        doubtful = _doubtful(seen, _CERTAIN)
+        if iteration and before.shape == seen.posteriors.index.shape:
+            # What does not change any more will not do so later.
+            doubtful &= (before != seen.posteriors.index).any(axis=(0, 2))
+        columns = np.flatnonzero(doubtful)
         if columns.size == 0:
             break
         if iteration == 0:
