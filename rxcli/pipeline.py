@@ -46,7 +46,7 @@ _CERTAIN_AT_ONCE = -1e-6
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
 _HOPELESS_WEIGHT = 20.0
 #: Rounds of light model and detection from where the auto-encoder starts.
-_RESTART_ITERATIONS = 2
+_RESTART_ITERATIONS = 1
 #: A header peak less than this times the strongest rival is no lock.
 _MIN_LOCK = 1.6
 #: Orientations in which the readout runs along the columns' width.
@@ -463,6 +463,7 @@ def _second_opinion(
         log_odds = denoiser.slot_log_odds(_scene_of(seen), columns)
     except ReceiverError as error:
         return seen, frozenset(), {**report, "columns": 0, "message": str(error)}
+    seen = _with_bursts_of(seen, log_odds, lock.screen.repeats)
     again = _restart(seen, log_odds, columns)
     better = _evidence(again.metrics, seen) > _evidence(seen.metrics[columns], seen)
     kept = columns[better]
@@ -483,6 +484,14 @@ def _scene_of(seen: _Reception) -> denoise.Scene:
     model = seen.model
     lit = channel.lit_on_grid(seen.posteriors, seen.clock)
     return denoise.Scene(seen.samples, seen.clock, lit, model.floor, model.sigma, model.shot, model.spread)
+
+
+def _with_bursts_of(seen: _Reception, log_odds: Float32Array, repeats: int) -> _Reception:
+    """Bursts told apart by log-odds that no copy has lent to another; symbols detected anew where that moves them."""
+    now = clock.assign_bursts(seen.clock, log_odds, repeats)
+    if np.array_equal(now.burst, seen.clock.burst):
+        return seen
+    return replace(seen, clock=now, posteriors=_detect(seen.metrics, now, seen.model))
 
 
 def _restart(seen: _Reception, log_odds: Float32Array, columns: NDArray[np.int64]) -> channel.SlotLikelihoods:
