@@ -52,7 +52,7 @@ _DARK_FROM, _DARK_TO = 5.9, 7.1
 _DARK_MARGIN = 0.002
 
 #: Columns worked on at a time: what fits the cache.
-_COLUMNS_AT_A_TIME = 5
+_COLUMNS_AT_A_TIME = 3
 #: NumPy works outside the interpreter's lock; more threads than this gain nothing on a few columns.
 _THREADS = 2
 
@@ -362,9 +362,12 @@ def predict_picture(
             if len(best) <= side:
                 best.append(Prediction(guess, variance))
                 continue
-            better = variance < best[side].variance
-            np.copyto(best[side].picture, guess, where=better)
-            np.copyto(best[side].variance, variance, where=better)
+            # Arithmetic picks several times quicker than a masked copy.
+            better = (variance < best[side].variance).astype(np.float32)
+            guess -= best[side].picture
+            guess *= better
+            best[side].picture[...] += guess
+            np.minimum(best[side].variance, variance, out=best[side].variance)
     return best
 
 
@@ -387,19 +390,25 @@ def _sides(boxes: Float32Array, half: int, hole: int) -> tuple[Float32Array, Flo
 
 
 class _Texture:
-    """Relative variance of a prediction thereabouts, beyond the noise; averaged slot by slot, which is fine enough."""
+    """Relative variance of a prediction thereabouts, beyond the noise.
+
+    Every other sample tells it, averaged slot by slot, which is fine enough.
+    """
 
     def __init__(
         self, light: Float32Array, expected: Float32Array, valid: Float32Array, sigma: float, samples_per_slot: int
     ) -> None:
-        self._light, self._expected, self._q = light, expected * valid, samples_per_slot
-        count = self._around(valid)
+        self._q = samples_per_slot
+        self._step = 2 if samples_per_slot % 2 == 0 else 1
+        self._light = np.ascontiguousarray(light[..., :: self._step])
+        self._expected = expected[..., :: self._step] * valid[..., :: self._step]
+        count = self._around(np.ascontiguousarray(valid[..., :: self._step]))
         self._noise = np.float32(sigma * sigma) * count
         self._least = np.float32(1e-5) * count + np.float32(1e-9)
 
     def of(self, picture: Float32Array) -> Float32Array:
         """(C, S, n) relative variance of `picture`."""
-        predicted = picture * self._expected
+        predicted = picture[..., :: self._step] * self._expected
         residual = self._light - predicted
         error = self._around(np.square(residual, out=residual)) - self._noise
         power = self._around(np.square(predicted, out=predicted)) + self._least
@@ -407,7 +416,7 @@ class _Texture:
         return np.repeat(np.clip(error / power, np.float32(low), np.float32(high)), self._q, axis=-1)
 
     def _around(self, values: Float32Array) -> Float32Array:
-        return _box(_by_slot(values, self._q), _ERROR_SLOTS // 2)
+        return _box(_by_slot(values, self._q // self._step), _ERROR_SLOTS // 2)
 
 
 def _by_slot(values: Float32Array, samples_per_slot: int) -> Float32Array:
