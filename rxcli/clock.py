@@ -25,6 +25,12 @@ _CONTRAST_SIGMAS = 8.0
 _MAX_DELAY_SLOTS = 2.0
 #: Slots are taken to be at most this sure when copies are compared.
 _SURE_LLR = 5.0
+#: Header correlation, added over the copies, that a delay must win.
+_MIN_DELAY_LEAD = 0.3
+#: A lock below this may be one of columns that are spread in time.
+_SURE_LOCK = 2.5
+#: Weight of the first idea of a column's delay, as information: a standard deviation of a tenth of a slot.
+_DELAY_PRIOR = 100.0
 #: Largest correction of the clock at a time, slots.
 _MAX_CORRECTION = 0.25
 
@@ -172,6 +178,11 @@ def find_clock(
     start, lock = _comb(response, packet_slots * _SEARCH_SAMPLES)
     if not np.isfinite(start):
         return None
+    delays = _delays(pooled, weight, start, packet_slots)
+    many_delays = np.count_nonzero(delays) > delays.size / 4
+    if lock < _SURE_LOCK or many_delays:
+        spread = _spread_comb(pooled, weight, packet_slots * _SEARCH_SAMPLES)
+        start, lock, delays = spread if spread[1] > lock or many_delays else (start, lock, delays)
     row0 = top + start * step
     before = int(np.ceil((row0 - top) / rows_per_slot))
     n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))
@@ -185,7 +196,7 @@ def find_clock(
         n_slots=n_slots,
         first_slot=first_slot,
         burst=np.zeros(n_copies, np.int64),
-        delay_slots=_delays(pooled, weight, start, packet_slots),
+        delay_slots=delays,
         lock=lock,
     )
 
@@ -214,12 +225,38 @@ def _comb(response: FloatArray, period: int) -> tuple[float, float]:
     left, middle, right = score[best - 1], score[best], score[(best + 1) % period]
     bend = left - 2 * middle + right
     offset = 0.5 * (left - right) / bend if bend < 0 else 0.0
-    away = (
-        np.abs((np.arange(period) - best + period // 2) % period - period // 2)
-        > SLOTS_PER_SYMBOL * _SEARCH_SAMPLES // 4
-    )
-    rival = float(score[away].max(initial=0.0))
+    rival = float(score[_away(period, best)].max(initial=0.0))
     return best + float(np.clip(offset, -0.5, 0.5)), float(middle / max(rival, 1e-12))
+
+
+def _away(period: int, best: int, further: int = 0) -> BoolArray:
+    """(period,) samples that are further from `best` than a quarter of a header, and `further` samples."""
+    distance = np.abs((np.arange(period) - best + period // 2) % period - period // 2)
+    return np.asarray(distance > SLOTS_PER_SYMBOL * _SEARCH_SAMPLES // 4 + further)
+
+
+def _spread_comb(pooled: Float32Array, weight: Float32Array, period: int) -> tuple[float, float, FloatArray]:
+    """Start, lead and delays of columns whose headers lie too far apart to be seen in their mean.
+
+    Each column's own header correlation is folded; the start is where most columns have a peak within reach.
+    """
+    n_columns = pooled.shape[0]
+    responses = [header_response(pooled[c : c + 1], weight[c : c + 1], _SEARCH_SAMPLES) for c in range(n_columns)]
+    folded = np.zeros((n_columns, -(-pooled.shape[1] // period) * period))
+    folded[:, : pooled.shape[1]] = np.maximum(responses, 0)
+    folded = folded.reshape(n_columns, -1, period).sum(axis=1)
+    reach = int(_MAX_DELAY_SLOTS * _SEARCH_SAMPLES)
+    wrapped = np.pad(folded, ((0, 0), (reach, reach)), mode="wrap")
+    near = np.lib.stride_tricks.sliding_window_view(wrapped, 2 * reach + 1, axis=1)
+    score = (near.max(axis=2) ** 2).sum(axis=0)
+    start = int(score.argmax())
+    lock = score[start] / max(float(score[_away(period, start, 2 * reach)].max(initial=0.0)), 1e-12)
+    around = near[:, start]
+    best = around.argmax(axis=1)
+    delays = best + _parabola(around, best) - reach
+    sure = around[np.arange(n_columns), best] > _MIN_DELAY_LEAD
+    middle = float(np.median(delays[sure])) if sure.any() else 0.0
+    return (start + middle) % period, float(lock), np.where(sure, delays - middle, 0.0) / _SEARCH_SAMPLES
 
 
 def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slots: int) -> FloatArray:
@@ -235,7 +272,7 @@ def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slo
     score = (signal * template).sum(axis=(1, 3))
     best = score.argmax(axis=1)
     lead = score[np.arange(best.size), best] - score[:, reach]
-    moved = (lead > 0.3) & (best > 0) & (best < 2 * reach)
+    moved = (lead > _MIN_DELAY_LEAD) & (best > 0) & (best < 2 * reach)
     fine = best + _parabola(score, best)
     return np.where(moved, (fine - reach - (start - round(start))) / _SEARCH_SAMPLES, 0.0)
 
@@ -249,7 +286,7 @@ def _parabola(score: FloatArray, best: NDArray[np.int64]) -> FloatArray:
 
 
 def corrected(clock: Clock, timing: FloatArray) -> Clock:
-    """The clock moved by what the columns together say of its lateness.
+    """The clock moved by what the columns together say of its lateness; delays, where there are any, one by one.
 
     Args:
         clock: the clock.
@@ -257,7 +294,11 @@ def corrected(clock: Clock, timing: FloatArray) -> Clock:
     """
     numerator, denominator = timing.sum(axis=0)
     late = float(np.clip(numerator / denominator, -_MAX_CORRECTION, _MAX_CORRECTION)) if denominator > 0 else 0.0
-    return replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
+    moved = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
+    if not clock.delay_slots.any():
+        return moved
+    own = (timing[:, 0] - late * timing[:, 1]) / (timing[:, 1] + _DELAY_PRIOR)
+    return replace(moved, delay_slots=clock.delay_slots - np.clip(own, -_MAX_CORRECTION, _MAX_CORRECTION))
 
 
 def sample_slots(profiles: RowProfiles, clock: Clock, samples_per_slot: int) -> SlotSamples:
