@@ -107,10 +107,15 @@ def exposure_taps(exposure_slots: float, blur_slots: float, memory: int, samples
 
 
 def spread_matrix(n_strips: int, light_spread: float) -> FloatArray:
-    """(S, 3) light of columns -1, 0, +1 in each strip of a column, for a Gaussian of sigma `light_spread` pitches."""
+    """(S, 3) shares of columns -1, 0, +1 in the light of each strip, for a Gaussian of sigma `light_spread` pitches.
+
+    Shares, because the picture takes up any common factor; so a spread of 0 is no crosstalk, not no light.
+    """
     across = (np.arange(n_strips) + 0.5) / n_strips - 0.5
     distance = across[:, None] - np.arange(-1, 2)
-    return np.asarray(np.exp(-(distance**2) / (2 * max(light_spread, 1e-3) ** 2)))
+    exponent = -(distance**2) / (2 * max(light_spread, 1e-3) ** 2)
+    weight = np.exp(exponent - exponent.max(axis=1, keepdims=True))
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
 def estimate_floor(samples: SlotSamples, clock: Clock) -> float:
