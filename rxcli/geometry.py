@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.profiles import LensModel
-from rxcli.types import FloatArray, IntArray, Lens, Outlines
+from rxcli.types import BoolArray, FloatArray, IntArray, Lens, Outlines
 
 #: Rows of a picture for the viewer start at this stored corner: EXIF orientation -> order of the stored corners
 #: (top-left, top-right, bottom-right, bottom-left of the stored picture) as the viewer meets them.
@@ -131,9 +131,11 @@ def column_outlines(
     knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
     knot_x, knot_v = _edges_at(points, v, knots)
     edges_x = _between_knots(knot_x, knots, rows).astype(np.float32)
-    middle_v = _between_knots((knot_v[1:] + knot_v[:-1]) / 2, knots, rows)
-    in_picture = (edges_x >= 0) & (edges_x <= width - 1)
-    inside = (middle_v > 0) & (middle_v < 1) & in_picture[1:] & in_picture[:-1]
+    middle_v = (knot_v[1:] + knot_v[:-1]) / 2
+    inside = _rows_between(middle_v, knots, rows, 0.0, 1.0)
+    if knot_x.min() < 0 or knot_x.max() > width - 1:
+        in_picture = (edges_x >= 0) & (edges_x <= width - 1)
+        inside &= in_picture[1:] & in_picture[:-1]
     shape = (n_columns, n_strips, rows.size)
     sensor_row = None
     if lens is not None and lens.corrected:
@@ -163,6 +165,14 @@ def _between_knots(values: FloatArray, knots: IntArray, rows: IntArray) -> Float
     start = values[:, left]
     start += (values[:, right] - start) * part
     return start
+
+
+def _rows_between(values: FloatArray, knots: IntArray, rows: IntArray, low: float, high: float) -> BoolArray:
+    """(n, rows) where values (n, knots), monotonic along the knots, lie strictly between `low` and `high`."""
+    step = 1 if values[0, -1] > values[0, 0] else -1
+    beyond = (-np.inf * step, np.inf * step)
+    ends = np.array([np.interp([low, high], line[::step], knots[::step], *beyond) for line in values])
+    return np.asarray((rows > ends.min(axis=1)[:, None]) & (rows < ends.max(axis=1)[:, None]))
 
 
 def _sensor_rows(edges_x: FloatArray, knots: IntArray, lens: Lens) -> FloatArray:
