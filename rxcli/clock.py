@@ -23,12 +23,18 @@ _EXTREMES_SLOTS = 19
 #: Contrast that half-convinces, over the noise of a sample.
 _CONTRAST_SIGMAS = 8.0
 _MAX_DELAY_SLOTS = 2.0
+#: Light beyond this many times white is no measurement.
+_MOST_LIGHT = 1e3
 #: Slots are taken to be at most this sure when copies are compared.
 _SURE_LLR = 5.0
-#: Header correlation, added over the copies, that a delay must win.
+#: Without delays, no more than this share of the columns seems to be off by more than so many slots.
+_MANY, _SAME_DELAY = 0.25, 0.12
+#: Header correlation, added over the copies, that the delay of a single column must win.
 _MIN_DELAY_LEAD = 0.3
 #: A lock below this may be one of columns that are spread in time.
 _SURE_LOCK = 2.5
+#: Columns without delays differ by less than this many slots (root mean square) in the light model's view.
+_SAME_TIMING = 0.03
 #: Weight of the first idea of a column's delay, as information: a standard deviation of a tenth of a slot.
 _DELAY_PRIOR = 100.0
 #: Largest correction of the clock at a time, slots.
@@ -40,10 +46,10 @@ def halved_strips(profiles: RowProfiles) -> RowProfiles:
     n_strips = profiles.light.shape[1]
     if n_strips % 2:
         return profiles
-    rows = profiles.sensor_row
+    rows, light = profiles.sensor_row, _bounded(profiles.light)
     return replace(
         profiles,
-        light=(profiles.light[:, ::2] + profiles.light[:, 1::2]) * np.float32(0.5),
+        light=(light[:, ::2] + light[:, 1::2]) * np.float32(0.5),
         inside=profiles.inside[:, ::2] & profiles.inside[:, 1::2],
         sensor_row=None if rows is None else (rows[:, ::2] + rows[:, 1::2]) / 2,
         count=profiles.count[:, ::2] + profiles.count[:, 1::2],
@@ -65,7 +71,7 @@ def resample(
         (C, S, n_samples) float32 light, 0 where not valid; and 1 where a sample lies on the screen altogether, else 0.
     """
     borders = row0 + rows_per_sample * np.arange(n_samples + 1, dtype=np.float64)
-    light = profiles.light.reshape(-1, profiles.light.shape[-1])
+    light = _bounded(profiles.light.reshape(-1, profiles.light.shape[-1]))
     first, stop = _shown_rows(profiles.inside.reshape(light.shape))
     positions = _row_positions(profiles, borders)
     widths = np.diff(positions, axis=-1)
@@ -75,6 +81,13 @@ def resample(
     mean *= valid
     shape = (*profiles.light.shape[:2], n_samples)
     return mean.astype(np.float32).reshape(shape), valid.astype(np.float32).reshape(shape)
+
+
+def _bounded(light: Float32Array) -> Float32Array:
+    """Light with what no sensor delivers taken as dark: one NaN would spoil every sum after it."""
+    if float(np.abs(light).max(initial=0.0)) <= _MOST_LIGHT:
+        return light
+    return np.where(np.abs(light) <= _MOST_LIGHT, light, np.float32(0))
 
 
 def _shown_rows(inside: BoolArray) -> tuple[IntArray, IntArray]:
@@ -179,7 +192,7 @@ def find_clock(
     if not np.isfinite(start):
         return None
     delays = _delays(pooled, weight, start, packet_slots)
-    many_delays = np.count_nonzero(delays) > delays.size / 4
+    many_delays = np.count_nonzero(delays) > delays.size * _MANY
     if lock < _SURE_LOCK or many_delays:
         spread = _spread_comb(pooled, weight, packet_slots * _SEARCH_SAMPLES)
         start, lock, delays = spread if spread[1] > lock or many_delays else (start, lock, delays)
@@ -271,10 +284,12 @@ def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slo
     signal = (pooled * share)[:, np.clip(index, 0, n - 1)] * seen
     score = (signal * template).sum(axis=(1, 3))
     best = score.argmax(axis=1)
-    lead = score[np.arange(best.size), best] - score[:, reach]
-    moved = (lead > _MIN_DELAY_LEAD) & (best > 0) & (best < 2 * reach)
-    fine = best + _parabola(score, best)
-    return np.where(moved, (fine - reach - (start - round(start))) / _SEARCH_SAMPLES, 0.0)
+    fine = (best + _parabola(score, best) - reach - (start - round(start))) / _SEARCH_SAMPLES
+    top = score[np.arange(best.size), best]
+    strong = top > 0.5 * np.median(top)
+    scattered = np.mean(np.abs(fine[strong]) > _SAME_DELAY) > _MANY if strong.any() else False
+    moved = (top - score[:, reach] > _MIN_DELAY_LEAD) | scattered
+    return np.where(moved & strong & (best > 0) & (best < 2 * reach), fine, 0.0)
 
 
 def _parabola(score: FloatArray, best: NDArray[np.int64]) -> FloatArray:
@@ -295,9 +310,9 @@ def corrected(clock: Clock, timing: FloatArray) -> Clock:
     numerator, denominator = timing.sum(axis=0)
     late = float(np.clip(numerator / denominator, -_MAX_CORRECTION, _MAX_CORRECTION)) if denominator > 0 else 0.0
     moved = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
-    if not clock.delay_slots.any():
-        return moved
     own = (timing[:, 0] - late * timing[:, 1]) / (timing[:, 1] + _DELAY_PRIOR)
+    if not clock.delay_slots.any() and np.sqrt(np.mean(own**2)) < _SAME_TIMING:
+        return moved
     return replace(moved, delay_slots=clock.delay_slots - np.clip(own, -_MAX_CORRECTION, _MAX_CORRECTION))
 
 
