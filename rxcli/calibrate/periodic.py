@@ -18,6 +18,8 @@ _PAD = 8
 #: Harmonics looked at in the search, and numbers of them tried in the fit.
 _SEARCH_HARMONICS = 12
 _HARMONICS = (1, 2, 3, 5, 7, 10, 14, 20, 28)
+#: Slow terms while the number of harmonics is chosen.
+_AMPLE_SLOW = 8
 #: Highest frequency searched, cycles per row: beyond it a period has too few rows to be told from its alias.
 MAX_FREQUENCY = 0.45
 #: Share of the variance that a harmonic must explain to pay for itself in the search.
@@ -49,8 +51,12 @@ class PeriodicFit:
     n_rows: int
     #: Share of the variance about the slow part that the stripes explain.
     explained: float
-    #: Bayesian information criterion of the fit; lower is better.
-    bic: float
+    #: Sum of squared residuals, number of parameters, and how many independent values the residual is worth.
+    rss: float
+    n_parameters: int
+    #: Terms of the slow mean, and of the envelope.
+    n_slow: int
+    n_effective: float
     #: (n_rows,) slow mean and envelope of the stripes, profile units.
     mean: FloatArray
     envelope: FloatArray
@@ -61,6 +67,16 @@ class PeriodicFit:
     def periods(self) -> float:
         """Periods in the rows fitted."""
         return self.frequency * self.n_rows
+
+    def beats(self, other: PeriodicFit) -> bool:
+        """Whether this fit is better by the Bayesian information criterion, as coloured noise allows.
+
+        The richer fit's residual says how many values are independent; counting all of them would let harmonics
+        follow slow noise.
+        """
+        richer = self if self.n_parameters >= other.n_parameters else other
+        gain = float(np.log(max(other.rss, 1e-300) / max(self.rss, 1e-300))) * richer.n_effective
+        return gain > (self.n_parameters - other.n_parameters) * float(np.log(self.n_rows))
 
     def waveform(self, rows: FloatArray) -> FloatArray:
         """The periodic part at `rows`, in units of the profile where the envelope is 1."""
@@ -87,7 +103,7 @@ def whitened_power(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
     taper = np.hanning(n)
     power = np.abs(np.fft.rfft(_detrend(profiles) * taper, _PAD * n)) ** 2
     frequency = np.fft.rfftfreq(_PAD * n)
-    low, high = (frequency > 3 / n) & (frequency < 0.1), frequency > 0.3
+    low, high = (frequency > 3 / n) & (frequency < max(0.1, 6 / n)), frequency > 0.3
     scene = np.median(power[:, low] * frequency[low] ** 2, axis=1, keepdims=True) / np.log(2)
     white = np.median(power[:, high], axis=1, keepdims=True) / np.log(2)
     floor = np.finfo(float).eps * power.max(axis=1, keepdims=True) + 1e-300
@@ -157,62 +173,76 @@ def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -
     """
     n = profile.size
     candidates = sorted((frequency * ratio for ratio in (3, 2, 1, 1 / 2, 1 / 3)), reverse=True)
-    fits = [fit_periodic(profile, f, first_row) for f in candidates if 1.5 / n <= f <= MAX_FREQUENCY]
+    # With one limit for all, or the slow part of a fast candidate would follow the stripes themselves.
+    most_slow = max(frequency * n, 2.0)
+    inside = [f for f in candidates if 1.5 / n <= f <= MAX_FREQUENCY]
+    fits = [fit_periodic(profile, f, first_row, most_slow) for f in inside]
     best: PeriodicFit | None = None
     for fit in fits:
         if fit is None:
             continue
-        if best is None or (fit.bic < best.bic and fit.explained > best.explained * (1 + _SUBHARMONIC_SHARE)):
+        if best is None or (fit.beats(best) and fit.explained > best.explained * (1 + _SUBHARMONIC_SHARE)):
             best = fit
     return best
 
 
-def fit_periodic(profile: FloatArray, frequency: float, first_row: int = 0) -> PeriodicFit | None:
+def fit_periodic(
+    profile: FloatArray, frequency: float, first_row: int = 0, most_slow: float = np.inf
+) -> PeriodicFit | None:
     """Maximum-likelihood fit near `frequency`; the numbers of harmonics and of slow terms by information criterion.
 
     Args:
         profile: (n,) values.
         frequency: cycles per row, right to about a third of a cycle over the profile.
         first_row: row of the profile's first value.
+        most_slow: most terms of the slow mean and envelope.
     """
-    n_slow, *more_slow = _slow_terms(frequency * profile.size)
+    slow_terms = _slow_terms(min(frequency * profile.size, most_slow))
+    # A fall-off that is not followed passes for noise of long memory, in which harmonics drown.
+    ample = max(terms for terms in slow_terms if terms <= _AMPLE_SLOW)
     best: PeriodicFit | None = None
     worse = 0
     for n_harmonics in _HARMONICS:
         # One harmonic of a pulse may vanish, two in a row say that there are no more.
         if worse == 2 or (n_harmonics > 1 and n_harmonics * frequency >= 0.5):
             break
-        fit = _fit_near(profile, frequency, n_harmonics, n_slow, first_row)
-        better = fit is not None and (best is None or fit.bic < best.bic)
-        worse = 0 if better else worse + 1
-        if better:
-            best = fit
+        fit = _fit_near(profile, frequency, n_harmonics, ample, first_row)
+        if fit is not None and (best is None or fit.beats(best)):
+            best, worse = fit, 0
+        else:
+            worse += 1
     if best is None:
         return None
-    fits = [best]
-    for n_slow in more_slow:
-        fit = _fit_near(profile, best.frequency, best.cosines.size, n_slow, first_row)
-        fits += [] if fit is None else [fit]
-    return _choose_slow(fits)
+    fits = [_fit_near(profile, best.frequency, best.cosines.size, terms, first_row) for terms in slow_terms]
+    return _with_model_spread(profile, _choose_slow([fit for fit in fits if fit is not None] or [best]))
 
 
 def _choose_slow(fits: list[PeriodicFit]) -> PeriodicFit:
-    """The fit with the best number of slow terms (fewest first); what richer ones say adds to its uncertainty.
+    """The fit with the best number of slow terms; `fits` has the fewest first."""
+    best = fits[0]
+    for fit in fits[1:]:
+        if fit.beats(best):
+            best = fit
+    return best
+
+
+def _with_model_spread(profile: FloatArray, best: PeriodicFit) -> PeriodicFit:
+    """The fit with what richer envelopes would say added to its uncertainty.
 
     Over a few periods the envelope trades against the frequency, and the choice between envelopes is an error that
     the residual does not show.
     """
-    at = min(range(len(fits)), key=lambda i: fits[i].bic)
-    best = fits[at]
     if best.periods >= FEW_PERIODS:
         return best
-    spread = max(abs(fit.frequency - best.frequency) for fit in fits[at:])
+    richer = (best.n_slow + extra for extra in (1, 2))
+    fits = [_fit_near(profile, best.frequency, best.cosines.size, terms, best.first_row) for terms in richer]
+    spread = max((abs(fit.frequency - best.frequency) for fit in fits if fit is not None), default=0.0)
     return replace(best, frequency_sd=float(np.hypot(best.frequency_sd, spread)))
 
 
 def _slow_terms(periods: float) -> list[int]:
-    """Numbers of Chebyshev terms to try; at two a period the envelope could imitate the stripes."""
-    return [terms for terms in (2, 3, 4, 6, 8, 11, 16) if terms <= max(1.5 * periods, 2)]
+    """Numbers of Chebyshev terms to try; with two a period the envelope could imitate the stripes."""
+    return [terms for terms in (2, 3, 4, 6, 8, 11, 16) if terms <= max(periods, 2)]
 
 
 def _fit_near(
@@ -225,7 +255,7 @@ def _fit_near(
     model, jacobian = series.evaluate(state)
     rss = float(np.sum((profile - model) ** 2))
     for _ in range(12):
-        step = np.asarray(np.linalg.lstsq(jacobian, profile - model, rcond=1e-9)[0])
+        step = _solve(jacobian, jacobian.T @ (profile - model))
         state, model, jacobian, new_rss = series.descend(profile, state, step, rss)
         converged = rss - new_rss <= 1e-9 * rss
         rss = new_rss
@@ -245,7 +275,10 @@ def _fit_near(
         first_row=first_row,
         n_rows=n,
         explained=1 - rss / max(float(np.sum((profile - trend) ** 2)), 1e-300),
-        bic=n * float(np.log(max(rss, 1e-300) / n)) + state.size * float(np.log(n)),
+        rss=rss,
+        n_parameters=state.size,
+        n_slow=n_slow,
+        n_effective=_independent(profile - model),
         mean=mean,
         envelope=envelope,
         influence=influence,
@@ -271,7 +304,8 @@ class _Series:
     def start(self, profile: FloatArray, frequency: float) -> FloatArray:
         """Least squares with a constant envelope."""
         cosine, sine = self._waves(frequency)
-        linear = np.linalg.lstsq(np.hstack([self.slow, cosine, sine]), profile, rcond=1e-9)[0]
+        design = np.hstack([self.slow, cosine, sine])
+        linear = _solve(design, design.T @ profile)
         n_slow = self.slow.shape[1]
         return np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
 
@@ -309,10 +343,22 @@ class _Series:
         return trial, model, jacobian, new_rss
 
 
+def _solve(design: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution of the normal equations of `design` for the right-hand side, with columns brought to one scale.
+
+    A trace of damping keeps parameters that hardly matter (the envelope of a vanishing wave) where they are.
+    """
+    scale = np.linalg.norm(design, axis=0) + 1e-300
+    gram = (design / scale).T @ (design / scale)
+    gram[np.diag_indices_from(gram)] += 1e-10
+    return np.asarray(np.linalg.solve(gram, right / scale) / scale)
+
+
 def _influence(jacobian: FloatArray) -> FloatArray:
     """(n,) what a unit of noise in each row does to the frequency (the last parameter)."""
-    scale = np.linalg.norm(jacobian, axis=0) + 1e-300
-    return np.asarray(np.linalg.pinv(jacobian / scale, rcond=1e-9)[-1] / scale[-1])
+    last = np.zeros(jacobian.shape[1])
+    last[-1] = 1
+    return np.asarray(jacobian @ _solve(jacobian, last))
 
 
 def _noise_sd(influence: FloatArray, residual: FloatArray, n_parameters: int) -> float:
@@ -354,6 +400,24 @@ def scatter_sd(influence: FloatArray, profiles: FloatArray) -> float:
     return float(np.std(parts, ddof=1) / np.sqrt(sizes) * widening)
 
 
+def _independent(residual: FloatArray) -> float:
+    """Number of independent values that `residual` is worth (Bartlett).
+
+    Its autocorrelation counts up to where it first vanishes: beyond, a harmonic not yet fitted would pass for noise
+    of long memory.
+    """
+    power = float(residual @ residual)
+    if power <= 0:
+        return float(residual.size)
+    total = 0.0
+    for lag in range(1, min(residual.size // 4, 100)):
+        correlation = float(residual[lag:] @ residual[:-lag]) / power
+        if correlation < 1 / np.sqrt(residual.size):
+            break
+        total += correlation**2
+    return residual.size / (1 + 2 * total)
+
+
 def noise_spectrum(residual: FloatArray, n_fft: int) -> FloatArray:
     """(n_fft,) power spectrum of the autoregressive process that fits `residual` (Yule-Walker)."""
     order = int(np.clip(residual.size // 20, 1, 12))
@@ -388,7 +452,7 @@ def explained_share(profiles: FloatArray, template: FloatArray) -> tuple[FloatAr
 
 def significant(fit: PeriodicFit) -> bool:
     """Whether a fit is stripes and not a scene: a few waves that fit badly are found in any picture."""
-    return fit.explained > float(np.interp(fit.periods, [FEW_PERIODS, 2 * FEW_PERIODS], [0.9, 0.5]))
+    return fit.explained > float(np.interp(fit.periods, [2, 4, FEW_PERIODS, 2 * FEW_PERIODS], [0.985, 0.97, 0.93, 0.5]))
 
 
 def longest_block(members: BoolArray) -> tuple[int, int]:

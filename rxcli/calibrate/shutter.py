@@ -38,8 +38,8 @@ _STRIPS = 32
 #: Shortest side of a picture that is looked at, pixels.
 _MIN_SIDE = 24
 _MAX_LAMPS = 8
-#: Smallest region of a lamp, as a share of the picture, with many periods and with few.
-_MIN_AREA, _MIN_AREA_FEW = 0.003, 0.015
+#: Smallest region of a lamp, as a share of the picture, by its number of periods.
+_MIN_AREA = ((2.0, 4.0, 6.0, 12.0), (0.15, 0.05, 0.015, 0.003))
 _HINT = (
     "let the lamp fill more of the frame, shorten the exposure to well below half a period, and use the electronic "
     "shutter with HDR and flicker reduction off"
@@ -190,7 +190,8 @@ def _one_lamp(shares: FloatArray, members: BoolArray, area: float, fit: Periodic
     """
     few = fit.periods < 2 * FEW_PERIODS
     upside_down = int(np.sum(shares < -0.3))
-    return area >= (_MIN_AREA_FEW if few else _MIN_AREA) and not (few and 8 * upside_down > int(members.sum()))
+    least = float(np.interp(fit.periods, *_MIN_AREA))
+    return area >= least and not (few and 8 * upside_down > int(members.sum()))
 
 
 def _seed(strips: FloatArray, free: BoolArray) -> PeriodicFit | None:

@@ -1,0 +1,354 @@
+"""Line delay from blinking lamps: waveforms, regions, several lamps, refusals, intervals that hold."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from rxcli.calibrate.frames import light_of
+from rxcli.calibrate.periodic import explained_share, fit_fundamental, fit_periodic, longest_block, noise_spectrum
+from rxcli.calibrate.saving import profile_to_extend, with_mode, write_profile
+from rxcli.calibrate.shutter import calibrate_shutter, find_stripes
+from rxcli.cli.main import run
+from rxcli.errors import ExitCode, ProfileError, ReceiverError, UsageError
+from rxcli.profiles import CameraProfile, ReadoutMode, load_profile
+from rxcli.types import Frame, Metadata, Mosaic
+
+LINE_DELAY_S = 20e-6
+
+
+def lamp(frequency_hz: float, n_rows: int, exposure_s: float, duty: float | None = 0.5, phase: float = 0.3) -> Any:
+    """(n_rows,) light of a lamp, averaged over each row's exposure exactly; a sine where `duty` is None."""
+    start = np.arange(n_rows) * LINE_DELAY_S
+    if duty is None:
+        depth = np.sinc(frequency_hz * exposure_s)
+        return 0.5 + 0.5 * depth * np.sin(2 * np.pi * (frequency_hz * (start + exposure_s / 2) + phase))
+
+    def lit_until(t: Any) -> Any:
+        cycles = frequency_hz * t + phase
+        return (np.floor(cycles) * duty + np.minimum(cycles % 1, duty)) / frequency_hz
+
+    return (lit_until(start + exposure_s) - lit_until(start)) / exposure_s
+
+
+def scene(height: int, width: int) -> Any:
+    y, x = np.mgrid[0:height, 0:width]
+    return 1 - 0.3 * ((x / width - 0.4) ** 2 + (y / height - 0.5) ** 2)
+
+
+def spot(height: int, width: int, x: float, y: float, radius: float) -> Any:
+    yy, xx = np.mgrid[0:height, 0:width]
+    return np.exp(-0.5 * (((xx - x) / radius) ** 2 + ((yy - y) / radius) ** 2) ** 2)
+
+
+def exposed(light: Any, rng: np.random.Generator, noise: float = 0.01, gain: float = 0.6) -> Any:
+    """The picture of `light`: ambient light, shot and read noise, 8 bits."""
+    values = 0.02 + gain * light
+    values = values + noise * np.sqrt(0.1 + np.maximum(values, 0)) * rng.standard_normal(values.shape)
+    return np.round(255 * np.clip(values, 0, 1)) / 255
+
+
+def only(picture: Any, axis: Any = None) -> Any:
+    along, regions = find_stripes(picture, axis)
+    assert len(regions) == 1, [region.bounds for region in regions]
+    return along, regions[0]
+
+
+@pytest.mark.parametrize("duty", [None, 0.1, 0.2, 1 / 3, 0.5, 0.7, 0.9])
+@pytest.mark.parametrize("period", [7.7, 31.1, 97.3])
+def test_the_fundamental_is_found_for_every_waveform(duty: float | None, period: float) -> None:
+    frequency = 1 / (period * LINE_DELAY_S)
+    light = lamp(frequency, 800, 0.2 / frequency, duty)[:, None] * scene(800, 160)
+    along, found = only(exposed(light, np.random.default_rng(1)))
+    assert along == "rows"
+    assert found.period_px == pytest.approx(period, rel=2e-3)
+    assert abs(found.period_px - period) < 5 * found.period_sd_px
+
+
+def test_strong_harmonics_are_no_fundamental() -> None:
+    """Two thirds of the light in the third harmonic, and a second one stronger than the first."""
+    rng = np.random.default_rng(2)
+    phase = np.arange(900) / 90.0
+    for harmonics in ([0.4, 0.0, 0.9], [0.4, 0.8, 0.3], [1.0, 0.0, 0.3]):
+        wave = sum(a * np.sin(2 * np.pi * (k + 1) * phase + k) for k, a in enumerate(harmonics))
+        fit = fit_fundamental(1 + wave + 0.05 * rng.standard_normal(900), 3 / 90)
+        assert fit is not None
+        assert 1 / fit.frequency == pytest.approx(90, rel=2e-3)
+
+
+def test_columns_are_found_as_the_readout_axis() -> None:
+    light = (lamp(1200, 600, 1e-4)[:, None] * scene(600, 300)).T
+    along, found = only(exposed(light, np.random.default_rng(3)))
+    assert along == "columns"
+    assert found.period_px == pytest.approx(1 / 1200 / LINE_DELAY_S, rel=1e-3)
+    assert found.bounds == (0, 0, 600, 300)
+
+
+def test_a_spot_in_a_corner_is_enough() -> None:
+    light = lamp(2500, 800, 1e-4)[:, None] * spot(800, 600, 130, 600, 80)
+    _, found = only(exposed(light, np.random.default_rng(4)))
+    _, top, right, _ = found.bounds
+    assert found.period_px == pytest.approx(20, rel=5e-3)
+    assert right < 300
+    assert top > 400
+
+
+def test_lamps_of_different_frequency_each_have_their_region() -> None:
+    left = lamp(1000, 800, 1e-4)[:, None] * spot(800, 640, 150, 400, 130)
+    right = lamp(1370, 800, 1e-4, 0.3, 0.7)[:, None] * spot(800, 640, 490, 380, 130)
+    result = calibrate_shutter([exposed(left + right, np.random.default_rng(5))], [1370, 1000])
+    by_frequency = {reading.frequency_hz: reading.stripes for reading in result.lamps}
+    assert set(by_frequency) == {1000, 1370}
+    assert by_frequency[1000].bounds[2] <= 340
+    assert by_frequency[1370].bounds[0] >= 300
+    assert result.line_delay_s == pytest.approx(LINE_DELAY_S, rel=1e-3)
+    assert result.readout_s == pytest.approx(800 * LINE_DELAY_S, rel=1e-3)
+    assert not result.warnings
+
+
+def test_a_lamp_that_was_not_named_is_told() -> None:
+    big = lamp(1000, 800, 1e-4)[:, None] * spot(800, 640, 200, 400, 190)
+    small = lamp(1900, 800, 1e-4)[:, None] * spot(800, 640, 560, 400, 60)
+    result = calibrate_shutter([exposed(big + small, np.random.default_rng(6))], [1000])
+    assert result.line_delay_s == pytest.approx(LINE_DELAY_S, rel=2e-3)
+    assert any("1900" in warning or "190" in warning for warning in result.warnings)
+
+
+def textured(rng: np.random.Generator) -> Any:
+    """A picture with the spectrum of natural scenes."""
+    spectrum = np.fft.rfft2(rng.standard_normal((400, 300)))
+    frequency = np.hypot(np.fft.fftfreq(400)[:, None], np.fft.rfftfreq(300)[None])
+    values = np.fft.irfft2(spectrum / np.maximum(frequency, 1 / 400), (400, 300))
+    return np.clip(0.5 + 0.15 * values / values.std(), 0, 1)
+
+
+def test_no_stripes_are_found_where_there_are_none() -> None:
+    rng = np.random.default_rng(7)
+    tiles = np.indices((400, 300)) // 40
+    scenes = [textured(rng) for _ in range(6)]
+    scenes += [np.full((400, 300), 0.5) + 0.01 * rng.standard_normal((400, 300)), np.zeros((400, 300))]
+    scenes += [np.where((tiles[0] + tiles[1]) % 2, 0.8, 0.1), scene(400, 300), spot(400, 300, 150, 200, 60)]
+    assert [find_stripes(picture)[1] for picture in scenes] == [[]] * len(scenes)
+    with pytest.raises(ReceiverError, match="no stripes"):
+        calibrate_shutter(scenes, [1000])
+
+
+def test_stripes_are_found_on_a_textured_scene() -> None:
+    rng = np.random.default_rng(8)
+    light = lamp(1800, 400, 1e-4)[:, None] * (0.4 + textured(rng))
+    result = calibrate_shutter([exposed(light, rng)], [1800])
+    assert result.line_delay_s == pytest.approx(LINE_DELAY_S, rel=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("duty", "noise", "gain"), [(None, 0.1, 0.15), (0.5, 0.05, 0.5), (0.2, 0.2, 0.6), (None, 0.3, 0.4)]
+)
+def test_the_interval_holds_as_often_as_it_says(duty: float | None, noise: float, gain: float) -> None:
+    """Of 60 intervals of 95 % at least 51 hold (fewer: 1 in 2000), and they are not needlessly wide."""
+    deviations = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        period = 25 + rng.random()
+        light = lamp(1 / (period * LINE_DELAY_S), 400, 1e-4, duty, rng.random())
+        profile = exposed(light[:, None] * scene(400, 12), rng, noise, gain).mean(axis=1)
+        fit = fit_periodic(profile, 1 / 25.5)
+        assert fit is not None
+        deviations.append((fit.frequency - 1 / period) / fit.frequency_sd)
+    assert sum(abs(d) < 1.96 for d in deviations) >= 51
+    assert np.std(deviations) > 0.5
+
+
+def test_coloured_noise_widens_the_interval() -> None:
+    """Autoregressive noise: the interval must follow the noise's power at the stripes' own frequency."""
+    deviations = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        noise = rng.standard_normal(600)
+        for i in range(1, 600):
+            noise[i] += 0.9 * noise[i - 1]
+        fit = fit_periodic(10 * lamp(500, 600, 1e-4, None, rng.random()) + noise, 0.01)
+        if fit is not None:
+            deviations.append((fit.frequency - 0.01) / fit.frequency_sd)
+    assert len(deviations) >= 55
+    assert np.mean(np.abs(deviations) < 1.96) > 0.84
+
+
+def test_noise_spectrum_of_a_known_process() -> None:
+    rng = np.random.default_rng(9)
+    noise = rng.standard_normal(20_000)
+    for i in range(1, noise.size):
+        noise[i] += 0.8 * noise[i - 1]
+    found = noise_spectrum(noise, 256)
+    truth = 1 / np.abs(1 - 0.8 * np.exp(-2j * np.pi * np.arange(256) / 256)) ** 2
+    np.testing.assert_allclose(found, truth, rtol=0.2)
+
+
+def test_more_pictures_narrow_the_interval() -> None:
+    def picture(seed: int) -> Any:
+        rng = np.random.default_rng(seed)
+        return exposed(lamp(1000, 500, 1e-4, 0.5, rng.random())[:, None] * scene(500, 100), rng, 0.1)
+
+    one = calibrate_shutter([picture(0)], [1000])
+    many = calibrate_shutter([picture(seed) for seed in range(6)], [1000])
+    assert np.ptp(many.line_delay_interval_s) < 0.7 * np.ptp(one.line_delay_interval_s)
+    low, high = many.line_delay_interval_s
+    assert low - np.ptp([low, high]) < LINE_DELAY_S < high + np.ptp([low, high])
+
+
+@pytest.mark.parametrize("exposure_s", [1e-4, 2e-4])
+def test_exposure_from_the_edges(exposure_s: float) -> None:
+    light = lamp(800, 800, exposure_s)[:, None] * scene(800, 200)
+    result = calibrate_shutter([exposed(light, np.random.default_rng(10))], [800])
+    assert result.exposure_s == pytest.approx(exposure_s, rel=0.03)
+    assert result.exposure_interval_s is not None
+    assert result.exposure_interval_s[0] < result.exposure_s < result.exposure_interval_s[1]
+
+
+def test_the_files_exposure_decides_between_flash_and_exposure() -> None:
+    """A flash of 0.1 ms seen through 0.4 ms looks as a flash of 0.4 ms through 0.1 ms does."""
+    light = lamp(800, 800, 4e-4, 0.08)[:, None] * scene(800, 200)
+    picture = exposed(light, np.random.default_rng(11), gain=2.0)
+    assert calibrate_shutter([picture], [800]).exposure_s == pytest.approx(1e-4, rel=0.05)
+    assert calibrate_shutter([picture], [800], exif_exposure_s=1 / 2500).exposure_s == pytest.approx(4e-4, rel=0.05)
+
+
+def test_no_exposure_from_a_sine() -> None:
+    light = lamp(800, 800, 1e-4, None)[:, None] * scene(800, 200)
+    result = calibrate_shutter([exposed(light, np.random.default_rng(12))], [800])
+    assert result.exposure_s is None
+    assert result.exposure_note
+
+
+def test_cell_helpers() -> None:
+    wave = np.sin(np.arange(60) / 3.0)
+    share, amplitude = explained_share(np.array([2 * wave + 5, -wave, np.zeros(60)]), wave)
+    np.testing.assert_allclose(share, [1, -1, 0], atol=1e-9)
+    np.testing.assert_allclose(amplitude, [2, -1, 0], atol=1e-9)
+    members = np.array([[0, 1, 1, 1], [0, 1, 1, 0], [1, 1, 1, 0], [0, 1, 1, 0]], dtype=bool)
+    assert longest_block(members) == (1, 3)  # four strips of two blocks: 32; one strip of three: 27
+    assert longest_block(members[:3]) == (0, 3)
+    assert longest_block(np.zeros((2, 3), dtype=bool)) == (0, 0)
+
+
+def test_green_rows_of_a_mosaic_are_not_mixed() -> None:
+    pattern = np.array([[0, 1], [1, 2]], np.uint8)
+    rows = np.arange(8, dtype=np.uint16)[:, None] * np.ones((1, 6), np.uint16)
+    pixels = (1000 + 100 * rows).astype(np.uint16)
+    pixels[::2, ::2] = 4000  # red pixels, which a red lamp would saturate
+    frame = Frame(pixels, "x", mosaic=Mosaic(pattern, (2.0, 1.0, 1.5), (1000.0,) * 3, 5000.0))
+    np.testing.assert_allclose(light_of(frame), np.repeat(np.arange(8)[:, None] * 100 / 4000, 6, axis=1), rtol=1e-6)
+
+
+def test_light_undoes_tone_and_range() -> None:
+    frame = Frame(np.array([[16, 235, 126]], np.uint8), "x", black=16, white=235)
+    np.testing.assert_allclose(light_of(frame), [[0, 1, ((110 / 219 + 0.055) / 1.055) ** 2.4]], rtol=1e-5)
+    linear = Frame(np.array([[0, 128]], np.uint8), "x", linear=True)
+    np.testing.assert_allclose(light_of(linear), [[0, 128 / 255]], rtol=1e-5)
+
+
+def test_a_mode_replaces_that_of_its_size_and_keeps_the_rest(tmp_path: Path) -> None:
+    path = tmp_path / "cam.toml"
+    old = ReadoutMode(name="video", width=640, height=480, line_delay_s=1e-5, frame_rate_hz=30.0)
+    other = ReadoutMode(name="still", width=4000, height=3000, line_delay_s=1e-5)
+    profile = with_mode(with_mode(profile_to_extend(path, Metadata(make="A", model="B ")), old), other)
+    write_profile(profile, path)
+    new = ReadoutMode(name="640x480", width=640, height=480, line_delay_s=2e-5)
+    write_profile(with_mode(profile_to_extend(path), new), path)
+    saved = load_profile(str(path), CameraProfile)
+    assert saved.models == ("B",)
+    assert saved.mode_for(4000, 3000) == other
+    mode = saved.mode_for(640, 480)
+    assert mode is not None
+    assert (mode.line_delay_s, mode.frame_rate_hz, len(saved.modes)) == (2e-5, 30.0, 2)
+
+
+def test_a_profile_is_not_written_over_something_else(tmp_path: Path) -> None:
+    path = tmp_path / "notes.toml"
+    path.write_text("hello = 1")
+    with pytest.raises(ProfileError, match="notes"):
+        profile_to_extend(path)
+    with pytest.raises(UsageError, match="cannot name"):
+        profile_to_extend(tmp_path / "my camera.toml")
+
+
+@pytest.fixture
+def lamp_file(tmp_path: Path) -> str:
+    picture = exposed(lamp(1000, 480, 1e-4)[:, None] * scene(480, 200), np.random.default_rng(13))
+    path = tmp_path / "lamp.png"
+    encoded = np.where(picture <= 0.0031308, 12.92 * picture, 1.055 * picture ** (1 / 2.4) - 0.055)
+    Image.fromarray(np.round(255 * encoded).astype(np.uint8)).save(path)
+    return str(path)
+
+
+def test_command(lamp_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    profile = tmp_path / "cam.toml"
+    arguments = ["calibrate", "shutter", lamp_file, "--frequency", "1000"]
+    assert run([*arguments, "--json", "-", "--save", str(profile), "--mode", "clip"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["readout_s"] == pytest.approx(480 * LINE_DELAY_S, rel=2e-3)
+    assert record["readout_interval_s"][0] < record["readout_s"] < record["readout_interval_s"][1]
+    assert record["periods"] == pytest.approx(9.6, rel=0.01)
+    assert record["axis"] == "rows"
+    mode = load_profile(str(profile), CameraProfile).mode_for(200, 480)
+    assert mode is not None
+    assert mode.name == "clip"
+    assert mode.line_delay_s == pytest.approx(record["line_delay_s"], abs=0, rel=1e-12)
+    assert run([*arguments, "--region", "0,0,200,300"]) == 0
+    assert "ms over 480 rows" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("extra", "word"),
+    [
+        ([], "--frequency"),
+        (["--frequency", "0"], "--frequency"),
+        (["--frequency", "nan"], "--frequency"),
+        (["--frequency", "1000", "--region", "1,2"], "--region"),
+        (["--frequency", "1000", "--region", "900,900,100,100"], "region"),
+        (["--frequency", "1000", "--exposure", "3"], "--exposure"),
+        (["--frequency", "1000", "--save", "a.toml", "--name", "b"], "--name"),
+        (["--frequency", "1000", "--name", "a/b"], "--name"),
+    ],
+)
+def test_wrong_usage_is_one_line(
+    lamp_file: str, extra: list[str], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["calibrate", "shutter", lamp_file, *extra]) == ExitCode.USAGE
+    err = capsys.readouterr().err
+    assert word in err
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_refusals_and_unreadable_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dull = tmp_path / "dull.png"
+    Image.new("L", (200, 200), 99).save(dull)
+    assert run(["calibrate", "shutter", str(dull), "--frequency", "1000"]) == ExitCode.NOT_RECEIVED
+    assert "no stripes" in capsys.readouterr().err
+    assert run(["calibrate", "shutter", str(tmp_path / "absent.png"), "--frequency", "9"]) == ExitCode.UNREADABLE
+
+
+def test_rotated_pictures_give_no_mode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = exposed(lamp(1000, 480, 1e-4)[:, None] * scene(480, 200), np.random.default_rng(14)).T
+    path = tmp_path / "turned.png"
+    Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(path)
+    arguments = ["calibrate", "shutter", str(path), "--frequency", "1000"]
+    assert run([*arguments, "--save", str(tmp_path / "c.toml")]) == ExitCode.USAGE
+    assert not (tmp_path / "c.toml").exists()
+    capsys.readouterr()
+    assert run([*arguments, "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["axis"] == "columns"
+
+
+def test_nikon_led(shared_real: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = shared_real / "shutter" / "nikon_1j1_1000hz.png"
+    assert run(["calibrate", "shutter", str(path), "--frequency", "1000", "--json", "-"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["readout_s"] == pytest.approx(15.73e-3, rel=3e-3)
+    assert record["periods"] == pytest.approx(15.73, rel=3e-3)
+    assert record["axis"] == "rows"
+    assert record["exposure_s"] == pytest.approx(1 / 16000, rel=0.3)
