@@ -624,8 +624,8 @@ class _Timing:
     covariance: FloatArray
     exposure_slots: float
     exposure_sd: float
-    #: (C, N) bool: lit slots.
-    lit: BoolArray
+    #: Log-likelihood ratio of header and weights over chance.
+    evidence: float
     #: Share of the strips' local variance that the slots explain.
     explained: float
 
@@ -643,9 +643,8 @@ def refine(
     """
     ordered, bend = (in_readout_order(strips), _reversed_bend(bend)) if hypothesis.reversed else (strips, bend)
     ordered = _thinned(ordered, hypothesis.rows_per_slot)
-    timing, grid, corrected = _fit_timing(ordered, hypothesis, bend, exposure_slots)
+    timing, corrected = _fit_timing(ordered, hypothesis, bend, exposure_slots)
     found, sd = timing.values[2:], np.sqrt(np.diag(timing.covariance))
-    evidence = structure_evidence(timing.lit.astype(np.float64), grid.first_slot, hypothesis.packet_slots)
     return BlindEstimate(
         rows_per_slot=float(timing.values[1]),
         rows_per_slot_sd=float(sd[1]),
@@ -656,7 +655,7 @@ def refine(
         bend=_reversed_bend(found) if hypothesis.reversed else found,
         bend_sd=sd[2:],
         corrected=corrected,
-        evidence=evidence,
+        evidence=timing.evidence,
         explained=timing.explained,
     )
 
@@ -684,7 +683,7 @@ def _thinned(strips: Strips, rows_per_slot: float) -> Strips:
 
 def _fit_timing(
     strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None
-) -> tuple[_Timing, _Grid, bool]:
+) -> tuple[_Timing, bool]:
     """The row-time map, with a bend only where it is beyond doubt: one that is free for nothing blurs the period."""
     first_row = strips.rows[0] - 0.5 * (strips.rows[1] - strips.rows[0])
     before = int(hypothesis.start_row // hypothesis.rows_per_slot) + 2
@@ -693,10 +692,10 @@ def _fit_timing(
     values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
     bent = _descend(strips, grid, values, exposure_slots, n_free=6)
     if _is_bent(bent):
-        return bent, grid, True
+        return bent, True
     values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else bent.values * _FLAT
     flat = _descend(strips, grid, values, bent.exposure_slots, n_free=2)
-    return replace(flat, exposure_sd=bent.exposure_sd), grid, False
+    return replace(flat, exposure_sd=bent.exposure_sd), False
 
 
 def _descend(strips: Strips, grid: _Grid, values: FloatArray, exposure_slots: float | None, n_free: int) -> _Timing:
@@ -714,7 +713,10 @@ def _descend(strips: Strips, grid: _Grid, values: FloatArray, exposure_slots: fl
         moved = float(np.abs(_slot_time(strips, terms, values)[:, ::_BLOCK_ROWS] - time[:, ::_BLOCK_ROWS]).max())
         if moved < _CONVERGED and step >= max(_EXPOSURE_STEPS):
             break
-    return _Timing(values, covariance, exposure, exposure_sd, lit, explained)
+    # Headers that were taken as known are no evidence: they are looked at anew.
+    seen = _decide(waves, exposure, None).astype(np.float64)
+    evidence = structure_evidence(seen, grid.first_slot, grid.packet_slots)
+    return _Timing(values, covariance, exposure, exposure_sd, evidence, explained)
 
 
 def _time_terms(strips: Strips) -> FloatArray:
@@ -760,33 +762,36 @@ def _column_waves(strips: Strips, time: Float32Array, rows_per_slot: float) -> _
     return _Waves(value.astype(np.float32), total.reshape(value.shape).astype(np.float32))
 
 
-def _filled(waves: _Waves) -> tuple[Float32Array, Float32Array]:
-    """Slot means (C, N) and weights; where a slot has few rows its empty samples do not count."""
+def _slot_values(waves: _Waves) -> Float32Array:
+    """(C, N) mean of every slot."""
     shape = (waves.value.shape[0], -1, _SAMPLES)
     weight = waves.weight.reshape(shape)
-    total = weight.sum(axis=2)
-    return (waves.value.reshape(shape) * weight).sum(axis=2) / (total + np.float32(1e-3)), total
+    summed = (waves.value.reshape(shape) * weight).sum(axis=2)
+    return np.asarray(summed / (weight.sum(axis=2) + np.float32(1e-3)), np.float32)
 
 
-def _decide(waves: _Waves, exposure_slots: float, grid: _Grid) -> BoolArray:
-    """(C, N) lit slots: the nearer of the extremes, then with the neighbours' share through the exposure taken off."""
-    mean, _ = _filled(waves)
+def _decide(waves: _Waves, exposure_slots: float, grid: _Grid | None) -> BoolArray:
+    """(C, N) lit slots: the nearer of the extremes, then with the neighbours' share through the exposure taken off.
+
+    The headers of `grid` are taken as known; None where they are to be seen.
+    """
+    mean = _slot_values(waves)
     n = mean.shape[1]
     windows = np.pad(mean, ((0, 0), (_EXTREMES_SLOTS // 2, _EXTREMES_SLOTS // 2)), mode="edge")
     around = np.lib.stride_tricks.sliding_window_view(windows, _EXTREMES_SLOTS, axis=1)
     high, low = around.max(axis=2), around.min(axis=2)
     value = (2 * mean - high - low) / (high - low + np.float32(1e-3))
-    header, lit_header = grid.header(n)
+    header, lit_header = grid.header(n) if grid else (np.zeros(0, np.int64), np.zeros(0, bool))
     state = np.sign(value)
     state[:, header] = np.where(lit_header, 1, -1)
     taps = _slot_taps(exposure_slots)
     reach = taps.size // 2
-    for _ in range(4):
-        for parity in (0, 1):
-            padded = np.pad(state, ((0, 0), (reach, reach)))
-            others = sum(taps[k] * padded[:, k : k + n] for k in range(taps.size) if k != reach)
-            state[:, parity::2] = np.where(value - others >= 0, 1, -1)[:, parity::2]
-            state[:, header] = np.where(lit_header, 1, -1)
+    for sweep in range(8):
+        padded = np.pad(state, ((0, 0), (reach, reach)))
+        others = sum(taps[k] * padded[:, k : k + n] for k in range(taps.size) if k != reach)
+        turn = slice(sweep % 2, None, 2)
+        state[:, turn] = np.where(value - others >= 0, 1, -1)[:, turn]
+        state[:, header] = np.where(lit_header, 1, -1)
     return np.asarray(state > 0)
 
 
@@ -979,14 +984,13 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
 
 
 def _worth_refining(found: list[tuple[Hypothesis, FloatArray]]) -> list[tuple[Hypothesis, FloatArray]]:
-    """The best hypothesis, and others of another period, direction or bend that come close."""
+    """The best hypothesis, and others of another period, packet, direction or bend that come close."""
     chosen: list[tuple[Hypothesis, FloatArray]] = []
     most = _REFINED_IF_WEAK if found and found[0][0].evidence < _WEAK_EVIDENCE else _REFINED
     for clock, bend in found:
         if len(chosen) == most or clock.evidence < _CLOSE_EVIDENCE * found[0][0].evidence:
             break
-        # The same rows per slot with another length of packet: the one with more evidence is already there.
-        if not any(_same_slots(clock, other) and bend is b for other, b in chosen):
+        if not any(_alike(clock, other) and bend is b for other, b in chosen):
             chosen.append((clock, bend))
     return chosen or found[:1]
 
@@ -1095,7 +1099,7 @@ def camera_profile(
 # What cannot work -----------------------------------------------------------------------------------------------------
 
 #: Likeness of neighbouring strips, over the light's own variance, below which a picture has no stripes.
-_STRIPED = 0.15
+_STRIPED = 0.25
 #: Share of the screen's height that must be striped.
 _STRIPED_SHARE = 0.7
 _LIKENESS_BANDS = 16
@@ -1109,8 +1113,8 @@ def why_not(strips: Strips) -> str:
         return "the screen is dark; show a brighter picture or raise the exposure"
     if not striped.any():
         return (
-            "the screen shows no stripes; check that it sends, and take the picture with the electronic shutter, "
-            "HDR and night mode off (a mechanical or global shutter sees no slots)"
+            "the screen shows no stripes, or too faint ones; check that it sends, show a brighter picture, and take it with "
+            "the electronic shutter, HDR and night mode off (a mechanical or global shutter sees no slots)"
         )
     if striped[lit].mean() < _STRIPED_SHARE:
         return (
@@ -1132,7 +1136,7 @@ def why_not(strips: Strips) -> str:
 
 
 def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
-    """Correlation of neighbouring strips in bands of rows, 0..1, median over the strips; and whether a band is lit."""
+    """Correlation of neighbouring strips in bands of rows, 0..1; and whether a band is lit."""
     level, weight = _levelled(strips.light, strips.inside, _BEND_LEVEL_ROWS, strips.sigma)
     blocks = np.linspace(0, strips.rows.size, _LIKENESS_BANDS + 1).astype(int)[:-1]
     step = _distances(strips)[0] if _distances(strips) else 1
@@ -1140,9 +1144,11 @@ def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
     def summed(values: Float32Array) -> FloatArray:
         return np.asarray(np.add.reduceat(values, blocks, axis=1), np.float64)
 
-    product = summed(level[:-step] * level[step:])
-    power = np.sqrt(summed(level[:-step] ** 2) * summed(level[step:] ** 2))
-    likeness = np.median(product / np.maximum(power, 1e-9), axis=0)
+    # Strips without light have no say.
+    level = level * weight
+    product = summed(level[:-step] * level[step:]).sum(axis=0)
+    power = np.sqrt(summed(level[:-step] ** 2).sum(axis=0) * summed(level[step:] ** 2).sum(axis=0))
+    likeness = product / np.maximum(power, 1e-9)
     lit = summed(weight).max(axis=0) > 0.2 * strips.rows.size / _LIKENESS_BANDS
     lit |= summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / _LIKENESS_BANDS
     return np.asarray(likeness), np.asarray(lit)
