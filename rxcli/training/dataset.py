@@ -100,7 +100,7 @@ def _write(path: Path, samples: list[Sample]) -> None:
 def _read(path: Path) -> list[Sample] | None:
     """Samples of a file; None where it is missing or damaged, so that it is made again."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             return [
                 Sample(stored[f"strips{i}"], stored[f"columns{i}"], stored[f"slots{i}"], stored[f"seen{i}"])
                 for i in range(int(stored["n"]))
