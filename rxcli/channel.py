@@ -155,15 +155,6 @@ def metrics_of(llr: Float32Array, memory: int) -> FloatArray:
     return np.asarray(padded[..., None] / 2 * (2.0 * slot_patterns(memory)[:, -1] - 1))
 
 
-def slot_llr(metrics: FloatArray) -> Float32Array:
-    """(C, N) log-likelihood ratio of every slot being lit, from metrics (C, N + memory, patterns), one at a time."""
-    memory = metrics.shape[-1].bit_length() - 2
-    by_slot = metrics.reshape(*metrics.shape[:2], -1, 2)
-    top = by_slot.max(axis=2, keepdims=True)
-    total = np.log(np.exp(by_slot - top).sum(axis=2)) + top[:, :, 0]
-    return np.asarray((total[..., 1] - total[..., 0])[:, : metrics.shape[1] - memory], np.float32)
-
-
 def lit_on_grid(posteriors: BurstPosteriors, clock: Clock) -> Float32Array:
     """(C, N) probability that each slot of the grid is lit."""
     copies = posteriors.lit[clock.burst].transpose(1, 0, 2)

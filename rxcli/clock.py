@@ -43,10 +43,9 @@ _MAX_CORRECTION = 0.25
 
 def halved_strips(profiles: RowProfiles) -> RowProfiles:
     """Profiles with strips pooled in pairs, for a quick look; the same profiles where their number is odd."""
-    n_strips = profiles.light.shape[1]
-    if n_strips % 2:
-        return profiles
     rows, light = profiles.sensor_row, _bounded(profiles.light)
+    if light.shape[1] % 2:
+        return replace(profiles, light=light)
     return replace(
         profiles,
         light=(light[:, ::2] + light[:, 1::2]) * np.float32(0.5),

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, bits_per_symbol, codebook, dimming_symbol
-from rxcli.types import BurstPosteriors, FloatArray
+from rxcli.types import BurstPosteriors, Float32Array, FloatArray
 
 #: Longest memory of the trellis; five slots cover an exposure of four.
 MAX_MEMORY = 5
@@ -126,6 +126,28 @@ def _tail(metrics: FloatArray, memory: int) -> FloatArray:
     return np.asarray(metrics[:, np.arange(memory), index].sum(axis=2))
 
 
+def slot_llr(metrics: FloatArray) -> Float32Array:
+    """Log-likelihood ratio of every slot being lit, each slot on its own, its neighbours lit or not alike.
+
+    A slot shows in its own metric and in the `memory` metrics after it; what each says of it is added.
+
+    Args:
+        metrics: (..., N + memory, patterns).
+
+    Returns:
+        (..., N) float32.
+    """
+    memory = _memory_of(metrics)
+    n_slots = metrics.shape[-2] - memory
+    total = np.zeros((*metrics.shape[:-2], n_slots))
+    for age in range(memory + 1):
+        # Bit `age` of the pattern's number is the slot `age` slots ago.
+        split = metrics[..., age : age + n_slots, :].reshape(*total.shape, -1, 2, 1 << age)
+        by_state = _log_sum(np.moveaxis(split, -2, -3).reshape(*total.shape, 2, -1), axis=-1)
+        total += by_state[..., 1] - by_state[..., 0]
+    return total.astype(np.float32)
+
+
 def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
     """Weights that stand up to a quick look, (C, 9): the best one and those within `margin` nats of it.
 
@@ -137,10 +159,7 @@ def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
         margin: nats.
     """
     memory = _memory_of(metrics)
-    by_state = metrics.reshape(*metrics.shape[:3], -1, 2)[:, :, memory:]
-    llr = np.diff(_log_sum(by_state, axis=3), axis=-1)[..., 0]
-    llr = np.clip(llr[:, :, : metrics.shape[2] - 2 * memory], -_SURE_LLR, _SURE_LLR)
-    llr = np.concatenate([np.zeros((*llr.shape[:2], memory)), llr], axis=2)
+    llr = np.clip(slot_llr(metrics)[:, :, : metrics.shape[2] - memory], -_SURE_LLR, _SURE_LLR)
     symbols = llr.reshape(*llr.shape[:2], -1, SLOTS_PER_SYMBOL)
     payload = symbols[:, :, 2:]
     coefficients = np.zeros((*payload.shape[:3], SLOTS_PER_SYMBOL + 1))

@@ -404,7 +404,7 @@ def _quick_look(lock: _Lock) -> _Reception:
     columns = np.arange(samples.light.shape[0])
     lit = channel.lit_on_grid(posteriors, now)
     likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
-    now = clock.assign_bursts(now, channel.slot_llr(likelihoods.metrics), lock.screen.repeats)
+    now = clock.assign_bursts(now, detect.slot_llr(likelihoods.metrics), lock.screen.repeats)
     now = clock.corrected(now, likelihoods.timing)
     metrics = likelihoods.metrics
     return _Reception(now, samples, _detect(metrics, now, model), likelihoods.snr, model, metrics)
@@ -433,7 +433,7 @@ def _iterate(lock: _Lock, seen: _Reception) -> _Reception:
             break
         if iteration == 0:
             bursts = now.burst
-            now = clock.assign_bursts(now, channel.slot_llr(metrics), lock.screen.repeats)
+            now = clock.assign_bursts(now, detect.slot_llr(metrics), lock.screen.repeats)
             if not np.array_equal(now.burst, bursts):
                 seen = replace(seen, clock=now, posteriors=_detect(metrics, now, model))
             now = clock.corrected(now, likelihoods.timing)

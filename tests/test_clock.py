@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_of
+from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_of, slot_odds
 
 from rxcli import channel, clock, detect
 from rxcli.protocol import encode_packet
@@ -53,7 +53,7 @@ def received(
         lit = channel.lit_on_grid(posteriors, now)
         found = channel.slot_likelihoods(samples, now, model, lit, np.arange(lit.shape[0]))
         metrics = found.metrics
-        now = clock.corrected(clock.assign_bursts(now, channel.slot_llr(metrics), REPEATS), found.timing)
+        now = clock.corrected(clock.assign_bursts(now, detect.slot_llr(metrics), REPEATS), found.timing)
         samples = clock.sample_slots(profiles, now, Q)
     posteriors = detect.detect(channel.by_burst(metrics, now, memory))
     return now, posteriors, samples
