@@ -45,6 +45,8 @@ _JUMP, _STILL = 0.012, 0.0004
 _FIRST_LESSONS, _LESSON_EVERY = 12, 6
 #: Columns decided worse than this many times the foreseen variance do not fit what is known.
 _MISFIT = 6.0
+#: Share of a frame's noise in what is expected of the next.
+_NOISE_SHARE = 0.2
 #: A column's symbol of at least this log probability is certain.
 _CERTAIN = -1e-5
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
@@ -249,14 +251,28 @@ class _Clip:
             if now is None:
                 return None
         with stages("detect"):
-            positions = known_picture.row_positions(self._rows, now)
-            metrics = known_picture.pattern_metrics(flat, positions, now, last.memory)
+            flat, now, positions, metrics = self._refined(light, flat, now, last.memory)
             shown = _shown(place.map.inside, positions, now)
             snr = _snr(flat, now)
         bursts = tracking.FrameBursts(frame.index, 0, now, metrics, shown)
         return _View(
             last.camera, replace(last.lock, clock=now), bursts, last.memory, frame.height, snr, light=light, flat=flat
         )
+
+    def _refined(
+        self, light: Float32Array, flat: known_picture.ColumnLight, now: Clock, memory: int
+    ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, FloatArray]:
+        """Clock, response and noise put right by a first decision slot by slot; then positions and metrics."""
+        assert self._picture is not None
+        positions = known_picture.row_positions(self._rows, now)
+        first = known_picture.pattern_metrics(flat, positions, now, memory)
+        lit = (0.5 + 0.5 * np.tanh(0.5 * detect.slot_llr(first))).astype(np.float32)
+        response, late = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
+        now = replace(now, row0=now.row0 - late * now.rows_per_slot)
+        positions = known_picture.row_positions(self._rows, now)
+        expected = response.of(lit, positions, now.exposure_slots)
+        flat = self._picture.judge(self._picture.solve_again(light, expected), expected, _NOISE_SHARE)
+        return flat, now, positions, known_picture.pattern_metrics(flat, positions, now, memory, response, lit)
 
     @property
     def _rows(self) -> FloatArray:
@@ -361,7 +377,7 @@ class _Clip:
         """What the frame says of the phase of the bursts."""
         assert self._link is not None
         now = view.bursts.clock
-        llr = channel.slot_llr(view.bursts.metrics)
+        llr = detect.slot_llr(view.bursts.metrics)
         copies = clock.to_copies(llr, now).transpose(1, 0, 2) * (view.bursts.shown > 0)
         self._link.phase.take(view.bursts.first_copy, np.asarray(copies, np.float64))
 
@@ -424,8 +440,6 @@ class _Clip:
         now = view.bursts.clock
         positions = known_picture.row_positions(self._rows, now)
         slots = known_picture.exposed(lit, positions, now.exposure_slots)
-        if view.flat is not None:
-            picture.judge(view.flat, slots, 0.2)
         self._n_lessons += 1
         if self._n_lessons <= _FIRST_LESSONS or self._n_lessons % _LESSON_EVERY == 0:
             doubt = known_picture.exposed(lit * (1 - lit), positions, now.exposure_slots)
