@@ -49,9 +49,8 @@ def test_a_table_for_people(tmp_path: Path, decode: Decode) -> None:
     code, out, err = decode(tmp_path / "a.png", "--truth", "auto")
     assert (code, err) == (0, "")
     rows = [line.split() for line in out.splitlines()[2 : 2 + N_COLUMNS]]
-    assert [(row[0], row[1], row[2], row[6], row[7]) for row in rows] == [
-        (str(column), "ok", str(W), "0", payload) for column, payload in enumerate(payloads)
-    ]
+    shown = [(row[0], row[1].removesuffix("*"), row[2], row[6], row[7]) for row in rows]  # *: by the auto-encoder
+    assert shown == [(str(column), "ok", str(W), "0", payload) for column, payload in enumerate(payloads)]
     assert f"{N_COLUMNS} packets in {N_COLUMNS} of {N_COLUMNS} columns" in out
 
 
