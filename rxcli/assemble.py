@@ -224,3 +224,9 @@ def _header_row(copy: int, column: int, clock: Clock) -> float:
     """Sensor row whose exposure starts with the header of `copy`."""
     slots = copy * clock.packet_slots - clock.first_slot + clock.delay_slots[column] + clock.exposure_slots / 2
     return float(clock.row0 + slots * clock.rows_per_slot)
+
+
+def in_stored_rows(column: ColumnResult, height: int) -> ColumnResult:
+    """The column with rows as stored, where they were counted in readout order."""
+    packets = (replace(packet, first_row=height - 1 - packet.first_row) for packet in column.packets)
+    return replace(column, packets=tuple(packets))

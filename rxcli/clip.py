@@ -12,12 +12,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli import assemble, channel, clock, detect, geometry, known_picture, sampling, strips, tracking
+from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock
+from rxcli.options import ReceiverOptions
+from rxcli.reception import Reception, decode, second_opinion
 from rxcli.types import (
     BurstPosteriors,
     Clock,
@@ -29,9 +32,6 @@ from rxcli.types import (
     IntArray,
     RowProfiles,
 )
-
-if TYPE_CHECKING:
-    from rxcli.pipeline import ReceiverOptions, _Camera, _Lock, _Reception, _Stages
 
 #: Frames that may wait until it is clear which copies begin a burst.
 _MAX_WAITING = 8
@@ -73,8 +73,8 @@ def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[
 class _View:
     """A frame with a lock."""
 
-    camera: _Camera
-    lock: _Lock
+    camera: Camera
+    lock: Lock
     bursts: tracking.FrameBursts
     memory: int
     height: int
@@ -127,7 +127,7 @@ class _Clip:
         self._link: _Link | None = None
         self._next_number = 0
         #: The camera and the options with the screens that remain, and what they were found for.
-        self._camera: tuple[_Camera, ReceiverOptions] | None = None
+        self._camera: tuple[Camera, ReceiverOptions] | None = None
         self._taken_with: tuple[object, ...] = ()
         self._corners: FloatArray | None = None
         self._place: _Place | None = None
@@ -139,9 +139,7 @@ class _Clip:
 
     def take(self, frame: Frame) -> list[FrameResult]:
         """Receive the next frame; returns the results that are complete."""
-        from rxcli.pipeline import _Failure, _Stages
-
-        stages = _Stages()
+        stages = Stages()
         waiting = _Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok"))
         try:
             view = self._known(frame, stages)
@@ -152,7 +150,7 @@ class _Clip:
             waiting.view = view
             waiting.result = replace(waiting.result, **_facts(view), corners=self._corners)
             done = self._enter(waiting, frame, stages)
-        except _Failure as failure:
+        except Failure as failure:
             self._forget()
             waiting.result = replace(waiting.result, status=failure.status, message=failure.message)
             self._waiting.append(waiting)
@@ -177,23 +175,21 @@ class _Clip:
 
     # -- a frame like a photograph ------------------------------------------------------------------------------
 
-    def _search(self, frame: Frame, result: FrameResult, stages: _Stages) -> tuple[_View, FrameResult]:
+    def _search(self, frame: Frame, result: FrameResult, stages: Stages) -> tuple[_View, FrameResult]:
         """Receive a frame like a photograph; only the camera is taken from the frames before."""
-        from rxcli.pipeline import _camera_and_screens, _decode, _find_corners, _find_lock, _second_opinion
-
         self._forget()
         with stages("geometry"):
-            corners = _find_corners(frame, self._options)
+            corners = find_corners(frame, self._options)
         self._corners = corners
         if self._camera is None or self._taken_with != _taken_with(frame) or "tracking" not in self._options.skip:
-            self._camera = _camera_and_screens(frame, corners, self._options, stages)
+            self._camera = find_camera(frame, corners, self._options, stages)
             self._taken_with = _taken_with(frame)
         camera, options = self._camera
-        lock = _find_lock(frame, corners, camera, options, stages)
+        lock = find_lock(frame, corners, camera, options, stages)
         with stages("detect"):
-            seen = _decode(lock)
+            seen = decode(lock, options.skip)
         with stages("denoise"):
-            seen, denoised, report = _second_opinion(lock, seen, options)
+            seen, denoised, report = second_opinion(lock, seen, options)
         view = _View(camera, lock, _bursts_of(frame, seen), seen.model.memory, frame.height, seen.snr, denoised)
         lit = channel.lit_on_grid(seen.posteriors, seen.clock)
         if self._can_track(frame, camera, lock):
@@ -204,7 +200,7 @@ class _Clip:
         self._last = view
         return view, replace(result, denoiser=report)
 
-    def _can_track(self, frame: Frame, camera: _Camera, lock: _Lock) -> bool:
+    def _can_track(self, frame: Frame, camera: Camera, lock: Lock) -> bool:
         """Whether a row of the picture is one instant, in the order of time."""
         return (
             "tracking" in self._options.skip
@@ -213,9 +209,7 @@ class _Clip:
             and not camera.reversed
         )
 
-    def _start_tracking(
-        self, frame: Frame, corners: FloatArray, camera: _Camera, lock: _Lock, seen: _Reception
-    ) -> None:
+    def _start_tracking(self, frame: Frame, corners: FloatArray, camera: Camera, lock: Lock, seen: Reception) -> None:
         self._place = _Place(
             corners,
             _map(frame, corners, camera, lock),
@@ -234,7 +228,7 @@ class _Clip:
 
     # -- a frame whose place and picture are known -------------------------------------------------------------------
 
-    def _known(self, frame: Frame, stages: _Stages) -> _View | None:
+    def _known(self, frame: Frame, stages: Stages) -> _View | None:
         """The view of a frame by what is known; None where that does not fit."""
         last, place, picture = self._last, self._place, self._picture
         if last is None or place is None or picture is None or self._link is None:
@@ -284,7 +278,7 @@ class _Clip:
         assert self._place is not None
         return strips.sample_strips(frame, self._place.map, self._place.light_of_value)
 
-    def _look(self, frame: Frame, camera: _Camera, lock: _Lock) -> None:
+    def _look(self, frame: Frame, camera: Camera, lock: Lock) -> None:
         """Look where the screen is, now and then."""
         place = self._place
         assert place is not None
@@ -305,7 +299,7 @@ class _Clip:
             self._corners = place.corners + share * (seen - place.corners)
             self._move(frame, camera, lock, self._corners)
 
-    def _move(self, frame: Frame, camera: _Camera, lock: _Lock, corners: FloatArray) -> None:
+    def _move(self, frame: Frame, camera: Camera, lock: Lock, corners: FloatArray) -> None:
         place, picture = self._place, self._picture
         assert place is not None and picture is not None
         before, rows_before = place.corners, place.map.first_row
@@ -340,7 +334,7 @@ class _Clip:
 
     # -- bursts ---------------------------------------------------------------------------------------------------
 
-    def _enter(self, waiting: _Waiting, frame: Frame, stages: _Stages) -> list[FrameResult]:
+    def _enter(self, waiting: _Waiting, frame: Frame, stages: Stages) -> list[FrameResult]:
         view = waiting.view
         assert view is not None
         done: list[FrameResult] = []
@@ -482,11 +476,9 @@ class _Clip:
     def _columns(
         self, view: _View, ended: list[assemble.BurstInClip], sure: Float32Array, height: int
     ) -> tuple[ColumnResult, ...]:
-        from rxcli.pipeline import _in_stored_rows
-
         columns = assemble.clip_results(view.bursts.clock, ended, sure, view.snr, self._options.min_confidence)
         columns = tuple(replace(c, denoised=c.column in view.denoised) for c in columns)
-        return tuple(_in_stored_rows(c, height) for c in columns) if view.camera.reversed else columns
+        return tuple(assemble.in_stored_rows(c, height) for c in columns) if view.camera.reversed else columns
 
 
 def _taken_with(frame: Frame) -> tuple[object, ...]:
@@ -506,7 +498,7 @@ def _facts(view: _View) -> dict[str, Any]:
     }
 
 
-def _map(frame: Frame, corners: FloatArray, camera: _Camera, lock: _Lock) -> strips.StripMap:
+def _map(frame: Frame, corners: FloatArray, camera: Camera, lock: Lock) -> strips.StripMap:
     n_columns = lock.screen.columns
     column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
     n_strips = sampling.strips_per_column(column_px)
@@ -514,7 +506,7 @@ def _map(frame: Frame, corners: FloatArray, camera: _Camera, lock: _Lock) -> str
     return strips.map_strips(outlines)
 
 
-def _bursts_of(frame: Frame, seen: _Reception) -> tracking.FrameBursts:
+def _bursts_of(frame: Frame, seen: Reception) -> tracking.FrameBursts:
     by_copy = replace(seen.clock, burst=np.arange(seen.clock.n_copies))
     shown = np.minimum(assemble.slots_seen(seen.samples, by_copy), 1)
     return tracking.FrameBursts(frame.index, 0, seen.clock, seen.metrics, shown)

@@ -1,0 +1,238 @@
+"""From a frame to a locked clock: corners, camera, screen profile, row profiles. Part of the wiring."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from rxcli import blind, clock, geometry, sampling
+from rxcli.options import ReceiverOptions
+from rxcli.profiles import ReadoutMode, ScreenProfile, match_camera
+from rxcli.types import Clock, FloatArray, Frame, Lens, Outlines, RowProfiles
+
+_DEFAULT_TONE = "srgb"
+#: A header peak less than this times the strongest rival is no lock.
+_MIN_LOCK = 1.6
+#: Orientations in which the readout runs along the columns' width.
+_PORTRAIT = (5, 6, 7, 8)
+
+
+class Failure(Exception):
+    """Reception ends here, with a status and a message; never leaves this module."""
+
+    def __init__(self, status: Literal["no_screen", "no_signal"], message: str) -> None:
+        super().__init__(message)
+        self.status = status
+        self.message = message
+
+
+class Stages:
+    """Wall time by stage."""
+
+    def __init__(self) -> None:
+        self.timing_ms: dict[str, float] = {}
+        self._start = time.perf_counter()
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            elapsed = 1e3 * (time.perf_counter() - start)
+            self.timing_ms[name] = self.timing_ms.get(name, 0.0) + elapsed
+
+    def total(self) -> dict[str, float]:
+        return {**self.timing_ms, "total": 1e3 * (time.perf_counter() - self._start)}
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """What is known of the camera that took a frame."""
+
+    #: None for a camera that was estimated from the frame itself.
+    profile: str | None
+    line_delay_s: float
+    exposure_s: float
+    lens: Lens | None
+    tone: str
+    #: True where the stored rows run against the readout.
+    reversed: bool = False
+    #: What was estimated: name -> (value, standard deviation).
+    estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Lock:
+    """A screen whose clock was found."""
+
+    screen: ScreenProfile
+    profiles: RowProfiles
+    clock: Clock
+
+
+def _camera_of(frame: Frame, options: ReceiverOptions) -> Camera | None:
+    """What the profiles say of the frame's camera; None where none fits."""
+    meta = frame.metadata
+    profile = (
+        options.cameras[0]
+        if options.force_camera
+        else match_camera(options.cameras, meta.make, meta.model, frame.width, frame.height)
+    )
+    mode = profile.mode_for(frame.width, frame.height) if profile else None
+    if profile is None:
+        return None
+    if mode is None:
+        raise Failure(
+            "no_signal",
+            f"camera profile {profile.name} has no readout mode for {frame.width} x {frame.height}; add one with "
+            "vlc-rx calibrate shutter, or leave the camera to be estimated with --camera auto",
+        )
+    lens = geometry.lens_for(profile.lens, frame.width, frame.height) if profile.lens else None
+    tone = _DEFAULT_TONE if profile.tone == "auto" else profile.tone
+    return Camera(profile.name, mode.line_delay_s, _exposure_of(frame, mode), lens, tone)
+
+
+def find_camera(
+    frame: Frame, corners: FloatArray, options: ReceiverOptions, stages: Stages
+) -> tuple[Camera, ReceiverOptions]:
+    """The camera, from a profile or estimated, and the options with the screens that remain."""
+    known = _camera_of(frame, options)
+    return (known, options) if known is not None else _estimate_camera(frame, corners, options, stages)
+
+
+def _estimate_camera(
+    frame: Frame, corners: FloatArray, options: ReceiverOptions, stages: Stages
+) -> tuple[Camera, ReceiverOptions]:
+    """A camera that no profile fits, estimated from the frame; and the options with the screens that remain."""
+    n_columns = min(screen.columns for screen in options.screens)
+    with stages("sampling"):
+        outlines = _outlines(frame, corners, None, n_columns)
+        profiles = sampling.sample_rows(frame, outlines, _DEFAULT_TONE)
+    with stages("blind"):
+        centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
+        strips = blind.strips_of(profiles, centre_x, frame.width, frame.height)
+        found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
+    estimate = found.estimate
+    if estimate is None:
+        raise Failure("no_signal", found.reason)
+    screens = [screen for screen in options.screens if screen.packet_slots == estimate.packet_slots]
+    rate = screens[0].slot_rate_hz
+    camera = Camera(
+        profile=None,
+        line_delay_s=1 / (estimate.rows_per_slot * rate),
+        exposure_s=estimate.exposure_slots / rate,
+        lens=blind.lens_of(estimate, frame.width, frame.height),
+        tone=_DEFAULT_TONE,
+        reversed=estimate.reversed,
+        estimated=blind.summary(estimate, rate),
+    )
+    return camera, replace(options, screens=tuple(screen for screen in screens if screen.slot_rate_hz == rate))
+
+
+def _exposure_of(frame: Frame, mode: ReadoutMode) -> float:
+    exposure = frame.metadata.exposure_s or mode.exposure_s
+    return exposure if exposure else 5 * mode.line_delay_s
+
+
+def find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
+    orientation = frame.metadata.orientation
+    if orientation in _PORTRAIT:
+        raise Failure(
+            "no_signal",
+            f"the picture was taken in portrait (EXIF orientation {orientation}): the sensor reads along the width of "
+            "the columns, so that they cannot be told apart; hold the camera in landscape",
+        )
+    if options.corners is not None:
+        return options.corners
+    from rxcli.find_screen import find_screen
+
+    levels = frame.mosaic
+    black, white = (float(np.mean(levels.black)), levels.white) if levels else (frame.black, frame.white)
+    period = levels.pattern.shape[1] if levels else 1
+    found = find_screen(frame.pixels, black=black, white=white, mosaic_period=period)
+    if found.corners is None:
+        raise Failure("no_screen", f"no screen found: {found.reason}; give its place with --corners")
+    return geometry.viewer_order(found.corners, orientation)
+
+
+def find_lock(frame: Frame, corners: FloatArray, camera: Camera, options: ReceiverOptions, stages: Stages) -> Lock:
+    """The screen profile that fits best, with the row profiles of its columns.
+
+    Screens that differ in nothing but their columns share a clock: which of them it is, is asked last.
+    """
+    n_columns = min(screen.columns for screen in options.screens)
+    with stages("sampling"):
+        profiles = _sample(frame, corners, camera, n_columns)
+    with stages("clock"):
+        quick = clock.halved_strips(profiles)
+        rates = {(s.slot_rate_hz, s.packet_slots): s for s in options.screens}
+        clocks = {rate: found for rate, screen in rates.items() if (found := _clock_of(screen, quick, camera))}
+        clocks = {rate: found for rate, found in clocks.items() if found.lock >= _MIN_LOCK}
+        if not clocks:
+            raise Failure("no_signal", _why_no_signal(corners, camera, options))
+        rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(quick, clocks[r]))
+    alike = [screen for screen in options.screens if (screen.slot_rate_hz, screen.packet_slots) == rate]
+    locks = [Lock(alike[0], profiles, clocks[rate])] if alike[0].columns == n_columns else []
+    for screen in alike[len(locks) :]:
+        with stages("sampling"):
+            finer = _sample(frame, corners, camera, screen.columns)
+        with stages("clock"):
+            found = _clock_of(screen, clock.halved_strips(finer), camera)
+        if found:
+            locks.append(Lock(screen, finer, found))
+    if not locks:
+        raise Failure("no_signal", _why_no_signal(corners, camera, options))
+    return locks[0] if len(locks) == 1 else _with_likely_columns(locks)
+
+
+def _structure(profiles: RowProfiles, now: Clock) -> float:
+    """How much the strips, each on its own, look like packets on this clock."""
+    samples = clock.sample_slots(profiles, now, 1)
+    slots = samples.light.reshape(-1, now.n_slots).astype(np.float64)
+    return blind.structure_evidence(slots, now.first_slot, now.packet_slots)
+
+
+def _with_likely_columns(locks: list[Lock]) -> Lock:
+    """Among screens of one clock, the one whose columns are as wide as seen."""
+    finest = max(locks, key=lambda lock: lock.profiles.light.shape[0] * lock.profiles.light.shape[1])
+    likely = blind.likely_columns(finest.profiles, finest.clock, [lock.screen for lock in locks])
+    return next(lock for lock in locks if lock.screen is likely)
+
+
+def _outlines(frame: Frame, corners: FloatArray, lens: Lens | None, n_columns: int) -> Outlines:
+    column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
+    n_strips = sampling.strips_per_column(column_px)
+    return geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
+
+
+def _sample(frame: Frame, corners: FloatArray, camera: Camera, n_columns: int) -> RowProfiles:
+    profiles = sampling.sample_rows(frame, _outlines(frame, corners, camera.lens, n_columns), camera.tone)
+    return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
+
+
+def _clock_of(screen: ScreenProfile, profiles: RowProfiles, camera: Camera) -> Clock | None:
+    rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
+    exposure_slots = camera.exposure_s * screen.slot_rate_hz
+    return clock.find_clock(profiles, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(profiles))
+
+
+def _why_no_signal(corners: FloatArray, camera: Camera, options: ReceiverOptions) -> str:
+    visible_s = float(np.ptp(corners[:, 1])) * camera.line_delay_s
+    shortest = min(options.screens, key=lambda screen: screen.packet_s)
+    if visible_s < shortest.packet_s:
+        return (
+            f"the screen's {np.ptp(corners[:, 1]):.0f} rows show {1e3 * visible_s:.2f} ms of the link, less than one "
+            f"packet of {shortest.name} ({1e3 * shortest.packet_s:.2f} ms); move closer or use a faster slot rate"
+        )
+    return "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
+
+
+def noise_of(profiles: RowProfiles) -> float:
+    """Standard deviation of a strip's row of no light."""
+    return float(np.sqrt(profiles.noise_floor / max(float(np.median(profiles.count)), 1.0)))

@@ -1,0 +1,223 @@
+"""From a locked clock to posteriors: light model and detection in turn. Part of the wiring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli import assemble, channel, clock, denoise, detect
+from rxcli.errors import ReceiverError
+from rxcli.locate import Lock, noise_of
+from rxcli.options import SKIPS, ReceiverOptions
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
+
+_SAMPLES_PER_SLOT = 4
+_MAX_ITERATIONS = 5
+#: A column all of whose symbols have at least this log probability is not looked at again.
+_CERTAIN = -1e-5
+#: The quick look at the picture is surer than it should be of textured ones: it must do for all columns, and clearly.
+_CERTAIN_AT_ONCE = -1e-6
+#: A column whose slots stand out less than this has no light to speak of.
+_DARK_SNR_DB = -3.0
+#: Weights that a quick look finds this much less likely than the best are dropped, nats.
+_HOPELESS_WEIGHT = 20.0
+#: Rounds of light model and detection from where the auto-encoder starts.
+_RESTART_ITERATIONS = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Reception:
+    """What was received of a frame."""
+
+    clock: Clock
+    samples: SlotSamples
+    posteriors: BurstPosteriors
+    #: (C, N): squared contrast over variance of every slot.
+    snr: Float32Array
+    model: channel.LightModel
+    #: (C, N + memory, patterns).
+    metrics: FloatArray
+    #: What was skipped: name -> columns.
+    skipped: dict[str, int] = field(default_factory=dict)
+
+
+def decode(lock: Lock, skip: frozenset[str]) -> Reception:
+    """A quick look first; where that leaves doubt, the light model in depth.
+
+    Args:
+        lock: the clock and the row profiles.
+        skip: shortcuts in use, see `rxcli.options.SKIPS`.
+    """
+    seen = quick_look(lock)
+    if "certain_columns" in skip and not _doubtful(seen, _CERTAIN_AT_ONCE).any():
+        return replace(seen, skipped={"certain_columns": seen.snr.shape[0]})
+    return iterate(lock, seen, skip)
+
+
+def quick_look(lock: Lock) -> Reception:
+    """One pass over the strips pooled in pairs, from the first guess."""
+    profiles = clock.halved_strips(lock.profiles)
+    now = lock.clock
+    samples = clock.sample_slots(profiles, now, _SAMPLES_PER_SLOT)
+    model = _light_model(replace(lock, profiles=profiles), samples)
+    llr = channel.first_llr(*clock.slot_contrast(samples, model.sigma))
+    now = clock.assign_bursts(now, llr, lock.screen.repeats)
+    posteriors = _detect(channel.metrics_of(llr, model.memory), now, model)
+    columns = np.arange(samples.light.shape[0])
+    lit = channel.lit_on_grid(posteriors, now)
+    likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
+    now = clock.assign_bursts(now, detect.slot_llr(likelihoods.metrics), lock.screen.repeats)
+    now = clock.corrected(now, likelihoods.timing)
+    metrics = likelihoods.metrics
+    return Reception(now, samples, _detect(metrics, now, model), likelihoods.snr, model, metrics)
+
+
+def iterate(lock: Lock, seen: Reception, skip: frozenset[str] = frozenset(SKIPS)) -> Reception:
+    """Light model and detection in turn, until every column is certain or nothing more is to be expected."""
+    now = seen.clock
+    samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
+    model = _light_model(lock, samples)
+    metrics, snr = seen.metrics.copy(), seen.snr.copy()
+    wanted = ~_dark(snr) if "dark_columns" in skip else np.ones(snr.shape[0], bool)
+    skipped = {"dark_columns": int((~wanted).sum())}
+    columns = np.flatnonzero(wanted)
+    for iteration in range(_MAX_ITERATIONS):
+        if columns.size == 0:
+            break
+        lit = channel.lit_on_grid(seen.posteriors, now)
+        likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns)
+        metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
+        before = seen.posteriors.index
+        seen = Reception(now, samples, _detect(metrics, now, model), snr, model, metrics)
+        if iteration == 0:
+            bursts = now.burst
+            now = clock.assign_bursts(now, detect.slot_llr(metrics), lock.screen.repeats)
+            if not np.array_equal(now.burst, bursts):
+                seen = replace(seen, clock=now, posteriors=_detect(metrics, now, model))
+        columns = np.flatnonzero(wanted & _unsettled(seen, before, iteration, skip))
+        skipped["certain_columns"] = skipped.get("certain_columns", 0) + int(wanted.sum()) - columns.size
+        if iteration == 0:
+            now = clock.corrected(now, likelihoods.timing)
+            samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
+    return replace(seen, skipped={name: count for name, count in skipped.items() if count})
+
+
+def _dark(snr: Float32Array) -> NDArray[np.bool_]:
+    """(C,) whether a column has too little light for the light model to make anything of it."""
+    seen = np.where(snr > 0, snr, np.nan)
+    seen[np.isnan(seen).all(axis=1)] = 0.0
+    return np.asarray(10 * np.log10(np.maximum(np.nanmedian(seen, axis=1), 1e-6)) < _DARK_SNR_DB)
+
+
+def _unsettled(seen: Reception, before: NDArray[np.int64], iteration: int, skip: frozenset[str]) -> NDArray[np.bool_]:
+    """(C,) which columns are worth another iteration."""
+    if "certain_columns" not in skip:
+        return np.ones(seen.snr.shape[0], bool)
+    doubtful = _doubtful(seen, _CERTAIN)
+    index = seen.posteriors.index
+    if iteration and before.shape == index.shape:
+        # What does not change any more will not do so later.
+        doubtful &= (before != index).any(axis=(0, 2))
+    return doubtful
+
+
+def second_opinion(
+    lock: Lock, seen: Reception, options: ReceiverOptions
+) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
+    """Doubtful columns once more from where the auto-encoder starts; whichever end is more plausible is kept.
+
+    Returns:
+        What is kept, the columns whose second end that is, and what to report; None where nothing was done.
+    """
+    if options.cae == "never":
+        return seen, frozenset(), None
+    if options.cae == "always" and seen.samples.light.shape[1] < lock.profiles.light.shape[1]:
+        seen = iterate(lock, seen)
+    doubtful = np.ones(seen.snr.shape[0], bool) if options.cae == "always" else _doubtful(seen, _CERTAIN)
+    columns = np.flatnonzero(doubtful)
+    if columns.size == 0:
+        return seen, frozenset(), None
+    report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
+    try:
+        denoiser = _denoiser()
+        log_odds = denoiser.slot_log_odds(scene_of(seen), columns)
+    except ReceiverError as error:
+        return seen, frozenset(), {**report, "columns": 0, "message": str(error)}
+    seen = _with_bursts_of(seen, log_odds, lock.screen.repeats)
+    again = _restart(seen, log_odds, columns)
+    better = _evidence(again.metrics, seen) > _evidence(seen.metrics[columns], seen)
+    kept = columns[better]
+    if kept.size:
+        metrics, snr = seen.metrics.copy(), seen.snr.copy()
+        metrics[kept], snr[kept] = again.metrics[better], again.snr[better]
+        posteriors = _detect(metrics, seen.clock, seen.model)
+        seen = replace(seen, metrics=metrics, snr=snr, posteriors=posteriors)
+    return seen, frozenset(kept.tolist()), {**report, "model": denoiser.name, "kept": kept.size}
+
+
+@lru_cache(maxsize=1)
+def _denoiser() -> denoise.Denoiser:
+    return denoise.load_denoiser()
+
+
+def scene_of(seen: Reception) -> denoise.Scene:
+    model = seen.model
+    lit = channel.lit_on_grid(seen.posteriors, seen.clock)
+    return denoise.Scene(seen.samples, seen.clock, lit, model.floor, model.sigma, model.shot, model.spread)
+
+
+def _with_bursts_of(seen: Reception, log_odds: Float32Array, repeats: int) -> Reception:
+    """Bursts told apart by log-odds that no copy has lent to another; symbols detected anew where that moves them."""
+    now = clock.assign_bursts(seen.clock, log_odds, repeats)
+    if np.array_equal(now.burst, seen.clock.burst):
+        return seen
+    return replace(seen, clock=now, posteriors=_detect(seen.metrics, now, seen.model))
+
+
+def _restart(seen: Reception, log_odds: Float32Array, columns: NDArray[np.int64]) -> channel.SlotLikelihoods:
+    """Light model and detection of some columns from given log-odds of their slots; the other columns stay."""
+    lit = channel.lit_on_grid(seen.posteriors, seen.clock).copy()
+    metrics = channel.metrics_of(log_odds, seen.model.memory)
+    for _ in range(_RESTART_ITERATIONS):
+        lit[columns] = channel.lit_on_grid(_detect(metrics, seen.clock, seen.model), seen.clock)
+        likelihoods = channel.slot_likelihoods(seen.samples, seen.clock, seen.model, lit, columns)
+        metrics = likelihoods.metrics
+    return likelihoods
+
+
+def _evidence(metrics: FloatArray, seen: Reception) -> FloatArray:
+    """(C,) log evidence of columns, over all weights."""
+    bursts = channel.by_burst(metrics, seen.clock, seen.model.memory)
+    return np.asarray(
+        np.logaddexp.reduce(detect.weight_evidence(bursts, detect.plausible_weights(bursts, _HOPELESS_WEIGHT)), axis=1)
+    )
+
+
+def _doubtful(seen: Reception, certain: float) -> NDArray[np.bool_]:
+    """(C,) whether a packet that could be reported has a symbol of less than the log probability `certain`."""
+    complete = assemble.complete(assemble.slots_seen(seen.samples, seen.clock))
+    return np.asarray(((seen.posteriors.log_prob.min(axis=2) < certain) & complete).any(axis=0))
+
+
+def _detect(metrics: FloatArray, now: Clock, model: channel.LightModel) -> BurstPosteriors:
+    bursts = channel.by_burst(metrics, now, model.memory)
+    return detect.detect(bursts, detect.plausible_weights(bursts, _HOPELESS_WEIGHT))
+
+
+def _light_model(lock: Lock, samples: SlotSamples) -> channel.LightModel:
+    now, profiles = lock.clock, lock.profiles
+    memory = channel.memory_for(now.exposure_slots)
+    rows_per_sample = max(now.rows_per_slot / _SAMPLES_PER_SLOT, 1.0)
+    floor = channel.estimate_floor(samples, now)
+    least = noise_of(profiles) / np.sqrt(rows_per_sample)
+    return channel.LightModel(
+        floor=floor,
+        sigma=channel.estimate_sigma(samples, floor, 0.5 * float(least)),
+        shot=profiles.noise_slope / max(float(np.median(profiles.count)), 1.0) / rows_per_sample,
+        spread=channel.spread_matrix(samples.light.shape[1], lock.screen.light_spread),
+        taps=channel.exposure_taps(now.exposure_slots, 1 / _SAMPLES_PER_SLOT, memory, _SAMPLES_PER_SLOT),
+    )
