@@ -169,7 +169,9 @@ def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
     words = np.array([comb(SLOTS_PER_SYMBOL, w) for w in WEIGHTS])
     score = np.log(coefficients[..., 1:SLOTS_PER_SYMBOL] / words).sum(axis=(0, 2))
     score += np.cumsum(symbols[:, :, 1], axis=2)[..., : len(WEIGHTS)].sum(axis=0)
-    return np.asarray(score >= score.max(axis=1, keepdims=True) - margin)
+    # The metrics that a slot shares with its neighbours were counted for each of them.
+    lead = margin * (memory + 1) / 2
+    return np.asarray(score >= score.max(axis=1, keepdims=True) - lead)
 
 
 def weight_evidence(metrics: FloatArray, candidates: NDArray[np.bool_]) -> FloatArray:

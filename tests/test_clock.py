@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_of, slot_odds
+from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_of
 
 from rxcli import channel, clock, detect
 from rxcli.protocol import encode_packet
@@ -179,7 +179,9 @@ def test_one_packet_and_a_little_is_enough(start: float) -> None:
     profiles = row_profiles(link, shot, rng)
     now, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 70))
     assert abs(start_error(now, shot)) < (0.15 if start == 0.3 else 0.05)  # at 0.3 the first header is cut
-    assert right_packets(posteriors, link, 0)[0].mean() > 0.9
+    n_bursts = posteriors.lit.shape[0]
+    sent = replace(link, bits=[link.bits[0]] * n_bursts)  # a sliver of the copy before may count as a burst
+    assert right_packets(posteriors, sent, 0).any(axis=0).mean() > 0.9
 
 
 @pytest.mark.parametrize("n_rows", [1, 5, 30])
@@ -254,4 +256,4 @@ def test_halved_strips_keep_the_light() -> None:
     np.testing.assert_allclose(halved.light[:, 1], profiles.light[:, 2:].mean(axis=1), rtol=1e-5)
     np.testing.assert_allclose(halved.count, 2.0)
     odd = row_profiles(random_link(rng, [5] * 2, 5), Shot(n_rows=60, n_strips=3), rng)
-    assert clock.halved_strips(odd) is odd
+    assert (clock.halved_strips(odd).light == odd.light).all()

@@ -1,0 +1,224 @@
+"""Results from posteriors made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli import assemble
+from rxcli.protocol import bits_per_symbol, bits_to_hex, indices_to_bits
+from rxcli.types import BurstPosteriors, Clock, ColumnResult, PacketResult, SlotSamples
+
+N_SYMBOLS, PACKET, Q = 3, 50, 4
+
+
+def clock_of(n_slots: int, first_slot: int, burst: list[int], n_columns: int = 2) -> Clock:
+    return Clock(
+        rows_per_slot=5.0,
+        exposure_slots=1.2,
+        packet_slots=PACKET,
+        row0=17.0,
+        n_slots=n_slots,
+        first_slot=first_slot,
+        burst=np.array(burst),
+        delay_slots=np.array([0.0, 1.5, 0.0, 0.0][:n_columns]),
+        lock=5.0,
+    )
+
+
+def samples_of(n_slots: int, n_columns: int = 2) -> SlotSamples:
+    shape = (n_columns, 2, n_slots * Q)
+    return SlotSamples(np.ones(shape, np.float32), np.ones(shape, np.float32), Q)
+
+
+def posteriors_of(
+    w: list[int], index: NDArray[np.int64], probability: float = 0.9999, w_probability: float = 0.9999
+) -> BurstPosteriors:
+    """Posteriors of (B, C, N) indices, each right with `probability`, its bits as sure as that."""
+    n_bursts, n_columns, n_symbols = index.shape
+    w_log_prob = np.full((n_columns, 9), np.log((1 - w_probability) / 8))
+    w_log_prob[np.arange(n_columns), np.array(w) - 1] = np.log(w_probability)
+    bit_llr = np.full((n_bursts, n_columns, n_symbols, 7), np.nan)
+    for column, weight in enumerate(w):
+        k = bits_per_symbol(weight)
+        bits = indices_to_bits(index[:, column].ravel(), weight).reshape(n_bursts, n_symbols, k)
+        bit_llr[:, column, :, :k] = (2.0 * bits - 1) * np.log(probability / (1 - probability))
+    return BurstPosteriors(
+        w=np.array(w),
+        w_log_prob=w_log_prob,
+        lit=np.zeros((n_bursts, n_columns, PACKET), np.float32),
+        index=index,
+        log_prob=np.full(index.shape, np.log(probability)),
+        bit_llr=bit_llr,
+    )
+
+
+def indices(w: list[int], n_bursts: int = 1) -> NDArray[np.int64]:
+    rng = np.random.default_rng(0)
+    columns = [rng.integers(0, 1 << bits_per_symbol(weight), (n_bursts, N_SYMBOLS)) for weight in w]
+    return np.stack(columns, axis=1)
+
+
+def snr(n_slots: int, value: float = 100.0, n_columns: int = 2) -> NDArray[np.float32]:
+    return np.full((n_columns, n_slots), value, np.float32)
+
+
+def test_a_sure_packet() -> None:
+    w = [5, 8]
+    index = indices(w)
+    columns = assemble.column_results(
+        clock_of(120, 30, [0, 0, 0]), posteriors_of(w, index), snr(120), samples_of(120), 0
+    )
+    assert [c.status for c in columns] == ["ok", "ok"]
+    assert [c.column for c in columns] == [0, 1]
+    assert [c.w for c in columns] == w
+    assert [c.snr_db for c in columns] == pytest.approx([20.0, 20.0])
+    assert [c.delay_slots for c in columns] == [0.0, 1.5]
+    assert [c.message for c in columns] == [None, None]
+    for column, result in enumerate(columns):
+        (packet,) = result.packets
+        assert packet.payload_bits == N_SYMBOLS * bits_per_symbol(w[column])
+        assert packet.payload == bits_to_hex(indices_to_bits(index[0, column], w[column]))
+        assert packet.copies == pytest.approx(120 / 50)
+        assert packet.confidence == pytest.approx(0.9999**3)
+        assert packet.ber_hat == pytest.approx(1e-4, rel=0.01)
+        assert packet.bit_errors is None
+
+
+def test_first_row_is_where_the_exposure_of_the_header_starts() -> None:
+    """Grid slot 0 is slot 30 of its packet; row0 has it in the middle of its exposure of 1.2 slots of 5 rows."""
+    columns = assemble.column_results(
+        clock_of(120, 30, [0, 0, 0]), posteriors_of([5, 5], indices([5, 5])), snr(120), samples_of(120), 0
+    )
+    rows = [c.packets[0].first_row for c in columns]
+    assert rows == pytest.approx([17 + (0.6 - 30) * 5, 17 + (0.6 - 30 + 1.5) * 5])
+
+
+def test_one_entry_a_burst_in_time_order() -> None:
+    index = indices([5, 5], n_bursts=2)
+    now = clock_of(180, 0, [0, 0, 1, 1])
+    columns = assemble.column_results(now, posteriors_of([5, 5], index), snr(180), samples_of(180), 0)
+    for column, result in enumerate(columns):
+        payloads = [bits_to_hex(indices_to_bits(index[burst, column], 5)) for burst in range(2)]
+        assert [packet.payload for packet in result.packets] == payloads
+        assert [packet.copies for packet in result.packets] == pytest.approx([2.0, 1.6])
+        assert result.packets[1].first_row - result.packets[0].first_row == pytest.approx(100 * 5)
+
+
+def test_a_payload_slot_that_was_never_seen_is_no_packet() -> None:
+    """37 slots of the second burst are seen: some of its payload is not."""
+    now = clock_of(137, 0, [0, 0, 1])
+    index = indices([5, 5], n_bursts=2)
+    columns = assemble.column_results(now, posteriors_of([5, 5], index), snr(137), samples_of(137), 0)
+    assert [len(c.packets) for c in columns] == [1, 1]
+
+
+def test_a_cut_copy_completes_another() -> None:
+    """The end of one copy and the beginning of the next hold every slot once: 60 slots from slot 25 on."""
+    columns = assemble.column_results(
+        clock_of(60, 25, [0, 0]), posteriors_of([5, 5], indices([5, 5])), snr(60), samples_of(60), 0
+    )
+    assert [c.packets[0].copies for c in columns] == pytest.approx([1.2, 1.2])
+
+
+def test_slots_off_the_screen_are_not_seen() -> None:
+    now, samples = clock_of(60, 0, [0, 0]), samples_of(60)
+    valid = samples.valid.copy()
+    valid[0, :, 30 * Q : 32 * Q] = 0
+    valid[1, 0, 30 * Q : 32 * Q] = 0
+    samples = replace(samples, valid=valid)
+    columns = assemble.column_results(now, posteriors_of([5, 5], indices([5, 5])), snr(60), samples, 0)
+    assert [len(c.packets) for c in columns] == [0, 1]
+    assert assemble.slots_seen(samples, now)[0, 0, 28:34].tolist() == [1, 1, 0, 0, 1, 1]
+    assert assemble.slots_seen(samples, now)[0, 1, :12].tolist() == [2] * 10 + [1] * 2
+
+
+@pytest.mark.parametrize(("min_confidence", "n_packets"), [(0.0, 1), (0.7, 1), (0.75, 0), (1.0, 0)])
+def test_packets_below_the_confidence_asked_for(min_confidence: float, n_packets: int) -> None:
+    posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.9)
+    columns = assemble.column_results(
+        clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), min_confidence
+    )
+    assert [len(c.packets) for c in columns] == [n_packets] * 2
+
+
+@pytest.mark.parametrize(
+    ("probability", "status"), [(0.99, "ok"), (0.9, "ok"), (0.7, None), (0.93, "ok"), (0.55, "no_packet")]
+)
+def test_status_follows_the_confidence(probability: float, status: str | None) -> None:
+    """Below a half: weak, or nothing where too many bits are uncertain."""
+    posteriors = posteriors_of([5, 5], indices([5, 5]), probability=probability)
+    (first, _) = assemble.column_results(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+    assert first.status == status or (status is None and first.status in {"weak", "no_packet"})
+    for packet in first.packets:
+        assert packet.ber_hat <= 0.2
+
+
+def test_a_packet_of_low_confidence_is_weak() -> None:
+    posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.95)
+    posteriors = replace(posteriors, log_prob=np.full((1, 2, N_SYMBOLS), np.log(0.7)))
+    (first, _) = assemble.column_results(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+    assert first.status == "weak"
+    assert first.packets[0].confidence == pytest.approx(0.343)
+
+
+def test_nothing_decoded_says_why() -> None:
+    unsure = posteriors_of([5, 5], indices([5, 5]), probability=0.5001)
+    now, samples = clock_of(120, 0, [0, 0, 0]), samples_of(120)
+    light = np.stack([snr(120)[0], snr(120, 0.01)[0]])
+    bright, dark = assemble.column_results(now, unsure, light, samples, 0)
+    assert (bright.status, dark.status) == ("no_packet", "dark")
+    assert bright.message is not None
+    assert "20.0 dB" in bright.message
+    assert dark.message is not None
+    assert "too little light" in dark.message
+    short = clock_of(30, 0, [0])
+    (few, _) = assemble.column_results(short, unsure, snr(30), samples_of(30), 0)
+    assert few.message is not None
+    assert "30 slots of the column are visible, a packet has 50" in few.message
+    for column in (bright, dark, few):
+        assert "\n" not in (column.message or "")
+        assert "; " in (column.message or "")
+
+
+def test_a_column_never_seen_is_dark() -> None:
+    (first, _) = assemble.column_results(
+        clock_of(120, 0, [0, 0, 0]),
+        posteriors_of([5, 5], indices([5, 5]), probability=0.5001),
+        snr(120, 0.0),
+        samples_of(120),
+        0,
+    )
+    assert (first.status, first.snr_db, first.packets) == ("dark", None, ())
+
+
+@pytest.mark.parametrize(("w_probability", "known"), [(0.999, True), (0.6, False)])
+def test_an_unsure_weight_is_not_reported_alone(w_probability: float, known: bool) -> None:
+    unsure = posteriors_of([6, 5], indices([6, 5]), probability=0.5001, w_probability=w_probability)
+    (first, _) = assemble.column_results(clock_of(120, 0, [0, 0, 0]), unsure, snr(120), samples_of(120), 0)
+    assert first.w == (6 if known else None)
+
+
+PACKET_RESULT = PacketResult(0.0, 1.0, 21, "000000", 0.99, 0.001)
+
+
+def column(status: str, with_packet: bool) -> ColumnResult:
+    return ColumnResult(0, status, packets=(PACKET_RESULT,) if with_packet else ())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        ([column("ok", True), column("weak", True)], "ok"),
+        ([column("ok", True), column("dark", False)], "ok"),
+        ([column("ok", True), column("no_packet", False)], "partial"),
+        ([column("no_packet", False), column("dark", False)], "no_signal"),
+        ([column("dark", False)], "no_signal"),
+        ([], "no_signal"),
+    ],
+)
+def test_frame_status(columns: list[ColumnResult], expected: str) -> None:
+    assert assemble.frame_status(tuple(columns)) == expected
