@@ -11,6 +11,9 @@ import click
 
 from rxcli.errors import UsageError
 
+#: Samples that the ranges of eight-bit integers are laid out for.
+CALIBRATION_SAMPLES = 12
+
 
 @click.command()
 @click.argument("out", type=click.Path(file_okay=False, path_type=Path))
@@ -26,6 +29,9 @@ from rxcli.errors import UsageError
 @click.option(
     "--cache", type=click.Path(file_okay=False, path_type=Path), help="Folder of the data sets.  [default: OUT/data]"
 )
+@click.option(
+    "--int8/--float", "quantise", default=True, show_default=True, help="Compute in eight-bit integers, or not."
+)
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint in OUT.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress bars.")
 def train(
@@ -40,6 +46,7 @@ def train(
     column_width: int,
     seed: int,
     cache: Path | None,
+    quantise: bool,
     resume: bool,
     quiet: bool,
 ) -> None:
@@ -56,15 +63,10 @@ def train(
 
     data, progress = cache or out / "data", not quiet
     recipe = fit.Recipe(shape=Shape(strip_width=strip_width, column_width=column_width), steps=steps, seed=seed)
-    network = fit.fit(
-        dataset.column_samples(pictures, seed, data, progress=progress),
-        dataset.frame_samples(frames, seed, data, progress=progress),
-        dataset.validation_samples(held_out, data, progress=progress),
-        recipe,
-        out,
-        resume=resume,
-        progress=progress,
-    )
+    small = dataset.column_samples(pictures, seed, data, progress=progress)
+    whole = dataset.frame_samples(frames, seed, data, progress=progress)
+    held = dataset.validation_samples(held_out, data, progress=progress)
+    network = fit.fit(small, whole, held, recipe, out, resume=resume, progress=progress)
     described = {
         **asdict(recipe),
         "pictures": pictures,
@@ -73,7 +75,8 @@ def train(
         "parameters": n_parameters(network),
     }
     losses = fit.final_losses(out)
-    card = export.export_model(network, out, name, model_version, described, losses)
+    calibration = (whole or small)[:CALIBRATION_SAMPLES] if quantise else ()
+    card = export.export_model(network, out, name, model_version, described, losses, calibration)
     click.echo(
         f"{out / card.file}: {described['parameters']} parameters, cross-entropy {losses['training_nats']:.4f} nats a "
         f"slot in training, {losses['validation_nats']:.4f} on held-out scenes",

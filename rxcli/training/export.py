@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +23,23 @@ from rxcli.denoise import (
     ModelCard,
 )
 from rxcli.errors import ReceiverError
+from rxcli.training.fit import Sample
 from rxcli.training.network import StripNetwork
 
 _OPSET = 17
 #: Largest difference from torch that an exported network may show.
 PARITY = 1e-4
+_CALIBRATION_COLUMNS = 4
 
 
 def export_model(
-    network: StripNetwork, folder: Path, name: str, version: int, recipe: dict[str, Any], figures: dict[str, Any]
+    network: StripNetwork,
+    folder: Path,
+    name: str,
+    version: int,
+    recipe: dict[str, Any],
+    figures: dict[str, Any],
+    calibration: Sequence[Sample] = (),
 ) -> ModelCard:
     """Write `model.onnx` and `model.toml`.
 
@@ -40,6 +50,8 @@ def export_model(
         version: of the model, from 1.
         recipe: how it was fitted.
         figures: what it measured.
+        calibration: samples whose ranges the eight-bit integers of a quantised network are laid out for; none: the
+            network stays in floating point.
 
     Raises:
         ReceiverError: the exported network computes something else than torch.
@@ -47,6 +59,11 @@ def export_model(
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "model.onnx"
     _write_onnx(network.eval(), file)
+    difference = parity(network, file)
+    if not difference < PARITY:
+        raise ReceiverError(f"{file}: differs from torch by {difference:.1e}", "report this")
+    if calibration:
+        quantise(file, calibration)
     contract = Contract(
         version=1,
         samples_per_slot=4,
@@ -65,9 +82,6 @@ def export_model(
         recipe=recipe,
         figures=figures,
     )
-    difference = parity(network, file)
-    if not difference < PARITY:
-        raise ReceiverError(f"{file}: differs from torch by {difference:.1e}", "report this")
     (folder / "model.toml").write_text(tomli_w.dumps(msgspec.to_builtins(card)), encoding="utf-8")
     return card
 
@@ -91,6 +105,49 @@ def _write_onnx(network: StripNetwork, file: Path) -> None:
             opset_version=_OPSET,
             dynamo=False,
         )
+
+
+class _Ranges:
+    """Feeds calibration samples to ONNX Runtime's quantiser, a few columns of each."""
+
+    def __init__(self, samples: Sequence[Sample]) -> None:
+        self._left = iter(samples)
+
+    def get_next(self) -> dict[str, Any] | None:
+        sample = next(self._left, None)
+        if sample is None:
+            return None
+        return {
+            "strips": sample.strips[:_CALIBRATION_COLUMNS].astype(np.float32),
+            "columns": sample.columns[:_CALIBRATION_COLUMNS].astype(np.float32),
+        }
+
+
+def quantise(file: Path, samples: Sequence[Sample]) -> None:
+    """Replace a network by one that computes in eight-bit integers.
+
+    Args:
+        file: ONNX file.
+        samples: typical inputs.
+    """
+    from onnxruntime import quantization
+
+    log = logging.getLogger()
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        part = file.with_suffix(".part")
+        quantization.quantize_static(
+            file,
+            part,
+            _Ranges(samples),
+            per_channel=True,
+            activation_type=quantization.QuantType.QUInt8,
+            weight_type=quantization.QuantType.QInt8,
+        )
+        part.replace(file)
+    finally:
+        log.setLevel(level)
 
 
 def parity(network: StripNetwork, file: Path, seed: int = 0) -> float:
