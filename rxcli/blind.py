@@ -56,6 +56,8 @@ _ALIKE_ROWS = 0.015
 _TRIALS = 24
 #: Any window of this many slots holds a lit and a dark one.
 _EXTREMES_SLOTS = 19
+#: Most that repeated packets count, nats.
+_MOST_FOR_REPEATS = 40.0
 #: Log-likelihood ratio of header and weights, over chance, that a clock must reach.
 MIN_EVIDENCE = 30.0
 
@@ -528,7 +530,7 @@ def structure_evidence(slots: FloatArray | Float32Array, first_slot: int, packet
     """Log-likelihood ratio of slots being packets, over slots lit at random.
 
     Headers must read 0011100011, and every other symbol of a column must have the same number of lit slots; a column
-    may be too dark to say anything.
+    may be too dark to say anything. A packet may come again.
 
     Args:
         slots: (C, N) light of every slot, any scale.
@@ -550,7 +552,24 @@ def structure_evidence(slots: FloatArray | Float32Array, first_slot: int, packet
     weight = _weight_evidence(count, lit.mean(axis=1))
     dimming = _dimming_evidence(lit, position)
     best = (weight + dimming).max(axis=1)
-    return float(np.logaddexp(header + best, 0.0).sum() - n_columns * np.log(2.0))
+    columns = float(np.logaddexp(header + best, 0.0).sum() - n_columns * np.log(2.0))
+    return columns + _repeat_evidence(lit, position, packet_slots)
+
+
+def _repeat_evidence(lit: BoolArray, position: NDArray[np.int64], packet_slots: int) -> float:
+    """Log-likelihood ratio of copies being followed by the same packet, over other packets; bursts may end anywhere."""
+    payload: NDArray[np.int64] = np.flatnonzero(position[: max(position.size - packet_slots, 0)] >= PREAMBLE_SLOTS)
+    if payload.size == 0:
+        return 0.0
+    share = np.clip(lit.mean(axis=1, keepdims=True), 0.1, 0.9)
+    chance = share**2 + (1 - share) ** 2
+    same = lit[:, payload] == lit[:, payload + packet_slots]
+    # Errors come in runs and columns share light: a third of the slots' say.
+    ratio = np.where(same, np.log(0.92 / chance), np.log(0.08 / (1 - chance))).sum(axis=0) / 3
+    copy = np.cumsum(np.diff(position[payload], prepend=position[payload[0]]) < 0)
+    by_copy = np.bincount(copy, ratio)
+    # Half the rows per slot repeat as well, with twice the slots: this may decide a draw, no more.
+    return min(float(np.logaddexp(by_copy + np.log(2 / 3), np.log(1 / 3)).sum()), _MOST_FOR_REPEATS)
 
 
 def _sliced(slots: FloatArray | Float32Array) -> BoolArray:
@@ -1113,8 +1132,8 @@ def why_not(strips: Strips) -> str:
         return "the screen is dark; show a brighter picture or raise the exposure"
     if not striped.any():
         return (
-            "the screen shows no stripes, or too faint ones; check that it sends, show a brighter picture, and take it with "
-            "the electronic shutter, HDR and night mode off (a mechanical or global shutter sees no slots)"
+            "the screen shows no stripes, or too faint ones; check that it sends, show a brighter picture, and take it "
+            "with the electronic shutter, HDR and night mode off (a mechanical or global shutter sees no slots)"
         )
     if striped[lit].mean() < _STRIPED_SHARE:
         return (
