@@ -43,6 +43,8 @@ _CORNER_SHARE = 0.25
 _JUMP, _STILL = 0.012, 0.0004
 #: Frames from which the picture is learned one by one, and how often from then on.
 _FIRST_LESSONS, _LESSON_EVERY = 12, 6
+#: Frames of which the picture is known so little that strips are compared with what is expected of them.
+_FEW_LESSONS = 4
 #: Columns decided worse than this many times the foreseen variance do not fit what is known.
 _MISFIT = 6.0
 #: Share of a frame's noise in what is expected of the next.
@@ -261,11 +263,14 @@ class _Clip:
         positions = known_picture.row_positions(self._rows, now)
         first = known_picture.pattern_metrics(flat, positions, now, memory)
         lit = (0.5 + 0.5 * np.tanh(0.5 * detect.slot_llr(first))).astype(np.float32)
+        if self._n_lessons < _FEW_LESSONS:
+            response, _ = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
+            flat = self._picture.solve_again(light, response.of(lit, positions, now.exposure_slots))
+        flat = known_picture.evened(flat, lit, positions, now.exposure_slots)
         response, late = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
         now = replace(now, row0=now.row0 - late * now.rows_per_slot)
         positions = known_picture.row_positions(self._rows, now)
-        expected = response.of(lit, positions, now.exposure_slots)
-        flat = self._picture.judge(self._picture.solve_again(light, expected), expected, _NOISE_SHARE)
+        flat = self._picture.judge(flat, response.of(lit, positions, now.exposure_slots), _NOISE_SHARE)
         return flat, now, positions, known_picture.pattern_metrics(flat, positions, now, memory, response, lit)
 
     @property

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.protocol import slot_patterns
-from rxcli.types import BoolArray, Clock, Float32Array, FloatArray
+from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray
 
 #: Share of its weight that a frame keeps with every frame after it.
 _MEMORY = 0.95
@@ -29,8 +29,16 @@ _PRIOR = 4.0
 _TEMPER = 0.5
 #: Error of a column's light, in parts of full light, that no pooling removes.
 _COMMON_ERROR = 0.04
+#: Rows around, in each direction, over which a strip's error is averaged; degrees of freedom of its own.
+_ERROR_ROWS, _DEGREES = 12, 3.0
 #: A column's light further than this beyond dark or lit is not to be trusted.
 _BEYOND = 0.15
+#: Slots to each side that a blur reaches, what is possible in the middle and at a side, and how much less is likelier.
+_SIDE, _CENTRE, _AT_SIDE, _RIDGE = 0.5, (0.3, 1.3), (-0.1, 0.35), 1e-4
+#: Groups of rows by their precision, and the contrast that compression may leave of theirs.
+_GROUPS, _GAIN = 8, (0.15, 1.3)
+#: Largest correction of the clock at a time, slots.
+_MAX_LATE = 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +83,7 @@ class KnownPicture:
         self._light = np.zeros(inside.shape, np.float32)
         self._seen = np.zeros(inside.shape, np.float32)
         self._system: _System | None = None
+        self._picture = self._error = self._light
         #: (C,) variance of the columns' light over what was foreseen.
         self._excess = np.ones(inside.shape[0], np.float32)
 
@@ -103,7 +112,24 @@ class KnownPicture:
         """
         if self._system is None:
             self._system = self._factor()
-        system = self._system
+        return self._solved(light, self._system)
+
+    def solve_again(self, light: Float32Array, expected: Float32Array) -> ColumnLight:
+        """The columns' own light once more, strips trusted as far as they show what is expected.
+
+        Args:
+            light: (C, S, R).
+            expected: (C, R) light that the slots decided so far give.
+        """
+        assert self._system is not None
+        foreseen = self._picture * (self._spread @ _with_neighbours(expected))
+        error = light - self._floor - foreseen
+        np.square(error, out=error)
+        around = _box(error * self._inside, _ERROR_ROWS) / (_box(self._inside, _ERROR_ROWS) + np.float32(1e-3))
+        system = self._factor(around + error / np.float32(_DEGREES))
+        return self._solved(light, system)
+
+    def _solved(self, light: Float32Array, system: _System) -> ColumnLight:
         seen = self._spread.T @ (system.gain * (light - self._floor))
         right = seen[:, 1] + np.float32(_PRIOR / 2)
         right[1:] += seen[:-1, 2]
@@ -113,22 +139,22 @@ class KnownPicture:
         value = shrunk + (shrunk - np.float32(0.5)) * (np.float32(_PRIOR) / np.maximum(precision, np.float32(1e-3)))
         return ColumnLight(value, self._tempered(value, precision), shrunk)
 
-    def judge(self, seen: ColumnLight, slots: Float32Array, share: float) -> Float32Array:
-        """Compare columns with what was decided; what comes next is trusted accordingly.
+    def judge(self, seen: ColumnLight, expected: Float32Array, share: float) -> ColumnLight:
+        """Compare columns with what was decided; they are trusted accordingly, now and, in part, from now on.
 
         Args:
             seen: as `solve` gave it.
-            slots: (C, R) exposure-averaged decided slots.
+            expected: (C, R) what the decided slots give.
             share: weight of this frame against those before, 0..1.
 
         Returns:
-            (C,) mean squared error over the variance foreseen.
+            The light with its precision put right.
         """
-        error = np.square(seen.value - slots) * seen.precision
+        error = np.square(seen.value - expected) * seen.precision
         ratio = error.sum(axis=1) / np.maximum((seen.precision > 0).sum(axis=1), 1) / np.float32(_TEMPER)
-        self._excess *= np.clip(1 + np.float32(share) * (ratio - 1), 0.25, 16.0)
-        np.clip(self._excess, 0.25, 100.0, out=self._excess)
-        return np.asarray(ratio)
+        now = np.clip(self._excess * ratio, 0.25, 100.0)
+        self._excess += np.float32(share) * (now - self._excess)
+        return ColumnLight(seen.value, seen.precision / np.maximum(ratio, 0.5)[:, None], seen.shrunk)
 
     def moved(self, row_of: FloatArray, inside: BoolArray) -> None:
         """Follow the screen to another place.
@@ -163,11 +189,16 @@ class KnownPicture:
         unseen = np.float32(_SMOOTH * _AROUND_ERROR) / total
         return picture, unseen * unseen + np.float32(_LEAST_ERROR**2)
 
-    def _factor(self) -> _System:
+    def _factor(self, measured: Float32Array | None = None) -> _System:
         """Normal equations A m = b of every row, A symmetric with two bands: A = L D L', and the diagonal of A^-1."""
-        picture, error = self.picture()
+        if self._system is None:
+            self._picture, self._error = self.picture()
+        picture = self._picture
         half = np.float32(0.5) * picture
-        gain = picture * self._inside / (self._variance + half * (self._shot + half * error))
+        variance = self._variance + half * (self._shot + half * self._error)
+        if measured is not None:
+            variance += measured
+        gain = picture * self._inside / variance
         left, own, right = self._spread.T
         products = np.stack([own * own, left * left, right * right, own * right, left * own, left * right])
         power = products @ (gain * picture)
@@ -275,7 +306,93 @@ def row_positions(rows: FloatArray, clock: Clock) -> FloatArray:
     return np.asarray(common - clock.delay_slots[:, None])
 
 
-def pattern_metrics(seen: ColumnLight, positions: FloatArray, clock: Clock, memory: int) -> FloatArray:
+@dataclass(frozen=True, slots=True)
+class Response:
+    """What a camera and its compression make of the exposed slots m: offset + centre m(g) + side (m(g - h) + m(g + h)),
+    h being half a slot. Compression blurs stripes, frame by frame as its bits last."""
+
+    centre: float = 1.0
+    side: float = 0.0
+    offset: float = 0.0
+
+    def of(self, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
+        """(C, R) light that slots (C, N) give at the positions; see `exposed`."""
+        out = np.float32(self.centre) * exposed(lit, positions, exposure_slots) + np.float32(self.offset)
+        if self.side:
+            beside = exposed(lit, positions - _SIDE, exposure_slots) + exposed(lit, positions + _SIDE, exposure_slots)
+            out += np.float32(self.side) * beside
+        return np.asarray(out)
+
+
+def fit_response(
+    seen: ColumnLight, lit: Float32Array, positions: FloatArray, exposure_slots: float
+) -> tuple[Response, float]:
+    """The response of a frame, and how many slots its clock is late, by least squares over all columns.
+
+    Args:
+        seen: the columns' light.
+        lit: (C, N) probability that each slot is lit.
+        positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
+        exposure_slots: exposure in slots.
+    """
+    before, here, after = (exposed(lit, positions + shift, exposure_slots) for shift in (-_SIDE, 0.0, _SIDE))
+    parts = [here, before + after, np.ones_like(here), (after - before) * np.float32(0.5 / _SIDE)]
+    weighted = [part * seen.precision for part in parts]
+    normal = np.array([[np.vdot(a, b) for b in parts] for a in weighted], np.float64)
+    right = np.array([np.vdot(a, seen.value) for a in weighted], np.float64)
+    weight = float(seen.precision.sum()) + 1e-9
+    # Drawn, a little, to no blur.
+    usual = np.array([1.0, 0.0, 0.0, 0.0])
+    centre, side, offset, late = usual + np.linalg.solve(
+        normal / weight + _RIDGE * np.eye(4), (right - normal @ usual) / weight
+    )
+    response = Response(
+        float(np.clip(centre, *_CENTRE)), float(np.clip(side, *_AT_SIDE)), float(np.clip(offset, -0.2, 0.2))
+    )
+    return response, float(np.clip(late / max(centre + 2 * side, 0.3), -_MAX_LATE, _MAX_LATE))
+
+
+def evened(seen: ColumnLight, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> ColumnLight:
+    """The light with its contrast put right: compression takes stripes away where they are faint, and only there.
+
+    Rows are grouped by their precision; in each group the contrast that is left is measured against the slots.
+
+    Args:
+        seen: the columns' light.
+        lit: (C, N) probability that each slot is lit.
+        positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
+        exposure_slots: exposure in slots.
+    """
+    half = np.float32(0.5)
+    before, here, after = (exposed(lit, positions + shift, exposure_slots) for shift in (-_SIDE, 0.0, _SIDE))
+    parts = np.stack([here - half, before + after - 1, np.ones_like(here)])
+    seen_here = seen.precision > 1e-3
+    level = np.log(np.maximum(seen.precision, np.float32(1e-3)))
+    if np.count_nonzero(seen_here) < 10 * _GROUPS:
+        return seen
+    borders = np.quantile(level[seen_here], np.linspace(0, 1, _GROUPS + 1))
+    group = np.clip(np.searchsorted(borders, level, "right") - 1, 0, _GROUPS - 1)
+    gain, offset = np.ones(_GROUPS, np.float32), np.zeros(_GROUPS, np.float32)
+    for number in range(_GROUPS):
+        mine = seen_here & (group == number)
+        model, value = parts[:, mine], np.clip(seen.value[mine] - half, -1.2, 1.2)
+        normal = model @ model.T / value.size + np.float32(1e-3) * np.eye(3, dtype=np.float32)
+        centre, side, offset[number] = np.linalg.solve(normal, model @ value / value.size + [1e-3, 0, 0])
+        gain[number] = np.clip(centre + 2 * side, *_GAIN)
+    middle = (borders[1:] + borders[:-1]) / 2
+    gains = np.interp(level, middle, gain).astype(np.float32)
+    offsets = np.interp(level, middle, offset).astype(np.float32)
+    return ColumnLight((seen.value - half - offsets) / gains + half, seen.precision * gains * gains, seen.shrunk)
+
+
+def pattern_metrics(
+    seen: ColumnLight,
+    positions: FloatArray,
+    clock: Clock,
+    memory: int,
+    response: Response = Response(),  # noqa: B008  # frozen
+    lit: Float32Array | None = None,
+) -> FloatArray:
     """Log-likelihood of every slot pattern at every slot, (C, N + memory, patterns); see `channel.SlotLikelihoods`.
 
     Args:
@@ -283,34 +400,76 @@ def pattern_metrics(seen: ColumnLight, positions: FloatArray, clock: Clock, memo
         positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
         clock: the clock.
         memory: slots of memory.
+        response: what becomes of the exposed slots.
+        lit: (C, N) present idea of the slots, for what reaches beyond the memory; None: nothing does.
     """
-    if positions.shape[0] > 1:
-        return np.concatenate(
-            [
-                pattern_metrics(
-                    ColumnLight(*(part[c : c + 1] for part in (seen.value, seen.precision, seen.shrunk))),
-                    positions[c : c + 1],
-                    clock,
-                    memory,
-                )
-                for c in range(positions.shape[0])
-            ]
+    value = seen.value - np.float32(response.offset)
+    if lit is not None:
+        whole = response.of(lit, positions, clock.exposure_slots) - np.float32(response.offset)
+        value = value - whole
+    if positions.shape[0] == 1:
+        return _row_metrics(value, seen.precision, positions[0], clock, memory, response, lit)
+    parts = [
+        _row_metrics(
+            value[c : c + 1],
+            seen.precision[c : c + 1],
+            positions[c],
+            clock,
+            memory,
+            response,
+            None if lit is None else lit[c : c + 1],
         )
-    centre = positions[0]
+        for c in range(positions.shape[0])
+    ]
+    return np.concatenate(parts)
+
+
+def _row_metrics(
+    value: Float32Array,
+    precision: Float32Array,
+    centre: FloatArray,
+    clock: Clock,
+    memory: int,
+    response: Response,
+    lit: Float32Array | None,
+) -> FloatArray:
+    """Metrics of columns whose rows have the positions `centre` (R,); `value` lacks, where `lit` is given, all of it."""
     metric = np.floor(centre + memory / 2).astype(np.int64)
-    slots = metric[:, None] + np.arange(-memory, 1)
-    half = clock.exposure_slots / 2
-    reach = np.minimum((centre + half)[:, None], slots + 1) - np.maximum((centre - half)[:, None], slots)
-    share = np.maximum(reach, 0) / clock.exposure_slots
-    levels = (share @ slot_patterns(memory).T.astype(np.float64)).astype(np.float32)
     n_metrics = clock.n_slots + memory
     use = (metric >= 0) & (metric < n_metrics)
-    borders = np.searchsorted(metric[use], np.arange(n_metrics + 1))
-    precision, value, levels = seen.precision[:, use], seen.value[:, use], levels[use].T
-    weighted = precision * value
-    out = np.empty((value.shape[0], levels.shape[0], n_metrics))
-    total = np.zeros((value.shape[0], value.shape[1] + 1))
-    for number, level in enumerate(levels):
-        np.cumsum(weighted * level - precision * (np.float32(0.5) * level * level), axis=1, out=total[:, 1:])
-        out[:, number] = np.diff(total[:, borders], axis=1)
-    return np.ascontiguousarray(out.transpose(0, 2, 1))
+    metric, centre, value, precision = metric[use], centre[use], value[:, use], precision[:, use]
+    slots = metric[:, None] + np.arange(-memory, 1)
+    share = response.centre * _overlap(centre, slots, clock.exposure_slots)
+    if response.side:
+        share += response.side * _overlap(centre - _SIDE, slots, clock.exposure_slots)
+        share += response.side * _overlap(centre + _SIDE, slots, clock.exposure_slots)
+    share = share.astype(np.float32)
+    if lit is not None:
+        padded = np.pad(lit, ((0, 0), (memory, memory)), constant_values=np.float32(0.5))
+        value = value.copy()
+        for back in range(memory + 1):
+            value += share[:, back] * padded[:, slots[:, back] + memory]
+    borders = np.searchsorted(metric, np.arange(n_metrics + 1))
+    linear = [_sums(precision * value * share[:, j], borders) for j in range(memory + 1)]
+    out = np.zeros((value.shape[0], n_metrics, 2 << memory))
+    patterns = slot_patterns(memory).astype(np.float64)
+    for j, at_j in enumerate(linear):
+        out += at_j[:, :, None] * patterns[:, j]
+        for k in range(j, memory + 1):
+            power = _sums(precision * (share[:, j] * share[:, k]), borders)
+            out -= power[:, :, None] * (patterns[:, j] * patterns[:, k] * (0.5 if j == k else 1.0))
+    return out
+
+
+def _overlap(centre: FloatArray, slots: IntArray, exposure_slots: float) -> FloatArray:
+    """Share of an exposure around `centre` (R,) that falls into each of its `slots` (R, n)."""
+    half = exposure_slots / 2
+    reach = np.minimum((centre + half)[:, None], slots + 1) - np.maximum((centre - half)[:, None], slots)
+    return np.asarray(np.maximum(reach, 0) / exposure_slots)
+
+
+def _sums(values: Float32Array, borders: IntArray) -> FloatArray:
+    """Sums of `values` (C, R) between neighbouring borders, (C, n - 1)."""
+    total = np.zeros((values.shape[0], values.shape[1] + 1))
+    np.cumsum(values, axis=1, out=total[:, 1:])
+    return np.diff(total[:, borders], axis=1)
