@@ -56,7 +56,7 @@ class Scene:
     sigma: float
     #: Variance of a sample per unit of light.
     shot: float
-    #: (S, 3) share of the light of columns -1, 0, +1 in each strip.
+    #: (S, 3) shares of columns -1, 0, +1 in the light of each strip, up to a factor.
     spread: FloatArray
 
 
@@ -97,7 +97,7 @@ def network_inputs(scene: Scene, columns: NDArray[np.int64]) -> tuple[Float32Arr
         *np.moveaxis(_from_neighbours(scene, columns, q).reshape(shape), -1, 0),
         valid.reshape(shape).mean(axis=-1),
         *_noise_features(level.reshape(shape)[..., 0], sigma, np.float32(scene.shot)),
-        scene.spread[None, :, 1, None],
+        _against_middle(scene.spread)[None, :, 1, None],
         np.float32(scene.clock.exposure_slots),
         known,
     ]
@@ -143,13 +143,27 @@ def _from_neighbours(scene: Scene, columns: NDArray[np.int64], q: int) -> Float3
     n_columns = scene.lit.shape[0]
     out = np.zeros((columns.size, *scene.samples.light.shape[1:]), np.float32)
     centres = (np.arange(out.shape[-1]) + 0.5) / q
-    for side, share in ((-1, scene.spread[:, 0]), (1, scene.spread[:, 2])):
+    spread = _against_middle(scene.spread)
+    for side, share in ((-1, spread[:, 0]), (1, spread[:, 2])):
         for row, column in enumerate(columns):
             other = int(column) + side
             if 0 <= other < n_columns:
                 ahead = scene.clock.delay_slots[column] - scene.clock.delay_slots[other]
                 out[row] += share[:, None] * _exposed(scene.lit[other], centres + ahead, scene.clock.exposure_slots)
     return out
+
+
+def _against_middle(spread: FloatArray) -> FloatArray:
+    """(S, 3) light of columns -1, 0, +1 in each strip against the column's own light in its middle.
+
+    A Gaussian's shares tell where in the column the strip lies: their logarithms bend by 1 / sigma**2 and rise by the
+    strip's place over sigma**2.
+    """
+    log = np.log(np.maximum(spread, 1e-12))
+    bend = np.maximum(2 * log[:, 1] - log[:, 0] - log[:, 2], 1e-6)
+    rise = (log[:, 2] - log[:, 0]) / 2
+    own = np.exp(-np.square(rise) / (2 * bend))
+    return np.asarray(spread / spread[:, 1:2] * own[:, None])
 
 
 def _exposed(lit: Float32Array, centres: FloatArray, exposure_slots: float) -> FloatArray:

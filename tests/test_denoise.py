@@ -95,6 +95,15 @@ def test_neighbours_light_is_slots_through_the_exposure(scene: Scene) -> None:
     np.testing.assert_allclose(np.moveaxis(feature(strips, "neighbours[4]")[0], 1, 2), alone, atol=0.02)
 
 
+def test_shares_count_up_to_a_factor(scene: Scene) -> None:
+    shares = replace(scene, spread=scene.spread / scene.spread.sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(
+        network_inputs(shares, np.array([1]))[0], network_inputs(scene, np.array([1]))[0], atol=1e-5
+    )
+    alone = replace(scene, spread=np.array([[0.0, 1.0, 0.0]] * N_STRIPS))
+    assert feature(network_inputs(alone, np.array([1]))[0], "neighbours[4]").max() < 1e-6
+
+
 def test_delayed_neighbours_move(scene: Scene) -> None:
     delayed = replace(scene, clock=replace(scene.clock, delay_slots=np.array([1.0, 0.0, 1.0])))
     on_time = feature(network_inputs(scene, np.array([1]))[0], "neighbours[4]")
