@@ -13,7 +13,10 @@ ROOT = Path(rxcli.__file__).parent
 #: What everything may import.
 BASE = {"rxcli", "rxcli.errors", "rxcli.resources"}
 DATA = BASE | {"rxcli.types", "rxcli.protocol", "rxcli.profiles"}
-PIPELINE_STAGES = ("ingest", "find_screen", "geometry", "sampling", "clock", "channel", "denoise", "detect", "assemble")
+PIPELINE_STAGES = ("ingest", "find_screen", "geometry", "blind", "sampling", "clock", "channel", "denoise", "detect")
+PIPELINE_STAGES += ("assemble", "strips", "known_picture", "tracking")
+#: What puts the stages together.
+WIRING = {"pipeline", "locate", "reception", "clip", "options"}
 #: Too heavy to be loaded by a module that does not need it at once (milliseconds each on import: 70 to 1000).
 HEAVY = {"cv2", "rawpy", "av", "onnxruntime", "matplotlib", "scipy", "skimage", "simplejpeg", "tifffile"}
 HEAVY |= {"distributed", "dask", "pyarrow", "torch", "onnx", "lensfunpy", "pillow_heif", "tqdm"}
@@ -123,7 +126,14 @@ def test_reports_know_results_only(part: str) -> None:
 
 def test_only_those_above_it_call_the_pipeline() -> None:
     callers = {part_of(name) for name, tree in MODULES.items() if "rxcli.pipeline" in imports(tree)}
-    assert callers <= {"cli", "benchmark", "batch", "training", "pipeline", "clip"}  # clip: the wiring of clips
+    assert callers <= {"cli", "benchmark", "batch", "training"}
+
+
+def test_only_the_wiring_puts_stages_together() -> None:
+    for name, tree in MODULES.items():
+        stages = {part_of(other) for other in own(imports(tree))} & set(PIPELINE_STAGES)
+        if part_of(name) not in WIRING | {"cli", "benchmark", "training", "batch", "pictures", "undistort"}:
+            assert stages <= {part_of(name)}, name
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))
