@@ -101,7 +101,9 @@ def iterate(lock: Lock, seen: Reception, skip: frozenset[str] = frozenset(SKIPS)
         columns = np.flatnonzero(wanted & _unsettled(seen, before, iteration, skip))
         skipped["certain_columns"] = skipped.get("certain_columns", 0) + int(wanted.sum()) - columns.size
         if iteration == 0:
-            now = clock.corrected(now, likelihoods.timing)
+            timing = np.zeros((wanted.size, 2))
+            timing[wanted] = likelihoods.timing
+            now = clock.corrected(now, timing)
             samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
     return replace(seen, skipped={name: count for name, count in skipped.items() if count})
 
