@@ -175,7 +175,7 @@ def find_lock(frame: Frame, corners: FloatArray, camera: Camera, options: Receiv
         clocks = {rate: found for rate, screen in rates.items() if (found := _clock_of(screen, quick, camera))}
         clocks = {rate: found for rate, found in clocks.items() if found.lock >= _MIN_LOCK}
         if not clocks:
-            raise Failure("no_signal", _why_no_signal(corners, camera, options))
+            raise Failure("no_signal", _why_no_signal(frame, corners, camera, options))
         rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(quick, clocks[r]))
     alike = [screen for screen in options.screens if (screen.slot_rate_hz, screen.packet_slots) == rate]
     locks = [Lock(alike[0], profiles, clocks[rate])] if alike[0].columns == n_columns else []
@@ -187,7 +187,7 @@ def find_lock(frame: Frame, corners: FloatArray, camera: Camera, options: Receiv
         if found:
             locks.append(Lock(screen, finer, found))
     if not locks:
-        raise Failure("no_signal", _why_no_signal(corners, camera, options))
+        raise Failure("no_signal", _why_no_signal(frame, corners, camera, options))
     return locks[0] if len(locks) == 1 else _with_likely_columns(locks)
 
 
@@ -222,15 +222,24 @@ def _clock_of(screen: ScreenProfile, profiles: RowProfiles, camera: Camera) -> C
     return clock.find_clock(profiles, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(profiles))
 
 
-def _why_no_signal(corners: FloatArray, camera: Camera, options: ReceiverOptions) -> str:
-    visible_s = float(np.ptp(corners[:, 1])) * camera.line_delay_s
+def _why_no_signal(frame: Frame, corners: FloatArray, camera: Camera, options: ReceiverOptions) -> str:
     shortest = min(options.screens, key=lambda screen: screen.packet_s)
-    if visible_s < shortest.packet_s:
-        return (
-            f"the screen's {np.ptp(corners[:, 1]):.0f} rows show {1e3 * visible_s:.2f} ms of the link, less than one "
-            f"packet of {shortest.name} ({1e3 * shortest.packet_s:.2f} ms); move closer or use a faster slot rate"
-        )
-    return "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
+    return too_small(frame, corners, camera, shortest) or (
+        "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
+    )
+
+
+def too_small(frame: Frame, corners: FloatArray, camera: Camera, screen: ScreenProfile) -> str | None:
+    """Why no packet of `screen` fits the rows that show it, None where one does."""
+    fill = float(np.ptp(np.clip(corners[:, 1], 0, frame.height - 1))) / frame.height
+    needed = screen.packet_s / (camera.line_delay_s * frame.height)
+    if fill >= needed:
+        return None
+    advice = "move closer" if needed < 1 else "use a faster slot rate or shorter packets"
+    return (
+        f"the screen fills {np.floor(100 * fill):.0f} % of the height: one packet at {screen.slot_rate_hz / 1e3:g} kHz "
+        f"needs {np.ceil(100 * needed):.0f} % with this camera; {advice}"
+    )
 
 
 def noise_of(profiles: RowProfiles) -> float:

@@ -13,12 +13,14 @@ from itertools import chain
 
 from rxcli import assemble, denoise
 from rxcli.dump import dump_frame
-from rxcli.locate import Failure, Stages, find_camera, find_corners, find_lock
+from rxcli.locate import Failure, Stages, find_camera, find_corners, find_lock, too_small
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.reception import decode, iterate, quick_look, scene_of, second_opinion
 from rxcli.types import Frame, FrameResult
 
 __all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "denoiser_scene", "receive", "receive_frame"]
+
+_NO_PACKET = "no column gave a packet, though headers were found; each column says why: see --json"
 
 
 def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
@@ -90,6 +92,8 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
             columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
         result = replace(result, denoiser=report, skipped=seen.skipped)
         result = replace(result, columns=columns, status=assemble.frame_status(columns))
+        if result.status == "no_signal":
+            result = replace(result, message=too_small(frame, corners, camera, lock.screen) or _NO_PACKET)
     except Failure as failure:
         result = replace(result, status=failure.status, message=failure.message)
     return replace(result, timing_ms=stages.total())
