@@ -10,6 +10,10 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from rxcli.errors import InputError
+from rxcli.ingest import open_source
+from rxcli.types import Frame
+
 BAYER = np.array([[0, 1], [1, 2]], np.uint8)
 #: The X-Trans pattern of the Fujifilm X-S10, from its first active pixel on.
 XTRANS = np.array(["GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB", "RBGBRG"])
@@ -75,3 +79,14 @@ def _fill(frame: av.VideoFrame, luma: NDArray[Any]) -> NDArray[Any]:
             samples[:, : luma.shape[1]] = luma
         plane.update(samples.tobytes())
     return luma
+
+
+def read_all(path: Path) -> tuple[list[Frame], InputError | None]:
+    """The frames of a file, and the error that it ended with."""
+    frames = []
+    try:
+        for frame in open_source(path):
+            frames.append(frame)  # noqa: PERF402 - what came before an error counts
+    except InputError as error:
+        return frames, error
+    return frames, None

@@ -16,24 +16,12 @@ import simplejpeg
 import tifffile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from ingest_files import BAYER, XTRANS, write_clip, write_dng
+from ingest_files import BAYER, XTRANS, read_all, write_clip, write_dng
 from PIL import Image
 
-from rxcli.errors import ExitCode, InputError
-from rxcli.ingest import open_source
-from rxcli.types import Frame
+from rxcli.errors import ExitCode
 
 NOISE = np.random.default_rng(7).integers(0, 255, (64, 96), dtype=np.uint8)
-
-
-def read(path: Path) -> tuple[list[Frame], InputError | None]:
-    frames = []
-    try:
-        for frame in open_source(path):
-            frames.append(frame)  # noqa: PERF402 - what came before an error counts
-    except InputError as error:
-        return frames, error
-    return frames, None
 
 
 def jpeg(pixels: np.ndarray) -> bytes:
@@ -91,7 +79,7 @@ BAD = {
 def test_bad_file(tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]) -> None:
     data, reason = BAD[name]
     (tmp_path / name).write_bytes(data)
-    frames, error = read(tmp_path / name)
+    frames, error = read_all(tmp_path / name)
     assert not frames
     assert error is not None
     assert str(error).startswith(f"{tmp_path / name}: ")
@@ -103,27 +91,27 @@ def test_bad_file(tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]) 
 
 
 def test_missing(tmp_path: Path) -> None:
-    assert "no such file" in str(read(tmp_path / "nothing.jpg")[1])
+    assert "no such file" in str(read_all(tmp_path / "nothing.jpg")[1])
     (tmp_path / "file").write_bytes(b"x")
-    assert "no such file" in str(read(tmp_path / "file" / "a.jpg")[1])
-    assert "a\\0b" not in str(read(Path("a\0b"))[1])
+    assert "no such file" in str(read_all(tmp_path / "file" / "a.jpg")[1])
+    assert "a\\0b" not in str(read_all(Path("a\0b"))[1])
 
 
 def test_folder_and_pipe(tmp_path: Path) -> None:
-    assert "is a folder" in str(read(tmp_path)[1])
+    assert "is a folder" in str(read_all(tmp_path)[1])
     os.mkfifo(tmp_path / "pipe.jpg")
-    assert "is not a regular file" in str(read(tmp_path / "pipe.jpg")[1])
+    assert "is not a regular file" in str(read_all(tmp_path / "pipe.jpg")[1])
 
 
 def test_device_that_is_no_camera() -> None:
-    assert "/dev/null: is no V4L2 device" in str(read(Path("/dev/null"))[1])
+    assert "/dev/null: is no V4L2 device" in str(read_all(Path("/dev/null"))[1])
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
 def test_permission(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(jpeg(NOISE))
     (tmp_path / "a.jpg").chmod(0)
-    assert "cannot be read (Permission denied)" in str(read(tmp_path / "a.jpg")[1])
+    assert "cannot be read (Permission denied)" in str(read_all(tmp_path / "a.jpg")[1])
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 96), (64, 1)])
@@ -132,7 +120,7 @@ def test_tiny_pictures_are_frames(
     tmp_path: Path, shape: tuple[int, int], encode: Callable[[np.ndarray], bytes]
 ) -> None:
     (tmp_path / "a.jpg").write_bytes(encode(NOISE[: shape[0], : shape[1]]))
-    frames, error = read(tmp_path / "a.jpg")
+    frames, error = read_all(tmp_path / "a.jpg")
     assert error is None
     assert frames[0].pixels.shape == shape
 
@@ -141,7 +129,7 @@ def test_tiny_pictures_are_frames(
 @pytest.mark.parametrize("encode", [jpeg, png, tiff])
 def test_even_pictures_are_frames(tmp_path: Path, value: int, encode: Callable[[np.ndarray], bytes]) -> None:
     (tmp_path / "a.jpg").write_bytes(encode(np.full_like(NOISE, value)))
-    frames, error = read(tmp_path / "a.jpg")
+    frames, error = read_all(tmp_path / "a.jpg")
     assert error is None
     assert (frames[0].pixels == value).all()
 
@@ -186,7 +174,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _survives(path: Path, data: bytes) -> None:
     path.write_bytes(data)
-    frames, error = read(path)
+    frames, error = read_all(path)
     assert error is None or "\n" not in str(error)
     for frame in frames:
         assert frame.pixels.ndim == 2

@@ -8,23 +8,10 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from ingest_files import HEIGHT, N_FRAMES, RATE, WIDTH, write_clip
+from ingest_files import HEIGHT, N_FRAMES, RATE, WIDTH, read_all, write_clip
 
-from rxcli.errors import ExitCode, InputError
+from rxcli.errors import ExitCode
 from rxcli.ingest import open_source
-from rxcli.types import Frame
-
-
-def read(path: Path) -> tuple[list[Frame], InputError | None]:
-    """The frames of a clip, and the error that it ended with."""
-    frames = []
-    try:
-        for frame in open_source(path):
-            frames.append(frame)  # noqa: PERF402 - what came before an error counts
-    except InputError as error:
-        return frames, error
-    return frames, None
-
 
 CODECS = [
     ("libx264", "yuv420p", 16, 235),
@@ -42,7 +29,7 @@ def test_luma_levels_and_times(tmp_path: Path, suffix: str, codec: str, form: st
     if suffix == "avi" and codec == "libx265":
         pytest.skip("AVI holds no HEVC")
     planes = write_clip(tmp_path / f"a.{suffix}", codec, form, encoder={"bf": "0"})
-    frames, error = read(tmp_path / f"a.{suffix}")
+    frames, error = read_all(tmp_path / f"a.{suffix}")
     assert error is None
     assert [frame.index for frame in frames] == list(range(N_FRAMES))
     steps = np.diff([frame.time_s for frame in frames])
@@ -67,14 +54,14 @@ def test_pixels_are_views_that_stay(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("degrees", "orientation"), [(0, 1), (180, 3), (90, 8), (-90, 6)])
 def test_rotation_is_noted_not_applied(tmp_path: Path, degrees: int, orientation: int) -> None:
     write_clip(tmp_path / "a.mp4", rotation=degrees)
-    frames, _ = read(tmp_path / "a.mp4")
+    frames, _ = read_all(tmp_path / "a.mp4")
     assert {frame.metadata.orientation for frame in frames} == {orientation}
     assert frames[0].pixels.shape == (HEIGHT, WIDTH)
 
 
 def test_camera_from_tags(tmp_path: Path) -> None:
     write_clip(tmp_path / "a.mkv", tags={"MAKE": "FUJIFILM", "MODEL": "X-S10"})
-    frames, _ = read(tmp_path / "a.mkv")
+    frames, _ = read_all(tmp_path / "a.mkv")
     assert (frames[0].metadata.make, frames[0].metadata.model) == ("FUJIFILM", "X-S10")
 
 
@@ -96,11 +83,11 @@ def test_cut_clip_gives_what_is_there(
     form = "yuvj420p" if codec == "mjpeg" else "yuv420p"
     path = tmp_path / f"a.{suffix}"
     write_clip(path, codec, form, container=container, encoder={"bf": "0", "g": "4"}, noise=True)
-    whole, error = read(path)
+    whole, error = read_all(path)
     assert error is None
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    frames, error = read(path)
+    frames, error = read_all(path)
     assert error is not None
     assert error.exit_code == ExitCode.UNREADABLE
     assert f"breaks off at {frames[-1].time_s:.3f} s" in str(error)
@@ -113,7 +100,7 @@ def test_clip_without_its_index(tmp_path: Path) -> None:
     write_clip(tmp_path / "a.mp4")
     data = (tmp_path / "a.mp4").read_bytes()
     (tmp_path / "a.mp4").write_bytes(data[: len(data) // 2])
-    frames, error = read(tmp_path / "a.mp4")
+    frames, error = read_all(tmp_path / "a.mp4")
     assert not frames
     assert "its index is missing" in str(error)
 
@@ -124,7 +111,7 @@ def test_damaged_frame_is_left_out_and_told(tmp_path: Path) -> None:
     at = [i for i in range(len(data)) if data[i : i + 3] == b"\xff\xd8\xff"][N_FRAMES // 2]
     data[at + 2 : at + 40] = bytes(38)
     (tmp_path / "a.avi").write_bytes(data)
-    frames, error = read(tmp_path / "a.avi")
+    frames, error = read_all(tmp_path / "a.avi")
     assert len(frames) == N_FRAMES - 1
     assert "1 frames are damaged, the first after 0.367 s" in str(error)
 
@@ -144,5 +131,5 @@ def test_sound_without_pictures(tmp_path: Path) -> None:
             frame.sample_rate = 44100
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    _, error = read(tmp_path / "a.mp4")
+    _, error = read_all(tmp_path / "a.mp4")
     assert "a.mp4: no video in it" in str(error)

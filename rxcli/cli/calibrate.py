@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import re
 from collections.abc import Iterator
 from itertools import islice
@@ -12,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rxcli.cli.common import write_json
 from rxcli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -141,7 +140,7 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
 
 def _say_lens(result: LensCalibration, json_path: str | None, target: Path | None) -> None:
     if json_path is not None:
-        _write_json(_lens_record(result, target), json_path)
+        write_json(_lens_record(result, target), json_path)
     if json_path == "-":
         return
     matrix = result.model.camera_matrix
@@ -295,7 +294,7 @@ def _say_shutter(result: ShutterCalibration, json_path: str | None, target: Path
     for warning in result.warnings:
         click.echo(f"vlc-rx: {warning}", err=True)
     if json_path is not None:
-        _write_json(_shutter_record(result, target), json_path)
+        write_json(_shutter_record(result, target), json_path)
     if json_path == "-":
         return
     low, high = result.readout_interval_s
@@ -397,7 +396,7 @@ def lensfun(
         "profile": str(target) if target is not None else None,
     }
     if json_path is not None:
-        _write_json(record, json_path)
+        write_json(record, json_path)
     if json_path != "-":
         click.echo(f"camera      {found.camera_name}")
         click.echo(f"lens        {found.lens_name} at {metadata.focal_length_mm:g} mm")
@@ -406,23 +405,3 @@ def lensfun(
         click.echo(f"conversion  within {found.worst_px:.2f} px of lensfun's own")
         if target is not None:
             click.echo(f"written     {target}")
-
-
-def _write_json(record: dict[str, Any], path: str) -> None:
-    text = json.dumps(_finite(record), indent=2)
-    if path == "-":
-        click.echo(text)
-        return
-    try:
-        Path(path).write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})", "name another file") from None
-
-
-def _finite(value: Any) -> Any:
-    """JSON knows no NaN and no infinity."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

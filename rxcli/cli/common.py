@@ -1,14 +1,16 @@
-"""Options that several commands share, and the receiver's options made of them."""
+"""What several commands share: options, the receiver's options made of them, writing JSON."""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from rxcli.errors import UsageError
+from rxcli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from rxcli.pipeline import ReceiverOptions
@@ -159,3 +161,28 @@ def _checked(corners: Any) -> Any:
             "check their order and the numbers",
         )
     return corners
+
+
+def write_json(value: Any, path: str) -> None:
+    """Write `value` as indented JSON to a file, or to stdout where `path` is "-".
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    text = json.dumps(_finite(value), indent=2)
+    if path == "-":
+        click.echo(text)
+        return
+    try:
+        Path(path).write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})", "name another file") from None
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows no NaN and no infinity."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

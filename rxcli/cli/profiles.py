@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from rxcli.cli.common import write_json
 from rxcli.errors import ExitCode, InputError, ProfileError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def list_profiles(json_path: str | None) -> None:
 
     screens, cameras = shipped_profiles(ScreenProfile), shipped_profiles(CameraProfile)
     if json_path is not None:
-        _write({"screens": [_builtins(s) for s in screens], "cameras": [_builtins(c) for c in cameras]}, json_path)
+        write_json({"screens": [_builtins(s) for s in screens], "cameras": [_builtins(c) for c in cameras]}, json_path)
     if json_path == "-":
         return
     for screen in screens:
@@ -61,7 +61,7 @@ def show(name: str, json_path: str | None) -> None:
 
     profile = _load_any(name)
     if json_path is not None:
-        _write(_builtins(profile), json_path)
+        write_json(_builtins(profile), json_path)
     if json_path != "-":
         click.echo(dump_profile(profile), nl=False)
 
@@ -97,7 +97,7 @@ def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | No
             click.echo(f"vlc-rx: {error}", err=True)
             codes.append(error.exit_code)
     if json_path is not None:
-        _write(records, json_path)
+        write_json(records, json_path)
     if json_path != "-":
         for record in records:
             click.echo(f"{record['source']}: {record['camera'] or 'no profile'} ({record['reason']})")
@@ -206,14 +206,3 @@ def _reason(frame: Frame, cameras: list[CameraProfile], found: str | None) -> st
         return f"no profile of {camera}; all is estimated, or use `vlc-rx calibrate shutter`"
     sizes = ", ".join(f"{mode.width}x{mode.height}" for c in same for mode in c.modes) or "none"
     return f"{same[0].name} is this camera but has no readout mode of {size} (it has {sizes})"
-
-
-def _write(value: Any, path: str) -> None:
-    text = json.dumps(value, indent=2)
-    if path == "-":
-        click.echo(text)
-        return
-    try:
-        Path(path).write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})", "name another file") from None
