@@ -95,6 +95,8 @@ def cli() -> None:
 
 def main() -> None:
     """Entry point of `vlc-rx`."""
+    # Our matrices are small: threads inside their products spin more than they help, and numpy is not loaded yet.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.exit(run(sys.argv[1:]))
 
 
