@@ -12,12 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rxcli import denoise
+from rxcli import denoise, reception
+from rxcli.benchmark.trial import Trial, simulate_trial
 from rxcli.denoise import COLUMN_FEATURES, STRIP_FEATURES, Scene, load_denoiser, network_inputs
 from rxcli.errors import ProfileError
 from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
 from rxcli.resources import data_dir
-from rxcli.types import Clock, SlotSamples
+from rxcli.training.scenes import SCENE_CLASSES, validation_scene
+from rxcli.truth import Score
+from rxcli.types import Clock, FrameResult, SlotSamples
 
 N_COLUMNS, N_STRIPS, Q = 3, 5, 4
 N_SYMBOLS, W = 5, 5
@@ -252,3 +255,58 @@ def test_a_foreign_network_is_refused(model: Path, scene: Scene) -> None:
     replace_weights(model, made.SerializeToString())
     with pytest.raises(ProfileError, match=r"its tensors .*image.* are not those of its contract"):
         load_denoiser(str(model)).slot_log_odds(scene, np.array([0]))
+
+
+@pytest.fixture(scope="module")
+def trials() -> dict[str, Trial]:
+    """A clean frame, and one whose long exposure leaves the receiver in doubt."""
+    clean, *_, long_exposure = SCENE_CLASSES
+    return {
+        "clean": simulate_trial(validation_scene(clean, "paper-17k3", 0), 1),
+        "hard": simulate_trial(validation_scene(long_exposure, "paper-17k3", 3), 1),
+    }
+
+
+def packets(result: FrameResult) -> list[str]:
+    return [packet.payload for column in result.columns for packet in column.packets]
+
+
+def received(trial: Trial, mode: str) -> tuple[FrameResult, Score]:
+    return trial.receive(trial.options(cae=mode))
+
+
+def test_a_clean_frame_goes_without(trials: dict[str, Trial]) -> None:
+    result, score = received(trials["clean"], "auto")
+    assert score.bit_errors == 0
+    assert result.denoiser is None
+    assert not any(column.denoised for column in result.columns)
+
+
+def test_always_runs_on_every_column_and_harms_none(trials: dict[str, Trial]) -> None:
+    result, score = received(trials["clean"], "always")
+    assert score.bit_errors == 0
+    assert result.denoiser is not None
+    assert result.denoiser["columns"] == 20
+    assert result.denoiser["kept"] == sum(column.denoised for column in result.columns)
+
+
+def test_doubtful_columns_get_a_second_opinion(trials: dict[str, Trial]) -> None:
+    never, without = received(trials["hard"], "never")
+    auto, with_it = received(trials["hard"], "auto")
+    assert never.denoiser is None
+    assert auto.denoiser is not None
+    assert 0 < auto.denoiser["columns"] <= 20
+    assert with_it.error_free >= without.error_free
+
+
+def test_the_receiver_goes_on_without_a_broken_model(trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch) -> None:
+    never, _ = received(trials["hard"], "never")
+
+    def broken() -> denoise.Denoiser:
+        raise ProfileError("models/strips/model.onnx: does not match its checksum", "install the package again")
+
+    monkeypatch.setattr(reception, "_denoiser", broken)
+    auto, _ = received(trials["hard"], "auto")
+    assert packets(auto) == packets(never)
+    assert auto.denoiser is not None
+    assert "does not match its checksum; install the package again" in auto.denoiser["message"]
