@@ -78,36 +78,53 @@ def clip_results(
         snr: (C, N) squared contrast over variance of every slot of the grid.
         min_confidence: packets below it are left out.
     """
-    return tuple(
-        _clip_column(column, clock, bursts, float(going_on[column]), snr[column], min_confidence)
-        for column in range(snr.shape[0])
-    )
+    snr_db = _snr_db_of_columns(snr)
+    complete_ones = [complete(burst.seen[None])[0] for burst in bursts]
+    own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
+    out = []
+    for column in range(snr.shape[0]):
+        whole = [(b, c) for b, c, done in zip(bursts, own, complete_ones, strict=True) if done[column]]
+        packets = [
+            replace(packet, burst=burst.number, frames=burst.frames)
+            for burst, now in whole
+            if (packet := _packet(0, column, now, burst.posteriors, burst.seen[column]))
+            and packet.confidence >= min_confidence
+        ]
+        out.append(_clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], tuple(packets)))
+    return tuple(out)
 
 
 def _clip_column(
-    column: int, clock: Clock, bursts: Sequence[BurstInClip], going_on: float, snr: Float32Array, min_confidence: float
+    column: int,
+    clock: Clock,
+    bursts: Sequence[BurstInClip],
+    going_on: float,
+    snr_db: float | None,
+    packets: tuple[PacketResult, ...],
 ) -> ColumnResult:
-    found = []
-    for burst in bursts:
-        own = replace(clock, burst=np.where(clock.burst == burst.index, 0, 1))
-        if (burst.seen[column, PREAMBLE_SLOTS:] > 0).all():
-            packet = _packet(0, column, own, burst.posteriors, burst.seen[column])
-            if packet and packet.confidence >= min_confidence:
-                found.append(replace(packet, burst=burst.number, frames=burst.frames))
-    snr_db = _snr_db(snr)
-    status = _column_status(tuple(found), snr_db)
-    if not found and going_on >= _WEAK_CONFIDENCE:
+    status = _column_status(packets, snr_db)
+    if not packets and going_on >= _WEAK_CONFIDENCE:
         status = "ok"
-    n_seen = max((int(burst.seen[column].sum()) for burst in bursts), default=0)
+    message = None
+    if not packets:
+        n_seen = max((int(burst.seen[column].sum()) for burst in bursts), default=0)
+        message = _why_none_here(status, snr_db, n_seen, clock, bool(bursts))
     return ColumnResult(
         column=column,
         status=status,
-        w=_sure_weight(column, [burst.posteriors for burst in bursts], bool(found)),
+        w=_sure_weight(column, [burst.posteriors for burst in bursts], bool(packets)),
         snr_db=snr_db,
         delay_slots=float(clock.delay_slots[column]),
-        packets=tuple(found),
-        message=None if found else _why_none_here(status, snr_db, n_seen, clock, bool(bursts)),
+        packets=packets,
+        message=message,
     )
+
+
+def _snr_db_of_columns(snr: Float32Array) -> list[float | None]:
+    """Median over the slots of each column that show anything."""
+    if (snr > 0).all():
+        return [float(db) for db in 10 * np.log10(np.maximum(np.median(snr, axis=1), 1e-6))]
+    return [_snr_db(column) for column in snr]
 
 
 def _sure_weight(column: int, posteriors: Sequence[BurstPosteriors], found: bool) -> int | None:

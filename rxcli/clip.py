@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rxcli import assemble, channel, clock, detect, geometry, known_picture, sampling, strips, tracking
 from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock
 from rxcli.options import ReceiverOptions
+from rxcli.protocol import WEIGHTS
 from rxcli.reception import Reception, decode, second_opinion
 from rxcli.types import (
     BurstPosteriors,
@@ -36,7 +37,7 @@ from rxcli.types import (
 #: Frames that may wait until it is clear which copies begin a burst.
 _MAX_WAITING = 8
 #: Frames whose corners are averaged at the start, and how often they are looked at from then on.
-_FIRST_LOOKS, _LOOK_EVERY = 4, 12
+_FIRST_LOOKS, _LOOK_EVERY = 4, 30
 #: Share of a new look in the corners.
 _CORNER_SHARE = 0.25
 #: Movement of a corner that is followed at once, and the one below which nothing is changed, in screen widths.
@@ -47,6 +48,9 @@ _FIRST_LESSONS, _LESSON_EVERY = 12, 6
 _FEW_LESSONS = 4
 #: Columns decided worse than this many times the foreseen variance do not fit what is known.
 _MISFIT = 6.0
+#: Slots of lateness that are put right, contrast of headers, against full, below which nothing is known any more, and
+#: contrast of a frame below which compression has taken much of it.
+_LATE, _LEAST_HEADER, _FADED = 0.03, 0.3, 0.85
 #: Share of a frame's noise in what is expected of the next.
 _NOISE_SHARE = 0.2
 #: A column's symbol of at least this log probability is certain.
@@ -135,6 +139,8 @@ class _Clip:
         self._place: _Place | None = None
         self._picture: known_picture.KnownPicture | None = None
         self._n_lessons = 0
+        #: (C, 9) the weight that a column was last certain of, alone; None before any.
+        self._weights: NDArray[np.bool_] | None = None
         self._last: _View | None = None
 
     # -- one frame ---------------------------------------------------------------------------------------------
@@ -247,7 +253,10 @@ class _Clip:
             if now is None:
                 return None
         with stages("detect"):
-            flat, now, positions, metrics = self._refined(light, flat, now, last.memory)
+            refined = self._refined(light, flat, now, last.memory)
+            if refined is None:
+                return None
+            flat, now, positions, metrics = refined
             shown = _shown(place.map.inside, positions, now)
             snr = _snr(flat, now)
         bursts = tracking.FrameBursts(frame.index, 0, now, metrics, shown)
@@ -257,21 +266,29 @@ class _Clip:
 
     def _refined(
         self, light: Float32Array, flat: known_picture.ColumnLight, now: Clock, memory: int
-    ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, FloatArray]:
-        """Clock, response and noise put right by a first decision slot by slot; then positions and metrics."""
+    ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, FloatArray] | None:
+        """Clock, response and noise put right by a first decision slot by slot; then positions and metrics.
+
+        None where the headers are not where the clock has them: another scene, or something in front of the screen.
+        """
         assert self._picture is not None
         positions = known_picture.row_positions(self._rows, now)
-        first = known_picture.pattern_metrics(flat, positions, now, memory)
-        lit = (0.5 + 0.5 * np.tanh(0.5 * detect.slot_llr(first))).astype(np.float32)
+        lit = known_picture.first_decision(flat, positions, now)
+        if known_picture.header_contrast(flat, positions, now) < _LEAST_HEADER:
+            return None
+        fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
         if self._n_lessons < _FEW_LESSONS:
-            response, _ = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
-            flat = self._picture.solve_again(light, response.of(lit, positions, now.exposure_slots))
-        flat = known_picture.evened(flat, lit, positions, now.exposure_slots)
-        response, late = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
-        now = replace(now, row0=now.row0 - late * now.rows_per_slot)
-        positions = known_picture.row_positions(self._rows, now)
-        flat = self._picture.judge(flat, response.of(lit, positions, now.exposure_slots), _NOISE_SHARE)
-        return flat, now, positions, known_picture.pattern_metrics(flat, positions, now, memory, response, lit)
+            flat = self._picture.solve_again(light, fit.expected)
+            fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
+        if fit.response.centre < _FADED:
+            flat = known_picture.evened(flat, fit)
+            fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
+        if abs(fit.late) > _LATE:
+            now = replace(now, row0=now.row0 - fit.late * now.rows_per_slot)
+            positions = known_picture.row_positions(self._rows, now)
+            fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
+        flat = self._picture.judge(flat, fit.expected, _NOISE_SHARE)
+        return flat, now, positions, known_picture.pattern_metrics(flat, positions, now, memory, fit, lit)
 
     @property
     def _rows(self) -> FloatArray:
@@ -306,7 +323,8 @@ class _Clip:
 
     def _move(self, frame: Frame, camera: Camera, lock: Lock, corners: FloatArray) -> None:
         place, picture = self._place, self._picture
-        assert place is not None and picture is not None
+        assert place is not None
+        assert picture is not None
         before, rows_before = place.corners, place.map.first_row
         place.map = _map(frame, corners, camera, lock)
         place.corners = corners
@@ -314,12 +332,13 @@ class _Clip:
 
     def _clock(self, frame: Frame, flat: known_picture.ColumnLight, last: _View) -> Clock | None:
         """The clock of the frame: what the header says, or where it is not seen well, what was foretold."""
-        assert self._place is not None and self._link is not None
+        assert self._place is not None
+        assert self._link is not None
         lock = last.lock
         rows = self._rows
         profiles = RowProfiles(
             light=flat.shrunk[:, None],
-            inside=self._place.map.inside.any(axis=1, keepdims=True),
+            inside=np.asarray(self._place.map.inside.any(axis=1, keepdims=True)),
             rows=rows.astype(np.int64),
             sensor_row=None,
             count=np.ones((flat.shrunk.shape[0], 1), np.float32),
@@ -355,7 +374,7 @@ class _Clip:
         view.bursts = replace(view.bursts, first_copy=first_copy)
         self._waiting.append(waiting)
         with stages("detect"):
-            if not self._link.phase.settled or any(w.view and w.numbers is None for w in self._waiting):
+            if not self._link.phase.settled:
                 self._compare(view)
             n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)
             if self._link.phase.settled or n_unsettled > _MAX_WAITING:
@@ -394,7 +413,8 @@ class _Clip:
     def _detect(self, waiting: _Waiting) -> None:
         """Add a frame to its bursts, and detect them again."""
         view, link = waiting.view, self._link
-        assert view is not None and link is not None
+        assert view is not None
+        assert link is not None
         now = view.bursts.clock
         copies = view.bursts.first_copy + np.arange(now.n_copies)
         bursts = link.phase.burst_of(copies)
@@ -407,28 +427,45 @@ class _Clip:
         still_open = np.array([n for n in waiting.numbers if self._bursts.is_open(int(n))], np.int64)
         if still_open.size == 0:
             return
-        before = self._bursts.certain(still_open) if "certain_columns" in self._options.skip else None
-        posteriors, certain, n_skipped = self._detect_open(still_open, before)
-        self._bursts.note(still_open, posteriors, certain)
-        self._skip(waiting, "certain_columns", n_skipped)
+        certain = self._bursts.certain(still_open)
+        if "certain_columns" not in self._options.skip:
+            certain[:] = False
+        self._skip(waiting, "certain_columns", int(certain.sum()))
+        self._detect_open(still_open, ~certain)
         if view.flat is not None:
-            self._confirm(view, waiting.numbers, still_open, posteriors)
+            self._confirm(view, waiting.numbers, still_open)
 
-    def _detect_open(
-        self, numbers: IntArray, before: NDArray[np.bool_] | None
-    ) -> tuple[BurstPosteriors, NDArray[np.bool_], int]:
-        """Posteriors of bursts, (B, C) whether they are certain, and how many columns were known already."""
-        metrics = self._bursts.metrics(numbers)
-        posteriors = detect.detect(metrics, detect.plausible_weights(metrics, _HOPELESS_WEIGHT))
+    def _detect_open(self, numbers: IntArray, wanted: NDArray[np.bool_]) -> None:
+        """Detect the wanted columns, (B, C), of open bursts."""
+        bursts, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
+        if bursts.size == 0:
+            return
+        metrics = self._bursts.metrics(numbers[bursts])[:, columns]
+        known = self._weights[columns] if self._weights is not None else np.zeros((columns.size, len(WEIGHTS)), bool)
+        unknown = ~known.any(axis=1)
+        if unknown.any():
+            known = known.copy()
+            known[unknown] = detect.plausible_weights(metrics[:, unknown], _HOPELESS_WEIGHT)
+        candidates = known
+        posteriors = detect.detect(metrics, candidates)
         certain = posteriors.log_prob.min(axis=2) >= _CERTAIN
-        return posteriors, certain, 0
+        self._bursts.note(numbers[bursts], columns, posteriors, certain)
+        self._note_weights(columns, posteriors, certain)
 
-    def _confirm(self, view: _View, numbers: IntArray, still_open: IntArray, posteriors: BurstPosteriors) -> None:
+    def _note_weights(self, columns: IntArray, posteriors: BurstPosteriors, certain: NDArray[np.bool_]) -> None:
+        """Weights of columns that were certain are the only ones tried next, until they are not certain any more."""
+        if self._weights is None or self._weights.shape[0] != self._bursts.n_columns:
+            self._weights = np.zeros((self._bursts.n_columns, len(WEIGHTS)), bool)
+        self._weights[columns] = False
+        sure = certain.any(axis=0)
+        self._weights[columns[sure], posteriors.w[sure] - 1] = True
+
+    def _confirm(self, view: _View, numbers: IntArray, still_open: IntArray) -> None:
         """Check what was known against what was decided, and learn."""
         now = view.bursts.clock
-        lit = np.full((numbers.size, *posteriors.lit.shape[1:]), 0.5, np.float32)
-        lit[np.searchsorted(numbers, still_open)] = posteriors.lit
-        grid = channel.lit_on_grid(replace(posteriors, lit=lit), now)
+        lit = np.full((numbers.size, self._bursts.n_columns, now.packet_slots), 0.5, np.float32)
+        lit[np.searchsorted(numbers, still_open)] = self._bursts.lit(still_open)
+        grid = clock.from_copies(lit[now.burst].transpose(1, 0, 2), now)
         self._learn(view, grid)
         self._last = view
 
@@ -436,13 +473,14 @@ class _Clip:
         picture = self._picture
         if picture is None or view.light is None or view.light.shape[2] != self._rows.size:
             return
+        self._n_lessons += 1
+        if self._n_lessons > _FIRST_LESSONS and self._n_lessons % _LESSON_EVERY:
+            return
         now = view.bursts.clock
         positions = known_picture.row_positions(self._rows, now)
         slots = known_picture.exposed(lit, positions, now.exposure_slots)
-        self._n_lessons += 1
-        if self._n_lessons <= _FIRST_LESSONS or self._n_lessons % _LESSON_EVERY == 0:
-            doubt = known_picture.exposed(lit * (1 - lit), positions, now.exposure_slots)
-            picture.learn(view.light, slots, np.clip(1 - 8 * doubt, 0, 1).astype(np.float32))
+        doubt = known_picture.exposed(lit * (1 - lit), positions, now.exposure_slots)
+        picture.learn(view.light, slots, np.clip(1 - 8 * doubt, 0, 1).astype(np.float32))
 
     # -- results ---------------------------------------------------------------------------------------------------
 
@@ -519,7 +557,7 @@ def _bursts_of(frame: Frame, seen: Reception) -> tracking.FrameBursts:
 
 def _shown(inside: NDArray[np.bool_], positions: FloatArray, now: Clock) -> IntArray:
     """(n_copies, C, packet) 1 where the middle of a slot is on the screen."""
-    on_screen = inside.any(axis=1)
+    on_screen = np.asarray(inside.any(axis=1))
     middles = np.arange(now.n_slots) + 0.5
     out = np.zeros((on_screen.shape[0], now.n_slots), np.int64)
     for column, rows in enumerate(on_screen):

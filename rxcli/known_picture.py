@@ -9,10 +9,12 @@ once: no crosstalk is left, strips are pooled by what they tell, and every colum
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rxcli.protocol import slot_patterns
+from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL, slot_patterns
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray
 
 #: Share of its weight that a frame keeps with every frame after it.
@@ -37,6 +39,8 @@ _BEYOND = 0.15
 _SIDE, _CENTRE, _AT_SIDE, _RIDGE = 0.5, (0.3, 1.3), (-0.1, 0.35), 1e-4
 #: Groups of rows by their precision, and the contrast that compression may leave of theirs.
 _GROUPS, _GAIN = 8, (0.15, 1.3)
+#: Rows of a single column's header that must show, that it be judged.
+_LEAST_ROWS = 40
 #: Largest correction of the clock at a time, slots.
 _MAX_LATE = 0.4
 
@@ -163,7 +167,7 @@ class KnownPicture:
             row_of: (C, R) index of the row, before, of what each row shows now.
             inside: (C, S, R) as for the class, now.
         """
-        n_before = self._light.shape[2]
+        n_before = self._light.shape[-1]
         place = np.clip(row_of, 0, n_before - 1.001)
         left = place.astype(np.int64)[:, None]
         part = (place[:, None] - left).astype(np.float32)
@@ -250,7 +254,7 @@ def _factored(
         far = -first[i] * near[i + 1] - second[i] * inverse[i + 2]
         near[i] = -first[i] * inverse[i + 1] - second[i] * near[i + 1]
         inverse[i] = 1 / diagonal[i] - first[i] * near[i] - second[i] * far
-    return diagonal, first, second, 1 / inverse[:n]
+    return diagonal, first, second, np.asarray(1 / inverse[:n], np.float32)
 
 
 def _solve(system: _System, right: Float32Array) -> Float32Array:
@@ -315,19 +319,27 @@ class Response:
     side: float = 0.0
     offset: float = 0.0
 
-    def of(self, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
-        """(C, R) light that slots (C, N) give at the positions; see `exposed`."""
-        out = np.float32(self.centre) * exposed(lit, positions, exposure_slots) + np.float32(self.offset)
-        if self.side:
-            beside = exposed(lit, positions - _SIDE, exposure_slots) + exposed(lit, positions + _SIDE, exposure_slots)
-            out += np.float32(self.side) * beside
-        return np.asarray(out)
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A frame's response, fitted."""
+
+    response: Response
+    #: How many slots the clock is late.
+    late: float
+    #: (C, R) the slots exposed here, and the sum of those a little before and after.
+    here: Float32Array
+    beside: Float32Array
+
+    @property
+    def expected(self) -> Float32Array:
+        """(C, R) light that the slots give."""
+        r = self.response
+        return self.here * np.float32(r.centre) + self.beside * np.float32(r.side) + np.float32(r.offset)
 
 
-def fit_response(
-    seen: ColumnLight, lit: Float32Array, positions: FloatArray, exposure_slots: float
-) -> tuple[Response, float]:
-    """The response of a frame, and how many slots its clock is late, by least squares over all columns.
+def fit_response(seen: ColumnLight, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Fit:
+    """The response of a frame by least squares over all columns.
 
     Args:
         seen: the columns' light.
@@ -336,52 +348,82 @@ def fit_response(
         exposure_slots: exposure in slots.
     """
     before, here, after = (exposed(lit, positions + shift, exposure_slots) for shift in (-_SIDE, 0.0, _SIDE))
-    parts = [here, before + after, np.ones_like(here), (after - before) * np.float32(0.5 / _SIDE)]
-    weighted = [part * seen.precision for part in parts]
-    normal = np.array([[np.vdot(a, b) for b in parts] for a in weighted], np.float64)
-    right = np.array([np.vdot(a, seen.value) for a in weighted], np.float64)
+    beside = before + after
+    parts = np.stack([here, beside, np.ones_like(here), (after - before) * np.float32(0.5 / _SIDE)])
+    parts = parts.reshape(4, -1)
+    weighted = parts * seen.precision.ravel()
     weight = float(seen.precision.sum()) + 1e-9
+    normal, right = weighted @ parts.T / weight, weighted @ seen.value.ravel() / weight
     # Drawn, a little, to no blur.
     usual = np.array([1.0, 0.0, 0.0, 0.0])
-    centre, side, offset, late = usual + np.linalg.solve(
-        normal / weight + _RIDGE * np.eye(4), (right - normal @ usual) / weight
-    )
+    centre, side, offset, late = usual + np.linalg.solve(normal + _RIDGE * np.eye(4), right - normal @ usual)
     response = Response(
         float(np.clip(centre, *_CENTRE)), float(np.clip(side, *_AT_SIDE)), float(np.clip(offset, -0.2, 0.2))
     )
-    return response, float(np.clip(late / max(centre + 2 * side, 0.3), -_MAX_LATE, _MAX_LATE))
+    late = float(np.clip(late / max(centre + 2 * side, 0.3), -_MAX_LATE, _MAX_LATE))
+    return Fit(response, late, here, beside)
 
 
-def evened(seen: ColumnLight, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> ColumnLight:
+def first_decision(seen: ColumnLight, positions: FloatArray, clock: Clock) -> Float32Array:
+    """(C, N) probability that each slot is lit, from the rows around its middle alone.
+
+    Args:
+        seen: the columns' light.
+        positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
+        clock: the clock.
+    """
+    middles = np.arange(clock.n_slots) + 0.5
+    total = np.zeros((seen.value.shape[0], seen.value.shape[1] + 1))
+    np.cumsum((seen.value - np.float32(0.5)) * seen.precision, axis=1, out=total[:, 1:])
+    step = positions[:, -1:] - positions[:, :1]
+    rows = (middles - positions[:, :1]) * ((positions.shape[1] - 1) / step) + 0.5
+    reach = 0.35 * clock.rows_per_slot
+    llr = _read(total, rows + reach) - _read(total, rows - reach)
+    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * llr), np.float32)
+
+
+def header_contrast(seen: ColumnLight, positions: FloatArray, clock: Clock) -> float:
+    """Contrast of the headers where the clock has them, 1 being full and 0 none; 1 where no header shows.
+
+    Args:
+        seen: the columns' light.
+        positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
+        clock: the clock.
+    """
+    place = (np.floor(positions).astype(np.int64) + clock.first_slot) % clock.packet_slots
+    sign = np.where(place < SLOTS_PER_SYMBOL, 2.0 * np.array(HEADER)[np.minimum(place, SLOTS_PER_SYMBOL - 1)] - 1, 0)
+    weight = np.abs(sign) * np.minimum(seen.precision, np.float32(_PRIOR))
+    if weight.sum() < _PRIOR * _LEAST_ROWS:
+        return 1.0
+    return float((weight * sign * np.clip(2 * seen.value - 1, -1.5, 1.5)).sum() / weight.sum())
+
+
+def evened(seen: ColumnLight, fit: Fit) -> ColumnLight:
     """The light with its contrast put right: compression takes stripes away where they are faint, and only there.
 
     Rows are grouped by their precision; in each group the contrast that is left is measured against the slots.
 
     Args:
         seen: the columns' light.
-        lit: (C, N) probability that each slot is lit.
-        positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
-        exposure_slots: exposure in slots.
+        fit: the response of the whole.
     """
     half = np.float32(0.5)
-    before, here, after = (exposed(lit, positions + shift, exposure_slots) for shift in (-_SIDE, 0.0, _SIDE))
-    parts = np.stack([here - half, before + after - 1, np.ones_like(here)])
-    seen_here = seen.precision > 1e-3
-    level = np.log(np.maximum(seen.precision, np.float32(1e-3)))
-    if np.count_nonzero(seen_here) < 10 * _GROUPS:
+    level = np.log(np.maximum(seen.precision, np.float32(1e-3))).ravel()
+    order = np.argsort(level)
+    order = order[level[order] > np.log(2e-3)]
+    if order.size < 10 * _GROUPS:
         return seen
-    borders = np.quantile(level[seen_here], np.linspace(0, 1, _GROUPS + 1))
-    group = np.clip(np.searchsorted(borders, level, "right") - 1, 0, _GROUPS - 1)
-    gain, offset = np.ones(_GROUPS, np.float32), np.zeros(_GROUPS, np.float32)
-    for number in range(_GROUPS):
-        mine = seen_here & (group == number)
-        model, value = parts[:, mine], np.clip(seen.value[mine] - half, -1.2, 1.2)
-        normal = model @ model.T / value.size + np.float32(1e-3) * np.eye(3, dtype=np.float32)
-        centre, side, offset[number] = np.linalg.solve(normal, model @ value / value.size + [1e-3, 0, 0])
+    value = np.clip(seen.value.ravel() - half, -1.2, 1.2)
+    here, beside = fit.here.ravel() - half, fit.beside.ravel() - 1
+    middle, gain, offset = np.empty(_GROUPS), np.empty(_GROUPS), np.empty(_GROUPS)
+    for number, mine in enumerate(np.array_split(order, _GROUPS)):
+        model = np.stack([here[mine], beside[mine], np.ones(mine.size, np.float32)])
+        normal = model @ model.T / mine.size + np.float32(1e-3) * np.eye(3, dtype=np.float32)
+        centre, side, offset[number] = np.linalg.solve(normal, model @ value[mine] / mine.size + [1e-3, 0, 0])
         gain[number] = np.clip(centre + 2 * side, *_GAIN)
-    middle = (borders[1:] + borders[:-1]) / 2
-    gains = np.interp(level, middle, gain).astype(np.float32)
-    offsets = np.interp(level, middle, offset).astype(np.float32)
+        middle[number] = level[mine[mine.size // 2]]
+    gains = np.interp(level, middle, gain).astype(np.float32).reshape(seen.value.shape)
+    offsets = np.interp(level, middle, offset).astype(np.float32).reshape(seen.value.shape)
     return ColumnLight((seen.value - half - offsets) / gains + half, seen.precision * gains * gains, seen.shrunk)
 
 
@@ -390,8 +432,8 @@ def pattern_metrics(
     positions: FloatArray,
     clock: Clock,
     memory: int,
-    response: Response = Response(),  # noqa: B008  # frozen
-    lit: Float32Array | None = None,
+    fit: Fit,
+    lit: Float32Array,
 ) -> FloatArray:
     """Log-likelihood of every slot pattern at every slot, (C, N + memory, patterns); see `channel.SlotLikelihoods`.
 
@@ -400,13 +442,11 @@ def pattern_metrics(
         positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
         clock: the clock.
         memory: slots of memory.
-        response: what becomes of the exposed slots.
-        lit: (C, N) present idea of the slots, for what reaches beyond the memory; None: nothing does.
+        fit: what becomes of the exposed slots.
+        lit: (C, N) present idea of the slots, for what reaches beyond the memory.
     """
-    value = seen.value - np.float32(response.offset)
-    if lit is not None:
-        whole = response.of(lit, positions, clock.exposure_slots) - np.float32(response.offset)
-        value = value - whole
+    response = fit.response
+    value = seen.value - fit.expected
     if positions.shape[0] == 1:
         return _row_metrics(value, seen.precision, positions[0], clock, memory, response, lit)
     parts = [
@@ -417,7 +457,7 @@ def pattern_metrics(
             clock,
             memory,
             response,
-            None if lit is None else lit[c : c + 1],
+            lit[c : c + 1],
         )
         for c in range(positions.shape[0])
     ]
@@ -431,9 +471,9 @@ def _row_metrics(
     clock: Clock,
     memory: int,
     response: Response,
-    lit: Float32Array | None,
+    lit: Float32Array,
 ) -> FloatArray:
-    """Metrics of columns whose rows have the positions `centre` (R,); `value` lacks, where `lit` is given, all of it."""
+    """Metrics of columns whose rows have the positions `centre` (R,); `value` is what the slots `lit` do not explain."""
     metric = np.floor(centre + memory / 2).astype(np.int64)
     n_metrics = clock.n_slots + memory
     use = (metric >= 0) & (metric < n_metrics)
@@ -444,11 +484,9 @@ def _row_metrics(
         share += response.side * _overlap(centre - _SIDE, slots, clock.exposure_slots)
         share += response.side * _overlap(centre + _SIDE, slots, clock.exposure_slots)
     share = share.astype(np.float32)
-    if lit is not None:
-        padded = np.pad(lit, ((0, 0), (memory, memory)), constant_values=np.float32(0.5))
-        value = value.copy()
-        for back in range(memory + 1):
-            value += share[:, back] * padded[:, slots[:, back] + memory]
+    padded = np.pad(lit, ((0, 0), (memory, memory)), constant_values=np.float32(0.5))
+    for back in range(memory + 1):
+        value += share[:, back] * padded[:, slots[:, back] + memory]
     borders = np.searchsorted(metric, np.arange(n_metrics + 1))
     linear = [_sums(precision * value * share[:, j], borders) for j in range(memory + 1)]
     out = np.zeros((value.shape[0], n_metrics, 2 << memory))
@@ -468,7 +506,7 @@ def _overlap(centre: FloatArray, slots: IntArray, exposure_slots: float) -> Floa
     return np.asarray(np.maximum(reach, 0) / exposure_slots)
 
 
-def _sums(values: Float32Array, borders: IntArray) -> FloatArray:
+def _sums(values: NDArray[Any], borders: IntArray) -> FloatArray:
     """Sums of `values` (C, R) between neighbouring borders, (C, n - 1)."""
     total = np.zeros((values.shape[0], values.shape[1] + 1))
     np.cumsum(values, axis=1, out=total[:, 1:])

@@ -8,12 +8,14 @@ clip, and with the phase of the bursts (`BurstPhase`) every burst too, those in 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.types import BoolArray, BurstPosteriors, Clock, FloatArray, IntArray
+from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatArray, IntArray
 
 #: A clock that is off by more than this many slots from where the frames before foretell it belongs to another time.
 _MAX_JUMP_SLOTS = 2.0
@@ -173,9 +175,10 @@ class FrameBursts:
 class _Burst:
     metrics: FloatArray
     seen: IntArray
-    frames: list[int] = field(default_factory=list)
-    #: (C,) columns that need no further look, and all columns' posteriors, once detected.
-    certain: BoolArray | None = None
+    frames: list[int]
+    #: (C,) columns that need no further look.
+    certain: BoolArray
+    #: Of this burst alone, once detected.
     posteriors: BurstPosteriors | None = None
 
 
@@ -213,7 +216,9 @@ class Bursts:
             seen = view.shown[view.clock.burst == burst].sum(axis=0)
             have = self._open.get(int(number))
             if have is None:
-                self._open[int(number)] = _Burst(metrics[burst].copy(), seen, [view.frame])
+                self._open[int(number)] = _Burst(
+                    metrics[burst].copy(), seen, [view.frame], np.zeros(seen.shape[0], bool)
+                )
                 continue
             have.metrics += metrics[burst]
             have.seen = have.seen + seen
@@ -231,18 +236,27 @@ class Bursts:
         """(B, C, packet) how often each slot was seen."""
         return np.stack([self._open[int(n)].seen for n in numbers])
 
-    def certain(self, numbers: IntArray) -> BoolArray:
-        """(B, C) columns that were certain before this frame."""
-        none = np.zeros(next(iter(self._open.values())).seen.shape[0], bool)
-        known = [self._open[int(n)].certain for n in numbers]
-        return np.stack([none if k is None else k for k in known])
+    @property
+    def n_columns(self) -> int:
+        """Columns of the open bursts; 0 where none is open."""
+        return next((entry.seen.shape[0] for entry in self._open.values()), 0)
 
-    def note(self, numbers: IntArray, posteriors: BurstPosteriors, certain: BoolArray) -> None:
-        """Keep what was detected of open bursts; `certain` is (B, C)."""
+    def certain(self, numbers: IntArray) -> BoolArray:
+        """(B, C) columns that are certain."""
+        return np.stack([self._open[int(n)].certain for n in numbers])
+
+    def lit(self, numbers: IntArray) -> Float32Array:
+        """(B, C, packet) probability that each slot is lit."""
+        entries = [self._open[int(n)] for n in numbers]
+        half = np.full(entries[0].seen.shape, 0.5, np.float32)
+        return np.stack([half if e.posteriors is None else e.posteriors.lit[0] for e in entries])
+
+    def note(self, numbers: IntArray, columns: IntArray, posteriors: BurstPosteriors, certain: BoolArray) -> None:
+        """Keep what was detected of some columns of open bursts; `certain` is (B, columns)."""
         for burst, number in enumerate(numbers):
             entry = self._open[int(number)]
-            entry.posteriors = _one_burst(posteriors, burst)
-            entry.certain = certain[burst]
+            entry.posteriors = _merged(entry.posteriors, _one_burst(posteriors, burst), columns, entry.seen.shape[0])
+            entry.certain[columns] = certain[burst]
 
     def known(self, number: int) -> BurstPosteriors | None:
         """What was last detected of an open burst."""
@@ -268,4 +282,26 @@ def _one_burst(posteriors: BurstPosteriors, burst: int) -> BurstPosteriors:
         index=posteriors.index[part],
         log_prob=posteriors.log_prob[part],
         bit_llr=posteriors.bit_llr[part],
+    )
+
+
+def _merged(before: BurstPosteriors | None, new: BurstPosteriors, columns: IntArray, n: int) -> BurstPosteriors:
+    """One burst's posteriors with some of its `n` columns detected anew."""
+    if columns.size == n:
+        return new
+    if before is None:
+        raise ValueError("all columns of a burst are detected the first time")
+
+    def put(old: NDArray[Any], part: NDArray[Any], axis: int) -> NDArray[Any]:
+        out = old.copy()
+        out[(slice(None),) * axis + (columns,)] = part
+        return out
+
+    return BurstPosteriors(
+        w=put(before.w, new.w, 0),
+        w_log_prob=put(before.w_log_prob, new.w_log_prob, 0),
+        lit=put(before.lit, new.lit, 1),
+        index=put(before.index, new.index, 1),
+        log_prob=put(before.log_prob, new.log_prob, 1),
+        bit_llr=put(before.bit_llr, new.bit_llr, 1),
     )
