@@ -193,3 +193,14 @@ def test_reference_photo(shared_captures: Path, capsys: pytest.CaptureFixture[st
     code = run(["decode", str(photo), "--screen", "paper-34k6", "--truth", "auto", "--max-ber", "0"])
     assert "20 packets in 20 of 20 columns" in capsys.readouterr().out
     assert code == 0
+
+
+def test_an_estimated_camera_is_kept_as_a_profile(tmp_path: Path) -> None:
+    """What was estimated of a camera receives the same picture again, as well as it did."""
+    sample = Path(__file__).resolve().parents[1] / "sample_frames" / "phone_chelsea_17k3.jpg"
+    profile, again = tmp_path / "my phone.toml", tmp_path / "again.jsonl"
+    screen = ["--screen", "paper-17k3", "--truth", str(sample).replace(".jpg", ".truth.json"), "--max-ber", "0.01"]
+    assert run(["decode", str(sample), *screen, "--quiet", "--camera", "auto", "--save-camera", str(profile)]) == 0
+    assert 'name = "my-phone"' in profile.read_text()
+    assert run(["decode", str(sample), *screen, "--quiet", "--camera", str(profile), "--json", str(again)]) == 0
+    assert json.loads(again.read_text())["camera"]["profile"] == "my-phone"

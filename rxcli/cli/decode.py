@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -41,6 +42,7 @@ _FOLDER = click.Path(file_okay=False, path_type=Path)
 @click.option(
     "--save-undistorted", type=_FOLDER, help="Write every frame without its lens distortion into this folder."
 )
+@click.option("--save-camera", type=_FILE, help="Write what was estimated of an unknown camera as a profile (TOML).")
 @click.option("--quiet", is_flag=True, help="No table, no summary, no progress.")
 def decode(paths: tuple[str, ...], **options: Any) -> int:
     """Decode photos, RAW files and clips; PATH may be a folder, or - for one picture on stdin."""
@@ -77,9 +79,9 @@ def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
         raise UsageError("stdin cannot be sent to a cluster", "name a file that its workers see")
     if options["summary"]:
         check_summary_path(options["summary"])
-    for name in ("summary", "junit"):
+    for name in ("summary", "junit", "save_camera"):
         if options[name] is not None and not options[name].parent.is_dir():
-            raise UsageError(f"--{name} {options[name]}: there is no such folder", "make it, or name another")
+            raise UsageError(f"--{name.replace('_', '-')} {options[name]}: there is no such folder", "make it, or name another")
 
 
 def _make_folders(options: dict[str, Any]) -> None:
@@ -121,6 +123,8 @@ class _Run:
         self._limits = Limits(options["max_ber"], options["min_packets"])
         self._summaries: list[SourceSummary] = []
         self._to_stdout = options["json_path"] == "-"
+        #: The frame with the most packets of those whose camera was estimated.
+        self._estimated: FrameResult | None = None
 
     def run(self, sources: list[Source]) -> ExitCode:
         from rxcli.summary import exit_code
@@ -173,6 +177,7 @@ class _Run:
                     for result in results:
                         result = scorer.add(result) if scorer else result
                         summary.add(result)
+                        self._keep_estimate(result)
                         with progress.paused():
                             write(result)
                 finally:
@@ -212,6 +217,28 @@ class _Run:
             summary.score = scorer.score() if scorer else None
             self._summaries.append(summary)
 
+    def _keep_estimate(self, result: FrameResult) -> None:
+        best = self._estimated
+        if result.estimated and (best is None or _n_packets(result) > _n_packets(best)):
+            self._estimated = result
+
+    def _save_camera(self, path: Path) -> None:
+        from rxcli.blind import camera_profile
+        from rxcli.ingest import open_source
+        from rxcli.profiles import dump_profile
+
+        if self._estimated is None:
+            click.echo(f"vlc-rx: {path} was not written: no unknown camera was estimated", err=True)
+            return
+        frame = next(iter(open_source(self._estimated.source)))
+        about = frame.metadata
+        name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-") or "camera"
+        profile = camera_profile(self._estimated.estimated, name, about.make, about.model, frame.width, frame.height)
+        try:
+            path.write_text(dump_profile(profile), encoding="utf-8")
+        except OSError as error:
+            raise UsageError(f"--save-camera {path}: {error.strerror}", "name another file") from None
+
     def _conclude(self) -> None:
         from rxcli.summary import format_summary, write_junit, write_summary
 
@@ -219,8 +246,14 @@ class _Run:
             click.echo(format_summary(self._summaries, self._limits), err=self._to_stdout)
         if self._options["summary"]:
             write_summary(self._options["summary"], self._summaries, self._limits)
+        if self._options["save_camera"]:
+            self._save_camera(self._options["save_camera"])
         if self._options["junit"]:
             write_junit(self._options["junit"], self._summaries, self._limits)
+
+
+def _n_packets(result: FrameResult) -> int:
+    return sum(len(column.packets) for column in result.columns)
 
 
 def _order(names: list[str]) -> Any:
