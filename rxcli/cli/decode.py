@@ -81,7 +81,8 @@ def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
         check_summary_path(options["summary"])
     for name in ("summary", "junit", "save_camera"):
         if options[name] is not None and not options[name].parent.is_dir():
-            raise UsageError(f"--{name.replace('_', '-')} {options[name]}: there is no such folder", "make it, or name another")
+            option = name.replace("_", "-")
+            raise UsageError(f"--{option} {options[name]}: there is no such folder", "make it, or name another")
 
 
 def _make_folders(options: dict[str, Any]) -> None:
