@@ -20,7 +20,7 @@ MIN_BOARDS = 3
 #: Edge width, in squares, from which a picture counts as blurred, and its least value in pixels.
 _BLUR_SQUARES, _BLUR_PX = 0.2, 2.0
 #: A board is an outlier when its RMS is this many times the median and at least this many pixels above it.
-_OUTLIER_RATIO, _OUTLIER_PX = 2.5, 0.1
+_OUTLIER_RATIO, _OUTLIER_PX = 2.5, 0.2
 #: Longest side in which a chessboard is looked for; its corners are then refined in the whole picture.
 _DETECTION_SIDE = 2000
 #: Fewest ChArUco corners of a usable picture.
@@ -198,7 +198,7 @@ def _refine(image: GrayImage, corners: NDArray[np.float32], board: Board) -> NDA
     """Corners by the gradient's saddle, in a window that stays clear of the neighbouring corners."""
     import cv2
 
-    half = int(np.clip(_pitch(corners, board) * 0.3, 2, 11))
+    half = int(np.clip(_pitch(corners, board) * 0.3, 2, 25))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
     start = np.ascontiguousarray(corners, np.float32).reshape(-1, 1, 2).copy()
     return np.asarray(cv2.cornerSubPix(image, start, (half, half), (-1, -1), criteria).reshape(-1, 2), np.float32)

@@ -257,6 +257,8 @@ def _measure(
     if len(sizes) > 1:
         shown = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
         raise UsageError(f"the pictures are of different sizes ({shown})", "calibrate one readout mode at a time")
+    if screen is not None:
+        return _measure_screen(frames, screen, axis, window)
     known = exposure_s if exposure_s is not None else frames[0].metadata.exposure_s
     along = None if axis == "auto" else axis
     if frames[0].mosaic is not None:
@@ -269,6 +271,20 @@ def _measure(
         window=window,
         tone_known=frames[0].mosaic is not None or frames[0].linear,
     )
+
+
+def _measure_screen(
+    frames: list[Frame], screen: str, axis: str, window: tuple[int, int, int, int] | None
+) -> ShutterCalibration:
+    from rxcli.calibrate.frames import light_of
+    from rxcli.calibrate.slots import calibrate_slots
+    from rxcli.profiles import ScreenProfile, load_profile
+
+    if window is not None:
+        raise UsageError("--region goes with --frequency only", "leave it out")
+    profile = load_profile(screen, ScreenProfile)
+    along: Any = "rows" if axis == "auto" else axis
+    return calibrate_slots([light_of(frame) for frame in frames], profile.slot_rate_hz, profile.packet_slots, along)
 
 
 def _mode(result: ShutterCalibration, name: str | None) -> ReadoutMode:
