@@ -194,7 +194,9 @@ def find_clock(
     many_delays = np.count_nonzero(delays) > delays.size * _MANY
     if lock < _SURE_LOCK or many_delays:
         spread = _spread_comb(pooled, weight, packet_slots * _SEARCH_SAMPLES)
-        start, lock, delays = spread if spread[1] > lock or many_delays else (start, lock, delays)
+        if spread[1] > lock or many_delays:
+            start, delays = spread[0], spread[2]
+            lock = max(lock, spread[1])
     row0 = top + start * step
     before = int(np.ceil((row0 - top) / rows_per_slot))
     n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))
@@ -253,20 +255,26 @@ def _spread_comb(pooled: Float32Array, weight: Float32Array, period: int) -> tup
     Each column's own header correlation is folded; the start is where most columns have a peak within reach.
     """
     n_columns = pooled.shape[0]
+    length = SLOTS_PER_SYMBOL * _SEARCH_SAMPLES
+    share = np.pad(weight / (weight + 1.0), ((0, 0), (0, length - 1)))
+    total = np.cumsum(np.pad(share, ((0, 0), (1, 0))), axis=1)
+    support = (total[:, length:] - total[:, :-length]) / length
     responses = [header_response(pooled[c : c + 1], weight[c : c + 1], _SEARCH_SAMPLES) for c in range(n_columns)]
+    # Twice a correlation less its bound: the log-likelihood ratio, up to a factor, of a header against random slots.
     folded = np.zeros((n_columns, -(-pooled.shape[1] // period) * period))
-    folded[:, : pooled.shape[1]] = np.maximum(responses, 0)
+    folded[:, : pooled.shape[1]] = 2 * np.array(responses) - support
     folded = folded.reshape(n_columns, -1, period).sum(axis=1)
     reach = int(_MAX_DELAY_SLOTS * _SEARCH_SAMPLES)
-    wrapped = np.pad(folded, ((0, 0), (reach, reach)), mode="wrap")
-    near = np.lib.stride_tricks.sliding_window_view(wrapped, 2 * reach + 1, axis=1)
-    score = (near.max(axis=2) ** 2).sum(axis=0)
+    wide = reach + _SEARCH_SAMPLES
+    wrapped = np.pad(folded, ((0, 0), (wide, wide)), mode="wrap")
+    near = np.lib.stride_tricks.sliding_window_view(wrapped, 2 * reach + 1, axis=1)[:, wide - reach :][:, :period]
+    score = np.maximum(near.max(axis=2), 0).sum(axis=0)
     start = int(score.argmax())
     lock = score[start] / max(float(score[_away(period, start, 2 * reach)].max(initial=0.0)), 1e-12)
-    around = near[:, start]
+    around = wrapped[:, start : start + 2 * wide + 1]
     best = around.argmax(axis=1)
-    delays = best + _parabola(around, best) - reach
-    sure = around[np.arange(n_columns), best] > _MIN_DELAY_LEAD
+    delays = best + _parabola(around, best) - wide
+    sure = around[np.arange(n_columns), best] > 0
     middle = float(np.median(delays[sure])) if sure.any() else 0.0
     return (start + middle) % period, float(lock), np.where(sure, delays - middle, 0.0) / _SEARCH_SAMPLES
 
