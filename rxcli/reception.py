@@ -28,6 +28,8 @@ _HOPELESS_WEIGHT = 20.0
 #: A column with a symbol of less than this log probability gets a second opinion. Measured (models/strips/README.md): a
 #: stricter gate asks half as often again and mends nothing more, a laxer one leaves errors behind.
 _DOUBTFUL = -1e-2
+#: The auto-encoder sees the same light as the light model, so its log-odds count for less than an observation's own.
+_DENOISER_WEIGHT = 0.25
 #: Rounds of light model and detection from where the auto-encoder starts.
 _RESTART_ITERATIONS = 1
 
@@ -135,6 +137,8 @@ def second_opinion(
 ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
     """Doubtful columns once more from where the auto-encoder starts; whichever end is more plausible is kept.
 
+    Its log-odds are then added to the likelihoods of either end.
+
     Returns:
         What is kept, the columns whose second end that is, and what to report; None where nothing was done.
     """
@@ -156,11 +160,10 @@ def second_opinion(
     again = _restart(seen, log_odds, columns)
     better = _evidence(again.metrics, seen) > _evidence(seen.metrics[columns], seen)
     kept = columns[better]
-    if kept.size:
-        metrics, snr = seen.metrics.copy(), seen.snr.copy()
-        metrics[kept], snr[kept] = again.metrics[better], again.snr[better]
-        posteriors = _detect(metrics, seen.clock, seen.model)
-        seen = replace(seen, metrics=metrics, snr=snr, posteriors=posteriors)
+    metrics, snr = seen.metrics.copy(), seen.snr.copy()
+    metrics[kept], snr[kept] = again.metrics[better], again.snr[better]
+    metrics[columns] += _DENOISER_WEIGHT * channel.metrics_of(log_odds, seen.model.memory)
+    seen = replace(seen, metrics=metrics, snr=snr, posteriors=_detect(metrics, seen.clock, seen.model))
     return seen, frozenset(kept.tolist()), {**report, "model": denoiser.name, "kept": kept.size}
 
 
