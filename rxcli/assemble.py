@@ -23,6 +23,10 @@ from rxcli.types import (
 
 #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
 MAX_BER_HAT = 0.1
+#: Offset and slope from the log-odds of the posterior to those of being error-free; 2882 packets of 500 random frames.
+_CALIBRATION = (0.616, 0.770)
+#: Doubt that is left in the surest packet.
+_LEAST_DOUBT = 1e-9
 #: A column with a packet below this confidence is weak.
 _WEAK_CONFIDENCE = 0.5
 #: A weight is reported from this probability on.
@@ -232,9 +236,20 @@ def _packet(burst: int, column: int, clock: Clock, posteriors: BurstPosteriors, 
         copies=float(seen.sum() / clock.packet_slots),
         payload_bits=int(bits.size),
         payload=bits_to_hex(bits),
-        confidence=float(np.exp(posteriors.log_prob[burst, column].sum())),
+        confidence=_calibrated(float(posteriors.log_prob[burst, column].sum())),
         ber_hat=ber_hat,
     )
+
+
+def _calibrated(log_prob: float) -> float:
+    """Share of error-free packets among those whose symbols' log probabilities add up to `log_prob`.
+
+    The light model's likelihoods are tempered, since strips and samples err together; what is left of that is a
+    straight line between log-odds, fitted by `vlc-rx benchmark confidence`.
+    """
+    at_most = min(log_prob, -_LEAST_DOUBT)
+    log_odds = at_most - np.log(-np.expm1(at_most))
+    return float(1 / (1 + np.exp(-(_CALIBRATION[0] + _CALIBRATION[1] * log_odds))))
 
 
 def _header_row(copy: int, column: int, clock: Clock) -> float:
