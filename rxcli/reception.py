@@ -71,7 +71,7 @@ def quick_look(lock: Lock) -> Reception:
     model = _light_model(replace(lock, profiles=profiles), samples)
     llr = channel.first_llr(*clock.slot_contrast(samples, model.sigma))
     now = clock.assign_bursts(now, llr, lock.screen.repeats)
-    posteriors = _detect(channel.metrics_of(llr, model.memory), now, model)
+    posteriors = _detect(channel.metrics_of(llr, model.memory), now, model, margin=0.0)
     columns = np.arange(samples.light.shape[0])
     lit = channel.lit_on_grid(posteriors, now)
     likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
@@ -211,9 +211,11 @@ def _doubtful(seen: Reception, certain: float) -> NDArray[np.bool_]:
     return np.asarray(((seen.posteriors.log_prob.min(axis=2) < certain) & complete).any(axis=0))
 
 
-def _detect(metrics: FloatArray, now: Clock, model: channel.LightModel) -> BurstPosteriors:
+def _detect(
+    metrics: FloatArray, now: Clock, model: channel.LightModel, margin: float = _HOPELESS_WEIGHT
+) -> BurstPosteriors:
     bursts = channel.by_burst(metrics, now, model.memory)
-    return detect.detect(bursts, detect.plausible_weights(bursts, _HOPELESS_WEIGHT))
+    return detect.detect(bursts, detect.plausible_weights(bursts, margin))
 
 
 def _light_model(lock: Lock, samples: SlotSamples) -> channel.LightModel:

@@ -26,7 +26,7 @@ _CELLS_PER_STRIP = 4
 _BAND_ROWS = 64
 #: One row in this many is kept for the noise model, and of those as many as hold this many cells.
 _NOISE_ROW_STEP = 16
-_NOISE_CELLS = 30_000
+_NOISE_CELLS = 10_000
 #: OpenCV and NumPy work outside the interpreter's lock.
 _THREADS = 2
 _NOISE_BINS = 24
