@@ -34,6 +34,8 @@ from rxcli.types import (
     RowProfiles,
 )
 
+#: Frames at the start that are looked at once more when the picture is known better.
+_HELD = 6
 #: Frames that may wait until it is clear which copies begin a burst.
 _MAX_WAITING = 8
 #: Frames whose corners are averaged at the start, and how often they are looked at from then on.
@@ -139,6 +141,8 @@ class _Clip:
         self._place: _Place | None = None
         self._picture: known_picture.KnownPicture | None = None
         self._n_lessons = 0
+        #: Frames that are held back at the start, to be looked at once more; 0 from then on.
+        self._n_held = _HELD if "tracking" in options.skip else 0
         #: (C, 9) the weight that a column was last certain of, alone; None before any.
         self._weights: NDArray[np.bool_] | None = None
         self._last: _View | None = None
@@ -162,7 +166,7 @@ class _Clip:
             self._forget()
             waiting.result = replace(waiting.result, status=failure.status, message=failure.message)
             self._waiting.append(waiting)
-            done = self._ready()
+            done = self.finish() if self._n_held else self._ready()
         waiting.result = replace(waiting.result, timing_ms=stages.total())
         return done
 
@@ -173,6 +177,9 @@ class _Clip:
 
     def finish(self) -> list[FrameResult]:
         """The results still held back."""
+        if self._n_held:
+            self._settle()
+            self._look_again()
         done = self._settle()
         done += [self._report(waiting, None) for waiting in self._waiting]
         self._waiting.clear()
@@ -287,7 +294,9 @@ class _Clip:
             now = replace(now, row0=now.row0 - fit.late * now.rows_per_slot)
             positions = known_picture.row_positions(self._rows, now)
             fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
-        flat = self._picture.judge(flat, fit.expected, _NOISE_SHARE)
+        flat, ratio = self._picture.judge(flat, fit.expected, _NOISE_SHARE)
+        if ratio > _MISFIT:
+            return None
         return flat, now, positions, known_picture.pattern_metrics(flat, positions, now, memory, fit, lit)
 
     @property
@@ -331,7 +340,7 @@ class _Clip:
         picture.moved(_row_before(self._rows, corners, before, lock.screen.columns) - rows_before, place.map.inside)
 
     def _clock(self, frame: Frame, flat: known_picture.ColumnLight, last: _View) -> Clock | None:
-        """The clock of the frame: what the header says, or where it is not seen well, what was foretold."""
+        """The clock of the frame: what the header says, or where it is not seen well, what was foretold. None: another time."""
         assert self._place is not None
         assert self._link is not None
         lock = last.lock
@@ -350,11 +359,11 @@ class _Clip:
         top = float(rows[0]) - 0.5
         n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
         foretold = self._link.time.clock_at(frame.index, frame.time_s, old, n_slots, top)
-        if found is not None and (foretold is None or _apart(found, foretold) < _SAME_TIME_SLOTS):
+        if found is None:
+            return foretold
+        if foretold is None or _apart(found, foretold) < _SAME_TIME_SLOTS:
             return replace(found, delay_slots=old.delay_slots)
-        if found is not None and found.lock > _OWN_LOCK:
-            return replace(found, delay_slots=old.delay_slots)
-        return foretold
+        return None if found.lock > _OWN_LOCK else foretold
 
     # -- bursts ---------------------------------------------------------------------------------------------------
 
@@ -364,7 +373,7 @@ class _Clip:
         done: list[FrameResult] = []
         first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock) if self._link else None
         if first_copy is None:
-            done = self.finish()
+            done = self.finish() if self._link is not None else []
             self._begin_link(view, frame)
             assert self._link is not None
             first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock)
@@ -379,6 +388,8 @@ class _Clip:
             n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)
             if self._link.phase.settled or n_unsettled > _MAX_WAITING:
                 self._settle_bursts()
+                if self._n_held and len(self._waiting) >= self._n_held:
+                    self._look_again()
         return done + self._ready()
 
     def _begin_link(self, view: _View, frame: Frame) -> None:
@@ -482,11 +493,35 @@ class _Clip:
         doubt = known_picture.exposed(lit * (1 - lit), positions, now.exposure_slots)
         picture.learn(view.light, slots, np.clip(1 - 8 * doubt, 0, 1).astype(np.float32))
 
+    def _look_again(self) -> None:
+        """The first frames once more, with what was learned of the picture since."""
+        self._n_held = 0
+        held = [waiting for waiting in self._waiting if waiting.numbers is not None]
+        if not any(waiting.view and waiting.view.flat is not None for waiting in held):
+            return
+        self._bursts = tracking.Bursts()
+        for waiting in held:
+            view, waiting.numbers = waiting.view, None
+            if view is not None and view.flat is not None and view.light is not None:
+                self._measure_again(view, view.light)
+            self._detect(waiting)
+
+    def _measure_again(self, view: _View, light: Float32Array) -> None:
+        if self._picture is None or light.shape[2] != self._rows.size:
+            return
+        refined = self._refined(light, self._picture.solve(light), view.bursts.clock, view.memory)
+        if refined is not None:
+            burst = view.bursts.clock.burst
+            view.flat, now, _, metrics = refined
+            view.bursts = replace(view.bursts, clock=replace(now, burst=burst), metrics=metrics)
+
     # -- results ---------------------------------------------------------------------------------------------------
 
     def _ready(self) -> list[FrameResult]:
         """Results of the frames whose bursts all ended, oldest first."""
-        done = []
+        done: list[FrameResult] = []
+        if self._n_held:
+            return done
         while self._waiting:
             first = self._waiting[0]
             if first.view is not None:

@@ -84,8 +84,8 @@ class KnownPicture:
         self._inside = inside.astype(np.float32)
         self._spread = spread.astype(np.float32)
         self._floor, self._variance, self._shot = np.float32(floor), np.float32(variance), np.float32(shot)
-        self._light = np.zeros(inside.shape, np.float32)
-        self._seen = np.zeros(inside.shape, np.float32)
+        self._light: Float32Array = np.zeros(inside.shape, np.float32)
+        self._seen: Float32Array = np.zeros(inside.shape, np.float32)
         self._system: _System | None = None
         self._picture = self._error = self._light
         #: (C,) variance of the columns' light over what was foreseen.
@@ -143,7 +143,7 @@ class KnownPicture:
         value = shrunk + (shrunk - np.float32(0.5)) * (np.float32(_PRIOR) / np.maximum(precision, np.float32(1e-3)))
         return ColumnLight(value, self._tempered(value, precision), shrunk)
 
-    def judge(self, seen: ColumnLight, expected: Float32Array, share: float) -> ColumnLight:
+    def judge(self, seen: ColumnLight, expected: Float32Array, share: float) -> tuple[ColumnLight, float]:
         """Compare columns with what was decided; they are trusted accordingly, now and, in part, from now on.
 
         Args:
@@ -152,13 +152,15 @@ class KnownPicture:
             share: weight of this frame against those before, 0..1.
 
         Returns:
-            The light with its precision put right.
+            The light with its precision put right; and the median over the columns of the squared error over the
+            variance foreseen.
         """
         error = np.square(seen.value - expected) * seen.precision
         ratio = error.sum(axis=1) / np.maximum((seen.precision > 0).sum(axis=1), 1) / np.float32(_TEMPER)
         now = np.clip(self._excess * ratio, 0.25, 100.0)
         self._excess += np.float32(share) * (now - self._excess)
-        return ColumnLight(seen.value, seen.precision / np.maximum(ratio, 0.5)[:, None], seen.shrunk)
+        better = ColumnLight(seen.value, seen.precision / np.maximum(ratio, 0.5)[:, None], seen.shrunk)
+        return better, float(np.median(ratio))
 
     def moved(self, row_of: FloatArray, inside: BoolArray) -> None:
         """Follow the screen to another place.
