@@ -1,0 +1,51 @@
+"""Exit codes and what an error says; where shipped data lie."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+
+from rxcli.errors import ExitCode, InputError, ProfileError, ReceiverError, UsageError, worst
+from rxcli.resources import data_dir
+
+
+def test_exit_codes_of_the_command_line() -> None:
+    assert {code.name: code.value for code in ExitCode} == {
+        "OK": 0,
+        "NOT_RECEIVED": 1,
+        "USAGE": 2,
+        "UNREADABLE": 3,
+        "INTERRUPTED": 130,
+    }
+
+
+@pytest.mark.parametrize(
+    ("codes", "expected"),
+    [([], 0), ([0, 0], 0), ([0, 1], 1), ([1, 3], 3), ([3, 2, 1], 2), ([1, 2, 3, 130, 0], 130)],
+)
+def test_where_several_hold_the_first_of_130_2_3_1_wins(codes: list[int], expected: int) -> None:
+    assert worst([ExitCode(code) for code in codes]) == expected
+
+
+@pytest.mark.parametrize(
+    ("kind", "code"), [(InputError, 3), (ProfileError, 2), (UsageError, 2), (ReceiverError, ExitCode.NOT_RECEIVED)]
+)
+def test_an_error_is_one_line_with_its_next_step(kind: type[ReceiverError], code: int) -> None:
+    error = kind("a.jpg: no picture", "name a photo")
+    assert str(error) == "a.jpg: no picture; name a photo"
+    assert str(kind("a.jpg: no picture")) == "a.jpg: no picture"
+    assert error.exit_code == code
+    assert isinstance(error, ReceiverError)
+
+
+@pytest.mark.parametrize("kind", [InputError, ProfileError, UsageError])
+def test_errors_pass_between_processes_whole(kind: type[ReceiverError]) -> None:
+    copy = pickle.loads(pickle.dumps(kind("a.jpg: no picture", "name a photo")))
+    assert type(copy) is kind
+    assert str(copy) == "a.jpg: no picture; name a photo"
+
+
+@pytest.mark.parametrize(("name", "suffix"), [("calibration", ".toml"), ("models", ".onnx"), ("sample_frames", ".jpg")])
+def test_shipped_data_are_found(name: str, suffix: str) -> None:
+    assert any(path.suffix == suffix for path in data_dir(name).rglob("*"))
