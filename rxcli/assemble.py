@@ -25,6 +25,13 @@ from rxcli.types import (
 MAX_BER_HAT = 0.1
 #: Offset and slope from the log-odds of the posterior to those of being error-free; 2882 packets of 500 random frames.
 _CALIBRATION = (0.616, 0.770)
+#: Headers less likely than this against slots that are anything, nats, are not headers.
+_CONTRADICTED = -2.0
+#: Together the columns' headers must be this much more likely than slots that are anything; one good header gives 12.
+_HEADERS_AT_LEAST = 6.0
+_HEADERLESS = (
+    "the header does not show where it should; check for overexposure, or give the screen's place with --corners"
+)
 #: Doubt that is left in the surest packet.
 _LEAST_DOUBT = 1e-9
 #: A column with a packet below this confidence is weak.
@@ -187,13 +194,15 @@ def complete(seen: IntArray) -> BoolArray:
 def _column_result(
     column: int, clock: Clock, posteriors: BurstPosteriors, snr: Float32Array, seen: IntArray, min_confidence: float
 ) -> ColumnResult:
+    contradicted = not _headers_show(posteriors) or bool(posteriors.header_llr[:, column].min() < _CONTRADICTED)
     found = [
         _packet(int(burst), column, clock, posteriors, seen[burst])
         for burst in np.flatnonzero(complete(seen[:, None])[:, 0])
+        if not contradicted
     ]
     packets = tuple(packet for packet in found if packet and packet.confidence >= min_confidence)
     snr_db = _snr_db(snr)
-    sure_of_w = posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
+    sure_of_w = not contradicted and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
     return ColumnResult(
         column=column,
@@ -202,8 +211,13 @@ def _column_result(
         snr_db=snr_db,
         delay_slots=float(clock.delay_slots[column]),
         packets=packets,
-        message=None if packets else _why_none(status, snr_db, int(seen.sum()), clock),
+        message=None if packets else _HEADERLESS if contradicted else _why_none(status, snr_db, int(seen.sum()), clock),
     )
+
+
+def _headers_show(posteriors: BurstPosteriors) -> bool:
+    """Whether the columns together bear out that there are headers: no light, no packet."""
+    return bool(posteriors.header_llr.sum() > _HEADERS_AT_LEAST)
 
 
 def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:

@@ -254,7 +254,16 @@ def _posteriors(metrics: FloatArray, w_log_prob: FloatArray) -> BurstPosteriors:
         log_prob[:, columns] = _log_of_best(posterior, best).reshape(n_bursts, columns.size, n_symbols)
         k = bits_per_symbol(int(w))
         bit_llr[:, columns, :, :k] = _bit_llr(posterior, k).reshape(n_bursts, columns.size, n_symbols, k)
-    return BurstPosteriors(weights, w_log_prob, lit, index, log_prob, bit_llr)
+    return BurstPosteriors(weights, w_log_prob, lit, index, log_prob, bit_llr, _header_llr(metrics))
+
+
+def _header_llr(metrics: FloatArray) -> FloatArray:
+    """(B, C) log-likelihood of the header's slots as they must be, over slots that are anything with equal chance."""
+    memory = _memory_of(metrics)
+    header = metrics[:, :, memory : len(HEADER)]
+    known = header[:, :, np.arange(len(HEADER) - memory), _pattern_index(np.array(HEADER), memory)]
+    anything = _log_sum(header, axis=3) - np.log(metrics.shape[-1])
+    return np.asarray((known - anything).sum(axis=2))
 
 
 def _log_of_best(posterior: FloatArray, best: NDArray[np.int64]) -> FloatArray:

@@ -163,7 +163,9 @@ def second_opinion(
     metrics, snr = seen.metrics.copy(), seen.snr.copy()
     metrics[kept], snr[kept] = again.metrics[better], again.snr[better]
     metrics[columns] += _DENOISER_WEIGHT * channel.metrics_of(log_odds, seen.model.memory)
-    seen = replace(seen, metrics=metrics, snr=snr, posteriors=_detect(metrics, seen.clock, seen.model))
+    # The network is told where headers are; whether they show there, the light alone must say.
+    posteriors = replace(_detect(metrics, seen.clock, seen.model), header_llr=seen.posteriors.header_llr)
+    seen = replace(seen, metrics=metrics, snr=snr, posteriors=posteriors)
     return seen, frozenset(kept.tolist()), {**report, "model": denoiser.name, "kept": kept.size}
 
 

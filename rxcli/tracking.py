@@ -304,4 +304,5 @@ def _merged(before: BurstPosteriors | None, new: BurstPosteriors, columns: IntAr
         index=put(before.index, new.index, 1),
         log_prob=put(before.log_prob, new.log_prob, 1),
         bit_llr=put(before.bit_llr, new.bit_llr, 1),
+        header_llr=put(before.header_llr, new.header_llr, 1),
     )

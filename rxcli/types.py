@@ -185,6 +185,8 @@ class BurstPosteriors:
     log_prob: FloatArray
     #: (B, C, N, 7) float64: ln p(1)/p(0) of the symbol's bits, first bit first; nan where w has fewer bits.
     bit_llr: FloatArray
+    #: (B, C) float64: log-likelihood of the headers as they must be, over slots that are anything; 0 where none is seen.
+    header_llr: FloatArray
 
 
 FrameStatus = Literal["ok", "partial", "no_screen", "no_signal", "unreadable"]

@@ -53,6 +53,7 @@ def posteriors_of(
         index=index,
         log_prob=np.full(index.shape, np.log(probability)),
         bit_llr=bit_llr,
+        header_llr=np.full((n_bursts, n_columns), 20.0),
     )
 
 
@@ -175,6 +176,18 @@ def test_confidence_grows_with_the_log_probability_and_stays_below_one() -> None
     assert confidences == sorted(confidences)
     assert confidences[0] >= 0
     assert confidences[-1] < 1
+
+
+def test_a_header_that_is_contradicted_stands_for_no_packet() -> None:
+    posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.9999)
+    posteriors = replace(posteriors, header_llr=np.array([[-20.0, 40.0]]))
+    first, second = assemble.column_results(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+    assert not first.packets
+    assert first.w is None
+    assert first.status == "no_packet"
+    assert first.message is not None
+    assert "header" in first.message
+    assert second.packets
 
 
 def test_nothing_decoded_says_why() -> None:
