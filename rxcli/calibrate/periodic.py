@@ -8,6 +8,7 @@ harmonic is no rival of its fundamental, and a sub-harmonic has to explain somet
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -152,17 +153,24 @@ def search_few(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
     n = profiles.shape[1] // thin
     values = _detrend(profiles[:, : n * thin].reshape(len(profiles), n, thin).mean(axis=2))
     energy = np.sum(values**2, axis=1) + 1e-300
-    rows = np.arange(n) - (n - 1) / 2
-    slow = np.polynomial.chebyshev.chebvander(2 * rows / n, 3)
     best, chosen = np.zeros(len(profiles)), np.full(len(profiles), MIN_PERIODS / profiles.shape[1])
-    for periods in np.arange(MIN_PERIODS, FEW_PERIODS + 1, 0.125):
-        for n_harmonics in (1, 3, 5):
-            angle = 2 * np.pi * periods / n * np.multiply.outer(rows, np.arange(1, n_harmonics + 1))
-            basis, _ = np.linalg.qr(np.hstack([slow, np.cos(angle), np.sin(angle)]))
-            score = np.sum((values @ basis) ** 2, axis=1) / energy - _PRICE * n_harmonics
-            chosen = np.where(score > best, periods / (n * thin), chosen)
-            best = np.maximum(best, score)
+    for periods, n_harmonics, basis in _few_bases(n):
+        score = np.sum((values @ basis) ** 2, axis=1) / energy - _PRICE * n_harmonics
+        chosen = np.where(score > best, periods / (n * thin), chosen)
+        best = np.maximum(best, score)
     return chosen, np.where(best > _FEW_SCORE, best, 0)
+
+
+@lru_cache(maxsize=8)
+def _few_bases(n: int) -> list[tuple[float, int, FloatArray]]:
+    """Periods, number of harmonics and orthonormal basis (n, k) of every trial of `search_few`."""
+    trials = [(float(p), h) for p in np.arange(MIN_PERIODS, FEW_PERIODS + 1, 0.125) for h in (1, 3, 5)]
+    bases = []
+    for periods, n_harmonics in trials:
+        series = _Series.make(n, 4, n_harmonics)
+        basis, _ = np.linalg.qr(np.hstack([series.slow, *series.waves(periods / n)]))
+        bases.append((periods, n_harmonics, np.asarray(basis)))
+    return bases
 
 
 def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -> PeriodicFit | None:
@@ -176,7 +184,9 @@ def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -
     # With one limit for all, or the slow part of a fast candidate would follow the stripes themselves.
     most_slow = max(frequency * n, 2.0)
     inside = [f for f in candidates if 1.5 / n <= f <= MAX_FREQUENCY]
-    fits = [fit_periodic(profile, f, first_row, most_slow) for f in inside]
+    shares = np.array([_rough_share(profile, f) for f in inside])
+    likely = [f for f, share in zip(inside, shares, strict=True) if share >= 0.6 * shares.max()]
+    fits = [fit_periodic(profile, f, first_row, most_slow) for f in likely]
     best: PeriodicFit | None = None
     for fit in fits:
         if fit is None:
@@ -184,6 +194,15 @@ def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -
         if best is None or (fit.beats(best) and fit.explained > best.explained * (1 + _SUBHARMONIC_SHARE)):
             best = fit
     return best
+
+
+def _rough_share(profile: FloatArray, frequency: float) -> float:
+    """Share of the variance about a cubic that five harmonics explain."""
+    series = _Series.make(profile.size, 4, 5)
+    basis, _ = np.linalg.qr(np.hstack([series.slow, *series.waves(frequency)]))
+    parts = (basis.T @ profile) ** 2
+    total = float(profile @ profile) - float(parts[:4].sum())
+    return float(parts[4:].sum()) / max(total, 1e-300)
 
 
 def fit_periodic(
@@ -257,7 +276,7 @@ def _fit_near(
     for _ in range(12):
         step = _solve(jacobian, jacobian.T @ (profile - model))
         state, model, jacobian, new_rss = series.descend(profile, state, step, rss)
-        converged = rss - new_rss <= 1e-9 * rss
+        converged = rss - new_rss <= 1e-7 * rss
         rss = new_rss
         if converged:
             break
@@ -303,13 +322,14 @@ class _Series:
 
     def start(self, profile: FloatArray, frequency: float) -> FloatArray:
         """Least squares with a constant envelope."""
-        cosine, sine = self._waves(frequency)
+        cosine, sine = self.waves(frequency)
         design = np.hstack([self.slow, cosine, sine])
         linear = _solve(design, design.T @ profile)
         n_slow = self.slow.shape[1]
         return np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
 
-    def _waves(self, frequency: float) -> tuple[FloatArray, FloatArray]:
+    def waves(self, frequency: float) -> tuple[FloatArray, FloatArray]:
+        """Cosines and sines of the harmonics, (n, H) each."""
         angle = 2 * np.pi * frequency * np.multiply.outer(self.rows, self.order)
         return np.cos(angle), np.sin(angle)
 
@@ -323,7 +343,7 @@ class _Series:
     def evaluate(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The model (n,) and its Jacobian (n, parameters)."""
         mean, envelope, a, b = self.unpack(state)
-        cosine, sine = self._waves(state[-1])
+        cosine, sine = self.waves(state[-1])
         wave = cosine @ a + sine @ b
         slope = 2 * np.pi * self.rows * (cosine @ (self.order * b) - sine @ (self.order * a))
         e = envelope[:, None]
