@@ -40,8 +40,10 @@ _HELD = 6
 _MAX_WAITING = 8
 #: Frames whose corners are averaged at the start, and how often they are looked at from then on.
 _FIRST_LOOKS, _LOOK_EVERY = 4, 30
-#: Share of a new look in the corners.
-_CORNER_SHARE = 0.25
+#: Looks whose median is where the corners are.
+_LOOKS = 5
+#: A screen found anew whose corners are closer than this to where they were, in screen widths, is where it was.
+_NEAR = 0.06
 #: Movement of a corner that is followed at once, and the one below which nothing is changed, in screen widths.
 _JUMP, _STILL = 0.012, 0.0004
 #: Frames from which the picture is learned one by one, and how often from then on.
@@ -49,7 +51,7 @@ _FIRST_LESSONS, _LESSON_EVERY = 12, 6
 #: Frames of which the picture is known so little that strips are compared with what is expected of them.
 _FEW_LESSONS = 4
 #: Columns decided worse than this many times the foreseen variance do not fit what is known.
-_MISFIT = 6.0
+_MISFIT = 40.0
 #: Slots of lateness that are put right, contrast of headers, against full, below which nothing is known any more, and
 #: contrast of a frame below which compression has taken much of it.
 _LATE, _LEAST_HEADER, _FADED = 0.03, 0.3, 0.85
@@ -59,8 +61,6 @@ _NOISE_SHARE = 0.2
 _CERTAIN = -1e-5
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
 _HOPELESS_WEIGHT = 20.0
-#: A header peak this much over the strongest rival is believed against what the frames before foretell.
-_OWN_LOCK = 3.0
 #: Slots that a clock may be off the foretold one.
 _SAME_TIME_SLOTS = 1.5
 
@@ -77,7 +77,7 @@ def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[
     yield from clip.finish()
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _View:
     """A frame with a lock."""
 
@@ -92,9 +92,11 @@ class _View:
     #: (C, S, R) light of the strips as tracking samples them; None where that cannot be done.
     light: Float32Array | None = None
     flat: known_picture.ColumnLight | None = None
+    #: Kept only while the frame is held back to be looked at once more.
+    frame: Frame | None = None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Waiting:
     """A frame whose result is held back."""
 
@@ -104,17 +106,19 @@ class _Waiting:
     numbers: IntArray | None = None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Place:
     """Where the screen is, and how strips are read there."""
 
     corners: FloatArray
     map: strips.StripMap
     light_of_value: Float32Array
-    n_looks: int = 0
+    #: Where it was found at the last looks.
+    looks: deque[FloatArray]
+    n_frames: int = 0
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Link:
     """The link's time, as long as it is not lost."""
 
@@ -140,6 +144,8 @@ class _Clip:
         self._corners: FloatArray | None = None
         self._place: _Place | None = None
         self._picture: known_picture.KnownPicture | None = None
+        #: The lock and the light of a dark slot that the picture began with.
+        self._model: tuple[Lock, float] | None = None
         self._n_lessons = 0
         #: Frames that are held back at the start, to be looked at once more; 0 from then on.
         self._n_held = _HELD if "tracking" in options.skip else 0
@@ -192,9 +198,12 @@ class _Clip:
 
     def _search(self, frame: Frame, result: FrameResult, stages: Stages) -> tuple[_View, FrameResult]:
         """Receive a frame like a photograph; only the camera is taken from the frames before."""
+        before = self._place
         self._forget()
         with stages("geometry"):
             corners = find_corners(frame, self._options)
+            if before is not None and np.abs(corners - before.corners).max() < _NEAR * np.ptp(before.corners[:, 0]):
+                corners = before.corners
         self._corners = corners
         if self._camera is None or self._taken_with != _taken_with(frame) or "tracking" not in self._options.skip:
             self._camera = find_camera(frame, corners, self._options, stages)
@@ -229,17 +238,22 @@ class _Clip:
             corners,
             _map(frame, corners, camera, lock),
             strips.light_of_values(frame, lambda coded: sampling.tone_to_light(camera.tone, coded)),
+            deque([corners], maxlen=_LOOKS),
         )
-        profiles, n_strips = lock.profiles, self._place.map.inside.shape[1]
-        pixels = self._place.map.pixels
-        self._picture = known_picture.KnownPicture(
-            self._place.map.inside,
-            channel.spread_matrix(n_strips, lock.screen.light_spread),
-            seen.model.floor,
-            max(profiles.noise_floor / pixels, 1e-7),
-            profiles.noise_slope / pixels,
-        )
+        self._model = lock, seen.model.floor
+        self._picture = self._new_picture(*self._model)
+
+    def _new_picture(self, lock: Lock, floor: float) -> known_picture.KnownPicture:
+        assert self._place is not None
         self._n_lessons = 0
+        profiles, strip_map = lock.profiles, self._place.map
+        return known_picture.KnownPicture(
+            strip_map.inside,
+            channel.spread_matrix(strip_map.inside.shape[1], lock.screen.light_spread),
+            floor,
+            max(profiles.noise_floor / strip_map.pixels, 1e-7),
+            profiles.noise_slope / strip_map.pixels,
+        )
 
     # -- a frame whose place and picture are known -------------------------------------------------------------------
 
@@ -313,8 +327,10 @@ class _Clip:
         """Look where the screen is, now and then."""
         place = self._place
         assert place is not None
-        place.n_looks += 1
-        if self._options.corners is not None or not (place.n_looks < _FIRST_LOOKS or place.n_looks % _LOOK_EVERY == 0):
+        place.n_frames += 1
+        if self._options.corners is not None or not (
+            place.n_frames < _FIRST_LOOKS or place.n_frames % _LOOK_EVERY == 0
+        ):
             return
         from rxcli.find_screen import track_screen
 
@@ -324,11 +340,13 @@ class _Clip:
             return
         seen = found.corners[order]
         width = float(np.linalg.norm(place.corners[1] - place.corners[0]))
-        moved = float(np.abs(seen - place.corners).max()) / width
-        share = 1.0 if moved > _JUMP else max(_CORNER_SHARE, 1 / (1 + place.n_looks))
-        if moved > _STILL:
-            self._corners = place.corners + share * (seen - place.corners)
-            self._move(frame, camera, lock, self._corners)
+        if np.abs(seen - place.corners).max() > _JUMP * width:
+            place.looks.clear()
+        place.looks.append(seen)
+        corners = np.median(place.looks, axis=0)
+        if np.abs(corners - place.corners).max() > _STILL * width:
+            self._corners = corners
+            self._move(frame, camera, lock, corners)
 
     def _move(self, frame: Frame, camera: Camera, lock: Lock, corners: FloatArray) -> None:
         place, picture = self._place, self._picture
@@ -340,7 +358,7 @@ class _Clip:
         picture.moved(_row_before(self._rows, corners, before, lock.screen.columns) - rows_before, place.map.inside)
 
     def _clock(self, frame: Frame, flat: known_picture.ColumnLight, last: _View) -> Clock | None:
-        """The clock of the frame: what the header says, or where it is not seen well, what was foretold. None: another time."""
+        """The clock of the frame: from its headers where they are about as foretold, else as foretold."""
         assert self._place is not None
         assert self._link is not None
         lock = last.lock
@@ -359,11 +377,9 @@ class _Clip:
         top = float(rows[0]) - 0.5
         n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
         foretold = self._link.time.clock_at(frame.index, frame.time_s, old, n_slots, top)
-        if found is None:
-            return foretold
-        if foretold is None or _apart(found, foretold) < _SAME_TIME_SLOTS:
+        if found is not None and (foretold is None or _apart(found, foretold) < _SAME_TIME_SLOTS):
             return replace(found, delay_slots=old.delay_slots)
-        return None if found.lock > _OWN_LOCK else foretold
+        return foretold
 
     # -- bursts ---------------------------------------------------------------------------------------------------
 
@@ -382,6 +398,8 @@ class _Clip:
         self._link.last_time_s = frame.time_s
         view.bursts = replace(view.bursts, first_copy=first_copy)
         self._waiting.append(waiting)
+        if self._n_held and view.light is not None:
+            view.frame = frame
         with stages("detect"):
             if not self._link.phase.settled:
                 self._compare(view)
@@ -444,7 +462,8 @@ class _Clip:
         self._skip(waiting, "certain_columns", int(certain.sum()))
         self._detect_open(still_open, ~certain)
         if view.flat is not None:
-            self._confirm(view, waiting.numbers, still_open)
+            self._learn(view, self._grid(waiting))
+            self._last = view
 
     def _detect_open(self, numbers: IntArray, wanted: NDArray[np.bool_]) -> None:
         """Detect the wanted columns, (B, C), of open bursts."""
@@ -471,15 +490,6 @@ class _Clip:
         sure = certain.any(axis=0)
         self._weights[columns[sure], posteriors.w[sure] - 1] = True
 
-    def _confirm(self, view: _View, numbers: IntArray, still_open: IntArray) -> None:
-        """Check what was known against what was decided, and learn."""
-        now = view.bursts.clock
-        lit = np.full((numbers.size, self._bursts.n_columns, now.packet_slots), 0.5, np.float32)
-        lit[np.searchsorted(numbers, still_open)] = self._bursts.lit(still_open)
-        grid = clock.from_copies(lit[now.burst].transpose(1, 0, 2), now)
-        self._learn(view, grid)
-        self._last = view
-
     def _learn(self, view: _View, lit: Float32Array) -> None:
         picture = self._picture
         if picture is None or view.light is None or view.light.shape[2] != self._rows.size:
@@ -494,26 +504,45 @@ class _Clip:
         picture.learn(view.light, slots, np.clip(1 - 8 * doubt, 0, 1).astype(np.float32))
 
     def _look_again(self) -> None:
-        """The first frames once more, with what was learned of the picture since."""
+        """The first frames once more: by then it is known better where the screen is, and what is on it."""
         self._n_held = 0
         held = [waiting for waiting in self._waiting if waiting.numbers is not None]
-        if not any(waiting.view and waiting.view.flat is not None for waiting in held):
-            return
-        self._bursts = tracking.Bursts()
-        for waiting in held:
-            view, waiting.numbers = waiting.view, None
-            if view is not None and view.flat is not None and view.light is not None:
-                self._measure_again(view, view.light)
-            self._detect(waiting)
+        views = [waiting.view for waiting in held if waiting.view and waiting.view.frame is not None]
+        if len(views) > 1 and self._place is not None and self._model is not None:
+            known = [self._grid(waiting) for waiting in held if waiting.view in views]
+            self._picture = self._new_picture(*self._model)
+            for view, lit in zip(views, known, strict=True):
+                assert view.frame is not None
+                view.light = self._strips(view.frame)
+                self._learn(view, lit)
+            for view in views:
+                self._measure_again(view)
+            self._bursts = tracking.Bursts()
+            for waiting in held:
+                self._detect(waiting)
+        for view in views:
+            view.frame = None
 
-    def _measure_again(self, view: _View, light: Float32Array) -> None:
-        if self._picture is None or light.shape[2] != self._rows.size:
-            return
-        refined = self._refined(light, self._picture.solve(light), view.bursts.clock, view.memory)
+    def _measure_again(self, view: _View) -> None:
+        assert self._picture is not None
+        assert view.light is not None
+        flat = self._picture.solve(view.light)
+        refined = self._refined(view.light, flat, view.bursts.clock, view.memory)
         if refined is not None:
             burst = view.bursts.clock.burst
             view.flat, now, _, metrics = refined
             view.bursts = replace(view.bursts, clock=replace(now, burst=burst), metrics=metrics)
+
+    def _grid(self, waiting: _Waiting) -> Float32Array:
+        """(C, N) probability that each slot of a frame is lit, by all that is known of its bursts."""
+        assert waiting.view is not None
+        assert waiting.numbers is not None
+        now = waiting.view.bursts.clock
+        lit = np.full((waiting.numbers.size, self._bursts.n_columns, now.packet_slots), 0.5, np.float32)
+        for place, number in enumerate(waiting.numbers):
+            if self._bursts.is_open(int(number)):
+                lit[place] = self._bursts.lit(waiting.numbers[place : place + 1])[0]
+        return clock.from_copies(lit[now.burst].transpose(1, 0, 2), now)
 
     # -- results ---------------------------------------------------------------------------------------------------
 

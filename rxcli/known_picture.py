@@ -170,9 +170,9 @@ class KnownPicture:
             inside: (C, S, R) as for the class, now.
         """
         n_before = self._light.shape[-1]
-        place = np.clip(row_of, 0, n_before - 1.001)
-        left = place.astype(np.int64)[:, None]
-        part = (place[:, None] - left).astype(np.float32)
+        place = np.clip(row_of, 0, n_before - 1.001)[:, None]
+        left: IntArray = place.astype(np.int64)
+        part = (place - left).astype(np.float32)
         for name in ("_light", "_seen"):
             values = getattr(self, name)
             before = np.take_along_axis(values, left, 2)
@@ -475,7 +475,7 @@ def _row_metrics(
     response: Response,
     lit: Float32Array,
 ) -> FloatArray:
-    """Metrics of columns whose rows have the positions `centre` (R,); `value` is what the slots `lit` do not explain."""
+    """Metrics of columns whose rows lie at `centre` (R,); `value` is what the slots `lit` do not explain."""
     metric = np.floor(centre + memory / 2).astype(np.int64)
     n_metrics = clock.n_slots + memory
     use = (metric >= 0) & (metric < n_metrics)
