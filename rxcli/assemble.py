@@ -158,6 +158,11 @@ def _snr_db(snr: Float32Array) -> float | None:
     return float(10 * np.log10(max(float(np.median(lit)), 1e-6))) if lit.size else None
 
 
+def all_dark(snr: Float32Array) -> bool:
+    """Whether no column has light enough; `snr` is (C, N), squared contrast over variance of every slot."""
+    return all(db is None or db < _DARK_SNR_DB for db in _snr_db_of_columns(snr))
+
+
 def clip_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
     """`ok` when every lit column has a packet, here or in a frame to come; `partial` when some have none."""
     return "ok" if all(column.status in ("ok", "weak", "dark") for column in columns) else "partial"

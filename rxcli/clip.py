@@ -214,6 +214,8 @@ class _Clip:
             seen = decode(lock, options.skip)
         with stages("denoise"):
             seen, denoised, report = second_opinion(lock, seen, options)
+        if assemble.all_dark(seen.snr):
+            raise Failure("no_signal", "no light of the screen's columns is seen; something may be in front of it")
         view = _View(camera, lock, _bursts_of(frame, seen), seen.model.memory, frame.height, seen.snr, denoised)
         lit = channel.lit_on_grid(seen.posteriors, seen.clock)
         if self._can_track(frame, camera, lock):

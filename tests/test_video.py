@@ -1,0 +1,269 @@
+"""Clips: time through the frames, bursts over several frames, what is reused and what makes it start again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from rxcli.errors import InputError
+from rxcli.known_picture import KnownPicture, exposed
+from rxcli.options import SKIPS, ReceiverOptions
+from rxcli.pipeline import receive
+from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
+from rxcli.simulate.capture import Take, prepare
+from rxcli.simulate.scenes import preset
+from rxcli.tracking import BurstPhase, LinkTime
+from rxcli.truth import Score, Scorer, Truth
+from rxcli.types import Clock, Frame, FrameResult
+
+N_FRAMES = 14
+BURST_SLOTS = 210
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A simulated clip, its truth and the options to receive it."""
+
+    frames: tuple[Frame, ...]
+    truth: Truth
+    options: ReceiverOptions
+
+
+def camera_of(take: Take) -> CameraProfile:
+    scene, told = take.scene, take.truth("clip")["camera"]
+    width, height = scene.sensor.width, scene.sensor.height
+    mode = ReadoutMode(
+        name="video",
+        width=width,
+        height=height,
+        line_delay_s=scene.sensor.line_delay_s,
+        exposure_s=scene.exposure_s,
+    )
+    rows = [tuple(float(v) for v in row) for row in told["camera_matrix"]]
+    lens = LensModel(
+        width=width,
+        height=height,
+        camera_matrix=(rows[0], rows[1], rows[2]),  # type: ignore[arg-type]
+        dist_coeffs=tuple(told["dist_coeffs"]),
+    )
+    return CameraProfile(format=1, kind="camera", name="sim", tone="bt709", modes=(mode,), lens=lens)
+
+
+def simulate(seed: int, n_frames: int, picture: str = "coffee") -> Clip:
+    """Nearly the whole height is screen: a frame shows 1.3 packets, so that bursts fall into two or three frames."""
+    scene = preset("video-1080p", "paper-8k65").scaled(0.32, 0.5, keep_readout=True)
+    left, top, right, bottom = 20.0, 15.0, scene.sensor.width - 22.0, scene.sensor.height - 18.0
+    corners = ((left, top), (right, top + 3), (right - 2, bottom), (left + 3, bottom - 2))
+    scene = replace(scene, n_frames=n_frames, picture=picture, pose=replace(scene.pose, corners=corners), shake_px=0.0)
+    take = prepare(scene, seed)
+    frames = tuple(
+        Frame(np.asarray(take.frame(k).pixels), "clip", k, round(k / scene.frame_rate_hz, 3)) for k in range(n_frames)
+    )
+    truth = msgspec.json.decode(msgspec.json.encode(take.truth("clip")), type=Truth)
+    corners_px = np.array(take.truth("clip")["corners_sensor_px"])
+    options = ReceiverOptions(
+        screens=(scene.screen,), cameras=(camera_of(take),), force_camera=True, corners=corners_px, cae="never"
+    )
+    return Clip(frames, truth, options)
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    return simulate(3, N_FRAMES)
+
+
+def scored(results: list[FrameResult], truth: Truth) -> tuple[list[FrameResult], Score]:
+    scorer = Scorer(truth)
+    return [scorer.add(result) for result in results], scorer.score()
+
+
+def bursts_in(results: list[FrameResult]) -> list[tuple[int | None, int]]:
+    return [(p.burst, c.column) for r in results for c in r.columns for p in c.packets]
+
+
+@pytest.fixture(scope="module")
+def results(clip: Clip) -> list[FrameResult]:
+    return list(receive(clip.frames, clip.options))
+
+
+def test_every_frame_has_a_result_in_order(results: list[FrameResult]) -> None:
+    assert [result.frame for result in results] == list(range(N_FRAMES))
+
+
+def test_packets_are_right_and_none_is_false(clip: Clip, results: list[FrameResult]) -> None:
+    _, score = scored(results, clip.truth)
+    assert score.false == 0
+    assert score.error_free >= 0.9 * score.expected
+
+
+def test_a_packet_stands_once_in_the_last_frame_that_shows_it(clip: Clip, results: list[FrameResult]) -> None:
+    found = bursts_in(results)
+    assert len(found) == len(set(found))
+    for result in results:
+        for column in result.columns:
+            for packet in column.packets:
+                assert packet.frames is not None
+                assert packet.frames[-1] == result.frame
+    combined = [p for r in results for c in r.columns for p in c.packets if p.frames and len(p.frames) > 1]
+    assert len(combined) >= 20
+
+
+def test_the_counter_counts_bursts_as_they_were_sent(clip: Clip, results: list[FrameResult]) -> None:
+    shown = {f.frame: [b.burst for b in f.bursts] for f in clip.truth.frames}
+    first = shown[0][0]
+    for result in results:
+        numbers = {p.burst for c in result.columns for p in c.packets}
+        assert numbers <= {burst - first for burst in shown[result.frame]}
+
+
+def test_tracking_is_counted_and_can_be_switched_off(clip: Clip, results: list[FrameResult]) -> None:
+    assert sum(result.skipped.get("tracking", 0) for result in results) >= N_FRAMES - 2
+    few = clip.frames[:4]
+    plain = list(receive(few, replace(clip.options, skip=frozenset(SKIPS) - {"tracking", "certain_columns"})))
+    assert all("tracking" not in result.skipped for result in plain)
+    assert scored(plain, clip.truth)[1].error_free >= 20
+
+
+def test_an_occluded_frame_costs_its_own_packets_only(clip: Clip) -> None:
+    dark = replace(clip.frames[7], pixels=np.full_like(clip.frames[7].pixels, 20))
+    got = list(receive((*clip.frames[:7], dark, *clip.frames[8:]), clip.options))
+    assert got[7].status in ("no_signal", "no_screen")
+    assert got[7].message
+    marked, score = scored(got, clip.truth)
+    assert score.false == 0
+    after = [p for r in marked[8:] for c in r.columns for p in c.packets]
+    assert len(after) >= 60
+    first = clip.truth.frames[0].bursts[0].burst
+    sent = {b.burst - first for f in clip.truth.frames[8:] for b in f.bursts}
+    assert {p.burst for p in after} <= sent
+
+
+def test_what_came_before_a_break_comes_out(clip: Clip) -> None:
+    def breaking() -> Iterator[Frame]:
+        yield from clip.frames[:5]
+        raise InputError("clip: the clip breaks off", "copy it again")
+
+    got: list[FrameResult] = []
+    with pytest.raises(InputError, match="breaks off"):
+        got.extend(receive(breaking(), clip.options))
+    assert [result.frame for result in got] == [0, 1, 2, 3, 4]
+    assert scored(got, clip.truth)[1].error_free >= 20
+
+
+def test_the_source_is_closed_when_reception_is_left(clip: Clip) -> None:
+    closed = []
+
+    def source() -> Iterator[Frame]:
+        try:
+            yield from clip.frames
+        finally:
+            closed.append(True)
+
+    reception = receive(source(), clip.options)
+    next(reception)
+    reception.close()  # type: ignore[attr-defined]
+    assert closed == [True]
+
+
+def test_a_single_frame_is_a_photograph(clip: Clip) -> None:
+    (result,) = receive(clip.frames[:1], clip.options)
+    packets = [p for c in result.columns for p in c.packets]
+    assert all(p.burst is None and p.frames is None for p in packets)
+
+
+def test_another_scene_is_searched_anew(clip: Clip) -> None:
+    other = simulate(8, 8, "chelsea")
+    moved = tuple(replace(frame, index=6 + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames))
+    got = list(receive((*clip.frames[:6], *moved), clip.options))
+    late = [replace(result, frame=result.frame - 6) for result in got[6:]]
+    _, score = scored(late, other.truth)
+    assert score.error_free >= 0.7 * score.expected
+    numbers = [p.burst for r in got for c in r.columns[:1] for p in c.packets if p.burst is not None]
+    assert numbers == sorted(numbers)
+
+
+def clock_at(slot: float, rows_per_slot: float = 5.0, packet: int = 70) -> Clock:
+    """A clock whose sensor row 0 is `slot`."""
+    whole = int(np.floor(slot))
+    return Clock(
+        rows_per_slot=rows_per_slot,
+        exposure_slots=1.0,
+        packet_slots=packet,
+        row0=-(slot - whole) * rows_per_slot,
+        n_slots=100,
+        first_slot=whole % packet,
+        burst=np.zeros(3, np.int64),
+        delay_slots=np.zeros(20),
+        lock=5.0,
+    )
+
+
+@pytest.mark.parametrize("digits", [3, 6])
+def test_link_time_counts_copies_over_rounded_times(digits: int) -> None:
+    rate, frame_s, start = 8650.0 * (1 + 80e-6), 1001 / 60000, 33.3
+    time = LinkTime(70, 8650.0)
+    for number in range(400):
+        if number % 50 == 17:
+            continue  # a frame that the camera dropped
+        slot = start + number * frame_s * rate
+        copy = time.take(number - number // 50, round(number * frame_s, digits), clock_at(slot))
+        assert copy == int(slot // 70)
+
+
+def test_link_time_tells_another_time() -> None:
+    time = LinkTime(70, 8650.0)
+    for number in range(5):
+        assert time.take(number, number / 60, clock_at(10 + number * 8650 / 60)) is not None
+    assert time.take(5, 5 / 60, clock_at(10 + 20 + 5 * 8650 / 60)) is None
+
+
+def test_burst_phase_from_parts_of_copies_over_frames() -> None:
+    rng = np.random.default_rng(1)
+    repeats, packet, columns = 3, 70, 10
+    sent = {burst: rng.integers(0, 2, (columns, packet)) for burst in range(40)}
+    phase = BurstPhase(repeats)
+    for frame in range(30):
+        start = 2.22 * frame
+        first = int(start)
+        llr = np.zeros((2, columns, packet))
+        for copy in (0, 1):
+            place = first + copy + np.arange(packet) / packet
+            seen = (place >= start) & (place < start + 0.8)
+            slots = 2.0 * sent[(first + copy + 1) // repeats] - 1
+            llr[copy] = seen * (2.5 * slots + rng.normal(0, 1.5, slots.shape))
+        phase.take(first, llr)
+    assert phase.settled
+    copies = np.arange(60)
+    assert (phase.burst_of(copies) == (copies + 1) // repeats).all()
+
+
+def test_known_picture_gives_back_the_columns_light() -> None:
+    """Light made by the equation itself, in another way: a loop over strips and columns."""
+    rng = np.random.default_rng(5)
+    columns, strips, rows, floor = 6, 4, 200, 0.01
+    picture = rng.uniform(0.02, 0.5, (columns, strips, rows)).astype(np.float32)
+    spread = rng.uniform(0.1, 1.0, (strips, 3))
+    inside = np.ones(picture.shape, bool)
+    known = KnownPicture(inside, spread, floor, 1e-7, 1e-6)
+
+    def frame() -> tuple[np.ndarray, np.ndarray]:
+        slots = exposed(rng.integers(0, 2, (columns, 42)).astype(np.float32), np.arange(rows)[None] / 5 + 0.5, 1.08)
+        light = np.full(picture.shape, floor)
+        for column in range(columns):
+            for strip in range(strips):
+                for k in (-1, 0, 1):
+                    if 0 <= column + k < columns:
+                        light[column, strip] += picture[column, strip] * spread[strip, k + 1] * slots[column + k]
+        return light.astype(np.float32), slots
+
+    for _ in range(25):
+        light, slots = frame()
+        known.learn(light, slots, np.ones_like(slots))
+    light, slots = frame()
+    seen = known.solve(light)
+    assert np.abs(seen.value - slots).max() < 0.1
+    assert (seen.precision > 0).all()
