@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterable
+from itertools import chain
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -155,6 +157,8 @@ def _check_lens(lens: LensModel | None, source: str) -> None:
     if lens is None:
         return
     (fx, _, _), (_, fy, _), last = lens.camera_matrix
+    if not all(map(isfinite, (*lens.dist_coeffs, *chain.from_iterable(lens.camera_matrix)))):
+        raise ProfileError(f"{source}: lens: camera_matrix and dist_coeffs must be finite numbers", "correct the file")
     if fx <= 0 or fy <= 0 or last != (0.0, 0.0, 1.0):
         raise ProfileError(
             f"{source}: lens.camera_matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy "
@@ -224,5 +228,14 @@ def _without_none(value: Any) -> Any:
 def match_camera(
     cameras: Iterable[CameraProfile], make: str | None, model: str | None, width: int, height: int
 ) -> CameraProfile | None:
-    """The first camera that matches make and model and has a readout mode for the size; None where none does."""
-    return next((c for c in cameras if c.matches(make, model) and c.mode_for(width, height)), None)
+    """The first camera that matches make and model and has a readout mode for the size; None where none does.
+
+    A body without a lens takes the lens of the first profile of the same camera that has one for this size.
+    """
+    fitting = [camera for camera in cameras if camera.matches(make, model)]
+    body = next((camera for camera in fitting if camera.mode_for(width, height)), None)
+    if body is None or body.lens is not None:
+        return body
+    lenses = (camera.lens for camera in fitting if camera.lens is not None)
+    lens = next((lens for lens in lenses if (lens.width, lens.height) == (width, height)), None)
+    return msgspec.structs.replace(body, lens=lens)

@@ -280,3 +280,24 @@ def test_a_profile_knows_its_modes_by_size() -> None:
     assert mode.name == "still"
     assert camera.mode_for(480, 640) is None
     assert msgspec.to_builtins(camera)["kind"] == "camera"
+
+
+def test_a_body_takes_the_lens_that_a_profile_of_its_own_gives() -> None:
+    mode = {"name": "still", "width": 60, "height": 40, "line_delay_s": 1e-5}
+    matrix = [[50.0, 0.0, 30.0], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]]
+    lens = {"width": 60, "height": 40, "camera_matrix": matrix, "dist_coeffs": [0.1, 0.0, 0.0, 0.0]}
+    about = {"format": 1, "kind": "camera", "models": ["M"]}
+    body = check_profile({**about, "name": "body", "modes": [mode]}, CameraProfile, "body")
+    glass = check_profile({**about, "name": "lens", "lens": lens}, CameraProfile, "lens")
+    found = match_camera([glass, body], None, "m", 60, 40)
+    assert found is not None
+    assert (found.name, found.lens) == ("body", glass.lens)
+    assert match_camera([glass], None, "m", 60, 40) is None
+
+
+@pytest.mark.parametrize("number", ["nan", "inf"])
+def test_lens_numbers_must_be_finite(number: str) -> None:
+    matrix = [[50.0, 0.0, float(number)], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]]
+    lens = {"width": 60, "height": 40, "camera_matrix": matrix, "dist_coeffs": [0.1, 0.0, 0.0, 0.0]}
+    with pytest.raises(ProfileError, match="finite"):
+        check_profile({"format": 1, "kind": "camera", "name": "x", "lens": lens}, CameraProfile, "x.toml")
