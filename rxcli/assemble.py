@@ -32,8 +32,9 @@ _HEADERS_AT_LEAST = 6.0
 _HEADERLESS = (
     "the header does not show where it should; check for overexposure, or give the screen's place with --corners"
 )
-#: Doubt that is left in the surest packet.
+#: Doubt that is left in the surest packet, and at most in any, nats.
 _LEAST_DOUBT = 1e-9
+_MOST_DOUBT = 500.0
 #: A column with a packet below this confidence is weak.
 _WEAK_CONFIDENCE = 0.5
 #: A weight is reported from this probability on.
@@ -266,7 +267,7 @@ def _calibrated(log_prob: float) -> float:
     The light model's likelihoods are tempered, since strips and samples err together; what is left of that is a
     straight line between log-odds, fitted by `vlc-rx benchmark confidence`.
     """
-    at_most = min(log_prob, -_LEAST_DOUBT)
+    at_most = float(np.clip(log_prob, -_MOST_DOUBT, -_LEAST_DOUBT))
     log_odds = at_most - np.log(-np.expm1(at_most))
     return float(1 / (1 + np.exp(-(_CALIBRATION[0] + _CALIBRATION[1] * log_odds))))
 
