@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli import assemble, channel, clock, detect, geometry, known_picture, sampling, strips, tracking
-from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock
+from rxcli.clip_start import Start, agree, lock_at, shows_little
+from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock, sample_columns
 from rxcli.options import ReceiverOptions
 from rxcli.protocol import WEIGHTS
 from rxcli.reception import Reception, decode, second_opinion
@@ -36,6 +37,8 @@ from rxcli.types import (
 
 #: Frames at the start that are looked at once more when the picture is known better.
 _HELD = 6
+#: Frames that find their clock together where each shows little.
+_TOGETHER = 8
 #: Frames that may wait until it is clear which copies begin a burst.
 _MAX_WAITING = 8
 #: Frames whose corners are averaged at the start, and how often they are looked at from then on.
@@ -137,6 +140,9 @@ class _Clip:
         self._waiting: deque[_Waiting] = deque()
         self._bursts = tracking.Bursts()
         self._link: _Link | None = None
+        #: The first frames, until they have agreed on a clock; None when that is done, or not needed.
+        self._first: list[Frame] | None = [] if "tracking" in options.skip else None
+        self._start: Start | None = None
         self._next_number = 0
         #: The camera and the options with the screens that remain, and what they were found for.
         self._camera: tuple[Camera, ReceiverOptions] | None = None
@@ -157,6 +163,21 @@ class _Clip:
 
     def take(self, frame: Frame) -> list[FrameResult]:
         """Receive the next frame; returns the results that are complete."""
+        if self._first is None:
+            return self._take(frame)
+        if self._first or shows_little(frame, self._options):
+            self._first.append(frame)
+            return self._begin() if len(self._first) == _TOGETHER else []
+        self._first = None
+        return self._take(frame)
+
+    def _begin(self) -> list[FrameResult]:
+        """The first frames, once they have agreed on a clock."""
+        frames, self._first = self._first or [], None
+        self._start = agree(frames, self._options) if len(frames) > 1 else None
+        return [result for frame in frames for result in self._take(frame)]
+
+    def _take(self, frame: Frame) -> list[FrameResult]:
         stages = Stages()
         waiting = _Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok"))
         try:
@@ -172,7 +193,7 @@ class _Clip:
             self._forget()
             waiting.result = replace(waiting.result, status=failure.status, message=failure.message)
             self._waiting.append(waiting)
-            done = self.finish() if self._n_held else self._ready()
+            done = self._finish() if self._n_held else self._ready()
         waiting.result = replace(waiting.result, timing_ms=stages.total())
         return done
 
@@ -183,6 +204,10 @@ class _Clip:
 
     def finish(self) -> list[FrameResult]:
         """The results still held back."""
+        done = self._begin() if self._first else []
+        return done + self._finish()
+
+    def _finish(self) -> list[FrameResult]:
         if self._n_held:
             self._settle()
             self._look_again()
@@ -209,7 +234,7 @@ class _Clip:
             self._camera = find_camera(frame, corners, self._options, stages)
             self._taken_with = _taken_with(frame)
         camera, options = self._camera
-        lock = find_lock(frame, corners, camera, options, stages)
+        lock = self._foretold(frame, corners, camera, stages) or find_lock(frame, corners, camera, options, stages)
         with stages("detect"):
             seen = decode(lock, options.skip)
         with stages("denoise"):
@@ -225,6 +250,14 @@ class _Clip:
             self._learn(view, lit)
         self._last = view
         return view, replace(result, denoiser=report)
+
+    def _foretold(self, frame: Frame, corners: FloatArray, camera: Camera, stages: Stages) -> Lock | None:
+        """The lock by the clock that the first frames agreed on, where a frame cannot find its own."""
+        if self._start is None:
+            return None
+        with stages("sampling"):
+            profiles = sample_columns(frame, corners, camera, self._start.screen.columns)
+        return lock_at(self._start, frame, profiles, camera)
 
     def _can_track(self, frame: Frame, camera: Camera, lock: Lock) -> bool:
         """Whether a row of the picture is one instant, in the order of time."""
@@ -391,7 +424,7 @@ class _Clip:
         done: list[FrameResult] = []
         first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock) if self._link else None
         if first_copy is None:
-            done = self.finish() if self._link is not None else []
+            done = self._finish() if self._link is not None else []
             self._begin_link(view, frame)
             assert self._link is not None
             first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock)
@@ -417,9 +450,8 @@ class _Clip:
         offset = self._next_number
         if self._link is not None and offset:
             offset += int((frame.time_s - self._link.last_time_s) / (screen.packet_s * screen.repeats))
-        self._link = _Link(
-            tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz), tracking.BurstPhase(screen.repeats), offset
-        )
+        time = self._start.time if self._start else tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz)
+        self._link = _Link(time, tracking.BurstPhase(screen.repeats), offset)
         self._bursts = tracking.Bursts()
 
     def _compare(self, view: _View) -> None:

@@ -168,7 +168,7 @@ def find_lock(frame: Frame, corners: FloatArray, camera: Camera, options: Receiv
     """
     n_columns = min(screen.columns for screen in options.screens)
     with stages("sampling"):
-        profiles = _sample(frame, corners, camera, n_columns)
+        profiles = sample_columns(frame, corners, camera, n_columns)
     with stages("clock"):
         quick = clock.halved_strips(profiles)
         rates = {(s.slot_rate_hz, s.packet_slots): s for s in options.screens}
@@ -181,7 +181,7 @@ def find_lock(frame: Frame, corners: FloatArray, camera: Camera, options: Receiv
     locks = [Lock(alike[0], profiles, clocks[rate])] if alike[0].columns == n_columns else []
     for screen in alike[len(locks) :]:
         with stages("sampling"):
-            finer = _sample(frame, corners, camera, screen.columns)
+            finer = sample_columns(frame, corners, camera, screen.columns)
         with stages("clock"):
             found = _clock_of(screen, clock.halved_strips(finer), camera)
         if found:
@@ -211,7 +211,8 @@ def _outlines(frame: Frame, corners: FloatArray, lens: Lens | None, n_columns: i
     return geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
 
 
-def _sample(frame: Frame, corners: FloatArray, camera: Camera, n_columns: int) -> RowProfiles:
+def sample_columns(frame: Frame, corners: FloatArray, camera: Camera, n_columns: int) -> RowProfiles:
+    """Row profiles of a screen of `n_columns` columns, in the order of time."""
     profiles = sampling.sample_rows(frame, _outlines(frame, corners, camera.lens, n_columns), camera.tone)
     return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
 

@@ -40,6 +40,19 @@ class LinkTime:
     #: Least time between two frames so far.
     _frame_s: float = float("inf")
 
+    def begin(self, frame: int, time_s: float, slot: float, period: float) -> None:
+        """Start from what several frames agreed on.
+
+        Args:
+            frame: number of a frame.
+            time_s: its time.
+            slot: slot of its sensor row 0, from the start of any packet.
+            period: slots from frame to frame.
+        """
+        self._last = (frame, time_s, slot % self.packet_slots)
+        self._period = period
+        self._frame_s = period / self.slot_rate_hz
+
     def foretell(self, frame: int, time_s: float) -> float | None:
         """Slot of sensor row 0 in a frame, from the locks before; None before the first."""
         if self._last is None:
