@@ -185,7 +185,7 @@ class BurstPosteriors:
     log_prob: FloatArray
     #: (B, C, N, 7) float64: ln p(1)/p(0) of the symbol's bits, first bit first; nan where w has fewer bits.
     bit_llr: FloatArray
-    #: (B, C) float64: log-likelihood of the headers as they must be, over slots that are anything; 0 where none is seen.
+    #: (B, C) float64: log-likelihood of the headers as they must be, over slots of any kind; 0 where none is seen.
     header_llr: FloatArray
 
 
