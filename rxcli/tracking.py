@@ -108,6 +108,8 @@ class LinkTime:
     def _measure(self, frame: int, time_s: float, slot: float) -> None:
         assert self._last is not None
         number, at_s, before = self._last
+        if frame == number:
+            return
         if frame - number == 1 and time_s > at_s:
             self._frame_s = min(self._frame_s, time_s - at_s)
         period = (slot - before) / max(self._frames_since(number, frame, time_s - at_s), 1)
