@@ -66,6 +66,8 @@ _CERTAIN = -1e-5
 _HOPELESS_WEIGHT = 20.0
 #: Slots that a clock may be off the foretold one.
 _SAME_TIME_SLOTS = 1.5
+#: How much better its headers must show for a clock to be taken instead of the foretold one.
+_BETTER = 0.05
 
 
 def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
@@ -412,9 +414,14 @@ class _Clip:
         top = float(rows[0]) - 0.5
         n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
         foretold = self._link.time.clock_at(frame.index, frame.time_s, old, n_slots, top)
-        if found is not None and (foretold is None or _apart(found, foretold) < _SAME_TIME_SLOTS):
-            return replace(found, delay_slots=old.delay_slots)
-        return foretold
+        if found is None or foretold is None:
+            return foretold if found is None else replace(found, delay_slots=old.delay_slots)
+        found = replace(found, delay_slots=old.delay_slots)
+        near = _apart(found, foretold) < _SAME_TIME_SLOTS
+        return found if near and self._header(flat, found) > self._header(flat, foretold) + _BETTER else foretold
+
+    def _header(self, flat: known_picture.ColumnLight, now: Clock) -> float:
+        return known_picture.header_contrast(flat, known_picture.row_positions(self._rows, now), now)
 
     # -- bursts ---------------------------------------------------------------------------------------------------
 
