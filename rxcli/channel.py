@@ -52,7 +52,7 @@ _DARK_FROM, _DARK_TO = 5.9, 7.1
 _DARK_MARGIN = 0.002
 
 #: Columns worked on at a time: what fits the cache.
-_COLUMNS_AT_A_TIME = 3
+_COLUMNS_AT_A_TIME = 5
 #: NumPy works outside the interpreter's lock; more threads than this gain nothing on a few columns.
 _THREADS = 2
 
