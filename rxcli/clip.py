@@ -182,6 +182,11 @@ class _Clip:
     def _take(self, frame: Frame) -> list[FrameResult]:
         stages = Stages()
         waiting = _Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok"))
+        if self._options.stop_when_certain and self._shows_nothing_new(frame):
+            waiting.result = replace(waiting.result, message="its bursts are certain from the frames before")
+            self._skip(waiting, "certain_frames", 1)
+            self._waiting.append(waiting)
+            return self._ready()
         try:
             view = self._known(frame, stages)
             if view is not None:
@@ -198,6 +203,20 @@ class _Clip:
             done = self._finish() if self._n_held else self._ready()
         waiting.result = replace(waiting.result, timing_ms=stages.total())
         return done
+
+    def _shows_nothing_new(self, frame: Frame) -> bool:
+        """Whether all bursts that a frame should show are certain already in all columns that are lit."""
+        link, last = self._link, self._last
+        if link is None or last is None or not link.phase.settled or self._n_held or self._place is None:
+            return False
+        top, bottom = self._rows[[0, -1]]
+        slot, rows_per_slot = link.time.foretell(frame.index, frame.time_s), last.lock.clock.rows_per_slot
+        if slot is None:
+            return False
+        ends = (slot + np.array([top, bottom]) / rows_per_slot) // link.time.packet_slots
+        numbers = np.unique(link.phase.burst_of(np.arange(ends[0], ends[1] + 1).astype(np.int64))) + link.offset
+        lit = np.median(last.snr, axis=1) >= 1.0
+        return bool(lit.any()) and all(self._bursts.settled(int(number), lit) for number in numbers)
 
     def _skip(self, waiting: _Waiting, name: str, count: int) -> None:
         if count:

@@ -31,5 +31,7 @@ class ReceiverOptions:
     min_confidence: float = 0.0
     #: Shortcuts in use.
     skip: frozenset[str] = field(default_factory=lambda: frozenset(SKIPS))
+    #: Pass over frames of a clip all of whose bursts are certain already.
+    stop_when_certain: bool = False
     #: Folder for the arrays of every stage boundary; None: none are written.
     dump_dir: Path | None = None

@@ -23,6 +23,8 @@ _MAX_JUMP_SLOTS = 2.0
 _PERIOD_SHARE = 0.2
 #: Likelihood ratio, in nats, that settles the phase of the bursts.
 _SETTLED = 12.0
+#: Closed bursts of which it is remembered whether they were certain.
+_REMEMBERED = 4
 #: Log-odds that a slot seen once is taken to be at most sure of: copies are compared with what may be wrong.
 _SURE = 3.0
 
@@ -216,6 +218,14 @@ class Bursts:
     def __init__(self) -> None:
         self._open: dict[int, _Burst] = {}
         self._closed = -1
+        #: Columns of the last closed bursts that were certain.
+        self._certain: dict[int, BoolArray] = {}
+
+    def settled(self, number: int, lit: BoolArray) -> bool:
+        """Whether all columns that are lit, (C,), are certain of a burst, open or closed."""
+        entry = self._open.get(number)
+        certain = entry.certain if entry else self._certain.get(number)
+        return certain is not None and bool(certain[lit].all())
 
     def add(self, view: FrameBursts, numbers: IntArray, metrics: FloatArray) -> None:
         """Take what a frame sees.
@@ -282,6 +292,8 @@ class Bursts:
         if len(numbers):
             self._closed = max(self._closed, int(numbers.max()))
         entries = [(int(n), self._open.pop(int(n), None)) for n in np.sort(numbers)]
+        self._certain |= {number: entry.certain for number, entry in entries if entry is not None}
+        self._certain = {n: c for n, c in self._certain.items() if n > self._closed - _REMEMBERED}
         return [
             ClosedBurst(number, entry.posteriors, entry.seen, tuple(entry.frames))
             for number, entry in entries

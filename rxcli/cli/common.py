@@ -107,6 +107,7 @@ def receiver_options(
     min_confidence: float = 0.0,
     no_skip: tuple[str, ...] = (),
     dump_dir: Path | None = None,
+    stop_when_certain: bool = False,
 ) -> ReceiverOptions:
     """The receiver's options from what the command line gave.
 
@@ -131,6 +132,7 @@ def receiver_options(
         min_confidence=min_confidence,
         skip=frozenset(SKIPS) - set(no_skip),
         dump_dir=dump_dir,
+        stop_when_certain=stop_when_certain,
     )
 
 

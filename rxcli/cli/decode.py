@@ -43,13 +43,25 @@ _FOLDER = click.Path(file_okay=False, path_type=Path)
     "--save-undistorted", type=_FOLDER, help="Write every frame without its lens distortion into this folder."
 )
 @click.option("--save-camera", type=_FILE, help="Write what was estimated of an unknown camera as a profile (TOML).")
+@click.option(
+    "--stop-when-certain", is_flag=True, help="Pass over frames of a clip all of whose packets are certain already."
+)
 @click.option("--quiet", is_flag=True, help="No table, no summary, no progress.")
 def decode(paths: tuple[str, ...], **options: Any) -> int:
     """Decode photos, RAW files and clips; PATH may be a folder, or - for one picture on stdin."""
     _check(paths, options)
     receiver = {
         name: options[name]
-        for name in ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip", "dump_dir")
+        for name in (
+            "screens",
+            "cameras",
+            "corners",
+            "cae",
+            "min_confidence",
+            "no_skip",
+            "dump_dir",
+            "stop_when_certain",
+        )
     }
     from rxcli.batch import standard_decoder
 
