@@ -19,7 +19,7 @@ from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.tracking import LinkTime
 from rxcli.types import Clock, FloatArray, Frame, RowProfiles
 
-#: A frame that shows fewer packets than this finds its clock together with others; one that shows more does better alone.
+#: A frame that shows fewer packets than this finds its clock with others; one that shows more does better alone.
 _FEW_PACKETS = 1.05
 _SAMPLES_PER_SLOT = 4
 #: Errors of the frames' period that are tried, in slots over all frames: times are rounded to milliseconds.
