@@ -97,9 +97,9 @@ def clip_results(
     for column in range(snr.shape[0]):
         whole = [(b, c) for b, c, done in zip(bursts, own, complete_ones, strict=True) if done[column]]
         packets = [
-            replace(packet, burst=burst.number, frames=burst.frames)
+            packet
             for burst, now in whole
-            if (packet := _packet(0, column, now, burst.posteriors, burst.seen[column]))
+            if (packet := _packet(0, column, now, burst.posteriors, burst.seen[column], burst.number, burst.frames))
             and packet.confidence >= min_confidence
         ]
         out.append(_clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], tuple(packets)))
@@ -243,7 +243,15 @@ def _why_none(status: ColumnStatus, snr_db: float | None, n_seen: int, clock: Cl
     return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
 
 
-def _packet(burst: int, column: int, clock: Clock, posteriors: BurstPosteriors, seen: IntArray) -> PacketResult | None:
+def _packet(
+    burst: int,
+    column: int,
+    clock: Clock,
+    posteriors: BurstPosteriors,
+    seen: IntArray,
+    number: int | None = None,
+    frames: tuple[int, ...] | None = None,
+) -> PacketResult | None:
     """The packet of one burst, None where too many bits are uncertain; `seen` is (packet,)."""
     w = int(posteriors.w[column])
     llr = posteriors.bit_llr[burst, column, :, : bits_per_symbol(w)]
@@ -258,6 +266,8 @@ def _packet(burst: int, column: int, clock: Clock, posteriors: BurstPosteriors, 
         payload=bits_to_hex(bits),
         confidence=_calibrated(float(posteriors.log_prob[burst, column].sum())),
         ber_hat=ber_hat,
+        burst=number,
+        frames=frames,
     )
 
 

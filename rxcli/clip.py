@@ -64,8 +64,8 @@ _NOISE_SHARE = 0.2
 _CERTAIN = -1e-5
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
 _HOPELESS_WEIGHT = 20.0
-#: Slots that a clock may be off the foretold one.
-_SAME_TIME_SLOTS = 1.5
+#: Contrast of its headers at which the foretold clock is not doubted.
+_GOOD_HEADER = 0.6
 #: How much better its headers must show for a clock to be taken instead of the foretold one.
 _BETTER = 0.05
 
@@ -417,8 +417,12 @@ class _Clip:
         """The clock of the frame: from its headers where they are about as foretold, else as foretold."""
         assert self._place is not None
         assert self._link is not None
-        lock = last.lock
-        rows = self._rows
+        rows, old, time = self._rows, last.lock.clock, self._link.time
+        n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
+        foretold = time.clock_at(frame.index, frame.time_s, old, n_slots, float(rows[0]) - 0.5)
+        contrast = self._header(flat, foretold) if foretold is not None else 0.0
+        if contrast > _GOOD_HEADER:
+            return foretold
         profiles = RowProfiles(
             light=flat.shrunk[:, None],
             inside=np.asarray(self._place.map.inside.any(axis=1, keepdims=True)),
@@ -428,16 +432,13 @@ class _Clip:
             noise_floor=1e-4,
             noise_slope=0.0,
         )
-        old = lock.clock
         found = clock.find_clock(profiles, old.rows_per_slot, old.exposure_slots, old.packet_slots, 0.03)
-        top = float(rows[0]) - 0.5
-        n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
-        foretold = self._link.time.clock_at(frame.index, frame.time_s, old, n_slots, top)
-        if found is None or foretold is None:
-            return foretold if found is None else replace(found, delay_slots=old.delay_slots)
+        if found is None:
+            return foretold
         found = replace(found, delay_slots=old.delay_slots)
-        near = _apart(found, foretold) < _SAME_TIME_SLOTS
-        return found if near and self._header(flat, found) > self._header(flat, foretold) + _BETTER else foretold
+        if foretold is not None and _apart(found, foretold) > time.sure_slots:
+            return foretold
+        return found if self._header(flat, found) > contrast + _BETTER else foretold
 
     def _header(self, flat: known_picture.ColumnLight, now: Clock) -> float:
         return known_picture.header_contrast(flat, known_picture.row_positions(self._rows, now), now)
@@ -644,7 +645,8 @@ class _Clip:
         self, view: _View, ended: list[assemble.BurstInClip], sure: Float32Array, height: int
     ) -> tuple[ColumnResult, ...]:
         columns = assemble.clip_results(view.bursts.clock, ended, sure, view.snr, self._options.min_confidence)
-        columns = tuple(replace(c, denoised=c.column in view.denoised) for c in columns)
+        if view.denoised:
+            columns = tuple(replace(c, denoised=c.column in view.denoised) for c in columns)
         return tuple(assemble.in_stored_rows(c, height) for c in columns) if view.camera.reversed else columns
 
 

@@ -55,6 +55,11 @@ class LinkTime:
         self._period = period
         self._frame_s = period / self.slot_rate_hz
 
+    @property
+    def sure_slots(self) -> float:
+        """How far a clock may be from the foretold one: at first by the times, which may be rounded to milliseconds."""
+        return _MAX_JUMP_SLOTS if self._period is not None else self.packet_slots / 4
+
     def foretell(self, frame: int, time_s: float) -> float | None:
         """Slot of sensor row 0 in a frame, from the locks before; None before the first."""
         if self._last is None:
