@@ -41,8 +41,6 @@ _WEAK_CONFIDENCE = 0.5
 _MIN_WEIGHT_PROBABILITY = 0.99
 #: A column below this signal-to-noise ratio is too dark to try.
 _DARK_SNR_DB = 0.0
-#: A slot counts as seen when at least this share of its samples lies on the screen in at least one strip.
-_SEEN_SHARE = 0.5
 
 
 def column_results(
@@ -179,9 +177,9 @@ def frame_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
 
 
 def slots_seen(samples: SlotSamples, clock: Clock) -> IntArray:
-    """How often each slot of each burst's packet is on the screen and in the picture, (B, C, packet)."""
+    """How often the middle of each slot of each burst's packet is on the screen and in the picture, (B, C, packet)."""
     q = samples.samples_per_slot
-    shown = np.add.reduce([samples.valid[..., k::q] for k in range(q)]).max(axis=1) >= _SEEN_SHARE * q
+    shown = samples.valid[..., q // 2 :: q].max(axis=1) > 0
     copies = np.zeros((shown.shape[0], clock.n_copies * clock.packet_slots), np.int64)
     copies[:, clock.first_slot : clock.first_slot + clock.n_slots] = shown
     by_copy = copies.reshape(shown.shape[0], clock.n_copies, clock.packet_slots)

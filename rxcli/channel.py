@@ -51,8 +51,8 @@ _DARK_FROM, _DARK_TO = 5.9, 7.1
 #: Light over the floor up to which a sample counts as dark.
 _DARK_MARGIN = 0.002
 
-#: Columns worked on at a time: what fits the cache.
-_COLUMNS_AT_A_TIME = 5
+#: Strips worked on at a time: what fits the cache.
+_STRIPS_AT_A_TIME = 40
 #: NumPy works outside the interpreter's lock; more threads than this gain nothing on a few columns.
 _THREADS = 2
 
@@ -247,7 +247,7 @@ def slot_likelihoods(
         expected = _Expected(others[part], own, shape[part, None], others_slope[part] + own * slope[part, None])
         return _likelihoods(samples.light[part], samples.valid[part], expected, model, thorough)
 
-    parts = np.array_split(columns, -(-columns.size // _COLUMNS_AT_A_TIME))
+    parts = np.array_split(columns, -(-columns.size * samples.light.shape[1] // _STRIPS_AT_A_TIME))
     with ThreadPoolExecutor(_THREADS) as pool:
         done = list(pool.map(of_columns, parts))
     return SlotLikelihoods(

@@ -66,6 +66,14 @@ def _log_sum(values: FloatArray, axis: int) -> FloatArray:
     return np.asarray((top + np.log(np.exp(values - top).sum(axis=axis, keepdims=True))).squeeze(axis))
 
 
+def _log_sum_of_few(values: FloatArray) -> FloatArray:
+    """`_log_sum` over a short last axis, where adding slices is quicker than a reduction."""
+    total = values[..., 0]
+    for number in range(1, values.shape[-1]):
+        total = np.logaddexp(total, values[..., number])
+    return total
+
+
 @dataclass(frozen=True, slots=True)
 class _Packets:
     """Posterior of n packets of one weight."""
@@ -143,8 +151,8 @@ def slot_llr(metrics: FloatArray) -> Float32Array:
     for age in range(memory + 1):
         # Bit `age` of the pattern's number is the slot `age` slots ago.
         split = metrics[..., age : age + n_slots, :].reshape(*total.shape, -1, 2, 1 << age)
-        by_state = _log_sum(np.moveaxis(split, -2, -3).reshape(*total.shape, 2, -1), axis=-1)
-        total += by_state[..., 1] - by_state[..., 0]
+        dark, lit = (split[..., state, :].reshape(*total.shape, -1) for state in (0, 1))
+        total += _log_sum_of_few(lit) - _log_sum_of_few(dark)
     return total.astype(np.float32)
 
 

@@ -23,7 +23,7 @@ _MAX_STRIPS = 8
 #: Cells that a strip should have, so that the fractions at its slanted edges are fine.
 _CELLS_PER_STRIP = 4
 #: Rows read at a time: what fits the cache.
-_BAND_ROWS = 256
+_BAND_ROWS = 512
 #: One row in this many is kept for the noise model, and of those as many as hold this many cells.
 _NOISE_ROW_STEP = 16
 _NOISE_CELLS = 10_000
