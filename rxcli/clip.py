@@ -22,7 +22,7 @@ from rxcli.clip_start import Start, agree, lock_at, shows_little
 from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock, sample_columns
 from rxcli.options import ReceiverOptions
 from rxcli.protocol import WEIGHTS
-from rxcli.reception import Reception, decode, second_opinion
+from rxcli.reception import CERTAIN, HOPELESS_WEIGHT, Reception, decode, second_opinion
 from rxcli.types import (
     BurstPosteriors,
     Clock,
@@ -60,10 +60,6 @@ _MISFIT = 40.0
 _LATE, _LEAST_HEADER, _FADED = 0.03, 0.3, 0.85
 #: Share of a frame's noise in what is expected of the next.
 _NOISE_SHARE = 0.2
-#: A column's symbol of at least this log probability is certain.
-_CERTAIN = -1e-5
-#: Weights that a quick look finds this much less likely than the best are dropped, nats.
-_HOPELESS_WEIGHT = 20.0
 #: Contrast of its headers at which the foretold clock is not doubted.
 _GOOD_HEADER = 0.6
 #: How much better its headers must show for a clock to be taken instead of the foretold one.
@@ -536,10 +532,10 @@ class _Clip:
         unknown = ~known.any(axis=1)
         if unknown.any():
             known = known.copy()
-            known[unknown] = detect.plausible_weights(metrics[:, unknown], _HOPELESS_WEIGHT)
+            known[unknown] = detect.plausible_weights(metrics[:, unknown], HOPELESS_WEIGHT)
         candidates = known
         posteriors = detect.detect(metrics, candidates)
-        certain = posteriors.log_prob.min(axis=2) >= _CERTAIN
+        certain = posteriors.log_prob.min(axis=2) >= CERTAIN
         self._bursts.note(numbers[bursts], columns, posteriors, certain)
         self._note_weights(columns, posteriors, certain)
 

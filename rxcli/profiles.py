@@ -21,12 +21,10 @@ from rxcli.errors import ProfileError
 from rxcli.protocol import packet_slots
 from rxcli.resources import data_dir
 
-FORMAT_VERSION = 1
-
 PositiveInt = Annotated[int, Meta(gt=0, le=1_000_000)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 Seconds = Annotated[float, Meta(gt=0, lt=1)]
-#: Names of the tone curves that `rxcli.tone` can undo.
+#: Names of the tone curves that `rxcli.sampling.tone_to_light` can undo.
 ToneName = Literal["linear", "srgb", "bt709", "auto"]
 Triple = tuple[float, float, float]
 

@@ -18,13 +18,13 @@ from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSa
 _SAMPLES_PER_SLOT = 4
 _MAX_ITERATIONS = 5
 #: A column all of whose symbols have at least this log probability is not looked at again.
-_CERTAIN = -1e-5
+CERTAIN = -1e-5
 #: The quick look at the picture is surer than it should be of textured ones: it must do for all columns, and clearly.
 _CERTAIN_AT_ONCE = -1e-6
 #: A column whose slots stand out less than this has no light to speak of.
 _DARK_SNR_DB = -3.0
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
-_HOPELESS_WEIGHT = 20.0
+HOPELESS_WEIGHT = 20.0
 #: A column with a symbol of less than this log probability gets a second opinion. Measured (models/strips/README.md): a
 #: stricter gate asks half as often again and mends nothing more, a laxer one leaves errors behind.
 _DOUBTFUL = -1e-2
@@ -124,7 +124,7 @@ def _unsettled(seen: Reception, before: NDArray[np.int64], iteration: int, skip:
     """(C,) which columns are worth another iteration."""
     if "certain_columns" not in skip:
         return np.ones(seen.snr.shape[0], bool)
-    doubtful = _doubtful(seen, _CERTAIN)
+    doubtful = _doubtful(seen, CERTAIN)
     index = seen.posteriors.index
     if iteration and before.shape == index.shape:
         # What does not change any more will not do so later.
@@ -203,7 +203,7 @@ def _evidence(metrics: FloatArray, seen: Reception) -> FloatArray:
     """(C,) log evidence of columns, over all weights."""
     bursts = channel.by_burst(metrics, seen.clock, seen.model.memory)
     return np.asarray(
-        np.logaddexp.reduce(detect.weight_evidence(bursts, detect.plausible_weights(bursts, _HOPELESS_WEIGHT)), axis=1)
+        np.logaddexp.reduce(detect.weight_evidence(bursts, detect.plausible_weights(bursts, HOPELESS_WEIGHT)), axis=1)
     )
 
 
@@ -214,7 +214,7 @@ def _doubtful(seen: Reception, certain: float) -> NDArray[np.bool_]:
 
 
 def _detect(
-    metrics: FloatArray, now: Clock, model: channel.LightModel, margin: float = _HOPELESS_WEIGHT
+    metrics: FloatArray, now: Clock, model: channel.LightModel, margin: float = HOPELESS_WEIGHT
 ) -> BurstPosteriors:
     bursts = channel.by_burst(metrics, now, model.memory)
     return detect.detect(bursts, detect.plausible_weights(bursts, margin))

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from rxcli.types import Float32Array, FloatArray, Frame, Mosaic, Outlines, RowProfiles
 
-#: Scale of linear light in 16-bit cells; headroom is not needed, values are clipped at white.
-_FULL = 65535.0
 #: Pixels that a strip should have before a column gets another one.
 _STRIP_PX = 12
 _MAX_STRIPS = 8

@@ -18,8 +18,6 @@ from rxcli.simulate.scenes import Scene, preset
 
 FloatArray = NDArray[np.float64]
 N_BINS = 10
-#: Frames of a run, unless told otherwise: some 20 packets each.
-DEFAULT_FRAMES = 600
 _SCREENS = ("paper-8k65", "paper-17k3", "paper-34k6")
 _PRESETS = ("video-1080p", "phone-plain", "xs10-still")
 #: Sensor widths, pixels: few, because thousands of frames are wanted.

@@ -26,7 +26,6 @@ from rxcli.report import to_record
 from rxcli.simulate.scenes import Scene, preset, random_scene
 from rxcli.types import FloatArray, Frame, FrameResult
 
-DEFAULT_SCENES = 10_000
 #: From this confidence on a packet claims to be right.
 CONFIDENT = 0.99
 #: Rows per slot of the small scenes, and their width in pixels.

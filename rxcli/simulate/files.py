@@ -41,11 +41,6 @@ def encode_jpeg(rgb: NDArray[np.uint8], scene: Scene) -> bytes:
     return bytes(body[:2] + segment + body[2:])
 
 
-def write_jpeg(rgb: NDArray[np.uint8], scene: Scene, path: Path) -> None:
-    """Write a developed picture as JPEG."""
-    path.write_bytes(encode_jpeg(rgb, scene))
-
-
 def write_png(rgb: NDArray[np.generic], path: Path) -> None:
     """Write a developed picture of 8 or 16 bits as PNG."""
     import cv2

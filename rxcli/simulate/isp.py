@@ -21,9 +21,8 @@ Float32Array = NDArray[np.float32]
 Tone = Literal["srgb", "bt709", "gamma", "linear"]
 Subsampling = Literal["444", "422", "420"]
 
-#: Weights of red, green and blue in luma: JPEG (BT.601) and video (BT.709).
+#: Weights of red, green and blue in luma (BT.601).
 LUMA_BT601 = (0.299, 0.587, 0.114)
-LUMA_BT709 = (0.2126, 0.7152, 0.0722)
 #: Tone curves: exponent, gain (offset gain - 1), end and slope of the straight toe.
 _TONES = {
     "srgb": (1 / 2.4, 1.055, 0.0031308, 12.92),
