@@ -1,0 +1,51 @@
+"""What a picture says of the camera that took it: rows per slot, direction of readout, exposure, bend of the stripes.
+
+Four steps on the row profiles, none of which needs to know the camera.
+
+1. **Bend.** Neighbouring strips show the same slots, so the lag between them, over all of the picture, is the slope of
+   the stripes. Where a camera has taken the distortion out of its picture, the sensor row of a point p is the y of
+   K distort(K^-1 p); with any focal length in K the same map comes out for other coefficients, so that one width is
+   taken and k1 k2 p1 p2 are what is sought.
+2. **Scan.** Light between its local extremes, averaged over columns, shows the header wherever a packet starts; and a
+   packet sent again shows in every column's autocorrelation. Both are looked up over a grid of rows per slot for each
+   length of packet. The header read backwards, 1100011100, is its own complement, so the sign tells the direction.
+3. **Trial.** The best hypotheses are sliced into slots; header, dimming symbol and the constant weight of all symbols
+   decide between them: a wrong one may show a header by chance, but never twenty columns of constant weight.
+4. **Refinement.** The slots of the winner, seen through the exposure, predict the light of every strip on every row.
+   What is missing is the derivative with respect to time: least squares over all strips gives row and period of the
+   clock and the bend at once, with standard deviations from the spread between columns.
+"""
+
+from rxcli.blind.advice import stripe_likeness, why_not
+from rxcli.blind.bend import bend_terms, estimate_bend, straightened
+from rxcli.blind.camera import camera_profile, in_time_order, lens_of, summary
+from rxcli.blind.columns import likely_columns
+from rxcli.blind.refine import BlindEstimate, refine
+from rxcli.blind.scan import Hypothesis, find_clocks
+from rxcli.blind.search import MIN_EVIDENCE, BlindSearch, estimate_camera
+from rxcli.blind.strips import Strips, in_readout_order, strips_of
+from rxcli.blind.structure import structure_evidence
+
+__all__ = [
+    "MIN_EVIDENCE",
+    "BlindEstimate",
+    "BlindSearch",
+    "Hypothesis",
+    "Strips",
+    "bend_terms",
+    "camera_profile",
+    "estimate_bend",
+    "estimate_camera",
+    "find_clocks",
+    "in_readout_order",
+    "in_time_order",
+    "lens_of",
+    "likely_columns",
+    "refine",
+    "straightened",
+    "stripe_likeness",
+    "strips_of",
+    "structure_evidence",
+    "summary",
+    "why_not",
+]

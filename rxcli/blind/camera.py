@@ -1,0 +1,101 @@
+"""What an estimate means for the receiver, the report and the next picture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rxcli.blind.refine import BlindEstimate
+from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
+from rxcli.types import Lens, RowProfiles
+
+
+def lens_of(estimate: BlindEstimate, width: int, height: int) -> Lens | None:
+    """The lens model of a picture that was corrected in the camera; None where no bend was seen."""
+    if not estimate.corrected:
+        return None
+    matrix = np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1.0]])
+    return Lens(matrix, np.append(estimate.bend, 0.0), corrected=True)
+
+
+def in_time_order(profiles: RowProfiles, height: int) -> RowProfiles:
+    """Row profiles of a picture whose rows run against the readout, with rows counted from the first one read.
+
+    Args:
+        profiles: C columns, S strips, R rows.
+        height: rows of the picture.
+    """
+    sensor_row = None if profiles.sensor_row is None else height - 1 - profiles.sensor_row[..., ::-1]
+    return replace(
+        profiles,
+        light=np.ascontiguousarray(profiles.light[..., ::-1]),
+        inside=np.ascontiguousarray(profiles.inside[..., ::-1]),
+        rows=height - 1 - profiles.rows[::-1],
+        sensor_row=sensor_row,
+    )
+
+
+def summary(estimate: BlindEstimate, slot_rate_hz: float) -> dict[str, tuple[float, float]]:
+    """What was estimated: name -> (value, standard deviation)."""
+    line_delay_s = 1 / (estimate.rows_per_slot * slot_rate_hz)
+    relative = estimate.rows_per_slot_sd / estimate.rows_per_slot
+    out = {
+        "rows_per_slot": (estimate.rows_per_slot, estimate.rows_per_slot_sd),
+        "line_delay_s": (line_delay_s, line_delay_s * relative),
+        "readout_reversed": (float(estimate.reversed), 0.0),
+    }
+    if estimate.exposure_slots_sd > 0:
+        out["exposure_s"] = (estimate.exposure_slots / slot_rate_hz, estimate.exposure_slots_sd / slot_rate_hz)
+    if estimate.corrected:
+        names = ("k1", "k2", "p1", "p2")
+        out |= {n: (float(v), float(sd)) for n, v, sd in zip(names, estimate.bend, estimate.bend_sd, strict=True)}
+    return out
+
+
+def camera_profile(
+    estimated: dict[str, tuple[float, float]], name: str, make: str | None, model: str | None, width: int, height: int
+) -> CameraProfile:
+    """A camera profile of what was estimated, for the next pictures of this camera and size.
+
+    Args:
+        estimated: see `summary`; `FrameResult.estimated`.
+        name: of the profile.
+        make: of the camera, None where the file does not tell it.
+        model: of the camera, None where the file does not tell it.
+        width: of the picture.
+        height: of the picture.
+
+    Raises:
+        KeyError: no line delay among what was estimated.
+    """
+    lens = None
+    if "k1" in estimated:
+        k = tuple(estimated[key][0] for key in ("k1", "k2", "p1", "p2"))
+        centre_x, centre_y, focal = (width - 1) / 2, (height - 1) / 2, float(width)
+        matrix = ((focal, 0.0, centre_x), (0.0, focal, centre_y), (0.0, 0.0, 1.0))
+        lens = LensModel(
+            width=width,
+            height=height,
+            camera_matrix=matrix,
+            dist_coeffs=(*k, 0.0),
+            distortion_already_corrected=True,
+        )
+    line_delay_s, sd = estimated["line_delay_s"]
+    mode = ReadoutMode(
+        name=f"{width}x{height}",
+        width=width,
+        height=height,
+        line_delay_s=line_delay_s,
+        exposure_s=estimated["exposure_s"][0] if "exposure_s" in estimated else None,
+    )
+    return CameraProfile(
+        format=1,
+        kind="camera",
+        name=name,
+        make=make or "",
+        models=(model,) if model else (),
+        modes=(mode,),
+        lens=lens,
+        description=f"estimated from one picture; line delay to {100 * sd / line_delay_s:.2g} %",
+    )

@@ -1,0 +1,253 @@
+"""The clock, the bend and the exposure that fit all light of a picture best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.blind.bend import BEND_SCALE, bend_terms, reversed_bend
+from rxcli.blind.scan import Hypothesis
+from rxcli.blind.strips import Strips, in_readout_order
+from rxcli.blind.structure import structure_evidence
+from rxcli.blind.waves import LOCAL_SLOTS, Grid, column_waves, decide, estimate_exposure, local_mean, seen_through
+from rxcli.types import BoolArray, Float32Array, FloatArray
+
+_BEND_PRECISION = np.concatenate([[0.0, 0.0], BEND_SCALE**-2])
+
+#: Samples of a slot and strips of a column err alike: so many of them say what one would.
+_ALIKE = 10.0
+
+_REFINE_STEPS = 8
+
+#: Steps at which the exposure is estimated.
+_EXPOSURE_STEPS = (1, 3)
+
+#: The descent ends when no row moves by more slots than this.
+_CONVERGED = 0.003
+
+#: Chi-square of the four coefficients that a bend beyond doubt has; unbent pictures stay below 35.
+_BENT_CHI_SQUARE = 80.0
+
+#: Keeps the clock of a row-time map and drops its bend.
+_FLAT = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+
+#: Rows of one block of the normal equations; the bend does not change within.
+_BLOCK_ROWS = 32
+
+
+@dataclass(frozen=True, slots=True)
+class BlindEstimate:
+    """What was estimated of a camera, with standard deviations."""
+
+    rows_per_slot: float
+    rows_per_slot_sd: float
+    packet_slots: int
+    reversed: bool
+    exposure_slots: float
+    exposure_slots_sd: float
+    #: (4,) k1 k2 p1 p2 for a focal length of one picture width, of a picture that was corrected in the camera.
+    bend: FloatArray
+    bend_sd: FloatArray
+    #: True where the stripes are bent beyond doubt.
+    corrected: bool
+    #: Log-likelihood ratio of header and weights over chance.
+    evidence: float
+    #: Share of the local variance of the light that the slots explain.
+    explained: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Timing:
+    """Row-time map: slot position of row s is (s + bend - start) / rows_per_slot."""
+
+    #: start, rows_per_slot, k1, k2, p1, p2.
+    values: FloatArray
+    #: (6, 6) covariance of the values.
+    covariance: FloatArray
+    exposure_slots: float
+    exposure_sd: float
+    #: Log-likelihood ratio of header and weights over chance.
+    evidence: float
+    #: Share of the strips' local variance that the slots explain.
+    explained: float
+
+
+def refine(
+    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None = None
+) -> BlindEstimate:
+    """The clock, the bend and the exposure that fit all light of the picture best.
+
+    Args:
+        strips: the strips as the picture has them, not straightened.
+        hypothesis: a clock found on the straightened strips.
+        bend: the bend they were straightened with.
+        exposure_slots: exposure, None to estimate it.
+    """
+    ordered, bend = (in_readout_order(strips), reversed_bend(bend)) if hypothesis.reversed else (strips, bend)
+    ordered = _thinned(ordered, hypothesis.rows_per_slot)
+    timing, corrected = _fit_timing(ordered, hypothesis, bend, exposure_slots)
+    found, sd = timing.values[2:], np.sqrt(np.diag(timing.covariance))
+    return BlindEstimate(
+        rows_per_slot=float(timing.values[1]),
+        rows_per_slot_sd=float(sd[1]),
+        packet_slots=hypothesis.packet_slots,
+        reversed=hypothesis.reversed,
+        exposure_slots=timing.exposure_slots,
+        exposure_slots_sd=timing.exposure_sd,
+        bend=reversed_bend(found) if hypothesis.reversed else found,
+        bend_sd=sd[2:],
+        corrected=corrected,
+        evidence=timing.evidence,
+        explained=timing.explained,
+    )
+
+
+def _thinned(strips: Strips, rows_per_slot: float) -> Strips:
+    """Neighbouring rows averaged as far as a slot keeps at least four."""
+    join = max(1, int(rows_per_slot // 4))
+    if join == 1:
+        return strips
+    n = strips.rows.size // join
+
+    def mean(values: FloatArray | Float32Array) -> FloatArray:
+        return np.asarray(values[..., : n * join].reshape(*values.shape[:-1], n, join).mean(axis=-1))
+
+    inside = (mean(strips.inside) > 0.99).astype(np.float32)
+    return replace(
+        strips,
+        light=mean(strips.light).astype(np.float32),
+        inside=inside,
+        x=mean(strips.x),
+        rows=mean(strips.rows),
+        sigma=strips.sigma / np.sqrt(join),
+    )
+
+
+def _fit_timing(
+    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None
+) -> tuple[_Timing, bool]:
+    """The row-time map, with a bend only where it is beyond doubt: one that is free for nothing blurs the period."""
+    first_row = strips.rows[0] - 0.5 * (strips.rows[1] - strips.rows[0])
+    before = int(hypothesis.start_row // hypothesis.rows_per_slot) + 2
+    start = first_row + hypothesis.start_row - before * hypothesis.rows_per_slot
+    grid = Grid(-before % hypothesis.packet_slots, hypothesis.packet_slots)
+    values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
+    bent = _descend(strips, grid, values, exposure_slots, n_free=6)
+    if _is_bent(bent):
+        return bent, True
+    values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else bent.values * _FLAT
+    flat = _descend(strips, grid, values, bent.exposure_slots, n_free=2)
+    return replace(flat, exposure_sd=bent.exposure_sd), False
+
+
+def _descend(strips: Strips, grid: Grid, values: FloatArray, exposure_slots: float | None, n_free: int) -> _Timing:
+    """Gauss-Newton on the first `n_free` values of the row-time map, deciding the slots anew at every step."""
+    terms = _time_terms(strips)
+    exposure, exposure_sd = exposure_slots or 1.0, 0.0
+    for step in range(_REFINE_STEPS):
+        time = _slot_time(strips, terms, values)
+        waves = column_waves(strips, time, values[1])
+        if exposure_slots is None and step in _EXPOSURE_STEPS:
+            exposure, exposure_sd = estimate_exposure(waves, grid)
+        lit = decide(waves, exposure, grid)
+        change, covariance, explained = _gauss_newton(strips, terms, values, time, lit, exposure, n_free)
+        values = values + change
+        moved = float(np.abs(_slot_time(strips, terms, values)[:, ::_BLOCK_ROWS] - time[:, ::_BLOCK_ROWS]).max())
+        if moved < _CONVERGED and step >= max(_EXPOSURE_STEPS):
+            break
+    # Headers that were taken as known are no evidence: they are looked at anew.
+    seen = decide(waves, exposure, None).astype(np.float64)
+    evidence = structure_evidence(seen, grid.first_slot, grid.packet_slots)
+    return _Timing(values, covariance, exposure, exposure_sd, evidence, explained)
+
+
+def _time_terms(strips: Strips) -> FloatArray:
+    """(4, M, blocks + 1) bend terms at the borders of blocks of rows."""
+    n = strips.rows.size
+    nodes = np.minimum(np.arange(-(-n // _BLOCK_ROWS) + 1) * _BLOCK_ROWS, n - 1)
+    return bend_terms(strips.x[:, nodes], strips.rows[nodes], strips.width, strips.height)
+
+
+def _slot_time(strips: Strips, terms: FloatArray, values: FloatArray) -> Float32Array:
+    """(M, R) slot position of every strip's row; the bend is interpolated between the blocks' borders."""
+    n = strips.rows.size
+    start, rows_per_slot = values[:2]
+    moved = np.tensordot(values[2:], terms, 1)
+    index = np.arange(n)
+    low = index // _BLOCK_ROWS
+    width = np.minimum((low + 1) * _BLOCK_ROWS, n - 1) - low * _BLOCK_ROWS
+    f = (index - low * _BLOCK_ROWS) / np.maximum(width, 1)
+    bent = moved[:, low] + (moved[:, low + 1] - moved[:, low]) * f
+    return np.asarray((strips.rows + bent - start) / rows_per_slot, np.float32)
+
+
+def _gauss_newton(
+    strips: Strips,
+    terms: FloatArray,
+    values: FloatArray,
+    time: Float32Array,
+    lit: BoolArray,
+    exposure_slots: float,
+    n_free: int,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Step of the row-time map, its covariance, and the share of variance explained before the step."""
+    per_column = strips.light.shape[0] // strips.n_columns
+    column = np.arange(strips.light.shape[0]) // per_column
+    wave, slope = seen_through(lit, time, column, exposure_slots)
+    pitch = float(strips.rows[1] - strips.rows[0])
+    window = round(LOCAL_SLOTS * values[1] / pitch)
+    inside = strips.inside
+    share = local_mean(inside, window) + np.float32(1e-3)
+    mean_light, mean_wave = local_mean(strips.light * inside, window) / share, local_mean(wave * inside, window) / share
+    covariance = local_mean(strips.light * wave * inside, window) / share - mean_light * mean_wave
+    variance = local_mean(wave * wave * inside, window) / share - mean_wave * mean_wave
+    gain = np.maximum(covariance, 0) / (variance + np.float32(0.02))
+    residual = (strips.light - mean_light - gain * (wave - mean_wave)) * inside
+    spread = local_mean(residual * residual, window) / share + np.float32(strips.sigma**2)
+    power = gain * slope
+    weight = inside / spread
+    fit = residual * weight * power
+    blocks = np.arange(0, strips.rows.size, _BLOCK_ROWS)
+    information = np.add.reduceat(weight * power * power, blocks, axis=1).astype(np.float64)
+    pull = np.add.reduceat(fit, blocks, axis=1).astype(np.float64)
+    jacobian = _jacobian(terms, values, time, blocks)
+    step, covariance_matrix = _solve(jacobian, information, pull, values, strips.n_columns, n_free)
+    light_power = float((gain * gain * variance * weight).sum())
+    left = float((residual * residual * weight).sum())
+    return step, covariance_matrix, light_power / max(light_power + left, 1e-9)
+
+
+def _jacobian(terms: FloatArray, values: FloatArray, time: Float32Array, blocks: NDArray[np.int64]) -> FloatArray:
+    """(6, M, blocks) change of the slot position with start, rows per slot and bend."""
+    rows_per_slot = values[1]
+    middle = np.minimum(blocks + _BLOCK_ROWS // 2, time.shape[1] - 1)
+    out = np.empty((6, terms.shape[1], blocks.size))
+    out[0] = -1 / rows_per_slot
+    out[1] = -time[:, middle] / rows_per_slot
+    out[2:] = (terms[:, :, :-1] + terms[:, :, 1:]) / 2 / rows_per_slot
+    return out
+
+
+def _solve(
+    jacobian: FloatArray, information: FloatArray, pull: FloatArray, values: FloatArray, n_columns: int, n_free: int
+) -> tuple[FloatArray, FloatArray]:
+    """Step and covariance; the spread of the columns' pulls stands for all that makes residuals alike."""
+    free = jacobian[:n_free]
+    flat = free.reshape(n_free, -1)
+    prior = (_ALIKE * _BEND_PRECISION)[:n_free]
+    hessian = (flat * information.ravel()) @ flat.T + np.diag(prior)
+    inverse = np.linalg.inv(hessian)
+    by_column = (free * pull).reshape(n_free, n_columns, -1).sum(axis=2)
+    spread = by_column - by_column.mean(axis=1, keepdims=True)
+    step, covariance = np.zeros(6), np.zeros((6, 6))
+    step[:n_free] = inverse @ (flat @ pull.ravel() - prior * values[:n_free])
+    covariance[:n_free, :n_free] = inverse @ (spread @ spread.T) @ inverse * n_columns / max(n_columns - 1, 1)
+    return step, covariance
+
+
+def _is_bent(timing: _Timing) -> bool:
+    """Whether the bend is beyond doubt; columns share too much for its chi-square to be taken at its word."""
+    bend, covariance = timing.values[2:], timing.covariance[2:, 2:]
+    return float(bend @ np.linalg.solve(covariance + 1e-8 * np.diag(BEND_SCALE**2), bend)) > _BENT_CHI_SQUARE

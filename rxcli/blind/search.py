@@ -1,0 +1,83 @@
+"""All steps together: from strips to an estimate, or the reason why there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rxcli.blind.advice import why_not
+from rxcli.blind.bend import estimate_bend, straightened
+from rxcli.blind.refine import _ALIKE, BlindEstimate, refine
+from rxcli.blind.scan import Hypothesis, alike, find_clocks
+from rxcli.blind.strips import Strips
+from rxcli.profiles import ScreenProfile
+from rxcli.types import FloatArray
+
+#: Log-likelihood ratio of header and weights, over chance, that a clock must reach.
+MIN_EVIDENCE = 30.0
+
+#: A bend that fits this many nats better than none is tried; from the second on, it alone.
+_BEND_GAINS = (5.0, 25.0)
+
+#: Hypotheses that are refined, and the share of the best one's evidence that another needs.
+_REFINED, _CLOSE_EVIDENCE = 3, 0.3
+
+#: Below this evidence, more of them.
+_WEAK_EVIDENCE, _REFINED_IF_WEAK = 120.0, 8
+
+
+@dataclass(frozen=True, slots=True)
+class BlindSearch:
+    """What was estimated, or why nothing was."""
+
+    estimate: BlindEstimate | None
+    #: Why not: thing, reason and next step. Empty where an estimate was found.
+    reason: str = ""
+
+
+def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None) -> BlindSearch:
+    """Estimate the camera from one picture of a sending screen.
+
+    Args:
+        strips: see `strips_of`.
+        screens: screens that it may be.
+        exposure_s: exposure, None where the file does not tell it.
+
+    Raises:
+        ValueError: no screens.
+    """
+    if not screens:
+        raise ValueError("screens must name at least one screen (got none)")
+    rates = {screen.packet_slots: screen.slot_rate_hz for screen in reversed(screens)}
+    bend, gain = estimate_bend(strips)
+    bends = [bend] if gain > _BEND_GAINS[1] else [np.zeros(4), bend] if gain > _BEND_GAINS[0] else [np.zeros(4)]
+    found = [(clock, b) for b in bends for clock in find_clocks(straightened(strips, b), sorted(rates))]
+    found.sort(key=lambda pair: -pair[0].evidence)
+    estimates: list[BlindEstimate] = []
+    for clock, b in _worth_refining(found):
+        exposure = exposure_s * rates[clock.packet_slots] if exposure_s else None
+        estimates.append(refine(strips, clock, b, exposure))
+    best = max(estimates, key=lambda estimate: _plausibility(estimate, strips, estimates[0]), default=None)
+    if best is None or best.evidence < MIN_EVIDENCE:
+        return BlindSearch(None, why_not(strips))
+    return BlindSearch(best)
+
+
+def _worth_refining(found: list[tuple[Hypothesis, FloatArray]]) -> list[tuple[Hypothesis, FloatArray]]:
+    """The best hypothesis, and others of another period, packet, direction or bend that come close."""
+    chosen: list[tuple[Hypothesis, FloatArray]] = []
+    most = _REFINED_IF_WEAK if found and found[0][0].evidence < _WEAK_EVIDENCE else _REFINED
+    for clock, bend in found:
+        if len(chosen) == most or clock.evidence < _CLOSE_EVIDENCE * found[0][0].evidence:
+            break
+        if not any(alike(clock, other) and bend is b for other, b in chosen):
+            chosen.append((clock, bend))
+    return chosen or found[:1]
+
+
+def _plausibility(estimate: BlindEstimate, strips: Strips, first: BlindEstimate) -> float:
+    """Evidence of the slots' structure and of the light that they explain, nats."""
+    slots = strips.n_columns * strips.rows.size / first.rows_per_slot
+    return estimate.evidence - 0.5 * slots / _ALIKE * float(np.log(max(1 - estimate.explained, 1e-3)))

@@ -1,0 +1,86 @@
+"""Strips: the light of a picture in the order of its readout."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rxcli.types import Float32Array, FloatArray, RowProfiles
+
+#: Strips that a column keeps while its camera is unknown.
+_STRIPS = 4
+
+#: Any window of this many slots holds a lit and a dark one.
+EXTREMES_SLOTS = 19
+
+#: Samples a slot while the clock is sought.
+SAMPLES = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Strips:
+    """Light of M strips on R rows in readout order; the columns' strips lie side by side."""
+
+    #: (M, R) float32: light; and 1 where it is on the screen, else 0.
+    light: Float32Array
+    inside: Float32Array
+    #: (M, R) float64: picture x of the strip's middle.
+    x: FloatArray
+    #: (R,) float64: rows counted in readout order from the picture's first one read.
+    rows: FloatArray
+    n_columns: int
+    #: Standard deviation of a strip's row of no light.
+    sigma: float
+    #: Size of the picture.
+    width: int
+    height: int
+
+
+def strips_of(profiles: RowProfiles, centre_x: FloatArray, width: int, height: int) -> Strips:
+    """Strips for the functions below, from row profiles that were sampled without a lens.
+
+    Args:
+        profiles: C columns, S strips, R rows; `sensor_row` None.
+        centre_x: (C*S, R) picture x of the strips' middles.
+        width: of the picture, pixels.
+        height: of the picture, rows.
+    """
+    n_columns, n_strips, n_rows = profiles.light.shape
+    join = n_strips // _STRIPS if n_strips % _STRIPS == 0 else 1
+    shape = (n_columns * n_strips // join, join, n_rows)
+    inside = profiles.inside.reshape(shape).astype(np.float32).min(axis=1)
+    sigma = np.sqrt(profiles.noise_floor / max(float(np.median(profiles.count)), 1.0) / join)
+    return Strips(
+        light=profiles.light.reshape(shape).mean(axis=1) * inside,
+        inside=inside,
+        x=centre_x.reshape(shape).mean(axis=1),
+        rows=profiles.rows.astype(np.float64),
+        n_columns=n_columns,
+        sigma=float(sigma),
+        width=width,
+        height=height,
+    )
+
+
+def in_readout_order(strips: Strips) -> Strips:
+    """The strips of a picture whose rows run against the readout, in readout order; its own inverse."""
+    return replace(
+        strips,
+        light=np.ascontiguousarray(strips.light[:, ::-1]),
+        inside=np.ascontiguousarray(strips.inside[:, ::-1]),
+        x=np.ascontiguousarray(strips.x[:, ::-1]),
+        rows=strips.height - 1 - strips.rows[::-1],
+    )
+
+
+def levelled(light: Float32Array, inside: Float32Array, window: int, sigma: float) -> tuple[Float32Array, Float32Array]:
+    """Light against mean and spread of the `window` rows around it; and the weight behind it, 0..1."""
+    import cv2
+
+    size = (window | 1, 1)
+    share = cv2.blur(inside, size) + np.float32(1e-3)
+    mean = cv2.blur(light, size) / share
+    variance = np.maximum(cv2.blur(light * light, size) / share - mean * mean, 0)
+    level = np.clip((light - mean) / np.sqrt(variance + np.float32(9 * sigma**2)), -3, 3) * inside
+    return level, variance / (variance + np.float32(16 * sigma**2)) * inside
