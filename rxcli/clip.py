@@ -35,8 +35,13 @@ from rxcli.types import (
     RowProfiles,
 )
 
-#: Frames at the start that are looked at once more when the picture is known better.
-_HELD = 6
+#: Frames at the start that are looked at once more when the picture is known better; and where many columns that are
+#: well lit are still in doubt, for compression has taken much, how many are waited for.
+_HELD, _HELD_LONG = 6, 24
+#: Squared contrast over variance of a slot that is well lit, log probability of a packet in doubt, and much doubt.
+_WELL_LIT_SNR, _DOUBTFUL, _MUCH_DOUBT = 10.0, -0.05, 0.03
+#: Frames beyond which each one's share of what is known of the picture does not matter.
+_MANY_VIEWS = 12
 #: Frames that find their clock together where each shows little.
 _TOGETHER = 8
 #: Frames that may wait until it is clear which copies begin a burst.
@@ -92,6 +97,8 @@ class _View:
     denoised: frozenset[int] = frozenset()
     #: (C, S, R) light of the strips as tracking samples them; None where that cannot be done.
     light: Float32Array | None = None
+    #: Where the strips were then.
+    map: strips.StripMap | None = None
     flat: known_picture.ColumnLight | None = None
     #: Kept only while the frame is held back to be looked at once more.
     frame: Frame | None = None
@@ -227,7 +234,7 @@ class _Clip:
     def _finish(self) -> list[FrameResult]:
         if self._n_held:
             self._settle()
-            self._look_again()
+            self._look_again(at_last=True)
         done = self._settle()
         done += [self._report(waiting, None) for waiting in self._waiting]
         self._waiting.clear()
@@ -263,7 +270,7 @@ class _Clip:
         if self._can_track(frame, camera, lock):
             with stages("sampling"):
                 self._start_tracking(frame, corners, camera, lock, seen)
-                view.light = self._strips(frame)
+                view.light, view.map = self._strips(frame), self._place.map if self._place else None
             self._learn(view, lit)
         self._last = view
         return view, replace(result, denoiser=report)
@@ -326,7 +333,7 @@ class _Clip:
             if now is None:
                 return None
         with stages("detect"):
-            refined = self._refined(light, flat, now, last.memory)
+            refined = self._refined(picture, light, flat, now, last.memory)
             if refined is None:
                 return None
             flat, now, positions, metrics = refined
@@ -334,24 +341,36 @@ class _Clip:
             snr = _snr(flat, now)
         bursts = tracking.FrameBursts(frame.index, 0, now, metrics, shown)
         return _View(
-            last.camera, replace(last.lock, clock=now), bursts, last.memory, frame.height, snr, light=light, flat=flat
+            last.camera,
+            replace(last.lock, clock=now),
+            bursts,
+            last.memory,
+            frame.height,
+            snr,
+            light=light,
+            map=place.map,
+            flat=flat,
         )
 
     def _refined(
-        self, light: Float32Array, flat: known_picture.ColumnLight, now: Clock, memory: int
+        self,
+        picture: known_picture.KnownPicture,
+        light: Float32Array,
+        flat: known_picture.ColumnLight,
+        now: Clock,
+        memory: int,
     ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, FloatArray] | None:
         """Clock, response and noise put right by a first decision slot by slot; then positions and metrics.
 
         None where the headers are not where the clock has them: another scene, or something in front of the screen.
         """
-        assert self._picture is not None
         positions = known_picture.row_positions(self._rows, now)
         lit = known_picture.first_decision(flat, positions, now)
         if known_picture.header_contrast(flat, positions, now) < _LEAST_HEADER:
             return None
         fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
-        if self._n_lessons < _FEW_LESSONS:
-            flat = self._picture.solve_again(light, fit.expected)
+        if self._n_lessons < _FEW_LESSONS or fit.response.centre < _FADED:
+            flat = picture.solve_again(light, fit.expected, now.rows_per_slot)
             fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
         if fit.response.centre < _FADED:
             flat = known_picture.evened(flat, fit)
@@ -360,7 +379,7 @@ class _Clip:
             now = replace(now, row0=now.row0 - fit.late * now.rows_per_slot)
             positions = known_picture.row_positions(self._rows, now)
             fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
-        flat, ratio = self._picture.judge(flat, fit.expected, _NOISE_SHARE)
+        flat, ratio = picture.judge(flat, fit.expected, _NOISE_SHARE)
         if ratio > _MISFIT:
             return None
         return flat, now, positions, known_picture.pattern_metrics(flat, positions, now, memory, fit, lit)
@@ -404,10 +423,12 @@ class _Clip:
         place, picture = self._place, self._picture
         assert place is not None
         assert picture is not None
-        before, rows_before = place.corners, place.map.first_row
-        place.map = _map(frame, corners, camera, lock)
+        before, before_map = place.corners, place.map
+        place.map = _map(frame, corners, camera, lock, before_map.inside.shape[1])
         place.corners = corners
-        picture.moved(_row_before(self._rows, corners, before, lock.screen.columns) - rows_before, place.map.inside)
+        picture.moved(
+            _row_before(self._rows, corners, before, lock.screen.columns) - before_map.first_row, place.map.inside
+        )
 
     def _clock(self, frame: Frame, flat: known_picture.ColumnLight, last: _View) -> Clock | None:
         """The clock of the frame: from its headers where they are about as foretold, else as foretold."""
@@ -456,7 +477,7 @@ class _Clip:
         self._link.last_time_s = frame.time_s
         view.bursts = replace(view.bursts, first_copy=first_copy)
         self._waiting.append(waiting)
-        if self._n_held and view.light is not None:
+        if self._n_held == _HELD and view.light is not None:
             view.frame = frame
         with stages("detect"):
             if not self._link.phase.settled:
@@ -465,7 +486,7 @@ class _Clip:
             if self._link.phase.settled or n_unsettled > _MAX_WAITING:
                 self._settle_bursts()
                 if self._n_held and len(self._waiting) >= self._n_held:
-                    self._look_again()
+                    self._look_again(at_last=False)
         return done + self._ready()
 
     def _begin_link(self, view: _View, frame: Frame) -> None:
@@ -496,7 +517,7 @@ class _Clip:
             if waiting.view is not None and waiting.numbers is None:
                 self._detect(waiting)
 
-    def _detect(self, waiting: _Waiting) -> None:
+    def _detect(self, waiting: _Waiting, learn: bool = True) -> None:
         """Add a frame to its bursts, and detect them again."""
         view, link = waiting.view, self._link
         assert view is not None
@@ -519,7 +540,8 @@ class _Clip:
         self._skip(waiting, "certain_columns", int(certain.sum()))
         self._detect_open(still_open, ~certain)
         if view.flat is not None:
-            self._learn(view, self._grid(waiting))
+            if learn:
+                self._learn(view, self._grid(waiting))
             self._last = view
 
     def _detect_open(self, numbers: IntArray, wanted: NDArray[np.bool_]) -> None:
@@ -547,48 +569,83 @@ class _Clip:
         sure = certain.any(axis=0)
         self._weights[columns[sure], posteriors.w[sure] - 1] = True
 
-    def _learn(self, view: _View, lit: Float32Array) -> None:
+    def _learn(
+        self, view: _View, lit: Float32Array, keep: float | None = None
+    ) -> tuple[Float32Array, Float32Array] | None:
+        """Take a frame into the picture, later ones only now and then unless `keep` is given; returns what it showed.
+
+        See `known_picture.KnownPicture.learn` for `keep`, and for what is returned: slots and trust.
+        """
         picture = self._picture
         if picture is None or view.light is None or view.light.shape[2] != self._rows.size:
-            return
+            return None
         self._n_lessons += 1
-        if self._n_lessons > _FIRST_LESSONS and self._n_lessons % _LESSON_EVERY:
-            return
+        if keep is None and self._n_lessons > _FIRST_LESSONS and self._n_lessons % _LESSON_EVERY:
+            return None
         now = view.bursts.clock
         positions = known_picture.row_positions(self._rows, now)
         slots = known_picture.exposed(lit, positions, now.exposure_slots)
         doubt = known_picture.exposed(lit * (1 - lit), positions, now.exposure_slots)
-        picture.learn(view.light, slots, np.clip(1 - 8 * doubt, 0, 1).astype(np.float32))
+        trust = np.clip(1 - 8 * doubt, 0, 1).astype(np.float32)
+        picture.learn(view.light, slots, trust, known_picture.MEMORY if keep is None else keep)
+        return slots, trust
 
-    def _look_again(self) -> None:
-        """The first frames once more: by then it is known better where the screen is, and what is on it."""
-        self._n_held = 0
-        held = [waiting for waiting in self._waiting if waiting.numbers is not None]
-        views = [waiting.view for waiting in held if waiting.view and waiting.view.frame is not None]
+    def _look_again(self, at_last: bool) -> None:
+        """The first frames once more: by then it is known better where the screen is, and what is on it.
+
+        Where that leaves doubt, more frames are waited for, unless it is `at_last`.
+        """
+        held = [waiting for waiting in self._waiting if waiting.view is not None and waiting.numbers is not None]
+        views = [view for waiting in held if (view := waiting.view) and self._can_look_again(view)]
         if len(views) > 1 and self._place is not None and self._model is not None:
-            known = [self._grid(waiting) for waiting in held if waiting.view in views]
-            self._picture = self._new_picture(*self._model)
-            for view, lit in zip(views, known, strict=True):
-                assert view.frame is not None
-                view.light = self._strips(view.frame)
-                self._learn(view, lit)
-            for view in views:
-                self._measure_again(view)
+            self._measure_again(views, [self._grid(waiting) for waiting in held if waiting.view in views])
             self._bursts = tracking.Bursts()
             for waiting in held:
-                self._detect(waiting)
+                self._detect(waiting, learn=False)
         for view in views:
             view.frame = None
+        self._n_held = _HELD_LONG if self._n_held < _HELD_LONG and not at_last and self._in_doubt(held) else 0
 
-    def _measure_again(self, view: _View) -> None:
-        assert self._picture is not None
-        assert view.light is not None
-        flat = self._picture.solve(view.light)
-        refined = self._refined(view.light, flat, view.bursts.clock, view.memory)
-        if refined is not None:
-            burst = view.bursts.clock.burst
-            view.flat, now, _, metrics = refined
-            view.bursts = replace(view.bursts, clock=replace(now, burst=burst), metrics=metrics)
+    def _can_look_again(self, view: _View) -> bool:
+        return view.frame is not None or (
+            view.light is not None and self._place is not None and view.map is self._place.map
+        )
+
+    def _measure_again(self, views: list[_View], known: list[Float32Array]) -> None:
+        """Frames by the picture that the others give, whose slots are `known`, (C, N) each."""
+        assert self._place is not None
+        assert self._model is not None
+        self._picture = self._new_picture(*self._model)
+        lessons = []
+        for view, lit in zip(views, known, strict=True):
+            if view.frame is not None:
+                view.light, view.map = self._strips(view.frame), self._place.map
+            lessons.append(self._learn(view, lit, keep=1.0))
+        for view, lesson in zip(views, lessons, strict=True):
+            assert view.light is not None
+            alone = len(views) > _MANY_VIEWS or lesson is None
+            picture = self._picture if alone or lesson is None else self._picture.without(view.light, *lesson)
+            flat = picture.solve(view.light)
+            refined = self._refined(picture, view.light, flat, view.bursts.clock, view.memory)
+            if refined is not None:
+                burst = view.bursts.clock.burst
+                view.flat, now, _, metrics = refined
+                view.bursts = replace(view.bursts, clock=replace(now, burst=burst), metrics=metrics)
+
+    def _in_doubt(self, held: list[_Waiting]) -> bool:
+        """Whether many columns that are lit are not certain of bursts that the frames show whole."""
+        doubtful = total = 0
+        for waiting in held:
+            assert waiting.view is not None
+            assert waiting.numbers is not None
+            lit = np.median(waiting.view.snr, axis=1) >= _WELL_LIT_SNR
+            for number in waiting.numbers:
+                known = self._bursts.known(int(number)) if self._bursts.is_open(int(number)) else None
+                if known is not None:
+                    whole = assemble.complete(self._bursts.seen(np.array([number])))[0] & lit
+                    doubtful += int((known.log_prob.sum(axis=2).min(axis=0) < _DOUBTFUL)[whole].sum())
+                    total += int(whole.sum())
+        return doubtful > _MUCH_DOUBT * total
 
     def _grid(self, waiting: _Waiting) -> Float32Array:
         """(C, N) probability that each slot of a frame is lit, by all that is known of its bursts."""
@@ -663,10 +720,11 @@ def _facts(view: _View) -> dict[str, Any]:
     }
 
 
-def _map(frame: Frame, corners: FloatArray, camera: Camera, lock: Lock) -> strips.StripMap:
+def _map(frame: Frame, corners: FloatArray, camera: Camera, lock: Lock, n_strips: int | None = None) -> strips.StripMap:
+    """Where the strips lie; as many as before where `n_strips` says so, for a picture known by strips cannot follow."""
     n_columns = lock.screen.columns
-    column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
-    n_strips = sampling.strips_per_column(column_px)
+    if n_strips is None:
+        n_strips = sampling.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
     outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, camera.lens)
     return strips.map_strips(outlines)
 

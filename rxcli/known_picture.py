@@ -8,6 +8,7 @@ once: no crosstalk is left, strips are pooled by what they tell, and every colum
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL, slot_patterns
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray
 
 #: Share of its weight that a frame keeps with every frame after it.
-_MEMORY = 0.95
+MEMORY = 0.95
 #: Weight of the picture around a row against one frame's look at the row itself at full light.
 _SMOOTH = 0.05
 #: Rows around, in each direction, from which the picture of a row that was never lit is taken.
@@ -31,8 +32,8 @@ _PRIOR = 4.0
 _TEMPER = 0.5
 #: Error of a column's light, in parts of full light, that no pooling removes.
 _COMMON_ERROR = 0.04
-#: Rows around, in each direction, over which a strip's error is averaged; degrees of freedom of its own.
-_ERROR_ROWS, _DEGREES = 12, 3.0
+#: Slots around, in each direction, over which a strip's error is averaged, and those of them left out as its own.
+_ERROR_SLOTS, _OWN_SLOTS = 20.0, 1.3
 #: A column's light further than this beyond dark or lit is not to be trusted.
 _BEYOND = 0.15
 #: Slots to each side that a blur reaches, what is possible in the middle and at a side, and how much less is likelier.
@@ -91,22 +92,44 @@ class KnownPicture:
         #: (C,) variance of the columns' light over what was foreseen.
         self._excess = np.ones(inside.shape[0], np.float32)
 
-    def learn(self, light: Float32Array, slots: Float32Array, trust: Float32Array) -> None:
+    def learn(self, light: Float32Array, slots: Float32Array, trust: Float32Array, keep: float = MEMORY) -> None:
         """Take a frame whose slots are known into the picture.
 
         Args:
             light: (C, S, R).
             slots: (C, R) exposure-averaged slots, 0..1.
             trust: (C, R) 0..1.
+            keep: share of their weight that the frames before keep.
         """
+        lit, seen = self._lesson(light, slots, trust)
+        self._light = self._light * np.float32(keep) + lit
+        self._seen = self._seen * np.float32(keep) + seen
+        self._system = None
+
+    def without(self, light: Float32Array, slots: Float32Array, trust: Float32Array) -> KnownPicture:
+        """What the other frames say alone, for a frame that was learned last or with nothing forgotten since.
+
+        A picture learned from a frame's own light bears out whatever was decided there, wrong or right.
+
+        Args:
+            light: (C, S, R) as it was learned.
+            slots: (C, R) likewise.
+            trust: (C, R) likewise.
+        """
+        lit, seen = self._lesson(light, slots, trust)
+        other = copy(self)
+        other._light, other._seen = self._light - lit, np.maximum(self._seen - seen, 0)
+        other._system, other._excess = None, self._excess.copy()
+        return other
+
+    def _lesson(
+        self, light: Float32Array, slots: Float32Array, trust: Float32Array
+    ) -> tuple[Float32Array, Float32Array]:
+        """Light and light expected of a picture of 1, each weighted with the latter."""
         expected = self._spread @ _with_neighbours(slots)
         trust = np.minimum.reduce(_with_neighbours(trust, 1.0), axis=1)
         weighted = expected * (trust[:, None] * self._inside)
-        self._light *= np.float32(_MEMORY)
-        self._light += weighted * (light - self._floor)
-        self._seen *= np.float32(_MEMORY)
-        self._seen += weighted * expected
-        self._system = None
+        return weighted * (light - self._floor), weighted * expected
 
     def solve(self, light: Float32Array) -> ColumnLight:
         """The columns' own light in a frame.
@@ -118,20 +141,25 @@ class KnownPicture:
             self._system = self._factor()
         return self._solved(light, self._system)
 
-    def solve_again(self, light: Float32Array, expected: Float32Array) -> ColumnLight:
-        """The columns' own light once more, strips trusted as far as they show what is expected.
+    def solve_again(self, light: Float32Array, expected: Float32Array, rows_per_slot: float) -> ColumnLight:
+        """The columns' own light once more, strips trusted as far as they show what is expected of other slots nearby.
+
+        Were a slot's own error counted, whatever was decided of it would bear itself out.
 
         Args:
             light: (C, S, R).
             expected: (C, R) light that the slots decided so far give.
+            rows_per_slot: rows per slot.
         """
         assert self._system is not None
         foreseen = self._picture * (self._spread @ _with_neighbours(expected))
         error = light - self._floor - foreseen
-        np.square(error, out=error)
-        around = _box(error * self._inside, _ERROR_ROWS) / (_box(self._inside, _ERROR_ROWS) + np.float32(1e-3))
-        system = self._factor(around + error / np.float32(_DEGREES))
-        return self._solved(light, system)
+        error *= error
+        error *= self._inside
+        near, far = (int(slots * rows_per_slot) for slots in (_OWN_SLOTS, _ERROR_SLOTS))
+        around = _box(error, far) - _box(error, near)
+        count = _box(self._inside, far) - _box(self._inside, near)
+        return self._solved(light, self._factor(np.maximum(around, 0) / (count + np.float32(1e-3))))
 
     def _solved(self, light: Float32Array, system: _System) -> ColumnLight:
         seen = self._spread.T @ (system.gain * (light - self._floor))

@@ -314,6 +314,7 @@ def _one_burst(posteriors: BurstPosteriors, burst: int) -> BurstPosteriors:
         index=posteriors.index[part],
         log_prob=posteriors.log_prob[part],
         bit_llr=posteriors.bit_llr[part],
+        header_llr=posteriors.header_llr[part],
     )
 
 
