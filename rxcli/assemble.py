@@ -25,6 +25,12 @@ from rxcli.types import (
 MAX_BER_HAT = 0.1
 #: Offset and slope from the log-odds of the posterior to those of being error-free; 4883 packets of 500 random frames.
 _CALIBRATION = (0.501, 0.906)
+#: The same of clips, and the slope of the logarithm of what the payload slot says that is most against its codeword,
+#: nats; packets of `rxcli.benchmark.clip_confidence`.
+_CLIP_CALIBRATION = (0.103, 0.477, -0.83)
+_AGAINST_AT_LEAST = 0.5
+#: Share of wrong bits of packets as likely right as wrong, and the power of the odds of being wrong that it goes with.
+_BER_AT_EVENS, _BER_EXPONENT = 0.018, 0.85
 #: Headers less likely than this against slots that are anything, nats, are not headers.
 _CONTRADICTED = -2.0
 #: Together the columns' headers must be this much more likely than slots that are anything; one good header gives 12.
@@ -74,6 +80,9 @@ class BurstInClip:
     #: (C, packet) how often each slot was seen, over all frames.
     seen: IntArray
     frames: tuple[int, ...]
+    #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
+    #: received like photographs.
+    against: Float32Array | None = None
 
 
 def clip_results(
@@ -97,8 +106,7 @@ def clip_results(
         packets = [
             packet
             for burst, now in whole
-            if (packet := _packet(0, column, now, burst.posteriors, burst.seen[column], burst.number, burst.frames))
-            and packet.confidence >= min_confidence
+            if (packet := _clip_packet(column, now, burst)) and packet.confidence >= min_confidence
         ]
         out.append(_clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], tuple(packets)))
     return tuple(out)
@@ -241,6 +249,23 @@ def _why_none(status: ColumnStatus, snr_db: float | None, n_seen: int, clock: Cl
     return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
 
 
+def _clip_packet(column: int, clock: Clock, burst: BurstInClip) -> PacketResult | None:
+    """The packet of a burst of a clip, None where too many bits are uncertain.
+
+    Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
+    What slots say against the codeword that was decided shows it.
+    """
+    posteriors = burst.posteriors
+    packet = _packet(0, column, clock, posteriors, burst.seen[column], burst.number, burst.frames)
+    if packet is None or burst.against is None:
+        return packet
+    log_odds = _log_odds(float(posteriors.log_prob[0, column].sum()))
+    offset, slope, slope_against = _CLIP_CALIBRATION
+    log_odds = offset + slope * log_odds + slope_against * float(np.log(burst.against[column] + _AGAINST_AT_LEAST))
+    ber_hat = max(packet.ber_hat, min(_BER_AT_EVENS * float(np.exp(-_BER_EXPONENT * log_odds)), 0.5))
+    return None if ber_hat > MAX_BER_HAT else replace(packet, confidence=_probability(log_odds), ber_hat=ber_hat)
+
+
 def _packet(
     burst: int,
     column: int,
@@ -275,9 +300,17 @@ def _calibrated(log_prob: float) -> float:
     The light model's likelihoods are tempered, since strips and samples err together; what is left of that is a
     straight line between log-odds, fitted by `vlc-rx benchmark confidence`.
     """
+    offset, slope = _CALIBRATION
+    return _probability(offset + slope * _log_odds(log_prob))
+
+
+def _log_odds(log_prob: float) -> float:
     at_most = float(np.clip(log_prob, -_MOST_DOUBT, -_LEAST_DOUBT))
-    log_odds = at_most - np.log(-np.expm1(at_most))
-    return float(1 / (1 + np.exp(-(_CALIBRATION[0] + _CALIBRATION[1] * log_odds))))
+    return float(at_most - np.log(-np.expm1(at_most)))
+
+
+def _probability(log_odds: float) -> float:
+    return float(1 / (1 + np.exp(-log_odds)))
 
 
 def _header_row(copy: int, column: int, clock: Clock) -> float:

@@ -21,7 +21,7 @@ from rxcli import assemble, channel, clock, detect, geometry, known_picture, sam
 from rxcli.clip_start import Start, agree, lock_at, shows_little
 from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock, sample_columns
 from rxcli.options import ReceiverOptions
-from rxcli.protocol import WEIGHTS
+from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS
 from rxcli.reception import CERTAIN, HOPELESS_WEIGHT, Reception, decode, second_opinion
 from rxcli.types import (
     BurstPosteriors,
@@ -339,7 +339,7 @@ class _Clip:
             flat, now, positions, metrics = refined
             shown = _shown(place.map.inside, positions, now)
             snr = _snr(flat, now)
-        bursts = tracking.FrameBursts(frame.index, 0, now, metrics, shown)
+        bursts = tracking.FrameBursts(frame.index, 0, now, metrics, shown, tracked=True)
         return _View(
             last.camera,
             replace(last.lock, clock=now),
@@ -630,7 +630,7 @@ class _Clip:
             if refined is not None:
                 burst = view.bursts.clock.burst
                 view.flat, now, _, metrics = refined
-                view.bursts = replace(view.bursts, clock=replace(now, burst=burst), metrics=metrics)
+                view.bursts = replace(view.bursts, clock=replace(now, burst=burst), metrics=metrics, tracked=True)
 
     def _in_doubt(self, held: list[_Waiting]) -> bool:
         """Whether many columns that are lit are not certain of bursts that the frames show whole."""
@@ -685,7 +685,7 @@ class _Clip:
             going_on = np.intersect1d(waiting.numbers, following.numbers)
         first = waiting.numbers[0]
         ended = [
-            assemble.BurstInClip(b.number, int(b.number - first), b.posteriors, b.seen, b.frames)
+            assemble.BurstInClip(b.number, int(b.number - first), b.posteriors, b.seen, b.frames, _against(b))
             for b in self._bursts.close(np.setdiff1d(waiting.numbers, going_on))
         ]
         known = [p for p in (self._bursts.known(int(n)) for n in going_on if self._bursts.is_open(int(n))) if p]
@@ -733,6 +733,15 @@ def _bursts_of(frame: Frame, seen: Reception) -> tracking.FrameBursts:
     by_copy = replace(seen.clock, burst=np.arange(seen.clock.n_copies))
     shown = np.minimum(assemble.slots_seen(seen.samples, by_copy), 1)
     return tracking.FrameBursts(frame.index, 0, seen.clock, seen.metrics, shown)
+
+
+def _against(burst: tracking.ClosedBurst) -> Float32Array | None:
+    """(C,) log-likelihood against what was decided of the payload slot that says so most; None for photographs."""
+    if not burst.tracked:
+        return None
+    llr = detect.slot_llr(burst.metrics[None])[0, :, PREAMBLE_SLOTS:]
+    decided = np.sign(burst.posteriors.lit[0, :, PREAMBLE_SLOTS:] - 0.5)
+    return np.asarray(np.maximum(-llr * decided, 0).max(axis=1), np.float32)
 
 
 def _shown(inside: NDArray[np.bool_], positions: FloatArray, now: Clock) -> IntArray:

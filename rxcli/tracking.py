@@ -191,6 +191,8 @@ class FrameBursts:
     metrics: FloatArray
     #: (n_copies, C, packet) int: 1 where the slot is on the screen and in the picture.
     shown: IntArray
+    #: Whether the picture was known from other frames.
+    tracked: bool = False
 
 
 @dataclass(slots=True)
@@ -200,6 +202,7 @@ class _Burst:
     frames: list[int]
     #: (C,) columns that need no further look.
     certain: BoolArray
+    tracked: bool
     #: Of this burst alone, once detected.
     posteriors: BurstPosteriors | None = None
 
@@ -215,6 +218,10 @@ class ClosedBurst:
     #: (C, packet) how often each slot was seen.
     seen: IntArray
     frames: tuple[int, ...]
+    #: (C, packet + memory, patterns) of all frames together.
+    metrics: FloatArray
+    #: Whether the picture was known from other frames in any of them.
+    tracked: bool
 
 
 class Bursts:
@@ -247,12 +254,13 @@ class Bursts:
             have = self._open.get(int(number))
             if have is None:
                 self._open[int(number)] = _Burst(
-                    metrics[burst].copy(), seen, [view.frame], np.zeros(seen.shape[0], bool)
+                    metrics[burst].copy(), seen, [view.frame], np.zeros(seen.shape[0], bool), view.tracked
                 )
                 continue
             have.metrics += metrics[burst]
             have.seen = have.seen + seen
             have.frames.append(view.frame)
+            have.tracked |= view.tracked
 
     def is_open(self, number: int) -> bool:
         """Whether the burst can still be added to."""
@@ -300,7 +308,7 @@ class Bursts:
         self._certain |= {number: entry.certain for number, entry in entries if entry is not None}
         self._certain = {n: c for n, c in self._certain.items() if n > self._closed - _REMEMBERED}
         return [
-            ClosedBurst(number, entry.posteriors, entry.seen, tuple(entry.frames))
+            ClosedBurst(number, entry.posteriors, entry.seen, tuple(entry.frames), entry.metrics, entry.tracked)
             for number, entry in entries
             if entry is not None and entry.posteriors is not None
         ]
