@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import exp, expm1, log
 
 import numpy as np
 
@@ -261,8 +262,8 @@ def _clip_packet(column: int, clock: Clock, burst: BurstInClip) -> PacketResult 
         return packet
     log_odds = _log_odds(float(posteriors.log_prob[0, column].sum()))
     offset, slope, slope_against = _CLIP_CALIBRATION
-    log_odds = offset + slope * log_odds + slope_against * float(np.log(burst.against[column] + _AGAINST_AT_LEAST))
-    ber_hat = max(packet.ber_hat, min(_BER_AT_EVENS * float(np.exp(-_BER_EXPONENT * log_odds)), 0.5))
+    log_odds = offset + slope * log_odds + slope_against * log(float(burst.against[column]) + _AGAINST_AT_LEAST)
+    ber_hat = max(packet.ber_hat, min(_BER_AT_EVENS * exp(-_BER_EXPONENT * log_odds), 0.5))
     return None if ber_hat > MAX_BER_HAT else replace(packet, confidence=_probability(log_odds), ber_hat=ber_hat)
 
 
@@ -305,12 +306,12 @@ def _calibrated(log_prob: float) -> float:
 
 
 def _log_odds(log_prob: float) -> float:
-    at_most = float(np.clip(log_prob, -_MOST_DOUBT, -_LEAST_DOUBT))
-    return float(at_most - np.log(-np.expm1(at_most)))
+    at_most = min(max(log_prob, -_MOST_DOUBT), -_LEAST_DOUBT)
+    return at_most - log(-expm1(at_most))
 
 
 def _probability(log_odds: float) -> float:
-    return float(1 / (1 + np.exp(-log_odds)))
+    return 1 / (1 + exp(-log_odds))
 
 
 def _header_row(copy: int, column: int, clock: Clock) -> float:

@@ -333,7 +333,7 @@ class _Clip:
             if now is None:
                 return None
         with stages("detect"):
-            refined = self._refined(picture, light, flat, now, last.memory)
+            refined = self._refined(picture, light, flat, now, last.memory, thorough=self._n_held != _HELD_LONG)
             if refined is None:
                 return None
             flat, now, positions, metrics = refined
@@ -359,9 +359,11 @@ class _Clip:
         flat: known_picture.ColumnLight,
         now: Clock,
         memory: int,
+        thorough: bool,
     ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, FloatArray] | None:
         """Clock, response and noise put right by a first decision slot by slot; then positions and metrics.
 
+        Not `thorough` is enough of faded frames that will be measured again.
         None where the headers are not where the clock has them: another scene, or something in front of the screen.
         """
         positions = known_picture.row_positions(self._rows, now)
@@ -369,7 +371,7 @@ class _Clip:
         if known_picture.header_contrast(flat, positions, now) < _LEAST_HEADER:
             return None
         fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
-        if self._n_lessons < _FEW_LESSONS or fit.response.centre < _FADED:
+        if self._n_lessons < _FEW_LESSONS or (thorough and fit.response.centre < _FADED):
             flat = picture.solve_again(light, fit.expected, now.rows_per_slot)
             fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
         if fit.response.centre < _FADED:
@@ -595,57 +597,69 @@ class _Clip:
 
         Where that leaves doubt, more frames are waited for, unless it is `at_last`.
         """
-        held = [waiting for waiting in self._waiting if waiting.view is not None and waiting.numbers is not None]
-        views = [view for waiting in held if (view := waiting.view) and self._can_look_again(view)]
-        if len(views) > 1 and self._place is not None and self._model is not None:
-            self._measure_again(views, [self._grid(waiting) for waiting in held if waiting.view in views])
+        held = [w for w in self._waiting if w.view is not None and w.numbers is not None]
+        held = [w for w in held if w.view is not None and self._can_look_again(w.view)]
+        if len(held) > 1:
+            self._learn_again(held)
             self._bursts = tracking.Bursts()
-            for waiting in held:
-                self._detect(waiting, learn=False)
-        for view in views:
-            view.frame = None
-        self._n_held = _HELD_LONG if self._n_held < _HELD_LONG and not at_last and self._in_doubt(held) else 0
+            for waiting in self._waiting:
+                if waiting.view is not None and waiting.numbers is not None:
+                    self._detect(waiting, learn=False)
+        for waiting in held:
+            assert waiting.view is not None
+            waiting.view.frame = None
+        doubtful, whole = np.sum([self._doubts(waiting) for waiting in held], axis=0) if held else (0, 0)
+        wait = self._n_held < _HELD_LONG and not at_last and doubtful > _MUCH_DOUBT * whole
+        self._n_held = _HELD_LONG if wait else 0
 
     def _can_look_again(self, view: _View) -> bool:
-        return view.frame is not None or (
-            view.light is not None and self._place is not None and view.map is self._place.map
-        )
+        if self._place is None or self._model is None:
+            return False
+        return view.frame is not None or (view.light is not None and view.map is self._place.map)
 
-    def _measure_again(self, views: list[_View], known: list[Float32Array]) -> None:
-        """Frames by the picture that the others give, whose slots are `known`, (C, N) each."""
+    def _learn_again(self, held: list[_Waiting]) -> None:
+        """Learn the picture anew from all frames held, and measure those in doubt by what the others say of it."""
         assert self._place is not None
         assert self._model is not None
+        known = [self._grid(waiting) for waiting in held]
+        doubtful = [self._n_held == _HELD or self._doubts(waiting)[0] > 0 for waiting in held]
         self._picture = self._new_picture(*self._model)
         lessons = []
-        for view, lit in zip(views, known, strict=True):
+        for waiting, lit in zip(held, known, strict=True):
+            view = waiting.view
+            assert view is not None
             if view.frame is not None:
                 view.light, view.map = self._strips(view.frame), self._place.map
             lessons.append(self._learn(view, lit, keep=1.0))
-        for view, lesson in zip(views, lessons, strict=True):
-            assert view.light is not None
-            alone = len(views) > _MANY_VIEWS or lesson is None
-            picture = self._picture if alone or lesson is None else self._picture.without(view.light, *lesson)
-            flat = picture.solve(view.light)
-            refined = self._refined(picture, view.light, flat, view.bursts.clock, view.memory)
-            if refined is not None:
-                burst = view.bursts.clock.burst
-                view.flat, now, _, metrics = refined
-                view.bursts = replace(view.bursts, clock=replace(now, burst=burst), metrics=metrics, tracked=True)
+        for waiting, lesson, needed in zip(held, lessons, doubtful, strict=True):
+            if needed and waiting.view is not None:
+                self._measure_again(waiting.view, lesson if len(held) <= _MANY_VIEWS else None)
 
-    def _in_doubt(self, held: list[_Waiting]) -> bool:
-        """Whether many columns that are lit are not certain of bursts that the frames show whole."""
+    def _measure_again(self, view: _View, lesson: tuple[Float32Array, Float32Array] | None) -> None:
+        """Measure a frame by the picture, less what the frame itself has shown of it where that is given."""
+        assert self._picture is not None
+        assert view.light is not None
+        picture = self._picture if lesson is None else self._picture.without(view.light, *lesson)
+        flat = picture.solve(view.light)
+        refined = self._refined(picture, view.light, flat, view.bursts.clock, view.memory, thorough=True)
+        if refined is not None:
+            burst = view.bursts.clock.burst
+            view.flat, now, _, metrics = refined
+            view.bursts = replace(view.bursts, clock=replace(now, burst=burst), metrics=metrics, tracked=True)
+
+    def _doubts(self, waiting: _Waiting) -> tuple[int, int]:
+        """Packets of a frame in columns that are well lit and of which all was seen: those in doubt, and all."""
+        assert waiting.view is not None
+        assert waiting.numbers is not None
+        lit = np.median(waiting.view.snr, axis=1) >= _WELL_LIT_SNR
         doubtful = total = 0
-        for waiting in held:
-            assert waiting.view is not None
-            assert waiting.numbers is not None
-            lit = np.median(waiting.view.snr, axis=1) >= _WELL_LIT_SNR
-            for number in waiting.numbers:
-                known = self._bursts.known(int(number)) if self._bursts.is_open(int(number)) else None
-                if known is not None:
-                    whole = assemble.complete(self._bursts.seen(np.array([number])))[0] & lit
-                    doubtful += int((known.log_prob.sum(axis=2).min(axis=0) < _DOUBTFUL)[whole].sum())
-                    total += int(whole.sum())
-        return doubtful > _MUCH_DOUBT * total
+        for number in waiting.numbers:
+            known = self._bursts.known(int(number)) if self._bursts.is_open(int(number)) else None
+            if known is not None:
+                whole = assemble.complete(self._bursts.seen(np.array([number])))[0] & lit
+                doubtful += int((known.log_prob[0].sum(axis=1) < _DOUBTFUL)[whole].sum())
+                total += int(whole.sum())
+        return doubtful, total
 
     def _grid(self, waiting: _Waiting) -> Float32Array:
         """(C, N) probability that each slot of a frame is lit, by all that is known of its bursts."""

@@ -40,6 +40,8 @@ _BEYOND = 0.15
 _SIDE, _CENTRE, _AT_SIDE, _RIDGE = 0.5, (0.3, 1.3), (-0.1, 0.35), 1e-4
 #: Groups of rows by their precision, and the contrast that compression may leave of theirs.
 _GROUPS, _GAIN = 8, (0.15, 1.3)
+#: Rows of columns, about, from which that is measured: more would tell no more.
+_SAMPLES_OF_CONTRAST = 9000
 #: Rows of a single column's header that must show, that it be judged.
 _LEAST_ROWS = 40
 #: Largest correction of the clock at a time, slots.
@@ -439,19 +441,21 @@ def evened(seen: ColumnLight, fit: Fit) -> ColumnLight:
     """
     half = np.float32(0.5)
     level = np.log(np.maximum(seen.precision, np.float32(1e-3))).ravel()
-    order = np.argsort(level)
-    order = order[level[order] > np.log(2e-3)]
+    enough = slice(None, None, max(level.size // _SAMPLES_OF_CONTRAST, 1))
+    some = level[enough]
+    order = np.argsort(some)
+    order = order[some[order] > np.log(2e-3)]
     if order.size < 10 * _GROUPS:
         return seen
-    value = np.clip(seen.value.ravel() - half, -1.2, 1.2)
-    here, beside = fit.here.ravel() - half, fit.beside.ravel() - 1
+    value = np.clip(seen.value.ravel()[enough] - half, -1.2, 1.2)
+    here, beside = fit.here.ravel()[enough] - half, fit.beside.ravel()[enough] - 1
     middle, gain, offset = np.empty(_GROUPS), np.empty(_GROUPS), np.empty(_GROUPS)
     for number, mine in enumerate(np.array_split(order, _GROUPS)):
         model = np.stack([here[mine], beside[mine], np.ones(mine.size, np.float32)])
         normal = model @ model.T / mine.size + np.float32(1e-3) * np.eye(3, dtype=np.float32)
         centre, side, offset[number] = np.linalg.solve(normal, model @ value[mine] / mine.size + [1e-3, 0, 0])
         gain[number] = np.clip(centre + 2 * side, *_GAIN)
-        middle[number] = level[mine[mine.size // 2]]
+        middle[number] = some[mine[mine.size // 2]]
     gains = np.interp(level, middle, gain).astype(np.float32).reshape(seen.value.shape)
     offsets = np.interp(level, middle, offset).astype(np.float32).reshape(seen.value.shape)
     return ColumnLight((seen.value - half - offsets) / gains + half, seen.precision * gains * gains, seen.shrunk)
