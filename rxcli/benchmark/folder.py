@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rxcli.errors import ExitCode, ReceiverError
+from rxcli.errors import ExitCode, ReceiverError, UsageError
 from rxcli.profiles import ReadoutMode, dump_profile
 from rxcli.simulate.scenes import Scene, preset
 
@@ -30,8 +30,10 @@ if TYPE_CHECKING:
 
 #: Suffixes of the good files, by turns; every sixth is a clip.
 _STILLS = (".jpg", ".png", ".dng", ".tif", ".jpeg")
-_CLIPS = (".mp4", ".mov", ".mkv", ".avi")
+_CLIPS = (".mp4", ".avi", ".mov", ".mkv")
 _CLIP_FRAMES, _CLIP_EVERY = 4, 6
+#: Good files among which there is one of every kind that is spoilt.
+_FEWEST_GOOD = 2 * _CLIP_EVERY
 _PICTURES = ("sky", "chelsea", "gradient")
 _SUBFOLDERS = ("", "monday", "monday/roof", "tuesday")
 #: Readout modes of the one camera: name -> width, height, rows per slot. A mosaic gives up resolution to its colours.
@@ -61,7 +63,12 @@ def make_folder(folder: Path, n_good: int = 180, n_bad: int = 20, seed: int = 0)
         n_good: files that hold packets.
         n_bad: files that hold none, of as many kinds as there are.
         seed: of the scenes.
+
+    Raises:
+        UsageError: too few good files for bad ones to be made of them.
     """
+    if n_bad and n_good < _FEWEST_GOOD:
+        raise UsageError(f"bad files are made of {_FEWEST_GOOD} good ones (got {n_good})", "ask for more files")
     good = [_good_path(folder, number) for number in range(n_good)]
     for number, path in enumerate(good):
         if not path.exists():
@@ -196,7 +203,6 @@ def _write_capture(take: Take, path: Path) -> None:
 Spoil = Callable[[Sequence[Path], np.random.Generator], bytes]
 
 
-
 def _bytes_of(good: Sequence[Path], suffix: str) -> bytes:
     return next(path for path in good if path.suffix == suffix).read_bytes()
 
@@ -304,24 +310,27 @@ class Outcome:
         }
 
 
-def run(contents: Contents, scratch: Path, n_kills: int = 10, seed: int = 0) -> list[Outcome]:
-    """Decode the folder undisturbed and killed, with one worker and with two.
+def run(
+    contents: Contents, scratch: Path, n_kills: int = 10, seed: int = 0, workers: Sequence[int] = (1, 2)
+) -> list[Outcome]:
+    """Decode the folder undisturbed and killed, with each number of workers.
 
     Args:
         contents: of the folder.
         scratch: folder for results.
         n_kills: `kill -9` at random moments of every disturbed run.
         seed: of the moments.
+        workers: processes that decode; the first run of the first number is what all are held against.
     """
     scratch.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([seed, 12])
     outcomes: list[Outcome] = []
     expected: list[str] | None = None
-    for workers in (1, 2):
+    for number in workers:
         longest_s = 0.0
         for kills in (0, n_kills):
-            label = f"{workers} worker{'s' * (workers > 1)}{', killed' * (kills > 0)}"
-            job = _Job(contents, scratch / f"results-{workers}-{kills}.jsonl", workers)
+            label = f"{number} worker{'s' * (number > 1)}{', killed' * (kills > 0)}"
+            job = _Job(contents, scratch / f"results-{number}-{kills}.jsonl", number)
             code, wall_s, done = job.undisturbed() if kills == 0 else job.killed(kills, longest_s, rng)
             lines = job.lines()
             expected = lines if expected is None else expected
@@ -403,9 +412,19 @@ class _Job:
         return good, sum(row["exit_code"] != str(int(ExitCode.OK)) and bool(row["reason"]) for row in bad)
 
 
-def reasons(contents: Contents, scratch: Path) -> list[dict[str, Any]]:
-    """What the first run said of every bad file; a table."""
-    with (scratch / "results-1-0.csv").open(encoding="utf-8", newline="") as file:
+def passed(contents: Contents, outcomes: Sequence[Outcome]) -> bool:
+    """Whether every run decoded all good files, gave a reason for all bad ones, and the results of the first."""
+    wanted = len(contents.good), len(contents.bad), True
+    code = ExitCode.UNREADABLE if contents.bad else ExitCode.OK
+    return all((one.n_good, one.n_reasons, one.same) == wanted and one.exit_code == code for one in outcomes)
+
+
+def reasons(contents: Contents, scratch: Path, workers: int = 1) -> list[dict[str, Any]]:
+    """What the undisturbed run with so many workers said of every bad file; a table."""
+    with (scratch / f"results-{workers}-0.csv").open(encoding="utf-8", newline="") as file:
         rows = {row["source"]: row for row in csv.DictReader(file)}
     names = {str(path): path.relative_to(contents.folder).as_posix() for path in contents.bad}
-    return [{"file": name, "exit": int(rows[key]["exit_code"]), "reason": rows[key]["reason"]} for key, name in names.items()]
+    return [
+        {"file": name, "exit": int(rows[key]["exit_code"]), "reason": rows[key]["reason"]}
+        for key, name in names.items()
+    ]

@@ -12,6 +12,7 @@ import numpy as np
 from rxcli.pipeline import ReceiverOptions, receive
 from rxcli.profiles import CameraProfile
 from rxcli.simulate.capture import Capture, simulate_frame
+from rxcli.simulate.optics import View
 from rxcli.simulate.scenes import Scene
 from rxcli.simulate.truth import build_camera_profile
 from rxcli.truth import Score, Scorer, Truth
@@ -90,8 +91,13 @@ def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False, threads: in
 
 def stored_corners(capture: Capture) -> FloatArray:
     """(4, 2) corners of the screen on the stored picture: on the sensor, or where in-camera correction moves them."""
-    view, scene = capture.exposure.view, capture.scene
-    if not (scene.isp.correct_distortion and scene.output == "developed"):
+    scene = capture.scene
+    return corners_on_picture(capture.exposure.view, scene.isp.correct_distortion and scene.output == "developed")
+
+
+def corners_on_picture(view: View, corrected: bool) -> FloatArray:
+    """(4, 2) corners of the screen on a picture whose distortion was corrected in the camera, or not."""
+    if not corrected:
         return view.corners
     matrix = view.camera_matrix
     return np.asarray(view.pixels_to_ideal(view.corners) * matrix[[0, 1], [0, 1]] + matrix[:2, 2])

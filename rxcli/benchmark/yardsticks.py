@@ -23,7 +23,8 @@ from rxcli.protocol import (
     indices_to_bits,
     payload_bits,
 )
-from rxcli.truth import Score
+from rxcli.simulate.bound import Oracle
+from rxcli.truth import Score, Truth
 from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, Lens, PacketResult
 from rxcli.undistort import undistorted
 
@@ -46,16 +47,20 @@ def bound_score(trial: Trial) -> Score:
     """
     oracle = trial.capture.oracle
     assert oracle is not None, "the bound needs a trial with oracle=True"
-    shown = [burst.burst for burst in trial.truth.frames[0].bursts]
+    return genie_score(oracle, trial.truth)
+
+
+def genie_score(oracle: Oracle, truth: Truth) -> Score:
+    """Score of a genie on one frame, by the statistics that it was given."""
     columns = []
-    for column, w in enumerate(trial.truth.w):
+    for column, w in enumerate(truth.w):
         packets = []
-        for burst in shown:
-            decided, _, seen = oracle.decide(column, burst)
+        for burst in truth.frames[0].bursts:
+            decided, _, seen = oracle.decide(column, burst.burst)
             if seen.all():
                 packets.append(_packet(decided, w))
         columns.append(ColumnResult(column, "ok", w=w, packets=tuple(packets)))
-    return score_result(_result(columns), trial.truth)[1]
+    return score_result(_result(columns), truth)[1]
 
 
 def paper_score(trial: Trial) -> Score:

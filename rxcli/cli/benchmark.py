@@ -1,4 +1,4 @@
-"""`vlc-rx benchmark`: run time against error, time per stage, stability, calibration of the confidence."""
+"""`vlc-rx benchmark`: error, run time, stability, calibration, captures beside twins, folders, memory."""
 
 from __future__ import annotations
 
@@ -240,3 +240,83 @@ def stability(scenes: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: 
     summary = {"confident": verdict.confident, "wrong": verdict.wrong, "status": verdict.status}
     _say_written(write_outputs(out, "stability", rows, summary))
     return ExitCode.OK if verdict.stable else ExitCode.NOT_RECEIVED
+
+
+@benchmark.command()
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--twins", type=click.IntRange(1), default=3, show_default=True, help="Simulated twins of each capture.")
+@click.option(
+    "--pictures",
+    type=click.Path(exists=True, file_okay=False, path_type=Path),
+    help="Folder of the pictures shown, NAME.png or NAME.jpg for a capture with NAME in its own.",
+)
+@click.option("--only", multiple=True, metavar="TEXT", help="Captures with this in their name; may be repeated.")
+@_JOBS
+@_common
+def captures(
+    folder: Path,
+    twins: int,
+    pictures: Path | None,
+    only: tuple[str, ...],
+    jobs: int,
+    out: Path,
+    seed: int,
+    fresh: bool,
+    quiet: bool,
+) -> None:
+    """Captures of FOLDER that have a truth beside simulated twins of them: is either easier?
+
+    Beside both stands the bound, on the sensor's electrons and on the delivered file.
+    """
+    from rxcli.benchmark import captures as work
+    from rxcli.benchmark.tables import format_table, write_outputs
+
+    found = work.find_captures(folder, pictures)
+    wanted = [one for one in found if not only or any(text in one.path.name for text in only)]
+    if not wanted:
+        raise click.BadParameter(f"no capture with such a name; there are: {', '.join(o.path.name for o in found)}")
+    rows = work.run(wanted, twins, _journal(out, "captures", fresh), seed=seed, jobs=jobs, quiet=quiet)
+    click.echo(format_table(rows))
+    _say_written(write_outputs(out, "captures", rows))
+
+
+@benchmark.command()
+@click.option("--files", type=click.IntRange(1), default=200, show_default=True, help="Files of the folder.")
+@click.option("--bad", type=click.IntRange(0), default=20, show_default=True, help="Those of them that are bad.")
+@click.option("--kills", type=click.IntRange(0), default=10, show_default=True, help="Kills of each disturbed run.")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("benchmark-results"))
+@click.option("--seed", type=click.IntRange(0, 10**6), default=0, show_default=True, help="Of scenes and moments.")
+def folder(files: int, bad: int, kills: int, out: Path, seed: int) -> int:
+    """A folder of good and bad files, decoded undisturbed and by runs killed at random moments and resumed.
+
+    Exit code 1 unless all good files give packets, all bad ones a reason, and all runs the same results.
+    """
+    from rxcli.benchmark import folder as work
+    from rxcli.benchmark.tables import format_table, write_outputs
+    from rxcli.errors import ExitCode
+
+    if bad >= files:
+        raise click.BadParameter(f"--bad must be below --files, {files} (got {bad})")
+    contents = work.make_folder(out / f"folder-{files}-{bad}-{seed}", files - bad, bad, seed)
+    outcomes = work.run(contents, out / "folder-runs", kills, seed)
+    rows = [outcome.as_row() for outcome in outcomes]
+    reasons = work.reasons(contents, out / "folder-runs")
+    click.echo(format_table(rows) + "\n\n" + format_table(reasons))
+    _say_written(write_outputs(out, "folder", rows, reasons))
+    return ExitCode.OK if work.passed(contents, outcomes) else ExitCode.NOT_RECEIVED
+
+
+@benchmark.command()
+@click.option("--frames", type=click.IntRange(100), default=10_000, show_default=True, help="Frames of the clip.")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("benchmark-results"))
+def memory(frames: int, out: Path) -> None:
+    """Memory of `vlc-rx decode` over a long clip."""
+    from rxcli.benchmark import long_clip as work
+    from rxcli.benchmark.tables import format_table, write_outputs
+
+    clip = work.make_clip(out / "media", frames)
+    places = tuple(sorted({max(round(frames * share), 1) for share in (0.1, 0.2, 0.5, 1.0)}))
+    found = work.measure(clip, places, out / "media" / "long.jsonl")
+    click.echo(format_table(work.rows(found)))
+    click.echo(f"{found.growth_kb:.3g} kB a frame, {found.packets} packets")
+    _say_written(write_outputs(out, "memory", work.rows(found), {"growth_kb": found.growth_kb}))
