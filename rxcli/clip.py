@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from rxcli import assemble, channel, clock, detect, geometry, known_picture, sampling, strips, tracking
 from rxcli.clip_start import Start, agree, lock_at, shows_little
+from rxcli.dump import dump_stages
 from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock, sample_columns
 from rxcli.options import ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS
@@ -706,6 +707,8 @@ class _Clip:
         later = np.max([np.exp(p.log_prob.sum(axis=2)).max(axis=0) for p in known], axis=0) if known else None
         sure = np.zeros(view.snr.shape[0], np.float32) if later is None else later.astype(np.float32)
         columns = self._columns(view, ended, sure, view.height)
+        if self._options.dump_dir is not None:
+            dump_stages(self._options.dump_dir, waiting.result.source, waiting.result.frame, _taps(waiting, ended))
         return replace(waiting.result, columns=columns, status=assemble.clip_status(columns))
 
     def _columns(
@@ -720,6 +723,21 @@ class _Clip:
 def _taken_with(frame: Frame) -> tuple[object, ...]:
     """What the camera and the place of the picture hang on."""
     return frame.width, frame.height, frame.pixels.dtype.str, frame.black, frame.white, frame.metadata
+
+
+def _taps(waiting: _Waiting, ended: list[assemble.BurstInClip]) -> dict[str, Any]:
+    """What is written of a frame: as of a photograph, but strips as tracking samples them, and bursts that end here."""
+    view = waiting.view
+    assert view is not None
+    taps: dict[str, Any] = {"geometry.corners": waiting.result.corners, "clock": view.bursts.clock}
+    if view.light is not None and view.map is not None:
+        rows = view.map.first_row + np.arange(view.light.shape[2])
+        taps |= {"sampling.light": view.light, "sampling.inside": view.map.inside, "sampling.rows": rows}
+    else:
+        taps["sampling"] = view.lock.profiles
+    taps |= {"channel.metrics": view.bursts.metrics, "bursts.shown": view.bursts.shown}
+    taps |= {"bursts.number": waiting.numbers, "bursts.ended": np.array([burst.number for burst in ended], np.int64)}
+    return taps | {f"detect.{burst.number}": burst.posteriors for burst in ended}
 
 
 def _facts(view: _View) -> dict[str, Any]:

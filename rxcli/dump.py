@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +32,43 @@ def dump_frame(
     Raises:
         UsageError: the folder cannot be written.
     """
-    arrays: dict[str, Any] = {"geometry.corners": corners, "channel.metrics": metrics}
-    for stage, value in (("sampling", profiles), ("clock", clock), ("samples", samples), ("detect", posteriors)):
-        for item in fields(value):
-            content = getattr(value, item.name)
-            if content is not None:
-                arrays[f"{stage}.{item.name}"] = np.asarray(content)
-    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", Path(frame.source).name) or "frame"
-    path = folder / f"{stem}-{frame.index:06d}.npz"
+    stages = {
+        "geometry.corners": corners,
+        "sampling": profiles,
+        "clock": clock,
+        "samples": samples,
+        "channel.metrics": metrics,
+        "detect": posteriors,
+    }
+    return dump_stages(folder, frame.source, frame.index, stages)
+
+
+def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]) -> Path:
+    """Write arrays, and dataclasses of arrays, to `folder`/SOURCE-FRAME.npz.
+
+    Args:
+        folder: made where it does not exist.
+        source: path or device that the frame came from.
+        frame: its number.
+        stages: name -> array, or dataclass whose fields are written as `name.field`; None is left out.
+
+    Raises:
+        UsageError: the folder cannot be written.
+    """
+    arrays: dict[str, Any] = {name: array for stage, value in stages.items() for name, array in _arrays(stage, value)}
+    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", Path(source).name) or "frame"
+    path = folder / f"{stem}-{frame:06d}.npz"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         np.savez(path, **arrays)
     except OSError as error:
         raise UsageError(f"{path}: cannot be written ({error})", "name another folder with --dump-dir") from None
     return path
+
+
+def _arrays(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    if is_dataclass(value):
+        for item in fields(value):
+            yield from _arrays(f"{name}.{item.name}", getattr(value, item.name))
+    elif value is not None:
+        yield name, np.asarray(value)
