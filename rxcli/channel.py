@@ -36,10 +36,13 @@ _SIDES = (0.5, 0.25, 0.25)
 _HOLE_SLOTS = 0.7
 #: The error of the prediction is averaged over this many slots.
 _ERROR_SLOTS = 28
-#: Degrees of freedom of the Student-t likelihood.
+#: Degrees of freedom of the Student-t likelihood; `_density` is written for four.
 _DEGREES = 4.0
-#: Samples of one slot and strips of one column err alike; their summed log-likelihood counts this much.
-_TEMPER = 0.16
+#: Densities are taken to be at least this, so that their logarithm exists.
+_LEAST_DENSITY = np.float32(1e-37)
+#: Samples of one slot and strips of one column err alike: the log-likelihoods of a slot's samples, added over the
+#: strips, count as much as this many samples of one strip would.
+_TEMPER = 0.64
 #: Bounds on the relative variance of a predicted picture.
 _TEXTURE_BOUNDS = (0.003, 2.0)
 #: Log-likelihood ratio of a slot that the first guess sees at full contrast in all strips.
@@ -51,8 +54,8 @@ _DARK_FROM, _DARK_TO = 5.9, 7.1
 #: Light over the floor up to which a sample counts as dark.
 _DARK_MARGIN = 0.002
 
-#: Strips worked on at a time: what fits the cache.
-_STRIPS_AT_A_TIME = 40
+#: Samples worked on at a time: what fits the cache.
+_SAMPLES_AT_A_TIME = 60_000
 #: NumPy works outside the interpreter's lock; more threads than this gain nothing on a few columns.
 _THREADS = 2
 
@@ -228,11 +231,11 @@ def slot_likelihoods(
     """Log-likelihood of every slot pattern at every slot, given the present idea of all slots.
 
     Args:
-        samples: C columns, S strips, N slots of Q samples.
+        samples: of the columns to look at, S strips, N slots of Q samples.
         clock: the clock.
         model: the light model.
-        lit: (C, N) probability that each slot is lit.
-        columns: columns to look at; the result has these alone.
+        lit: (C, N) probability that each slot is lit, of all columns.
+        columns: which columns the samples are of; the result has these alone.
         thorough: predict the picture from each side too, and on all scales; else from both sides together, on the
             middle scales, which is several times quicker and enough for a plain picture.
     """
@@ -243,13 +246,15 @@ def slot_likelihoods(
     others_slope = _from_neighbours(slope, model, clock)
     own = model.spread[None, :, 1, None].astype(np.float32)
 
-    def of_columns(part: NDArray[np.int64]) -> SlotLikelihoods:
-        expected = _Expected(others[part], own, shape[part, None], others_slope[part] + own * slope[part, None])
+    def of_part(part: NDArray[np.int64]) -> SlotLikelihoods:
+        these = columns[part]
+        expected = _Expected(others[these], own, shape[these, None], others_slope[these] + own * slope[these, None])
         return _likelihoods(samples.light[part], samples.valid[part], expected, model, thorough)
 
-    parts = np.array_split(columns, -(-columns.size * samples.light.shape[1] // _STRIPS_AT_A_TIME))
+    n_parts = round(samples.light.size / _SAMPLES_AT_A_TIME)
+    parts = np.array_split(np.arange(columns.size), np.clip(n_parts, 1, columns.size))
     with ThreadPoolExecutor(_THREADS) as pool:
-        done = list(pool.map(of_columns, parts))
+        done = list(pool.map(of_part, parts))
     return SlotLikelihoods(
         np.concatenate([d.metrics for d in done]),
         np.concatenate([d.snr for d in done]),
@@ -271,8 +276,9 @@ def _slot_snr(valid: Float32Array, prediction: Prediction, own: Float32Array, mo
     """(C, N) squared contrast over variance of a slot, as far as strips and samples are independent."""
     contrast = prediction.picture * own
     noise = np.float32(model.sigma**2) + np.float32(model.shot) * contrast + prediction.variance * own * own
-    ratio = (contrast * contrast / noise * valid).sum(axis=1) * np.float32(_TEMPER)
-    return _by_slot(ratio, model.taps.shape[0])
+    q = model.taps.shape[0]
+    ratio = (contrast * contrast / noise * valid).sum(axis=1) * np.float32(_TEMPER / q)
+    return _by_slot(ratio, q)
 
 
 def _timing(
@@ -348,8 +354,8 @@ def predict_picture(
     hole = max(int(np.ceil(_HOLE_SLOTS * samples_per_slot)) - 1, 0)
     texture = _Texture(light, expected, valid, sigma, samples_per_slot)
     best: list[Prediction] = []
-    for scale in PICTURE_SCALES if thorough else _QUICK_SCALES:
-        half = max(int(scale * samples_per_slot), 1)
+    scales = PICTURE_SCALES if thorough else _QUICK_SCALES
+    for half in dict.fromkeys(max(int(scale * samples_per_slot), 1) for scale in scales):
         sides = _sides if thorough else _both_sides
         sums = zip(sides(_box(numerator, half), half, hole), sides(_box(denominator, half), half, hole), strict=True)
         for side, (light_seen, seen) in enumerate(sums):
@@ -435,46 +441,39 @@ def _pattern_metrics(
     n_columns, _, n = light.shape
     lead = memory * q // 2
     out = np.zeros((n_columns, n // q + memory, 1 << (memory + 1)))
-    weight = np.float32(_TEMPER) * valid
+    weight = np.float32(_TEMPER / q) * valid
+    priors = _SIDES if len(predictions) > 1 else (1.0,)
     for number, levels in enumerate(slot_patterns(memory) @ model.taps.T):
         # Sample i belongs to metric (i + lead) // q.
         mine = np.resize(np.roll(levels, -(lead % q)), n).astype(np.float32)
         whole = expected.others + expected.own * mine
-        parts = [
-            _log_likelihood(light, whole, prediction, model) + np.float32(np.log(prior))
-            for prediction, prior in zip(predictions, _SIDES, strict=False)
-        ]
-        summed = (_log_sum(parts) * weight).sum(axis=1)
-        padded = np.pad(summed, ((0, 0), (lead, memory * q - lead)))
+        density = np.zeros_like(light)
+        for prediction, prior in zip(predictions, priors, strict=True):
+            density += _density(light, whole, prediction, model, prior)
+        np.log(np.maximum(density, _LEAST_DENSITY, out=density), out=density)
+        density *= weight
+        padded = np.pad(density.sum(axis=1), ((0, 0), (lead, memory * q - lead)))
         out[:, :, number] = _by_slot(padded, q)
     return out
 
 
-def _log_likelihood(
-    light: Float32Array, whole: Float32Array, prediction: Prediction, model: LightModel
+def _density(
+    light: Float32Array, whole: Float32Array, prediction: Prediction, model: LightModel, prior: float
 ) -> Float32Array:
-    """Student-t log-density of the light, up to a constant."""
-    spread = prediction.variance * whole
-    spread += np.float32(model.shot) * prediction.picture
-    spread *= whole
-    spread += np.float32(model.sigma**2)
-    residual = light - prediction.picture * whole
-    np.square(residual, out=residual)
-    residual /= spread
-    residual *= np.float32(1 / _DEGREES)
-    np.log1p(residual, out=residual)
-    residual *= np.float32(-0.5 * (_DEGREES + 1))
-    np.log(spread, out=spread)
-    spread *= np.float32(0.5)
-    residual -= spread
-    return residual
+    """Student-t density of the light times a prior, up to a constant.
 
-
-def _log_sum(parts: list[Float32Array]) -> Float32Array:
-    if len(parts) == 1:
-        return parts[0]
-    top = np.maximum.reduce(parts)
-    total = np.zeros_like(top)
-    for part in parts:
-        total += np.exp(part - top)
-    return np.asarray(top + np.log(total))
+    With four degrees of freedom, variance v and residual r it is v^2 / (v + r^2 / 4)^2.5: a root, and no logarithm.
+    """
+    variance = prediction.variance * whole
+    variance += np.float32(model.shot) * prediction.picture
+    variance *= whole
+    variance += np.float32(model.sigma**2)
+    wide = light - prediction.picture * whole
+    np.square(wide, out=wide)
+    wide *= np.float32(1 / _DEGREES)
+    wide += variance
+    variance /= wide
+    np.square(variance, out=variance)
+    variance *= np.float32(prior)
+    variance /= np.sqrt(wide, out=wide)
+    return variance

@@ -323,29 +323,41 @@ def corrected(clock: Clock, timing: FloatArray) -> Clock:
     return replace(moved, delay_slots=clock.delay_slots - np.clip(own, -_MAX_CORRECTION, _MAX_CORRECTION))
 
 
-def sample_slots(profiles: RowProfiles, clock: Clock, samples_per_slot: int) -> SlotSamples:
+def sample_slots(
+    profiles: RowProfiles, clock: Clock, samples_per_slot: int, columns: IntArray | None = None
+) -> SlotSamples:
     """Row profiles on the slot grid of `clock`, each column at its own delay.
 
     Args:
         profiles: row profiles.
         clock: the clock.
         samples_per_slot: samples a slot, Q.
+        columns: columns to sample, all by default.
     """
     step = clock.rows_per_slot / samples_per_slot
     n = clock.n_slots * samples_per_slot
-    if not clock.delay_slots.any():
+    delays = clock.delay_slots if columns is None else clock.delay_slots[columns]
+    if columns is not None:
+        profiles = _of_columns(profiles, columns)
+    if not delays.any():
         light, valid = resample(profiles, clock.row0, step, n)
         return SlotSamples(light, valid, samples_per_slot)
-    parts = []
-    for column, delay in enumerate(clock.delay_slots):
-        one = replace(
-            profiles,
-            light=profiles.light[column : column + 1],
-            inside=profiles.inside[column : column + 1],
-            sensor_row=None if profiles.sensor_row is None else profiles.sensor_row[column : column + 1],
-        )
-        parts.append(resample(one, clock.row0 + delay * clock.rows_per_slot, step, n))
+    parts = [
+        resample(_of_columns(profiles, slice(column, column + 1)), clock.row0 + delay * clock.rows_per_slot, step, n)
+        for column, delay in enumerate(delays)
+    ]
     return SlotSamples(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), samples_per_slot)
+
+
+def _of_columns(profiles: RowProfiles, columns: IntArray | slice) -> RowProfiles:
+    rows = profiles.sensor_row
+    return replace(
+        profiles,
+        light=profiles.light[columns],
+        inside=profiles.inside[columns],
+        sensor_row=None if rows is None else rows[columns],
+        count=profiles.count[columns],
+    )
 
 
 def assign_bursts(clock: Clock, llr: Float32Array, repeats: int) -> Clock:

@@ -58,7 +58,7 @@ def denoiser_scene(frame: Frame, options: ReceiverOptions) -> denoise.Scene | No
         lock = find_lock(frame, corners, camera, options, Stages())
     except Failure:
         return None
-    return scene_of(iterate(lock, quick_look(lock)))
+    return scene_of(lock, iterate(lock, quick_look(lock)))
 
 
 def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -13,14 +13,15 @@ from rxcli import assemble, channel, clock, denoise, detect
 from rxcli.errors import ReceiverError
 from rxcli.locate import Lock, noise_of
 from rxcli.options import SKIPS, ReceiverOptions
-from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
+from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
-_SAMPLES_PER_SLOT = 4
+#: Samples a slot: of first looks, and of those at columns that are still in doubt.
+_COARSE, _FINE = 2, 4
 _MAX_ITERATIONS = 5
 #: A column all of whose symbols have at least this log probability is not looked at again.
 CERTAIN = -1e-5
-#: The quick look at the picture is surer than it should be of textured ones: it must do for all columns, and clearly.
-_CERTAIN_AT_ONCE = -1e-6
+#: The quick look at the picture is surer than it should be of textured ones.
+_CERTAIN_AT_ONCE = -1e-7
 #: A column whose slots stand out less than this has no light to speak of.
 _DARK_SNR_DB = -3.0
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
@@ -39,13 +40,17 @@ class Reception:
     """What was received of a frame."""
 
     clock: Clock
+    #: Of the quick look: strips pooled in pairs.
     samples: SlotSamples
     posteriors: BurstPosteriors
     #: (C, N): squared contrast over variance of every slot.
     snr: Float32Array
+    #: For the samples.
     model: channel.LightModel
     #: (C, N + memory, patterns).
     metrics: FloatArray
+    #: (C,) whether the metrics come of all strips on the fine grid.
+    fine: BoolArray
     #: What was skipped: name -> columns.
     skipped: dict[str, int] = field(default_factory=dict)
 
@@ -65,10 +70,10 @@ def decode(lock: Lock, skip: frozenset[str]) -> Reception:
 
 def quick_look(lock: Lock) -> Reception:
     """One pass over the strips pooled in pairs, from the first guess."""
-    profiles = clock.halved_strips(lock.profiles)
+    lock = replace(lock, profiles=clock.halved_strips(lock.profiles))
     now = lock.clock
-    samples = clock.sample_slots(profiles, now, _SAMPLES_PER_SLOT)
-    model = _light_model(replace(lock, profiles=profiles), samples)
+    samples = clock.sample_slots(lock.profiles, now, _COARSE)
+    model = _light_model(lock, samples)
     llr = channel.first_llr(*clock.slot_contrast(samples, model.sigma))
     now = clock.assign_bursts(now, llr, lock.screen.repeats)
     posteriors = _detect(channel.metrics_of(llr, model.memory), now, model, margin=0.0)
@@ -77,40 +82,76 @@ def quick_look(lock: Lock) -> Reception:
     likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
     now = clock.assign_bursts(now, detect.slot_llr(likelihoods.metrics), lock.screen.repeats)
     now = clock.corrected(now, likelihoods.timing)
-    metrics = likelihoods.metrics
-    return Reception(now, samples, _detect(metrics, now, model), likelihoods.snr, model, metrics)
+    posteriors = _detect(likelihoods.metrics, now, model)
+    fine = np.zeros(columns.size, bool)
+    return Reception(now, samples, posteriors, likelihoods.snr, model, likelihoods.metrics, fine)
 
 
 def iterate(lock: Lock, seen: Reception, skip: frozenset[str] = frozenset(SKIPS)) -> Reception:
-    """Light model and detection in turn, until every column is certain or nothing more is to be expected."""
-    now = seen.clock
-    samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
-    model = _light_model(lock, samples)
-    metrics, snr = seen.metrics.copy(), seen.snr.copy()
-    wanted = ~_dark(snr) if "dark_columns" in skip else np.ones(snr.shape[0], bool)
-    skipped = {"dark_columns": int((~wanted).sum())}
-    columns = np.flatnonzero(wanted)
+    """Light model and detection in turn, until every column is certain or nothing more is to be expected.
+
+    Columns in doubt are looked at on the coarse grid once, and those that still are on the fine one.
+    """
+    every = np.ones(seen.snr.shape[0], bool)
+    wanted = ~_dark(seen.snr) if "dark_columns" in skip else every
+    doubtful = _doubtful(seen, _CERTAIN_AT_ONCE) if "certain_columns" in skip else every
+    skipped = {"dark_columns": int((~wanted).sum()), "certain_columns": 0}
     for iteration in range(_MAX_ITERATIONS):
+        columns = np.flatnonzero(wanted & doubtful)
+        skipped["certain_columns"] += int(wanted.sum()) - columns.size
         if columns.size == 0:
             break
-        lit = channel.lit_on_grid(seen.posteriors, now)
-        likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns)
-        metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
         before = seen.posteriors.index
-        seen = Reception(now, samples, _detect(metrics, now, model), snr, model, metrics)
+        seen, timing = _look_again(lock, seen, columns, fine=iteration > 0)
         if iteration == 0:
-            bursts = now.burst
-            now = clock.assign_bursts(now, detect.slot_llr(metrics), lock.screen.repeats)
-            if not np.array_equal(now.burst, bursts):
-                seen = replace(seen, clock=now, posteriors=_detect(metrics, now, model))
-        columns = np.flatnonzero(wanted & _unsettled(seen, before, iteration, skip))
-        skipped["certain_columns"] = skipped.get("certain_columns", 0) + int(wanted.sum()) - columns.size
-        if iteration == 0:
-            timing = np.zeros((wanted.size, 2))
-            timing[wanted] = likelihoods.timing
-            now = clock.corrected(now, timing)
-            samples = clock.sample_slots(lock.profiles, now, _SAMPLES_PER_SLOT)
+            seen = _with_bursts_of(seen, detect.slot_llr(seen.metrics), lock.screen.repeats)
+            seen = replace(seen, clock=clock.corrected(seen.clock, timing))
+        doubtful = _unsettled(seen, before, iteration, skip)
     return replace(seen, skipped={name: count for name, count in skipped.items() if count})
+
+
+def _look_again(lock: Lock, seen: Reception, columns: NDArray[np.int64], fine: bool) -> tuple[Reception, FloatArray]:
+    """What is seen with some columns looked at again, and the (C, 2) timing of all, 0 for the others."""
+    samples, model = _view(lock, seen, columns, _FINE if fine else _COARSE)
+    lit = channel.lit_on_grid(seen.posteriors, seen.clock)
+    likelihoods = channel.slot_likelihoods(samples, seen.clock, model, lit, columns)
+    metrics, snr, of_fine = seen.metrics.copy(), seen.snr.copy(), seen.fine.copy()
+    timing = np.zeros((lit.shape[0], 2))
+    metrics[columns], snr[columns], of_fine[columns] = likelihoods.metrics, likelihoods.snr, fine
+    timing[columns] = likelihoods.timing
+    posteriors = _replaced(seen.posteriors, columns, _detect(metrics[columns], seen.clock, model))
+    return replace(seen, metrics=metrics, snr=snr, posteriors=posteriors, fine=of_fine), timing
+
+
+def _view(
+    lock: Lock, seen: Reception, columns: NDArray[np.int64], samples_per_slot: int
+) -> tuple[SlotSamples, channel.LightModel]:
+    """All strips of some columns, and the light model of the quick look fitted to them."""
+    now, quick = seen.clock, seen.samples
+    samples = clock.sample_slots(lock.profiles, now, samples_per_slot, columns)
+    n_strips = samples.light.shape[1]
+    # A sample of the quick look has so many times the pixels.
+    larger = n_strips / quick.light.shape[1]
+    larger *= _rows_per_sample(now, quick.samples_per_slot) / _rows_per_sample(now, samples_per_slot)
+    model = replace(
+        seen.model,
+        sigma=seen.model.sigma * larger**0.5,
+        shot=seen.model.shot * larger,
+        spread=channel.spread_matrix(n_strips, lock.screen.light_spread),
+        taps=_taps(now, samples_per_slot),
+    )
+    return samples, model
+
+
+def _replaced(every: BurstPosteriors, columns: NDArray[np.int64], some: BurstPosteriors) -> BurstPosteriors:
+    """Posteriors of all columns, with those of some in their place."""
+
+    def merged(name: str) -> Any:
+        out = getattr(every, name).copy()
+        out[columns if name.startswith("w") else (slice(None), columns)] = getattr(some, name)
+        return out
+
+    return BurstPosteriors(*(merged(field.name) for field in fields(BurstPosteriors)))
 
 
 def _dark(snr: Float32Array) -> NDArray[np.bool_]:
@@ -144,8 +185,6 @@ def second_opinion(
     """
     if options.cae == "never":
         return seen, frozenset(), None
-    if options.cae == "always" and seen.samples.light.shape[1] < lock.profiles.light.shape[1]:
-        seen = iterate(lock, seen)
     doubtful = np.ones(seen.snr.shape[0], bool) if options.cae == "always" else _doubtful(seen, _DOUBTFUL)
     columns = np.flatnonzero(doubtful)
     if columns.size == 0:
@@ -153,11 +192,15 @@ def second_opinion(
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
     try:
         denoiser = _denoiser()
-        log_odds = denoiser.slot_log_odds(scene_of(seen), columns)
+        log_odds = denoiser.slot_log_odds(scene_of(lock, seen), columns)
     except ReceiverError as error:
         return seen, frozenset(), {**report, "columns": 0, "message": str(error)}
+    coarse = columns[~seen.fine[columns]]
+    if coarse.size:
+        # Likelihoods compare on the same samples alone.
+        seen, _ = _look_again(lock, seen, coarse, fine=True)
     seen = _with_bursts_of(seen, log_odds, lock.screen.repeats)
-    again = _restart(seen, log_odds, columns)
+    again = _restart(lock, seen, log_odds, columns)
     better = _evidence(again.metrics, seen) > _evidence(seen.metrics[columns], seen)
     kept = columns[better]
     metrics, snr = seen.metrics.copy(), seen.snr.copy()
@@ -174,10 +217,10 @@ def _denoiser() -> denoise.Denoiser:
     return denoise.load_denoiser()
 
 
-def scene_of(seen: Reception) -> denoise.Scene:
-    model = seen.model
+def scene_of(lock: Lock, seen: Reception) -> denoise.Scene:
+    samples, model = _view(lock, seen, np.arange(seen.snr.shape[0]), denoise.SAMPLES_PER_SLOT)
     lit = channel.lit_on_grid(seen.posteriors, seen.clock)
-    return denoise.Scene(seen.samples, seen.clock, lit, model.floor, model.sigma, model.shot, model.spread)
+    return denoise.Scene(samples, seen.clock, lit, model.floor, model.sigma, model.shot, model.spread)
 
 
 def _with_bursts_of(seen: Reception, log_odds: Float32Array, repeats: int) -> Reception:
@@ -188,13 +231,16 @@ def _with_bursts_of(seen: Reception, log_odds: Float32Array, repeats: int) -> Re
     return replace(seen, clock=now, posteriors=_detect(seen.metrics, now, seen.model))
 
 
-def _restart(seen: Reception, log_odds: Float32Array, columns: NDArray[np.int64]) -> channel.SlotLikelihoods:
+def _restart(
+    lock: Lock, seen: Reception, log_odds: Float32Array, columns: NDArray[np.int64]
+) -> channel.SlotLikelihoods:
     """Light model and detection of some columns from given log-odds of their slots; the other columns stay."""
     lit = channel.lit_on_grid(seen.posteriors, seen.clock).copy()
-    metrics = channel.metrics_of(log_odds, seen.model.memory)
+    samples, model = _view(lock, seen, columns, _FINE)
+    metrics = channel.metrics_of(log_odds, model.memory)
     for _ in range(_RESTART_ITERATIONS):
-        lit[columns] = channel.lit_on_grid(_detect(metrics, seen.clock, seen.model), seen.clock)
-        likelihoods = channel.slot_likelihoods(seen.samples, seen.clock, seen.model, lit, columns)
+        lit[columns] = channel.lit_on_grid(_detect(metrics, seen.clock, model), seen.clock)
+        likelihoods = channel.slot_likelihoods(samples, seen.clock, model, lit, columns)
         metrics = likelihoods.metrics
     return likelihoods
 
@@ -222,14 +268,21 @@ def _detect(
 
 def _light_model(lock: Lock, samples: SlotSamples) -> channel.LightModel:
     now, profiles = lock.clock, lock.profiles
-    memory = channel.memory_for(now.exposure_slots)
-    rows_per_sample = max(now.rows_per_slot / _SAMPLES_PER_SLOT, 1.0)
+    rows = _rows_per_sample(now, samples.samples_per_slot)
     floor = channel.estimate_floor(samples, now)
-    least = noise_of(profiles) / np.sqrt(rows_per_sample)
     return channel.LightModel(
         floor=floor,
-        sigma=channel.estimate_sigma(samples, floor, 0.5 * float(least)),
-        shot=profiles.noise_slope / max(float(np.median(profiles.count)), 1.0) / rows_per_sample,
+        sigma=channel.estimate_sigma(samples, floor, 0.5 * noise_of(profiles) / rows**0.5),
+        shot=profiles.noise_slope / max(float(np.median(profiles.count)), 1.0) / rows,
         spread=channel.spread_matrix(samples.light.shape[1], lock.screen.light_spread),
-        taps=channel.exposure_taps(now.exposure_slots, 1 / _SAMPLES_PER_SLOT, memory, _SAMPLES_PER_SLOT),
+        taps=_taps(now, samples.samples_per_slot),
     )
+
+
+def _rows_per_sample(now: Clock, samples_per_slot: int) -> float:
+    return max(now.rows_per_slot / samples_per_slot, 1.0)
+
+
+def _taps(now: Clock, samples_per_slot: int) -> FloatArray:
+    memory = channel.memory_for(now.exposure_slots)
+    return channel.exposure_taps(now.exposure_slots, 1 / samples_per_slot, memory, samples_per_slot)
