@@ -32,7 +32,7 @@ CONFIDENT = 0.99
 _ROWS_PER_SLOT = (1.5, 6.0)
 _WIDTH_PX = (48, 400)
 #: Every so many random scenes are received again on other threads.
-_THREADS_EVERY = 20
+_THREADS_EVERY = 50
 #: Size of the panel of small scenes: drawing the picture would otherwise take longer than the reception.
 _PANEL_PX = (342, 192)
 #: Ties: float32 may decide otherwise where the best two log-probabilities are this close.

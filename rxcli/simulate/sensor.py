@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -76,8 +77,16 @@ class Sensor:
 
     def pixel_gains(self) -> Float32Array:
         """(tile, tile) gains of the pixels; the same for every picture of this sensor."""
-        rng = np.random.Generator(np.random.SFC64(20240814))
-        return 1 + np.float32(self.prnu) * rng.standard_normal((_GAIN_TILE, _GAIN_TILE), dtype=np.float32)
+        return 1 + np.float32(self.prnu) * _gain_tile()
+
+
+@lru_cache(maxsize=1)
+def _gain_tile() -> Float32Array:
+    """(tile, tile) standard normal numbers, drawn once: small frames would take longer over them than over the rest."""
+    rng = np.random.Generator(np.random.SFC64(20240814))
+    tile: Float32Array = rng.standard_normal((_GAIN_TILE, _GAIN_TILE), dtype=np.float32)
+    tile.flags.writeable = False
+    return tile
 
 
 def pick_colours(planes: Float32Array, pattern: NDArray[np.uint8] | None, first_row: int) -> Float32Array:
