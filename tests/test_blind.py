@@ -177,7 +177,7 @@ def _flat_strips(light: FloatArray) -> blind.Strips:
         x=np.broadcast_to(np.linspace(10, 790, light.shape[0])[:, None], light.shape),
         rows=np.arange(n_rows, dtype=np.float64),
         n_columns=20,
-        sigma=0.002,
+        noise=blind.Noise(0.002**2, 0.0),
         width=800,
         height=n_rows,
     )

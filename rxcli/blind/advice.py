@@ -34,7 +34,7 @@ def why_not(strips: Strips) -> str:
             "only a part of the screen's height shows stripes; the picture may be merged from several exposures or "
             "taken with flash: switch HDR and flash off, or use a manual-camera app"
         )
-    level, weight = levelled(strips.light, strips.inside, 38, strips.sigma)
+    level, weight = levelled(strips.light, strips.inside, 38, strips.noise)
     columns = (level * weight).reshape(strips.n_columns, -1, strips.rows.size).mean(axis=1)
     width = half_width(autocorrelation(columns))
     if width < HALF_WIDTH[0] * MIN_ROWS_PER_SLOT:
@@ -50,7 +50,7 @@ def why_not(strips: Strips) -> str:
 
 def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
     """Correlation of neighbouring strips in bands of rows, 0..1; and whether a band is lit."""
-    level, weight = levelled(strips.light, strips.inside, BEND_LEVEL_ROWS, strips.sigma)
+    level, weight = levelled(strips.light, strips.inside, BEND_LEVEL_ROWS, strips.noise)
     blocks = np.linspace(0, strips.rows.size, _LIKENESS_BANDS + 1).astype(int)[:-1]
     step = strip_distances(strips)[0] if strip_distances(strips) else 1
 

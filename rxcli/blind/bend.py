@@ -74,7 +74,7 @@ def _lag_correlations(strips: Strips, distance: int) -> tuple[Float32Array, Floa
         (lags, strips, windows) float32; (4, strips, windows) float64 rows.
     """
     n_rows = strips.light.shape[1]
-    level = levelled(strips.light, strips.inside, BEND_LEVEL_ROWS, strips.sigma)[0]
+    level = levelled(strips.light, strips.inside, BEND_LEVEL_ROWS, strips.noise)[0]
     borders = np.linspace(_BEND_LAGS, n_rows - _BEND_LAGS, _BEND_WINDOWS + 1).astype(int)
     middles = (borders[1:] + borders[:-1]) // 2
     rows, x = strips.rows[middles], strips.x[:, middles]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rxcli.blind.strips import EXTREMES_SLOTS, levelled
+from rxcli.blind.strips import EXTREMES_SLOTS, Noise, levelled
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.types import BoolArray, Clock, FloatArray, RowProfiles
@@ -60,7 +60,7 @@ def _strip_slots(profiles: RowProfiles, borders: FloatArray) -> tuple[FloatArray
 
     seen = integral(inside.astype(np.float64)) > 0.99
     means = (integral(light) * seen).astype(np.float32)
-    level, _ = levelled(means, seen.astype(np.float32), EXTREMES_SLOTS, 1e-4)
+    level, _ = levelled(means, seen.astype(np.float32), EXTREMES_SLOTS, Noise(1e-8, 0.0))
     return level.astype(np.float64), seen
 
 

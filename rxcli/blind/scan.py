@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.blind.strips import SAMPLES, Strips, levelled
+from rxcli.blind.strips import SAMPLES, Noise, Strips, levelled
 from rxcli.blind.structure import structure_evidence
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.types import Float32Array, FloatArray
@@ -47,6 +47,8 @@ class Hypothesis:
     reversed: bool
     #: Log-likelihood ratio of header and weights over chance; of the scan while it was not tried.
     evidence: float
+    #: How much headers and repeats stood out in the scan.
+    salience: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +81,7 @@ def _octaves(strips: Strips) -> list[_Octave]:
         if light.shape[1] * rows < 2 * PREAMBLE_SLOTS * least:
             break
         window = round(_OCTAVE_ROWS * most / (_OCTAVE[1] * rows))
-        noise = strips.sigma / np.sqrt(rows)
+        noise = strips.noise.over(rows)
         columns = _pooled(light, (inside > 0.99).astype(np.float32), window, noise, strips.n_columns)
         correlation = autocorrelation(columns)
         width = half_width(correlation) * rows
@@ -96,9 +98,9 @@ def _halved(values: Float32Array) -> Float32Array:
     return np.asarray((values[:, 0:even:2] + values[:, 1:even:2]) / 2, np.float32)
 
 
-def _pooled(light: Float32Array, inside: Float32Array, window: int, sigma: float, n_columns: int) -> Float32Array:
+def _pooled(light: Float32Array, inside: Float32Array, window: int, noise: Noise, n_columns: int) -> Float32Array:
     """(C, R) mean of the levelled strips of each column, small where little light is behind it."""
-    level, weight = levelled(light, inside, window, sigma)
+    level, weight = levelled(light, inside, window, noise)
     total = weight.reshape(n_columns, -1, weight.shape[1]).sum(axis=1)
     summed = (level * weight).reshape(n_columns, -1, weight.shape[1]).sum(axis=1)
     return np.asarray(summed / (total + 0.01) * (total / (total + 1)), np.float32)
@@ -239,7 +241,7 @@ def _try(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
     borders = np.arange(first, columns.shape[1], rows_per_slot)
     total = np.concatenate([np.zeros((columns.shape[0], 1)), np.cumsum(columns, axis=1)], axis=1)
     evidence = structure_evidence(_slot_means(total, borders), -before % fine.packet_slots, fine.packet_slots)
-    return replace(fine, start_row=start * octave.rows, evidence=evidence)
+    return replace(fine, start_row=start * octave.rows, evidence=evidence, salience=hypothesis.evidence)
 
 
 def _slot_means(total: FloatArray, borders: FloatArray) -> FloatArray:

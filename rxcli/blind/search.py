@@ -9,14 +9,16 @@ import numpy as np
 
 from rxcli.blind.advice import why_not
 from rxcli.blind.bend import estimate_bend, straightened
-from rxcli.blind.refine import _ALIKE, BlindEstimate, refine
 from rxcli.blind.scan import Hypothesis, alike, find_clocks
 from rxcli.blind.strips import Strips
+from rxcli.blind.timing import _ALIKE, BlindEstimate, refine
 from rxcli.profiles import ScreenProfile
 from rxcli.types import FloatArray
 
 #: Log-likelihood ratio of header and weights, over chance, that a clock must reach.
-MIN_EVIDENCE = 30.0
+MIN_EVIDENCE = 45.0
+#: Share of the light's local variance that the slots of a clock must explain; wrong clocks explain less than a tenth.
+_LEAST_EXPLAINED = 0.15
 
 #: A bend that fits this many nats better than none is tried; from the second on, it alone.
 _BEND_GAINS = (5.0, 25.0)
@@ -24,8 +26,10 @@ _BEND_GAINS = (5.0, 25.0)
 #: Hypotheses that are refined, and the share of the best one's evidence that another needs.
 _REFINED, _CLOSE_EVIDENCE = 3, 0.3
 
+#: After an estimate of this evidence, others need this share of the first one's.
+_PLAIN_EVIDENCE, _RIVAL = 150.0, 0.7
 #: Below this evidence, more of them.
-_WEAK_EVIDENCE, _REFINED_IF_WEAK = 120.0, 8
+_WEAK_EVIDENCE, _REFINED_IF_WEAK = 120.0, 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,24 +61,37 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     found.sort(key=lambda pair: -pair[0].evidence)
     estimates: list[BlindEstimate] = []
     for clock, b in _worth_refining(found):
+        if any(e.evidence > _PLAIN_EVIDENCE for e in estimates) and clock.evidence < _RIVAL * found[0][0].evidence:
+            continue
         exposure = exposure_s * rates[clock.packet_slots] if exposure_s else None
-        estimates.append(refine(strips, clock, b, exposure))
+        estimates.append(refine(strips, clock, b, exposure, sure=gain > _BEND_GAINS[1]))
     best = max(estimates, key=lambda estimate: _plausibility(estimate, strips, estimates[0]), default=None)
-    if best is None or best.evidence < MIN_EVIDENCE:
+    if best is None or best.evidence < MIN_EVIDENCE or best.explained < _LEAST_EXPLAINED:
         return BlindSearch(None, why_not(strips))
     return BlindSearch(best)
 
 
 def _worth_refining(found: list[tuple[Hypothesis, FloatArray]]) -> list[tuple[Hypothesis, FloatArray]]:
-    """The best hypothesis, and others of another period, packet, direction or bend that come close."""
+    """The best hypothesis, and others of another period, packet, direction or bend that come close.
+
+    Where slots cannot be told by eye (dark pictures, long exposures) those that stood out in the scan come too.
+    """
+    if not found:
+        return []
+    best = found[0][0].evidence
+    close = [pair for pair in found[: 4 * _REFINED] if pair[0].evidence >= _CLOSE_EVIDENCE * best]
+    chosen = _distinct(close, _REFINED) or found[:1]
+    if best < _WEAK_EVIDENCE:
+        chosen = _distinct([*chosen, *sorted(found, key=lambda pair: -pair[0].salience)], _REFINED_IF_WEAK)
+    return chosen
+
+
+def _distinct(found: list[tuple[Hypothesis, FloatArray]], most: int) -> list[tuple[Hypothesis, FloatArray]]:
     chosen: list[tuple[Hypothesis, FloatArray]] = []
-    most = _REFINED_IF_WEAK if found and found[0][0].evidence < _WEAK_EVIDENCE else _REFINED
     for clock, bend in found:
-        if len(chosen) == most or clock.evidence < _CLOSE_EVIDENCE * found[0][0].evidence:
-            break
-        if not any(alike(clock, other) and bend is b for other, b in chosen):
+        if len(chosen) < most and not any(alike(clock, other) and bend is b for other, b in chosen):
             chosen.append((clock, bend))
-    return chosen or found[:1]
+    return chosen
 
 
 def _plausibility(estimate: BlindEstimate, strips: Strips, first: BlindEstimate) -> float:

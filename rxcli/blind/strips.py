@@ -16,6 +16,24 @@ EXTREMES_SLOTS = 19
 
 #: Samples a slot while the clock is sought.
 SAMPLES = 4
+#: Of light that is nothing but rounding.
+_LEAST_VARIANCE = 1e-10
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """A strip's row of light x has variance floor + slope * x."""
+
+    floor: float
+    slope: float
+
+    def over(self, n: int) -> Noise:
+        """The noise of the mean of `n` rows."""
+        return Noise(self.floor / n, self.slope / n)
+
+    def variance(self, light: Float32Array) -> Float32Array:
+        """Variance of rows of some light."""
+        return np.maximum(light, np.float32(0)) * np.float32(self.slope) + np.float32(self.floor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +48,7 @@ class Strips:
     #: (R,) float64: rows counted in readout order from the picture's first one read.
     rows: FloatArray
     n_columns: int
-    #: Standard deviation of a strip's row of no light.
-    sigma: float
+    noise: Noise
     #: Size of the picture.
     width: int
     height: int
@@ -50,14 +67,14 @@ def strips_of(profiles: RowProfiles, centre_x: FloatArray, width: int, height: i
     join = n_strips // _STRIPS if n_strips % _STRIPS == 0 else 1
     shape = (n_columns * n_strips // join, join, n_rows)
     inside = profiles.inside.reshape(shape).astype(np.float32).min(axis=1)
-    sigma = np.sqrt(profiles.noise_floor / max(float(np.median(profiles.count)), 1.0) / join)
+    pixels = max(float(np.median(profiles.count)), 1.0) * join
     return Strips(
         light=profiles.light.reshape(shape).mean(axis=1) * inside,
         inside=inside,
         x=centre_x.reshape(shape).mean(axis=1),
         rows=profiles.rows.astype(np.float64),
         n_columns=n_columns,
-        sigma=float(sigma),
+        noise=Noise(profiles.noise_floor / pixels, profiles.noise_slope / pixels),
         width=width,
         height=height,
     )
@@ -74,13 +91,14 @@ def in_readout_order(strips: Strips) -> Strips:
     )
 
 
-def levelled(light: Float32Array, inside: Float32Array, window: int, sigma: float) -> tuple[Float32Array, Float32Array]:
+def levelled(light: Float32Array, inside: Float32Array, window: int, noise: Noise) -> tuple[Float32Array, Float32Array]:
     """Light against mean and spread of the `window` rows around it; and the weight behind it, 0..1."""
     import cv2
 
     size = (window | 1, 1)
     share = cv2.blur(inside, size) + np.float32(1e-3)
     mean = cv2.blur(light, size) / share
-    variance = np.maximum(cv2.blur(light * light, size) / share - mean * mean, 0)
-    level = np.clip((light - mean) / np.sqrt(variance + np.float32(9 * sigma**2)), -3, 3) * inside
-    return level, variance / (variance + np.float32(16 * sigma**2)) * inside
+    random = noise.variance(mean) + np.float32(_LEAST_VARIANCE)
+    signal = np.maximum(cv2.blur(light * light, size) / share - mean * mean - random, 0)
+    level = np.clip((light - mean) / np.sqrt(signal + 9 * random), -3, 3) * inside
+    return level, signal / (signal + 16 * random) * inside

@@ -8,11 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.blind.strips import EXTREMES_SLOTS, SAMPLES, Strips, levelled
-from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
-from rxcli.types import BoolArray, Float32Array, FloatArray
+from rxcli.blind.trellis import lit_probability, pattern_light
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
+from rxcli.types import Float32Array, FloatArray
 
-#: Exposures that are compared, slots.
-_EXPOSURES = np.array([0.15, 0.3, 0.45, 0.6, 0.8, 1.0, 1.2, 1.4, 1.7, 2.0, 2.35, 2.7, 3.1])
+#: Exposures that are compared, slots; and those near one, as factors.
+_EXPOSURES = np.array([0.3, 0.7, 1.1, 1.5, 1.9, 2.3, 2.8])
+_NEAR_EXPOSURES = np.array([0.8, 1.0, 1.25])
+
+#: Reach of a column's light, columns; less than this share of a strip's light is left out.
+_LIGHT_SPREAD, _LEAST_SHARE = 0.45, 0.02
+
+#: Rounds of levels and slots at every step; slots over which levels are taken; weight of a column's own level there.
+_ROUNDS, _LEVEL_SLOTS = 1, 31
+_GAIN_PRIOR = np.float32(0.05)
+#: Log-odds of known slots; and the say of a sample, as samples of a slot err alike.
+_KNOWN, _TEMPER = 6.0, 0.5
+#: Noise that is expected of levelled light before any is known.
+_FIRST_POWER = 0.3
+#: Rounds of weights and how many columns have them.
+_SHARING_ROUNDS = 5
 
 #: Slots over which the light of a strip may be taken as constant.
 LOCAL_SLOTS = 15
@@ -25,11 +40,25 @@ class Grid:
     first_slot: int
     packet_slots: int
 
-    def header(self, n: int) -> tuple[NDArray[np.int64], BoolArray]:
-        """Slots of the headers among slots 0..n, and whether they are lit."""
+    def log_odds(self, w: NDArray[np.int64], n: int) -> FloatArray:
+        """(C, n) prior log-odds of slots 0..n: headers and dimming symbols are known, others are lit by the weight."""
         position = (np.arange(n) + self.first_slot) % self.packet_slots
-        slots = np.flatnonzero(position < SLOTS_PER_SYMBOL)
-        return slots, np.array(HEADER, bool)[position[slots]]
+        out = np.log(w / (SLOTS_PER_SYMBOL - w))[:, None] + np.zeros(n)
+        preamble = position < PREAMBLE_SLOTS
+        symbol = np.arange(SLOTS_PER_SYMBOL) < w[:, None]
+        known = np.concatenate([np.broadcast_to(np.array(HEADER, bool), symbol.shape), symbol], axis=1)
+        out[:, preamble] = np.where(known[:, position[preamble]], _KNOWN, -_KNOWN)
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Slots:
+    """What is believed of the columns' slots."""
+
+    #: (C, N) float32: probability that a slot is lit.
+    lit: Float32Array
+    #: (C,) int64: weight of every column.
+    w: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +70,19 @@ class Waves:
     weight: Float32Array
 
 
+def column_shares(strips: Strips) -> FloatArray:
+    """(M, C) share of every column's light in every strip's, for columns that are lit alike."""
+    n_strips = strips.light.shape[0]
+    across = (np.arange(n_strips) + 0.5) / n_strips * strips.n_columns
+    light = np.exp(-((across[:, None] - np.arange(strips.n_columns) - 0.5) ** 2) / (2 * _LIGHT_SPREAD**2))
+    light[light < _LEAST_SHARE * light.max(axis=1, keepdims=True)] = 0
+    return np.asarray(light / light.sum(axis=1, keepdims=True))
+
+
 def column_waves(strips: Strips, time: Float32Array, rows_per_slot: float) -> Waves:
     """Levelled light of every column by slot position."""
     window = round(EXTREMES_SLOTS * rows_per_slot / (strips.rows[1] - strips.rows[0]))
-    level, weight = levelled(strips.light, strips.inside, window, strips.sigma)
+    level, weight = levelled(strips.light, strips.inside, window, strips.noise)
     n = (int(time.max()) + 2) * SAMPLES
     per_column = strips.light.shape[0] // strips.n_columns
     column = np.arange(strips.light.shape[0]) // per_column
@@ -63,44 +101,133 @@ def _slot_values(waves: Waves) -> Float32Array:
     return np.asarray(summed / (weight.sum(axis=2) + np.float32(1e-3)), np.float32)
 
 
-def decide(waves: Waves, exposure_slots: float, grid: Grid | None) -> BoolArray:
-    """(C, N) lit slots: the nearer of the extremes, then with the neighbours' share through the exposure taken off.
+def first_slots(waves: Waves, exposure_slots: float, grid: Grid) -> Slots:
+    """Slots at the levels that each weight would give, of the weight that explains its column best."""
+    pattern = pattern_light(exposure_slots, SAMPLES)
+    n_columns, n = waves.value.shape[0], waves.value.shape[1] // SAMPLES
+    w = np.repeat(np.array(WEIGHTS), n_columns)
+    known = grid.log_odds(w, n)
+    many = Waves(np.tile(waves.value, (len(WEIGHTS), 1)), np.tile(waves.weight, (len(WEIGHTS), 1)))
+    levels = np.array([_expected_levels(one, exposure_slots) for one in WEIGHTS], np.float32)
+    gain, offset = (np.broadcast_to(np.repeat(one, n_columns)[:, None], many.value.shape) for one in levels.T)
+    power = np.full((w.size, 1), _FIRST_POWER, np.float32)
+    lit, _ = lit_probability(_pattern_metric(many, gain, offset, power, pattern), known)
+    gain, offset, residual = _levels(many, lit, exposure_slots)
+    power = _power(many, residual)
+    lit, evidence = lit_probability(_pattern_metric(many, gain, offset, power, pattern), known)
+    evidence = evidence - 0.5 * _TEMPER * _trust(many).sum(axis=1) * np.log(power[:, 0])
+    best = _shared_weights(evidence.reshape(len(WEIGHTS), n_columns))
+    return Slots(lit.reshape(len(WEIGHTS), n_columns, n)[best, np.arange(n_columns)], np.array(WEIGHTS)[best])
 
-    The headers of `grid` are taken as known; None where they are to be seen.
+
+def _shared_weights(evidence: FloatArray) -> NDArray[np.int64]:
+    """(C,) most probable weight of each column, where weights that many columns have are more probable."""
+    prior = np.full((evidence.shape[0], 1), 1 / evidence.shape[0])
+    for _ in range(_SHARING_ROUNDS):
+        posterior = np.exp(evidence - evidence.max(axis=0)) * prior
+        posterior /= posterior.sum(axis=0)
+        prior = posterior.mean(axis=1, keepdims=True) + 0.01
+    return np.asarray(posterior.argmax(axis=0))
+
+
+def decide(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots, rounds: int = _ROUNDS) -> Slots:
+    """Slots by rounds of levels from slots and slots from levels; weights stay.
+
+    Args:
+        waves: light by slot position.
+        exposure_slots: exposure.
+        grid: where the headers are.
+        slots: to start from.
+        rounds: of levels and slots.
     """
-    mean = _slot_values(waves)
-    n = mean.shape[1]
-    windows = np.pad(mean, ((0, 0), (EXTREMES_SLOTS // 2, EXTREMES_SLOTS // 2)), mode="edge")
-    around = np.lib.stride_tricks.sliding_window_view(windows, EXTREMES_SLOTS, axis=1)
-    high, low = around.max(axis=2), around.min(axis=2)
-    value = (2 * mean - high - low) / (high - low + np.float32(1e-3))
-    header, lit_header = grid.header(n) if grid else (np.zeros(0, np.int64), np.zeros(0, bool))
-    state = np.sign(value)
-    state[:, header] = np.where(lit_header, 1, -1)
-    taps = _slot_taps(exposure_slots)
-    reach = taps.size // 2
-    for sweep in range(8):
-        padded = np.pad(state, ((0, 0), (reach, reach)))
-        others = sum(taps[k] * padded[:, k : k + n] for k in range(taps.size) if k != reach)
-        turn = slice(sweep % 2, None, 2)
-        state[:, turn] = np.where(value - others >= 0, 1, -1)[:, turn]
-        state[:, header] = np.where(lit_header, 1, -1)
-    return np.asarray(state > 0)
+    n = waves.value.shape[1] // SAMPLES
+    lit = _fitted(slots.lit, n)
+    known = grid.log_odds(slots.w, n)
+    pattern = pattern_light(exposure_slots, SAMPLES)
+    for _ in range(rounds):
+        gain, offset, residual = _levels(waves, lit, exposure_slots)
+        lit, _ = lit_probability(_pattern_metric(waves, gain, offset, _power(waves, residual), pattern), known)
+    return Slots(lit, slots.w)
 
 
-def _slot_taps(exposure_slots: float) -> FloatArray:
-    """Share of each slot in the mean over a slot of the light seen through the exposure, odd length."""
-    fine = 40
-    box = np.ones(max(round(exposure_slots * fine), 1))
-    shape = np.convolve(np.convolve(box / box.size, np.ones(fine)), np.ones(fine) / fine)
-    reach = int(np.ceil((exposure_slots + 1) / 2))
-    lags = np.arange(-reach, reach + 1)
-    centre = (shape.size - 1) / 2
-    return np.asarray(np.interp(centre + lags * fine, np.arange(shape.size), shape, left=0, right=0))
+def _fitted(lit: Float32Array, n: int) -> Float32Array:
+    """Slots cut, or filled with doubt, to a number of `n`."""
+    more = n - lit.shape[1]
+    return lit[:, :n] if more <= 0 else np.pad(lit, ((0, 0), (0, more)), constant_values=0.5)
+
+
+def packet_evidence(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots) -> float:
+    """Log-likelihood ratio of headers and dimming symbols being where they must, over slots of any kind, nats."""
+    n = slots.lit.shape[1]
+    gain, offset, residual = _levels(waves, slots.lit, exposure_slots)
+    metric = _pattern_metric(waves, gain, offset, _power(waves, residual), pattern_light(exposure_slots, SAMPLES))
+    _, known = lit_probability(metric, grid.log_odds(slots.w, n))
+    _, free = lit_probability(metric, _duty_log_odds(slots.w)[:, None] + np.zeros(n))
+    # A column may be too dark to say anything.
+    return float(np.logaddexp(known - free, 0.0).sum() - slots.w.size * np.log(2.0))
+
+
+def _expected_levels(w: int, exposure_slots: float) -> tuple[float, float]:
+    """Gain and offset of levelled light, which has no mean and a variance of one, for symbols of weight `w`."""
+    duty = w / SLOTS_PER_SYMBOL
+    light = pattern_light(exposure_slots, SAMPLES)
+    n_bits = light.shape[0].bit_length() - 1
+    lit = np.array([bin(p).count("1") for p in range(light.shape[0])])
+    share = duty**lit * (1 - duty) ** (n_bits - lit)
+    mean = (share @ light).mean()
+    gain = 1 / np.sqrt((share @ (light - mean) ** 2).mean())
+    return float(gain), float(-gain * mean)
+
+
+def _duty_log_odds(w: NDArray[np.int64]) -> FloatArray:
+    return np.asarray(np.log(w / (SLOTS_PER_SYMBOL - w)))
+
+
+def _power(waves: Waves, residual: Float32Array) -> Float32Array:
+    """(C, 1) weighted mean of squares that are left."""
+    trust = _trust(waves)
+    total = trust.sum(axis=1, keepdims=True) + np.float32(1e-6)
+    return np.asarray((trust * residual).sum(axis=1, keepdims=True) / total + np.float32(1e-4))
+
+
+def _trust(waves: Waves) -> Float32Array:
+    """(C, n) say of every sample, 0 to 1."""
+    return np.asarray(np.minimum(waves.weight / (np.median(waves.weight, axis=1, keepdims=True) + 1e-6), 1), np.float32)
+
+
+def _pattern_metric(
+    waves: Waves, gain: Float32Array, offset: Float32Array, power: Float32Array, pattern: FloatArray
+) -> Float32Array:
+    """(C, N, patterns) log-likelihood of every slot's samples at given levels and noise, up to a constant."""
+    scale = _trust(waves) * np.float32(_TEMPER / 2) / power
+    shape = (waves.value.shape[0], -1, SAMPLES)
+    value, gain, scale = ((waves.value - offset).reshape(shape), gain.reshape(shape), scale.reshape(shape))
+    light = pattern.astype(np.float32)
+    square = (value * value * scale).sum(axis=2, keepdims=True)
+    return np.asarray(2 * (value * gain * scale) @ light.T - (gain * gain * scale) @ (light * light).T - square)
+
+
+def _levels(waves: Waves, lit: Float32Array, exposure_slots: float) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Of every sample: gain and offset of lit slots thereabouts, and the square that is expected to be left."""
+    centres = np.broadcast_to((np.arange(waves.value.shape[1]) + 0.5) / SAMPLES, waves.value.shape)
+    column = np.arange(lit.shape[0])
+    wave, _ = seen_through(lit, centres, column, exposure_slots)
+    unsure, _ = seen_through(lit * (1 - lit), centres, column, exposure_slots)
+    unsure /= np.float32(max(exposure_slots, 1.0))
+    window, weight = _LEVEL_SLOTS * SAMPLES, waves.weight
+    share = local_mean(weight, window) + np.float32(1e-3)
+    mean_value, mean_wave = local_mean(waves.value * weight, window) / share, local_mean(wave * weight, window) / share
+    both = local_mean(waves.value * wave * weight, window) / share - mean_value * mean_wave
+    power = local_mean((wave * wave + unsure) * weight, window) / share - mean_wave * mean_wave
+    total = weight.sum(axis=1, keepdims=True) + np.float32(1e-6)
+    overall = (both * weight).sum(axis=1, keepdims=True) / ((power * weight).sum(axis=1, keepdims=True) + 0.01 * total)
+    gain = (np.maximum(both, 0) + _GAIN_PRIOR * np.maximum(overall, 0)) / (np.maximum(power, 0) + _GAIN_PRIOR)
+    offset = mean_value - gain * mean_wave
+    return gain, offset, (waves.value - offset - gain * wave) ** 2 + gain * gain * unsure
 
 
 def seen_through(
-    lit: BoolArray, time: FloatArray | Float32Array, column: NDArray[np.int64], exposure_slots: float
+    lit: Float32Array, time: FloatArray | Float32Array, column: NDArray[np.int64], exposure_slots: float
 ) -> tuple[Float32Array, Float32Array]:
     """Light 0..1 of slots through the exposure at slot positions (n, m) of columns (n,); and its change per slot."""
     n = lit.shape[1]
@@ -131,19 +258,32 @@ def local_mean(values: Float32Array, window: int) -> Float32Array:
     return np.asarray(cv2.blur(values, (window | 1, 1)))
 
 
-def estimate_exposure(waves: Waves, grid: Grid) -> tuple[float, float]:
-    """Exposure in slots by the blur of the slots' edges, and its standard deviation."""
-    errors = np.array([_misfit(waves, exposure, decide(waves, exposure, grid)) for exposure in _EXPOSURES])
-    best = int(np.clip(errors.argmin(), 1, _EXPOSURES.size - 2))
-    bend, slope, _ = np.polyfit(_EXPOSURES[best - 1 : best + 2], np.log(errors[best - 1 : best + 2]), 2)
+def estimate_exposure(waves: Waves, grid: Grid, slots: Slots, near: float | None = None) -> tuple[float, float, Slots]:
+    """Exposure in slots by the blur of the slots' edges.
+
+    Args:
+        waves: light by slot position.
+        grid: where the headers are.
+        slots: to start from.
+        near: what it is near to; None to try all.
+
+    Returns:
+        The exposure, its standard deviation, and the slots at the exposure tried that is nearest to it.
+    """
+    tried = _EXPOSURES if near is None else near * _NEAR_EXPOSURES
+    found = [decide(waves, exposure, grid, slots) for exposure in tried]
+    errors = np.log([_misfit(waves, exposure, one.lit) for exposure, one in zip(tried, found, strict=True)])
+    best = int(errors.argmin())
+    inner = int(np.clip(best, 1, tried.size - 2))
+    bend, slope, _ = np.polyfit(tried[inner - 1 : inner + 2], errors[inner - 1 : inner + 2], 2)
     if bend <= 0:
-        return float(_EXPOSURES[errors.argmin()]), 0.3
-    found = float(np.clip(-slope / (2 * bend), _EXPOSURES[0], _EXPOSURES[-1]))
+        return float(tried[best]), 0.3, found[best]
+    exposure = float(np.clip(-slope / (2 * bend), tried[inner - 1], tried[inner + 1]))
     independent = waves.value.size / SAMPLES
-    return found, float(np.clip(np.sqrt(1 / (bend * independent)), 0.02, 0.5))
+    return exposure, float(np.clip(np.sqrt(1 / (bend * independent)), 0.02, 0.5)), found[best]
 
 
-def _misfit(waves: Waves, exposure_slots: float, lit: BoolArray) -> float:
+def _misfit(waves: Waves, exposure_slots: float, lit: Float32Array) -> float:
     """Weighted square of what the slots through this exposure leave of the waves, as a share."""
     centres = np.broadcast_to((np.arange(waves.value.shape[1]) + 0.5) / SAMPLES, waves.value.shape)
     wave, _ = seen_through(lit, centres, np.arange(lit.shape[0]), exposure_slots)

@@ -10,25 +10,40 @@ from numpy.typing import NDArray
 from rxcli.blind.bend import BEND_SCALE, bend_terms, reversed_bend
 from rxcli.blind.scan import Hypothesis
 from rxcli.blind.strips import Strips, in_readout_order
-from rxcli.blind.structure import structure_evidence
-from rxcli.blind.waves import LOCAL_SLOTS, Grid, column_waves, decide, estimate_exposure, local_mean, seen_through
-from rxcli.types import BoolArray, Float32Array, FloatArray
+from rxcli.blind.waves import (
+    LOCAL_SLOTS,
+    Grid,
+    Slots,
+    column_shares,
+    column_waves,
+    decide,
+    estimate_exposure,
+    first_slots,
+    local_mean,
+    packet_evidence,
+    seen_through,
+)
+from rxcli.types import Float32Array, FloatArray
 
 _BEND_PRECISION = np.concatenate([[0.0, 0.0], BEND_SCALE**-2])
 
 #: Samples of a slot and strips of a column err alike: so many of them say what one would.
 _ALIKE = 10.0
 
-_REFINE_STEPS = 8
+_REFINE_STEPS = 10
+#: Steps in which the clock alone moves, where no bend is known: slots that are wrong yet would bend it.
+_RIGID_STEPS = 3
 
-#: Steps at which the exposure is estimated.
+#: Exposure before any is known, slots; and steps at which it is estimated.
+_FIRST_EXPOSURE = 1.2
 _EXPOSURE_STEPS = (1, 3)
 
 #: The descent ends when no row moves by more slots than this.
 _CONVERGED = 0.003
 
-#: Chi-square of the four coefficients that a bend beyond doubt has; unbent pictures stay below 35.
-_BENT_CHI_SQUARE = 80.0
+#: Chi-square of the four coefficients that a bend beyond doubt has. Columns share too much for it to be taken at its
+#: word: unbent pictures reach 150.
+_BENT_CHI_SQUARE = 160.0
 
 #: Keeps the clock of a row-time map and drops its bend.
 _FLAT = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
@@ -72,10 +87,11 @@ class _Timing:
     evidence: float
     #: Share of the strips' local variance that the slots explain.
     explained: float
+    slots: Slots
 
 
 def refine(
-    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None = None
+    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None = None, sure: bool = False
 ) -> BlindEstimate:
     """The clock, the bend and the exposure that fit all light of the picture best.
 
@@ -84,10 +100,11 @@ def refine(
         hypothesis: a clock found on the straightened strips.
         bend: the bend they were straightened with.
         exposure_slots: exposure, None to estimate it.
+        sure: whether the stripes are bent without doubt.
     """
     ordered, bend = (in_readout_order(strips), reversed_bend(bend)) if hypothesis.reversed else (strips, bend)
     ordered = _thinned(ordered, hypothesis.rows_per_slot)
-    timing, corrected = _fit_timing(ordered, hypothesis, bend, exposure_slots)
+    timing, corrected = _fit_timing(ordered, hypothesis, bend, exposure_slots, sure)
     found, sd = timing.values[2:], np.sqrt(np.diag(timing.covariance))
     return BlindEstimate(
         rows_per_slot=float(timing.values[1]),
@@ -121,12 +138,12 @@ def _thinned(strips: Strips, rows_per_slot: float) -> Strips:
         inside=inside,
         x=mean(strips.x),
         rows=mean(strips.rows),
-        sigma=strips.sigma / np.sqrt(join),
+        noise=strips.noise.over(join),
     )
 
 
 def _fit_timing(
-    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None
+    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None, sure: bool
 ) -> tuple[_Timing, bool]:
     """The row-time map, with a bend only where it is beyond doubt: one that is free for nothing blurs the period."""
     first_row = strips.rows[0] - 0.5 * (strips.rows[1] - strips.rows[0])
@@ -135,32 +152,42 @@ def _fit_timing(
     grid = Grid(-before % hypothesis.packet_slots, hypothesis.packet_slots)
     values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
     bent = _descend(strips, grid, values, exposure_slots, n_free=6)
-    if _is_bent(bent):
+    if sure or _is_bent(bent):
         return bent, True
     values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else bent.values * _FLAT
-    flat = _descend(strips, grid, values, bent.exposure_slots, n_free=2)
+    flat = _descend(strips, grid, values, bent.exposure_slots, n_free=2, slots=bent.slots)
     return replace(flat, exposure_sd=bent.exposure_sd), False
 
 
-def _descend(strips: Strips, grid: Grid, values: FloatArray, exposure_slots: float | None, n_free: int) -> _Timing:
+def _descend(
+    strips: Strips,
+    grid: Grid,
+    values: FloatArray,
+    exposure_slots: float | None,
+    n_free: int,
+    slots: Slots | None = None,
+) -> _Timing:
     """Gauss-Newton on the first `n_free` values of the row-time map, deciding the slots anew at every step."""
     terms = _time_terms(strips)
-    exposure, exposure_sd = exposure_slots or 1.0, 0.0
+    exposure, exposure_sd = exposure_slots or _FIRST_EXPOSURE, 0.0
+    if slots is None:
+        waves = column_waves(strips, _slot_time(strips, terms, values), values[1])
+        slots = first_slots(waves, exposure, grid)
     for step in range(_REFINE_STEPS):
         time = _slot_time(strips, terms, values)
         waves = column_waves(strips, time, values[1])
         if exposure_slots is None and step in _EXPOSURE_STEPS:
-            exposure, exposure_sd = estimate_exposure(waves, grid)
-        lit = decide(waves, exposure, grid)
-        change, covariance, explained = _gauss_newton(strips, terms, values, time, lit, exposure, n_free)
+            near = None if step == _EXPOSURE_STEPS[0] else exposure
+            exposure, exposure_sd, slots = estimate_exposure(waves, grid, slots, near)
+        slots = decide(waves, exposure, grid, slots)
+        free = n_free if step >= _RIGID_STEPS or values[2:].any() else 2
+        change, covariance, explained = _gauss_newton(strips, terms, values, time, slots.lit, exposure, free)
         values = values + change
         moved = float(np.abs(_slot_time(strips, terms, values)[:, ::_BLOCK_ROWS] - time[:, ::_BLOCK_ROWS]).max())
-        if moved < _CONVERGED and step >= max(_EXPOSURE_STEPS):
+        if moved < _CONVERGED and step > max(_EXPOSURE_STEPS):
             break
-    # Headers that were taken as known are no evidence: they are looked at anew.
-    seen = decide(waves, exposure, None).astype(np.float64)
-    evidence = structure_evidence(seen, grid.first_slot, grid.packet_slots)
-    return _Timing(values, covariance, exposure, exposure_sd, evidence, explained)
+    evidence = packet_evidence(waves, exposure, grid, slots)
+    return _Timing(values, covariance, exposure, exposure_sd, evidence, explained, slots)
 
 
 def _time_terms(strips: Strips) -> FloatArray:
@@ -188,14 +215,13 @@ def _gauss_newton(
     terms: FloatArray,
     values: FloatArray,
     time: Float32Array,
-    lit: BoolArray,
+    lit: Float32Array,
     exposure_slots: float,
     n_free: int,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Step of the row-time map, its covariance, and the share of variance explained before the step."""
-    per_column = strips.light.shape[0] // strips.n_columns
-    column = np.arange(strips.light.shape[0]) // per_column
-    wave, slope = seen_through(lit, time, column, exposure_slots)
+    mixed = np.asarray(column_shares(strips) @ lit, np.float32)
+    wave, slope = seen_through(mixed, time, np.arange(mixed.shape[0]), exposure_slots)
     pitch = float(strips.rows[1] - strips.rows[0])
     window = round(LOCAL_SLOTS * values[1] / pitch)
     inside = strips.inside
@@ -205,7 +231,7 @@ def _gauss_newton(
     variance = local_mean(wave * wave * inside, window) / share - mean_wave * mean_wave
     gain = np.maximum(covariance, 0) / (variance + np.float32(0.02))
     residual = (strips.light - mean_light - gain * (wave - mean_wave)) * inside
-    spread = local_mean(residual * residual, window) / share + np.float32(strips.sigma**2)
+    spread = local_mean(residual * residual, window) / share + strips.noise.variance(mean_light)
     power = gain * slope
     weight = inside / spread
     fit = residual * weight * power
@@ -248,6 +274,6 @@ def _solve(
 
 
 def _is_bent(timing: _Timing) -> bool:
-    """Whether the bend is beyond doubt; columns share too much for its chi-square to be taken at its word."""
+    """Whether the bend is beyond doubt."""
     bend, covariance = timing.values[2:], timing.covariance[2:, 2:]
     return float(bend @ np.linalg.solve(covariance + 1e-8 * np.diag(BEND_SCALE**2), bend)) > _BENT_CHI_SQUARE
