@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from rxcli import geometry
 from rxcli.benchmark import captures
-from rxcli.benchmark.delivered import aligned, delivered
+from rxcli.benchmark.delivered import delivered
 from rxcli.benchmark.trial import Trial, simulate_trial
 from rxcli.benchmark.yardsticks import bound_score, genie_score
 from rxcli.cli.benchmark import benchmark
@@ -73,8 +73,9 @@ def test_a_genie_who_decides_worse_than_the_receiver_gives_no_bound(bright: Tria
 
 def test_the_start_of_the_clock_is_found(bright: Trial) -> None:
     exposure = replace(bright.capture.exposure, start_slot=0.0)
-    found = aligned(bright.frame, exposure, small().isp, bright.corners, lens_of(bright), (START - 5, START + 5))
-    assert found.start_slot == pytest.approx(START, abs=0.06)
+    starts = START - 5, START + 5
+    found = delivered(bright.frame, exposure, small().isp, bright.corners, lens_of(bright), starts)
+    assert found.oracle.exposure.start_slot == pytest.approx(START, abs=0.06)
 
 
 @pytest.fixture(scope="module")

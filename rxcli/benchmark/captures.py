@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from rxcli import geometry
-from rxcli.benchmark.delivered import Delivered, aligned, delivered
+from rxcli.benchmark.delivered import Delivered, delivered
 from rxcli.benchmark.journal import Journal, Record, Task, run_tasks
 from rxcli.benchmark.statistics import wilson
 from rxcli.benchmark.trial import corners_on_picture, frame_of
@@ -29,7 +29,6 @@ from rxcli.pipeline import ReceiverOptions, receive
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile
 from rxcli.simulate.camera import Exposure
 from rxcli.simulate.capture import Capture, Take, prepare
-from rxcli.simulate.isp import Isp
 from rxcli.simulate.optics import Lens, Pose
 from rxcli.simulate.pictures import picture_names
 from rxcli.simulate.scenes import PRESETS, Scene, preset
@@ -238,18 +237,13 @@ def _look_at_file(reference: Reference) -> Look:
     frame = next(iter(open_source(reference.path)))
     scene = replace(reference.scene, payload=reference.message, start_slot=max(reference.starts))
     exposure = prepare(scene, 0).exposure()
-    best = max(
-        (_delivered(frame, exposure, replace(scene.isp, tone=tone), reference) for tone in ("srgb", "bt709")),
-        key=lambda found: found.explained,
-    )
+    found = []
+    for tone in ("srgb", "bt709"):  # the truth does not tell
+        isp = replace(scene.isp, tone=tone)
+        corners, lens = _geometry(exposure, isp.correct_distortion, reference)
+        found.append(delivered(frame, exposure, isp, corners, lens, reference.starts))
+    best = max(found, key=lambda one: one.explained)
     return Look(score, None, *_bound(best, reference.truth, score), best.light)
-
-
-def _delivered(frame: Frame, exposure: Exposure, isp: Isp, reference: Reference) -> Delivered:
-    """The genie's statistics of a capture, whose clock starts where its light agrees best with what was sent."""
-    corners, lens = _geometry(exposure, isp.correct_distortion, reference)
-    exposure = aligned(frame, exposure, isp, corners, lens, reference.starts)
-    return delivered(frame, exposure, isp, corners, lens)
 
 
 def _geometry(exposure: Exposure, corrected: bool, reference: Reference) -> tuple[FloatArray, Any]:

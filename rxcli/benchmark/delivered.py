@@ -61,7 +61,14 @@ class _AlwaysLit(Link):
         return np.ones((self.screen.columns, stop - first), np.uint8)
 
 
-def delivered(frame: Frame, exposure: Exposure, isp: Isp, corners: FloatArray, lens: Lens | None) -> Delivered:
+def delivered(
+    frame: Frame,
+    exposure: Exposure,
+    isp: Isp,
+    corners: FloatArray,
+    lens: Lens | None,
+    starts: tuple[float, float] | None = None,
+) -> Delivered:
     """The genie's statistics of a developed file.
 
     Args:
@@ -70,35 +77,12 @@ def delivered(frame: Frame, exposure: Exposure, isp: Isp, corners: FloatArray, l
         isp: how the file was developed: tone curve, and whether its distortion was corrected.
         corners: (4, 2) of the screen on the stored picture.
         lens: of the stored picture.
+        starts: first and last slot at which row 0 may have begun: the one at which the file's light agrees best with
+            what was sent is taken; None: the exposure knows it.
     """
     outlines = _outlines(corners, exposure.link.screen.columns, frame, lens)
-    known = _Known(exposure, isp, outlines, sampling.sample_rows(frame, outlines, _tone(isp)))
-    return known.delivered()
-
-
-def aligned(
-    frame: Frame,
-    exposure: Exposure,
-    isp: Isp,
-    corners: FloatArray,
-    lens: Lens | None,
-    span: tuple[float, float],
-) -> Exposure:
-    """The exposure with the start of its clock where the file's light agrees best, between two slots.
-
-    Args:
-        frame: see `delivered`.
-        exposure: whose `start_slot` is known about.
-        isp: see `delivered`.
-        corners: see `delivered`.
-        lens: see `delivered`.
-        span: first and last `start_slot` to try.
-    """
-    outlines = _outlines(corners, exposure.link.screen.columns, frame, lens)
-    known = _Known(exposure, isp, outlines, sampling.sample_rows(frame, outlines, _tone(isp)))
-    best = known.best_start(np.arange(span[0], span[1] + _COARSE_STEP, _COARSE_STEP))
-    best = known.best_start(best + np.arange(-_COARSE_STEP, _COARSE_STEP + _FINE_STEP, _FINE_STEP))
-    return replace(exposure, start_slot=best)
+    profiles = sampling.sample_rows(frame, outlines, _tone(isp))
+    return _Known(exposure, isp, outlines, profiles, starts).delivered()
 
 
 def _outlines(corners: FloatArray, n_columns: int, frame: Frame, lens: Lens | None) -> Outlines:
@@ -145,7 +129,14 @@ def _effective_luma(mean_e: Float32Array, to_panel: Float32Array, tone: Tone) ->
 class _Known:
     """A file's strips, and what the genie knows of them."""
 
-    def __init__(self, exposure: Exposure, isp: Isp, outlines: Outlines, profiles: RowProfiles) -> None:
+    def __init__(
+        self,
+        exposure: Exposure,
+        isp: Isp,
+        outlines: Outlines,
+        profiles: RowProfiles,
+        starts: tuple[float, float] | None,
+    ) -> None:
         self._exposure = exposure
         self._profiles = profiles
         self._outlines = outlines
@@ -156,12 +147,15 @@ class _Known:
         slots_per_row = exposure.sensor.line_delay_s * exposure.slot_rate_hz
         self._window = round(_FIT_SLOTS / slots_per_row)
         self._step = max(round(1 / (slots_per_row * _ROWS_PER_SLOT)), 1)
-        self._curve = self._curve_of(full_light(exposure, isp))
-
-    def _curve_of(self, full: NDArray[np.uint16]) -> Float32Array:
-        """(levels, C, S, R) light of the strips at `_LEVELS` of the full light, pixels clipped where the file's are."""
+        full = full_light(exposure, isp)
         linear = self._sampled(full)
-        self._curve = np.stack([linear * level for level in _LEVELS])
+        self._curve: Float32Array = np.stack([linear * level for level in _LEVELS])
+        if starts is not None:
+            self._exposure = replace(exposure, start_slot=self._best_start(*starts))
+        self._curve = self._clipped(full)
+
+    def _clipped(self, full: NDArray[np.uint16]) -> Float32Array:
+        """(levels, C, S, R) light of the strips at `_LEVELS` of the full light, pixels clipped where the file's are."""
         fit = self._fitted(self._expected(self._lit_shares(self._exposure)))
         cap = 65535 * float((1 - np.median(fit.offset)) / max(float(np.median(fit.gain)), 1e-9))
         curve = [
@@ -174,8 +168,12 @@ class _Known:
             Frame(picture, "full light", white=65535.0, linear=True), self._outlines, "linear"
         ).light
 
-    def best_start(self, starts: FloatArray) -> float:
+    def _best_start(self, low: float, high: float) -> float:
         """The start of the clock at which the known picture explains most of the light."""
+        coarse = self._best_of(np.arange(low, high + _COARSE_STEP, _COARSE_STEP))
+        return self._best_of(coarse + np.arange(-_COARSE_STEP, _COARSE_STEP + _FINE_STEP, _FINE_STEP))
+
+    def _best_of(self, starts: FloatArray) -> float:
         some = slice(None, None, self._step)
         inside = self._profiles.inside[..., some]
         left = []
