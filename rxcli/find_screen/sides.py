@@ -1,0 +1,133 @@
+"""Sides of the screen as curves, and lines through the places where energy begins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rxcli.types import BoolArray, FloatArray
+
+#: Sides in the order of `ScreenSearch.corners`: side i goes from corner i to corner i + 1.
+TOP, RIGHT, BOTTOM, LEFT = range(4)
+#: Direction in which x or y grows from each side into the screen; and sign of its slope in depth for a positive roll.
+INWARD = (1, -1, -1, 1)
+TURN = (1, 1, -1, -1)
+SIDE_NAMES = ("top", "right", "bottom", "left")
+#: Pairs of places through which lines are tried.
+_TRIES = 140
+#: Pairs that are closer than this share of the side say little of its slope.
+_PAIR_APART = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """One side of the screen: x of left and right, y of top and bottom, as a polynomial of the other coordinate."""
+
+    #: Highest power first, of (t - middle) / half.
+    coefficients: FloatArray
+    middle: float
+    half: float
+    #: Share of the side that supports it; 0 where it is inferred.
+    support: float
+
+    def at(self, t: FloatArray) -> FloatArray:
+        """Place of the side at `t`."""
+        return np.asarray(np.polyval(self.coefficients, (t - self.middle) / self.half), np.float64)
+
+    @property
+    def slope(self) -> float:
+        """Change of place with t at the middle."""
+        return float(self.coefficients[-2] / self.half)
+
+    def moved(self, distance: float) -> Side:
+        """The side, moved across itself."""
+        coefficients = self.coefficients.copy()
+        coefficients[-1] += distance
+        return Side(coefficients, self.middle, self.half, self.support)
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line through places of depth: depth = start + slope * t."""
+
+    start: float
+    slope: float
+    #: Share of the places that lie on it, nearer ones counting more.
+    support: float
+
+
+def across(side: int) -> bool:
+    """Whether a side runs along the rows."""
+    return side in (TOP, BOTTOM)
+
+
+def straight(corners: FloatArray, side: int) -> Side:
+    """The straight side between two corners."""
+    a, b = corners[side], corners[(side + 1) % 4]
+    (ta, pa), (tb, pb) = (a, b) if across(side) else (a[::-1], b[::-1])
+    half = (tb - ta) / 2 if tb != ta else 1.0
+    return Side(np.array([(pb - pa) / 2, (pa + pb) / 2]), float((ta + tb) / 2), float(half), 1.0)
+
+
+def extent(sides: list[Side], height: int) -> float:
+    """Width of the screen in pixels, through the picture's middle."""
+    middle = np.array(height / 2)
+    return abs(float(sides[RIGHT].at(middle) - sides[LEFT].at(middle)))
+
+
+def corners_of(sides: list[Side], width: int, height: int) -> FloatArray:
+    """(4, 2) where neighbouring sides meet, by turns."""
+    found = []
+    for flat, upright in ((TOP, LEFT), (TOP, RIGHT), (BOTTOM, RIGHT), (BOTTOM, LEFT)):
+        x, y = np.array(width / 2), np.array(height / 2)
+        for _ in range(12):
+            x = sides[upright].at(y)
+            y = sides[flat].at(x)
+        found.append((float(x), float(y)))
+    return np.array(found)
+
+
+def outermost_line(
+    t: FloatArray,
+    depth: FloatArray,
+    weight: FloatArray,
+    seen: BoolArray,
+    tolerance: float,
+    *,
+    slope: float,
+    spread: float,
+    outside_cost: float,
+) -> Line | None:
+    """The best supported line with little beyond it, by trying lines through pairs of places.
+
+    Args:
+        t: (n,) place along the side.
+        depth: (n,) where energy begins, growing inwards.
+        weight: (n,) support that a place may give, 0..1.
+        seen: (n,) places that may speak against one.
+        tolerance: distance at which support ends.
+        slope: expected slope.
+        spread: largest deviation from it.
+        outside_cost: how often a place counts against a line that it lies outside of.
+
+    Returns:
+        None where there is too little.
+    """
+    candidates = np.flatnonzero(weight)
+    if candidates.size < 5:
+        return None
+    i, j = np.random.default_rng(1).choice(candidates, (2, _TRIES))
+    far = np.abs(t[i] - t[j]) > _PAIR_APART * np.ptp(t)
+    i, j = i[far], j[far]
+    slopes = (depth[j] - depth[i]) / (t[j] - t[i])
+    fitting = np.abs(slopes - slope) < spread
+    i, slopes = i[fitting], slopes[fitting]
+    if not i.size:
+        return None
+    starts = depth[i] - slopes * t[i]
+    beyond = (depth[seen] - starts[:, None] - slopes[:, None] * t[seen]) / tolerance
+    support = np.maximum(1 - beyond**2, 0) @ weight[seen]
+    against = np.clip(-beyond - 1, 0, 1).sum(axis=1)
+    best = int((support - outside_cost * against).argmax())
+    return Line(float(starts[best]), float(slopes[best]), float(support[best] / t.size))
