@@ -41,13 +41,15 @@ from rxcli.types import (
 _HELD, _HELD_LONG = 6, 24
 #: Squared contrast over variance of a slot that is well lit, log probability of a packet in doubt, and much doubt.
 _WELL_LIT_SNR, _DOUBTFUL, _MUCH_DOUBT = 10.0, -0.05, 0.03
+#: Squared contrast over variance of a slot, at which all copies of a packet together do not give one.
+_DARK_SNR = 0.3
 #: Frames beyond which each one's share of what is known of the picture does not matter.
 _MANY_VIEWS = 12
 #: Frames that find their clock together where each shows little.
 _TOGETHER = 8
 #: Frames that may wait until it is clear which copies begin a burst.
 _MAX_WAITING = 8
-#: Frames whose corners are averaged at the start, and how often they are looked at from then on.
+#: Frames whose corners are averaged at the start; how often they, and dark columns, are looked at from then on.
 _FIRST_LOOKS, _LOOK_EVERY = 4, 30
 #: Looks whose median is where the corners are.
 _LOOKS = 5
@@ -540,12 +542,21 @@ class _Clip:
         certain = self._bursts.certain(still_open)
         if "certain_columns" not in self._options.skip:
             certain[:] = False
+        dark = ~certain & self._dark(view)
         self._skip(waiting, "certain_columns", int(certain.sum()))
-        self._detect_open(still_open, ~certain)
+        self._skip(waiting, "dark_columns", int(dark.sum()))
+        self._detect_open(still_open, ~certain & ~dark)
         if view.flat is not None:
             if learn:
                 self._learn(view, self._grid(waiting))
             self._last = view
+
+    def _dark(self, view: _View) -> NDArray[np.bool_]:
+        """(C,) columns of a tracked frame with too little light to try; now and then they are tried all the same."""
+        tried = self._n_held or view.bursts.frame % _LOOK_EVERY == 0
+        if view.flat is None or "dark_columns" not in self._options.skip or tried:
+            return np.zeros(view.snr.shape[0], bool)
+        return np.asarray(np.median(view.snr, axis=1) < _DARK_SNR)
 
     def _detect_open(self, numbers: IntArray, wanted: NDArray[np.bool_]) -> None:
         """Detect the wanted columns, (B, C), of open bursts."""
@@ -646,6 +657,7 @@ class _Clip:
         if refined is not None:
             burst = view.bursts.clock.burst
             view.flat, now, _, metrics = refined
+            view.snr = _snr(view.flat, now)
             view.bursts = replace(view.bursts, clock=replace(now, burst=burst), metrics=metrics, tracked=True)
 
     def _doubts(self, waiting: _Waiting) -> tuple[int, int]:

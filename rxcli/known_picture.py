@@ -22,6 +22,8 @@ from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray
 MEMORY = 0.95
 #: Weight of the picture around a row against one frame's look at the row itself at full light.
 _SMOOTH = 0.05
+#: Share of a strip's light in doubt, inverse, from which it says nothing of the picture.
+_DOUBT = 4.0
 #: Rows around, in each direction, from which the picture of a row that was never lit is taken.
 _AROUND_ROWS = 4
 #: Relative error of a picture taken from the rows around, and of one that was looked at well.
@@ -129,8 +131,8 @@ class KnownPicture:
     ) -> tuple[Float32Array, Float32Array]:
         """Light and light expected of a picture of 1, each weighted with the latter."""
         expected = self._spread @ _with_neighbours(slots)
-        trust = np.minimum.reduce(_with_neighbours(trust, 1.0), axis=1)
-        weighted = expected * (trust[:, None] * self._inside)
+        doubt = self._spread @ (1 - _with_neighbours(trust, 1.0))
+        weighted = expected * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * self._inside
         return weighted * (light - self._floor), weighted * expected
 
     def solve(self, light: Float32Array) -> ColumnLight:
@@ -153,7 +155,8 @@ class KnownPicture:
             expected: (C, R) light that the slots decided so far give.
             rows_per_slot: rows per slot.
         """
-        assert self._system is not None
+        if self._system is None:
+            self._system = self._factor()
         foreseen = self._picture * (self._spread @ _with_neighbours(expected))
         error = light - self._floor - foreseen
         error *= error

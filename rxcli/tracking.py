@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.protocol import PREAMBLE_SLOTS
+from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS, bits_per_symbol
 from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatArray, IntArray
 
 #: A clock that is off by more than this many slots from where the frames before foretell it belongs to another time.
@@ -326,12 +326,30 @@ def _one_burst(posteriors: BurstPosteriors, burst: int) -> BurstPosteriors:
     )
 
 
+def _nothing_known(like: BurstPosteriors, n: int) -> BurstPosteriors:
+    """Posteriors of a burst of `n` columns that no light tells of: all slots, words and weights are alike."""
+    symbols, slots, weights = like.index.shape[2], like.lit.shape[2], like.w_log_prob.shape[1]
+    middle = WEIGHTS[len(WEIGHTS) // 2]
+    k = bits_per_symbol(middle)
+    bit_llr = np.full((1, n, symbols, like.bit_llr.shape[3]), np.nan)
+    bit_llr[..., :k] = 0
+    return BurstPosteriors(
+        w=np.full(n, middle, np.int64),
+        w_log_prob=np.full((n, weights), -np.log(weights)),
+        lit=np.full((1, n, slots), 0.5, np.float32),
+        index=np.zeros((1, n, symbols), np.int64),
+        log_prob=np.full((1, n, symbols), -k * np.log(2)),
+        bit_llr=bit_llr,
+        header_llr=np.zeros((1, n)),
+    )
+
+
 def _merged(before: BurstPosteriors | None, new: BurstPosteriors, columns: IntArray, n: int) -> BurstPosteriors:
     """One burst's posteriors with some of its `n` columns detected anew."""
     if columns.size == n:
         return new
     if before is None:
-        raise ValueError("all columns of a burst are detected the first time")
+        before = _nothing_known(new, n)
 
     def put(old: NDArray[Any], part: NDArray[Any], axis: int) -> NDArray[Any]:
         out = old.copy()

@@ -87,16 +87,23 @@ def benchmark(context: click.Context, quick: bool, jobs: int, out: Path, seed: i
 @click.option(
     "--frames", type=click.IntRange(1), default=600, show_default=True, help="Random frames, some 20 packets each."
 )
+@click.option(
+    "--clips", type=click.IntRange(1), help="Random compressed clips in place of frames, some 70 packets each."
+)
 @click.option("--cae", type=click.Choice(["auto", "always", "never"]), default="auto", show_default=True)
 @_JOBS
 @_common
-def confidence(frames: int, cae: str, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
+def confidence(
+    frames: int, clips: int | None, cae: str, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool
+) -> None:
     """Share of error-free packets in ten bins of reported confidence."""
+    from rxcli.benchmark import clip_confidence, plots
     from rxcli.benchmark import confidence as work
-    from rxcli.benchmark import plots
     from rxcli.benchmark.tables import format_table, write_outputs
 
-    records = work.run(frames, _journal(out, "confidence", fresh), seed=seed, cae=cae, jobs=jobs, quiet=quiet)
+    journal = _journal(out, "confidence", fresh)
+    run = work.run if clips is None else clip_confidence.run
+    records = run(clips or frames, journal, seed=seed, cae=cae, jobs=jobs, quiet=quiet)
     result = work.calibration(records)
     rows = work.rows(result)
     click.echo(format_table(rows))
