@@ -159,12 +159,13 @@ def _edges_at(points: FloatArray, v: FloatArray, knots: IntArray) -> tuple[Float
 
 def _between_knots(values: FloatArray, knots: IntArray, rows: IntArray) -> FloatArray:
     """(n, rows) linear interpolation of values (n, knots)."""
-    left = np.minimum((rows - rows[0]) // _KNOT_ROWS, max(knots.size - 2, 0))
-    right = np.minimum(left + 1, knots.size - 1)
-    part = (rows - knots[left]) / np.maximum(knots[right] - knots[left], 1)
-    start = values[:, left]
-    start += (values[:, right] - start) * part
-    return start
+    if knots.size == 1:
+        return values
+    slope = np.diff(values) / np.diff(knots)
+    between = values[:, :-1, None] + slope[..., None] * np.arange(_KNOT_ROWS)
+    # The last two knots may be closer together than the others.
+    between = between.reshape(values.shape[0], -1)[:, : rows.size]
+    return between if between.shape[1] == rows.size else np.append(between, values[:, -1:], axis=1)
 
 
 def _rows_between(values: FloatArray, knots: IntArray, rows: IntArray, low: float, high: float) -> BoolArray:

@@ -76,13 +76,13 @@ def quick_look(lock: Lock) -> Reception:
     model = _light_model(lock, samples)
     llr = channel.first_llr(*clock.slot_contrast(samples, model.sigma))
     now = clock.assign_bursts(now, llr, lock.screen.repeats)
-    posteriors = _detect(channel.metrics_of(llr, model.memory), now, model, margin=0.0)
+    posteriors = _detect(channel.metrics_of(llr, 0), now, margin=0.0)
     columns = np.arange(samples.light.shape[0])
     lit = channel.lit_on_grid(posteriors, now)
     likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
     now = clock.assign_bursts(now, detect.slot_llr(likelihoods.metrics), lock.screen.repeats)
     now = clock.corrected(now, likelihoods.timing)
-    posteriors = _detect(likelihoods.metrics, now, model)
+    posteriors = _detect(likelihoods.metrics, now)
     fine = np.zeros(columns.size, bool)
     return Reception(now, samples, posteriors, likelihoods.snr, model, likelihoods.metrics, fine)
 
@@ -119,7 +119,7 @@ def _look_again(lock: Lock, seen: Reception, columns: NDArray[np.int64], fine: b
     timing = np.zeros((lit.shape[0], 2))
     metrics[columns], snr[columns], of_fine[columns] = likelihoods.metrics, likelihoods.snr, fine
     timing[columns] = likelihoods.timing
-    posteriors = _replaced(seen.posteriors, columns, _detect(metrics[columns], seen.clock, model))
+    posteriors = _replaced(seen.posteriors, columns, _detect(metrics[columns], seen.clock))
     return replace(seen, metrics=metrics, snr=snr, posteriors=posteriors, fine=of_fine), timing
 
 
@@ -207,7 +207,7 @@ def second_opinion(
     metrics[kept], snr[kept] = again.metrics[better], again.snr[better]
     metrics[columns] += _DENOISER_WEIGHT * channel.metrics_of(log_odds, seen.model.memory)
     # The network is told where headers are; whether they show there, the light alone must say.
-    posteriors = replace(_detect(metrics, seen.clock, seen.model), header_llr=seen.posteriors.header_llr)
+    posteriors = replace(_detect(metrics, seen.clock), header_llr=seen.posteriors.header_llr)
     seen = replace(seen, metrics=metrics, snr=snr, posteriors=posteriors)
     return seen, frozenset(kept.tolist()), {**report, "model": denoiser.name, "kept": kept.size}
 
@@ -228,7 +228,7 @@ def _with_bursts_of(seen: Reception, log_odds: Float32Array, repeats: int) -> Re
     now = clock.assign_bursts(seen.clock, log_odds, repeats)
     if np.array_equal(now.burst, seen.clock.burst):
         return seen
-    return replace(seen, clock=now, posteriors=_detect(seen.metrics, now, seen.model))
+    return replace(seen, clock=now, posteriors=_detect(seen.metrics, now))
 
 
 def _restart(
@@ -239,7 +239,7 @@ def _restart(
     samples, model = _view(lock, seen, columns, _FINE)
     metrics = channel.metrics_of(log_odds, model.memory)
     for _ in range(_RESTART_ITERATIONS):
-        lit[columns] = channel.lit_on_grid(_detect(metrics, seen.clock, model), seen.clock)
+        lit[columns] = channel.lit_on_grid(_detect(metrics, seen.clock), seen.clock)
         likelihoods = channel.slot_likelihoods(samples, seen.clock, model, lit, columns)
         metrics = likelihoods.metrics
     return likelihoods
@@ -247,7 +247,7 @@ def _restart(
 
 def _evidence(metrics: FloatArray, seen: Reception) -> FloatArray:
     """(C,) log evidence of columns, over all weights."""
-    bursts = channel.by_burst(metrics, seen.clock, seen.model.memory)
+    bursts = _by_burst(metrics, seen.clock)
     return np.asarray(
         np.logaddexp.reduce(detect.weight_evidence(bursts, detect.plausible_weights(bursts, HOPELESS_WEIGHT)), axis=1)
     )
@@ -259,11 +259,13 @@ def _doubtful(seen: Reception, certain: float) -> NDArray[np.bool_]:
     return np.asarray(((seen.posteriors.log_prob.min(axis=2) < certain) & complete).any(axis=0))
 
 
-def _detect(
-    metrics: FloatArray, now: Clock, model: channel.LightModel, margin: float = HOPELESS_WEIGHT
-) -> BurstPosteriors:
-    bursts = channel.by_burst(metrics, now, model.memory)
+def _detect(metrics: FloatArray, now: Clock, margin: float = HOPELESS_WEIGHT) -> BurstPosteriors:
+    bursts = _by_burst(metrics, now)
     return detect.detect(bursts, detect.plausible_weights(bursts, margin))
+
+
+def _by_burst(metrics: FloatArray, now: Clock) -> FloatArray:
+    return channel.by_burst(metrics, now, memory=metrics.shape[1] - now.n_slots)
 
 
 def _light_model(lock: Lock, samples: SlotSamples) -> channel.LightModel:
