@@ -353,24 +353,34 @@ def predict_picture(
     numerator, denominator = weighted * light, weighted * expected
     hole = max(int(np.ceil(_HOLE_SLOTS * samples_per_slot)) - 1, 0)
     texture = _Texture(light, expected, valid, sigma, samples_per_slot)
-    best: list[Prediction] = []
+    pictures: list[Float32Array] = []
+    variances: list[Float32Array] = []
     scales = PICTURE_SCALES if thorough else _QUICK_SCALES
     for half in dict.fromkeys(max(int(scale * samples_per_slot), 1) for scale in scales):
         sides = _sides if thorough else _both_sides
         sums = zip(sides(_box(numerator, half), half, hole), sides(_box(denominator, half), half, hole), strict=True)
         for side, (light_seen, seen) in enumerate(sums):
-            guess = np.maximum(light_seen, 0) / (seen + np.float32(1e-4))
-            variance = guess * guess * texture.of(guess) + np.float32(sigma * sigma) / (seen + np.float32(1e-6))
-            if len(best) <= side:
-                best.append(Prediction(guess, variance))
+            guess = np.maximum(light_seen, 0, out=light_seen)
+            guess /= seen + np.float32(1e-4)
+            # Which scale is best is asked once a slot, in its middle.
+            variance = np.square(guess[..., samples_per_slot // 2 :: samples_per_slot]) * texture.of(guess)
+            variance += np.float32(sigma * sigma) / (
+                seen[..., samples_per_slot // 2 :: samples_per_slot] + np.float32(1e-6)
+            )
+            if len(pictures) <= side:
+                pictures.append(guess)
+                variances.append(variance)
                 continue
             # Arithmetic picks several times quicker than a masked copy.
-            better = (variance < best[side].variance).astype(np.float32)
-            guess -= best[side].picture
-            guess *= better
-            best[side].picture[...] += guess
-            np.minimum(best[side].variance, variance, out=best[side].variance)
-    return best
+            better = (variance < variances[side]).astype(np.float32)
+            guess -= pictures[side]
+            guess *= np.repeat(better, samples_per_slot, axis=-1)
+            pictures[side] += guess
+            np.minimum(variances[side], variance, out=variances[side])
+    return [
+        Prediction(picture, np.repeat(variance, samples_per_slot, axis=-1))
+        for picture, variance in zip(pictures, variances, strict=True)
+    ]
 
 
 def _both_sides(boxes: Float32Array, half: int, hole: int) -> tuple[Float32Array]:
@@ -409,13 +419,13 @@ class _Texture:
         self._least = np.float32(1e-5) * count + np.float32(1e-9)
 
     def of(self, picture: Float32Array) -> Float32Array:
-        """(C, S, n) relative variance of `picture`."""
+        """(C, S, N) relative variance of `picture`, slot by slot."""
         predicted = picture[..., :: self._step] * self._expected
         residual = self._light - predicted
         error = self._around(np.square(residual, out=residual)) - self._noise
         power = self._around(np.square(predicted, out=predicted)) + self._least
         low, high = _TEXTURE_BOUNDS
-        return np.repeat(np.clip(error / power, np.float32(low), np.float32(high)), self._q, axis=-1)
+        return np.asarray(np.clip(error / power, np.float32(low), np.float32(high)))
 
     def _around(self, values: Float32Array) -> Float32Array:
         return _box(_by_slot(values, self._q // self._step), _ERROR_SLOTS // 2)

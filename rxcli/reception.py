@@ -17,7 +17,7 @@ from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatAr
 
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
 _COARSE, _FINE = 2, 4
-_MAX_ITERATIONS = 5
+_MAX_ITERATIONS = 3
 #: A column all of whose symbols have at least this log probability is not looked at again.
 CERTAIN = -1e-5
 #: The quick look at the picture is surer than it should be of textured ones.
