@@ -30,6 +30,9 @@ _BEND_PRECISION = np.concatenate([[0.0, 0.0], BEND_SCALE**-2])
 #: Samples of a slot and strips of a column err alike: so many of them say what one would.
 _ALIKE = 10.0
 
+#: Slots that are wrong are wrong in neighbouring columns alike: the spread between columns says this much too little.
+_UNDERSTATED = 3.0
+
 _REFINE_STEPS = 10
 #: Steps in which the clock alone moves, where no bend is known: slots that are wrong yet would bend it.
 _RIGID_STEPS = 3
@@ -105,7 +108,7 @@ def refine(
     ordered, bend = (in_readout_order(strips), reversed_bend(bend)) if hypothesis.reversed else (strips, bend)
     ordered = _thinned(ordered, hypothesis.rows_per_slot)
     timing, corrected = _fit_timing(ordered, hypothesis, bend, exposure_slots, sure)
-    found, sd = timing.values[2:], np.sqrt(np.diag(timing.covariance))
+    found, sd = timing.values[2:], _UNDERSTATED * np.sqrt(np.diag(timing.covariance))
     return BlindEstimate(
         rows_per_slot=float(timing.values[1]),
         rows_per_slot_sd=float(sd[1]),

@@ -94,8 +94,56 @@ class ShutterCalibration:
     exposure_interval_s: tuple[float, float] | None
     #: Why there is no exposure, or what it rests on.
     exposure_note: str
-    lamps: tuple[LampReading, ...]
-    warnings: tuple[str, ...]
+    lamps: tuple[LampReading, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @classmethod
+    def from_line_delay(
+        cls,
+        line_delay_s: float,
+        sd_s: float,
+        axis: Axis,
+        shape: tuple[int, ...],
+        *,
+        periods: float,
+        exposure_note: str,
+        exposure_s: float | None = None,
+        exposure_interval_s: tuple[float, float] | None = None,
+        lamps: tuple[LampReading, ...] = (),
+        warnings: tuple[str, ...] = (),
+    ) -> ShutterCalibration:
+        """Readout and 95 % intervals from a line delay and its standard deviation.
+
+        Args:
+            line_delay_s: time between two rows.
+            sd_s: its standard deviation.
+            axis: readout axis.
+            shape: height and width of the pictures.
+            periods: most periods seen in one region.
+            exposure_note: why there is no exposure, or what it rests on.
+            exposure_s: exposure, None where it cannot be told.
+            exposure_interval_s: its 95 % interval.
+            lamps: what was seen of every lamp.
+            warnings: what a user should know before trusting the figures.
+        """
+        height, width = shape
+        n_rows = height if axis == "rows" else width
+        low, high = line_delay_s - _Z95 * sd_s, line_delay_s + _Z95 * sd_s
+        return cls(
+            axis=axis,
+            width=width,
+            height=height,
+            line_delay_s=line_delay_s,
+            line_delay_interval_s=(low, high),
+            readout_s=line_delay_s * n_rows,
+            readout_interval_s=(low * n_rows, high * n_rows),
+            periods=periods,
+            exposure_s=exposure_s,
+            exposure_interval_s=exposure_interval_s,
+            exposure_note=exposure_note,
+            lamps=lamps,
+            warnings=warnings,
+        )
 
 
 def find_stripes(picture: Picture, axis: Axis | None = None) -> tuple[Axis, list[Stripes]]:
@@ -373,7 +421,7 @@ def _reading(picture: int, stripes: Stripes, frequencies_hz: Sequence[float], li
     return LampReading(picture, stripes, frequency, value, stripes.fit.frequency_sd / frequency)
 
 
-def _weighted(values: FloatArray, sds: FloatArray) -> tuple[float, float]:
+def weighted_mean(values: FloatArray, sds: FloatArray) -> tuple[float, float]:
     """Inverse-variance mean and its standard deviation, enlarged where the values scatter more than they say."""
     weights = 1 / np.maximum(sds, 1e-12 * np.abs(values)) ** 2
     mean = float(weights @ values / weights.sum())
@@ -390,22 +438,16 @@ def _combine(
     tone_known: bool,
 ) -> ShutterCalibration:
     used = [lamp for lamp in lamps if lamp.line_delay_s is not None]
-    value, sd = _weighted(
+    value, sd = weighted_mean(
         np.array([lamp.line_delay_s for lamp in used]), np.array([lamp.line_delay_sd_s for lamp in used])
     )
-    height, width = shape
-    n_rows = height if axis == "rows" else width
-    low, high = value - _Z95 * sd, value + _Z95 * sd
     clearest = max(used, key=lambda lamp: lamp.stripes.explained * np.sqrt(_area(lamp.stripes)))
     exposure = estimate_exposure(clearest.stripes.fit, clearest.stripes.profile, value, exif_exposure_s, tone_known)
-    return ShutterCalibration(
-        axis=axis,
-        width=width,
-        height=height,
-        line_delay_s=value,
-        line_delay_interval_s=(low, high),
-        readout_s=value * n_rows,
-        readout_interval_s=(low * n_rows, high * n_rows),
+    return ShutterCalibration.from_line_delay(
+        value,
+        sd,
+        axis,
+        shape,
         periods=max(lamp.stripes.periods for lamp in used),
         exposure_s=exposure.exposure_s,
         exposure_interval_s=exposure.interval_s,

@@ -70,7 +70,14 @@ def calibrate_slots(
         values, weights = _refine([z**2 for part in slopes for z in np.array_split(part, _GROUPS)], frequency)
         mean, sd = _mean_and_sd(values, weights)
         if sd * _Z95 <= _WIDEST * mean:
-            return _calibration(mean / slot_rate_hz, sd / slot_rate_hz, mean, axis, pictures[0].shape)
+            return ShutterCalibration.from_line_delay(
+                mean / slot_rate_hz,
+                sd / slot_rate_hz,
+                axis,
+                pictures[0].shape,
+                periods=mean * pictures[0].shape[0 if axis == "rows" else 1],
+                exposure_note="not told by data; use a lamp and --frequency",
+            )
     raise ReceiverError(
         "no slot clock of a sending screen in the pictures",
         "let the screen fill the frame and use a short exposure; at least two rows a slot are needed",
@@ -165,26 +172,3 @@ def _mean_and_sd(values: FloatArray, weights: FloatArray) -> tuple[float, float]
     groups = 1 / float(np.sum(share**2) + 1e-300)
     variance = float(np.sum(share**2 * (values - mean) ** 2)) * groups / max(groups - 1, 0.5)
     return mean, float(np.sqrt(variance)) * (1 + 1.5 / max(groups - 2, 0.5))
-
-
-def _calibration(
-    line_delay_s: float, sd_s: float, slots_per_row: float, axis: Axis, shape: tuple[int, ...]
-) -> ShutterCalibration:
-    height, width = shape
-    n_rows = height if axis == "rows" else width
-    low, high = line_delay_s - _Z95 * sd_s, line_delay_s + _Z95 * sd_s
-    return ShutterCalibration(
-        axis=axis,
-        width=width,
-        height=height,
-        line_delay_s=line_delay_s,
-        line_delay_interval_s=(low, high),
-        readout_s=line_delay_s * n_rows,
-        readout_interval_s=(low * n_rows, high * n_rows),
-        periods=slots_per_row * n_rows,
-        exposure_s=None,
-        exposure_interval_s=None,
-        exposure_note="not told by data; use a lamp and --frequency",
-        lamps=(),
-        warnings=(),
-    )

@@ -276,6 +276,7 @@ def _measure(
 def _measure_screen(
     frames: list[Frame], screen: str, axis: str, window: tuple[int, int, int, int] | None
 ) -> ShutterCalibration:
+    from rxcli.calibrate.bent import calibrate_bent
     from rxcli.calibrate.frames import light_of
     from rxcli.calibrate.slots import calibrate_slots
     from rxcli.profiles import ScreenProfile, load_profile
@@ -284,7 +285,10 @@ def _measure_screen(
         raise UsageError("--region goes with --frequency only", "leave it out")
     profile = load_profile(screen, ScreenProfile)
     along: Any = "rows" if axis == "auto" else axis
-    return calibrate_slots([light_of(frame) for frame in frames], profile.slot_rate_hz, profile.packet_slots, along)
+    bent = calibrate_bent(frames, profile) if along == "rows" else None
+    return bent or calibrate_slots(
+        [light_of(frame) for frame in frames], profile.slot_rate_hz, profile.packet_slots, along
+    )
 
 
 def _mode(result: ShutterCalibration, name: str | None) -> ReadoutMode:
