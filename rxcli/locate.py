@@ -156,9 +156,14 @@ def find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
     black, white = (float(np.mean(levels.black)), levels.white) if levels else (frame.black, frame.white)
     period = levels.pattern.shape[1] if levels else 1
     found = find_screen(frame.pixels, black=black, white=white, mosaic_period=period)
-    if found.corners is None:
+    corners = found.corners
+    if corners is None and "no_screen" in options.skip:
         raise Failure("no_screen", f"no screen found: {found.reason}; give its place with --corners")
-    return geometry.viewer_order(found.corners, orientation)
+    if corners is None:
+        # Told not to give up: the picture may show nothing but a part of the screen.
+        right, bottom = frame.width - 1.0, frame.height - 1.0
+        corners = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
+    return geometry.viewer_order(corners, orientation)
 
 
 def find_lock(frame: Frame, corners: FloatArray, camera: Camera, options: ReceiverOptions, stages: Stages) -> Lock:

@@ -95,5 +95,6 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
         if result.status == "no_signal":
             result = replace(result, message=too_small(frame, corners, camera, lock.screen) or _NO_PACKET)
     except Failure as failure:
-        result = replace(result, status=failure.status, message=failure.message)
+        skipped = {"no_screen": 1} if failure.status == "no_screen" else {}
+        result = replace(result, status=failure.status, message=failure.message, skipped=skipped)
     return replace(result, timing_ms=stages.total())

@@ -274,6 +274,20 @@ def test_no_packet_where_none_was_sent(kind: str, given: bool) -> None:
     assert "\n" not in result.message
 
 
+def test_a_picture_without_a_screen_is_stopped_at_once_unless_told_not_to() -> None:
+    taken = clean()
+    grey = frame_of(taken, without_signal("grey", taken))
+    options = options_for(taken, corners=None)
+    stopped = received(grey, options)
+    assert stopped.status == "no_screen"
+    assert stopped.skipped == {"no_screen": 1}
+    assert "clock" not in stopped.timing_ms
+    tried = received(grey, replace(options, skip=options.skip - {"no_screen"}))
+    assert tried.status == "no_signal"
+    assert not tried.skipped
+    assert "clock" in tried.timing_ms
+
+
 @pytest.mark.parametrize("given", [True, False], ids=["corners given", "corners searched"])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 600), (600, 1), (3, 7)])
 def test_tiny_pictures(shape: tuple[int, int], given: bool) -> None:
