@@ -30,8 +30,9 @@ _CALIBRATION = (0.501, 0.906)
 #: nats; packets of `rxcli.benchmark.clip_confidence`.
 _CLIP_CALIBRATION = (0.103, 0.477, -0.83)
 _AGAINST_AT_LEAST = 0.5
-#: Share of wrong bits of packets as likely right as wrong, and the power of the odds of being wrong that it goes with.
-_BER_AT_EVENS, _BER_EXPONENT = 0.018, 0.85
+#: Wrong bits of packets as likely right as wrong, the least share of them, and the power of the odds of being wrong
+#: that it goes with.
+_WRONG_AT_EVENS, _BER_AT_EVENS, _BER_EXPONENT = 1.4, 0.018, 0.85
 #: Headers less likely than this against slots that are anything, nats, are not headers.
 _CONTRADICTED = -2.0
 #: Together the columns' headers must be this much more likely than slots that are anything; one good header gives 12.
@@ -131,7 +132,7 @@ def _clip_column(
     return ColumnResult(
         column=column,
         status=status,
-        w=_sure_weight(column, [burst.posteriors for burst in bursts], bool(packets)),
+        w=_weight_of_best(column, packets, bursts),
         snr_db=snr_db,
         delay_slots=float(clock.delay_slots[column]),
         packets=packets,
@@ -146,13 +147,12 @@ def _snr_db_of_columns(snr: Float32Array) -> list[float | None]:
     return [_snr_db(column) for column in snr]
 
 
-def _sure_weight(column: int, posteriors: Sequence[BurstPosteriors], found: bool) -> int | None:
-    """The weight of a column, where it is known."""
-    if not posteriors:
+def _weight_of_best(column: int, packets: Sequence[PacketResult], bursts: Sequence[BurstInClip]) -> int | None:
+    """The weight of a column's surest packet; without one, known picture and compression may feign any."""
+    if not packets:
         return None
-    best = max(posteriors, key=lambda p: float(p.w_log_prob[column].max()))
-    sure = found or best.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
-    return int(best.w[column]) if sure else None
+    number = max(packets, key=lambda packet: packet.confidence).burst
+    return next(int(burst.posteriors.w[column]) for burst in bursts if burst.number == number)
 
 
 def _why_none_here(status: ColumnStatus, snr_db: float | None, n_seen: int, clock: Clock, any_burst: bool) -> str:
@@ -263,7 +263,8 @@ def _clip_packet(column: int, clock: Clock, burst: BurstInClip) -> PacketResult 
     log_odds = _log_odds(float(posteriors.log_prob[0, column].sum()))
     offset, slope, slope_against = _CLIP_CALIBRATION
     log_odds = offset + slope * log_odds + slope_against * log(float(burst.against[column]) + _AGAINST_AT_LEAST)
-    ber_hat = max(packet.ber_hat, min(_BER_AT_EVENS * exp(-_BER_EXPONENT * log_odds), 0.5))
+    at_evens = max(_WRONG_AT_EVENS / packet.payload_bits, _BER_AT_EVENS)
+    ber_hat = max(packet.ber_hat, min(at_evens * exp(-_BER_EXPONENT * log_odds), 0.5))
     return None if ber_hat > MAX_BER_HAT else replace(packet, confidence=_probability(log_odds), ber_hat=ber_hat)
 
 

@@ -42,7 +42,7 @@ _HELD, _HELD_LONG = 6, 24
 #: Squared contrast over variance of a slot that is well lit, log probability of a packet in doubt, and much doubt.
 _WELL_LIT_SNR, _DOUBTFUL, _MUCH_DOUBT = 10.0, -0.05, 0.03
 #: Squared contrast over variance of a slot, at which all copies of a packet together do not give one.
-_DARK_SNR = 0.3
+_DARK_SNR = 0.5
 #: Frames beyond which each one's share of what is known of the picture does not matter.
 _MANY_VIEWS = 12
 #: Frames that find their clock together where each shows little.
@@ -305,7 +305,7 @@ class _Clip:
         self._model = lock, seen.model.floor
         self._picture = self._new_picture(*self._model)
 
-    def _new_picture(self, lock: Lock, floor: float) -> known_picture.KnownPicture:
+    def _new_picture(self, lock: Lock, floor: float | Float32Array) -> known_picture.KnownPicture:
         assert self._place is not None
         self._n_lessons = 0
         profiles, strip_map = lock.profiles, self._place.map
@@ -542,7 +542,7 @@ class _Clip:
         certain = self._bursts.certain(still_open)
         if "certain_columns" not in self._options.skip:
             certain[:] = False
-        dark = ~certain & self._dark(view)
+        dark = ~certain & self._dark(view, sure=not self._n_held or not learn)
         self._skip(waiting, "certain_columns", int(certain.sum()))
         self._skip(waiting, "dark_columns", int(dark.sum()))
         self._detect_open(still_open, ~certain & ~dark)
@@ -551,9 +551,9 @@ class _Clip:
                 self._learn(view, self._grid(waiting))
             self._last = view
 
-    def _dark(self, view: _View) -> NDArray[np.bool_]:
+    def _dark(self, view: _View, sure: bool) -> NDArray[np.bool_]:
         """(C,) columns of a tracked frame with too little light to try; now and then they are tried all the same."""
-        tried = self._n_held or view.bursts.frame % _LOOK_EVERY == 0
+        tried = not sure or (view.bursts.frame + 1) % _LOOK_EVERY == 0
         if view.flat is None or "dark_columns" not in self._options.skip or tried:
             return np.zeros(view.snr.shape[0], bool)
         return np.asarray(np.median(view.snr, axis=1) < _DARK_SNR)
@@ -635,17 +635,24 @@ class _Clip:
         assert self._model is not None
         known = [self._grid(waiting) for waiting in held]
         doubtful = [self._n_held == _HELD or self._doubts(waiting)[0] > 0 for waiting in held]
-        self._picture = self._new_picture(*self._model)
-        lessons = []
-        for waiting, lit in zip(held, known, strict=True):
-            view = waiting.view
-            assert view is not None
+        views = [waiting.view for waiting in held if waiting.view is not None]
+        for view in views:
             if view.frame is not None:
                 view.light, view.map = self._strips(view.frame), self._place.map
-            lessons.append(self._learn(view, lit, keep=1.0))
+        lock, floor = self._model
+        self._picture = self._new_picture(lock, self._dark_light(views, floor))
+        lessons = [self._learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
         for waiting, lesson, needed in zip(held, lessons, doubtful, strict=True):
             if needed and waiting.view is not None:
                 self._measure_again(waiting.view, lesson if len(held) <= _MANY_VIEWS else None)
+
+    def _dark_light(self, views: list[_View], usual: float) -> Float32Array:
+        """(C, S) light of the strips where nothing is lit."""
+        assert self._place is not None
+        lights = [view.light for view in views if view.light is not None]
+        clocks = [view.bursts.clock for view in views if view.light is not None]
+        dark = [known_picture.header_dark(known_picture.row_positions(self._rows, now), now) for now in clocks]
+        return known_picture.dark_light(lights, dark, self._place.map.inside, usual)
 
     def _measure_again(self, view: _View, lesson: tuple[Float32Array, Float32Array] | None) -> None:
         """Measure a frame by the picture, less what the frame itself has shown of it where that is given."""

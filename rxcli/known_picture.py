@@ -44,6 +44,8 @@ _SIDE, _CENTRE, _AT_SIDE, _RIDGE = 0.5, (0.3, 1.3), (-0.1, 0.35), 1e-4
 _GROUPS, _GAIN = 8, (0.15, 1.3)
 #: Rows of columns, about, from which that is measured: more would tell no more.
 _SAMPLES_OF_CONTRAST = 9000
+#: Slots of the header between which it is dark, and rows of a strip, over all frames, from which its light is known.
+_DARK_SLOTS, _LEAST_DARK_ROWS = (5.0, 8.0), 12
 #: Rows of a single column's header that must show, that it be judged.
 _LEAST_ROWS = 40
 #: Largest correction of the clock at a time, slots.
@@ -80,15 +82,18 @@ class KnownPicture:
     Args:
         inside: (C, S, R) the strip is on the screen there.
         spread: (S, 3) share of the light of columns -1, 0, +1 in each strip.
-        floor: light of a dark slot.
+        floor: light of a dark slot, one for all or (C, S).
         variance: of a strip's light where it is dark.
         shot: variance per unit of light.
     """
 
-    def __init__(self, inside: BoolArray, spread: FloatArray, floor: float, variance: float, shot: float) -> None:
+    def __init__(
+        self, inside: BoolArray, spread: FloatArray, floor: float | Float32Array, variance: float, shot: float
+    ) -> None:
         self._inside = inside.astype(np.float32)
         self._spread = spread.astype(np.float32)
-        self._floor, self._variance, self._shot = np.float32(floor), np.float32(variance), np.float32(shot)
+        self._floor = np.asarray(floor, np.float32)[..., None]
+        self._variance, self._shot = np.float32(variance), np.float32(shot)
         self._light: Float32Array = np.zeros(inside.shape, np.float32)
         self._seen: Float32Array = np.zeros(inside.shape, np.float32)
         self._system: _System | None = None
@@ -431,6 +436,36 @@ def header_contrast(seen: ColumnLight, positions: FloatArray, clock: Clock) -> f
     if weight.sum() < _PRIOR * _LEAST_ROWS:
         return 1.0
     return float((weight * sign * np.clip(2 * seen.value - 1, -1.5, 1.5)).sum() / weight.sum())
+
+
+def header_dark(positions: FloatArray, clock: Clock) -> BoolArray:
+    """(C, R) or (1, R) rows that see nothing but the three dark slots in the middle of a header."""
+    place = (positions + clock.first_slot) % clock.packet_slots
+    margin = clock.exposure_slots / 2
+    return np.asarray((place >= _DARK_SLOTS[0] + margin) & (place <= _DARK_SLOTS[1] - margin))
+
+
+def dark_light(lights: list[Float32Array], dark: list[BoolArray], inside: BoolArray, usual: float) -> Float32Array:
+    """(C, S) light of the strips where nothing is lit.
+
+    What a black picture or a starved encoder leaves of a strip does not change with the slots: it is no picture.
+
+    Args:
+        lights: (C, S, R) each.
+        dark: (C, R) or (1, R) each, from `header_dark`.
+        inside: (C, S, R) as for `KnownPicture`.
+        usual: what is taken where too few rows tell.
+    """
+    seen = [
+        np.where(np.broadcast_to(rows[:, None], light.shape) & inside, light, np.float32(np.nan))[..., rows.any(axis=0)]
+        for light, rows in zip(lights, dark, strict=True)
+    ]
+    together = np.concatenate(seen, axis=2)
+    few = (~np.isnan(together)).sum(axis=2) < _LEAST_DARK_ROWS
+    if together.shape[2] == 0:
+        return np.full(together.shape[:2], usual, np.float32)
+    together[few] = np.float32(usual)
+    return np.asarray(np.nanmedian(together, axis=2), np.float32)
 
 
 def evened(seen: ColumnLight, fit: Fit) -> ColumnLight:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from rxcli.detect import detect
 from rxcli.errors import InputError
 from rxcli.known_picture import KnownPicture, exposed
 from rxcli.options import SKIPS, ReceiverOptions
@@ -16,9 +22,9 @@ from rxcli.pipeline import receive
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.simulate.capture import Take, prepare
 from rxcli.simulate.scenes import preset
-from rxcli.tracking import BurstPhase, LinkTime
+from rxcli.tracking import BurstPhase, Bursts, FrameBursts, LinkTime
 from rxcli.truth import Score, Scorer, Truth
-from rxcli.types import Clock, Frame, FrameResult
+from rxcli.types import Clock, Float32Array, Frame, FrameResult
 
 N_FRAMES = 14
 BURST_SLOTS = 210
@@ -56,7 +62,7 @@ def camera_of(take: Take) -> CameraProfile:
 def simulate(
     seed: int,
     n_frames: int,
-    picture: str = "coffee",
+    picture: str | NDArray[np.uint8] = "coffee",
     height: float = 0.94,
     repeats: int = 3,
     frame_rate_hz: float = 60000 / 1001,
@@ -269,11 +275,11 @@ def test_burst_phase_from_parts_of_copies_over_frames() -> None:
         start = 2.22 * frame
         first = int(start)
         llr = np.zeros((2, columns, packet))
-        for copy in (0, 1):
-            place = first + copy + np.arange(packet) / packet
+        for number in (0, 1):
+            place = first + number + np.arange(packet) / packet
             seen = (place >= start) & (place < start + 0.8)
-            slots = 2.0 * sent[(first + copy + 1) // repeats] - 1
-            llr[copy] = seen * (2.5 * slots + rng.normal(0, 1.5, slots.shape))
+            slots = 2.0 * sent[(first + number + 1) // repeats] - 1
+            llr[number] = seen * (2.5 * slots + rng.normal(0, 1.5, slots.shape))
         phase.take(first, llr)
     assert phase.settled
     copies = np.arange(60)
@@ -306,3 +312,123 @@ def test_known_picture_gives_back_the_columns_light() -> None:
     seen = known.solve(light)
     assert np.abs(seen.value - slots).max() < 0.1
     assert (seen.precision > 0).all()
+
+
+def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, rows: int = 400) -> tuple[Any, ...]:
+    """A picture known from many frames, 5 rows a slot; and what makes a frame of it: light and exposed slots."""
+    picture = rng.uniform(0.1, 0.5, (columns, strips, rows)).astype(np.float32)
+    spread = np.tile([0.0, 1.0, 0.0], (strips, 1))
+    known = KnownPicture(np.ones(picture.shape, bool), spread, 0.0, 1e-6, 0.0)
+
+    def frame() -> tuple[Float32Array, Float32Array]:
+        bits = rng.integers(0, 2, (columns, rows // 5 + 2)).astype(np.float32)
+        slots = exposed(bits, np.arange(rows)[None] / 5 + 0.5, 1.0)
+        return (picture * slots[:, None]).astype(np.float32), slots
+
+    for _ in range(20):
+        light, slots = frame()
+        known.learn(light, slots, np.ones_like(slots))
+    return known, frame
+
+
+def test_strips_that_show_something_else_are_trusted_less() -> None:
+    rng = np.random.default_rng(8)
+    known, frame = known_picture(rng)
+    light, slots = frame()
+    light[:, 0] += rng.normal(0, 0.2, light[:, 0].shape).astype(np.float32)
+    plain = np.abs(known.solve(light).value - slots).mean()
+    again = np.abs(known.solve_again(light, slots, 5.0).value - slots).mean()
+    assert again < 0.5 * plain
+
+
+def test_a_decision_does_not_bear_itself_out() -> None:
+    """One slot that shows the opposite of what was decided must still show it."""
+    known, frame = known_picture(np.random.default_rng(9))
+    light, slots = frame()
+    wrong = slots.copy()
+    wrong[2, 200:205] = 1 - wrong[2, 200:205]
+    seen = known.solve_again(light, wrong, 5.0).value[2, 201:204]
+    assert np.abs(seen - slots[2, 201:204]).max() < 0.1
+
+
+def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
+    known, frame = known_picture(np.random.default_rng(10))
+    other = copy.deepcopy(known)
+    light, slots = frame()
+    trust = np.full_like(slots, 0.7)
+    known.learn(light, slots, trust, keep=1.0)
+    with_it, _ = known.picture()
+    without, _ = known.without(light, slots, trust).picture()
+    alone, _ = other.picture()
+    assert without == pytest.approx(alone, abs=1e-4)
+    assert known.picture()[0] == pytest.approx(with_it)
+
+
+def test_columns_not_yet_tried_are_unknown() -> None:
+    """Dark columns may be left out at first; the others are kept as they were found."""
+    rng = np.random.default_rng(2)
+    columns, packet, memory = 4, 70, 1
+    bursts = Bursts()
+    clock = replace(clock_at(0.0), burst=np.zeros(2, np.int64))
+    shown = np.ones((2, columns, packet), np.int64)
+    metrics = rng.normal(0, 2, (1, columns, packet + memory, 4))
+    bursts.add(FrameBursts(0, 0, clock, metrics[0], shown), np.array([7]), metrics)
+    tried = np.array([0, 2])
+    found = detect(metrics[:, tried])
+    bursts.note(np.array([7]), tried, found, np.ones((1, 2), bool))
+    known = bursts.known(7)
+    assert known is not None
+    assert (known.index[:, tried] == found.index).all()
+    assert (known.lit[:, [1, 3]] == 0.5).all()
+    (closed,) = bursts.close(np.array([7]))
+    assert closed.metrics == pytest.approx(metrics[0])
+    assert not closed.tracked
+
+
+def test_few_frames_are_not_sure_of_what_they_taught_themselves() -> None:
+    """A picture learned from the frames that it is then used on bears out every wrong decision."""
+    short = simulate(3, 2)
+    marked, score = scored(list(receive(short.frames, short.options)), short.truth)
+    packets = [p for r in marked for c in r.columns for p in c.packets]
+    sure = [p for p in packets if p.confidence >= 0.9]
+    assert score.error_free >= 10
+    assert score.false <= 1
+    assert sum(p.bit_errors != 0 for p in sure) <= 0.15 * len(sure)
+
+
+def test_dark_columns_are_left_out_and_counted() -> None:
+    """Nine columns of twenty under black: not tried, the others as they are without the shortcut."""
+    picture = np.full((90, 160, 3), 200, np.uint8)
+    picture[:, 88:] = 0
+    half = simulate(6, 12, picture)
+    results = [
+        list(receive(half.frames, replace(half.options, skip=skip)))
+        for skip in (frozenset(SKIPS), frozenset(SKIPS) - {"dark_columns"})
+    ]
+    counts = [sum(r.skipped.get("dark_columns", 0) for r in got) for got in results]
+    assert counts[0] >= 20
+    assert counts[1] == 0
+    marked, scores = zip(*(scored(got, half.truth) for got in results), strict=True)
+    assert scores[0].error_free == scores[1].error_free >= 90
+    assert scores[0].false <= scores[1].false
+    packets = [p for r in marked[0] for c in r.columns for p in c.packets]
+    assert all(p.bit_errors == 0 for p in packets if p.confidence >= 0.9)
+    assert all(not c.packets for r in marked[0][6:] for c in r.columns[12:])
+
+
+def test_the_screen_may_come_nearer(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many strips its columns would have now, the picture is known by those of the first frame."""
+    start = clip.options.corners
+    assert start is not None
+    looks = itertools.count(1)
+
+    def nearer(_pixels: object, stored: object, **_levels: object) -> SimpleNamespace:
+        return SimpleNamespace(corners=start + np.array([[-1, 0], [1, 0], [1, 0], [-1, 0]]) * 4.0 * next(looks))
+
+    numbers = itertools.count(4)
+    monkeypatch.setattr("rxcli.find_screen.track_screen", nearer)
+    monkeypatch.setattr("rxcli.clip.find_corners", lambda *_: start)
+    monkeypatch.setattr("rxcli.clip.sampling.strips_per_column", lambda _px: next(numbers))
+    got = list(receive(clip.frames[:8], replace(clip.options, corners=None)))
+    assert [result.frame for result in got] == list(range(8))
+    assert next(looks) > 2
