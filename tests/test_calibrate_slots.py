@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rxcli.calibrate.bent import calibrate_bent
 from rxcli.calibrate.slots import calibrate_slots
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode, ReceiverError
+from rxcli.profiles import ScreenProfile, load_profile
+from rxcli.simulate.capture import prepare
+from rxcli.simulate.optics import Lens
+from rxcli.simulate.scenes import preset
+from rxcli.types import Frame
 
 HEADER = [0, 0, 1, 1, 1, 0, 0, 0, 1, 1]
 
@@ -71,7 +78,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["calibrate", "shutter", str(path), "--screen", "no-such"]) == ExitCode.USAGE
 
 
-@pytest.mark.parametrize("name", ["video4k_rocket_34k6.mp4", "xs10_china_17k3.jpg"])
+@pytest.mark.parametrize("name", ["video4k_rocket_34k6.mp4", "xs10_china_17k3.jpg", "phone_astronaut_17k3.jpg"])
 def test_reference_captures(shared_captures: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     path = shared_captures / name
     truth = json.loads((shared_captures / f"{path.stem}.truth.json").read_text())
@@ -79,3 +86,26 @@ def test_reference_captures(shared_captures: Path, name: str, capsys: pytest.Cap
     assert run(arguments) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["line_delay_s"] == pytest.approx(truth["camera"]["line_delay_s"], rel=3e-4)
+
+
+def test_bent_stripes_are_measured_with_their_bend() -> None:
+    """A phone that took its lens distortion out: the slot clock along the picture's rows is not the sensor's."""
+    screen = load_profile("paper-17k3", ScreenProfile)
+    line_delay_s = 1 / (3.4 * screen.slot_rate_hz)
+    base = preset("phone-corrected", screen)
+    scene = replace(
+        base,
+        sensor=replace(base.sensor, width=1280, height=960, line_delay_s=line_delay_s),
+        lens=Lens(0.8, (0.08, -0.04, 0.0, 0.0, 0.0)),
+        exposure_s=0.6 / screen.slot_rate_hz,
+        light_e_per_s=2.5e6,
+    )
+    frame = Frame(prepare(scene, 1).frame(0).pixels, "phone")
+    result = calibrate_bent([frame], screen)
+    assert result is not None
+    assert result.line_delay_s == pytest.approx(line_delay_s, rel=5e-4)
+    low, high = result.line_delay_interval_s
+    assert low < line_delay_s < high
+    assert "bent" in result.warnings[0]
+    straight = replace(scene, isp=replace(base.isp, correct_distortion=False), lens=Lens(0.8, (0.0,) * 5))
+    assert calibrate_bent([Frame(prepare(straight, 1).frame(0).pixels, "phone")], screen) is None
