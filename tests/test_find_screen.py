@@ -12,6 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from rxcli.find_screen import ScreenSearch, find_screen, track_screen
+from rxcli.find_screen.pose import Places, Rectangle, fit_pose, misfit, pose_of
+from rxcli.find_screen.sides import across, straight
 
 WIDTH, HEIGHT = 1920, 1200
 
@@ -86,6 +88,50 @@ def error(found: ScreenSearch, truth: NDArray[np.float64]) -> float:
 )
 def test_corners_within_three_thousandths_of_the_width(case: NDArray[np.float64], options: dict[str, Any]) -> None:
     assert error(search(luma(draw(case, 3, **options))), case) < 0.003
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("roll_deg", [-3.0, 0.0, 2.0])
+def test_full_resolution_places_corners_to_a_pixel(roll_deg: float, seed: int) -> None:
+    case = quad(0.8, roll_deg=roll_deg)
+    assert error(search(luma(draw(case, seed))), case) < 1.5 / (0.8 * WIDTH)
+
+
+def test_slots_that_are_dark_in_all_columns_do_not_pull_the_bottom_in() -> None:
+    """The last slots before the lower edge are dark: stripes end along a row, the screen does not."""
+    case = quad(0.8, roll_deg=3)
+    light = draw(case, 4)
+    end = int(case[2:, 1].min()) - 12
+    light[end:] = np.minimum(light[end:], 0.03)
+    assert error(search(luma(light)), case) < 0.015
+
+
+def _turned_screen() -> tuple[Rectangle, NDArray[np.float64]]:
+    rectangle = Rectangle(WIDTH, HEIGHT, 16 / 9)
+    return rectangle, np.array([0.1, -0.12, 0.05, 0.02, -0.01, np.log(0.8), np.log(1.3), 0.0])
+
+
+def test_pose_of_corners_has_these_corners() -> None:
+    rectangle, pose = _turned_screen()
+    corners = rectangle.project(pose)
+    assert np.abs(rectangle.project(pose_of(corners, rectangle)) - corners).max() < 2.0
+
+
+def test_three_sides_tell_where_the_fourth_is_and_contradict_a_wrong_one() -> None:
+    rectangle, pose = _turned_screen()
+    corners = rectangle.project(pose)
+    places: list[Places | None] = []
+    for side in range(4):
+        ends = np.sort(corners[[side, (side + 1) % 4], 0 if across(side) else 1])
+        t = np.linspace(*ends, 12)
+        places.append(Places(t, straight(corners, side).at(t), 1.5))
+    start = pose_of(corners + 15.0, rectangle)
+    found = fit_pose([*places[:3], None], corners, 300.0, start, rectangle, 12)
+    assert np.abs(rectangle.project(found) - corners).max() < 0.01 * WIDTH
+    assert places[3] is not None
+    wrong: list[Places | None] = [*places[:3], Places(places[3].t, places[3].place + 0.05 * WIDTH, 1.5)]
+    costs = [misfit(p, fit_pose(p, corners, 300.0, start, rectangle, 12), rectangle) for p in (places, wrong)]
+    assert costs[1] > costs[0] + 20
 
 
 def test_order_is_clockwise_from_the_top_left_of_the_stored_picture() -> None:

@@ -208,7 +208,7 @@ def _pose_without(
     for number, side in enumerate(sides):
         t = side.middle + side.half * np.linspace(-0.8, 0.8, 5)
         places.append(None if number in missing else Places(t, side.at(t), _SIDE_SD * size))
-    pose = fit_pose(places, expected, 0.3 * size, start, rectangle, 8)
+    pose = fit_pose(places, expected, 0.3 * size, start, rectangle, 6)
     return pose, misfit(places, pose, rectangle)
 
 

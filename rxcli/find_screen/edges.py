@@ -219,7 +219,8 @@ def _across(
     centre = np.round(guess[side].at(t)).astype(np.int64)
     top = centre - (out if INWARD[side] > 0 else inward - 1)
     block = _cut(picture.pixels, top, left, (out + inward, strip), 1)
-    light = picture.linear(block.reshape(-1, strip)).mean(axis=1).reshape(n, -1)[:, :: INWARD[side]]
+    mean = np.full(strip, 1 / strip, np.float32)
+    light = (picture.linear(block.reshape(-1, strip)) @ mean).reshape(n, -1)[:, :: INWARD[side]]
     noise = float(np.median(light[:, : out // 2].std(axis=1)))
     threshold = np.maximum(_LEAST_SHARE * np.ptp(light, axis=1), max(_SIGMAS * noise * (2 / half) ** 0.5, _LEAST_LIGHT))
     inside = _in_picture(centre, side, out, inward, picture.height)
@@ -241,9 +242,10 @@ def _upright(
     centre = np.round(guess[side].at(t)).astype(np.int64)
     left = centre - (out if INWARD[side] > 0 else inward - 1)
     light = picture.linear(_cut(picture.pixels, top, left, (_BAND_ROWS + lag, out + inward), step))
-    change = (light[:, lag:] - light[:, :-lag])[:, :, :: INWARD[side]]
+    change = light[:, lag:] - light[:, :-lag]
+    change = change if INWARD[side] > 0 else np.ascontiguousarray(change[:, :, ::-1])
     within = change[:, :, out + int(_INSIDE * size) :].mean(axis=2)
-    common, power = np.einsum("brn,br->bn", change, within), (within**2).sum(axis=1)
+    common, power = (within[:, None] @ change)[:, 0], (within**2).sum(axis=1)
     noise = float(np.median((change[:, :, : max(out // 3, 2)] ** 2).mean(axis=(1, 2)))) + 1e-7
     # A step over `half` places has this variance where n rows of the mean power are joined: 4 noise / (half n power).
     rows = 4 * noise * (_SIGMAS / _JOINED_SHARE) ** 2 / half / max(float((within**2).mean()), 1e-12)

@@ -15,6 +15,8 @@ from rxcli.types import BoolArray, FloatArray
 
 #: Bands of rows for the left and right sides, at most, and rows of one band, at least.
 _BANDS, _BAND_ROWS = 40, 26
+#: Of more strips than these every second is looked at.
+_MANY_STRIPS = 240
 #: Strips that begin on one and the same row may show a slot's end; together they count as this share of the side.
 _ROW_TRUST = 0.05
 #: Rows in which a blurred edge comes to its full strength.
@@ -133,7 +135,7 @@ def _bend(
         degree = 2 if covered >= 6 and near.sum() >= 10 else 1
         powers = along[near, None] ** np.arange(degree, -1, -1)
         weighted = powers * weight[near, None]
-        fit = np.linalg.lstsq(weighted.T @ powers, weighted.T @ depth[near], rcond=None)[0]
+        fit = np.linalg.solve(weighted.T @ powers + 1e-9 * np.eye(degree + 1), weighted.T @ depth[near])
     return Side(sign * fit, middle, half, float((weight * near).mean() ** 0.5 if across_side else near.mean()))
 
 
@@ -155,7 +157,8 @@ def _strip_onsets(plane: Plane, stripes: Stripes, guess: list[Side], side: int, 
     # The lit screen is brighter than its bezel, so light grows inwards; from a bright wall to the bezel it shrinks.
     energies = stripes.growing if side == TOP else stripes.shrinking
     rows, n = energies.shape
-    t = (np.arange(n, dtype=np.float64) + (1 + plane.apart) / 2) * plane.fx - 0.5
+    strips = np.arange(0, n, 2 if n > _MANY_STRIPS else 1)
+    t = (strips.astype(np.float64) + (1 + plane.apart) / 2) * plane.fx - 0.5
     # A change spans the lag; from outside, the lit row comes last at the top and first at the bottom.
     origin = plane.fy * ((LAG - 0.5) if side == TOP else 0.5)
     window, inside = _window(guess, side, t, origin, plane.fy, reach, 0.004 * reach.size)
@@ -164,7 +167,7 @@ def _strip_onsets(plane: Plane, stripes: Stripes, guess: list[Side], side: int, 
     first, last = _span(window.index, rows)
     smooth = cv2.blur(energies[first:last], (3, 1))
     valid = (window.index >= 0) & (window.index < rows)
-    energy = np.where(valid, smooth[np.clip(window.index, first, last - 1) - first, np.flatnonzero(inside)[:, None]], 0)
+    energy = np.where(valid, smooth[np.clip(window.index, first, last - 1) - first, strips[inside][:, None]], 0)
     level = np.maximum(max(8 * stripes.noise, 16 * stripes.floor, 2e-5), 0.06 * _plateau(energy, window.outer))
     active = energy > level[:, None]
     depth = _half_way(energy, active.argmax(axis=1))
@@ -210,7 +213,7 @@ def _band_onsets(picture: Picture, plane: Plane, guess: list[Side], side: int, r
     if window.index.max() < 0 or window.index.min() >= n_columns:
         return _no_onsets(fx)
     first, last = _span(window.index, n_columns)
-    product, _ = products(*_with_steps(finer(picture, plane, first, last + steps), steps))
+    product, _ = products(*finer(picture, plane, first, last + steps), steps)
     # Every row is taken along the slanted side, then bands of rows are summed.
     valid = (window.index >= first) & (window.index < last)
     column = np.clip(window.index, first, last - 1) - first
@@ -220,10 +223,6 @@ def _band_onsets(picture: Picture, plane: Plane, guess: list[Side], side: int, r
     index = window.index.reshape(n_bands, rows, -1).mean(axis=1)
     bands = _Window(t, index, window.outer, origin, fx, window.sign)
     return _lasting_steps(energy, spread / rows, spread > 0, bands, between(guess, side, t, 0.004 * reach.size))
-
-
-def _with_steps(part: tuple[Any, Any], steps: int) -> tuple[Any, int, Any]:
-    return part[0], steps, part[1]
 
 
 def _lasting_steps(

@@ -89,7 +89,7 @@ def pose_of(corners: FloatArray, rectangle: Rectangle) -> FloatArray:
     size = float(np.linalg.norm(edge)) / 2
     width = np.log(size / rectangle.width)
     start = np.array([0.0, 0.0, np.arctan2(edge[1], edge[0]), *offset, width, _LOG_FOCAL, 0.0])
-    return fit_pose([None] * 4, corners, 0.004 * size, start, rectangle, 6)
+    return fit_pose([None] * 4, corners, 0.004 * size, start, rectangle, 4)
 
 
 def misfit(places: list[Places | None], pose: FloatArray, rectangle: Rectangle) -> float:

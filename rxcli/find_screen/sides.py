@@ -33,7 +33,11 @@ class Side:
 
     def at(self, t: FloatArray) -> FloatArray:
         """Place of the side at `t`."""
-        return np.asarray(np.polyval(self.coefficients, (t - self.middle) / self.half), np.float64)
+        along = (t - self.middle) / self.half
+        place = np.zeros_like(along)
+        for coefficient in self.coefficients:
+            place = place * along + coefficient
+        return np.asarray(place, np.float64)
 
     @property
     def slope(self) -> float:
@@ -81,7 +85,8 @@ def corners_of(sides: list[Side], width: int, height: int) -> FloatArray:
     found = []
     for flat, upright in ((TOP, LEFT), (TOP, RIGHT), (BOTTOM, RIGHT), (BOTTOM, LEFT)):
         x, y = np.array(width / 2), np.array(height / 2)
-        for _ in range(12):
+        # Each turn brings the corner nearer by the product of two slopes.
+        for _ in range(4):
             x = sides[upright].at(y)
             y = sides[flat].at(x)
         found.append((float(x), float(y)))

@@ -49,7 +49,7 @@ class Stripes:
         return float(self.striped[inside > 0].mean()) if inside.any() else 0.0
 
 
-def products(light: Float32Array, apart: int, wedge: BoolArray | None) -> tuple[Float32Array, BoolArray]:
+def products(light: Float32Array, wedge: BoolArray | None, apart: int) -> tuple[Float32Array, BoolArray]:
     """Change over the lag, times the same change `apart` columns further; and where light grows down the rows."""
     change = light[LAG:] - light[:-LAG]
     product = np.asarray(change[:, apart:] * change[:, :-apart], np.float32)
@@ -70,7 +70,7 @@ def find_stripes(plane: Plane) -> Stripes:
     """The map of stripe energy."""
     import cv2
 
-    product, grows = products(plane.light, plane.apart, plane.wedge)
+    product, grows = products(plane.light, plane.wedge, plane.apart)
     growing = product * grows
     shape = (product.shape[1] // _CELL_STRIPS, product.shape[0] // plane.cell_rows)
     inner = (slice(shape[1] * plane.cell_rows), slice(shape[0] * _CELL_STRIPS))
