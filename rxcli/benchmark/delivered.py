@@ -38,8 +38,9 @@ _LEVELS = np.array([0.25, 0.5, 0.75, 1.0], np.float32)
 _COARSE_STEP, _FINE_STEP = 0.25, 0.02
 #: One row in so many slots is looked at while the clock is sought.
 _ROWS_PER_SLOT = 4.0
-#: Bins of light in which the noise is measured.
-_NOISE_BINS = 32
+#: Slots over which the noise is measured, and the least variance of a strip's row: an eighth of a grey level, squared.
+_NOISE_SLOTS = 40
+_LEAST_VARIANCE = (0.125 / 255) ** 2 / 12.92**2
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +227,7 @@ class _Known:
         residual = self._residual(expected, fit)
         varies = light[inside] - light[inside].mean()
         explained = 1 - float((residual[inside] ** 2).sum()) / max(float((varies**2).sum()), 1e-30)
-        precision = inside / _noise(residual, fit.gain * expected, inside, profiles.count)
+        precision = inside / _noise(residual, inside, round(self._window * _NOISE_SLOTS / _FIT_SLOTS))
         height, n_columns = exposure.sensor.height, exposure.lit.shape[1]
         information, matched = np.zeros((height, n_columns)), np.zeros((height, n_columns))
         rows = np.clip(np.rint(self._sensor_rows), 0, height - 1).astype(np.int64)
@@ -304,18 +305,11 @@ def _box(values: NDArray[Any], window: int) -> FloatArray:
     return np.asarray(total[..., np.minimum(rows + half + 1, n)] - total[..., np.maximum(rows - half, 0)]) / window
 
 
-def _noise(
-    residual: Float32Array, expected: Float32Array, inside: NDArray[np.bool_], count: Float32Array
-) -> Float32Array:
-    """(C, S, R) variance of the strips: by light, from what the known picture leaves unexplained."""
-    pixel = residual**2 * count[..., None]
-    seen = np.maximum(expected[inside], 0)
-    edges = np.quantile(seen, np.linspace(0, 1, _NOISE_BINS + 1))
-    number = np.clip(np.searchsorted(edges, seen, side="right") - 1, 0, _NOISE_BINS - 1)
-    size = np.maximum(np.bincount(number, minlength=_NOISE_BINS), 1)
-    by_bin = np.bincount(number, pixel[inside], _NOISE_BINS) / size
-    middle = np.bincount(number, seen, _NOISE_BINS) / size
-    slope, floor = np.polyfit(middle, by_bin, 1, w=np.sqrt(size))
-    least = max(float(by_bin.min()), 1e-12)
-    variance = np.maximum(floor + slope * np.maximum(expected, 0), least)
-    return np.asarray(variance / np.maximum(count, 1)[..., None], np.float32)
+def _noise(residual: Float32Array, inside: NDArray[np.bool_], window: int) -> FloatArray:
+    """(C, S, R) variance of the strips around every row, from what the known picture leaves unexplained.
+
+    Measured strip by strip: noise differs with the light, and what is not known of the picture differs from place to
+    place, by orders of magnitude where dark areas lie beside bright ones.
+    """
+    variance = _box(np.where(inside, residual**2, 0), window) / np.maximum(_box(inside, window), 1e-6)
+    return np.maximum(variance, _LEAST_VARIANCE)
