@@ -19,9 +19,7 @@ from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatAr
 _COARSE, _FINE = 2, 4
 _MAX_ITERATIONS = 3
 #: A column all of whose symbols have at least this log probability is not looked at again.
-CERTAIN = -1e-5
-#: The quick look at the picture is surer than it should be of textured ones.
-_CERTAIN_AT_ONCE = -1e-7
+CERTAIN = -1e-4
 #: A column whose slots stand out less than this has no light to speak of.
 _DARK_SNR_DB = -3.0
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
@@ -63,7 +61,7 @@ def decode(lock: Lock, skip: frozenset[str]) -> Reception:
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
     """
     seen = quick_look(lock)
-    if "certain_columns" in skip and not _doubtful(seen, _CERTAIN_AT_ONCE).any():
+    if "certain_columns" in skip and not _doubtful(seen, CERTAIN).any():
         return replace(seen, skipped={"certain_columns": seen.snr.shape[0]})
     return iterate(lock, seen, skip)
 
@@ -94,7 +92,7 @@ def iterate(lock: Lock, seen: Reception, skip: frozenset[str] = frozenset(SKIPS)
     """
     every = np.ones(seen.snr.shape[0], bool)
     wanted = ~_dark(seen.snr) if "dark_columns" in skip else every
-    doubtful = _doubtful(seen, _CERTAIN_AT_ONCE) if "certain_columns" in skip else every
+    doubtful = _doubtful(seen, CERTAIN) if "certain_columns" in skip else every
     skipped = {"dark_columns": int((~wanted).sum()), "certain_columns": 0}
     for iteration in range(_MAX_ITERATIONS):
         columns = np.flatnonzero(wanted & doubtful)
