@@ -219,12 +219,12 @@ def _noise_model(cells: Float32Array) -> tuple[float, float]:
     rows = cells[:: max(1, cells.size // _NOISE_CELLS)]
     difference = np.abs(np.diff(rows, axis=1)).ravel()
     light = ((rows[:, 1:] + rows[:, :-1]) / 2).ravel()
-    order = np.argsort(light)
     n_bins = min(_NOISE_BINS, max(1, light.size // 50))
-    bins = np.array_split(order, n_bins)
-    x = np.array([np.median(light[part]) for part in bins])
+    # Bins of equal numbers; the few brightest that are left over do not matter.
+    bins = np.argsort(light)[: light.size // n_bins * n_bins].reshape(n_bins, -1)
+    x = np.median(light[bins], axis=1)
     # For a normal difference of two cells of variance s2: median |d| = 0.6745 sqrt(2 s2).
-    y = np.array([np.median(difference[part]) for part in bins]) ** 2 / (2 * 0.6745**2)
+    y = np.median(difference[bins], axis=1) ** 2 / (2 * 0.6745**2)
     return _floor_and_slope(x, y)
 
 
