@@ -20,8 +20,11 @@ FloatArray = NDArray[np.float64]
 N_BINS = 10
 _SCREENS = ("paper-8k65", "paper-17k3", "paper-34k6")
 _PRESETS = ("video-1080p", "phone-plain", "xs10-still")
-#: Sensor widths, pixels: few, because thousands of frames are wanted.
-_WIDTH_PX = (160.0, 560.0)
+#: Sensor widths, pixels: few, because thousands of frames are wanted, and each is to hold packets in doubt.
+_WIDTH_PX = (100.0, 320.0)
+#: Powers of ten of the light against that of the preset: clean at one end, hopeless at the other, most about where
+#: packets begin to fail.
+_LIGHT = (-1.4, 0.1)
 #: Confidences are kept this far from 0 and 1 where their logarithm is taken.
 _EDGE = 1e-6
 
@@ -92,7 +95,7 @@ def scene_of(seed: int) -> Scene:
         w="dimming" if rng.random() < 0.3 else int(rng.integers(2, 9)),
         pose=replace(base.pose, fill=rng.uniform(0.8, 0.97), roll_deg=rng.normal(0, 1.0), yaw_deg=rng.normal(0, 4)),
         exposure_s=exposure_s,
-        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(-1.8, 0.4),
+        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(*_LIGHT),
         blur_px=rng.uniform(0.4, 2.5),
         slot_rate_error_ppm=rng.uniform(-100, 100),
         column_delay_slots=float(rng.choice([0.0, rng.uniform(0, 2)])),
