@@ -1,12 +1,15 @@
-"""The convolutional auto-encoder: a second opinion on slots where the model-based path is unsure.
+"""The convolutional auto-encoder: a second opinion on slots where the light model is unsure.
 
-The network sees what the light model sees, the lateral strips of a column on the slot grid and what the neighbours are
-believed to send, but it needs no idea of the column's own slots: it has learned what pictures look like. So it serves
-where the iteration of picture and slots went astray. It returns log-odds of every slot, from which the iteration starts
-once more; the more plausible end is kept (that is the pipeline's business).
+The network is shown a column as the light model left it: the light of every strip, what neighbours and the column
+itself should have shed by the slots believed so far, the picture that follows, what is left unexplained, and how sure
+the light model is of every slot. It says by how much to correct the log-likelihood ratio of each slot. It has been
+fitted so that the words of the code come out right after the correction, so what it returns is just added.
+
+The rows' own light, an offset that all columns share (a sensor row is read out at once), is taken off first: it is what
+the other columns leave unexplained at the same instant.
 
 One model serves every camera, slot rate, number of columns and number of strips: time is measured in slots, light in
-multiples of the local level, strips are treated alike and pooled.
+multiples of the local level or of its noise, strips are treated alike and pooled.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ import hashlib
 import re
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
@@ -26,7 +29,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from rxcli.errors import ProfileError
-from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, slot_patterns
 from rxcli.resources import data_dir
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
@@ -34,11 +37,26 @@ from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 DEFAULT_MODEL = "strips"
 SAMPLES_PER_SLOT = 4
 #: Names of the features of a strip and of a column, in order; a name with `[4]` stands for one feature a sample.
-STRIP_FEATURES = ("light[4]", "log_light[4]", "neighbours[4]", "valid", "noise", "shot", "own", "exposure", "known")
-COLUMN_FEATURES = ("known", "phase[10]")
-N_STRIP_FEATURES, N_COLUMN_FEATURES = 18, 11
+STRIP_FEATURES = (
+    *("log_light[4]", "neighbours[4]", "own[4]", "residual[4]", "contrast[4]"),
+    *("valid", "noise", "shot", "share", "exposure", "known"),
+)
+COLUMN_FEATURES = ("known", "phase[10]", "believed", "lent", "weight", "score", "information")
+N_STRIP_FEATURES, N_COLUMN_FEATURES = 26, 16
 #: Slots on either side over which the local level is averaged.
 _LEVEL_SLOTS = 10
+#: Scales, in slots, over which the picture is predicted, and the half width of the hole in the middle.
+_PICTURE_SCALES, _HOLE_SLOTS = (0.75, 1.25, 2.5), 0.5
+#: The rows' own light is told by one strip in so many: strips of a column err alike.
+_ROW_STRIPS = 2
+#: Slots on either side over which the error of the prediction is averaged, and bounds of its relative variance.
+_ERROR_SLOTS, _TEXTURE_BOUNDS = 14, (0.003, 2.0)
+#: Largest residual, in standard deviations, in the rows' own light and as a feature.
+_ROW_SIGMAS, _RESIDUAL_SIGMAS = 3.0, 4.0
+#: Probabilities below this are not told apart.
+_TINY = 1e-30
+#: Strips and samples err alike: about so much of their summed information is left.
+_ALIKE = 0.16
 _MAX_MODEL_BYTES = 2_000_000
 
 
@@ -48,8 +66,12 @@ class Scene:
 
     samples: SlotSamples
     clock: Clock
-    #: (C, N) probability that each slot is lit, by the model-based path; only neighbours' are looked at.
+    #: (C, N) probability that each slot is lit, by the model-based path.
     lit: Float32Array
+    #: (C, N + memory, patterns) log-likelihood of every pattern of slots n - memory .. n by the light model.
+    metrics: FloatArray
+    #: (C,) most likely weight.
+    w: NDArray[np.int64]
     #: Light of a dark slot.
     floor: float
     #: Standard deviation of a sample of no light.
@@ -61,49 +83,215 @@ class Scene:
 
 
 class Denoiser(Protocol):
-    """Something that tells lit slots from dark ones by the light alone."""
+    """Something that corrects what the light model says of slots."""
 
     @property
     def name(self) -> str:
         """Name for reports."""
 
-    def slot_log_odds(self, scene: Scene, columns: NDArray[np.int64]) -> Float32Array:
-        """(len(columns), N) ln p(lit)/p(dark) of every slot of `columns`."""
+    def slot_corrections(self, scene: Scene, columns: NDArray[np.int64]) -> Float32Array:
+        """(len(columns), N) what to add to ln p(light | lit) - ln p(light | dark) of every slot of `columns`.
+
+        The scene is one `without_row_light`.
+        """
+
+
+def without_row_light(scene: Scene) -> Scene:
+    """The scene without the light that a sensor row shows everywhere.
+
+    For every column it is what the other columns leave unexplained at the same instant.
+    """
+    some = slice(None, None, _ROW_STRIPS)
+    thin = replace(scene.samples, light=scene.samples.light[:, some], valid=scene.samples.valid[:, some])
+    seen = _explain(replace(scene, samples=thin, spread=scene.spread[some]), np.arange(len(scene.lit)))
+    rows = _row_light(np.clip(seen.residual, -_ROW_SIGMAS, _ROW_SIGMAS), seen.scale)[:, None]
+    samples = replace(scene.samples, light=scene.samples.light - rows * scene.samples.valid)
+    return replace(scene, samples=samples)
 
 
 def network_inputs(scene: Scene, columns: NDArray[np.int64]) -> tuple[Float32Array, Float32Array]:
     """The input contract.
 
     Args:
-        scene: the frame.
+        scene: the frame, `without_row_light`.
         columns: columns to look at, B of them.
 
     Returns:
-        (B, S, 18, N) features of the strips, and (B, 11, N) of the columns; float32.
+        (B, S, 26, N) features of the strips, and (B, 16, N) of the columns; float32.
     """
-    q = scene.samples.samples_per_slot
-    valid = scene.samples.valid[columns]
+    seen = _explain(scene, columns)
+    return _strip_features(scene, seen, columns), _column_features(scene, seen, columns)
+
+
+@dataclass(frozen=True, slots=True)
+class _Explained:
+    """The light of some columns by the slots believed so far, (B, S, n) float32."""
+
+    #: Light over the floor; 0 where nothing is seen.
+    light: Float32Array
+    #: Light per unit of picture that the neighbours and the column itself should have shed.
+    others: Float32Array
+    own: Float32Array
+    #: One over the standard deviation of what is left unexplained; 0 where nothing is seen.
+    scale: Float32Array
+    #: In standard deviations: what a lit slot adds, and what is left unexplained.
+    contrast: Float32Array
+    residual: Float32Array
+
+
+def _explain(scene: Scene, columns: NDArray[np.int64]) -> _Explained:
+    valid, q = scene.samples.valid[columns], scene.samples.samples_per_slot
     light = (scene.samples.light[columns] - np.float32(scene.floor)) * valid
+    share = _against_middle(scene.spread)[None, :, 1, None].astype(np.float32)
+    own = share * _exposures(scene, columns, np.zeros(columns.size))[:, None]
+    others = _from_neighbours(scene, columns)
+    expected = own + others
+    picture, variance = _predict_picture(light, expected, valid, scene.sigma, q)
+    believed = picture * expected
+    noise = variance * expected * expected + np.float32(scene.shot) * believed + np.float32(scene.sigma**2)
+    scale = valid / np.sqrt(noise)
+    return _Explained(light, others, own, scale, picture * share * scale, (light - believed) * scale)
+
+
+def _row_light(residual: Float32Array, scale: Float32Array) -> Float32Array:
+    """(C, n) light that a row shows everywhere, by what the other columns leave unexplained; shrunk by its own error.
+
+    Args:
+        residual: (C, S, n) in standard deviations.
+        scale: (C, S, n) one over the standard deviation.
+    """
+    total, weight = (residual * scale).sum(axis=1), (scale * scale).sum(axis=1)
+    weight = np.maximum(weight.sum(axis=0) - weight, np.float32(1e-6))
+    mean = (total.sum(axis=0) - total) / weight
+    # Strips of a column err alike, so a mean over them is about twice as uncertain as independent ones would make it.
+    error = 2 / weight
+    power = max(float(np.median(mean * mean)) / 0.455 - float(np.median(error)), 0.0)
+    return np.asarray(mean * np.float32(power) / (np.float32(power) + error + np.float32(1e-20)), np.float32)
+
+
+def _predict_picture(
+    light: Float32Array, expected: Float32Array, valid: Float32Array, sigma: float, q: int
+) -> tuple[Float32Array, Float32Array]:
+    """Picture and its variance at every sample, from both sides of it but never from its own slot.
+
+    On each of several scales; the one that has predicted best thereabouts is taken.
+    """
+    weighted = expected * valid
+    sums = [(part, _box(part, int(_HOLE_SLOTS * q))) for part in (weighted * light, weighted * expected)]
+    # Every other sample tells the error well enough.
+    some = (slice(None), slice(None), slice(None, None, 2))
+    light, weighted, around = light[some], weighted[some], _ERROR_SLOTS * q // 2
+    floor = np.float32(sigma * sigma) * _box(valid[some], around)
+    picture = variance = None
+    for scale in _PICTURE_SCALES:
+        reach = int(_HOLE_SLOTS * q) + 2 * int(scale * q)
+        numerator, denominator = (_box(part, reach) - hole for part, hole in sums)
+        guess = np.maximum(numerator, 0) / (denominator + np.float32(1e-4))
+        predicted = guess[some] * weighted
+        error = _box(np.square(light - predicted), around) - floor
+        texture = np.clip(error / (_box(np.square(predicted), around) + np.float32(1e-9)), *_TEXTURE_BOUNDS)
+        spread = guess * guess * np.repeat(texture, 2, axis=2) + np.float32(sigma * sigma) / (
+            denominator + np.float32(1e-6)
+        )
+        if picture is None or variance is None:
+            picture, variance = guess, spread
+            continue
+        # Arithmetic picks several times quicker than a masked copy.
+        picture += (spread < variance) * (guess - picture)
+        np.minimum(variance, spread, out=variance)
+    assert picture is not None
+    assert variance is not None
+    return picture, variance
+
+
+def _box(values: Float32Array, half: int) -> Float32Array:
+    """Sum over the samples at most `half` away; last axis."""
+    import cv2
+
+    flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))
+    summed = cv2.boxFilter(flat, -1, (2 * half + 1, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(summed, np.float32).reshape(values.shape)
+
+
+def _strip_features(scene: Scene, seen: _Explained, columns: NDArray[np.int64]) -> Float32Array:
+    """(B, S, 26, N)"""
+    q, sigma = scene.samples.samples_per_slot, np.float32(max(scene.sigma, 1e-7))
+    valid, light = scene.samples.valid[columns], seen.light
     level = _local_level(light, valid, q)
-    sigma = np.float32(max(scene.sigma, 1e-7))
-    relative = np.clip(light / (level + 2 * sigma), -1, 4)
-    base = 0.02 * level + 2 * sigma
-    log_light = np.log((np.maximum(light, 0) + base) / (level + base))
+    base = np.float32(0.02) * level + 2 * sigma
+    by_sample = (
+        np.log((np.maximum(light, 0) + base) / (level + base)),
+        seen.others,
+        seen.own,
+        np.clip(seen.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS),
+        _tamed(seen.contrast),
+    )
     shape = (*light.shape[:2], -1, q)
-    known = _known_slots(scene.clock)
-    features = [
-        *np.moveaxis(relative.reshape(shape), -1, 0),
-        *np.moveaxis(log_light.reshape(shape), -1, 0),
-        *np.moveaxis(_from_neighbours(scene, columns, q).reshape(shape), -1, 0),
+    out = np.empty((*light.shape[:2], N_STRIP_FEATURES, light.shape[-1] // q), np.float32)
+    for number, values in enumerate(by_sample):
+        out[:, :, number * q : (number + 1) * q] = np.moveaxis(values.reshape(shape), -1, 2)
+    by_slot = (
         valid.reshape(shape).mean(axis=-1),
         *_noise_features(level.reshape(shape)[..., 0], sigma, np.float32(scene.shot)),
         _against_middle(scene.spread)[None, :, 1, None],
         np.float32(scene.clock.exposure_slots),
-        known,
-    ]
-    whole = features[0].shape
-    strips = np.stack([np.broadcast_to(feature, whole) for feature in features], axis=2).astype(np.float32)
-    return strips, np.broadcast_to(_column_features(known, scene.clock), (columns.size, N_COLUMN_FEATURES, whole[-1]))
+        _known_slots(scene.clock),
+    )
+    for number, values in enumerate(by_slot):
+        out[:, :, len(by_sample) * q + number] = values
+    return out
+
+
+def _column_features(scene: Scene, seen: _Explained, columns: NDArray[np.int64]) -> Float32Array:
+    """(B, 16, N)"""
+    q, clock = scene.samples.samples_per_slot, scene.clock
+    lit = np.clip(scene.lit[columns], 1e-5, 1 - 1e-5)
+    llr = _slot_llr(scene.metrics[columns], lit)
+    contrast = _tamed(seen.contrast)
+    place = (np.arange(clock.n_slots) + clock.first_slot) % SLOTS_PER_SYMBOL
+    by_slot = (
+        _known_slots(clock),
+        *(np.arange(SLOTS_PER_SYMBOL)[:, None] == place),
+        np.clip(llr / 4, -3, 3),
+        np.clip((np.log(lit / (1 - lit)) - llr) / 4, -3, 3),
+        scene.w[columns, None] / SLOTS_PER_SYMBOL,
+        np.clip(_pooled(_bounded(np.clip(seen.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS)) * contrast, q), -4, 4),
+        np.log1p(_pooled(contrast * contrast, q)),
+    )
+    shape = (columns.size, clock.n_slots)
+    return np.stack([np.broadcast_to(values, shape) for values in by_slot], axis=1).astype(np.float32)
+
+
+def _tamed(contrast: Float32Array) -> Float32Array:
+    return np.asarray(np.minimum(contrast, np.float32(2 * _RESIDUAL_SIGMAS)) / np.float32(4))
+
+
+def _bounded(residual: Float32Array) -> Float32Array:
+    """The slope of a Student-t log-density of four degrees of freedom: outliers count little."""
+    return np.asarray(residual / (1 + residual * residual / np.float32(4)))
+
+
+def _pooled(values: NDArray[np.floating[Any]], q: int) -> Float32Array:
+    """(B, N) sum over strips and the samples of a slot, as far as they are independent."""
+    return np.asarray(values.sum(axis=1).reshape(values.shape[0], -1, q).sum(axis=2) * np.float32(_ALIKE))
+
+
+def _slot_llr(metrics: FloatArray, lit: Float32Array) -> Float32Array:
+    """(B, N) log-likelihood ratio of every slot by the light model, the slots around it being lit as believed.
+
+    Args:
+        metrics: (B, N + memory, patterns).
+        lit: (B, N) probability that each slot is lit, neither 0 nor 1.
+    """
+    memory, n_slots = metrics.shape[1] - lit.shape[1], lit.shape[1]
+    patterns = slot_patterns(memory).astype(np.float64)
+    padded = np.pad(lit.astype(np.float64), ((0, 0), (memory, memory)), constant_values=0.5)
+    odds = np.lib.stride_tricks.sliding_window_view(np.log(padded) - np.log1p(-padded), memory + 1, axis=1)
+    joint = metrics + odds @ patterns.T
+    joint = np.exp(joint - joint.max(axis=2, keepdims=True))
+    # (B, N + memory, memory + 1): posterior odds of each slot of a pattern, against its prior ones.
+    gained = np.log(joint @ patterns + _TINY) - np.log(joint @ (1 - patterns) + _TINY) - odds
+    return np.asarray(sum(gained[:, age : age + n_slots, memory - age] for age in range(memory + 1)), np.float32)
 
 
 def _local_level(light: Float32Array, valid: Float32Array, q: int) -> Float32Array:
@@ -132,25 +320,24 @@ def _known_slots(clock: Clock) -> Float32Array:
     return np.where(position < len(HEADER), header[np.minimum(position, len(HEADER) - 1)], 0).astype(np.float32)
 
 
-def _column_features(known: Float32Array, clock: Clock) -> Float32Array:
-    """(11, N): known slots, and the place in the symbol as one of ten."""
-    place = (np.arange(clock.n_slots) + clock.first_slot) % SLOTS_PER_SYMBOL
-    return np.concatenate([known[None], np.arange(SLOTS_PER_SYMBOL)[:, None] == place]).astype(np.float32)
-
-
-def _from_neighbours(scene: Scene, columns: NDArray[np.int64], q: int) -> Float32Array:
+def _from_neighbours(scene: Scene, columns: NDArray[np.int64]) -> Float32Array:
     """(B, S, N * Q) light that the adjacent columns should shed into each strip, per unit of picture."""
-    n_columns = scene.lit.shape[0]
+    delay, spread = scene.clock.delay_slots, _against_middle(scene.spread).astype(np.float32)
     out = np.zeros((columns.size, *scene.samples.light.shape[1:]), np.float32)
-    centres = (np.arange(out.shape[-1]) + 0.5) / q
-    spread = _against_middle(scene.spread)
     for side, share in ((-1, spread[:, 0]), (1, spread[:, 2])):
-        for row, column in enumerate(columns):
-            other = int(column) + side
-            if 0 <= other < n_columns:
-                ahead = scene.clock.delay_slots[column] - scene.clock.delay_slots[other]
-                out[row] += share[:, None] * _exposed(scene.lit[other], centres + ahead, scene.clock.exposure_slots)
+        there = (columns + side >= 0) & (columns + side < delay.size)
+        own, other = columns[there], columns[there] + side
+        out[there] += share[:, None] * _exposures(scene, other, delay[own] - delay[other])[:, None]
     return out
+
+
+def _exposures(scene: Scene, columns: NDArray[np.int64], ahead: FloatArray) -> Float32Array:
+    """(B, N * Q) mean of the believed slots of columns over every sample's exposure, read `ahead` slots later."""
+    n = scene.samples.light.shape[-1]
+    centres = (np.arange(n) + 0.5) / scene.samples.samples_per_slot
+    exposure = scene.clock.exposure_slots
+    rows = [_exposed(scene.lit[c], centres + late, exposure) for c, late in zip(columns, ahead, strict=True)]
+    return np.asarray(rows, np.float32).reshape(columns.size, n)
 
 
 def _against_middle(spread: FloatArray) -> FloatArray:
@@ -178,17 +365,28 @@ def _exposed(lit: Float32Array, centres: FloatArray, exposure_slots: float) -> F
     )
 
 
+def payload_seen(scene: Scene) -> Float32Array:
+    """(C, N) 1 where any part of a payload slot can be seen, else 0.
+
+    Only payloads have been learned from: header and dimming symbol are left to the light model.
+    """
+    clock = scene.clock
+    payload = (np.arange(clock.n_slots) + clock.first_slot) % clock.packet_slots >= PREAMBLE_SLOTS
+    valid = scene.samples.valid.max(axis=1)
+    return np.asarray(payload & (valid.reshape(*scene.lit.shape, -1).max(axis=2) > 0), np.float32)
+
+
 class Contract(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What a model's tensors mean."""
 
-    version: Literal[1]
+    version: Literal[2]
     samples_per_slot: Literal[4]
     #: Names, in order; see `STRIP_FEATURES` and `COLUMN_FEATURES`.
     strip_features: tuple[str, ...]
     column_features: tuple[str, ...]
     strips: str = "strips"
     columns: str = "columns"
-    log_odds: str = "log_odds"
+    correction: str = "correction"
 
 
 class ModelCard(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -265,16 +463,19 @@ class OnnxDenoiser:
         """Name and version, for reports."""
         return f"{self.card.name}-{self.card.version}"
 
-    def slot_log_odds(self, scene: Scene, columns: NDArray[np.int64]) -> Float32Array:
-        """(len(columns), N) ln p(lit)/p(dark) of every slot of `columns`.
+    def slot_corrections(self, scene: Scene, columns: NDArray[np.int64]) -> Float32Array:
+        """(len(columns), N) what to add to ln p(light | lit) - ln p(light | dark) of every slot of `columns`.
+
+        The scene is one `without_row_light`.
 
         Raises:
             ProfileError: the file is not the network that its card tells of.
         """
         strips, features = network_inputs(scene, columns)
         contract = self.card.contract
-        fed = {contract.strips: strips, contract.columns: np.ascontiguousarray(features)}
-        return np.asarray(self._session.run([contract.log_odds], fed)[0], np.float32)
+        fed = {contract.strips: strips, contract.columns: features}
+        correction = np.asarray(self._session.run([contract.correction], fed)[0], np.float32)
+        return correction * payload_seen(scene)[columns]
 
     @cached_property
     def _session(self) -> Any:
@@ -299,7 +500,7 @@ class OnnxDenoiser:
         fits = found.keys() == wanted.keys() and all(
             len(found[name]) == rank and found[name][axis] == size for name, (rank, axis, size) in wanted.items()
         )
-        if not fits or [tensor.name for tensor in outputs] != [contract.log_odds]:
+        if not fits or [tensor.name for tensor in outputs] != [contract.correction]:
             raise ProfileError(
                 f"model {self.name}: its tensors {found} are not those of its contract {sorted(wanted)}",
                 "export it again with vlc-rx train",

@@ -11,14 +11,17 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import chain
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rxcli import assemble, denoise
 from rxcli.dump import dump_frame
 from rxcli.locate import Failure, Stages, find_camera, find_corners, find_lock, too_small
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
-from rxcli.reception import decode, iterate, quick_look, scene_of, second_opinion
+from rxcli.reception import decode, doubtful_columns, second_opinion, without_row_light
 from rxcli.types import Frame, FrameResult
 
-__all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "denoiser_scene", "receive", "receive_frame"]
+__all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "denoiser_case", "receive", "receive_frame"]
 
 _NO_PACKET = "no column gave a packet, though headers were found; each column says why: see --json"
 
@@ -50,15 +53,17 @@ def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
     yield from frames
 
 
-def denoiser_scene(frame: Frame, options: ReceiverOptions) -> denoise.Scene | None:
-    """What the auto-encoder is shown of a frame, None where no signal is found; for training."""
+def denoiser_case(frame: Frame, options: ReceiverOptions) -> tuple[denoise.Scene, NDArray[np.int64]] | None:
+    """For training: what the auto-encoder is shown of a frame, and which columns it is asked; None without any."""
     try:
         corners = find_corners(frame, options)
         camera, options = find_camera(frame, corners, options, Stages())
         lock = find_lock(frame, corners, camera, options, Stages())
     except Failure:
         return None
-    return scene_of(lock, iterate(lock, quick_look(lock)))
+    seen = decode(lock, options.skip)
+    columns = doubtful_columns(seen)
+    return (without_row_light(lock, seen, columns)[0], columns) if columns.size else None
 
 
 def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:

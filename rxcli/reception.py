@@ -27,10 +27,6 @@ HOPELESS_WEIGHT = 20.0
 #: A column with a symbol of less than this log probability gets a second opinion. Measured (models/strips/README.md): a
 #: stricter gate asks half as often again and mends nothing more, a laxer one leaves errors behind.
 _DOUBTFUL = -1e-2
-#: The auto-encoder sees the same light as the light model, so its log-odds count for less than an observation's own.
-_DENOISER_WEIGHT = 0.25
-#: Rounds of light model and detection from where the auto-encoder starts.
-_RESTART_ITERATIONS = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,40 +170,54 @@ def _unsettled(seen: Reception, before: NDArray[np.int64], iteration: int, skip:
 def second_opinion(
     lock: Lock, seen: Reception, options: ReceiverOptions
 ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
-    """Doubtful columns once more from where the auto-encoder starts; whichever end is more plausible is kept.
-
-    Its log-odds are then added to the likelihoods of either end.
+    """Doubtful columns once more without the rows' own light, and with the auto-encoder's corrections.
 
     Returns:
-        What is kept, the columns whose second end that is, and what to report; None where nothing was done.
+        What was received then, the columns in which that decides other symbols, and what to report; None where nothing
+        was done.
     """
     if options.cae == "never":
         return seen, frozenset(), None
-    doubtful = np.ones(seen.snr.shape[0], bool) if options.cae == "always" else _doubtful(seen, _DOUBTFUL)
-    columns = np.flatnonzero(doubtful)
+    columns = np.arange(seen.snr.shape[0]) if options.cae == "always" else doubtful_columns(seen)
     if columns.size == 0:
         return seen, frozenset(), None
-    report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
+    report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "changed": 0}
     try:
         denoiser = _denoiser()
-        log_odds = denoiser.slot_log_odds(scene_of(lock, seen), columns)
+        scene, cleaned = without_row_light(lock, seen, columns)
+        corrections = denoiser.slot_corrections(scene, columns)
     except ReceiverError as error:
         return seen, frozenset(), {**report, "columns": 0, "message": str(error)}
-    coarse = columns[~seen.fine[columns]]
-    if coarse.size:
-        # Likelihoods compare on the same samples alone.
-        seen, _ = _look_again(lock, seen, coarse, fine=True)
-    seen = _with_bursts_of(seen, log_odds, lock.screen.repeats)
-    again = _restart(lock, seen, log_odds, columns)
-    better = _evidence(again.metrics, seen) > _evidence(seen.metrics[columns], seen)
-    kept = columns[better]
-    metrics, snr = seen.metrics.copy(), seen.snr.copy()
-    metrics[kept], snr[kept] = again.metrics[better], again.snr[better]
-    metrics[columns] += _DENOISER_WEIGHT * channel.metrics_of(log_odds, seen.model.memory)
+    metrics = cleaned.metrics.copy()
+    metrics[columns] += channel.metrics_of(corrections, seen.model.memory)
+    posteriors = _replaced(cleaned.posteriors, columns, _detect(metrics[columns], seen.clock))
     # The network is told where headers are; whether they show there, the light alone must say.
-    posteriors = replace(_detect(metrics, seen.clock), header_llr=seen.posteriors.header_llr)
-    seen = replace(seen, metrics=metrics, snr=snr, posteriors=posteriors)
-    return seen, frozenset(kept.tolist()), {**report, "model": denoiser.name, "kept": kept.size}
+    posteriors = replace(posteriors, header_llr=cleaned.posteriors.header_llr)
+    changed = np.flatnonzero((posteriors.index != seen.posteriors.index).any(axis=(0, 2)))
+    report.update(model=denoiser.name, changed=changed.size)
+    return replace(cleaned, metrics=metrics, posteriors=posteriors), frozenset(changed.tolist()), report
+
+
+def without_row_light(lock: Lock, seen: Reception, columns: NDArray[np.int64]) -> tuple[denoise.Scene, Reception]:
+    """Some columns looked at again once the light that a sensor row shows everywhere is taken off.
+
+    Returns:
+        What the auto-encoder is shown, and what is received then.
+    """
+    samples, model = _view(lock, seen, np.arange(seen.snr.shape[0]), denoise.SAMPLES_PER_SLOT)
+    scene = denoise.without_row_light(_scene_of(seen, samples, model))
+    asked = replace(samples, light=scene.samples.light[columns], valid=samples.valid[columns])
+    likelihoods = channel.slot_likelihoods(asked, seen.clock, model, scene.lit, columns)
+    metrics, snr, fine = seen.metrics.copy(), seen.snr.copy(), seen.fine.copy()
+    metrics[columns], snr[columns], fine[columns] = likelihoods.metrics, likelihoods.snr, True
+    posteriors = _replaced(seen.posteriors, columns, _detect(metrics[columns], seen.clock))
+    cleaned = replace(seen, metrics=metrics, snr=snr, fine=fine, posteriors=posteriors)
+    return _scene_of(cleaned, scene.samples, model), cleaned
+
+
+def doubtful_columns(seen: Reception) -> NDArray[np.int64]:
+    """Columns that get a second opinion."""
+    return np.flatnonzero(_doubtful(seen, _DOUBTFUL))
 
 
 @lru_cache(maxsize=1)
@@ -215,10 +225,18 @@ def _denoiser() -> denoise.Denoiser:
     return denoise.load_denoiser()
 
 
-def scene_of(lock: Lock, seen: Reception) -> denoise.Scene:
-    samples, model = _view(lock, seen, np.arange(seen.snr.shape[0]), denoise.SAMPLES_PER_SLOT)
-    lit = channel.lit_on_grid(seen.posteriors, seen.clock)
-    return denoise.Scene(samples, seen.clock, lit, model.floor, model.sigma, model.shot, model.spread)
+def _scene_of(seen: Reception, samples: SlotSamples, model: channel.LightModel) -> denoise.Scene:
+    return denoise.Scene(
+        samples=samples,
+        clock=seen.clock,
+        lit=channel.lit_on_grid(seen.posteriors, seen.clock),
+        metrics=seen.metrics,
+        w=seen.posteriors.w,
+        floor=model.floor,
+        sigma=model.sigma,
+        shot=model.shot,
+        spread=model.spread,
+    )
 
 
 def _with_bursts_of(seen: Reception, log_odds: Float32Array, repeats: int) -> Reception:
@@ -227,28 +245,6 @@ def _with_bursts_of(seen: Reception, log_odds: Float32Array, repeats: int) -> Re
     if np.array_equal(now.burst, seen.clock.burst):
         return seen
     return replace(seen, clock=now, posteriors=_detect(seen.metrics, now))
-
-
-def _restart(
-    lock: Lock, seen: Reception, log_odds: Float32Array, columns: NDArray[np.int64]
-) -> channel.SlotLikelihoods:
-    """Light model and detection of some columns from given log-odds of their slots; the other columns stay."""
-    lit = channel.lit_on_grid(seen.posteriors, seen.clock).copy()
-    samples, model = _view(lock, seen, columns, _FINE)
-    metrics = channel.metrics_of(log_odds, model.memory)
-    for _ in range(_RESTART_ITERATIONS):
-        lit[columns] = channel.lit_on_grid(_detect(metrics, seen.clock), seen.clock)
-        likelihoods = channel.slot_likelihoods(samples, seen.clock, model, lit, columns)
-        metrics = likelihoods.metrics
-    return likelihoods
-
-
-def _evidence(metrics: FloatArray, seen: Reception) -> FloatArray:
-    """(C,) log evidence of columns, over all weights."""
-    bursts = _by_burst(metrics, seen.clock)
-    return np.asarray(
-        np.logaddexp.reduce(detect.weight_evidence(bursts, detect.plausible_weights(bursts, HOPELESS_WEIGHT)), axis=1)
-    )
 
 
 def _doubtful(seen: Reception, certain: float) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ import pytest
 
 from rxcli import denoise, reception
 from rxcli.benchmark.trial import Trial, simulate_trial
+from rxcli.channel import metrics_of
 from rxcli.denoise import COLUMN_FEATURES, STRIP_FEATURES, Scene, load_denoiser, network_inputs
 from rxcli.errors import ProfileError
 from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
@@ -44,18 +45,28 @@ def through_exposure(slots: np.ndarray, exposure: float) -> np.ndarray:
     return np.where((index < 0) | (index >= n), 0.5, values).mean(axis=2)
 
 
-def scene_of(slots: np.ndarray, rng: np.random.Generator, *, noise: float = 0.005) -> Scene:
-    """Columns in front of a slowly changing picture."""
+def scene_of(slots: np.ndarray, rng: np.random.Generator, *, noise: float = 0.005, rows: float = 0.0) -> Scene:
+    """Columns in front of a slowly changing picture, rightly believed; every row with an offset of its own."""
     shape = through_exposure(slots, EXPOSURE)
     place = (np.arange(N_STRIPS) + 0.5) / N_STRIPS - 0.5
     spread = np.exp(-((place[:, None] - np.arange(-1, 2)) ** 2) / (2 * 0.45**2))
     around = np.pad(shape, ((1, 1), (0, 0)))
-    light = sum(spread[None, :, k, None] * around[k : k + N_COLUMNS, None] for k in range(3))
+    light = sum(spread[None, :, k, None] * around[k : k + len(slots), None] for k in range(3))
     picture = 0.3 + 0.1 * np.sin(np.arange(shape.shape[1]) / 90 + place[:, None] * 5)
     light = 0.01 + light * picture + noise * rng.standard_normal(light.shape)
-    clock = Clock(5.0, EXPOSURE, PACKET, 0.0, slots.shape[1], 0, np.zeros(2, np.int64), np.zeros(N_COLUMNS), 9.0)
-    samples = SlotSamples(light.astype(np.float32), np.ones(light.shape, np.float32), Q)
-    return Scene(samples, clock, slots.astype(np.float32), 0.01, noise, 1e-6, spread)
+    light += rows * rng.standard_normal(light.shape[-1])
+    clock = Clock(5.0, EXPOSURE, PACKET, 0.0, slots.shape[1], 0, np.zeros(2, np.int64), np.zeros(len(slots)), 9.0)
+    return Scene(
+        samples=SlotSamples(light.astype(np.float32), np.ones(light.shape, np.float32), Q),
+        clock=clock,
+        lit=slots.astype(np.float32),
+        metrics=metrics_of(9.0 * (2.0 * slots - 1), 1),
+        w=np.full(len(slots), W),
+        floor=0.01,
+        sigma=noise,
+        shot=1e-6,
+        spread=spread,
+    )
 
 
 @pytest.fixture
@@ -64,29 +75,37 @@ def scene() -> Scene:
     return scene_of(sent(rng), rng)
 
 
+def widths(names: tuple[str, ...]) -> list[int]:
+    return [int(found.group(1)) if (found := re.search(r"\[(\d+)\]", name)) else 1 for name in names]
+
+
 def feature(strips: np.ndarray, name: str) -> np.ndarray:
     """(B, S, k, N) the features of one name."""
-    widths = [int(found.group(1)) if (found := re.search(r"\[(\d+)\]", n)) else 1 for n in STRIP_FEATURES]
-    start = sum(widths[: STRIP_FEATURES.index(name)])
-    return strips[:, :, start : start + widths[STRIP_FEATURES.index(name)]]
+    number = STRIP_FEATURES.index(name)
+    start = sum(widths(STRIP_FEATURES)[:number])
+    return strips[:, :, start : start + widths(STRIP_FEATURES)[number]]
+
+
+def column_feature(columns: np.ndarray, name: str) -> np.ndarray:
+    """(B, N) a feature of columns that is one number a slot."""
+    return columns[:, sum(widths(COLUMN_FEATURES)[: COLUMN_FEATURES.index(name)])]
 
 
 def test_the_contract_names_every_feature(scene: Scene) -> None:
     strips, columns = network_inputs(scene, np.array([0, 2]))
-    n_named = [sum(int(m.group(1)) if (m := re.search(r"\[(\d+)\]", n)) else 1 for n in names)
-               for names in (STRIP_FEATURES, COLUMN_FEATURES)]  # fmt: skip
+    n_named = [sum(widths(names)) for names in (STRIP_FEATURES, COLUMN_FEATURES)]
     assert strips.shape == (2, N_STRIPS, n_named[0], 2 * PACKET)
     assert columns.shape == (2, n_named[1], 2 * PACKET)
     assert strips.dtype == columns.dtype == np.float32
     assert np.isfinite(strips).all()
 
 
-def test_headers_are_known_and_nothing_else(scene: Scene) -> None:
+def test_headers_are_known_and_no_other_slot(scene: Scene) -> None:
     _, columns = network_inputs(scene, np.array([1]))
     np.testing.assert_array_equal(columns[0, 0, :10], 2 * np.array(HEADER) - 1)
     np.testing.assert_array_equal(columns[0, 0, PACKET : PACKET + 10], 2 * np.array(HEADER) - 1)
     assert not columns[0, 0, 10:PACKET].any()
-    np.testing.assert_array_equal(columns[0, 1:].argmax(axis=0), np.arange(2 * PACKET) % 10)
+    np.testing.assert_array_equal(columns[0, 1:11].argmax(axis=0), np.arange(2 * PACKET) % 10)
 
 
 def test_neighbours_light_is_slots_through_the_exposure(scene: Scene) -> None:
@@ -114,13 +133,90 @@ def test_delayed_neighbours_move(scene: Scene) -> None:
     np.testing.assert_allclose(late[..., 1:], on_time[..., :-1], atol=1e-5)
 
 
-def test_the_columns_own_belief_is_not_looked_at(scene: Scene) -> None:
+def test_own_light_is_the_columns_slots_through_the_exposure(scene: Scene) -> None:
+    strips, _ = network_inputs(scene, np.array([1]))
+    shape = through_exposure(scene.lit, EXPOSURE)[1].reshape(-1, Q)
+    expected = scene.spread[:, 1, None, None] * shape
+    np.testing.assert_allclose(np.moveaxis(feature(strips, "own[4]")[0], 1, 2), expected, atol=0.02)
+
+
+def test_right_beliefs_leave_noise_alone(scene: Scene) -> None:
+    strips, _ = network_inputs(scene, np.arange(N_COLUMNS))
+    inner = feature(strips, "residual[4]")[..., 5:-5]
+    assert abs(inner.mean()) < 0.1
+    assert 0.5 < inner.std() < 1.2
+
+
+@pytest.mark.parametrize("sent_state", [0, 1])
+def test_a_wrong_belief_stands_out(scene: Scene, sent_state: int) -> None:
+    """Light where the slot is believed dark, and the reverse."""
+    slot = 20 + int(np.flatnonzero(scene.lit[1, 20:] == sent_state)[5])
     lit = scene.lit.copy()
-    lit[1] = 1 - lit[1]
-    same = network_inputs(replace(scene, lit=lit), np.array([1]))[0]
-    np.testing.assert_array_equal(same, network_inputs(scene, np.array([1]))[0])
-    other = network_inputs(replace(scene, lit=lit), np.array([0]))[0]
-    assert np.abs(other - network_inputs(scene, np.array([0]))[0]).max() > 0.1
+    lit[1, slot] = 1 - sent_state
+    residual = feature(network_inputs(replace(scene, lit=lit), np.array([1]))[0], "residual[4]")[0].mean(axis=(0, 1))
+    assert np.abs(residual).argmax() == slot
+    assert np.sign(residual[slot]) == 2 * sent_state - 1
+
+
+def test_what_all_columns_show_at_one_instant_is_taken_off() -> None:
+    """Most of the rows' own light goes, and hardly anything of what the columns send."""
+    rng = np.random.default_rng(8)
+    slots = np.concatenate([sent(rng) for _ in range(4)])
+    rows = 0.008
+    scene = scene_of(slots, rng, rows=rows)
+    taken = scene.samples.light - denoise.without_row_light(scene).samples.light
+    own = np.random.default_rng(8)
+    _ = [sent(own) for _ in range(4)]
+    own.standard_normal(scene.samples.light.shape)
+    true = rows * own.standard_normal(scene.samples.light.shape[-1])
+    inner = slice(20, -20)
+    left = (true - taken)[..., inner]
+    assert left.std() < 0.6 * true[inner].std()
+    calm = scene_of(slots, rng)
+    spoiled = calm.samples.light - denoise.without_row_light(calm).samples.light
+    assert spoiled[..., inner].std() < 0.3 * rows
+
+
+def test_one_column_alone_has_no_row_light_to_tell(scene: Scene) -> None:
+    alone = scene_of(scene.lit[:1], np.random.default_rng(1))
+    np.testing.assert_array_equal(denoise.without_row_light(alone).samples.light, alone.samples.light)
+
+
+def test_slots_that_are_independent_keep_their_ratio() -> None:
+    llr = np.random.default_rng(1).normal(0, 3, (2, 50)).astype(np.float32)
+    for memory in (1, 3):
+        found = denoise._slot_llr(metrics_of(llr, memory), np.full(llr.shape, 0.5, np.float32))
+        np.testing.assert_allclose(found, llr, atol=1e-4)
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_ratios_of_slots_by_brute_force(memory: int) -> None:
+    """With all others known, a slot's ratio is a difference of sums of metrics."""
+    rng = np.random.default_rng(memory)
+    n = 12
+    metrics, slots = rng.normal(0, 2, (1, n + memory, 2 << memory)), rng.integers(0, 2, n)
+
+    def total(states: np.ndarray) -> float:
+        padded = np.pad(states, memory)
+        index = [int("".join(map(str, padded[i : i + memory + 1])), 2) for i in range(n + memory)]
+        return float(metrics[0, np.arange(n + memory), index].sum())
+
+    lit = np.where(slots == 1, 1 - 1e-5, 1e-5)[None].astype(np.float32)
+    found = denoise._slot_llr(metrics, lit)[0]
+    for slot in range(memory, n - memory):
+        lit_there, dark_there = (np.where(np.arange(n) == slot, state, slots) for state in (1, 0))
+        assert found[slot] == pytest.approx(total(lit_there) - total(dark_there), abs=1e-2)
+
+
+def test_only_the_own_belief_and_the_neighbours_are_looked_at(scene: Scene) -> None:
+    lit = scene.lit.copy()
+    lit[0] = 1 - lit[0]
+    far, near = (np.array([column]) for column in (2, 1))
+    name = "neighbours[4]"
+    before, after = (network_inputs(s, far)[0] for s in (scene, replace(scene, lit=lit)))
+    np.testing.assert_array_equal(feature(after, name), feature(before, name))
+    before, after = (network_inputs(s, near)[0] for s in (scene, replace(scene, lit=lit)))
+    assert np.abs(feature(after, name) - feature(before, name)).max() > 0.1
 
 
 def test_brightness_does_not_matter(scene: Scene) -> None:
@@ -154,35 +250,61 @@ def test_shipped_models_are_small_and_explained(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_models_tell_lit_from_dark(name: str, scene: Scene) -> None:
-    log_odds = load_denoiser(name).slot_log_odds(scene, np.arange(N_COLUMNS))
-    assert log_odds.shape == scene.lit.shape
-    wrong = (log_odds > 0) != (scene.lit > 0.5)
-    assert wrong[:, 2:-2].mean() < 0.01
+def test_shipped_models_do_not_spoil_what_is_right(name: str) -> None:
+    rng = np.random.default_rng(3)
+    scene = scene_of(sent(rng), rng, noise=0.02)
+    corrections = load_denoiser(name).slot_corrections(scene, np.arange(N_COLUMNS))
+    assert corrections.shape == scene.lit.shape
+    corrected = 9.0 * (2 * scene.lit - 1) + corrections
+    assert ((corrected > 0) == (scene.lit > 0.5)).mean() > 0.99
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_contradict_wrong_beliefs(name: str) -> None:
+    """Where the light model is wrongly sure of a slot, the correction points the other way."""
+    rng = np.random.default_rng(4)
+    scene = scene_of(sent(rng), rng, noise=0.03)
+    wrong = rng.random(scene.lit.shape) < 0.04
+    wrong[:, np.arange(2 * PACKET) % PACKET < 20] = False
+    lit = np.where(wrong, 1 - scene.lit, scene.lit).astype(np.float32)
+    doubted = replace(scene, lit=lit, metrics=metrics_of(2.0 * (2 * lit - 1), 1))
+    towards = load_denoiser(name).slot_corrections(doubted, np.arange(N_COLUMNS)) * (2 * scene.lit - 1)
+    assert (towards[wrong] > 0).mean() > 0.8
+    assert towards[wrong].mean() > towards[~wrong].mean() + 0.5
+
+
+def test_slots_that_are_not_seen_and_preambles_are_left_alone(scene: Scene) -> None:
+    valid = scene.samples.valid.copy()
+    valid[..., : 26 * Q] = 0
+    hidden = replace(scene, samples=replace(scene.samples, valid=valid))
+    corrections = load_denoiser().slot_corrections(hidden, np.array([1]))
+    assert not corrections[:, :26].any()
+    assert not corrections[:, PACKET : PACKET + 20].any()
+    assert corrections[:, 26:PACKET].all()
 
 
 def test_columns_and_the_order_of_strips_do_not_touch_each_other(scene: Scene) -> None:
     denoiser = load_denoiser()
-    together = denoiser.slot_log_odds(scene, np.array([0, 1, 2]))
-    alone = denoiser.slot_log_odds(scene, np.array([2]))
+    together = denoiser.slot_corrections(scene, np.array([0, 1, 2]))
+    alone = denoiser.slot_corrections(scene, np.array([2]))
     np.testing.assert_allclose(together[2], alone[0], atol=1e-3)
     order = np.array([3, 0, 4, 1, 2])
     samples = SlotSamples(scene.samples.light[:, order], scene.samples.valid[:, order], Q)
-    mixed = denoiser.slot_log_odds(replace(scene, samples=samples, spread=scene.spread[order]), np.array([0, 1, 2]))
+    mixed = denoiser.slot_corrections(replace(scene, samples=samples, spread=scene.spread[order]), np.array([0, 1, 2]))
     np.testing.assert_allclose(mixed, together, atol=1e-2)
 
 
 def test_the_session_is_made_when_first_needed_and_once(scene: Scene) -> None:
     denoiser = load_denoiser()
     assert "_session" not in vars(denoiser)
-    denoiser.slot_log_odds(scene, np.array([0]))
+    denoiser.slot_corrections(scene, np.array([0]))
     session = vars(denoiser)["_session"]
-    denoiser.slot_log_odds(scene, np.array([1]))
+    denoiser.slot_corrections(scene, np.array([1]))
     assert vars(denoiser)["_session"] is session
     copy = pickle.loads(pickle.dumps(denoiser))
     assert "_session" not in vars(copy)
     np.testing.assert_array_equal(
-        copy.slot_log_odds(scene, np.array([1])), denoiser.slot_log_odds(scene, np.array([1]))
+        copy.slot_corrections(scene, np.array([1])), denoiser.slot_corrections(scene, np.array([1]))
     )
 
 
@@ -243,7 +365,7 @@ def test_cards_are_strict(model: Path, old: str, new: str) -> None:
 def test_what_is_no_network_is_refused_when_it_is_needed(model: Path, scene: Scene) -> None:
     replace_weights(model, b"not a network")
     with pytest.raises(ProfileError, match="ONNX Runtime refuses it"):
-        load_denoiser(str(model)).slot_log_odds(scene, np.array([0]))
+        load_denoiser(str(model)).slot_corrections(scene, np.array([0]))
 
 
 def test_a_foreign_network_is_refused(model: Path, scene: Scene) -> None:
@@ -254,7 +376,7 @@ def test_a_foreign_network_is_refused(model: Path, scene: Scene) -> None:
     made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
     replace_weights(model, made.SerializeToString())
     with pytest.raises(ProfileError, match=r"its tensors .*image.* are not those of its contract"):
-        load_denoiser(str(model)).slot_log_odds(scene, np.array([0]))
+        load_denoiser(str(model)).slot_corrections(scene, np.array([0]))
 
 
 @pytest.fixture(scope="module")
@@ -287,7 +409,7 @@ def test_always_runs_on_every_column_and_harms_none(trials: dict[str, Trial]) ->
     assert score.bit_errors == 0
     assert result.denoiser is not None
     assert result.denoiser["columns"] == 20
-    assert result.denoiser["kept"] == sum(column.denoised for column in result.columns)
+    assert result.denoiser["changed"] == sum(column.denoised for column in result.columns)
 
 
 def test_doubtful_columns_get_a_second_opinion(trials: dict[str, Trial]) -> None:

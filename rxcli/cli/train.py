@@ -19,9 +19,8 @@ CALIBRATION_SAMPLES = 12
 @click.argument("out", type=click.Path(file_okay=False, path_type=Path))
 @click.option("--name", default="strips", show_default=True, help="Name of the model.")
 @click.option("--version", "model_version", type=click.IntRange(1), default=1, show_default=True, help="Its version.")
-@click.option("--steps", type=click.IntRange(1), default=4500, show_default=True, help="Steps of the optimiser.")
-@click.option("--frames", type=click.IntRange(0), default=240, show_default=True, help="Whole frames to simulate.")
-@click.option("--pictures", type=click.IntRange(1), default=300, show_default=True, help="Pictures for small screens.")
+@click.option("--steps", type=click.IntRange(1), default=1600, show_default=True, help="Steps of the optimiser.")
+@click.option("--frames", type=click.IntRange(1), default=640, show_default=True, help="Frames to simulate.")
 @click.option("--held-out", type=click.IntRange(0), default=12, show_default=True, help="Frames to validate on.")
 @click.option("--strip-width", type=click.IntRange(1), default=32, show_default=True, help="Channels of a strip.")
 @click.option("--column-width", type=click.IntRange(1), default=48, show_default=True, help="Channels of a column.")
@@ -40,7 +39,6 @@ def train(
     model_version: int,
     steps: int,
     frames: int,
-    pictures: int,
     held_out: int,
     strip_width: int,
     column_width: int,
@@ -63,22 +61,20 @@ def train(
 
     data, progress = cache or out / "data", not quiet
     recipe = fit.Recipe(shape=Shape(strip_width=strip_width, column_width=column_width), steps=steps, seed=seed)
-    small = dataset.column_samples(pictures, seed, data, progress=progress)
-    whole = dataset.frame_samples(frames, seed, data, progress=progress)
+    samples = dataset.frame_samples(frames, seed, data, progress=progress)
     held = dataset.validation_samples(held_out, data, progress=progress)
-    network = fit.fit(small, whole, held, recipe, out, resume=resume, progress=progress)
+    network = fit.fit(samples, held, recipe, out, resume=resume, progress=progress)
     described = {
         **asdict(recipe),
-        "pictures": pictures,
         "frames": frames,
         "held_out": held_out,
         "parameters": n_parameters(network),
     }
     losses = fit.final_losses(out)
-    calibration = (whole or small)[:CALIBRATION_SAMPLES] if quantise else ()
+    calibration = samples[:CALIBRATION_SAMPLES] if quantise else ()
     card = export.export_model(network, out, name, model_version, described, losses, calibration)
     click.echo(
         f"{out / card.file}: {described['parameters']} parameters, cross-entropy {losses['training_nats']:.4f} nats a "
-        f"slot in training, {losses['validation_nats']:.4f} on held-out scenes",
+        f"word in training, {losses['validation_nats']:.4f} on held-out scenes",
         file=sys.stderr,
     )

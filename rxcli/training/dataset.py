@@ -1,8 +1,13 @@
-"""Data sets: made once, kept in a folder, picked up where an interrupted run left them."""
+"""Data sets: made once, kept in a folder, picked up where an interrupted run left them.
+
+A sample is what the receiver shows the network of the doubtful columns of a frame, with what the light model alone says
+of every word that could have been sent, and the word that was.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -11,44 +16,27 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from rxcli.benchmark.trial import simulate_trial
-from rxcli.denoise import Scene, network_inputs
-from rxcli.pipeline import denoiser_scene
-from rxcli.protocol import HEADER
+from rxcli.channel import by_burst
+from rxcli.denoise import Scene, network_inputs, payload_seen
+from rxcli.pipeline import denoiser_case
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 from rxcli.simulate.camera import Exposure
 from rxcli.simulate.scenes import Scene as SimulatedScene
-from rxcli.training.columns import random_examples
-from rxcli.training.fit import Sample
-from rxcli.training.scenes import SCENE_CLASSES, random_picture, training_scene, validation_scene
-from rxcli.types import Clock
+from rxcli.training.fit import MOST_WORDS, UNKNOWN, Sample
+from rxcli.training.scenes import SCENE_CLASSES, training_scene, validation_scene
+from rxcli.types import Clock, FloatArray
 
-#: Examples that are cut from one picture.
-EXAMPLES_PER_PICTURE = 12
 _SCREENS = ("paper-34k6", "paper-17k3")
-_PICTURE_SIZE = (1366, 768)
+#: Columns of a frame that are learned from; more of one picture tell little more.
+_MOST_COLUMNS = 8
+#: Words are taken to be at most this much less likely than the best, nats.
+_LEAST_SCORE = -60.0
 #: Streams of random numbers.
-_COLUMNS, _FRAMES, _VALIDATION = 5, 77, 900_000
-
-
-def column_samples(n_pictures: int, seed: int, folder: Path, *, progress: bool = True) -> list[Sample]:
-    """Samples of small screens without pixels.
-
-    Args:
-        n_pictures: pictures, of `EXAMPLES_PER_PICTURE` samples each.
-        seed: equal ones give equal samples.
-        folder: cache.
-        progress: show a bar on stderr.
-    """
-
-    def make(number: int) -> list[Sample]:
-        rng = np.random.default_rng([_COLUMNS, seed, number])
-        picture = random_picture(rng, *_PICTURE_SIZE)
-        return [_sample(e.scene, e.slots) for e in random_examples(rng, picture, EXAMPLES_PER_PICTURE)]
-
-    return list(_cached(make, n_pictures, folder / f"columns-{seed}", "columns", progress))
+_FRAMES, _VALIDATION = 77, 900_000
 
 
 def frame_samples(n_frames: int, seed: int, folder: Path, *, progress: bool = True) -> list[Sample]:
-    """Samples of whole simulated frames, as the receiver samples them; frames without a lock are left out.
+    """Samples of simulated frames, as the receiver sees them; frames without a doubtful column or a lock give none.
 
     Args:
         n_frames: frames to simulate.
@@ -87,13 +75,13 @@ def _cached(make: Callable[[int], list[Sample]], n: int, folder: Path, what: str
 
 def _write(path: Path, samples: list[Sample]) -> None:
     arrays = {
-        f"{name}{i}": getattr(sample, name)
+        f"{part.name}{i}": np.asarray(getattr(sample, part.name))
         for i, sample in enumerate(samples)
-        for name in ("strips", "columns", "slots", "seen")
+        for part in fields(Sample)
     }
     part = path.with_suffix(".part")
     with part.open("wb") as file:
-        np.savez(file, n=np.array(len(samples)), **arrays)
+        np.savez(file, allow_pickle=False, n=np.array(len(samples)), **arrays)
     part.replace(path)
 
 
@@ -102,28 +90,108 @@ def _read(path: Path) -> list[Sample] | None:
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             return [
-                Sample(stored[f"strips{i}"], stored[f"columns{i}"], stored[f"slots{i}"], stored[f"seen{i}"])
+                Sample(**{part.name: stored[f"{part.name}{i}"] for part in fields(Sample)})
                 for i in range(int(stored["n"]))
             ]
     except (OSError, ValueError, KeyError, BadZipFile, EOFError):
         return None
 
 
-def _sample(scene: Scene, slots: NDArray[np.uint8]) -> Sample:
-    strips, columns = network_inputs(scene, np.arange(slots.shape[0]))
-    q = scene.samples.samples_per_slot
-    seen = scene.samples.valid.max(axis=1).reshape(slots.shape[0], -1, q).mean(axis=2)
-    return Sample(strips.astype(np.float16), columns.astype(np.float16), slots, seen.astype(np.float16))
-
-
 def _simulated(simulated: SimulatedScene, seed: int) -> list[Sample]:
-    """One frame as a sample; none where the receiver finds no clock, or a wrong one."""
+    """One frame as a sample; none where the receiver finds no clock, a wrong one, or nothing doubtful."""
     trial = simulate_trial(simulated, seed)
-    scene = denoiser_scene(trial.frame, trial.options())
-    if scene is None:
+    case = denoiser_case(trial.frame, trial.options())
+    if case is None:
         return []
+    scene, columns = case
     slots = sent_slots(trial.capture.exposure, scene.clock)
-    return [_sample(scene, slots)] if _headers_fit(slots, scene.clock) else []
+    if not _headers_fit(slots, scene.clock):
+        return []
+    chosen = np.sort(np.random.default_rng(seed).permutation(columns.size)[:_MOST_COLUMNS])
+    return sample_of(scene, columns[chosen], slots, trial.capture.exposure.link.weights)
+
+
+def sample_of(
+    scene: Scene, columns: NDArray[np.int64], slots: NDArray[np.uint8], weights: NDArray[np.integer]
+) -> list[Sample]:
+    """What is to be learned from some columns of a scene; nothing where the receiver mixed up the bursts.
+
+    Args:
+        scene: what the network is shown.
+        columns: columns to learn from, B of them.
+        slots: (C, N) what was sent on the receiver's grid.
+        weights: (C,) what was sent.
+    """
+    clock = scene.clock
+    memory = scene.metrics.shape[1] - clock.n_slots
+    lit, dark = (_by_packet(part, clock) for part in (slots[columns], 1 - slots[columns]))
+    if (lit * dark).any():
+        return []
+    bursts = by_burst(scene.metrics[columns], clock, memory)
+    scores, words = [], []
+    for burst in range(bursts.shape[0]):
+        for row, w in enumerate(weights[columns]):
+            sent = (lit[burst, row] > 0).astype(np.uint8)
+            scores.append(_word_scores(bursts[burst, row], sent, int(w)))
+            word = (codebook(int(w)).astype(np.int64) @ _payload(sent).T).argmax(axis=0)
+            words.append(np.where(_payload(lit[burst, row] + dark[burst, row]).all(axis=1), word, UNKNOWN))
+    shape = (*bursts.shape[:2], len(words[0]))
+    strips, features = network_inputs(scene, columns)
+    return [
+        Sample(
+            strips=strips.astype(np.float16),
+            columns=features.astype(np.float16),
+            seen=payload_seen(scene)[columns].astype(np.float16),
+            first_slot=np.array(clock.first_slot),
+            packet_slots=np.array(clock.packet_slots),
+            burst=clock.burst,
+            w=np.asarray(weights[columns], np.int64),
+            scores=np.stack(scores).reshape(*shape, MOST_WORDS),
+            words=np.stack(words).reshape(shape),
+        )
+    ]
+
+
+def _by_packet(slots: NDArray[np.uint8], clock: Clock) -> NDArray[np.int64]:
+    """(bursts, B, packet) slots (B, N) of the grid added over the copies of each burst."""
+    length = clock.packet_slots
+    out = np.zeros((int(clock.burst.max()) + 1, slots.shape[0], length), np.int64)
+    grid = np.arange(clock.n_slots) + clock.first_slot
+    for copy, burst in enumerate(clock.burst):
+        here = grid // length == copy
+        out[burst][:, grid[here] % length] += slots[:, here]
+    return out
+
+
+def _payload(packet: NDArray[np.integer]) -> NDArray[np.int64]:
+    """(symbols, 10) slots of a packet."""
+    return packet[PREAMBLE_SLOTS:].reshape(-1, SLOTS_PER_SYMBOL).astype(np.int64)
+
+
+def _word_scores(metrics: FloatArray, sent: NDArray[np.uint8], w: int) -> NDArray[np.float16]:
+    """(symbols, 128) log-likelihood of every word of weight `w` by the light model, the slots around it being known.
+
+    Against the best word; -inf where there is no word.
+
+    Args:
+        metrics: (packet + memory, patterns), copies added.
+        sent: (packet,) the slots that were sent.
+        w: weight.
+    """
+    memory = metrics.shape[0] - sent.size
+    words = codebook(w)
+    around = np.concatenate([sent, np.array(HEADER[:memory], np.uint8)])
+    out = np.full((len(_payload(sent)), MOST_WORDS), -np.inf)
+    for symbol in range(len(out)):
+        at = PREAMBLE_SLOTS + symbol * SLOTS_PER_SYMBOL
+        slots = np.repeat(around[None, at - memory : at + SLOTS_PER_SYMBOL + memory], len(words), axis=0)
+        slots[:, memory : memory + SLOTS_PER_SYMBOL] = words
+        windows = np.lib.stride_tricks.sliding_window_view(slots.astype(np.int64), memory + 1, axis=1)
+        pattern = windows @ (1 << np.arange(memory, -1, -1))
+        place = np.arange(at, at + SLOTS_PER_SYMBOL + memory)
+        score = metrics[place, pattern].sum(axis=1)
+        out[symbol, : len(words)] = np.maximum(score - score.max(), _LEAST_SCORE)
+    return out.astype(np.float16)
 
 
 def sent_slots(exposure: Exposure, clock: Clock) -> NDArray[np.uint8]:

@@ -65,7 +65,7 @@ def export_model(
     if calibration:
         quantise(file, calibration)
     contract = Contract(
-        version=1,
+        version=2,
         samples_per_slot=4,
         strip_features=STRIP_FEATURES,
         column_features=COLUMN_FEATURES,
@@ -78,7 +78,7 @@ def export_model(
         file=file.name,
         sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
         contract=contract,
-        description="Log-odds of slots from the lateral strips of a column",
+        description="Corrections of the light model's log-likelihood ratios of slots",
         recipe=recipe,
         figures=figures,
     )
@@ -96,11 +96,11 @@ def _write_onnx(network: StripNetwork, file: Path) -> None:
             example,
             str(file),
             input_names=["strips", "columns"],
-            output_names=["log_odds"],
+            output_names=["correction"],
             dynamic_axes={
                 "strips": {0: "batch", 1: "strip", 3: "slot"},
                 "columns": {0: "batch", 2: "slot"},
-                "log_odds": {0: "batch", 1: "slot"},
+                "correction": {0: "batch", 1: "slot"},
             },
             opset_version=_OPSET,
             dynamo=False,
@@ -158,7 +158,7 @@ def parity(network: StripNetwork, file: Path, seed: int = 0) -> float:
     strips = rng.standard_normal((3, 5, N_STRIP_FEATURES, 83), np.float32)
     columns = rng.standard_normal((3, N_COLUMN_FEATURES, 83), np.float32)
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
-    found = session.run(["log_odds"], {"strips": strips, "columns": columns})[0]
+    found = session.run(["correction"], {"strips": strips, "columns": columns})[0]
     with torch.no_grad():
         wanted = network.eval()(torch.from_numpy(strips), torch.from_numpy(columns)).numpy()
     return float(np.abs(found - wanted).max())

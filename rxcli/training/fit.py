@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +15,41 @@ from torch import Tensor
 from tqdm import tqdm
 
 from rxcli.errors import InputError
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 from rxcli.training.network import Shape, StripNetwork
 
 CHECKPOINT = "checkpoint.pt"
+#: Words of the largest codebook, and what stands for a word that is not known.
+MOST_WORDS, UNKNOWN = 128, -1
 _CHECKPOINT_EVERY = 200
-_CROP_SLOTS = 160
+_WEIGHT_DECAY, _LARGEST_GRADIENT = 5e-2, 1.0
+#: The weights that are kept are a mean over about so many steps.
+_AVERAGED_STEPS = 200
+#: Samples of a batch, columns of each, and how often strips are left out of a sample, down to how many.
+_BATCH_SAMPLES, _BATCH_COLUMNS, _THINNED, _LEAST_STRIPS = 2, 4, 0.5, 3
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Adjacent columns with equal numbers of strips, as the network sees them, with their truth."""
+    """Doubtful columns of a frame as the network sees them, and what was sent; B columns, N slots, M symbols."""
 
     #: (B, S, F, N) float16.
     strips: NDArray[np.float16]
     #: (B, G, N) float16.
     columns: NDArray[np.float16]
-    #: (B, N) 0/1.
-    slots: NDArray[np.uint8]
-    #: (B, N) 1 where the slot can be seen.
+    #: (B, N) 1 where a slot of the payload can be seen.
     seen: NDArray[np.float16]
+    #: (): place of the first slot in its packet, and slots of a packet.
+    first_slot: NDArray[np.int64]
+    packet_slots: NDArray[np.int64]
+    #: (copies,) burst of each copy.
+    burst: NDArray[np.int64]
+    #: (B,) weight that was sent.
+    w: NDArray[np.int64]
+    #: (bursts, B, M, 128) log-likelihood of every word by the light model alone.
+    scores: NDArray[np.float16]
+    #: (bursts, B, M) index of the word that was sent, or `UNKNOWN`.
+    words: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -40,52 +57,69 @@ class Recipe:
     """How a network is fitted."""
 
     shape: Shape = field(default_factory=Shape)
-    steps: int = 6000
-    batch_columns: int = 32
-    learning_rate: float = 3e-3
+    steps: int = 1600
+    learning_rate: float = 4e-3
     seed: int = 1
-    #: Share of batches from whole simulated frames; the others are from `rxcli.training.columns`.
-    frame_share: float = 0.5
 
 
-class _Batches:
-    """Random batches: random samples with equal numbers of strips, random parts of them."""
-
-    def __init__(self, samples: Sequence[Sample], n_columns: int) -> None:
-        self._groups: dict[int, list[Sample]] = {}
-        for sample in samples:
-            self._groups.setdefault(sample.strips.shape[1], []).append(sample)
-        self._n_columns = n_columns
-
-    def draw(self, rng: np.random.Generator) -> tuple[Tensor, ...]:
-        sizes = np.array([len(group) for group in self._groups.values()], np.float64)
-        group = list(self._groups.values())[int(rng.choice(sizes.size, p=sizes / sizes.sum()))]
-        parts: list[tuple[NDArray[Any], ...]] = []
-        while sum(len(part[0]) for part in parts) < self._n_columns:
-            parts.append(_cut(group[int(rng.integers(len(group)))], rng, self._n_columns // 2))
-        n_slots = min(part[0].shape[-1] for part in parts)
-        joined = (np.concatenate([array[..., :n_slots] for array in arrays]) for arrays in zip(*parts, strict=True))
-        return tuple(torch.from_numpy(array.astype(np.float32)) for array in joined)
+@lru_cache(maxsize=16)
+def _codebook(w: int) -> Tensor:
+    """(10, 128) the words of weight `w`, zeros where there are fewer."""
+    words = np.zeros((MOST_WORDS, SLOTS_PER_SYMBOL), np.float32)
+    words[: len(codebook(w))] = codebook(w)
+    return torch.from_numpy(words.T.copy())
 
 
-def _cut(sample: Sample, rng: np.random.Generator, most_columns: int) -> tuple[NDArray[Any], ...]:
-    n_columns, n_slots = sample.slots.shape
-    start = int(rng.integers(0, max(n_slots - _CROP_SLOTS, 0) + 1))
-    chosen = rng.permutation(n_columns)[:most_columns]
-    window = slice(start, start + _CROP_SLOTS)
-    return tuple(array[chosen][..., window] for array in (sample.strips, sample.columns, sample.slots, sample.seen))
+def loss_of(network: StripNetwork, sample: Sample, columns: NDArray[np.int64]) -> Tensor:
+    """Mean cross-entropy of the words of some columns, nats, when corrections are added to what the light model says.
+
+    The copies of a burst are added before its words are compared, as the receiver does.
+    """
+    strips, features, seen = (
+        torch.from_numpy(part[columns].astype(np.float32)) for part in (sample.strips, sample.columns, sample.seen)
+    )
+    bursts = _by_burst(network(strips, features) * seen, sample)
+    payload = bursts[..., PREAMBLE_SLOTS:].reshape(*bursts.shape[:2], -1, SLOTS_PER_SYMBOL)
+    books = torch.stack([_codebook(int(w)) for w in sample.w[columns]])
+    scores = torch.from_numpy(sample.scores[:, columns].astype(np.float32)) + payload @ books
+    words = torch.from_numpy(sample.words[:, columns])
+    each = torch.nn.functional.cross_entropy(
+        scores.reshape(-1, MOST_WORDS), words.reshape(-1), ignore_index=UNKNOWN, reduction="sum"
+    )
+    return each / (words != UNKNOWN).sum().clamp(min=1)
 
 
-def loss_of(network: StripNetwork, batch: tuple[Tensor, ...]) -> Tensor:
-    """Mean cross-entropy of the visible slots, nats."""
-    strips, columns, slots, seen = batch
-    each = torch.nn.functional.binary_cross_entropy_with_logits(network(strips, columns), slots, reduction="none")
-    return (each * seen).sum() / seen.sum().clamp(min=1)
+def _by_burst(corrections: Tensor, sample: Sample) -> Tensor:
+    """(bursts, B, packet) corrections (B, N) added over the copies of each burst."""
+    first, length, n_copies = int(sample.first_slot), int(sample.packet_slots), sample.burst.size
+    inside = corrections[:, : n_copies * length - first]
+    padded = torch.nn.functional.pad(inside, (first, n_copies * length - first - inside.shape[1]))
+    copies = padded.reshape(len(corrections), n_copies, length)
+    n_bursts = int(sample.burst.max()) + 1
+    return torch.stack([copies[:, torch.from_numpy(sample.burst == burst)].sum(dim=1) for burst in range(n_bursts)])
+
+
+def _drawn_loss(network: StripNetwork, samples: Sequence[Sample], rng: np.random.Generator) -> Tensor:
+    """Mean loss of a random batch."""
+    losses = []
+    for number in rng.integers(len(samples), size=_BATCH_SAMPLES):
+        sample = samples[int(number)]
+        columns = rng.permutation(sample.w.size)[:_BATCH_COLUMNS]
+        losses.append(loss_of(network, _thinned(sample, rng), columns))
+    return torch.stack(losses).mean()
+
+
+def _thinned(sample: Sample, rng: np.random.Generator) -> Sample:
+    """Now and then a sample without some of its strips: cameras differ in how many there are."""
+    n_strips = sample.strips.shape[1]
+    if n_strips <= _LEAST_STRIPS or rng.random() >= _THINNED:
+        return sample
+    left = np.sort(rng.permutation(n_strips)[: int(rng.integers(_LEAST_STRIPS, n_strips))])
+    return replace(sample, strips=sample.strips[:, left])
 
 
 def fit(
-    columns: Sequence[Sample],
-    frames: Sequence[Sample],
+    samples: Sequence[Sample],
     validation: Sequence[Sample],
     recipe: Recipe,
     folder: Path,
@@ -96,8 +130,7 @@ def fit(
     """Fit a network.
 
     Args:
-        columns: samples of `rxcli.training.columns`.
-        frames: samples of whole simulated frames; may be empty.
+        samples: what to learn from.
         validation: samples that are not learned from.
         recipe: sizes and steps.
         folder: gets the checkpoint and the plot of the loss.
@@ -105,73 +138,71 @@ def fit(
         progress: show a bar on stderr.
 
     Returns:
-        The network.
+        The network, its weights averaged over the last steps.
 
     Raises:
-        InputError: the checkpoint is missing or of another recipe.
+        InputError: nothing to learn from; or the checkpoint is missing or of another recipe.
     """
+    if not samples:
+        raise InputError("no frame gave a doubtful column to learn from", "simulate more with --frames")
     torch.manual_seed(recipe.seed)
     torch.set_num_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
     network = StripNetwork(recipe.shape)
-    optimiser = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=1e-3)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, recipe.learning_rate, total_steps=recipe.steps + 1)
+    averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_moving_average)
+    optimiser = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=_WEIGHT_DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, recipe.learning_rate, total_steps=recipe.steps + 1, pct_start=0.1
+    )
     history: list[tuple[int, float, float]] = []
-    first = _restore(folder / CHECKPOINT, recipe, network, optimiser, schedule, history) if resume else 0
-    sources = [_Batches(part, recipe.batch_columns) for part in (columns, frames) if part]
-    share = recipe.frame_share if len(sources) == 2 else 0.0
-    held = [_Batches([sample], sample.slots.shape[0]).draw(np.random.default_rng(0)) for sample in validation]
+    parts = {"network": network, "averaged": averaged, "optimiser": optimiser, "schedule": schedule}
+    first = _restore(folder / CHECKPOINT, recipe, parts, history) if resume else 0
     running = float("nan")
     for step in tqdm(range(first, recipe.steps), initial=first, total=recipe.steps, disable=not progress, unit="step"):
         # A generator of its own for every step: a resumed run draws the same batches.
-        rng = np.random.default_rng([recipe.seed, step])
-        batch = sources[int(rng.random() < share)].draw(rng)
+        loss = _drawn_loss(network, samples, np.random.default_rng([recipe.seed, step]))
         optimiser.zero_grad()
-        loss = loss_of(network, batch)
         torch.autograd.backward(loss)
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)
         optimiser.step()
         schedule.step()
+        averaged.update_parameters(network)
         running = loss.item() if np.isnan(running) else 0.98 * running + 0.02 * loss.item()
         if (step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == recipe.steps:
-            history.append((step + 1, running, _mean_loss(network, held)))
-            _save(folder / CHECKPOINT, recipe, step + 1, network, optimiser, schedule, history)
+            history.append((step + 1, running, mean_loss(averaged.module, validation)))
+            _save(folder / CHECKPOINT, recipe, step + 1, parts, history)
     plot_loss(history, folder / "loss.png")
-    network.eval()
-    return network
+    mean: StripNetwork = averaged.module
+    mean.eval()
+    return mean
 
 
-def _mean_loss(network: StripNetwork, batches: list[tuple[Tensor, ...]]) -> float:
-    network.eval()
+def _moving_average(averaged: Tensor, current: Tensor, n_averaged: Tensor) -> Tensor:
+    """Mean over about the last `_AVERAGED_STEPS` steps; over fewer at the start, which is soon forgotten."""
+    share = max(1 / _AVERAGED_STEPS, float(10 / (n_averaged + 20)))
+    return averaged + share * (current - averaged)
+
+
+def mean_loss(network: StripNetwork, samples: Sequence[Sample]) -> float:
+    """Mean over samples of `loss_of` all their columns; nan of none."""
     with torch.no_grad():
-        losses = [loss_of(network, batch).item() for batch in batches]
-    network.train()
+        losses = [loss_of(network, sample, np.arange(sample.w.size)).item() for sample in samples]
     return float(np.mean(losses)) if losses else float("nan")
 
 
-def _save(path: Path, recipe: Recipe, step: int, network: StripNetwork, *others: Any) -> None:
-    optimiser, schedule, history = others
-    state = {
-        "recipe": asdict(recipe),
-        "step": step,
-        "network": network.state_dict(),
-        "optimiser": optimiser.state_dict(),
-        "schedule": schedule.state_dict(),
-        "history": list(history),
-    }
+def _save(path: Path, recipe: Recipe, step: int, parts: dict[str, Any], history: Sequence[Any]) -> None:
+    states = {name: part.state_dict() for name, part in parts.items()}
     part = path.with_suffix(".part")
-    torch.save(state, part)
+    torch.save({"recipe": asdict(recipe), "step": step, "history": list(history), **states}, part)
     part.replace(path)
 
 
-def _restore(path: Path, recipe: Recipe, network: StripNetwork, *others: Any) -> int:
-    optimiser, schedule, history = others
+def _restore(path: Path, recipe: Recipe, parts: dict[str, Any], history: list[tuple[int, float, float]]) -> int:
     state = load_checkpoint(path)
     if state["recipe"] != asdict(recipe):
         raise InputError(f"{path}: the checkpoint was made by another recipe", "give the same options, or start anew")
-    network.load_state_dict(state["network"])
-    optimiser.load_state_dict(state["optimiser"])
-    schedule.load_state_dict(state["schedule"])
+    for name, part in parts.items():
+        part.load_state_dict(state[name])
     history.extend(tuple(entry) for entry in state["history"])
     return int(state["step"])
 
@@ -192,7 +223,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def final_losses(folder: Path) -> dict[str, float]:
-    """Cross-entropy of a slot at the end of the run in `folder`, nats; -1 where nothing was held out."""
+    """Cross-entropy of a word at the end of the run in `folder`, nats; -1 where nothing was held out."""
     _, training, validation = load_checkpoint(folder / CHECKPOINT)["history"][-1]
     return {
         "training_nats": round(training, 5),
@@ -211,7 +242,7 @@ def plot_loss(history: Sequence[tuple[int, float, float]], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7, 4))
     axes.plot(steps, training, label="training")
     axes.plot(steps, validation, label="validation")
-    axes.set(xlabel="step", ylabel="cross-entropy of a slot, nats", yscale="log")
+    axes.set(xlabel="step", ylabel="cross-entropy of a word, nats", yscale="log")
     axes.legend()
     figure.savefig(path, dpi=110, bbox_inches="tight")
     plt.close(figure)

@@ -32,7 +32,7 @@ class _Residual(nn.Module):  # type: ignore[misc]
 
 
 class StripNetwork(nn.Module):  # type: ignore[misc]
-    """Log-odds of slots from the features of `rxcli.denoise.network_inputs`; any number of strips and slots."""
+    """Corrections of slots from the features of `rxcli.denoise.network_inputs`; any number of strips and slots."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -44,9 +44,12 @@ class StripNetwork(nn.Module):  # type: ignore[misc]
         self.column_in = nn.Conv1d(2 * wide + N_COLUMN_FEATURES, tall, 3, padding=1)
         self.column = nn.Sequential(*(_Residual(tall, d) for d in shape.column_dilations))
         self.out = nn.Conv1d(tall, 1, 1)
+        # Before it has learned anything the network corrects nothing.
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
 
     def forward(self, strips: Tensor, columns: Tensor) -> Tensor:
-        """(B, S, F, N) and (B, G, N) to (B, N) log-odds."""
+        """(B, S, F, N) and (B, G, N) to (B, N) corrections."""
         batch, n_strips, _, n_slots = strips.shape
         x = torch.relu(self.strip_in(strips.reshape(batch * n_strips, N_STRIP_FEATURES, n_slots)))
         x = self.strip(x)
