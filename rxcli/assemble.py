@@ -66,9 +66,13 @@ def column_results(
         min_confidence: packets below it are left out.
     """
     seen = slots_seen(samples, clock)
+    whole = complete(seen)
+    contradicted = (posteriors.header_llr.min(axis=0) < _CONTRADICTED) | (not _headers_show(posteriors))
     return tuple(
-        _column_result(column, clock, posteriors, snr[column], seen[:, column], min_confidence)
-        for column in range(snr.shape[0])
+        _column_result(
+            column, clock, posteriors, db, seen[:, column], whole[:, column], bool(contradicted[column]), min_confidence
+        )
+        for column, db in enumerate(_snr_db_of_columns(snr))
     )
 
 
@@ -207,16 +211,18 @@ def complete(seen: IntArray) -> BoolArray:
 
 
 def _column_result(
-    column: int, clock: Clock, posteriors: BurstPosteriors, snr: Float32Array, seen: IntArray, min_confidence: float
+    column: int,
+    clock: Clock,
+    posteriors: BurstPosteriors,
+    snr_db: float | None,
+    seen: IntArray,
+    whole: BoolArray,
+    contradicted: bool,
+    min_confidence: float,
 ) -> ColumnResult:
-    contradicted = not _headers_show(posteriors) or bool(posteriors.header_llr[:, column].min() < _CONTRADICTED)
-    found = [
-        _packet(int(burst), column, clock, posteriors, seen[burst])
-        for burst in np.flatnonzero(complete(seen[:, None])[:, 0])
-        if not contradicted
-    ]
+    bursts = () if contradicted else np.flatnonzero(whole)
+    found = [_packet(int(burst), column, clock, posteriors, seen[burst]) for burst in bursts]
     packets = tuple(packet for packet in found if packet and packet.confidence >= min_confidence)
-    snr_db = _snr_db(snr)
     sure_of_w = not contradicted and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
     return ColumnResult(
