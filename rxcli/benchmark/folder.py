@@ -174,9 +174,11 @@ def _write_good(path: Path, seed: int) -> None:
     if mode != "clip":
         made = replace(made, start_slot=np.random.default_rng([seed, 13]).uniform(*_FIRST_SLOTS))
     take = prepare(made, seed)
-    # The truth comes first: a file that is there has its truth, wherever the making was interrupted.
+    # Hidden until it is whole, and after its truth: a file that is there is as it should be, whatever interrupted it.
     write_truth(take.truth(path.name), path)
-    _write_capture(take, path)
+    hidden = path.with_name(f".{path.name}")
+    _write_capture(take, hidden)
+    hidden.replace(path)
 
 
 def _write_capture(take: Take, path: Path) -> None:
