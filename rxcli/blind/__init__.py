@@ -1,6 +1,6 @@
 """What a picture says of the camera that took it: rows per slot, direction of readout, exposure, bend of the stripes.
 
-Four steps on the row profiles, none of which needs to know the camera.
+Five steps on the row profiles, none of which needs to know the camera.
 
 1. **Bend.** Neighbouring strips show the same slots, so the lag between them, over all of the picture, is the slope of
    the stripes. Where a camera has taken the distortion out of its picture, the sensor row of a point p is the y of
@@ -11,7 +11,9 @@ Four steps on the row profiles, none of which needs to know the camera.
    length of packet. The header read backwards, 1100011100, is its own complement, so the sign tells the direction.
 3. **Trial.** The best hypotheses are sliced into slots; header, dimming symbol and the constant weight of all symbols
    decide between them: a wrong one may show a header by chance, but never twenty columns of constant weight.
-4. **Refinement.** The slots of the winner, seen through the exposure, predict the light of every strip on every row.
+4. **Slots.** Light of neighbouring slots overlaps through the exposure, and nobody told its levels: each column is read
+   at the levels that every weight would give, by forward-backward, and levels and slots then follow from one another.
+5. **Refinement.** The slots, as probabilities seen through the exposure, predict the light of every strip on every row.
    What is missing is the derivative with respect to time: least squares over all strips gives row and period of the
    clock and the bend at once, with standard deviations from the spread between columns.
 """

@@ -187,10 +187,10 @@ def find_clocks(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesi
 
 
 def alike(one: Hypothesis, other: Hypothesis) -> bool:
-    return one.packet_slots == other.packet_slots and _same_slots(one, other)
+    return one.packet_slots == other.packet_slots and same_slots(one, other)
 
 
-def _same_slots(one: Hypothesis, other: Hypothesis) -> bool:
+def same_slots(one: Hypothesis, other: Hypothesis) -> bool:
     near = abs(np.log(one.rows_per_slot / other.rows_per_slot)) < _ALIKE_ROWS
     return near and one.reversed == other.reversed
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from rxcli.blind.advice import why_not
 from rxcli.blind.bend import estimate_bend, straightened
-from rxcli.blind.scan import Hypothesis, alike, find_clocks
+from rxcli.blind.scan import Hypothesis, alike, find_clocks, same_slots
 from rxcli.blind.strips import Strips
 from rxcli.blind.timing import _ALIKE, BlindEstimate, refine
 from rxcli.profiles import ScreenProfile
@@ -17,8 +17,8 @@ from rxcli.types import FloatArray
 
 #: Log-likelihood ratio of header and weights, over chance, that a clock must reach.
 MIN_EVIDENCE = 45.0
-#: Share of the light's local variance that the slots of a clock must explain; wrong clocks explain less than a tenth.
-_LEAST_EXPLAINED = 0.15
+#: Share of the light's local variance that the slots of a clock must explain; wrong ones reach a fifth on random stripes.
+_LEAST_EXPLAINED = 0.22
 
 #: A bend that fits this many nats better than none is tried; from the second on, it alone.
 _BEND_GAINS = (5.0, 25.0)
@@ -61,7 +61,8 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     found.sort(key=lambda pair: -pair[0].evidence)
     estimates: list[BlindEstimate] = []
     for clock, b in _worth_refining(found):
-        if any(e.evidence > _PLAIN_EVIDENCE for e in estimates) and clock.evidence < _RIVAL * found[0][0].evidence:
+        plain = any(estimate.evidence > _PLAIN_EVIDENCE for estimate in estimates)
+        if plain and clock.evidence < _RIVAL * found[0][0].evidence and not same_slots(clock, found[0][0]):
             continue
         exposure = exposure_s * rates[clock.packet_slots] if exposure_s else None
         estimates.append(refine(strips, clock, b, exposure, sure=gain > _BEND_GAINS[1]))

@@ -40,10 +40,10 @@ def structure_evidence(slots: FloatArray | Float32Array, first_slot: int, packet
     dimming = _dimming_evidence(lit, position)
     best = (weight + dimming).max(axis=1)
     columns = float(np.logaddexp(header + best, 0.0).sum() - n_columns * np.log(2.0))
-    return columns + _repeat_evidence(lit, position, packet_slots)
+    return columns + repeat_evidence(lit, position, packet_slots)
 
 
-def _repeat_evidence(lit: BoolArray, position: NDArray[np.int64], packet_slots: int) -> float:
+def repeat_evidence(lit: BoolArray, position: NDArray[np.int64], packet_slots: int) -> float:
     """Log-likelihood ratio of copies being followed by the same packet, over other packets; bursts may end anywhere."""
     payload: NDArray[np.int64] = np.flatnonzero(position[: max(position.size - packet_slots, 0)] >= PREAMBLE_SLOTS)
     if payload.size == 0:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rxcli.blind.bend import BEND_SCALE, bend_terms, reversed_bend
 from rxcli.blind.scan import Hypothesis
 from rxcli.blind.strips import Strips, in_readout_order
+from rxcli.blind.structure import repeat_evidence
 from rxcli.blind.waves import (
     LOCAL_SLOTS,
     Grid,
@@ -40,6 +41,8 @@ _RIGID_STEPS = 3
 #: Exposure before any is known, slots; and steps at which it is estimated.
 _FIRST_EXPOSURE = 1.2
 _EXPOSURE_STEPS = (1, 3)
+#: Slots that were read on a clock further off than this are read anew at this step.
+_AGAIN_STEP, _FAR = 5, 0.4
 
 #: The descent ends when no row moves by more slots than this.
 _CONVERGED = 0.003
@@ -173,23 +176,28 @@ def _descend(
     """Gauss-Newton on the first `n_free` values of the row-time map, deciding the slots anew at every step."""
     terms = _time_terms(strips)
     exposure, exposure_sd = exposure_slots or _FIRST_EXPOSURE, 0.0
+    first_time = _slot_time(strips, terms, values)
     if slots is None:
-        waves = column_waves(strips, _slot_time(strips, terms, values), values[1])
-        slots = first_slots(waves, exposure, grid)
+        slots = first_slots(column_waves(strips, first_time, values[1]), exposure, grid)
     for step in range(_REFINE_STEPS):
         time = _slot_time(strips, terms, values)
         waves = column_waves(strips, time, values[1])
-        if exposure_slots is None and step in _EXPOSURE_STEPS:
-            near = None if step == _EXPOSURE_STEPS[0] else exposure
+        again = step == _AGAIN_STEP and float(np.abs(time - first_time).max()) > _FAR
+        if again:
+            slots = first_slots(waves, exposure, grid)
+        if exposure_slots is None and (again or step in _EXPOSURE_STEPS):
+            near = None if again or step == _EXPOSURE_STEPS[0] else exposure
             exposure, exposure_sd, slots = estimate_exposure(waves, grid, slots, near)
         slots = decide(waves, exposure, grid, slots)
         free = n_free if step >= _RIGID_STEPS or values[2:].any() else 2
         change, covariance, explained = _gauss_newton(strips, terms, values, time, slots.lit, exposure, free)
         values = values + change
         moved = float(np.abs(_slot_time(strips, terms, values)[:, ::_BLOCK_ROWS] - time[:, ::_BLOCK_ROWS]).max())
-        if moved < _CONVERGED and step > max(_EXPOSURE_STEPS):
+        if moved < _CONVERGED and step >= _AGAIN_STEP:
             break
+    position = (np.arange(slots.lit.shape[1]) + grid.first_slot) % grid.packet_slots
     evidence = packet_evidence(waves, exposure, grid, slots)
+    evidence += repeat_evidence(slots.lit > 0.5, position, grid.packet_slots)
     return _Timing(values, covariance, exposure, exposure_sd, evidence, explained, slots)
 
 
