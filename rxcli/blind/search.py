@@ -17,7 +17,7 @@ from rxcli.types import FloatArray
 
 #: Log-likelihood ratio of header and weights, over chance, that a clock must reach.
 MIN_EVIDENCE = 45.0
-#: Share of the light's local variance that the slots of a clock must explain; wrong ones reach a fifth on random stripes.
+#: Share of the light's local variance that slots must explain; those of wrong clocks on random stripes reach a fifth.
 _LEAST_EXPLAINED = 0.22
 
 #: A bend that fits this many nats better than none is tried; from the second on, it alone.
