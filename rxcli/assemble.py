@@ -16,7 +16,6 @@ from rxcli.types import (
     ColumnResult,
     ColumnStatus,
     Float32Array,
-    FloatArray,
     FrameStatus,
     IntArray,
     PacketResult,
@@ -25,9 +24,8 @@ from rxcli.types import (
 
 #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
 MAX_BER_HAT = 0.1
-#: Offset and slopes from the log-odds that all symbols of a packet are right, and that the most doubtful one is, to
-#: those of the packet's being error-free; 5366 packets of 554 frames of `rxcli.benchmark.confidence`.
-_CALIBRATION = (0.449, 0.560, 0.542)
+#: Offset and slope from the log-odds of the posterior to those of being error-free; 4794 packets of 480 frames.
+_CALIBRATION = (-0.344, 1.026)
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
 _CLIP_CALIBRATION = (0.103, 0.477, -0.83)
@@ -297,23 +295,22 @@ def _packet(
         copies=float(seen.sum() / clock.packet_slots),
         payload_bits=int(bits.size),
         payload=bits_to_hex(bits),
-        confidence=_calibrated(posteriors.log_prob[burst, column]),
+        confidence=_calibrated(float(posteriors.log_prob[burst, column].sum())),
         ber_hat=ber_hat,
         burst=number,
         frames=frames,
     )
 
 
-def _calibrated(log_prob: FloatArray) -> float:
-    """Share of error-free packets among those whose (N,) symbols have these log probabilities.
+def _calibrated(log_prob: float) -> float:
+    """Share of error-free packets among those whose symbols' log probabilities add up to `log_prob`.
 
-    The light model's likelihoods are tempered, since strips and samples err together. Symbols do so too: the doubts of
-    a packet have one cause, so their sum overstates them and the most doubtful symbol says a good part of it. What is
-    left is a plane over both log-odds, fitted to packets of `rxcli.benchmark.confidence`.
+    The light model's likelihoods are tempered, since strips and samples err together; what is left of that is a
+    straight line between log-odds, fitted to packets of `rxcli.benchmark.confidence`. Whatever changes the likelihoods
+    of the light model or the auto-encoder asks for a new fit.
     """
-    offset, slope, slope_of_worst = _CALIBRATION
-    log_odds = slope * _log_odds(float(log_prob.sum())) + slope_of_worst * _log_odds(float(log_prob.min()))
-    return _probability(offset + log_odds)
+    offset, slope = _CALIBRATION
+    return _probability(offset + slope * _log_odds(log_prob))
 
 
 def _log_odds(log_prob: float) -> float:
