@@ -29,6 +29,11 @@ HOPELESS_WEIGHT = 20.0
 _DOUBTFUL = -1e-2
 
 
+#: A column whose symbols have a mean log probability below this may have settled on a wrong weight: it starts again,
+#: after so many quick rounds.
+_LOST, _FRESH_ROUNDS = -0.3, 2
+
+
 @dataclass(frozen=True, slots=True)
 class Reception:
     """What was received of a frame."""
@@ -210,9 +215,35 @@ def without_row_light(lock: Lock, seen: Reception, columns: NDArray[np.int64]) -
     likelihoods = channel.slot_likelihoods(asked, seen.clock, model, scene.lit, columns)
     metrics, snr, fine = seen.metrics.copy(), seen.snr.copy(), seen.fine.copy()
     metrics[columns], snr[columns], fine[columns] = likelihoods.metrics, likelihoods.snr, True
+    lost = np.flatnonzero(seen.posteriors.log_prob[:, columns].mean(axis=(0, 2)) < _LOST)
+    if lost.size:
+        there = columns[lost]
+        light = replace(asked, light=asked.light[lost], valid=asked.valid[lost])
+        fresh = _from_nothing(seen.clock, light, model, scene.lit, there)
+        better = _evidence(fresh.metrics, seen.clock) > _evidence(metrics[there], seen.clock)
+        metrics[there[better]], snr[there[better]] = fresh.metrics[better], fresh.snr[better]
     posteriors = _replaced(seen.posteriors, columns, _detect(metrics[columns], seen.clock))
     cleaned = replace(seen, metrics=metrics, snr=snr, fine=fine, posteriors=posteriors)
     return _scene_of(cleaned, scene.samples, model), cleaned
+
+
+def _from_nothing(
+    now: Clock, samples: SlotSamples, model: channel.LightModel, lit: Float32Array, columns: NDArray[np.int64]
+) -> channel.SlotLikelihoods:
+    """The light model of some columns once more, without what was believed of them: it may have explained itself."""
+    lit = lit.copy()
+    lit[columns] = 0.5
+    for _ in range(_FRESH_ROUNDS):
+        quick = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
+        lit[columns] = channel.lit_on_grid(_detect(quick.metrics, now), now)
+    return channel.slot_likelihoods(samples, now, model, lit, columns)
+
+
+def _evidence(metrics: FloatArray, now: Clock) -> FloatArray:
+    """(C,) log evidence of columns, over all weights."""
+    bursts = _by_burst(metrics, now)
+    candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
+    return np.asarray(np.logaddexp.reduce(detect.weight_evidence(bursts, candidates), axis=1))
 
 
 def doubtful_columns(seen: Reception) -> NDArray[np.int64]:
