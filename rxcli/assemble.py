@@ -40,6 +40,7 @@ _HEADERS_AT_LEAST = 6.0
 _HEADERLESS = (
     "the header does not show where it should; check for overexposure, or give the screen's place with --corners"
 )
+_ECHO = "it shows nothing but the light of the column beside it; show a brighter picture there"
 #: Doubt that is left in the surest packet, and at most in any, nats.
 _LEAST_DOUBT = 1e-9
 _MOST_DOUBT = 500.0
@@ -65,12 +66,15 @@ def column_results(
     """
     seen = slots_seen(samples, clock)
     whole = complete(seen)
-    contradicted = (posteriors.header_llr.min(axis=0) < _CONTRADICTED) | (not _headers_show(posteriors))
+    snr_db = _snr_db_of_columns(snr)
+    headerless = posteriors.header_llr.min(axis=0) < (_CONTRADICTED if _headers_show(posteriors) else np.inf)
+    echoes: BoolArray = np.any(_echoes(posteriors, snr_db) & whole, axis=0)
+    against = [_HEADERLESS if h else _ECHO if e else None for h, e in zip(headerless, echoes, strict=True)]
     return tuple(
         _column_result(
-            column, clock, posteriors, db, seen[:, column], whole[:, column], bool(contradicted[column]), min_confidence
+            column, clock, posteriors, db, seen[:, column], whole[:, column], against[column], min_confidence
         )
-        for column, db in enumerate(_snr_db_of_columns(snr))
+        for column, db in enumerate(snr_db)
     )
 
 
@@ -104,7 +108,7 @@ def clip_results(
         min_confidence: packets below it are left out.
     """
     snr_db = _snr_db_of_columns(snr)
-    complete_ones = [complete(burst.seen[None])[0] for burst in bursts]
+    complete_ones = [complete(burst.seen[None])[0] & ~_echoes(burst.posteriors, snr_db)[0] for burst in bursts]
     own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
     out = []
     for column in range(snr.shape[0]):
@@ -215,13 +219,13 @@ def _column_result(
     snr_db: float | None,
     seen: IntArray,
     whole: BoolArray,
-    contradicted: bool,
+    against: str | None,
     min_confidence: float,
 ) -> ColumnResult:
-    bursts = () if contradicted else np.flatnonzero(whole)
+    bursts = () if against else np.flatnonzero(whole)
     found = [_packet(int(burst), column, clock, posteriors, seen[burst]) for burst in bursts]
     packets = tuple(packet for packet in found if packet and packet.confidence >= min_confidence)
-    sure_of_w = not contradicted and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
+    sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
     return ColumnResult(
         column=column,
@@ -230,8 +234,25 @@ def _column_result(
         snr_db=snr_db,
         delay_slots=float(clock.delay_slots[column]),
         packets=packets,
-        message=None if packets else _HEADERLESS if contradicted else _why_none(status, snr_db, int(seen.sum()), clock),
+        message=None if packets else against or _why_none(status, snr_db, int(seen.sum()), clock),
     )
+
+
+def _echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolArray:
+    """(B, C) whether a column says word for word what a brighter one beside it says, and no other column does.
+
+    A column under black shows its neighbour's light, blurred; where all columns send the same, more than two agree.
+    """
+    words = np.concatenate(
+        [np.broadcast_to(posteriors.w[:, None], (*posteriors.index.shape[:2], 1)), posteriors.index], 2
+    )
+    alike = (words[:, :, None] == words[:, None]).all(axis=3)
+    two = alike.sum(axis=2) == 2
+    db = np.array([-np.inf if value is None else value for value in snr_db])
+    beside = np.zeros(two.shape, bool)
+    beside[:, 1:] |= alike[:, 1:, :-1].diagonal(axis1=1, axis2=2) & (db[1:] < db[:-1])
+    beside[:, :-1] |= alike[:, :-1, 1:].diagonal(axis1=1, axis2=2) & (db[:-1] < db[1:])
+    return np.asarray(two & beside)
 
 
 def _headers_show(posteriors: BurstPosteriors) -> bool:

@@ -18,6 +18,7 @@ compares every sample to the extremes around it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -46,7 +47,7 @@ _TEMPER = 0.64
 #: Bounds on the relative variance of a predicted picture.
 _TEXTURE_BOUNDS = (0.003, 2.0)
 #: Log-likelihood ratio of a slot that the first guess sees at full contrast in all strips.
-_FIRST_GUESS_LLR = 4.0
+_FIRST_GUESS_LLR = 8.0
 #: Strips of full contrast at which the first guess is as sure as it gets.
 _FIRST_GUESS_STRIPS = 3.0
 #: Positions in the packet of the header's middle dark slot, where only the floor is seen.
@@ -114,10 +115,12 @@ def spread_matrix(n_strips: int, light_spread: float) -> FloatArray:
 
     Shares, because the picture takes up any common factor; so a spread of 0 is no crosstalk, not no light.
     """
-    across = (np.arange(n_strips) + 0.5) / n_strips - 0.5
+    fine = 16
+    across = (np.arange(n_strips * fine) + 0.5) / (n_strips * fine) - 0.5
     distance = across[:, None] - np.arange(-1, 2)
-    exponent = -(distance**2) / (2 * max(light_spread, 1e-3) ** 2)
-    weight = np.exp(exponent - exponent.max(axis=1, keepdims=True))
+    exponent = (-(distance**2) / (2 * max(light_spread, 1e-3) ** 2)).reshape(n_strips, -1, 3)
+    # A strip sees the mean over its width: one that is a whole column has twice the crosstalk of the column's middle.
+    weight = np.exp(exponent - exponent.max(axis=(1, 2), keepdims=True)).mean(axis=1)
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
@@ -141,15 +144,37 @@ def estimate_sigma(samples: SlotSamples, floor: float, least: float) -> float:
     return max(float(np.median(np.abs(bend)) / (0.6745 * np.sqrt(6.0))), least)
 
 
-def first_llr(pooled: Float32Array, weight: Float32Array) -> Float32Array:
-    """First guess of every slot's log-likelihood ratio of being lit, from its contrast alone; (C, N).
+def first_metrics(pooled: Float32Array, weight: Float32Array, taps: FloatArray) -> FloatArray:
+    """First guess of the metrics (C, N + memory, patterns), from contrast alone.
 
     Args:
-        pooled: (C, N) slots between their local extremes, -1 dark to 1 lit.
-        weight: (C, N) strips of full contrast behind them.
+        pooled: (C, N * Q) light between its local extremes, -1 dark to 1 lit.
+        weight: (C, N * Q) strips of full contrast behind it.
+        taps: (Q, memory + 1), see `LightModel`.
     """
-    share = np.minimum(weight, _FIRST_GUESS_STRIPS) / _FIRST_GUESS_STRIPS
-    return np.asarray(_FIRST_GUESS_LLR * np.clip(pooled, -1.5, 1.5) * share, np.float32)
+    # Squared errors, so weighted that a slot seen right in all samples has the log-likelihood ratio of the constant.
+    most = np.float32(_FIRST_GUESS_LLR / 4 / taps.shape[0])
+    trust = np.minimum(weight / np.float32(_FIRST_GUESS_STRIPS), 1) * most
+    value = np.clip(pooled, -1.5, 1.5)
+    return _by_pattern(taps, pooled.shape[1], lambda levels: -np.square(value - (2 * levels - 1)) * trust)
+
+
+def _by_pattern(taps: FloatArray, n: int, of_levels: Callable[[Float32Array], Float32Array]) -> FloatArray:
+    """(C, N + memory, patterns) sums over the samples of a metric of what (C, n) samples say of every pattern.
+
+    Args:
+        taps: (Q, memory + 1).
+        n: samples.
+        of_levels: from the (n,) levels between dark and lit that a pattern has in every sample, to (C, n).
+    """
+    q, memory = taps.shape[0], taps.shape[1] - 1
+    lead = memory * q // 2
+    sums = []
+    for levels in slot_patterns(memory) @ taps.T:
+        # Sample i belongs to metric (i + lead) // q.
+        values = of_levels(np.resize(np.roll(levels, -(lead % q)), n).astype(np.float32))
+        sums.append(_by_slot(np.pad(values, ((0, 0), (lead, memory * q - lead))), q))
+    return np.stack(sums, axis=2).astype(np.float64)
 
 
 def metrics_of(llr: Float32Array, memory: int) -> FloatArray:
@@ -447,24 +472,19 @@ def _pattern_metrics(
     model: LightModel,
 ) -> FloatArray:
     """Mixture log-likelihoods summed over strips and the samples of a metric; (C, N + memory, patterns)."""
-    q, memory = model.taps.shape[0], model.memory
-    n_columns, _, n = light.shape
-    lead = memory * q // 2
-    out = np.zeros((n_columns, n // q + memory, 1 << (memory + 1)))
-    weight = np.float32(_TEMPER / q) * valid
+    weight = np.float32(_TEMPER / model.taps.shape[0]) * valid
     priors = _SIDES if len(predictions) > 1 else (1.0,)
-    for number, levels in enumerate(slot_patterns(memory) @ model.taps.T):
-        # Sample i belongs to metric (i + lead) // q.
-        mine = np.resize(np.roll(levels, -(lead % q)), n).astype(np.float32)
-        whole = expected.others + expected.own * mine
+
+    def log_likelihood(levels: Float32Array) -> Float32Array:
+        whole = expected.others + expected.own * levels
         density = np.zeros_like(light)
         for prediction, prior in zip(predictions, priors, strict=True):
             density += _density(light, whole, prediction, model, prior)
         np.log(np.maximum(density, _LEAST_DENSITY, out=density), out=density)
         density *= weight
-        padded = np.pad(density.sum(axis=1), ((0, 0), (lead, memory * q - lead)))
-        out[:, :, number] = _by_slot(padded, q)
-    return out
+        return np.asarray(density.sum(axis=1))
+
+    return _by_pattern(model.taps, light.shape[2], log_likelihood)
 
 
 def _density(

@@ -127,6 +127,9 @@ def contrast(
 ) -> tuple[Float32Array, Float32Array]:
     """Light of each strip between its local extremes, -1 dark to 1 lit, pooled over the strips of a column.
 
+    The extremes are those of smoothed light, lest noise set them; the light itself is not, because a blur dims single
+    slots.
+
     Args:
         light: (C, S, n).
         valid: (C, S, n) 1 or 0.
@@ -144,9 +147,8 @@ def contrast(
     smooth = cv2.blur(flat, (samples_per_slot // 2 * 2 + 1, 1)) if samples_per_slot > 1 else flat
     high = cv2.dilate(smooth, window).reshape(light.shape)
     low = cv2.erode(smooth, window).reshape(light.shape)
-    smooth = smooth.reshape(light.shape)
     span = high - low
-    value = (2 * smooth - high - low) / (span + np.float32(3 * sigma))
+    value = (2 * light - high - low) / (span + np.float32(3 * sigma))
     np.square(span, out=span)
     weight = span / (span + np.float32((_CONTRAST_SIGMAS * sigma) ** 2))
     weight *= valid
@@ -376,25 +378,6 @@ def assign_bursts(clock: Clock, llr: Float32Array, repeats: int) -> Clock:
         scores.append(float(np.where(burst[1:] == burst[:-1], likeness, -likeness).sum()))
     burst = (copies + int(np.argmax(scores))) // repeats
     return replace(clock, burst=burst - burst[0])
-
-
-def slot_contrast(samples: SlotSamples, sigma: float) -> tuple[Float32Array, Float32Array]:
-    """Slots between their local extremes, -1 dark to 1 lit, and the strips of full contrast behind them; (C, N) each.
-
-    Args:
-        samples: samples on the slot grid.
-        sigma: standard deviation of a sample of no light.
-    """
-    q = samples.samples_per_slot
-    pooled, weight = contrast(samples.light, samples.valid, q, sigma)
-    return _slot_means(pooled, q), _slot_means(weight, q)
-
-
-def _slot_means(samples: Float32Array, samples_per_slot: int) -> Float32Array:
-    total = samples[:, ::samples_per_slot].copy()
-    for offset in range(1, samples_per_slot):
-        total += samples[:, offset::samples_per_slot]
-    return total / np.float32(samples_per_slot)
 
 
 def copy_likeness(llr: Float32Array, clock: Clock) -> FloatArray:

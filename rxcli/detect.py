@@ -100,7 +100,7 @@ def _forward_backward(metrics: FloatArray, w: int, memory: int) -> _Packets:
     likelihood = np.exp(branch, out=branch)
     step = np.log(np.maximum(likelihood @ branches.into, _TINY)) + top
     start = np.full((n, n_states), _NEVER)
-    start[:, preamble[PREAMBLE_SLOTS - memory :] @ (1 << np.arange(memory - 1, -1, -1))] = 0.0
+    start[:, _pattern_index(preamble[PREAMBLE_SLOTS - memory :], memory - 1)[0]] = 0.0
     before, after = _recursions(step, start, _tail(metrics[:, length - memory :], memory))
     joint = _scaled(before + top[..., 0])[:, :, None, :] @ likelihood
     joint = joint[:, :, 0] * (_scaled(after) @ branches.into.T)
@@ -128,8 +128,6 @@ def _scaled(log_values: FloatArray) -> NDArray[np.float32]:
 
 def _tail(metrics: FloatArray, memory: int) -> FloatArray:
     """(n, states) log-likelihood of the next header's first slots after each state; they tell of the last symbol."""
-    if memory == 0:
-        return np.zeros((metrics.shape[0], 1))
     states = (np.arange(1 << memory)[:, None] >> np.arange(memory - 1, -1, -1)) & 1
     header = np.broadcast_to(np.array(HEADER[:memory], np.int64), (len(states), memory))
     index = _pattern_index(np.concatenate([states, header], axis=1), memory)
@@ -221,9 +219,9 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
     Raises:
         ValueError: shapes do not fit.
     """
-    if metrics.ndim != 4 or metrics.shape[-1] not in {1 << (m + 1) for m in range(MAX_MEMORY + 1)}:
+    if metrics.ndim != 4 or metrics.shape[-1] not in {1 << (m + 1) for m in range(1, MAX_MEMORY + 1)}:
         raise ValueError(
-            f"metrics must be (bursts, columns, slots, 2**(memory+1)) with memory 0..{MAX_MEMORY} (got {metrics.shape})"
+            f"metrics must be (bursts, columns, slots, 2**(memory+1)) with memory 1..{MAX_MEMORY} (got {metrics.shape})"
         )
     n_payload = metrics.shape[2] - _memory_of(metrics) - PREAMBLE_SLOTS
     if n_payload <= 0 or n_payload % SLOTS_PER_SYMBOL:

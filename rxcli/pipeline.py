@@ -18,7 +18,7 @@ from rxcli import assemble, denoise
 from rxcli.dump import dump_frame
 from rxcli.locate import Failure, Stages, find_camera, find_corners, find_lock, too_small
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
-from rxcli.reception import decode, doubtful_columns, second_opinion, without_row_light
+from rxcli.reception import decode, doubtful_columns, second_opinion
 from rxcli.types import Frame, FrameResult
 
 __all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "denoiser_case", "receive", "receive_frame"]
@@ -63,7 +63,7 @@ def denoiser_case(frame: Frame, options: ReceiverOptions) -> tuple[denoise.Scene
         return None
     seen = decode(lock, options.skip)
     columns = doubtful_columns(seen)
-    return (without_row_light(lock, seen, columns)[0], columns) if columns.size else None
+    return (seen.scene, columns) if seen.scene is not None and columns.size else None
 
 
 def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:

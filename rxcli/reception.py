@@ -27,8 +27,8 @@ HOPELESS_WEIGHT = 20.0
 #: A column with a symbol of less than this log probability gets a second opinion. Measured (models/strips/README.md): a
 #: stricter gate asks half as often again and mends nothing more, a laxer one leaves errors behind.
 _DOUBTFUL = -1e-2
-
-
+#: Corrections are kept in columns whose symbols' log probabilities, added, come down to this share.
+_LESS_DOUBT = 0.5
 #: A column whose symbols have a mean log probability below this may have settled on a wrong weight: it starts again,
 #: after so many quick rounds.
 _LOST, _FRESH_ROUNDS = -0.3, 2
@@ -50,6 +50,8 @@ class Reception:
     metrics: FloatArray
     #: (C,) whether the metrics come of all strips on the fine grid.
     fine: BoolArray
+    #: What the auto-encoder may be shown: the fine grid without the rows' own light; None where nothing was in doubt.
+    scene: denoise.Scene | None = None
     #: What was skipped: name -> columns.
     skipped: dict[str, int] = field(default_factory=dict)
 
@@ -64,7 +66,9 @@ def decode(lock: Lock, skip: frozenset[str]) -> Reception:
     seen = quick_look(lock)
     if "certain_columns" in skip and not _doubtful(seen, CERTAIN).any():
         return replace(seen, skipped={"certain_columns": seen.snr.shape[0]})
-    return iterate(lock, seen, skip)
+    seen = iterate(lock, seen, skip)
+    columns = doubtful_columns(seen)
+    return without_row_light(lock, seen, columns) if columns.size else seen
 
 
 def quick_look(lock: Lock) -> Reception:
@@ -73,9 +77,10 @@ def quick_look(lock: Lock) -> Reception:
     now = lock.clock
     samples = clock.sample_slots(lock.profiles, now, _COARSE)
     model = _light_model(lock, samples)
-    llr = channel.first_llr(*clock.slot_contrast(samples, model.sigma))
-    now = clock.assign_bursts(now, llr, lock.screen.repeats)
-    posteriors = _detect(channel.metrics_of(llr, 0), now, margin=0.0)
+    contrast = clock.contrast(samples.light, samples.valid, _COARSE, model.sigma)
+    first = channel.first_metrics(*contrast, model.taps)
+    now = clock.assign_bursts(now, detect.slot_llr(first), lock.screen.repeats)
+    posteriors = _detect(first, now, margin=0.0)
     columns = np.arange(samples.light.shape[0])
     lit = channel.lit_on_grid(posteriors, now)
     likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
@@ -147,10 +152,20 @@ def _replaced(every: BurstPosteriors, columns: NDArray[np.int64], some: BurstPos
 
     def merged(name: str) -> Any:
         out = getattr(every, name).copy()
-        out[columns if name.startswith("w") else (slice(None), columns)] = getattr(some, name)
+        out[_in_columns(name, columns)] = getattr(some, name)
         return out
 
     return BurstPosteriors(*(merged(field.name) for field in fields(BurstPosteriors)))
+
+
+def _of(every: BurstPosteriors, columns: NDArray[np.int64]) -> BurstPosteriors:
+    """Posteriors of some columns."""
+    return BurstPosteriors(*(getattr(every, f.name)[_in_columns(f.name, columns)] for f in fields(BurstPosteriors)))
+
+
+def _in_columns(name: str, columns: NDArray[np.int64]) -> Any:
+    """Index of some columns in a field of the posteriors; bursts come first in all but the weights."""
+    return columns if name.startswith("w") else (slice(None), columns)
 
 
 def _dark(snr: Float32Array) -> NDArray[np.bool_]:
@@ -175,40 +190,40 @@ def _unsettled(seen: Reception, before: NDArray[np.int64], iteration: int, skip:
 def second_opinion(
     lock: Lock, seen: Reception, options: ReceiverOptions
 ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
-    """Doubtful columns once more without the rows' own light, and with the auto-encoder's corrections.
+    """Doubtful columns once more, with the auto-encoder's corrections; kept where they leave less doubt.
 
     Returns:
-        What was received then, the columns in which that decides other symbols, and what to report; None where nothing
-        was done.
+        What was received then, the columns whose corrections were kept, what to report; None where nothing was done.
     """
     if options.cae == "never":
         return seen, frozenset(), None
+    if options.cae == "always":
+        seen = without_row_light(lock, seen, np.arange(seen.snr.shape[0]))
     columns = np.arange(seen.snr.shape[0]) if options.cae == "always" else doubtful_columns(seen)
-    if columns.size == 0:
+    if columns.size == 0 or seen.scene is None:
         return seen, frozenset(), None
-    report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "changed": 0}
+    report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
     try:
         denoiser = _denoiser()
-        scene, cleaned = without_row_light(lock, seen, columns)
-        corrections = denoiser.slot_corrections(scene, columns)
+        corrections = denoiser.slot_corrections(seen.scene, columns)
     except ReceiverError as error:
         return seen, frozenset(), {**report, "columns": 0, "message": str(error)}
-    metrics = cleaned.metrics.copy()
-    metrics[columns] += channel.metrics_of(corrections, seen.model.memory)
-    posteriors = _replaced(cleaned.posteriors, columns, _detect(metrics[columns], seen.clock))
+    metrics = seen.metrics[columns] + channel.metrics_of(corrections, seen.model.memory)
+    posteriors = _detect(metrics, seen.clock)
+    before, after = (p.log_prob.sum(axis=(0, 2)) for p in (_of(seen.posteriors, columns), posteriors))
+    better = np.flatnonzero(after > _LESS_DOUBT * before)
+    kept = columns[better]
     # The network is told where headers are; whether they show there, the light alone must say.
-    posteriors = replace(posteriors, header_llr=cleaned.posteriors.header_llr)
-    changed = np.flatnonzero((posteriors.index != seen.posteriors.index).any(axis=(0, 2)))
-    report.update(model=denoiser.name, changed=changed.size)
-    return replace(cleaned, metrics=metrics, posteriors=posteriors), frozenset(changed.tolist()), report
+    corrected = replace(_of(posteriors, better), header_llr=seen.posteriors.header_llr[:, kept])
+    every = seen.metrics.copy()
+    every[kept] = metrics[better]
+    report.update(model=denoiser.name, kept=kept.size)
+    seen = replace(seen, metrics=every, posteriors=_replaced(seen.posteriors, kept, corrected))
+    return seen, frozenset(kept.tolist()), report
 
 
-def without_row_light(lock: Lock, seen: Reception, columns: NDArray[np.int64]) -> tuple[denoise.Scene, Reception]:
-    """Some columns looked at again once the light that a sensor row shows everywhere is taken off.
-
-    Returns:
-        What the auto-encoder is shown, and what is received then.
-    """
+def without_row_light(lock: Lock, seen: Reception, columns: NDArray[np.int64]) -> Reception:
+    """Some columns looked at again once the light that a sensor row shows everywhere is taken off."""
     samples, model = _view(lock, seen, np.arange(seen.snr.shape[0]), denoise.SAMPLES_PER_SLOT)
     scene = denoise.without_row_light(_scene_of(seen, samples, model))
     asked = replace(samples, light=scene.samples.light[columns], valid=samples.valid[columns])
@@ -224,7 +239,7 @@ def without_row_light(lock: Lock, seen: Reception, columns: NDArray[np.int64]) -
         metrics[there[better]], snr[there[better]] = fresh.metrics[better], fresh.snr[better]
     posteriors = _replaced(seen.posteriors, columns, _detect(metrics[columns], seen.clock))
     cleaned = replace(seen, metrics=metrics, snr=snr, fine=fine, posteriors=posteriors)
-    return _scene_of(cleaned, scene.samples, model), cleaned
+    return replace(cleaned, scene=_scene_of(cleaned, scene.samples, model))
 
 
 def _from_nothing(

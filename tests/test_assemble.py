@@ -247,3 +247,28 @@ def column(status: str, with_packet: bool) -> ColumnResult:
 )
 def test_frame_status(columns: list[ColumnResult], expected: str) -> None:
     assert assemble.frame_status(tuple(columns)) == expected
+
+
+@pytest.mark.parametrize(
+    ("same", "quieter", "expected"),
+    [
+        ((1, 2), 2, [2]),
+        ((1, 2), 1, [1]),
+        ((1, 3), 3, []),
+        ((0, 1, 2, 3), 2, []),
+        ((), 2, []),
+    ],
+    ids=["of the left", "of the right", "not beside", "all send the same", "all differ"],
+)
+def test_a_column_that_shows_its_neighbour_has_no_packet(
+    same: tuple[int, ...], quieter: int, expected: list[int]
+) -> None:
+    now = clock_of(2 * PACKET, 0, [0, 0], n_columns=4)
+    w = [4, 4, 4, 4]
+    index = np.arange(4 * N_SYMBOLS).reshape(1, 4, N_SYMBOLS)
+    index[:, list(same)] = 50
+    snr = np.full((4, now.n_slots), 100.0, np.float32)
+    snr[quieter] = 30.0
+    results = assemble.column_results(now, posteriors_of(w, index), snr, samples_of(now.n_slots, 4), 0.0)
+    assert [c.column for c in results if not c.packets] == expected
+    assert all("the column beside it" in (results[column].message or "") for column in expected)

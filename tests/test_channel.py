@@ -162,7 +162,8 @@ def test_clean_slots_have_the_right_sign(kind: str, thorough: bool) -> None:
 def test_likelihoods_start_from_nothing_but_contrast() -> None:
     shot = Shot(texture=0.3, sigma=0.005, start_slot=12.3)
     link, now, samples, model = scene(shot, seed=3)
-    first = channel.first_llr(*clock.slot_contrast(samples, model.sigma))
+    contrast = clock.contrast(samples.light, samples.valid, Q, model.sigma)
+    first = slot_odds(channel.first_metrics(*contrast, model.taps), model.memory)
     lit = true_slots(link, shot, now.n_slots)
     idea = (1 / (1 + np.exp(-first))).astype(np.float32)
     llr = slot_odds(channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics, model.memory)
@@ -265,7 +266,8 @@ def test_hostile_light_gives_finite_likelihoods(kind: str, thorough: bool, idea:
     sigma = channel.estimate_sigma(samples, floor, 1e-5)
     model = model_for(Shot(), sigma, floor)
     lit = np.full((6, now.n_slots), idea, np.float32)
-    first = channel.first_llr(*clock.slot_contrast(samples, model.sigma))
+    contrast = clock.contrast(samples.light, samples.valid, Q, model.sigma)
+    first = channel.first_metrics(*contrast, model.taps)
     found = channel.slot_likelihoods(samples, now, model, lit, np.arange(6), thorough=thorough)
     for values in (first, found.metrics, found.snr, found.timing):
         assert np.isfinite(values).all()

@@ -45,9 +45,9 @@ def received(
         spread=np.tile([shot.crosstalk, 1.0, shot.crosstalk], (shot.n_strips, 1)),
         taps=channel.exposure_taps(shot.exposure_slots, 1 / Q, memory, Q),
     )
-    llr = channel.first_llr(*clock.slot_contrast(samples, model.sigma))
-    now = clock.assign_bursts(now, llr, REPEATS)
-    metrics = channel.metrics_of(llr, memory)
+    contrast = clock.contrast(samples.light, samples.valid, Q, model.sigma)
+    metrics = channel.first_metrics(*contrast, model.taps)
+    now = clock.assign_bursts(now, detect.slot_llr(metrics), REPEATS)
     for _ in range(rounds):
         posteriors = detect.detect(channel.by_burst(metrics, now, memory))
         lit = channel.lit_on_grid(posteriors, now)

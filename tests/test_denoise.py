@@ -409,7 +409,7 @@ def test_always_runs_on_every_column_and_harms_none(trials: dict[str, Trial]) ->
     assert score.bit_errors == 0
     assert result.denoiser is not None
     assert result.denoiser["columns"] == 20
-    assert result.denoiser["changed"] == sum(column.denoised for column in result.columns)
+    assert result.denoiser["kept"] == sum(column.denoised for column in result.columns)
 
 
 def test_doubtful_columns_get_a_second_opinion(trials: dict[str, Trial]) -> None:

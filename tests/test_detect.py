@@ -90,7 +90,7 @@ def sent_through(
 
 @pytest.mark.parametrize(
     ("w", "n_symbols", "memory"),
-    [(2, 2, 0), (1, 3, 1), (9, 3, 1), (2, 2, 1), (8, 2, 3), (1, 3, 3), (2, 2, 3), (9, 2, 5), (5, 1, 3)],
+    [(1, 3, 1), (9, 3, 1), (2, 2, 1), (8, 2, 3), (1, 3, 3), (2, 2, 3), (9, 2, 5), (5, 1, 3)],
 )
 def test_agrees_with_enumeration_of_all_sequences(w: int, n_symbols: int, memory: int) -> None:
     rng = np.random.default_rng([w, n_symbols, memory])
@@ -118,7 +118,7 @@ def test_agrees_with_enumeration_of_all_sequences(w: int, n_symbols: int, memory
             assert np.isnan(found.bit_llr[0, column, symbol, k:]).all()
 
 
-@pytest.mark.parametrize("memory", [0, 1, 3])
+@pytest.mark.parametrize("memory", [1, 3])
 def test_weight_probabilities_agree_with_enumeration(memory: int) -> None:
     rng = np.random.default_rng(memory)
     metrics = rng.normal(0, 0.4, (2, 3, 30 + memory, 2 << memory))
@@ -228,7 +228,7 @@ def test_hopeless_weights_are_dropped_and_a_wide_margin_keeps_all() -> None:
     assert plausible_weights(metrics, 1e9).all()
 
 
-@pytest.mark.parametrize("memory", [0, 1, 3])
+@pytest.mark.parametrize("memory", [1, 3])
 def test_constants_added_to_all_patterns_of_a_slot_change_nothing(memory: int) -> None:
     rng = np.random.default_rng(memory)
     metrics = rng.normal(0, 1, (2, 5, 40 + memory, 2 << memory))
@@ -263,7 +263,7 @@ def extreme(kind: str, shape: tuple[int, ...]) -> FloatArray:
 
 
 @pytest.mark.parametrize("kind", ["equal", "huge", "never", "mixed", "one huge"])
-@pytest.mark.parametrize("memory", [0, 1, 3, 5])
+@pytest.mark.parametrize("memory", [1, 3, 5])
 def test_extreme_metrics_give_finite_posteriors(kind: str, memory: int) -> None:
     metrics = extreme(kind, (2, 3, 40 + memory, 2 << memory))
     for candidates in (None, plausible_weights(metrics, 20.0)):
