@@ -30,7 +30,7 @@ from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSa
 
 #: Scales, in slots, over which the picture is predicted: fine texture to plain sky.
 PICTURE_SCALES = (0.3, 0.8, 2.5, 6.0)
-_QUICK_SCALES = (0.6, 1.2, 2.5)
+_QUICK_SCALES = (0.6, 2.5)
 #: Prior of the predictions from both sides, from before, from after.
 _SIDES = (0.5, 0.25, 0.25)
 #: Samples closer than this many slots to a sample say nothing of its picture: they show the same slot.

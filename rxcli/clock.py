@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
+#: Strips of which the search needs but half.
+_MANY_STRIPS = 4
 #: Samples a slot while the clock is sought.
 _SEARCH_SAMPLES = 4
 #: Any window of this many slots holds a lit and a dark one (two symbols meet dark-to-dark or lit-to-lit at worst).
@@ -39,6 +41,12 @@ _SAME_TIMING = 0.03
 _DELAY_PRIOR = 100.0
 #: Largest correction of the clock at a time, slots.
 _MAX_CORRECTION = 0.25
+
+
+def pooled_strips(profiles: RowProfiles) -> RowProfiles:
+    """Profiles of a few strips a column, to search the clock: pooled in pairs, in fours where there are eight."""
+    pooled = halved_strips(profiles)
+    return halved_strips(pooled) if pooled.light.shape[1] >= _MANY_STRIPS else pooled
 
 
 def halved_strips(profiles: RowProfiles) -> RowProfiles:

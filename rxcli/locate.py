@@ -175,7 +175,7 @@ def find_lock(frame: Frame, corners: FloatArray, camera: Camera, options: Receiv
     with stages("sampling"):
         profiles = sample_columns(frame, corners, camera, n_columns)
     with stages("clock"):
-        quick = clock.halved_strips(profiles)
+        quick = clock.pooled_strips(profiles)
         rates = {(s.slot_rate_hz, s.packet_slots): s for s in options.screens}
         clocks = {rate: found for rate, screen in rates.items() if (found := _clock_of(screen, quick, camera))}
         clocks = {rate: found for rate, found in clocks.items() if found.lock >= _MIN_LOCK}
@@ -188,7 +188,7 @@ def find_lock(frame: Frame, corners: FloatArray, camera: Camera, options: Receiv
         with stages("sampling"):
             finer = sample_columns(frame, corners, camera, screen.columns)
         with stages("clock"):
-            found = _clock_of(screen, clock.halved_strips(finer), camera)
+            found = _clock_of(screen, clock.pooled_strips(finer), camera)
         if found:
             locks.append(Lock(screen, finer, found))
     if not locks:

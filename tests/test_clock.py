@@ -248,12 +248,12 @@ def test_copies_and_back() -> None:
     assert (clock.from_copies(copies, now) == slots).all()
 
 
-def test_halved_strips_keep_the_light() -> None:
+@pytest.mark.parametrize(("n_strips", "n_pooled"), [(2, 1), (3, 3), (4, 2), (6, 3), (8, 2)])
+def test_pooled_strips_keep_the_light(n_strips: int, n_pooled: int) -> None:
     rng = np.random.default_rng(0)
-    profiles = row_profiles(random_link(rng, [5] * 2, 5), Shot(n_rows=60, n_strips=4), rng)
-    halved = clock.halved_strips(profiles)
-    assert halved.light.shape == (2, 2, 60)
-    np.testing.assert_allclose(halved.light[:, 1], profiles.light[:, 2:].mean(axis=1), rtol=1e-5)
-    np.testing.assert_allclose(halved.count, 2.0)
-    odd = row_profiles(random_link(rng, [5] * 2, 5), Shot(n_rows=60, n_strips=3), rng)
-    assert (clock.halved_strips(odd).light == odd.light).all()
+    profiles = row_profiles(random_link(rng, [5] * 2, 5), Shot(n_rows=60, n_strips=n_strips), rng)
+    pooled = clock.pooled_strips(profiles)
+    together = n_strips // n_pooled
+    assert pooled.light.shape == (2, n_pooled, 60)
+    np.testing.assert_allclose(pooled.light[:, -1], profiles.light[:, -together:].mean(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(pooled.count, together)
