@@ -24,8 +24,13 @@ from rxcli.types import (
 
 #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
 MAX_BER_HAT = 0.1
-#: Offset and slope from the log-odds of the posterior to those of being error-free; 4794 packets of 480 frames.
-_CALIBRATION = (-0.344, 1.026)
+#: Offset and slope from the log-odds of the posterior to those of being error-free: where the auto-encoder did not run,
+#: where it could not halve the doubt, and where it did, which are the columns it made surer of.
+_CALIBRATION: dict[bool | None, tuple[float, float]] = {
+    None: (1.77, 0.45),
+    False: (2.199, 0.648),
+    True: (-0.212, 0.648),
+}
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
 _CLIP_CALIBRATION = (0.103, 0.477, -0.83)
@@ -53,7 +58,12 @@ _DARK_SNR_DB = 0.0
 
 
 def column_results(
-    clock: Clock, posteriors: BurstPosteriors, snr: Float32Array, samples: SlotSamples, min_confidence: float
+    clock: Clock,
+    posteriors: BurstPosteriors,
+    snr: Float32Array,
+    samples: SlotSamples,
+    min_confidence: float,
+    denoised: frozenset[int] | None = None,
 ) -> tuple[ColumnResult, ...]:
     """Results of every column.
 
@@ -63,6 +73,7 @@ def column_results(
         snr: (C, N) squared contrast over variance of every slot of the grid.
         samples: the samples, for what was visible.
         min_confidence: packets below it are left out.
+        denoised: columns in which corrections of the auto-encoder were kept; None where it did not run.
     """
     seen = slots_seen(samples, clock)
     whole = complete(seen)
@@ -72,7 +83,15 @@ def column_results(
     against = [_HEADERLESS if h else _ECHO if e else None for h, e in zip(headerless, echoes, strict=True)]
     return tuple(
         _column_result(
-            column, clock, posteriors, db, seen[:, column], whole[:, column], against[column], min_confidence
+            column,
+            clock,
+            posteriors,
+            db,
+            seen[:, column],
+            whole[:, column],
+            against[column],
+            min_confidence,
+            None if denoised is None else column in denoised,
         )
         for column, db in enumerate(snr_db)
     )
@@ -221,9 +240,10 @@ def _column_result(
     whole: BoolArray,
     against: str | None,
     min_confidence: float,
+    denoised: bool | None,
 ) -> ColumnResult:
     bursts = () if against else np.flatnonzero(whole)
-    found = [_packet(int(burst), column, clock, posteriors, seen[burst]) for burst in bursts]
+    found = [_packet(int(burst), column, clock, posteriors, seen[burst], denoised=denoised) for burst in bursts]
     packets = tuple(packet for packet in found if packet and packet.confidence >= min_confidence)
     sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
@@ -232,6 +252,7 @@ def _column_result(
         status=status,
         w=int(posteriors.w[column]) if packets or sure_of_w else None,
         snr_db=snr_db,
+        denoised=bool(denoised),
         delay_slots=float(clock.delay_slots[column]),
         packets=packets,
         message=None if packets else against or _why_none(status, snr_db, int(seen.sum()), clock),
@@ -303,6 +324,7 @@ def _packet(
     seen: IntArray,
     number: int | None = None,
     frames: tuple[int, ...] | None = None,
+    denoised: bool | None = None,
 ) -> PacketResult | None:
     """The packet of one burst, None where too many bits are uncertain; `seen` is (packet,)."""
     w = int(posteriors.w[column])
@@ -316,21 +338,21 @@ def _packet(
         copies=float(seen.sum() / clock.packet_slots),
         payload_bits=int(bits.size),
         payload=bits_to_hex(bits),
-        confidence=_calibrated(float(posteriors.log_prob[burst, column].sum())),
+        confidence=_calibrated(float(posteriors.log_prob[burst, column].sum()), denoised),
         ber_hat=ber_hat,
         burst=number,
         frames=frames,
     )
 
 
-def _calibrated(log_prob: float) -> float:
+def _calibrated(log_prob: float, denoised: bool | None) -> float:
     """Share of error-free packets among those whose symbols' log probabilities add up to `log_prob`.
 
     The light model's likelihoods are tempered, since strips and samples err together; what is left of that is a
     straight line between log-odds, fitted to packets of `rxcli.benchmark.confidence`. Whatever changes the likelihoods
     of the light model or the auto-encoder asks for a new fit.
     """
-    offset, slope = _CALIBRATION
+    offset, slope = _CALIBRATION[denoised]
     return _probability(offset + slope * _log_odds(log_prob))
 
 

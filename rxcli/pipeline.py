@@ -91,8 +91,10 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
             dump_frame(
                 options.dump_dir, frame, corners, lock.profiles, seen.clock, seen.samples, seen.metrics, seen.posteriors
             )
-        columns = assemble.column_results(seen.clock, seen.posteriors, seen.snr, seen.samples, options.min_confidence)
-        columns = tuple(replace(column, denoised=column.column in denoised) for column in columns)
+        kept = denoised if report and report["columns"] else None
+        columns = assemble.column_results(
+            seen.clock, seen.posteriors, seen.snr, seen.samples, options.min_confidence, kept
+        )
         if camera.reversed:
             columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
         result = replace(result, denoiser=report, skipped=seen.skipped)

@@ -84,7 +84,7 @@ def test_a_sure_packet() -> None:
         assert packet.payload_bits == N_SYMBOLS * bits_per_symbol(w[column])
         assert packet.payload == bits_to_hex(indices_to_bits(index[0, column], w[column]))
         assert packet.copies == pytest.approx(120 / 50)
-        assert 0.998 < packet.confidence < 1
+        assert 0.99 < packet.confidence < 1
         assert packet.ber_hat == pytest.approx(1e-4, rel=0.01)
         assert packet.bit_errors is None
 
