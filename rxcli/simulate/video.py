@@ -63,7 +63,7 @@ def write_video(
     rate = Fraction(frame_rate_hz).limit_denominator(1001)
     with av.open(str(path), "w") as container:
         stream = None
-        for rgb in frames:
+        for number, rgb in enumerate(frames):
             if stream is None:
                 stream = _add_stream(container, settings, rate, rgb.shape, bit_rate)
             frame = av.VideoFrame.from_ndarray(
@@ -76,7 +76,7 @@ def write_video(
                 src_color_range=_JPEG_RANGE,
                 dst_color_range=target_range,
             )
-            converted.pts = None
+            converted.pts, converted.time_base = number, 1 / rate
             container.mux(stream.encode(converted))
         if stream is not None:
             container.mux(stream.encode(None))
@@ -101,5 +101,7 @@ def _add_stream(container: Any, settings: Codec, rate: Fraction, shape: tuple[in
     if settings.encoder != "mjpeg":
         stream.options = {"preset": "veryfast"} | ({} if bit_rate else {"crf": "23"})
         if settings.encoder == "libx265":
-            stream.options = stream.options | {"x265-params": "log-level=error"}
+            # Reordered frames of a clip shorter than the encoder's delay get times that no container takes; and the
+            # encoders in cameras do not reorder either.
+            stream.options = stream.options | {"x265-params": "log-level=error:bframes=0"}
     return stream
