@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rxcli import detect
 from rxcli.benchmark import stability
+from rxcli.benchmark.trial import simulate_trial
 from rxcli.benchmark.watch import problems_in, watched
 
 _QUICK = (
@@ -99,3 +100,13 @@ def test_random_scenes_are_counted() -> None:
     assert not verdict.stable
     assert replace(verdict, wrong=2).stable
     assert stability.rows(replace(verdict, scenes={"NaN": [7]}))[-1]["seeds"] == "7"
+
+
+@pytest.mark.parametrize("seed", [3394, 1000463])
+def test_scenes_that_led_the_pose_astray(seed: int) -> None:
+    """Found by ten thousand random scenes: sides that are no screen's, and a pose without a unique step."""
+    trial = simulate_trial(stability.small_scene(seed), seed)
+    result, problems = stability.inspect_frame(trial.frame, trial.options(known_outline=False))
+    assert not problems
+    assert result is not None
+    assert result.status == "no_screen"

@@ -131,6 +131,10 @@ def fit_pose(
             slopes = (model[1:] - model[0]) / _EPSILON
             normal = normal + weight * (slopes @ slopes.T)
             gradient = gradient - weight * (slopes @ (observed - model[0]))
-        step = np.linalg.solve(normal + _DAMPING, gradient)
+        try:
+            step = np.linalg.solve(normal + _DAMPING, gradient)
+        except np.linalg.LinAlgError:
+            # Sides that are no screen's led the pose astray; whether it has the shape of one is judged later.
+            break
         pose = pose - np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
     return np.asarray(pose, np.float64)
