@@ -564,12 +564,11 @@ class _Clip:
         if bursts.size == 0:
             return
         metrics = self._bursts.metrics(numbers[bursts])[:, columns]
-        known = self._weights[columns] if self._weights is not None else np.zeros((columns.size, len(WEIGHTS)), bool)
-        unknown = ~known.any(axis=1)
+        none = np.zeros((columns.size, len(WEIGHTS)), bool)
+        candidates = self._weights[columns] if self._weights is not None else none
+        unknown = ~candidates.any(axis=1)
         if unknown.any():
-            known = known.copy()
-            known[unknown] = detect.plausible_weights(metrics[:, unknown], HOPELESS_WEIGHT)
-        candidates = known
+            candidates[unknown] = detect.plausible_weights(metrics[:, unknown], HOPELESS_WEIGHT)
         posteriors = detect.detect(metrics, candidates)
         certain = posteriors.log_prob.min(axis=2) >= CERTAIN
         self._bursts.note(numbers[bursts], columns, posteriors, certain)

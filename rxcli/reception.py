@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from rxcli import assemble, channel, clock, denoise, detect
 from rxcli.errors import ReceiverError
 from rxcli.locate import Lock, noise_of
-from rxcli.options import SKIPS, ReceiverOptions
-from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
+from rxcli.options import ReceiverOptions
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
 _COARSE, _FINE = 2, 4
@@ -24,8 +24,8 @@ CERTAIN = -1e-4
 _DARK_SNR_DB = -3.0
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
 HOPELESS_WEIGHT = 20.0
-#: A column with a symbol of less than this log probability gets a second opinion. Measured (models/strips/README.md): a
-#: stricter gate asks half as often again and mends nothing more, a laxer one leaves errors behind.
+#: A column with a symbol of less than this log probability is looked at without the rows' own light, and gets a second
+#: opinion. Where the gate comes from: docs/auto_encoder.md.
 _DOUBTFUL = -1e-2
 #: Corrections are kept in columns whose symbols' log probabilities, added, come down to this share.
 _LESS_DOUBT = 0.5
@@ -48,8 +48,6 @@ class Reception:
     model: channel.LightModel
     #: (C, N + memory, patterns).
     metrics: FloatArray
-    #: (C,) whether the metrics come of all strips on the fine grid.
-    fine: BoolArray
     #: What the auto-encoder may be shown: the fine grid without the rows' own light; None where nothing was in doubt.
     scene: denoise.Scene | None = None
     #: What was skipped: name -> columns.
@@ -87,11 +85,10 @@ def quick_look(lock: Lock) -> Reception:
     now = clock.assign_bursts(now, detect.slot_llr(likelihoods.metrics), lock.screen.repeats)
     now = clock.corrected(now, likelihoods.timing)
     posteriors = _detect(likelihoods.metrics, now)
-    fine = np.zeros(columns.size, bool)
-    return Reception(now, samples, posteriors, likelihoods.snr, model, likelihoods.metrics, fine)
+    return Reception(now, samples, posteriors, likelihoods.snr, model, likelihoods.metrics)
 
 
-def iterate(lock: Lock, seen: Reception, skip: frozenset[str] = frozenset(SKIPS)) -> Reception:
+def iterate(lock: Lock, seen: Reception, skip: frozenset[str]) -> Reception:
     """Light model and detection in turn, until every column is certain or nothing more is to be expected.
 
     Columns in doubt are looked at on the coarse grid once, and those that still are on the fine one.
@@ -106,7 +103,7 @@ def iterate(lock: Lock, seen: Reception, skip: frozenset[str] = frozenset(SKIPS)
         if columns.size == 0:
             break
         before = seen.posteriors.index
-        seen, timing = _look_again(lock, seen, columns, fine=iteration > 0)
+        seen, timing = _look_again(lock, seen, columns, _COARSE if iteration == 0 else _FINE)
         if iteration == 0:
             seen = _with_bursts_of(seen, detect.slot_llr(seen.metrics), lock.screen.repeats)
             seen = replace(seen, clock=clock.corrected(seen.clock, timing))
@@ -114,17 +111,17 @@ def iterate(lock: Lock, seen: Reception, skip: frozenset[str] = frozenset(SKIPS)
     return replace(seen, skipped={name: count for name, count in skipped.items() if count})
 
 
-def _look_again(lock: Lock, seen: Reception, columns: NDArray[np.int64], fine: bool) -> tuple[Reception, FloatArray]:
+def _look_again(
+    lock: Lock, seen: Reception, columns: NDArray[np.int64], samples_per_slot: int
+) -> tuple[Reception, FloatArray]:
     """What is seen with some columns looked at again, and the (C, 2) timing of all, 0 for the others."""
-    samples, model = _view(lock, seen, columns, _FINE if fine else _COARSE)
+    samples, model = _view(lock, seen, columns, samples_per_slot)
     lit = channel.lit_on_grid(seen.posteriors, seen.clock)
     likelihoods = channel.slot_likelihoods(samples, seen.clock, model, lit, columns)
-    metrics, snr, of_fine = seen.metrics.copy(), seen.snr.copy(), seen.fine.copy()
-    timing = np.zeros((lit.shape[0], 2))
-    metrics[columns], snr[columns], of_fine[columns] = likelihoods.metrics, likelihoods.snr, fine
-    timing[columns] = likelihoods.timing
+    metrics, snr, timing = seen.metrics.copy(), seen.snr.copy(), np.zeros((lit.shape[0], 2))
+    metrics[columns], snr[columns], timing[columns] = likelihoods.metrics, likelihoods.snr, likelihoods.timing
     posteriors = _replaced(seen.posteriors, columns, _detect(metrics[columns], seen.clock))
-    return replace(seen, metrics=metrics, snr=snr, posteriors=posteriors, fine=of_fine), timing
+    return replace(seen, metrics=metrics, snr=snr, posteriors=posteriors), timing
 
 
 def _view(
@@ -198,8 +195,10 @@ def second_opinion(
     if options.cae == "never":
         return seen, frozenset(), None
     if options.cae == "always":
-        seen = without_row_light(lock, seen, np.arange(seen.snr.shape[0]))
-    columns = np.arange(seen.snr.shape[0]) if options.cae == "always" else doubtful_columns(seen)
+        columns = np.arange(seen.snr.shape[0])
+        seen = without_row_light(lock, seen, columns)
+    else:
+        columns = doubtful_columns(seen)
     if columns.size == 0 or seen.scene is None:
         return seen, frozenset(), None
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
@@ -215,10 +214,10 @@ def second_opinion(
     kept = columns[better]
     # The network is told where headers are; whether they show there, the light alone must say.
     corrected = replace(_of(posteriors, better), header_llr=seen.posteriors.header_llr[:, kept])
-    every = seen.metrics.copy()
-    every[kept] = metrics[better]
+    of_all = seen.metrics.copy()
+    of_all[kept] = metrics[better]
     report.update(model=denoiser.name, kept=kept.size)
-    seen = replace(seen, metrics=every, posteriors=_replaced(seen.posteriors, kept, corrected))
+    seen = replace(seen, metrics=of_all, posteriors=_replaced(seen.posteriors, kept, corrected))
     return seen, frozenset(kept.tolist()), report
 
 
@@ -228,8 +227,8 @@ def without_row_light(lock: Lock, seen: Reception, columns: NDArray[np.int64]) -
     scene = denoise.without_row_light(_scene_of(seen, samples, model))
     asked = replace(samples, light=scene.samples.light[columns], valid=samples.valid[columns])
     likelihoods = channel.slot_likelihoods(asked, seen.clock, model, scene.lit, columns)
-    metrics, snr, fine = seen.metrics.copy(), seen.snr.copy(), seen.fine.copy()
-    metrics[columns], snr[columns], fine[columns] = likelihoods.metrics, likelihoods.snr, True
+    metrics, snr = seen.metrics.copy(), seen.snr.copy()
+    metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
     lost = np.flatnonzero(seen.posteriors.log_prob[:, columns].mean(axis=(0, 2)) < _LOST)
     if lost.size:
         there = columns[lost]
@@ -238,7 +237,7 @@ def without_row_light(lock: Lock, seen: Reception, columns: NDArray[np.int64]) -
         better = _evidence(fresh.metrics, seen.clock) > _evidence(metrics[there], seen.clock)
         metrics[there[better]], snr[there[better]] = fresh.metrics[better], fresh.snr[better]
     posteriors = _replaced(seen.posteriors, columns, _detect(metrics[columns], seen.clock))
-    cleaned = replace(seen, metrics=metrics, snr=snr, fine=fine, posteriors=posteriors)
+    cleaned = replace(seen, metrics=metrics, snr=snr, posteriors=posteriors)
     return replace(cleaned, scene=_scene_of(cleaned, scene.samples, model))
 
 

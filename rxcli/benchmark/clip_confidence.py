@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 import msgspec
 import numpy as np
 
+from rxcli.benchmark.confidence import reported_packets
 from rxcli.benchmark.journal import Journal, Record, Task, run_tasks
 from rxcli.ingest import open_source
 from rxcli.pipeline import CaeMode, ReceiverOptions, receive
@@ -97,24 +98,7 @@ def packets_of(task: Task) -> Record:
         scorer = Scorer(truth)
         results = [scorer.add(result) for result in receive(open_source(path), options_for(take, cae=task["cae"]))]
     clip, score = scene_of(task["seed"]), scorer.score()
-    packets = [
-        {
-            "confidence": packet.confidence,
-            "ber_hat": packet.ber_hat,
-            "bit_errors": packet.payload_bits if packet.bit_errors is None else packet.bit_errors,
-            "payload_bits": packet.payload_bits,
-            "copies": packet.copies,
-            "frames": len(packet.frames or ()),
-            "frame": result.frame,
-            "column": column.column,
-            "w": column.w,
-            "tx_w": truth.w[column.column],
-            "snr_db": column.snr_db,
-        }
-        for result in results
-        for column in result.columns
-        for packet in column.packets
-    ]
+    packets = [packet for result in results for packet in reported_packets(result, truth.w)]
     return {
         "screen": clip.scene.screen.name,
         "picture": clip.scene.picture,

@@ -15,6 +15,7 @@ from rxcli.benchmark.statistics import wilson
 from rxcli.benchmark.trial import simulate_trial
 from rxcli.simulate.pictures import GENERATED, PHOTOS
 from rxcli.simulate.scenes import Scene, preset
+from rxcli.types import FrameResult
 
 FloatArray = NDArray[np.float64]
 N_BINS = 10
@@ -120,23 +121,29 @@ def packets_of(task: Task) -> Record:
         "expected": score.expected,
         "lost": score.lost,
     }
-    packets = [
+    return {**about, "packets": reported_packets(result, trial.truth.w)}
+
+
+def reported_packets(result: FrameResult, sent_w: Sequence[int]) -> list[Record]:
+    """What was reported of every packet of one scored frame, as JSON values; `sent_w`: true weight per column."""
+    return [
         {
             "confidence": packet.confidence,
             "ber_hat": packet.ber_hat,
             "bit_errors": packet.payload_bits if packet.bit_errors is None else packet.bit_errors,
             "payload_bits": packet.payload_bits,
             "copies": packet.copies,
+            "frames": len(packet.frames or ()),
+            "frame": result.frame,
             "column": column.column,
             "w": column.w,
-            "tx_w": trial.truth.w[column.column],
+            "tx_w": sent_w[column.column],
             "snr_db": column.snr_db,
             "denoised": column.denoised,
         }
         for column in result.columns
         for packet in column.packets
     ]
-    return {**about, "packets": packets}
 
 
 def run(

@@ -21,6 +21,7 @@ from rxcli.blind.waves import (
     estimate_exposure,
     first_slots,
     local_mean,
+    local_moments,
     packet_evidence,
     seen_through,
 )
@@ -236,13 +237,10 @@ def _gauss_newton(
     pitch = float(strips.rows[1] - strips.rows[0])
     window = round(LOCAL_SLOTS * values[1] / pitch)
     inside = strips.inside
-    share = local_mean(inside, window) + np.float32(1e-3)
-    mean_light, mean_wave = local_mean(strips.light * inside, window) / share, local_mean(wave * inside, window) / share
-    covariance = local_mean(strips.light * wave * inside, window) / share - mean_light * mean_wave
-    variance = local_mean(wave * wave * inside, window) / share - mean_wave * mean_wave
-    gain = np.maximum(covariance, 0) / (variance + np.float32(0.02))
-    residual = (strips.light - mean_light - gain * (wave - mean_wave)) * inside
-    spread = local_mean(residual * residual, window) / share + strips.noise.variance(mean_light)
+    near = local_moments(strips.light, wave, inside, window)
+    gain = near.gain
+    residual = (strips.light - near.value - gain * (wave - near.wave)) * inside
+    spread = local_mean(residual * residual, window) / near.share + strips.noise.variance(near.value)
     power = gain * slope
     weight = inside / spread
     fit = residual * weight * power
@@ -251,7 +249,7 @@ def _gauss_newton(
     pull = np.add.reduceat(fit, blocks, axis=1).astype(np.float64)
     jacobian = _jacobian(terms, values, time, blocks)
     step, covariance_matrix = _solve(jacobian, information, pull, values, strips.n_columns, n_free)
-    light_power = float((gain * gain * variance * weight).sum())
+    light_power = float((gain * gain * near.variance * weight).sum())
     left = float((residual * residual * weight).sum())
     return step, covariance_matrix, light_power / max(light_power + left, 1e-9)
 

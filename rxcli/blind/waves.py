@@ -93,14 +93,6 @@ def column_waves(strips: Strips, time: Float32Array, rows_per_slot: float) -> Wa
     return Waves(value.astype(np.float32), total.reshape(value.shape).astype(np.float32))
 
 
-def _slot_values(waves: Waves) -> Float32Array:
-    """(C, N) mean of every slot."""
-    shape = (waves.value.shape[0], -1, SAMPLES)
-    weight = waves.weight.reshape(shape)
-    summed = (waves.value.reshape(shape) * weight).sum(axis=2)
-    return np.asarray(summed / (weight.sum(axis=2) + np.float32(1e-3)), np.float32)
-
-
 def first_slots(waves: Waves, exposure_slots: float, grid: Grid) -> Slots:
     """Slots at the levels that each weight would give, of the weight that explains its column best."""
     pattern = pattern_light(exposure_slots, SAMPLES)
@@ -214,15 +206,13 @@ def _levels(waves: Waves, lit: Float32Array, exposure_slots: float) -> tuple[Flo
     wave, _ = seen_through(lit, centres, column, exposure_slots)
     unsure, _ = seen_through(lit * (1 - lit), centres, column, exposure_slots)
     unsure /= np.float32(max(exposure_slots, 1.0))
-    window, weight = _LEVEL_SLOTS * SAMPLES, waves.weight
-    share = local_mean(weight, window) + np.float32(1e-3)
-    mean_value, mean_wave = local_mean(waves.value * weight, window) / share, local_mean(wave * weight, window) / share
-    both = local_mean(waves.value * wave * weight, window) / share - mean_value * mean_wave
-    power = local_mean((wave * wave + unsure) * weight, window) / share - mean_wave * mean_wave
+    weight = waves.weight
+    near = local_moments(waves.value, wave, weight, _LEVEL_SLOTS * SAMPLES, unsure)
+    both, power = near.covariance, near.variance
     total = weight.sum(axis=1, keepdims=True) + np.float32(1e-6)
     overall = (both * weight).sum(axis=1, keepdims=True) / ((power * weight).sum(axis=1, keepdims=True) + 0.01 * total)
     gain = (np.maximum(both, 0) + _GAIN_PRIOR * np.maximum(overall, 0)) / (np.maximum(power, 0) + _GAIN_PRIOR)
-    offset = mean_value - gain * mean_wave
+    offset = near.value - gain * near.wave
     return gain, offset, (waves.value - offset - gain * wave) ** 2 + gain * gain * unsure
 
 
@@ -258,6 +248,35 @@ def local_mean(values: Float32Array, window: int) -> Float32Array:
     return np.asarray(cv2.blur(values, (window | 1, 1)))
 
 
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Weighted means, covariance and variance of light and of the wave that should explain it, thereabouts."""
+
+    #: Share of the window that counts.
+    share: Float32Array
+    value: Float32Array
+    wave: Float32Array
+    covariance: Float32Array
+    #: Of the wave.
+    variance: Float32Array
+
+    @property
+    def gain(self) -> Float32Array:
+        """Light per unit of the wave, never negative."""
+        return np.asarray(np.maximum(self.covariance, 0) / (self.variance + np.float32(0.02)))
+
+
+def local_moments(
+    value: Float32Array, wave: Float32Array, weight: Float32Array, window: int, unsure: Float32Array | float = 0.0
+) -> Moments:
+    """Moments over `window` samples along the last axis; `unsure` is the variance of the wave itself."""
+    share = local_mean(weight, window) + np.float32(1e-3)
+    mean_value, mean_wave = local_mean(value * weight, window) / share, local_mean(wave * weight, window) / share
+    covariance = local_mean(value * wave * weight, window) / share - mean_value * mean_wave
+    variance = local_mean((wave * wave + unsure) * weight, window) / share - mean_wave * mean_wave
+    return Moments(share, mean_value, mean_wave, covariance, variance)
+
+
 def estimate_exposure(waves: Waves, grid: Grid, slots: Slots, near: float | None = None) -> tuple[float, float, Slots]:
     """Exposure in slots by the blur of the slots' edges.
 
@@ -287,13 +306,8 @@ def _misfit(waves: Waves, exposure_slots: float, lit: Float32Array) -> float:
     """Weighted square of what the slots through this exposure leave of the waves, as a share."""
     centres = np.broadcast_to((np.arange(waves.value.shape[1]) + 0.5) / SAMPLES, waves.value.shape)
     wave, _ = seen_through(lit, centres, np.arange(lit.shape[0]), exposure_slots)
-    window = LOCAL_SLOTS * SAMPLES
     weight = waves.weight
-    share = local_mean(weight, window) + np.float32(1e-3)
-    mean_value, mean_wave = local_mean(waves.value * weight, window) / share, local_mean(wave * weight, window) / share
-    covariance = local_mean(waves.value * wave * weight, window) / share - mean_value * mean_wave
-    variance = local_mean(wave * wave * weight, window) / share - mean_wave * mean_wave
-    gain = np.maximum(covariance, 0) / (variance + np.float32(0.02))
-    residual = waves.value - mean_value - gain * (wave - mean_wave)
-    total = float((weight * (waves.value - mean_value) ** 2).sum())
+    near = local_moments(waves.value, wave, weight, LOCAL_SLOTS * SAMPLES)
+    residual = waves.value - near.value - near.gain * (wave - near.wave)
+    total = float((weight * (waves.value - near.value) ** 2).sum())
     return float((weight * residual * residual).sum()) / max(total, 1e-9)
