@@ -38,7 +38,7 @@ _AGAINST_AT_LEAST = 0.5
 #: Wrong bits of packets as likely right as wrong, the least share of them, and the power of the odds of being wrong
 #: that it goes with.
 _WRONG_AT_EVENS, _BER_AT_EVENS, _BER_EXPONENT = 1.4, 0.018, 0.85
-#: Headers less likely than this against slots that are anything, nats, are not headers.
+#: Headers of a column, all bursts together, less likely than this against slots that are anything, nats, are none.
 _CONTRADICTED = -2.0
 #: Together the columns' headers must be this much more likely than slots that are anything; one good header gives 12.
 _HEADERS_AT_LEAST = 6.0
@@ -78,7 +78,7 @@ def column_results(
     seen = slots_seen(samples, clock)
     whole = complete(seen)
     snr_db = _snr_db_of_columns(snr)
-    headerless = posteriors.header_llr.min(axis=0) < (_CONTRADICTED if _headers_show(posteriors) else np.inf)
+    headerless = posteriors.header_llr.sum(axis=0) < (_CONTRADICTED if _headers_show(posteriors) else np.inf)
     echoes: BoolArray = np.any(_echoes(posteriors, snr_db) & whole, axis=0)
     against = [_HEADERLESS if h else _ECHO if e else None for h, e in zip(headerless, echoes, strict=True)]
     return tuple(
