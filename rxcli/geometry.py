@@ -6,10 +6,15 @@ model carries points on to the stored picture, and each strip's edges become x a
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
+from numpy.typing import NDArray
 
 from rxcli.profiles import LensModel
 from rxcli.types import BoolArray, FloatArray, IntArray, Lens, Outlines
+
+_Real = TypeVar("_Real", np.float32, np.float64)
 
 #: Rows of a picture for the viewer start at this stored corner: EXIF orientation -> order of the stored corners
 #: (top-left, top-right, bottom-right, bottom-left of the stored picture) as the viewer meets them.
@@ -130,7 +135,7 @@ def column_outlines(
     rows = np.arange(first, last + 1)
     knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
     knot_x, knot_v = _edges_at(points, v, knots)
-    edges_x = _between_knots(knot_x, knots, rows).astype(np.float32)
+    edges_x = _between_knots(knot_x.astype(np.float32), knots, rows)
     middle_v = (knot_v[1:] + knot_v[:-1]) / 2
     inside = _rows_between(middle_v, knots, rows, 0.0, 1.0)
     if knot_x.min() < 0 or knot_x.max() > width - 1:
@@ -157,15 +162,17 @@ def _edges_at(points: FloatArray, v: FloatArray, knots: IntArray) -> tuple[Float
     return x, along
 
 
-def _between_knots(values: FloatArray, knots: IntArray, rows: IntArray) -> FloatArray:
-    """(n, rows) linear interpolation of values (n, knots)."""
+def _between_knots(values: NDArray[_Real], knots: IntArray, rows: IntArray) -> NDArray[_Real]:
+    """(n, rows) linear interpolation of values (n, knots), in their own precision."""
     if knots.size == 1:
         return values
-    slope = np.diff(values) / np.diff(knots)
-    between = values[:, :-1, None] + slope[..., None] * np.arange(_KNOT_ROWS)
+    slope = np.diff(values) / np.diff(knots).astype(values.dtype)
+    between = values[:, :-1, None] + slope[..., None] * np.arange(_KNOT_ROWS, dtype=values.dtype)
     # The last two knots may be closer together than the others.
     between = between.reshape(values.shape[0], -1)[:, : rows.size]
-    return between if between.shape[1] == rows.size else np.append(between, values[:, -1:], axis=1)
+    if between.shape[1] < rows.size:
+        between = np.concatenate([between, values[:, -1:]], axis=1)
+    return np.asarray(between, values.dtype)
 
 
 def _rows_between(values: FloatArray, knots: IntArray, rows: IntArray, low: float, high: float) -> BoolArray:

@@ -25,8 +25,8 @@ _N, _TILT, _YAW, _FOCAL, _DISTORTION = 8, 0, 1, 6, 7
 _EPSILON = 1e-6
 #: Weight against a step of what the sides say little of: turn, focal length and distortion make up for one another.
 _DAMPING = np.diag([1 / 0.05, 1 / 0.05, 0.0, 0.0, 0.0, 0.0, 1 / 0.15, 1 / 0.01]) ** 2
-#: Largest step of one iteration in any of the eight.
-_LARGEST_STEP = 0.25
+#: Largest step of one iteration in any of the eight; a step that moves no corner by this much is the last, pixels.
+_LARGEST_STEP, _SMALLEST_MOVE = 0.25, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ def fit_pose(
         sd: how well that is known, pixels.
         start: (8,) first guess.
         rectangle: picture and screen.
-        steps: iterations.
+        steps: iterations, at most.
     """
     pose = start
     for _ in range(steps):
@@ -136,5 +136,8 @@ def fit_pose(
         except np.linalg.LinAlgError:
             # Sides that are no screen's led the pose astray; whether it has the shape of one is judged later.
             break
-        pose = pose - np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+        step = np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+        pose = pose - step
+        if np.abs(step @ (terms[0][0][1:] - terms[0][0][0])).max() < _SMALLEST_MOVE * _EPSILON:
+            break
     return np.asarray(pose, np.float64)
