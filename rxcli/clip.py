@@ -43,6 +43,8 @@ _HELD, _HELD_LONG = 6, 24
 _WELL_LIT_SNR, _DOUBTFUL, _MUCH_DOUBT = 10.0, -0.05, 0.03
 #: Squared contrast over variance of a slot, at which all copies of a packet together do not give one.
 _DARK_SNR = 0.5
+#: Strips of a column, at most: more tell no more of a picture that is known, and take time.
+_STRIPS = 4
 #: Frames beyond which each one's share of what is known of the picture does not matter.
 _MANY_VIEWS = 12
 #: Frames that find their clock together where each shows little.
@@ -123,7 +125,6 @@ class _Place:
 
     corners: FloatArray
     map: strips.StripMap
-    light_of_value: Float32Array
     #: Where it was found at the last looks.
     looks: deque[FloatArray]
     n_frames: int = 0
@@ -299,7 +300,6 @@ class _Clip:
         self._place = _Place(
             corners,
             _map(frame, corners, camera, lock),
-            strips.light_of_values(frame, lambda coded: sampling.tone_to_light(camera.tone, coded)),
             deque([corners], maxlen=_LOOKS),
         )
         self._model = lock, seen.model.floor
@@ -397,7 +397,7 @@ class _Clip:
 
     def _strips(self, frame: Frame) -> Float32Array:
         assert self._place is not None
-        return strips.sample_strips(frame, self._place.map, self._place.light_of_value)
+        return strips.sample_strips(frame, self._place.map)
 
     def _look(self, frame: Frame, camera: Camera, lock: Lock) -> None:
         """Look where the screen is, now and then."""
@@ -774,9 +774,10 @@ def _map(frame: Frame, corners: FloatArray, camera: Camera, lock: Lock, n_strips
     """Where the strips lie; as many as before where `n_strips` says so, for a picture known by strips cannot follow."""
     n_columns = lock.screen.columns
     if n_strips is None:
-        n_strips = sampling.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
+        column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
+        n_strips = min(sampling.strips_per_column(column_px), _STRIPS)
     outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, camera.lens)
-    return strips.map_strips(outlines)
+    return strips.map_strips(outlines, frame, lambda coded: sampling.tone_to_light(camera.tone, coded))
 
 
 def _bursts_of(frame: Frame, seen: Reception) -> tracking.FrameBursts:
