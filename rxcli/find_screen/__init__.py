@@ -215,8 +215,7 @@ def _pose_without(
 def _inside(side: Side, number: int, pose: FloatArray, rectangle: Rectangle) -> float:
     """How far a pose has a side inside of where its stripes begin, pixels: stripes go to the side, not beyond."""
     expected = straight(rectangle.project(pose), number)
-    t = np.array(side.middle)
-    return max(float(INWARD[number] * (expected.at(t) - side.at(t))), 0.0)
+    return max(INWARD[number] * (expected.at(side.middle) - side.at(side.middle)), 0.0)
 
 
 def _implausible(corners: FloatArray, plane: Plane, aspect: float) -> str:

@@ -201,8 +201,8 @@ _Read = tuple[FloatArray, FloatArray, Float32Array, FloatArray, BoolArray]
 def _ends(guess: list[Side], side: int, size: float, limit: int) -> tuple[float, float]:
     """From where to where a side goes, a little inside its neighbours and inside the picture."""
     before, after = (guess[LEFT], guess[RIGHT]) if across(side) else (guess[TOP], guess[BOTTOM])
-    middle = guess[side].at(np.array(limit / 2))
-    return max(float(before.at(middle)) + 0.004 * size, 0.0), min(float(after.at(middle)) - 0.004 * size, limit - 1.0)
+    middle = guess[side].at(limit / 2)
+    return max(before.at(middle) + 0.004 * size, 0.0), min(after.at(middle) - 0.004 * size, limit - 1.0)
 
 
 def _across(

@@ -72,7 +72,7 @@ class _Window:
 def between(guess: list[Side], side: int, t: FloatArray, margin: float) -> BoolArray:
     """(K,) places along a side that lie between the neighbouring sides, by a margin."""
     before, after = (guess[LEFT], guess[RIGHT]) if across(side) else (guess[TOP], guess[BOTTOM])
-    middle = guess[side].at(np.array(t.mean()))
+    middle = guess[side].at(float(t.mean()))
     return np.asarray((t > before.at(middle) + margin) & (t < after.at(middle) - margin), np.bool_)
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from rxcli.types import BoolArray, FloatArray
+
+_Places = TypeVar("_Places", float, FloatArray)
 
 #: Sides in the order of `ScreenSearch.corners`: side i goes from corner i to corner i + 1.
 TOP, RIGHT, BOTTOM, LEFT = range(4)
@@ -24,20 +27,22 @@ _PAIR_APART = 0.15
 class Side:
     """One side of the screen: x of left and right, y of top and bottom, as a polynomial of the other coordinate."""
 
-    #: Highest power first, of (t - middle) / half.
+    #: Highest power first, of (t - middle) / half; two at least.
     coefficients: FloatArray
     middle: float
     half: float
     #: Share of the side that supports it; 0 where it is inferred.
     support: float
 
-    def at(self, t: FloatArray) -> FloatArray:
-        """Place of the side at `t`."""
+    def at(self, t: _Places) -> _Places:
+        """Place of the side at `t`, one or many."""
         along = (t - self.middle) / self.half
-        place = np.zeros_like(along)
-        for coefficient in self.coefficients:
+        powers: list[float] = self.coefficients.tolist()
+        highest, second, *others = powers
+        place = highest * along + second
+        for coefficient in others:
             place = place * along + coefficient
-        return np.asarray(place, np.float64)
+        return place
 
     @property
     def slope(self) -> float:
@@ -76,20 +81,19 @@ def straight(corners: FloatArray, side: int) -> Side:
 
 def extent(sides: list[Side], height: int) -> float:
     """Width of the screen in pixels, through the picture's middle."""
-    middle = np.array(height / 2)
-    return abs(float(sides[RIGHT].at(middle) - sides[LEFT].at(middle)))
+    return abs(sides[RIGHT].at(height / 2) - sides[LEFT].at(height / 2))
 
 
 def corners_of(sides: list[Side], width: int, height: int) -> FloatArray:
     """(4, 2) where neighbouring sides meet, by turns."""
     found = []
     for flat, upright in ((TOP, LEFT), (TOP, RIGHT), (BOTTOM, RIGHT), (BOTTOM, LEFT)):
-        x, y = np.array(width / 2), np.array(height / 2)
+        x, y = width / 2, height / 2
         # Each turn brings the corner nearer by the product of two slopes.
         for _ in range(4):
             x = sides[upright].at(y)
             y = sides[flat].at(x)
-        found.append((float(x), float(y)))
+        found.append((x, y))
     return np.array(found)
 
 
