@@ -369,25 +369,29 @@ class _Clip:
         Not `thorough` is enough of faded frames that will be measured again.
         None where the headers are not where the clock has them: another scene, or something in front of the screen.
         """
-        positions = known_picture.row_positions(self._rows, now)
-        lit = known_picture.first_decision(flat, positions, now)
+        positions, exposure_slots = known_picture.row_positions(self._rows, now), now.exposure_slots
         if known_picture.header_contrast(flat, positions, now) < _LEAST_HEADER:
             return None
-        fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
+        lit = known_picture.first_decision(flat, positions, now)
+        slots = known_picture.exposures(lit, positions, exposure_slots)
+        fit = known_picture.fit_response(flat, slots)
         if self._n_lessons < _FEW_LESSONS or (thorough and fit.response.centre < _FADED):
-            flat = picture.solve_again(light, fit.expected, now.rows_per_slot)
-            fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
+            expected = fit.response.expected(lit, positions, exposure_slots)
+            flat = picture.solve_again(light, expected, now.rows_per_slot)
+            fit = known_picture.fit_response(flat, slots)
         if fit.response.centre < _FADED:
-            flat = known_picture.evened(flat, fit)
-            fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
+            flat = known_picture.evened(flat, slots)
+            fit = known_picture.fit_response(flat, slots)
         if abs(fit.late) > _LATE:
             now = replace(now, row0=now.row0 - fit.late * now.rows_per_slot)
             positions = known_picture.row_positions(self._rows, now)
-            fit = known_picture.fit_response(flat, lit, positions, now.exposure_slots)
-        flat, ratio = picture.judge(flat, fit.expected, _NOISE_SHARE)
+            fit = known_picture.fit_response(flat, known_picture.exposures(lit, positions, exposure_slots))
+        expected = fit.response.expected(lit, positions, exposure_slots)
+        flat, ratio = picture.judge(flat, expected, _NOISE_SHARE)
         if ratio > _MISFIT:
             return None
-        return flat, now, positions, known_picture.pattern_metrics(flat, positions, now, memory, fit, lit)
+        metrics = known_picture.pattern_metrics(flat, positions, now, memory, fit.response, expected, lit)
+        return flat, now, positions, metrics
 
     @property
     def _rows(self) -> FloatArray:

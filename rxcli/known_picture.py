@@ -42,8 +42,13 @@ _BEYOND = 0.15
 _SIDE, _CENTRE, _AT_SIDE, _RIDGE = 0.5, (0.3, 1.3), (-0.1, 0.35), 1e-4
 #: Groups of rows by their precision, and the contrast that compression may leave of theirs.
 _GROUPS, _GAIN = 8, (0.15, 1.3)
-#: Rows of columns, about, from which that is measured: more would tell no more.
-_SAMPLES_OF_CONTRAST = 9000
+#: Steps of the table of what lies between the groups.
+_TABLE = 256
+#: Rows of columns, about, from which a response is measured, more would tell no more; and the golden ratio, whose
+#: multiples fall evenly between whole numbers.
+_SAMPLES_OF_RESPONSE, _GOLDEN = 9000, 0.6180339887
+#: Slots beyond the grid that a position may reach.
+_BEYOND_SLOTS = 8
 #: Slots of the header between which it is dark, and rows of a strip, over all frames, from which its light is known.
 _DARK_SLOTS, _LEAST_DARK_ROWS = (5.0, 8.0), 12
 #: Rows of a single column's header that must show, that it be judged.
@@ -97,6 +102,7 @@ class KnownPicture:
         self._light: Float32Array = np.zeros(inside.shape, np.float32)
         self._seen: Float32Array = np.zeros(inside.shape, np.float32)
         self._system: _System | None = None
+        self._of_one: Float32Array | None = None
         self._picture = self._error = self._light
         #: (C,) variance of the columns' light over what was foreseen.
         self._excess = np.ones(inside.shape[0], np.float32)
@@ -166,10 +172,15 @@ class KnownPicture:
         error = light - self._floor - foreseen
         error *= error
         error *= self._inside
-        near, far = (int(slots * rows_per_slot) for slots in (_OWN_SLOTS, _ERROR_SLOTS))
-        around = _box(error, far) - _box(error, near)
-        count = _box(self._inside, far) - _box(self._inside, near)
-        return self._solved(light, self._factor(np.maximum(around, 0) / (count + np.float32(1e-3))))
+        around = np.maximum(_around(error, rows_per_slot), 0)
+        around *= self._share_of_one(rows_per_slot)
+        return self._solved(light, self._factor(around))
+
+    def _share_of_one(self, rows_per_slot: float) -> Float32Array:
+        """(C, S, R) inverse of how many rows `_around` adds up."""
+        if self._of_one is None:
+            self._of_one = np.float32(1) / (_around(self._inside, rows_per_slot) + np.float32(1e-3))
+        return self._of_one
 
     def _solved(self, light: Float32Array, system: _System) -> ColumnLight:
         seen = self._spread.T @ (system.gain * (light - self._floor))
@@ -217,7 +228,7 @@ class KnownPicture:
             after = np.take_along_axis(values, left + 1, 2)
             setattr(self, name, before + (after - before) * part)
         self._inside = inside.astype(np.float32)
-        self._system = None
+        self._system = self._of_one = None
 
     def _tempered(self, value: Float32Array, precision: Float32Array) -> Float32Array:
         variance = self._excess[:, None] / np.maximum(precision, np.float32(1e-6)) + np.float32(_COMMON_ERROR**2)
@@ -259,6 +270,12 @@ def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
     """(C, 3, R): each column between its neighbours."""
     padded = np.pad(columns, ((1, 1), (0, 0)), constant_values=edge)
     return np.stack([padded[:-2], padded[1:-1], padded[2:]], axis=1)
+
+
+def _around(values: Float32Array, rows_per_slot: float) -> Float32Array:
+    """Sum over the slots around, a row's own left out; last axis."""
+    near, far = (int(slots * rows_per_slot) for slots in (_OWN_SLOTS, _ERROR_SLOTS))
+    return _box(values, far) - _box(values, near)
 
 
 def _box(values: Float32Array, half: int) -> Float32Array:
@@ -321,25 +338,49 @@ def exposed(slots: Float32Array, positions: FloatArray, exposure_slots: float) -
         positions: (C, R) or (1, R) exposure's centre in slots.
         exposure_slots: exposure in slots.
     """
-    n = slots.shape[1]
-    pad = 8
-    total = np.zeros((slots.shape[0], n + 2 * pad + 1))
-    np.cumsum(np.pad(slots, ((0, 0), (pad, pad)), constant_values=0.5), axis=1, out=total[:, 1:])
-    half = exposure_slots / 2
-    upper = _read(total, positions + (half + pad))
-    return np.asarray((upper - _read(total, positions - (half - pad))) / exposure_slots, np.float32)
+    return _Light(slots).between(positions, exposure_slots / 2) / np.float32(exposure_slots)
+
+
+class _Light:
+    """Slots (C, N), half lit beyond, and what they add up to.
+
+    Args:
+        slots: (C, N) values.
+    """
+
+    def __init__(self, slots: Float32Array) -> None:
+        n_columns, n = slots.shape
+        self._slots = np.full((n_columns, n + 2 * _BEYOND_SLOTS + 1), 0.5, np.float32)
+        self._slots[:, _BEYOND_SLOTS : _BEYOND_SLOTS + n] = slots
+        self._total = np.zeros_like(self._slots)
+        np.cumsum(self._slots[:, :-1], axis=1, out=self._total[:, 1:])
+
+    def between(self, positions: FloatArray, half: float) -> Float32Array:
+        """(C, R) light from `half` a slot before to as much after the positions, (C, R) or (1, R)."""
+        upper = self._until(positions + half)
+        upper -= self._until(positions - half)
+        return upper
+
+    def _until(self, positions: FloatArray) -> Float32Array:
+        place = np.clip(positions + _BEYOND_SLOTS, 0, self._total.shape[1] - 1.001)
+        left = place.astype(np.intp)
+        out = _taken(self._slots, left)
+        out *= (place - left).astype(np.float32)
+        out += _taken(self._total, left)
+        return out
+
+
+def _taken(values: NDArray[Any], index: IntArray) -> NDArray[Any]:
+    """`values` (C, n) at the places (C, R) or (1, R)."""
+    return values.take(index[0], axis=1) if index.shape[0] == 1 else np.take_along_axis(values, index, 1)
 
 
 def _read(values: FloatArray, place: FloatArray) -> FloatArray:
     """`values` (C, n) at the places (C, R) or (1, R), linearly between."""
     place = np.clip(place, 0, values.shape[1] - 1.001)
-    left = place.astype(np.int64)
-    part = place - left
-    if place.shape[0] == 1:
-        low, high = values[:, left[0]], values[:, left[0] + 1]
-    else:
-        low, high = np.take_along_axis(values, left, 1), np.take_along_axis(values, left + 1, 1)
-    return np.asarray(low + (high - low) * part)
+    left = place.astype(np.intp)
+    low = _taken(values, left)
+    return np.asarray(low + (_taken(values, left + 1) - low) * (place - left))
 
 
 def row_positions(rows: FloatArray, clock: Clock) -> FloatArray:
@@ -359,6 +400,48 @@ class Response:
     side: float = 0.0
     offset: float = 0.0
 
+    def expected(self, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
+        """(C, R) light that slots give; arguments as for `exposed`."""
+        light, half = _Light(lit), exposure_slots / 2
+        out = light.between(positions, half)
+        out *= np.float32(self.centre / exposure_slots)
+        beside = light.between(positions - _SIDE, half)
+        beside += light.between(positions + _SIDE, half)
+        beside *= np.float32(self.side / exposure_slots)
+        out += beside
+        out += np.float32(self.offset)
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Exposures:
+    """Exposed slots of some rows, from which a response is fitted; (C, n) each."""
+
+    #: (n,) index of the rows.
+    rows: IntArray
+    here: Float32Array
+    #: The sum of those a little before and after, and their slope.
+    beside: Float32Array
+    slope: Float32Array
+
+
+def exposures(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Exposures:
+    """Of as many rows as tell all there is to know of the response.
+
+    Args:
+        lit: (C, N) probability that each slot is lit.
+        positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
+        exposure_slots: exposure in slots.
+    """
+    n_rows = positions.shape[1]
+    every = max(n_rows * lit.shape[0] / _SAMPLES_OF_RESPONSE, 1.0)
+    step = np.arange(int(n_rows / every))
+    # Evenly spread, but not evenly spaced: the rows must not fall on the same part of every slot.
+    rows = ((step + (step * _GOLDEN if every > 1 else 0) % 1) * every).astype(np.intp)
+    some = positions[:, rows]
+    before, here, after = (exposed(lit, some + shift, exposure_slots) for shift in (-_SIDE, 0.0, _SIDE))
+    return Exposures(rows, here, before + after, (after - before) * np.float32(0.5 / _SIDE))
+
 
 @dataclass(frozen=True, slots=True)
 class Fit:
@@ -367,41 +450,27 @@ class Fit:
     response: Response
     #: How many slots the clock is late.
     late: float
-    #: (C, R) the slots exposed here, and the sum of those a little before and after.
-    here: Float32Array
-    beside: Float32Array
-
-    @property
-    def expected(self) -> Float32Array:
-        """(C, R) light that the slots give."""
-        r = self.response
-        return self.here * np.float32(r.centre) + self.beside * np.float32(r.side) + np.float32(r.offset)
 
 
-def fit_response(seen: ColumnLight, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Fit:
+def fit_response(seen: ColumnLight, slots: Exposures) -> Fit:
     """The response of a frame by least squares over all columns.
 
     Args:
         seen: the columns' light.
-        lit: (C, N) probability that each slot is lit.
-        positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
-        exposure_slots: exposure in slots.
+        slots: what they should have seen.
     """
-    before, here, after = (exposed(lit, positions + shift, exposure_slots) for shift in (-_SIDE, 0.0, _SIDE))
-    beside = before + after
-    parts = np.stack([here, beside, np.ones_like(here), (after - before) * np.float32(0.5 / _SIDE)])
-    parts = parts.reshape(4, -1)
-    weighted = parts * seen.precision.ravel()
-    weight = float(seen.precision.sum()) + 1e-9
-    normal, right = weighted @ parts.T / weight, weighted @ seen.value.ravel() / weight
+    value, precision = (values.take(slots.rows, axis=1).ravel() for values in (seen.value, seen.precision))
+    parts = np.stack([slots.here, slots.beside, np.ones_like(slots.here), slots.slope]).reshape(4, -1)
+    weighted = parts * precision
+    weight = float(precision.sum()) + 1e-9
+    normal, right = weighted @ parts.T / weight, weighted @ value / weight
     # Drawn, a little, to no blur.
     usual = np.array([1.0, 0.0, 0.0, 0.0])
     centre, side, offset, late = usual + np.linalg.solve(normal + _RIDGE * np.eye(4), right - normal @ usual)
     response = Response(
         float(np.clip(centre, *_CENTRE)), float(np.clip(side, *_AT_SIDE)), float(np.clip(offset, -0.2, 0.2))
     )
-    late = float(np.clip(late / max(centre + 2 * side, 0.3), -_MAX_LATE, _MAX_LATE))
-    return Fit(response, late, here, beside)
+    return Fit(response, float(np.clip(late / max(centre + 2 * side, 0.3), -_MAX_LATE, _MAX_LATE)))
 
 
 def first_decision(seen: ColumnLight, positions: FloatArray, clock: Clock) -> Float32Array:
@@ -431,11 +500,14 @@ def header_contrast(seen: ColumnLight, positions: FloatArray, clock: Clock) -> f
         clock: the clock.
     """
     place = (np.floor(positions).astype(np.int64) + clock.first_slot) % clock.packet_slots
+    rows = np.flatnonzero((place < SLOTS_PER_SYMBOL).any(axis=0))
+    place = place[:, rows]
     sign = np.where(place < SLOTS_PER_SYMBOL, 2.0 * np.array(HEADER)[np.minimum(place, SLOTS_PER_SYMBOL - 1)] - 1, 0)
-    weight = np.abs(sign) * np.minimum(seen.precision, np.float32(_PRIOR))
+    value, precision = (values.take(rows, axis=1) for values in (seen.value, seen.precision))
+    weight = np.abs(sign) * np.minimum(precision, np.float32(_PRIOR))
     if weight.sum() < _PRIOR * _LEAST_ROWS:
         return 1.0
-    return float((weight * sign * np.clip(2 * seen.value - 1, -1.5, 1.5)).sum() / weight.sum())
+    return float((weight * sign * np.clip(2 * value - 1, -1.5, 1.5)).sum() / weight.sum())
 
 
 def header_dark(positions: FloatArray, clock: Clock) -> BoolArray:
@@ -468,25 +540,24 @@ def dark_light(lights: list[Float32Array], dark: list[BoolArray], inside: BoolAr
     return np.asarray(np.nanmedian(together, axis=2), np.float32)
 
 
-def evened(seen: ColumnLight, fit: Fit) -> ColumnLight:
+def evened(seen: ColumnLight, slots: Exposures) -> ColumnLight:
     """The light with its contrast put right: compression takes stripes away where they are faint, and only there.
 
     Rows are grouped by their precision; in each group the contrast that is left is measured against the slots.
 
     Args:
         seen: the columns' light.
-        fit: the response of the whole.
+        slots: what they should have seen.
     """
     half = np.float32(0.5)
-    level = np.log(np.maximum(seen.precision, np.float32(1e-3))).ravel()
-    enough = slice(None, None, max(level.size // _SAMPLES_OF_CONTRAST, 1))
-    some = level[enough]
+    level = np.log(np.maximum(seen.precision, np.float32(1e-3)))
+    some = level.take(slots.rows, axis=1).ravel()
     order = np.argsort(some)
     order = order[some[order] > np.log(2e-3)]
     if order.size < 10 * _GROUPS:
         return seen
-    value = np.clip(seen.value.ravel()[enough] - half, -1.2, 1.2)
-    here, beside = fit.here.ravel()[enough] - half, fit.beside.ravel()[enough] - 1
+    value = np.clip(seen.value.take(slots.rows, axis=1).ravel() - half, -1.2, 1.2)
+    here, beside = slots.here.ravel() - half, slots.beside.ravel() - 1
     middle, gain, offset = np.empty(_GROUPS), np.empty(_GROUPS), np.empty(_GROUPS)
     for number, mine in enumerate(np.array_split(order, _GROUPS)):
         model = np.stack([here[mine], beside[mine], np.ones(mine.size, np.float32)])
@@ -494,9 +565,17 @@ def evened(seen: ColumnLight, fit: Fit) -> ColumnLight:
         centre, side, offset[number] = np.linalg.solve(normal, model @ value[mine] / mine.size + [1e-3, 0, 0])
         gain[number] = np.clip(centre + 2 * side, *_GAIN)
         middle[number] = some[mine[mine.size // 2]]
-    gains = np.interp(level, middle, gain).astype(np.float32).reshape(seen.value.shape)
-    offsets = np.interp(level, middle, offset).astype(np.float32).reshape(seen.value.shape)
+    gains, offsets = _interpolated(level, middle, gain), _interpolated(level, middle, offset)
     return ColumnLight((seen.value - half - offsets) / gains + half, seen.precision * gains * gains, seen.shrunk)
+
+
+def _interpolated(level: Float32Array, at: FloatArray, values: FloatArray) -> Float32Array:
+    """`values`, known at ascending levels, at every `level`: by a fine table, which is quicker than `np.interp`."""
+    steps = np.linspace(at[0], at[-1], _TABLE)
+    table = np.interp(steps, at, values).astype(np.float32)
+    step = np.float32((_TABLE - 1) / max(at[-1] - at[0], 1e-6))
+    place = np.clip((level - np.float32(at[0])) * step + np.float32(0.5), 0, _TABLE - 1)
+    return np.asarray(table.take(place.astype(np.intp)))
 
 
 def pattern_metrics(
@@ -504,7 +583,8 @@ def pattern_metrics(
     positions: FloatArray,
     clock: Clock,
     memory: int,
-    fit: Fit,
+    response: Response,
+    expected: Float32Array,
     lit: Float32Array,
 ) -> FloatArray:
     """Log-likelihood of every slot pattern at every slot, (C, N + memory, patterns); see `channel.SlotLikelihoods`.
@@ -514,26 +594,17 @@ def pattern_metrics(
         positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
         clock: the clock.
         memory: slots of memory.
-        fit: what becomes of the exposed slots.
+        response: what becomes of the exposed slots.
+        expected: (C, R) light that the slots give by it.
         lit: (C, N) present idea of the slots, for what reaches beyond the memory.
     """
-    response = fit.response
-    value = seen.value - fit.expected
-    if positions.shape[0] == 1:
-        return _row_metrics(value, seen.precision, positions[0], clock, memory, response, lit)
+    value = seen.value - expected
+    groups = [slice(None)] if positions.shape[0] == 1 else [slice(c, c + 1) for c in range(positions.shape[0])]
     parts = [
-        _row_metrics(
-            value[c : c + 1],
-            seen.precision[c : c + 1],
-            positions[c],
-            clock,
-            memory,
-            response,
-            lit[c : c + 1],
-        )
-        for c in range(positions.shape[0])
+        _row_metrics(value[group], seen.precision[group], centre, clock, memory, response, lit[group])
+        for group, centre in zip(groups, positions, strict=True)
     ]
-    return np.concatenate(parts)
+    return np.concatenate(parts).astype(np.float64)
 
 
 def _row_metrics(
@@ -544,31 +615,63 @@ def _row_metrics(
     memory: int,
     response: Response,
     lit: Float32Array,
-) -> FloatArray:
+) -> Float32Array:
     """Metrics of columns whose rows lie at `centre` (R,); `value` is what the slots `lit` do not explain."""
-    metric = np.floor(centre + memory / 2).astype(np.int64)
-    n_metrics = clock.n_slots + memory
-    use = (metric >= 0) & (metric < n_metrics)
-    metric, centre, value, precision = metric[use], centre[use], value[:, use], precision[:, use]
-    slots = metric[:, None] + np.arange(-memory, 1)
-    share = response.centre * _overlap(centre, slots, clock.exposure_slots)
-    if response.side:
-        share += response.side * _overlap(centre - _SIDE, slots, clock.exposure_slots)
-        share += response.side * _overlap(centre + _SIDE, slots, clock.exposure_slots)
-    share = share.astype(np.float32)
+    metric = np.floor(centre + memory / 2).astype(np.intp)
+    borders = np.searchsorted(metric, np.arange(clock.n_slots + memory + 1))
+    use = slice(borders[0], borders[-1])
+    slots = metric[use, None] + np.arange(-memory, 1)
+    share = _shares(centre[use], slots, clock.exposure_slots, response)
+    value, precision = value[:, use].copy(), precision[:, use]
     padded = np.pad(lit, ((0, 0), (memory, memory)), constant_values=np.float32(0.5))
     for back in range(memory + 1):
-        value += share[:, back] * padded[:, slots[:, back] + memory]
-    borders = np.searchsorted(metric, np.arange(n_metrics + 1))
-    linear = [_sums(precision * value * share[:, j], borders) for j in range(memory + 1)]
-    out = np.zeros((value.shape[0], n_metrics, 2 << memory))
-    patterns = slot_patterns(memory).astype(np.float64)
-    for j, at_j in enumerate(linear):
-        out += at_j[:, :, None] * patterns[:, j]
-        for k in range(j, memory + 1):
-            power = _sums(precision * (share[:, j] * share[:, k]), borders)
-            out -= power[:, :, None] * (patterns[:, j] * patterns[:, k] * (0.5 if j == k else 1.0))
-    return out
+        value += share[:, back] * padded.take(slots[:, back] + memory, axis=1)
+    value *= precision
+    sums, basis = _slot_sums(value, precision, share, borders - borders[0]), _pattern_basis(memory)
+    metrics = sums.reshape(len(basis), -1).T @ basis
+    return np.asarray(metrics.reshape(*sums.shape[1:], -1))
+
+
+def _slot_sums(weighted: Float32Array, precision: Float32Array, share: Float32Array, borders: IntArray) -> Float32Array:
+    """What the rows of every metric add up to: J sums of light, then of the precision of every pair of shares.
+
+    Args:
+        weighted: (C, R) light times precision.
+        precision: (C, R).
+        share: (R, J) share of each slot in a row.
+        borders: (n + 1,) first row of every metric, and the end of the last.
+
+    Returns:
+        (J + J (J + 1) / 2, C, n).
+    """
+    pairs = np.triu_indices(share.shape[1])
+    terms = np.concatenate([share.T, share.T[pairs[0]] * share.T[pairs[1]]])
+    counts = np.diff(borders)
+    sums = np.zeros((len(terms), weighted.shape[0], counts.size), np.float32)
+    # The first rows of all metrics, then the second ones, and so on: long vectors, where metrics have few rows each.
+    for place in range(int(counts.max(initial=0))):
+        rows = np.minimum(borders[:-1] + place, weighted.shape[1] - 1)
+        here = terms.take(rows, axis=1) * (place < counts)
+        sums[: share.shape[1]] += here[: share.shape[1], None] * weighted.take(rows, axis=1)
+        sums[share.shape[1] :] += here[share.shape[1] :, None] * precision.take(rows, axis=1)
+    return sums
+
+
+def _pattern_basis(memory: int) -> Float32Array:
+    """(terms, patterns) how `_slot_sums` make up the log-likelihood of every pattern."""
+    patterns = slot_patterns(memory).astype(np.float32)
+    first, second = np.triu_indices(memory + 1)
+    power = patterns[:, first] * patterns[:, second] * np.where(first == second, np.float32(0.5), np.float32(1))
+    return np.ascontiguousarray(np.concatenate([patterns, -power], axis=1).T)
+
+
+def _shares(centre: FloatArray, slots: IntArray, exposure_slots: float, response: Response) -> Float32Array:
+    """(R, n) share of each of the `slots` (R, n) in what a row at `centre` (R,) sees."""
+    share = response.centre * _overlap(centre, slots, exposure_slots)
+    if response.side:
+        share += response.side * _overlap(centre - _SIDE, slots, exposure_slots)
+        share += response.side * _overlap(centre + _SIDE, slots, exposure_slots)
+    return np.asarray(share, np.float32)
 
 
 def _overlap(centre: FloatArray, slots: IntArray, exposure_slots: float) -> FloatArray:
@@ -576,10 +679,3 @@ def _overlap(centre: FloatArray, slots: IntArray, exposure_slots: float) -> Floa
     half = exposure_slots / 2
     reach = np.minimum((centre + half)[:, None], slots + 1) - np.maximum((centre - half)[:, None], slots)
     return np.asarray(np.maximum(reach, 0) / exposure_slots)
-
-
-def _sums(values: NDArray[Any], borders: IntArray) -> FloatArray:
-    """Sums of `values` (C, R) between neighbouring borders, (C, n - 1)."""
-    total = np.zeros((values.shape[0], values.shape[1] + 1))
-    np.cumsum(values, axis=1, out=total[:, 1:])
-    return np.diff(total[:, borders], axis=1)
