@@ -148,6 +148,18 @@ def column_outlines(
     return Outlines(rows, edges_x, inside.reshape(shape), sensor_row)
 
 
+def some_columns(outlines: Outlines, columns: slice) -> Outlines:
+    """Outlines of neighbouring columns alone; `columns` has a start and a stop."""
+    n_strips = outlines.inside.shape[1]
+    rows = outlines.sensor_row
+    return Outlines(
+        rows=outlines.rows,
+        edges_x=outlines.edges_x[columns.start * n_strips : columns.stop * n_strips + 1],
+        inside=outlines.inside[columns],
+        sensor_row=None if rows is None else rows[columns],
+    )
+
+
 def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:
     first = int(np.clip(np.floor(corners[:, 1].min()), 0, height - 1))
     last = int(np.clip(np.ceil(corners[:, 1].max()), first, height - 1))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rxcli import blind, clock, geometry, sampling
 from rxcli.options import ReceiverOptions
@@ -74,6 +75,18 @@ class Lock:
     screen: ScreenProfile
     profiles: RowProfiles
     clock: Clock
+    #: Reads some columns pixel by pixel where the profiles are a quick look; None where they are not.
+    read: Callable[[slice], RowProfiles] | None = None
+
+    def in_depth(self, columns: NDArray[np.int64]) -> Lock:
+        """The lock with some columns read pixel by pixel."""
+        if self.read is None or not columns.size:
+            return self
+        light = self.profiles.light.copy()
+        for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
+            part = slice(int(run[0]), int(run[-1]) + 1)
+            light[part] = self.read(part).light
+        return replace(self, profiles=replace(self.profiles, light=light))
 
 
 def _camera_of(frame: Frame, options: ReceiverOptions) -> Camera | None:
@@ -166,31 +179,34 @@ def find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
     return geometry.viewer_order(corners, orientation)
 
 
-def find_lock(frame: Frame, corners: FloatArray, camera: Camera, options: ReceiverOptions, stages: Stages) -> Lock:
+def find_lock(
+    frame: Frame, corners: FloatArray, camera: Camera, options: ReceiverOptions, stages: Stages, *, quick: bool = False
+) -> Lock:
     """The screen profile that fits best, with the row profiles of its columns.
 
-    Screens that differ in nothing but their columns share a clock: which of them it is, is asked last.
+    Screens that differ in nothing but their columns share a clock: which of them it is, is asked last. With `quick`,
+    columns are read pixel by pixel when they are asked for, see `Lock.in_depth`.
     """
     n_columns = min(screen.columns for screen in options.screens)
     with stages("sampling"):
-        profiles = sample_columns(frame, corners, camera, n_columns)
+        profiles, read = _read_columns(frame, corners, camera, n_columns, quick=quick)
     with stages("clock"):
-        quick = clock.pooled_strips(profiles)
+        pooled = clock.pooled_strips(profiles)
         rates = {(s.slot_rate_hz, s.packet_slots): s for s in options.screens}
-        clocks = {rate: found for rate, screen in rates.items() if (found := _clock_of(screen, quick, camera))}
+        clocks = {rate: found for rate, screen in rates.items() if (found := _clock_of(screen, pooled, camera))}
         clocks = {rate: found for rate, found in clocks.items() if found.lock >= _MIN_LOCK}
         if not clocks:
             raise Failure("no_signal", _why_no_signal(frame, corners, camera, options))
-        rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(quick, clocks[r]))
+        rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(pooled, clocks[r]))
     alike = [screen for screen in options.screens if (screen.slot_rate_hz, screen.packet_slots) == rate]
-    locks = [Lock(alike[0], profiles, clocks[rate])] if alike[0].columns == n_columns else []
+    locks = [Lock(alike[0], profiles, clocks[rate], read)] if alike[0].columns == n_columns else []
     for screen in alike[len(locks) :]:
         with stages("sampling"):
-            finer = sample_columns(frame, corners, camera, screen.columns)
+            finer, read = _read_columns(frame, corners, camera, screen.columns, quick=quick)
         with stages("clock"):
             found = _clock_of(screen, clock.pooled_strips(finer), camera)
         if found:
-            locks.append(Lock(screen, finer, found))
+            locks.append(Lock(screen, finer, found, read))
     if not locks:
         raise Failure("no_signal", _why_no_signal(frame, corners, camera, options))
     return locks[0] if len(locks) == 1 else _with_likely_columns(locks)
@@ -218,8 +234,21 @@ def _outlines(frame: Frame, corners: FloatArray, lens: Lens | None, n_columns: i
 
 def sample_columns(frame: Frame, corners: FloatArray, camera: Camera, n_columns: int) -> RowProfiles:
     """Row profiles of a screen of `n_columns` columns, in the order of time."""
-    profiles = sampling.sample_rows(frame, _outlines(frame, corners, camera.lens, n_columns), camera.tone)
-    return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
+    return _read_columns(frame, corners, camera, n_columns, quick=False)[0]
+
+
+def _read_columns(
+    frame: Frame, corners: FloatArray, camera: Camera, n_columns: int, *, quick: bool
+) -> tuple[RowProfiles, Callable[[slice], RowProfiles] | None]:
+    """Row profiles of all columns; after a quick look, what reads some of them pixel by pixel."""
+    outlines = _outlines(frame, corners, camera.lens, n_columns)
+
+    def read(columns: slice, quick: bool = False) -> RowProfiles:
+        part = geometry.some_columns(outlines, columns)
+        profiles = sampling.sample_rows(frame, part, camera.tone, quick=quick)
+        return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
+
+    return read(slice(0, n_columns), quick), read if quick and sampling.is_coded(frame) else None
 
 
 def _clock_of(screen: ScreenProfile, profiles: RowProfiles, camera: Camera) -> Clock | None:

@@ -58,7 +58,7 @@ def denoiser_case(frame: Frame, options: ReceiverOptions) -> tuple[denoise.Scene
     try:
         corners = find_corners(frame, options)
         camera, options = find_camera(frame, corners, options, Stages())
-        lock = find_lock(frame, corners, camera, options, Stages())
+        lock = find_lock(frame, corners, camera, options, Stages(), quick=True)
     except Failure:
         return None
     seen = decode(lock, options.skip)
@@ -81,7 +81,7 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
             exposure_s=camera.exposure_s,
             estimated=camera.estimated,
         )
-        lock = find_lock(frame, corners, camera, options, stages)
+        lock = find_lock(frame, corners, camera, options, stages, quick=True)
         result = replace(result, screen_profile=lock.screen.name)
         with stages("detect"):
             seen = decode(lock, options.skip)

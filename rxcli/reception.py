@@ -62,8 +62,10 @@ def decode(lock: Lock, skip: frozenset[str]) -> Reception:
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
     """
     seen = quick_look(lock)
-    if "certain_columns" in skip and not _doubtful(seen, CERTAIN).any():
+    doubtful = _doubtful(seen, CERTAIN) if "certain_columns" in skip else np.ones(seen.snr.shape[0], bool)
+    if not doubtful.any():
         return replace(seen, skipped={"certain_columns": seen.snr.shape[0]})
+    lock = lock.in_depth(np.flatnonzero(doubtful))
     seen = iterate(lock, seen, skip)
     columns = doubtful_columns(seen)
     return without_row_light(lock, seen, columns) if columns.size else seen
@@ -196,7 +198,7 @@ def second_opinion(
         return seen, frozenset(), None
     if options.cae == "always":
         columns = np.arange(seen.snr.shape[0])
-        seen = without_row_light(lock, seen, columns)
+        seen = without_row_light(lock.in_depth(columns), seen, columns)
     else:
         columns = doubtful_columns(seen)
     if columns.size == 0 or seen.scene is None:

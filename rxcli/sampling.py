@@ -3,12 +3,17 @@
 Light is linearised pixel by pixel, averaged over cells of a few pixels along each row, and the cells are summed between
 the slanted edges of every strip. A mosaic is read without demosaicing: each row's pixels are weighted so that every row
 measures the same mix of red, green and blue.
+
+For a quick look at a developed picture the coded values are averaged and the mean is linearised, which takes half the
+time. Under a power law that changes how bright a textured strip is, but not how its light changes from row to row; room
+light and the straight part of the tone curve make it a little worse, so it serves where no doubt is left after it.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from concurrent.futures import ThreadPoolExecutor
-from typing import Protocol, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,16 +25,18 @@ _STRIP_PX = 12
 _MAX_STRIPS = 8
 #: Cells that a strip should have, so that the fractions at its slanted edges are fine.
 _CELLS_PER_STRIP = 4
-#: Rows read at a time: what fits the cache; a multiple of the next.
-_BAND_ROWS = 192
+#: Pixels read at a time: what fits the cache.
+_BAND_PIXELS = 900_000
 #: One row in this many is kept for the noise model, and of those as many as hold this many cells.
 _NOISE_ROW_STEP = 16
 _NOISE_CELLS = 10_000
 #: OpenCV and NumPy work outside the interpreter's lock.
 _THREADS = 2
 _NOISE_BINS = 24
-#: Edges that enclose less than this have no light between them, cells.
-_LEAST_CELLS = 0.1
+#: Edges that enclose less than this many values have no light between them.
+_LEAST_ENCLOSED = 0.1
+#: Places of the finer table for means of coded values, per value.
+_FINE_STEPS = 64
 
 
 def strips_per_column(column_px: float) -> int:
@@ -53,99 +60,137 @@ def tone_to_light(tone: str, encoded: FloatArray) -> FloatArray:
     raise ValueError(f"tone must be linear, srgb or bt709 (got {tone!r})")
 
 
-def sample_rows(frame: Frame, outlines: Outlines, tone: str) -> RowProfiles:
+def is_coded(frame: Frame) -> bool:
+    """Whether pixels hold coded values of 8 bits, of which there is a quick look."""
+    return frame.mosaic is None and frame.pixels.dtype == np.uint8 and not frame.linear
+
+
+def sample_rows(frame: Frame, outlines: Outlines, tone: str, *, quick: bool = False) -> RowProfiles:
     """Mean linear light of every strip on every row.
 
     Args:
         frame: the picture.
         outlines: where the strips lie.
         tone: the curve to undo, see `tone_to_light`; a mosaic is linear already.
+        quick: linearise means, not pixels, where the frame `is_coded`.
     """
     edges = outlines.edges_x
-    strip_px = float(np.median(np.abs(np.diff(edges[:, edges.shape[1] // 2]))))
-    reader = _reader(frame, strip_px, tone, edges)
+    reader = _reader(frame, edges, tone, quick=quick)
     n_rows = outlines.rows.size
+    # Bands begin at rows of the noise model.
+    band_rows = max(_BAND_PIXELS // reader.width // _NOISE_ROW_STEP, 1) * _NOISE_ROW_STEP
     light = np.empty((edges.shape[0] - 1, n_rows), np.float32)
     enclosed = np.empty_like(light)
 
     def read_band(start: int) -> Float32Array:
-        stop = min(start + _BAND_ROWS, n_rows)
-        cells = reader.read(int(outlines.rows[start]), int(outlines.rows[stop - 1]) + 1)
-        positions = (edges[:, start:stop] - np.float32(reader.first_x - 0.5)) * np.float32(1 / reader.cell_px)
-        light[:, start:stop], enclosed[:, start:stop] = _between_edges(cells, positions)
-        return cells[::_NOISE_ROW_STEP].copy()
+        band = slice(start, min(start + band_rows, n_rows))
+        first, last = int(outlines.rows[band.start]), int(outlines.rows[band.stop - 1]) + 1
+        light[:, band], enclosed[:, band], noise_cells = reader.read(first, last, edges[:, band])
+        return noise_cells
 
     with ThreadPoolExecutor(_THREADS) as pool:
-        noise_cells = list(pool.map(read_band, range(0, n_rows, _BAND_ROWS)))
+        noise_cells = list(pool.map(read_band, range(0, n_rows, band_rows)))
     floor, slope = _noise_model(np.concatenate(noise_cells))
     inside = outlines.inside
     light = light.reshape(inside.shape)
     light *= inside
-    count = np.median(enclosed[:, ::_NOISE_ROW_STEP], axis=1).reshape(inside.shape[:2]) * reader.cell_px
     return RowProfiles(
         light=light,
         inside=inside,
         rows=outlines.rows,
         sensor_row=outlines.sensor_row,
-        count=count.astype(np.float32),
+        count=np.median(enclosed[:, ::_NOISE_ROW_STEP], axis=1).reshape(inside.shape[:2]),
         noise_floor=floor * reader.cell_px,
         noise_slope=slope * reader.cell_px,
     )
 
 
-class _Reader(Protocol):
-    """Reads rows of a frame as cells: mean light of runs of `cell_px` pixels, from the column `first_x` on."""
+def _reader(frame: Frame, edges: Float32Array, tone: str, *, quick: bool) -> _Reader:
+    if frame.mosaic is not None:
+        return _MosaicReader(frame, edges, frame.mosaic)
+    return (_CodedReader if quick and is_coded(frame) else _DevelopedReader)(frame, edges, tone)
 
-    cell_px: int
-    first_x: int
 
-    def read(self, first: int, last: int) -> Float32Array:
+class _Reader(ABC):
+    """Reads rows of a frame by way of cells: mean light of runs of `cell_px` pixels."""
+
+    def __init__(self, frame: Frame, edges: Float32Array, cell_px: int) -> None:
+        self.cell_px = cell_px
+        n_cells = frame.width // cell_px
+        first = int(np.clip(edges.min() // cell_px, 0, n_cells - 1))
+        last = int(np.clip((edges.max() + 1) // cell_px + 1, first + 1, n_cells))
+        #: The cells that the screen reaches into, and where they begin.
+        self._pixels = frame.pixels[:, first * cell_px : last * cell_px]
+        self._first_x = first * cell_px
+
+    @property
+    def width(self) -> int:
+        """Pixels of a row that are read."""
+        return int(self._pixels.shape[1])
+
+    @abstractmethod
+    def _cells(self, first: int, last: int) -> Float32Array:
         """(last - first, cells) light of the rows `first` to `last`, not included."""
 
-
-def _reader(frame: Frame, strip_px: float, tone: str, edges: Float32Array) -> _Reader:
-    if frame.mosaic is not None:
-        return _MosaicReader(frame, frame.mosaic, edges)
-    return _DevelopedReader(frame, int(np.clip(strip_px // _CELLS_PER_STRIP, 1, min(16, frame.width))), tone, edges)
-
-
-def _screen_columns(edges: Float32Array, width: int, cell_px: int) -> slice:
-    """The whole cells of a row that the screen reaches into."""
-    n_cells = width // cell_px
-    first = int(np.clip(edges.min() // cell_px, 0, n_cells - 1))
-    last = int(np.clip((edges.max() + 1) // cell_px + 1, first + 1, n_cells))
-    return slice(first * cell_px, last * cell_px)
-
-
-class _DevelopedReader:
-    """Cells of a developed picture, its tone curve undone pixel by pixel."""
-
-    def __init__(self, frame: Frame, cell_px: int, tone: str, edges: Float32Array) -> None:
-        columns = _screen_columns(edges, frame.width, cell_px)
-        self.cell_px, self.first_x = cell_px, int(columns.start)
-        self._table = _light_table(frame, "linear" if frame.linear else tone)
-        self._pixels = frame.pixels[:, columns]
-
-    def read(self, first: int, last: int) -> Float32Array:
+    def read(self, first: int, last: int, edges: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
+        """Light between neighbouring edges (n, rows), pixels enclosed, and cells of some rows for the noise model."""
         import cv2
 
-        band = self._pixels[first:last]
-        light = cv2.LUT(band, self._table) if band.dtype == np.uint8 else self._table[band]
-        size = (band.shape[1] // self.cell_px, band.shape[0])
+        cells = self._cells(first, last)
+        area = cv2.integral(cells, sdepth=cv2.CV_64F)
+        light, enclosed = _between_edges(area, self._places(edges) * np.float32(1 / self.cell_px))
+        return light, enclosed * np.float32(self.cell_px), cells[::_NOISE_ROW_STEP].copy()
+
+    def _places(self, edges: Float32Array) -> Float32Array:
+        """Edges as pixels from the left border of what is read."""
+        return edges - np.float32(self._first_x - 0.5)
+
+
+class _DevelopedReader(_Reader):
+    """A developed picture, its tone curve undone pixel by pixel."""
+
+    def __init__(self, frame: Frame, edges: Float32Array, tone: str) -> None:
+        strip_px = float(np.median(np.abs(np.diff(edges[:, edges.shape[1] // 2]))))
+        super().__init__(frame, edges, int(np.clip(strip_px // _CELLS_PER_STRIP, 1, min(16, frame.width))))
+        values = np.arange(np.iinfo(frame.pixels.dtype).max + 1, dtype=np.float64)
+        self._table = _light_of(values, frame, tone)
+
+    def _cells(self, first: int, last: int) -> Float32Array:
+        return self._cells_of(self._pixels[first:last])
+
+    def _cells_of(self, rows: NDArray[Any]) -> Float32Array:
+        import cv2
+
+        light = cv2.LUT(rows, self._table) if rows.dtype == np.uint8 else self._table[rows]
+        size = (rows.shape[1] // self.cell_px, rows.shape[0])
         return np.asarray(cv2.resize(light, size, interpolation=cv2.INTER_AREA))
 
 
-class _MosaicReader:
-    """Cells of a mosaic, one period of the colour filter array long."""
+class _CodedReader(_DevelopedReader):
+    """A developed picture of 8 bits, the tone curve of its strips' means undone."""
 
-    def __init__(self, frame: Frame, mosaic: Mosaic, edges: Float32Array) -> None:
+    def __init__(self, frame: Frame, edges: Float32Array, tone: str) -> None:
+        super().__init__(frame, edges, tone)
+        self._fine_table = _light_of(np.arange(255 * _FINE_STEPS + 1) / _FINE_STEPS, frame, tone)
+
+    def read(self, first: int, last: int, edges: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
+        import cv2
+
+        rows = self._pixels[first:last]
+        coded, enclosed = _between_edges(cv2.integral(rows, sdepth=cv2.CV_32S), self._places(edges))
+        nearest = (coded * np.float32(_FINE_STEPS) + np.float32(0.5)).astype(np.intp)
+        light = self._fine_table.take(nearest, mode="clip")
+        return light, enclosed, self._cells_of(rows[::_NOISE_ROW_STEP])
+
+
+class _MosaicReader(_Reader):
+    """A mosaic, in cells of one period of its colours."""
+
+    def __init__(self, frame: Frame, edges: Float32Array, mosaic: Mosaic) -> None:
         self._weights, self._offsets, self._smooth = _mosaic_weights(mosaic)
-        self.cell_px = int(self._weights.shape[1])
-        columns = _screen_columns(edges, frame.width, self.cell_px)
-        self.first_x = int(columns.start)
-        self._pixels = frame.pixels[:, columns]
+        super().__init__(frame, edges, int(self._weights.shape[1]))
 
-    def read(self, first: int, last: int) -> Float32Array:
+    def _cells(self, first: int, last: int) -> Float32Array:
         if not self._smooth:
             return self._rows(first, last)
         top, bottom = max(first - 1, 0), min(last + 1, self._pixels.shape[0])
@@ -162,11 +207,10 @@ class _MosaicReader:
         return out
 
 
-def _light_table(frame: Frame, tone: str) -> Float32Array:
-    """Light of every pixel value; float32, one entry a value."""
-    values = np.arange(np.iinfo(frame.pixels.dtype).max + 1, dtype=np.float64)
+def _light_of(values: FloatArray, frame: Frame, tone: str) -> Float32Array:
+    """Linear light of pixel values of a developed frame."""
     encoded = np.clip((values - frame.black) / (frame.white - frame.black), 0, 1)
-    return tone_to_light(tone, encoded).astype(np.float32)
+    return tone_to_light("linear" if frame.linear else tone, encoded).astype(np.float32)
 
 
 def _mosaic_weights(mosaic: Mosaic) -> tuple[Float32Array, Float32Array, bool]:
@@ -196,30 +240,31 @@ def _smooth_rows(values: Float32Array) -> Float32Array:
     )
 
 
-def _between_edges(cells: Float32Array, edges: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Means of `cells` (rows, n) between neighbouring `edges` (n_edges, rows), in cells from the left border.
+def _between_edges(area: NDArray[Any], edges: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Means of values between neighbouring edges.
+
+    Args:
+        area: (rows + 1, n + 1) sums of all values above and left of a place (`cv2.integral`).
+        edges: (n_edges, rows) in values from the left border.
 
     Returns:
-        (n_edges - 1, rows) float32: means, 0 where the edges enclose less than a tenth of a cell; and cells enclosed.
+        (n_edges - 1, rows) float32: means, 0 where the edges enclose next to nothing; and how many values they enclose.
     """
-    import cv2
-
-    n = cells.shape[1]
-    # Running sums of each row. Over a thousand cells they are exact to 6e-5 of white in float32, far below noise.
-    area = cv2.integral(cells, sdepth=cv2.CV_64F)
-    total = np.subtract(area[1:], area[:-1]).astype(np.float32)
+    n = area.shape[1] - 1
+    above, below = area[:-1].ravel(), area[1:].ravel()
     position = np.clip(edges, 0, n)
     left = np.minimum(position, np.float32(n - 1)).astype(np.intp)
     part = np.subtract(position, left, dtype=np.float32)
-    left += np.arange(0, total.size, n + 1)
-    at_edge = total.take(left)
+    left += np.arange(0, above.size, n + 1)
+    at_edge = (below.take(left) - above.take(left)).astype(np.float32)
     left += 1
-    at_edge += (total.take(left) - at_edge) * part
-    light, widths = np.diff(at_edge, axis=0), np.diff(position, axis=0)
+    # Sums over a thousand cells are exact to 6e-5 of white in float32, shared by the cells of a strip: far below noise.
+    at_edge += ((below.take(left) - above.take(left)).astype(np.float32) - at_edge) * part
+    mean, widths = np.diff(at_edge, axis=0), np.diff(position, axis=0)
     enclosed = np.abs(widths)
-    widths[enclosed <= _LEAST_CELLS] = np.inf
-    light /= widths
-    return light, enclosed
+    widths[enclosed <= _LEAST_ENCLOSED] = np.inf
+    mean /= widths
+    return mean, enclosed
 
 
 def _noise_model(cells: Float32Array) -> tuple[float, float]:

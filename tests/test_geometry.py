@@ -251,6 +251,18 @@ def test_a_screen_beside_the_picture_has_nothing_inside(top: float) -> None:
     assert not found.inside.any()
 
 
+@pytest.mark.parametrize("of", [None, "corrected"])
+def test_outlines_of_some_columns(of: str | None) -> None:
+    corrected = None if of is None else lens(corrected=True)
+    whole = geometry.column_outlines(PERSPECTIVE, 5, 2, WIDTH, HEIGHT, corrected)
+    part = geometry.some_columns(whole, slice(1, 4))
+    np.testing.assert_array_equal(part.edges_x, whole.edges_x[2:9])
+    np.testing.assert_array_equal(part.inside, whole.inside[1:4])
+    assert (part.sensor_row is None) == (whole.sensor_row is None)
+    if part.sensor_row is not None and whole.sensor_row is not None:
+        np.testing.assert_array_equal(part.sensor_row, whole.sensor_row[1:4])
+
+
 def test_a_screen_of_one_row() -> None:
     corners = np.array([[100.0, 49.6], [900, 49.6], [900, 50.4], [100, 50.4]])
     found = geometry.column_outlines(corners, 4, 1, WIDTH, HEIGHT)

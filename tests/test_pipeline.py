@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rxcli.locate import Stages, find_camera, find_corners, find_lock
 from rxcli.pipeline import ReceiverOptions, receive
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
 from rxcli.simulate.capture import Capture, simulate_frame
@@ -142,6 +143,23 @@ def test_the_right_screen_among_all_is_told() -> None:
     result = received(frame_of(taken), options_for(taken, screens=tuple(shipped_profiles(ScreenProfile))))
     assert result.screen_profile == "paper-34k6"
     assert score_of(result, taken).error_free == 20
+
+
+def test_columns_in_doubt_are_read_pixel_by_pixel() -> None:
+    taken = clean()
+    frame, options = frame_of(taken), options_for(taken)
+    corners = find_corners(frame, options)
+    camera, options = find_camera(frame, corners, options, Stages())
+    quick = find_lock(frame, corners, camera, options, Stages(), quick=True)
+    exact = find_lock(frame, corners, camera, options, Stages())
+    assert not np.array_equal(quick.profiles.light, exact.profiles.light)
+    asked = np.array([0, 4, 5, 6, 19])
+    light = quick.in_depth(asked).profiles.light
+    np.testing.assert_allclose(light[asked], exact.profiles.light[asked], atol=1e-3)
+    others = np.setdiff1d(np.arange(20), asked)
+    np.testing.assert_array_equal(light[others], quick.profiles.light[others])
+    assert quick.in_depth(asked[:0]) is quick
+    assert exact.in_depth(asked) is exact
 
 
 def test_upside_down() -> None:
