@@ -15,11 +15,11 @@ LAG = 5
 #: Strips in one coarse cell.
 _CELL_STRIPS = 4
 #: Largest slope of a side, and its largest deviation from the others' when they are turned onto it.
-_MAX_SLOPE, MAX_SKEW = 0.25, 0.07
+_MAX_SLOPE, MAX_SKEW = 0.25, 0.13
 #: A segment that begins outside a line counts this often against it, so that the outermost line wins with a sixth.
 OUTSIDE_COST = 6.0
 #: In an area of stripes, changes down the rows have at least this many times the energy of those along them.
-_LYING = 2.0
+_LYING = 1.6
 #: Least share of the picture with stripes.
 _MIN_STRIPED = 0.02
 
