@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -191,10 +190,3 @@ def simulate_frame(
         threads: bands of rows computed at the same time; the pixels do not depend on it.
     """
     return prepare(scene, rng).frame(frame, oracle=oracle, threads=threads)
-
-
-def simulate_clip(scene: Scene, rng: np.random.Generator | int, *, oracle: bool = False) -> Iterator[Capture]:
-    """Simulate all frames of a scene, in order."""
-    take = prepare(scene, rng)
-    for number in range(scene.n_frames):
-        yield take.frame(number, oracle=oracle)
