@@ -267,13 +267,13 @@ def slot_likelihoods(
     shape = _shape_on_grid(lit, model)
     slope = np.zeros_like(shape)
     slope[:, 1:-1] = (shape[:, 2:] - shape[:, :-2]) * np.float32(samples.samples_per_slot / 2)
-    others = _from_neighbours(shape, model, clock)
-    others_slope = _from_neighbours(slope, model, clock)
+    others = _from_neighbours(shape, model, clock, columns)
+    others_slope = _from_neighbours(slope, model, clock, columns)
     own = model.spread[None, :, 1, None].astype(np.float32)
 
     def of_part(part: NDArray[np.int64]) -> SlotLikelihoods:
         these = columns[part]
-        expected = _Expected(others[these], own, shape[these, None], others_slope[these] + own * slope[these, None])
+        expected = _Expected(others[part], own, shape[these, None], others_slope[part] + own * slope[these, None])
         return _likelihoods(samples.light[part], samples.valid[part], expected, model, thorough)
 
     n_parts = round(samples.light.size / _SAMPLES_AT_A_TIME)
@@ -329,8 +329,8 @@ def _shape_on_grid(lit: Float32Array, model: LightModel) -> Float32Array:
     return np.ascontiguousarray(shape[:, skip : skip + lit.shape[1] * q])
 
 
-def _from_neighbours(shape: Float32Array, model: LightModel, clock: Clock) -> Float32Array:
-    """(C, S, N * Q) light that the adjacent columns shed into each strip, per unit of picture."""
+def _from_neighbours(shape: Float32Array, model: LightModel, clock: Clock, columns: NDArray[np.int64]) -> Float32Array:
+    """(len(columns), S, N * Q) light that the adjacent columns shed into each strip, per unit of picture."""
     left, right = np.zeros_like(shape), np.zeros_like(shape)
     left[1:], right[:-1] = shape[:-1], shape[1:]
     if clock.delay_slots.any():
@@ -338,7 +338,7 @@ def _from_neighbours(shape: Float32Array, model: LightModel, clock: Clock) -> Fl
         left[1:] = _shifted(left[1:], ahead)
         right[:-1] = _shifted(right[:-1], -ahead)
     spread = model.spread.astype(np.float32)
-    return left[:, None] * spread[None, :, 0, None] + right[:, None] * spread[None, :, 2, None]
+    return left[columns, None] * spread[None, :, 0, None] + right[columns, None] * spread[None, :, 2, None]
 
 
 def _shifted(rows: Float32Array, by: FloatArray) -> Float32Array:
