@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rxcli import blind, clock, geometry, sampling
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ReadoutMode, ScreenProfile, match_camera
-from rxcli.types import Clock, FloatArray, Frame, Lens, Outlines, RowProfiles
+from rxcli.types import Clock, Float32Array, FloatArray, Frame, Lens, Outlines, RowProfiles
 
 _DEFAULT_TONE = "srgb"
 #: A header peak less than this times the strongest rival is no lock.
@@ -66,6 +66,8 @@ class Camera:
     reversed: bool = False
     #: What was estimated: name -> (value, standard deviation).
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
+    #: The estimate and the strips it is of, for `refitted_camera`; None for a camera from a profile.
+    guess: tuple[blind.BlindEstimate, blind.Strips] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,37 +117,78 @@ def find_camera(
     frame: Frame, corners: FloatArray, options: ReceiverOptions, stages: Stages
 ) -> tuple[Camera, ReceiverOptions]:
     """The camera, from a profile or estimated, and the options with the screens that remain."""
-    known = _camera_of(frame, options)
-    return (known, options) if known is not None else _estimate_camera(frame, corners, options, stages)
-
-
-def _estimate_camera(
-    frame: Frame, corners: FloatArray, options: ReceiverOptions, stages: Stages
-) -> tuple[Camera, ReceiverOptions]:
-    """A camera that no profile fits, estimated from the frame; and the options with the screens that remain."""
-    n_columns = min(screen.columns for screen in options.screens)
-    with stages("sampling"):
-        outlines = _outlines(frame, corners, None, n_columns)
-        profiles = sampling.sample_rows(frame, outlines, _DEFAULT_TONE)
-    with stages("blind"):
-        centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
-        strips = blind.strips_of(profiles, centre_x, frame.width, frame.height)
-        found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
-    estimate = found.estimate
-    if estimate is None:
+    found = find_cameras(frame, corners, options, stages)
+    if found.first is None:
         raise Failure("no_signal", found.reason)
+    return found.first
+
+
+@dataclass(frozen=True, slots=True)
+class Cameras:
+    """Cameras that may have taken a frame, each with the options and the screens that remain with it."""
+
+    #: None where nothing was estimated, for the reason.
+    first: tuple[Camera, ReceiverOptions] | None
+    #: Estimates that are worth a look too, best first.
+    rivals: tuple[tuple[Camera, ReceiverOptions], ...] = ()
+    reason: str = ""
+
+
+def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, stages: Stages) -> Cameras:
+    """The camera that a profile tells, or those that may be, estimated from the frame."""
+    known = _camera_of(frame, options)
+    if known is not None:
+        return Cameras((known, options))
+    with stages("sampling"):
+        strips = _unbent_strips(frame, corners, min(screen.columns for screen in options.screens))
+    with stages("blind"):
+        found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
+    first = _with_screens(found.estimate, strips, options) if found.estimate else None
+    return Cameras(first, tuple(_with_screens(rival, strips, options) for rival in found.rivals), found.reason)
+
+
+def _with_screens(
+    estimate: blind.BlindEstimate, strips: blind.Strips, options: ReceiverOptions
+) -> tuple[Camera, ReceiverOptions]:
+    """An estimated camera, and the options with the screens that it may show."""
     screens = [screen for screen in options.screens if screen.packet_slots == estimate.packet_slots]
     rate = screens[0].slot_rate_hz
-    camera = Camera(
+    remaining = tuple(screen for screen in screens if screen.slot_rate_hz == rate)
+    return _estimated_camera(estimate, strips, rate), replace(options, screens=remaining)
+
+
+def _unbent_strips(frame: Frame, corners: FloatArray, n_columns: int) -> blind.Strips:
+    """Strips of a picture whose camera is not known."""
+    outlines = _outlines(frame, corners, None, n_columns)
+    centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
+    profiles = sampling.sample_rows(frame, outlines, _DEFAULT_TONE)
+    return blind.strips_of(profiles, centre_x, frame.width, frame.height)
+
+
+def _estimated_camera(estimate: blind.BlindEstimate, strips: blind.Strips, rate: float) -> Camera:
+    return Camera(
         profile=None,
         line_delay_s=1 / (estimate.rows_per_slot * rate),
         exposure_s=estimate.exposure_slots / rate,
-        lens=blind.lens_of(estimate, frame.width, frame.height),
+        lens=blind.lens_of(estimate, strips.width, strips.height),
         tone=_DEFAULT_TONE,
         reversed=estimate.reversed,
         estimated=blind.summary(estimate, rate),
+        guess=(estimate, strips),
     )
-    return camera, replace(options, screens=tuple(screen for screen in screens if screen.slot_rate_hz == rate))
+
+
+def refitted_camera(
+    frame: Frame, corners: FloatArray, camera: Camera, lock: Lock, now: Clock, lit: Float32Array
+) -> tuple[Camera, float]:
+    """An estimated camera from slots (C, N) that were decoded on a clock; and how far that moves the clock, slots."""
+    if camera.guess is None:
+        return camera, 0.0
+    estimate, strips = camera.guess
+    if strips.n_columns != lock.screen.columns:
+        strips = _unbent_strips(frame, corners, lock.screen.columns)
+    found, moved_slots = blind.refit(strips, estimate, now, lit)
+    return _estimated_camera(found, strips, lock.screen.slot_rate_hz), moved_slots
 
 
 def _exposure_of(frame: Frame, mode: ReadoutMode) -> float:

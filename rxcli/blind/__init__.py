@@ -1,6 +1,6 @@
 """What a picture says of the camera that took it: rows per slot, direction of readout, exposure, bend of the stripes.
 
-Five steps on the row profiles, none of which needs to know the camera.
+Six steps on the row profiles, none of which needs to know the camera.
 
 1. **Bend.** Neighbouring strips show the same slots, so the lag between them, over all of the picture, is the slope of
    the stripes. Where a camera has taken the distortion out of its picture, the sensor row of a point p is the y of
@@ -16,12 +16,15 @@ Five steps on the row profiles, none of which needs to know the camera.
 5. **Refinement.** The slots, as probabilities seen through the exposure, predict the light of every strip on every row.
    What is missing is the derivative with respect to time: least squares over all strips gives row and period of the
    clock and the bend at once, with standard deviations from the spread between columns.
+6. **Once more.** The receiver's own light model and codebook know the slots better than step 4. With those it has
+   decoded the least squares of step 5 are done again (`refit`), and the picture received again where that matters.
 """
 
 from rxcli.blind.advice import stripe_likeness, why_not
 from rxcli.blind.bend import bend_terms, estimate_bend, straightened
 from rxcli.blind.camera import camera_profile, in_time_order, lens_of, summary
 from rxcli.blind.columns import likely_columns
+from rxcli.blind.refit import refit
 from rxcli.blind.scan import Hypothesis, find_clocks
 from rxcli.blind.search import MIN_EVIDENCE, BlindSearch, estimate_camera
 from rxcli.blind.strips import Noise, Strips, in_readout_order, strips_of
@@ -45,6 +48,7 @@ __all__ = [
     "lens_of",
     "likely_columns",
     "refine",
+    "refit",
     "straightened",
     "stripe_likeness",
     "strips_of",

@@ -20,6 +20,9 @@ MIN_EVIDENCE = 45.0
 #: Share of the light's local variance that slots must explain; those of wrong clocks on random stripes reach a fifth.
 _LEAST_EXPLAINED = 0.22
 
+#: An estimate with this evidence has no rivals.
+_BEYOND_DOUBT = 250.0
+
 #: A bend that fits this many nats better than none is tried; from the second on, it alone.
 _BEND_GAINS = (5.0, 25.0)
 
@@ -39,6 +42,8 @@ class BlindSearch:
     estimate: BlindEstimate | None
     #: Why not: thing, reason and next step. Empty where an estimate was found.
     reason: str = ""
+    #: Other estimates that are worth a look, most plausible first; none where the estimate is beyond doubt.
+    rivals: tuple[BlindEstimate, ...] = ()
 
 
 def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None) -> BlindSearch:
@@ -66,10 +71,17 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
             continue
         exposure = exposure_s * rates[clock.packet_slots] if exposure_s else None
         estimates.append(refine(strips, clock, b, exposure, sure=gain > _BEND_GAINS[1]))
-    best = max(estimates, key=lambda estimate: _plausibility(estimate, strips, estimates[0]), default=None)
+    rows_per_slot = estimates[0].rows_per_slot if estimates else 1.0
+    estimates.sort(key=lambda estimate: -_plausibility(estimate, strips, rows_per_slot))
+    best = estimates[0] if estimates else None
     if best is None or best.evidence < MIN_EVIDENCE or best.explained < _LEAST_EXPLAINED:
-        return BlindSearch(None, why_not(strips))
-    return BlindSearch(best)
+        return BlindSearch(None, why_not(strips), _worth_a_look(estimates))
+    return BlindSearch(best, rivals=() if best.evidence > _BEYOND_DOUBT else _worth_a_look(estimates[1:]))
+
+
+def _worth_a_look(estimates: list[BlindEstimate]) -> tuple[BlindEstimate, ...]:
+    """Estimates whose slots explain light."""
+    return tuple(estimate for estimate in estimates if estimate.explained >= _LEAST_EXPLAINED)
 
 
 def _worth_refining(found: list[tuple[Hypothesis, FloatArray]]) -> list[tuple[Hypothesis, FloatArray]]:
@@ -95,7 +107,7 @@ def _distinct(found: list[tuple[Hypothesis, FloatArray]], most: int) -> list[tup
     return chosen
 
 
-def _plausibility(estimate: BlindEstimate, strips: Strips, first: BlindEstimate) -> float:
-    """Evidence of the slots' structure and of the light that they explain, nats."""
-    slots = strips.n_columns * strips.rows.size / first.rows_per_slot
+def _plausibility(estimate: BlindEstimate, strips: Strips, rows_per_slot: float) -> float:
+    """Evidence of the slots' structure and of the light that they explain, nats; of about so many rows a slot."""
+    slots = strips.n_columns * strips.rows.size / rows_per_slot
     return estimate.evidence - 0.5 * slots / _ALIKE * float(np.log(max(1 - estimate.explained, 1e-3)))

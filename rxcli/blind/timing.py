@@ -27,13 +27,14 @@ from rxcli.blind.waves import (
 )
 from rxcli.types import Float32Array, FloatArray
 
-_BEND_PRECISION = np.concatenate([[0.0, 0.0], BEND_SCALE**-2])
+#: Of the prior: next to nothing is known of start and period, which slots that tell nothing leave as they are.
+_PRECISION = np.concatenate([[1e-6, 1e-6], BEND_SCALE**-2])
 
 #: Samples of a slot and strips of a column err alike: so many of them say what one would.
 _ALIKE = 10.0
 
 #: Slots that are wrong are wrong in neighbouring columns alike: the spread between columns says this much too little.
-_UNDERSTATED = 3.0
+UNDERSTATED = 3.0
 
 _REFINE_STEPS = 10
 #: Steps in which the clock alone moves, where no bend is known: slots that are wrong yet would bend it.
@@ -53,10 +54,10 @@ _CONVERGED = 0.003
 _BENT_CHI_SQUARE = 160.0
 
 #: Keeps the clock of a row-time map and drops its bend.
-_FLAT = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+FLAT = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
 
-#: Rows of one block of the normal equations; the bend does not change within.
-_BLOCK_ROWS = 32
+#: Rows of one block of the normal equations; the bend is straight within, which in longer ones changes the period.
+BLOCK_ROWS = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +111,9 @@ def refine(
         sure: whether the stripes are bent without doubt.
     """
     ordered, bend = (in_readout_order(strips), reversed_bend(bend)) if hypothesis.reversed else (strips, bend)
-    ordered = _thinned(ordered, hypothesis.rows_per_slot)
+    ordered = thinned(ordered, hypothesis.rows_per_slot)
     timing, corrected = _fit_timing(ordered, hypothesis, bend, exposure_slots, sure)
-    found, sd = timing.values[2:], _UNDERSTATED * np.sqrt(np.diag(timing.covariance))
+    found, sd = timing.values[2:], UNDERSTATED * np.sqrt(np.diag(timing.covariance))
     return BlindEstimate(
         rows_per_slot=float(timing.values[1]),
         rows_per_slot_sd=float(sd[1]),
@@ -128,7 +129,7 @@ def refine(
     )
 
 
-def _thinned(strips: Strips, rows_per_slot: float) -> Strips:
+def thinned(strips: Strips, rows_per_slot: float) -> Strips:
     """Neighbouring rows averaged as far as a slot keeps at least four."""
     join = max(1, int(rows_per_slot // 4))
     if join == 1:
@@ -159,9 +160,9 @@ def _fit_timing(
     grid = Grid(-before % hypothesis.packet_slots, hypothesis.packet_slots)
     values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
     bent = _descend(strips, grid, values, exposure_slots, n_free=6)
-    if sure or _is_bent(bent):
+    if sure or bend_chi_square(bent.values, bent.covariance) > _BENT_CHI_SQUARE:
         return bent, True
-    values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else bent.values * _FLAT
+    values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else bent.values * FLAT
     flat = _descend(strips, grid, values, bent.exposure_slots, n_free=2, slots=bent.slots)
     return replace(flat, exposure_sd=bent.exposure_sd), False
 
@@ -175,13 +176,13 @@ def _descend(
     slots: Slots | None = None,
 ) -> _Timing:
     """Gauss-Newton on the first `n_free` values of the row-time map, deciding the slots anew at every step."""
-    terms = _time_terms(strips)
+    terms = time_terms(strips)
     exposure, exposure_sd = exposure_slots or _FIRST_EXPOSURE, 0.0
-    first_time = _slot_time(strips, terms, values)
+    first_time = slot_time(strips, terms, values)
     if slots is None:
         slots = first_slots(column_waves(strips, first_time, values[1]), exposure, grid)
     for step in range(_REFINE_STEPS):
-        time = _slot_time(strips, terms, values)
+        time = slot_time(strips, terms, values)
         waves = column_waves(strips, time, values[1])
         again = step == _AGAIN_STEP and float(np.abs(time - first_time).max()) > _FAR
         if again:
@@ -191,9 +192,9 @@ def _descend(
             exposure, exposure_sd, slots = estimate_exposure(waves, grid, slots, near)
         slots = decide(waves, exposure, grid, slots)
         free = n_free if step >= _RIGID_STEPS or values[2:].any() else 2
-        change, covariance, explained = _gauss_newton(strips, terms, values, time, slots.lit, exposure, free)
+        change, covariance, explained = gauss_newton(strips, terms, values, time, slots.lit, exposure, free)
         values = values + change
-        moved = float(np.abs(_slot_time(strips, terms, values)[:, ::_BLOCK_ROWS] - time[:, ::_BLOCK_ROWS]).max())
+        moved = float(np.abs(slot_time(strips, terms, values)[:, ::BLOCK_ROWS] - time[:, ::BLOCK_ROWS]).max())
         if moved < _CONVERGED and step >= _AGAIN_STEP:
             break
     position = (np.arange(slots.lit.shape[1]) + grid.first_slot) % grid.packet_slots
@@ -202,27 +203,27 @@ def _descend(
     return _Timing(values, covariance, exposure, exposure_sd, evidence, explained, slots)
 
 
-def _time_terms(strips: Strips) -> FloatArray:
+def time_terms(strips: Strips) -> FloatArray:
     """(4, M, blocks + 1) bend terms at the borders of blocks of rows."""
     n = strips.rows.size
-    nodes = np.minimum(np.arange(-(-n // _BLOCK_ROWS) + 1) * _BLOCK_ROWS, n - 1)
+    nodes = np.minimum(np.arange(-(-n // BLOCK_ROWS) + 1) * BLOCK_ROWS, n - 1)
     return bend_terms(strips.x[:, nodes], strips.rows[nodes], strips.width, strips.height)
 
 
-def _slot_time(strips: Strips, terms: FloatArray, values: FloatArray) -> Float32Array:
+def slot_time(strips: Strips, terms: FloatArray, values: FloatArray) -> Float32Array:
     """(M, R) slot position of every strip's row; the bend is interpolated between the blocks' borders."""
     n = strips.rows.size
     start, rows_per_slot = values[:2]
     moved = np.tensordot(values[2:], terms, 1)
     index = np.arange(n)
-    low = index // _BLOCK_ROWS
-    width = np.minimum((low + 1) * _BLOCK_ROWS, n - 1) - low * _BLOCK_ROWS
-    f = (index - low * _BLOCK_ROWS) / np.maximum(width, 1)
+    low = index // BLOCK_ROWS
+    width = np.minimum((low + 1) * BLOCK_ROWS, n - 1) - low * BLOCK_ROWS
+    f = (index - low * BLOCK_ROWS) / np.maximum(width, 1)
     bent = moved[:, low] + (moved[:, low + 1] - moved[:, low]) * f
     return np.asarray((strips.rows + bent - start) / rows_per_slot, np.float32)
 
 
-def _gauss_newton(
+def gauss_newton(
     strips: Strips,
     terms: FloatArray,
     values: FloatArray,
@@ -230,12 +231,13 @@ def _gauss_newton(
     lit: Float32Array,
     exposure_slots: float,
     n_free: int,
+    local_slots: float = LOCAL_SLOTS,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Step of the row-time map, its covariance, and the share of variance explained before the step."""
     mixed = np.asarray(column_shares(strips) @ lit, np.float32)
     wave, slope = seen_through(mixed, time, np.arange(mixed.shape[0]), exposure_slots)
     pitch = float(strips.rows[1] - strips.rows[0])
-    window = round(LOCAL_SLOTS * values[1] / pitch)
+    window = round(local_slots * values[1] / pitch)
     inside = strips.inside
     near = local_moments(strips.light, wave, inside, window)
     gain = near.gain
@@ -244,7 +246,7 @@ def _gauss_newton(
     power = gain * slope
     weight = inside / spread
     fit = residual * weight * power
-    blocks = np.arange(0, strips.rows.size, _BLOCK_ROWS)
+    blocks = np.arange(0, strips.rows.size, BLOCK_ROWS)
     information = np.add.reduceat(weight * power * power, blocks, axis=1).astype(np.float64)
     pull = np.add.reduceat(fit, blocks, axis=1).astype(np.float64)
     jacobian = _jacobian(terms, values, time, blocks)
@@ -257,7 +259,7 @@ def _gauss_newton(
 def _jacobian(terms: FloatArray, values: FloatArray, time: Float32Array, blocks: NDArray[np.int64]) -> FloatArray:
     """(6, M, blocks) change of the slot position with start, rows per slot and bend."""
     rows_per_slot = values[1]
-    middle = np.minimum(blocks + _BLOCK_ROWS // 2, time.shape[1] - 1)
+    middle = np.minimum(blocks + BLOCK_ROWS // 2, time.shape[1] - 1)
     out = np.empty((6, terms.shape[1], blocks.size))
     out[0] = -1 / rows_per_slot
     out[1] = -time[:, middle] / rows_per_slot
@@ -271,18 +273,20 @@ def _solve(
     """Step and covariance; the spread of the columns' pulls stands for all that makes residuals alike."""
     free = jacobian[:n_free]
     flat = free.reshape(n_free, -1)
-    prior = (_ALIKE * _BEND_PRECISION)[:n_free]
+    prior = (_ALIKE * _PRECISION)[:n_free]
     hessian = (flat * information.ravel()) @ flat.T + np.diag(prior)
     inverse = np.linalg.inv(hessian)
     by_column = (free * pull).reshape(n_free, n_columns, -1).sum(axis=2)
     spread = by_column - by_column.mean(axis=1, keepdims=True)
     step, covariance = np.zeros(6), np.zeros((6, 6))
-    step[:n_free] = inverse @ (flat @ pull.ravel() - prior * values[:n_free])
+    towards = prior * values[:n_free]
+    towards[:2] = 0
+    step[:n_free] = inverse @ (flat @ pull.ravel() - towards)
     covariance[:n_free, :n_free] = inverse @ (spread @ spread.T) @ inverse * n_columns / max(n_columns - 1, 1)
     return step, covariance
 
 
-def _is_bent(timing: _Timing) -> bool:
-    """Whether the bend is beyond doubt."""
-    bend, covariance = timing.values[2:], timing.covariance[2:, 2:]
-    return float(bend @ np.linalg.solve(covariance + 1e-8 * np.diag(BEND_SCALE**2), bend)) > _BENT_CHI_SQUARE
+def bend_chi_square(values: FloatArray, covariance: FloatArray) -> float:
+    """Chi-square of a bend against none, from a row-time map (6,) and its covariance."""
+    bend = values[2:]
+    return float(bend @ np.linalg.solve(covariance[2:, 2:] + 1e-8 * np.diag(BEND_SCALE**2), bend))

@@ -15,6 +15,7 @@ from rxcli.types import Float32Array, FloatArray
 #: Exposures that are compared, slots; and those near one, as factors.
 _EXPOSURES = np.array([0.3, 0.7, 1.1, 1.5, 1.9, 2.3, 2.8])
 _NEAR_EXPOSURES = np.array([0.8, 1.0, 1.25])
+_AROUND_EXPOSURE = np.array([0.7, 0.85, 1.0, 1.17, 1.37])
 
 #: Reach of a column's light, columns; less than this share of a strip's light is left out.
 _LIGHT_SPREAD, _LEAST_SHARE = 0.45, 0.02
@@ -133,7 +134,7 @@ def decide(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots, rounds
         rounds: of levels and slots.
     """
     n = waves.value.shape[1] // SAMPLES
-    lit = _fitted(slots.lit, n)
+    lit = fitted(slots.lit, n)
     known = grid.log_odds(slots.w, n)
     pattern = pattern_light(exposure_slots, SAMPLES)
     for _ in range(rounds):
@@ -142,7 +143,7 @@ def decide(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots, rounds
     return Slots(lit, slots.w)
 
 
-def _fitted(lit: Float32Array, n: int) -> Float32Array:
+def fitted(lit: Float32Array, n: int) -> Float32Array:
     """Slots cut, or filled with doubt, to a number of `n`."""
     more = n - lit.shape[1]
     return lit[:, :n] if more <= 0 else np.pad(lit, ((0, 0), (0, more)), constant_values=0.5)
@@ -292,14 +293,27 @@ def estimate_exposure(waves: Waves, grid: Grid, slots: Slots, near: float | None
     tried = _EXPOSURES if near is None else near * _NEAR_EXPOSURES
     found = [decide(waves, exposure, grid, slots) for exposure in tried]
     errors = np.log([_misfit(waves, exposure, one.lit) for exposure, one in zip(tried, found, strict=True)])
+    exposure, sd = _least(tried, errors, waves)
+    return exposure, sd, found[int(errors.argmin())]
+
+
+def exposure_of_known(waves: Waves, lit: Float32Array, near: float) -> tuple[float, float]:
+    """Exposure near one, by the blur of slots (C, N) that are known; and its standard deviation."""
+    known = fitted(lit, waves.value.shape[1] // SAMPLES)
+    tried = near * _AROUND_EXPOSURE
+    return _least(tried, np.log([_misfit(waves, exposure, known) for exposure in tried]), waves)
+
+
+def _least(tried: FloatArray, errors: FloatArray, waves: Waves) -> tuple[float, float]:
+    """Where the logarithm of the misfit is least, by a parabola, and the standard deviation."""
     best = int(errors.argmin())
     inner = int(np.clip(best, 1, tried.size - 2))
     bend, slope, _ = np.polyfit(tried[inner - 1 : inner + 2], errors[inner - 1 : inner + 2], 2)
     if bend <= 0:
-        return float(tried[best]), 0.3, found[best]
+        return float(tried[best]), 0.3
     exposure = float(np.clip(-slope / (2 * bend), tried[inner - 1], tried[inner + 1]))
     independent = waves.value.size / SAMPLES
-    return exposure, float(np.clip(np.sqrt(1 / (bend * independent)), 0.02, 0.5)), found[best]
+    return exposure, float(np.clip(np.sqrt(1 / (bend * independent)), 0.02, 0.5))
 
 
 def _misfit(waves: Waves, exposure_slots: float, lit: Float32Array) -> float:

@@ -1,0 +1,71 @@
+"""Cameras that no profile fits: which of several estimates it is, and the estimate once more. Part of the wiring."""
+
+from __future__ import annotations
+
+from rxcli import channel
+from rxcli.locate import Camera, Failure, Lock, Stages, find_cameras, find_lock, refitted_camera
+from rxcli.options import ReceiverOptions
+from rxcli.reception import Reception, decode, quick_look
+from rxcli.types import FloatArray, Frame
+
+#: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
+_MATTERS_SLOTS = 0.05
+_MOST_REFITS = 3
+#: Symbols' mean log probabilities this many times lower, and lower by that, are more doubt.
+_MORE_DOUBT, _LEAST_DOUBT = 1.2, 0.01
+#: Headers, all columns and bursts together, that a camera without evidence of its own must show, nats.
+_HEADERS_AT_LEAST = 80.0
+
+
+def likely_camera(
+    frame: Frame, corners: FloatArray, options: ReceiverOptions, stages: Stages
+) -> tuple[Camera, ReceiverOptions]:
+    """The camera, known or estimated, and the options with the screens that remain.
+
+    Where several estimates are left, each has a quick look: the one under which headers show best is it.
+    """
+    found = find_cameras(frame, corners, options, stages)
+    best, most = found.first, -float("inf") if found.first else _HEADERS_AT_LEAST
+    for camera, screens in (*filter(None, [found.first]), *found.rivals) if found.rivals else ():
+        try:
+            lock = find_lock(frame, corners, camera, screens, stages, quick=True)
+        except Failure:
+            continue
+        with stages("detect"):
+            headers = float(quick_look(lock).posteriors.header_llr.sum())
+        if headers > most:
+            best, most = (camera, screens), headers
+    if best is None:
+        raise Failure("no_signal", found.reason)
+    return best
+
+
+def with_refitted_camera(
+    frame: Frame,
+    corners: FloatArray,
+    camera: Camera,
+    lock: Lock,
+    seen: Reception,
+    options: ReceiverOptions,
+    stages: Stages,
+) -> tuple[Camera, Lock, Reception]:
+    """The camera that the slots tell, and what is received with it, until that moves the clock no more.
+
+    Where it leaves more doubt, what was received before stays.
+    """
+    for _ in range(_MOST_REFITS):
+        with stages("blind"):
+            lit = channel.lit_on_grid(seen.posteriors, seen.clock)
+            camera, moved_slots = refitted_camera(frame, corners, camera, lock, seen.clock, lit)
+        if moved_slots < _MATTERS_SLOTS:
+            break
+        try:
+            again = find_lock(frame, corners, camera, options, stages, quick=True)
+        except Failure:
+            break
+        with stages("detect"):
+            then = decode(again, options.skip)
+        if then.posteriors.log_prob.mean() < _MORE_DOUBT * seen.posteriors.log_prob.mean() - _LEAST_DOUBT:
+            break
+        lock, seen = again, then
+    return camera, lock, seen
