@@ -23,7 +23,7 @@ from rxcli.dump import dump_stages
 from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock, sample_columns
 from rxcli.options import ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS
-from rxcli.reception import CERTAIN, HOPELESS_WEIGHT, Reception, decode, second_opinion
+from rxcli.reception import CERTAIN, HOPELESS_WEIGHT, Reception, decode, quick_look, second_opinion
 from rxcli.types import (
     BurstPosteriors,
     Clock,
@@ -52,7 +52,7 @@ _TOGETHER = 8
 #: Frames that may wait until it is clear which copies begin a burst.
 _MAX_WAITING = 8
 #: Frames whose corners are averaged at the start; how often they, and dark columns, are looked at from then on.
-_FIRST_LOOKS, _LOOK_EVERY = 4, 30
+_FIRST_LOOKS, _LOOK_EVERY = 2, 30
 #: Looks whose median is where the corners are.
 _LOOKS = 5
 #: A screen found anew whose corners are closer than this to where they were, in screen widths, is where it was.
@@ -72,6 +72,8 @@ _LATE, _LEAST_HEADER, _FADED = 0.03, 0.3, 0.85
 _NOISE_SHARE = 0.2
 #: Contrast of its headers at which the foretold clock is not doubted.
 _GOOD_HEADER = 0.6
+#: Every so manieth row tells enough of a column's signal-to-noise ratio.
+_SNR_EVERY = 5
 #: How much better its headers must show for a clock to be taken instead of the foretold one.
 _BETTER = 0.05
 
@@ -157,6 +159,8 @@ class _Clip:
         self._camera: tuple[Camera, ReceiverOptions] | None = None
         self._taken_with: tuple[object, ...] = ()
         self._corners: FloatArray | None = None
+        #: Number of a frame that is yet to be received, and its corners.
+        self._found: tuple[int, FloatArray] | None = None
         self._place: _Place | None = None
         self._picture: known_picture.KnownPicture | None = None
         #: The lock and the light of a dark slot that the picture began with.
@@ -174,11 +178,20 @@ class _Clip:
         """Receive the next frame; returns the results that are complete."""
         if self._first is None:
             return self._take(frame)
-        if self._first or shows_little(frame, self._options):
+        if self._first or self._shows_little(frame):
             self._first.append(frame)
             return self._begin() if len(self._first) == _TOGETHER else []
         self._first = None
         return self._take(frame)
+
+    def _shows_little(self, frame: Frame) -> bool:
+        """Whether a frame shows so little that it should find its clock with others."""
+        try:
+            corners = find_corners(frame, self._options)
+        except Failure:
+            return False
+        self._found = frame.index, corners
+        return shows_little(frame, corners, self._options)
 
     def _begin(self) -> list[FrameResult]:
         """The first frames, once they have agreed on a clock."""
@@ -254,7 +267,8 @@ class _Clip:
         before = self._place
         self._forget()
         with stages("geometry"):
-            corners = find_corners(frame, self._options)
+            found, self._found = self._found, None
+            corners = found[1] if found and found[0] == frame.index else find_corners(frame, self._options)
             if before is not None and np.abs(corners - before.corners).max() < _NEAR * np.ptp(before.corners[:, 0]):
                 corners = before.corners
         self._corners = corners
@@ -263,21 +277,34 @@ class _Clip:
             self._taken_with = _taken_with(frame)
         camera, options = self._camera
         lock = self._foretold(frame, corners, camera, stages) or find_lock(frame, corners, camera, options, stages)
-        with stages("detect"):
-            seen = decode(lock, options.skip)
-        with stages("denoise"):
-            seen, denoised, report = second_opinion(lock, seen, options)
+        can_track = self._can_track(frame, camera, lock)
+        seen, denoised, report = self._decoded(lock, can_track and self._n_held == _HELD, stages)
         if assemble.all_dark(seen.snr):
             raise Failure("no_signal", "no light of the screen's columns is seen; something may be in front of it")
         view = _View(camera, lock, _bursts_of(frame, seen), seen.model.memory, frame.height, seen.snr, denoised)
         lit = channel.lit_on_grid(seen.posteriors, seen.clock)
-        if self._can_track(frame, camera, lock):
+        if can_track:
             with stages("sampling"):
                 self._start_tracking(frame, corners, camera, lock, seen)
                 view.light, view.map = self._strips(frame), self._place.map if self._place else None
             self._learn(view, lit)
         self._last = view
         return view, replace(result, denoiser=report)
+
+    def _decoded(
+        self, lock: Lock, again: bool, stages: Stages
+    ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
+        """What is received at a lock, columns that the auto-encoder changed, and its report.
+
+        A quick look is enough of a frame that is looked at `again` when the picture is known.
+        """
+        if again and self._options.cae != "always":
+            with stages("detect"):
+                return quick_look(lock), frozenset(), None
+        with stages("detect"):
+            seen = decode(lock, self._options.skip)
+        with stages("denoise"):
+            return second_opinion(lock, seen, self._options)
 
     def _foretold(self, frame: Frame, corners: FloatArray, camera: Camera, stages: Stages) -> Lock | None:
         """The lock by the clock that the first frames agreed on, where a frame cannot find its own."""
@@ -802,18 +829,17 @@ def _against(burst: tracking.ClosedBurst) -> Float32Array | None:
 def _shown(inside: NDArray[np.bool_], positions: FloatArray, now: Clock) -> IntArray:
     """(n_copies, C, packet) 1 where the middle of a slot is on the screen."""
     on_screen = np.asarray(inside.any(axis=1))
+    columns = np.arange(on_screen.shape[0]) % positions.shape[0]
+    first = positions[columns, on_screen.argmax(axis=1)][:, None]
+    last = positions[columns, on_screen.shape[1] - 1 - on_screen[:, ::-1].argmax(axis=1)][:, None]
     middles = np.arange(now.n_slots) + 0.5
-    out = np.zeros((on_screen.shape[0], now.n_slots), np.int64)
-    for column, rows in enumerate(on_screen):
-        seen = positions[min(column, positions.shape[0] - 1), rows]
-        if seen.size:
-            out[column] = (middles >= seen[0]) & (middles <= seen[-1])
-    return np.asarray(clock.to_copies(out.astype(np.float32), now), np.int64).transpose(1, 0, 2)
+    shown = (middles >= first) & (middles <= last) & np.asarray(on_screen.any(axis=1))[:, None]
+    return np.asarray(clock.to_copies(shown.astype(np.float32), now), np.int64).transpose(1, 0, 2)
 
 
 def _snr(flat: known_picture.ColumnLight, now: Clock) -> Float32Array:
     """(C, N) squared contrast over variance of a slot: the mean of the rows around."""
-    mean = np.median(flat.precision, axis=1) * np.float32(now.rows_per_slot)
+    mean = np.median(flat.precision[:, ::_SNR_EVERY], axis=1) * np.float32(now.rows_per_slot)
     return np.repeat(mean[:, None], now.n_slots, axis=1).astype(np.float32)
 
 

@@ -36,10 +36,9 @@ class Start:
     time: LinkTime
 
 
-def shows_little(frame: Frame, options: ReceiverOptions) -> bool:
-    """Whether a frame shows so few packets that it should not find its clock alone."""
+def shows_little(frame: Frame, corners: FloatArray, options: ReceiverOptions) -> bool:
+    """Whether a frame with the screen at the corners (4, 2) shows too few packets to find its clock alone."""
     try:
-        corners = find_corners(frame, options)
         camera, options = find_camera(frame, corners, options, Stages())
     except Failure:
         return False

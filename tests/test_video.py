@@ -425,10 +425,11 @@ def test_the_screen_may_come_nearer(clip: Clip, monkeypatch: pytest.MonkeyPatch)
     def nearer(_pixels: object, stored: object, **_levels: object) -> SimpleNamespace:
         return SimpleNamespace(corners=start + np.array([[-1, 0], [1, 0], [1, 0], [-1, 0]]) * 4.0 * next(looks))
 
-    numbers = itertools.count(4)
+    numbers = itertools.count(2)
+    monkeypatch.setattr("rxcli.clip._LOOK_EVERY", 3)
     monkeypatch.setattr("rxcli.find_screen.track_screen", nearer)
     monkeypatch.setattr("rxcli.clip.find_corners", lambda *_: start)
     monkeypatch.setattr("rxcli.clip.sampling.strips_per_column", lambda _px: next(numbers))
     got = list(receive(clip.frames[:8], replace(clip.options, corners=None)))
     assert [result.frame for result in got] == list(range(8))
-    assert next(looks) > 2
+    assert next(looks) == 4  # after the first frame's: the second's and every third

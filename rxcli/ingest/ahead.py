@@ -1,0 +1,96 @@
+"""Frames read ahead in a thread of their own, so that the decoder need not wait for whoever receives them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator
+from contextlib import closing
+from threading import Condition, Thread
+
+from rxcli.types import Frame
+
+#: What may wait: pixels of so many bytes, but at least so many frames.
+_MOST_BYTES, _LEAST_FRAMES = 100_000_000, 2
+
+
+def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:
+    """The same frames, and then the same exception; those to come are fetched while one is looked at.
+
+    Args:
+        frames: run to its end, or closed, in a thread of its own.
+    """
+    shelf = _Shelf()
+    thread = Thread(target=_fill, args=(frames, shelf), name="read-ahead", daemon=True)
+    thread.start()
+    try:
+        while (frame := shelf.take()) is not None:
+            yield frame
+    finally:
+        shelf.close()
+        thread.join()
+
+
+def _fill(frames: Generator[Frame, None, None], shelf: _Shelf) -> None:
+    try:
+        with closing(frames):
+            for frame in frames:
+                if not shelf.put(frame):
+                    return
+    except BaseException as error:  # raised again where the frames are taken
+        shelf.end(error)
+    else:
+        shelf.end(None)
+
+
+class _Shelf:
+    """Frames between the thread that brings them and the one that takes them."""
+
+    def __init__(self) -> None:
+        self._changed = Condition()
+        self._frames: deque[Frame] = deque()
+        self._bytes = 0
+        self._ended = self._closed = False
+        self._error: BaseException | None = None
+
+    def put(self, frame: Frame) -> bool:
+        """Wait for room and leave a frame there; False where nobody takes frames any more."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._has_room)
+            self._frames.append(frame)
+            self._bytes += frame.pixels.nbytes
+            self._changed.notify_all()
+            return not self._closed
+
+    @property
+    def _has_room(self) -> bool:
+        return len(self._frames) < _LEAST_FRAMES or self._bytes < _MOST_BYTES
+
+    def take(self) -> Frame | None:
+        """Wait for the next frame; None after the last one.
+
+        Raises:
+            BaseException: what ended the frames, after them.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._frames or self._ended)
+            if self._frames:
+                frame = self._frames.popleft()
+                self._bytes -= frame.pixels.nbytes
+                self._changed.notify_all()
+                return frame
+        if self._error is not None:
+            raise self._error
+        return None
+
+    def end(self, error: BaseException | None) -> None:
+        """No more frames come, because of an error where one is given."""
+        with self._changed:
+            self._ended, self._error = True, error
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """No more frames are taken."""
+        with self._changed:
+            self._closed = True
+            self._frames.clear()
+            self._changed.notify_all()
