@@ -276,8 +276,10 @@ def slot_likelihoods(
         expected = _Expected(others[part], own, shape[these, None], others_slope[part] + own * slope[these, None])
         return _likelihoods(samples.light[part], samples.valid[part], expected, model, thorough)
 
-    n_parts = round(samples.light.size / _SAMPLES_AT_A_TIME)
-    parts = np.array_split(np.arange(columns.size), np.clip(n_parts, 1, columns.size))
+    n_parts = int(np.clip(round(samples.light.size / _SAMPLES_AT_A_TIME), 1, columns.size))
+    if n_parts == 1:
+        return of_part(np.arange(columns.size))
+    parts = np.array_split(np.arange(columns.size), n_parts)
     with ThreadPoolExecutor(_THREADS) as pool:
         done = list(pool.map(of_part, parts))
     return SlotLikelihoods(
