@@ -169,9 +169,8 @@ def _in_columns(name: str, columns: NDArray[np.int64]) -> Any:
 
 def _dark(snr: Float32Array) -> NDArray[np.bool_]:
     """(C,) whether a column has too little light for the light model to make anything of it."""
-    seen = np.where(snr > 0, snr, np.nan)
-    seen[np.isnan(seen).all(axis=1)] = 0.0
-    return np.asarray(10 * np.log10(np.maximum(np.nanmedian(seen, axis=1), 1e-6)) < _DARK_SNR_DB)
+    seen, lit = ((snr > least).sum(axis=1) for least in (0.0, 10 ** (_DARK_SNR_DB / 10)))
+    return np.asarray((2 * lit < seen) | (seen == 0))
 
 
 def _unsettled(seen: Reception, before: NDArray[np.int64], iteration: int, skip: frozenset[str]) -> NDArray[np.bool_]:
