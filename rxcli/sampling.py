@@ -88,8 +88,12 @@ def sample_rows(frame: Frame, outlines: Outlines, tone: str, *, quick: bool = Fa
         light[:, band], enclosed[:, band], noise_cells = reader.read(first, last, edges[:, band])
         return noise_cells
 
-    with ThreadPoolExecutor(_THREADS) as pool:
-        noise_cells = list(pool.map(read_band, range(0, n_rows, band_rows)))
+    bands = range(0, n_rows, band_rows)
+    if len(bands) == 1:
+        noise_cells = [read_band(0)]
+    else:
+        with ThreadPoolExecutor(_THREADS) as pool:
+            noise_cells = list(pool.map(read_band, bands))
     floor, slope = _noise_model(np.concatenate(noise_cells))
     inside = outlines.inside
     light = light.reshape(inside.shape)
