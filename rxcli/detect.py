@@ -231,6 +231,36 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
     return _posteriors(metrics, _weights(metrics, candidates))
 
 
+def doubtful_words(
+    metrics: FloatArray, w: NDArray[np.int64], certain: float, most: int
+) -> tuple[NDArray[np.int64], NDArray[np.uint8], FloatArray]:
+    """Symbols whose best word is not sure, and their likeliest words.
+
+    Args:
+        metrics: (B, C, packet + memory, patterns) log-likelihoods of B bursts.
+        w: (C,) weight of each column.
+        certain: log probability from which on a word is sure.
+        most: words to give of each symbol, K; every code has eight.
+
+    Returns:
+        (J, 3) burst, column and number of each symbol; (J, K, 10) its words, best first; (J, K) their log probability.
+    """
+    memory = _memory_of(metrics)
+    places, words, log_prob = [np.zeros((0, 3), np.int64)], [np.zeros((0, most, 10), np.uint8)], [np.zeros((0, most))]
+    for weight in np.unique(w):
+        columns = np.flatnonzero(w == weight)
+        chosen = metrics[:, columns].reshape(-1, *metrics.shape[2:])
+        posterior = _forward_backward(chosen, int(weight), memory).word
+        posterior = posterior.reshape(len(metrics), columns.size, *posterior.shape[1:])
+        at = np.argwhere(posterior.max(axis=3) < np.exp(certain))
+        found = posterior[tuple(at.T)]
+        order = np.argsort(-found, axis=1)[:, :most]
+        places.append(np.stack([at[:, 0], columns[at[:, 1]], at[:, 2]], axis=1))
+        words.append(codebook(int(weight))[order])
+        log_prob.append(np.log(np.take_along_axis(found, order, axis=1) + _TINY))
+    return np.concatenate(places), np.concatenate(words), np.concatenate(log_prob)
+
+
 def _weights(metrics: FloatArray, candidates: NDArray[np.bool_]) -> FloatArray:
     """(C, 9) log probability of every weight; no evidence is needed where one candidate is left."""
     log_prob = np.where(candidates, 0.0, -np.inf)

@@ -27,8 +27,9 @@ HOPELESS_WEIGHT = 20.0
 #: A column with a symbol of less than this log probability is looked at without the rows' own light, and gets a second
 #: opinion. Where the gate comes from: docs/auto_encoder.md.
 _DOUBTFUL = -1e-2
-#: Corrections are kept in columns whose symbols' log probabilities, added, come down to this share.
-_LESS_DOUBT = 0.5
+#: Of symbols in doubt, so many words are weighed, down to so many nats below the best; not where even that is less
+#: likely than this, a log probability: there is nothing to choose from.
+_WORDS, _WORD_MARGIN, _HOPELESS_WORD = 4, 5.0, -1.4
 #: A column whose symbols have a mean log probability below this may have settled on a wrong weight: it starts again,
 #: after so many quick rounds.
 _LOST, _FRESH_ROUNDS = -0.3, 2
@@ -188,7 +189,7 @@ def _unsettled(seen: Reception, before: NDArray[np.int64], iteration: int, skip:
 def second_opinion(
     lock: Lock, seen: Reception, options: ReceiverOptions
 ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
-    """Doubtful columns once more, with the auto-encoder's corrections; kept where they leave less doubt.
+    """Doubtful columns once more, with the auto-encoder's corrections and words weighed; kept where less doubt is left.
 
     Returns:
         What was received then, the columns whose corrections were kept, what to report; None where nothing was done.
@@ -209,9 +210,10 @@ def second_opinion(
     except ReceiverError as error:
         return seen, frozenset(), {**report, "columns": 0, "message": str(error)}
     metrics = seen.metrics[columns] + channel.metrics_of(corrections, seen.model.memory)
+    metrics = _words_weighed(seen, seen.scene, columns, metrics)
     posteriors = _detect(metrics, seen.clock)
     before, after = (p.log_prob.sum(axis=(0, 2)) for p in (_of(seen.posteriors, columns), posteriors))
-    better = np.flatnonzero(after > _LESS_DOUBT * before)
+    better = np.flatnonzero(after > before)
     kept = columns[better]
     # The network is told where headers are; whether they show there, the light alone must say.
     corrected = replace(_of(posteriors, better), header_llr=seen.posteriors.header_llr[:, kept])
@@ -220,6 +222,23 @@ def second_opinion(
     report.update(model=denoiser.name, kept=kept.size)
     seen = replace(seen, metrics=of_all, posteriors=_replaced(seen.posteriors, kept, corrected))
     return seen, frozenset(kept.tolist()), report
+
+
+def _words_weighed(
+    seen: Reception, scene: denoise.Scene, columns: NDArray[np.int64], metrics: FloatArray
+) -> FloatArray:
+    """Metrics of some columns with the likeliest words of every symbol in doubt weighed as a whole."""
+    now, posteriors = seen.clock, _detect(metrics, seen.clock)
+    places, words, log_prob = detect.doubtful_words(_by_burst(metrics, now), posteriors.w, _DOUBTFUL, _WORDS)
+    asked = log_prob[:, 0] > _HOPELESS_WORD
+    model = channel.LightModel(
+        scene.floor, scene.sigma, scene.shot, scene.spread, _taps(now, scene.samples.samples_per_slot)
+    )
+    samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
+    lit = channel.lit_on_grid(_replaced(seen.posteriors, columns, posteriors), now)
+    likely = log_prob[asked] > log_prob[asked, :1] - _WORD_MARGIN
+    corrections = channel.word_corrections(samples, now, model, lit, columns, places[asked], words[asked], likely)
+    return metrics + channel.metrics_of(corrections, seen.model.memory)
 
 
 def without_row_light(lock: Lock, seen: Reception, columns: NDArray[np.int64]) -> Reception:

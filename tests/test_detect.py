@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli.detect import detect, plausible_weights, weight_evidence
+from rxcli.detect import detect, doubtful_words, plausible_weights, weight_evidence
 from rxcli.protocol import (
     HEADER,
     WEIGHTS,
@@ -291,3 +291,28 @@ def test_nothing_seen_is_nothing_known() -> None:
 def test_shapes_that_do_not_fit(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="metrics must"):
         detect(np.zeros(shape))
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_doubtful_words_are_those_of_the_posterior(memory: int) -> None:
+    metrics = np.random.default_rng(memory).normal(0, 1.5, (2, 3, 60 + memory, 2 << memory))
+    w = np.array([5, 1, 5])
+    candidates = np.zeros((3, 9), bool)
+    candidates[np.arange(3), w - 1] = True
+    found = detect(metrics, candidates)
+    places, words, log_prob = doubtful_words(metrics, w, -0.3, 4)
+    at = tuple(places.T)
+    assert {tuple(place) for place in places} == {tuple(place) for place in np.argwhere(found.log_prob < -0.3)}
+    assert 0 < len(places) < found.log_prob.size
+    np.testing.assert_allclose(log_prob[:, 0], found.log_prob[at], atol=1e-4)
+    best = [codebook(int(w[column]))[found.index[burst, column, symbol]] for burst, column, symbol in places]
+    np.testing.assert_array_equal(words[:, 0], best)
+    assert (np.diff(log_prob, axis=1) <= 0).all()
+    assert (words.sum(axis=2) == w[places[:, 1], None]).all()
+
+
+def test_no_word_is_doubtful_where_all_are_sure() -> None:
+    metrics = np.zeros((1, 2, 41, 4))
+    metrics[..., 1::2] = 30.0 * np.tile(codebook(5)[3], 5)[:41, None][:, :1]
+    metrics[..., ::2] = -metrics[..., 1::2]
+    assert [len(part) for part in doubtful_words(metrics, np.array([5, 5]), -10.0, 4)] == [0, 0, 0]
