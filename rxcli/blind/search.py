@@ -69,7 +69,7 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
         plain = any(estimate.evidence > _PLAIN_EVIDENCE for estimate in estimates)
         if plain and clock.evidence < _RIVAL * found[0][0].evidence and not same_slots(clock, found[0][0]):
             continue
-        exposure = exposure_s * rates[clock.packet_slots] if exposure_s else None
+        exposure = (exposure_s or 0.0) * rates[clock.packet_slots]
         estimates.append(refine(strips, clock, b, exposure, sure=gain > _BEND_GAINS[1]))
     rows_per_slot = estimates[0].rows_per_slot if estimates else 1.0
     estimates.sort(key=lambda estimate: -_plausibility(estimate, strips, rows_per_slot))

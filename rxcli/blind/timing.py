@@ -79,6 +79,8 @@ class BlindEstimate:
     evidence: float
     #: Share of the local variance of the light that the slots explain.
     explained: float
+    #: Exposure that the file tells, 0 where it does not.
+    least_exposure_slots: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,7 @@ class _Timing:
 
 
 def refine(
-    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None = None, sure: bool = False
+    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, least_exposure_slots: float = 0.0, sure: bool = False
 ) -> BlindEstimate:
     """The clock, the bend and the exposure that fit all light of the picture best.
 
@@ -107,12 +109,12 @@ def refine(
         strips: the strips as the picture has them, not straightened.
         hypothesis: a clock found on the straightened strips.
         bend: the bend they were straightened with.
-        exposure_slots: exposure, None to estimate it.
+        least_exposure_slots: exposure that the file tells, 0 where it does not; optics and demosaicing add to it.
         sure: whether the stripes are bent without doubt.
     """
     ordered, bend = (in_readout_order(strips), reversed_bend(bend)) if hypothesis.reversed else (strips, bend)
     ordered = thinned(ordered, hypothesis.rows_per_slot)
-    timing, corrected = _fit_timing(ordered, hypothesis, bend, exposure_slots, sure)
+    timing, corrected = _fit_timing(ordered, hypothesis, bend, least_exposure_slots, sure)
     found, sd = timing.values[2:], UNDERSTATED * np.sqrt(np.diag(timing.covariance))
     return BlindEstimate(
         rows_per_slot=float(timing.values[1]),
@@ -126,6 +128,7 @@ def refine(
         corrected=corrected,
         evidence=timing.evidence,
         explained=timing.explained,
+        least_exposure_slots=least_exposure_slots,
     )
 
 
@@ -151,7 +154,7 @@ def thinned(strips: Strips, rows_per_slot: float) -> Strips:
 
 
 def _fit_timing(
-    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, exposure_slots: float | None, sure: bool
+    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, least_exposure_slots: float, sure: bool
 ) -> tuple[_Timing, bool]:
     """The row-time map, with a bend only where it is beyond doubt: one that is free for nothing blurs the period."""
     first_row = strips.rows[0] - 0.5 * (strips.rows[1] - strips.rows[0])
@@ -159,7 +162,7 @@ def _fit_timing(
     start = first_row + hypothesis.start_row - before * hypothesis.rows_per_slot
     grid = Grid(-before % hypothesis.packet_slots, hypothesis.packet_slots)
     values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
-    bent = _descend(strips, grid, values, exposure_slots, n_free=6)
+    bent = _descend(strips, grid, values, least_exposure_slots, n_free=6)
     if sure or bend_chi_square(bent.values, bent.covariance) > _BENT_CHI_SQUARE:
         return bent, True
     values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else bent.values * FLAT
@@ -171,12 +174,16 @@ def _descend(
     strips: Strips,
     grid: Grid,
     values: FloatArray,
-    exposure_slots: float | None,
+    exposure_slots: float,
     n_free: int,
     slots: Slots | None = None,
 ) -> _Timing:
-    """Gauss-Newton on the first `n_free` values of the row-time map, deciding the slots anew at every step."""
+    """Gauss-Newton on the first `n_free` values of the row-time map, deciding the slots anew at every step.
+
+    The exposure is at least the one given, or that one where slots to start from are given too.
+    """
     terms = time_terms(strips)
+    estimating = slots is None
     exposure, exposure_sd = exposure_slots or _FIRST_EXPOSURE, 0.0
     first_time = slot_time(strips, terms, values)
     if slots is None:
@@ -187,9 +194,10 @@ def _descend(
         again = step == _AGAIN_STEP and float(np.abs(time - first_time).max()) > _FAR
         if again:
             slots = first_slots(waves, exposure, grid)
-        if exposure_slots is None and (again or step in _EXPOSURE_STEPS):
+        if estimating and (again or step in _EXPOSURE_STEPS):
             near = None if again or step == _EXPOSURE_STEPS[0] else exposure
             exposure, exposure_sd, slots = estimate_exposure(waves, grid, slots, near)
+            exposure, exposure_sd = (exposure, exposure_sd) if exposure > exposure_slots else (exposure_slots, 0.0)
         slots = decide(waves, exposure, grid, slots)
         free = n_free if step >= _RIGID_STEPS or values[2:].any() else 2
         change, covariance, explained = gauss_newton(strips, terms, values, time, slots.lit, exposure, free)
