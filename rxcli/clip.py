@@ -553,8 +553,17 @@ class _Clip:
             if waiting.view is not None and waiting.numbers is None:
                 self._detect(waiting)
 
-    def _detect(self, waiting: _Waiting, learn: bool = True) -> None:
-        """Add a frame to its bursts, and detect them again."""
+    def _detect(self, waiting: _Waiting) -> None:
+        """Add a frame to its bursts, detect them again, and learn from it."""
+        numbers = self._add(waiting)
+        self._detect_bursts(waiting, numbers, dark_too=bool(self._n_held))
+        view = waiting.view
+        if view is not None and view.flat is not None and self._bursts.is_open(int(numbers[-1])):
+            self._learn(view, self._grid(waiting))
+            self._last = view
+
+    def _add(self, waiting: _Waiting) -> IntArray:
+        """Add a frame to its bursts; returns their numbers."""
         view, link = waiting.view, self._link
         assert view is not None
         assert link is not None
@@ -567,24 +576,26 @@ class _Clip:
         waiting.numbers = numbers + link.offset
         self._next_number = max(self._next_number, int(waiting.numbers[-1]) + 1)
         self._bursts.add(view.bursts, waiting.numbers, channel.by_burst(view.bursts.metrics, now, view.memory))
-        still_open = np.array([n for n in waiting.numbers if self._bursts.is_open(int(n))], np.int64)
+        return waiting.numbers
+
+    def _detect_bursts(self, waiting: _Waiting, numbers: IntArray, dark_too: bool) -> None:
+        """Detect bursts of a frame as far as they are open, in columns that are neither certain nor, unless they are
+        to be tried too, dark."""
+        assert waiting.view is not None
+        still_open = np.array([n for n in numbers if self._bursts.is_open(int(n))], np.int64)
         if still_open.size == 0:
             return
         certain = self._bursts.certain(still_open)
         if "certain_columns" not in self._options.skip:
             certain[:] = False
-        dark = ~certain & self._dark(view, sure=not self._n_held or not learn)
+        dark = ~certain & (self._dark(waiting.view) & (not dark_too))
         self._skip(waiting, "certain_columns", int(certain.sum()))
         self._skip(waiting, "dark_columns", int(dark.sum()))
         self._detect_open(still_open, ~certain & ~dark)
-        if view.flat is not None:
-            if learn:
-                self._learn(view, self._grid(waiting))
-            self._last = view
 
-    def _dark(self, view: _View, sure: bool) -> NDArray[np.bool_]:
+    def _dark(self, view: _View) -> NDArray[np.bool_]:
         """(C,) columns of a tracked frame with too little light to try; now and then they are tried all the same."""
-        tried = not sure or (view.bursts.frame + 1) % _LOOK_EVERY == 0
+        tried = (view.bursts.frame + 1) % _LOOK_EVERY == 0
         if view.flat is None or "dark_columns" not in self._options.skip or tried:
             return np.zeros(view.snr.shape[0], bool)
         return np.asarray(np.median(view.snr, axis=1) < _DARK_SNR)
@@ -643,10 +654,7 @@ class _Clip:
         held = [w for w in held if w.view is not None and self._can_look_again(w.view)]
         if len(held) > 1:
             self._learn_again(held)
-            self._bursts = tracking.Bursts()
-            for waiting in self._waiting:
-                if waiting.view is not None and waiting.numbers is not None:
-                    self._detect(waiting, learn=False)
+            self._detect_again()
         for waiting in held:
             assert waiting.view is not None
             waiting.view.frame = None
@@ -675,6 +683,16 @@ class _Clip:
         for waiting, lesson, needed in zip(held, lessons, doubtful, strict=True):
             if needed and waiting.view is not None:
                 self._measure_again(waiting.view, lesson if len(held) <= _MANY_VIEWS else None)
+
+    def _detect_again(self) -> None:
+        """The bursts of all frames that wait, each once: in the last frame that shows it."""
+        self._bursts = tracking.Bursts()
+        waiting = [w for w in self._waiting if w.view is not None and w.numbers is not None]
+        numbers = [self._add(w) for w in waiting]
+        for now, mine, following in zip(waiting, numbers, [*numbers[1:], numbers[0][:0]], strict=True):
+            self._detect_bursts(now, np.setdiff1d(mine, following), dark_too=False)
+        tracked = [w.view for w in waiting if w.view is not None and w.view.flat is not None]
+        self._last = tracked[-1] if tracked else self._last
 
     def _dark_light(self, views: list[_View], usual: float) -> Float32Array:
         """(C, S) light of the strips where nothing is lit."""

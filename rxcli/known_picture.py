@@ -552,19 +552,20 @@ def evened(seen: ColumnLight, slots: Exposures) -> ColumnLight:
     half = np.float32(0.5)
     level = np.log(np.maximum(seen.precision, np.float32(1e-3)))
     some = level.take(slots.rows, axis=1).ravel()
-    order = np.argsort(some)
-    order = order[some[order] > np.log(2e-3)]
-    if order.size < 10 * _GROUPS:
+    shown = np.flatnonzero(some > np.log(2e-3))
+    if shown.size < 10 * _GROUPS:
         return seen
+    borders = shown.size * np.arange(1, _GROUPS) // _GROUPS
+    groups = np.split(shown[np.argpartition(some[shown], borders)], borders)
     value = np.clip(seen.value.take(slots.rows, axis=1).ravel() - half, -1.2, 1.2)
     here, beside = slots.here.ravel() - half, slots.beside.ravel() - 1
     middle, gain, offset = np.empty(_GROUPS), np.empty(_GROUPS), np.empty(_GROUPS)
-    for number, mine in enumerate(np.array_split(order, _GROUPS)):
+    for number, mine in enumerate(groups):
         model = np.stack([here[mine], beside[mine], np.ones(mine.size, np.float32)])
         normal = model @ model.T / mine.size + np.float32(1e-3) * np.eye(3, dtype=np.float32)
         centre, side, offset[number] = np.linalg.solve(normal, model @ value[mine] / mine.size + [1e-3, 0, 0])
         gain[number] = np.clip(centre + 2 * side, *_GAIN)
-        middle[number] = some[mine[mine.size // 2]]
+        middle[number] = np.median(some[mine])
     gains, offsets = _interpolated(level, middle, gain), _interpolated(level, middle, offset)
     return ColumnLight((seen.value - half - offsets) / gains + half, seen.precision * gains * gains, seen.shrunk)
 
