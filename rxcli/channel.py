@@ -62,9 +62,9 @@ _DARK_MARGIN = 0.002
 
 #: Kinds of picture, smooth to rough: relative standard deviation about the local mean, and slots after which it is
 #: another one (Ornstein-Uhlenbeck). Each strip may be of any.
-_PICTURE_KINDS = ((0.05, 0.7), (0.25, 1.0), (0.2, 3.0), (0.7, 3.0))
+_PICTURE_KINDS = ((0.06, 0.7), (0.25, 2.0), (0.7, 3.0))
 #: The local mean is taken over this many slots on either side; a word is weighed with so many slots around it.
-_MEAN_SLOTS, _AROUND_SLOTS = 10, 5
+_MEAN_SLOTS, _AROUND_SLOTS = 10, 3
 #: Variance of the mean of two adjacent samples against that of one: samples are interpolated, so they err alike.
 _PAIR_NOISE = 0.75
 #: Strips of a column err alike: what they say of a word, added, counts so much; and at most so many nats.

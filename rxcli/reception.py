@@ -27,6 +27,9 @@ HOPELESS_WEIGHT = 20.0
 #: A column with a symbol of less than this log probability is looked at without the rows' own light, and gets a second
 #: opinion. Where the gate comes from: docs/auto_encoder.md.
 _DOUBTFUL = -1e-2
+#: A column none of whose packets has symbols of at least this mean log probability is beyond repair: of 133 packets of
+#: such columns no second opinion made one error-free.
+_BEYOND_REPAIR = -1.0
 #: Of symbols in doubt, so many words are weighed, down to so many nats below the best; not where even that is less
 #: likely than this, a log probability: there is nothing to choose from.
 _WORDS, _WORD_MARGIN, _HOPELESS_WORD = 4, 5.0, -1.4
@@ -201,6 +204,7 @@ def second_opinion(
         seen = without_row_light(lock.in_depth(columns), seen, columns)
     else:
         columns = doubtful_columns(seen)
+        columns = columns[_best_packet(seen)[columns] > _BEYOND_REPAIR]
     if columns.size == 0 or seen.scene is None:
         return seen, frozenset(), None
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
@@ -283,6 +287,12 @@ def _evidence(metrics: FloatArray, now: Clock) -> FloatArray:
 def doubtful_columns(seen: Reception) -> NDArray[np.int64]:
     """Columns that get a second opinion."""
     return np.flatnonzero(_doubtful(seen, _DOUBTFUL))
+
+
+def _best_packet(seen: Reception) -> FloatArray:
+    """(C,) mean log probability of the symbols of each column's surest packet that could be reported."""
+    complete = assemble.complete(assemble.slots_seen(seen.samples, seen.clock))
+    return np.asarray(np.where(complete, seen.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0))
 
 
 @lru_cache(maxsize=1)

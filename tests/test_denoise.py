@@ -17,6 +17,7 @@ from rxcli.benchmark.trial import Trial, simulate_trial
 from rxcli.channel import metrics_of
 from rxcli.denoise import COLUMN_FEATURES, STRIP_FEATURES, Scene, load_denoiser, network_inputs
 from rxcli.errors import ProfileError
+from rxcli.locate import Stages, find_camera, find_corners, find_lock
 from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
 from rxcli.resources import data_dir
 from rxcli.training.scenes import SCENE_CLASSES, validation_scene
@@ -432,3 +433,19 @@ def test_the_receiver_goes_on_without_a_broken_model(trials: dict[str, Trial], m
     assert packets(auto) == packets(never)
     assert auto.denoiser is not None
     assert "does not match its checksum; install the package again" in auto.denoiser["message"]
+
+
+def test_columns_beyond_repair_are_not_asked(trials: dict[str, Trial]) -> None:
+    options = trials["hard"].options()
+    corners = find_corners(trials["hard"].frame, options)
+    camera, options = find_camera(trials["hard"].frame, corners, options, Stages())
+    lock = find_lock(trials["hard"].frame, corners, camera, options, Stages())
+    seen = reception.decode(lock, options.skip)
+    better, kept, report = reception.second_opinion(lock, seen, options)
+    assert report is not None
+    assert report["kept"] == len(kept) > 0
+    columns = sorted(kept)
+    doubt = [-part.posteriors.log_prob[:, columns].sum(axis=(0, 2)) for part in (seen, better)]
+    assert (doubt[1] < doubt[0]).all()
+    guessed = replace(seen.posteriors, log_prob=np.full_like(seen.posteriors.log_prob, -2.0))
+    assert reception.second_opinion(lock, replace(seen, posteriors=guessed), options)[2] is None
