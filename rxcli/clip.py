@@ -10,7 +10,8 @@ shows its burst, so results come a frame late.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -80,14 +81,30 @@ _BETTER = 0.05
 
 def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
     """Receive the frames of a clip; results come a frame or more late. An error of `frames` comes after all results."""
-    clip = _Clip(options)
+    clip, one_thread = _Clip(options), _one_blas_thread()
     try:
         for frame in frames:
-            yield from clip.take(frame)
+            with one_thread():
+                done = clip.take(frame)
+            yield from done
     except Exception:
         yield from clip.finish()
         raise
     yield from clip.finish()
+
+
+def _one_blas_thread() -> Callable[[], AbstractContextManager[object]]:
+    """Matrix products on one thread for a while.
+
+    Ours are small: further threads only wait for the next one, busily, and take from the decoder's what they need. So
+    they double the time that a clip takes of the processor.
+    """
+    try:
+        from threadpoolctl import ThreadpoolController
+    except ImportError:  # nothing but slower without it
+        return nullcontext
+    controller = ThreadpoolController()
+    return lambda: controller.limit(limits=1, user_api="blas")
 
 
 @dataclass(slots=True, eq=False)

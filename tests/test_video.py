@@ -191,6 +191,27 @@ def test_the_source_is_closed_when_reception_is_left(clip: Clip) -> None:
     assert closed == [True]
 
 
+def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More would spin beside the decoder's; what is done between the frames keeps its own."""
+    blas = pytest.importorskip("threadpoolctl").ThreadpoolController()
+    inside: list[list[int]] = []
+
+    def threads() -> list[int]:
+        return [library["num_threads"] for library in blas.info() if library["user_api"] == "blas"]
+
+    def take(_clip: object, _frame: Frame) -> list[object]:
+        inside.append(threads())
+        return [None]
+
+    monkeypatch.setattr("rxcli.clip._Clip.take", take)
+    with blas.limit(limits=2, user_api="blas"):
+        if max(threads(), default=0) < 2:
+            pytest.skip("this numpy's BLAS has one thread")
+        between = [threads() for _ in receive(clip.frames[:3], clip.options)]
+    assert inside == [[1] * len(threads())] * 3
+    assert all(max(counts) == 2 for counts in between)
+
+
 def test_a_single_frame_is_a_photograph(clip: Clip) -> None:
     (result,) = receive(clip.frames[:1], clip.options)
     packets = [p for c in result.columns for p in c.packets]
