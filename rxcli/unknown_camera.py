@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from rxcli import channel
 from rxcli.locate import Camera, Failure, Lock, Stages, find_cameras, find_lock, refitted_camera
 from rxcli.options import ReceiverOptions
@@ -13,8 +15,10 @@ _MATTERS_SLOTS = 0.05
 _MOST_REFITS = 3
 #: Symbols' mean log probabilities this many times lower, and lower by that, are more doubt.
 _MORE_DOUBT, _LEAST_DOUBT = 1.2, 0.01
-#: Headers, all columns and bursts together, that a camera without evidence of its own must show, nats.
+#: Headers, all columns and bursts together, that another than the most plausible estimate must show, nats.
 _HEADERS_AT_LEAST = 80.0
+#: Symbols' mean log probability counts so many times beside the headers: half a packet has headers, but no symbols.
+_SAY_OF_SYMBOLS = 40.0
 
 
 def likely_camera(
@@ -22,22 +26,32 @@ def likely_camera(
 ) -> tuple[Camera, ReceiverOptions]:
     """The camera, known or estimated, and the options with the screens that remain.
 
-    Where several estimates are left, each has a quick look: the one under which headers show best is it.
+    Where several estimates are left, each has a quick look: the one under which headers and symbols show best is it.
     """
     found = find_cameras(frame, corners, options, stages)
-    best, most = found.first, -float("inf") if found.first else _HEADERS_AT_LEAST
-    for camera, screens in (*filter(None, [found.first]), *found.rivals) if found.rivals else ():
-        try:
-            lock = find_lock(frame, corners, camera, screens, stages, quick=True)
-        except Failure:
-            continue
-        with stages("detect"):
-            headers = float(quick_look(lock).posteriors.header_llr.sum())
-        if headers > most:
-            best, most = (camera, screens), headers
+    best, most = found.first, -np.inf
+    if found.first is not None and found.rivals:
+        most = sum(_look(frame, corners, *found.first, stages))
+    for rival in found.rivals:
+        headers, symbols = _look(frame, corners, *rival, stages)
+        if headers > _HEADERS_AT_LEAST and headers + symbols > most:
+            best, most = rival, headers + symbols
     if best is None:
         raise Failure("no_signal", found.reason)
     return best
+
+
+def _look(
+    frame: Frame, corners: FloatArray, camera: Camera, options: ReceiverOptions, stages: Stages
+) -> tuple[float, float]:
+    """What a quick look says of a camera: log-likelihood ratio of the headers, and how sure the symbols are, nats."""
+    try:
+        lock = find_lock(frame, corners, camera, options, stages, quick=True)
+    except Failure:
+        return -np.inf, 0.0
+    with stages("detect"):
+        posteriors = quick_look(lock).posteriors
+    return float(posteriors.header_llr.sum()), _SAY_OF_SYMBOLS * float(posteriors.log_prob.mean())
 
 
 def with_refitted_camera(
