@@ -571,12 +571,15 @@ class _Clip:
                 self._detect(waiting)
 
     def _detect(self, waiting: _Waiting) -> None:
-        """Add a frame to its bursts, detect them again, and learn from it."""
-        numbers = self._add(waiting)
-        self._detect_bursts(waiting, numbers, dark_too=bool(self._n_held))
-        view = waiting.view
+        """Add a frame to its bursts, and learn from it; they are detected when somebody asks what they say."""
+        numbers, view = self._add(waiting), waiting.view
+        if "certain_columns" not in self._options.skip or self._options.stop_when_certain:
+            self._freshen(waiting)
         if view is not None and view.flat is not None and self._bursts.is_open(int(numbers[-1])):
-            self._learn(view, self._grid(waiting))
+            if self._n_lessons < _FIRST_LESSONS or (self._n_lessons + 1) % _LESSON_EVERY == 0:
+                self._learn(view, self._grid(waiting))
+            else:
+                self._n_lessons += 1
             self._last = view
 
     def _add(self, waiting: _Waiting) -> IntArray:
@@ -594,6 +597,12 @@ class _Clip:
         self._next_number = max(self._next_number, int(waiting.numbers[-1]) + 1)
         self._bursts.add(view.bursts, waiting.numbers, channel.by_burst(view.bursts.metrics, now, view.memory))
         return waiting.numbers
+
+    def _freshen(self, waiting: _Waiting) -> None:
+        """Detect the bursts of a frame that were added to since they were looked at."""
+        assert waiting.numbers is not None
+        stale = [n for n in waiting.numbers if self._bursts.is_stale(int(n))]
+        self._detect_bursts(waiting, np.array(stale, np.int64), dark_too=bool(self._n_held))
 
     def _detect_bursts(self, waiting: _Waiting, numbers: IntArray, dark_too: bool) -> None:
         """Detect bursts of a frame as far as they are open, in columns that are neither certain nor, unless they are
@@ -620,6 +629,7 @@ class _Clip:
     def _detect_open(self, numbers: IntArray, wanted: NDArray[np.bool_]) -> None:
         """Detect the wanted columns, (B, C), of open bursts."""
         bursts, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
+        self._bursts.looked_at(numbers)
         if bursts.size == 0:
             return
         metrics = self._bursts.metrics(numbers[bursts])[:, columns]
@@ -642,9 +652,9 @@ class _Clip:
         self._weights[columns[sure], posteriors.w[sure] - 1] = True
 
     def _learn(
-        self, view: _View, lit: Float32Array, keep: float | None = None
+        self, view: _View, lit: Float32Array, keep: float = known_picture.MEMORY
     ) -> tuple[Float32Array, Float32Array] | None:
-        """Take a frame into the picture, later ones only now and then unless `keep` is given; returns what it showed.
+        """Take a frame into the picture; returns what it showed.
 
         See `known_picture.KnownPicture.learn` for `keep`, and for what is returned: slots and trust.
         """
@@ -652,14 +662,12 @@ class _Clip:
         if picture is None or view.light is None or view.light.shape[2] != self._rows.size:
             return None
         self._n_lessons += 1
-        if keep is None and self._n_lessons > _FIRST_LESSONS and self._n_lessons % _LESSON_EVERY:
-            return None
         now = view.bursts.clock
         positions = known_picture.row_positions(self._rows, now)
         slots = known_picture.exposed(lit, positions, now.exposure_slots)
         doubt = known_picture.exposed(lit * (1 - lit), positions, now.exposure_slots)
         trust = np.clip(1 - 8 * doubt, 0, 1).astype(np.float32)
-        picture.learn(view.light, slots, trust, known_picture.MEMORY if keep is None else keep)
+        picture.learn(view.light, slots, trust, keep)
         return slots, trust
 
     def _look_again(self, at_last: bool) -> None:
@@ -736,6 +744,7 @@ class _Clip:
         """Packets of a frame in columns that are well lit and of which all was seen: those in doubt, and all."""
         assert waiting.view is not None
         assert waiting.numbers is not None
+        self._freshen(waiting)
         lit = np.median(waiting.view.snr, axis=1) >= _WELL_LIT_SNR
         doubtful = total = 0
         for number in waiting.numbers:
@@ -750,6 +759,7 @@ class _Clip:
         """(C, N) probability that each slot of a frame is lit, by all that is known of its bursts."""
         assert waiting.view is not None
         assert waiting.numbers is not None
+        self._freshen(waiting)
         now = waiting.view.bursts.clock
         lit = np.full((waiting.numbers.size, self._bursts.n_columns, now.packet_slots), 0.5, np.float32)
         for place, number in enumerate(waiting.numbers):
@@ -779,6 +789,7 @@ class _Clip:
         view = waiting.view
         if view is None or waiting.numbers is None:
             return waiting.result
+        self._freshen(waiting)
         going_on = waiting.numbers[:0]
         if following is not None and following.numbers is not None:
             going_on = np.intersect1d(waiting.numbers, following.numbers)

@@ -205,6 +205,8 @@ class _Burst:
     tracked: bool
     #: Of this burst alone, once detected.
     posteriors: BurstPosteriors | None = None
+    #: Whether frames were added since it was looked at.
+    stale: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,10 +263,20 @@ class Bursts:
             have.seen = have.seen + seen
             have.frames.append(view.frame)
             have.tracked |= view.tracked
+            have.stale = True
 
     def is_open(self, number: int) -> bool:
         """Whether the burst can still be added to."""
         return number in self._open
+
+    def is_stale(self, number: int) -> bool:
+        """Whether an open burst was added to since it was looked at."""
+        return number in self._open and self._open[number].stale
+
+    def looked_at(self, numbers: IntArray) -> None:
+        """All that there is to detect of open bursts is detected."""
+        for number in numbers:
+            self._open[int(number)].stale = False
 
     def metrics(self, numbers: IntArray) -> FloatArray:
         """(B, C, packet + memory, patterns) of open bursts, all frames added."""
