@@ -555,28 +555,25 @@ def evened(seen: ColumnLight, slots: Exposures) -> ColumnLight:
     shown = np.flatnonzero(some > np.log(2e-3))
     if shown.size < 10 * _GROUPS:
         return seen
-    borders = shown.size * np.arange(1, _GROUPS) // _GROUPS
-    groups = np.split(shown[np.argpartition(some[shown], borders)], borders)
-    value = np.clip(seen.value.take(slots.rows, axis=1).ravel() - half, -1.2, 1.2)
-    here, beside = slots.here.ravel() - half, slots.beside.ravel() - 1
-    middle, gain, offset = np.empty(_GROUPS), np.empty(_GROUPS), np.empty(_GROUPS)
-    for number, mine in enumerate(groups):
-        model = np.stack([here[mine], beside[mine], np.ones(mine.size, np.float32)])
-        normal = model @ model.T / mine.size + np.float32(1e-3) * np.eye(3, dtype=np.float32)
-        centre, side, offset[number] = np.linalg.solve(normal, model @ value[mine] / mine.size + [1e-3, 0, 0])
-        gain[number] = np.clip(centre + 2 * side, *_GAIN)
-        middle[number] = np.median(some[mine])
-    gains, offsets = _interpolated(level, middle, gain), _interpolated(level, middle, offset)
+    size = shown.size // _GROUPS
+    order = shown[np.argpartition(some[shown], size * np.arange(1, _GROUPS))][: size * _GROUPS]
+    value = np.clip(seen.value.take(slots.rows, axis=1).ravel()[order] - half, -1.2, 1.2)
+    here, beside = slots.here.ravel()[order] - half, slots.beside.ravel()[order] - 1
+    model = np.stack([here, beside, np.ones_like(here)]).reshape(3, _GROUPS, size).transpose(1, 0, 2)
+    normal = model @ model.transpose(0, 2, 1) / size + np.float32(1e-3) * np.eye(3, dtype=np.float32)
+    right = model @ value.reshape(_GROUPS, size, 1) / size + np.float32(1e-3) * np.eye(3, 1, dtype=np.float32)
+    centre, side, offset = np.linalg.solve(normal, right)[..., 0].T
+    gain, middle = np.clip(centre + 2 * side, *_GAIN), np.median(some[order].reshape(_GROUPS, size), axis=1)
+    gains, offsets = _interpolated(level, middle, gain, offset)
     return ColumnLight((seen.value - half - offsets) / gains + half, seen.precision * gains * gains, seen.shrunk)
 
 
-def _interpolated(level: Float32Array, at: FloatArray, values: FloatArray) -> Float32Array:
+def _interpolated(level: Float32Array, at: FloatArray, *values: FloatArray) -> list[Float32Array]:
     """`values`, known at ascending levels, at every `level`: by a fine table, which is quicker than `np.interp`."""
     steps = np.linspace(at[0], at[-1], _TABLE)
-    table = np.interp(steps, at, values).astype(np.float32)
     step = np.float32((_TABLE - 1) / max(at[-1] - at[0], 1e-6))
-    place = np.clip((level - np.float32(at[0])) * step + np.float32(0.5), 0, _TABLE - 1)
-    return np.asarray(table.take(place.astype(np.intp)))
+    place = np.clip((level - np.float32(at[0])) * step + np.float32(0.5), 0, _TABLE - 1).astype(np.intp)
+    return [np.interp(steps, at, one).astype(np.float32).take(place) for one in values]
 
 
 def pattern_metrics(
