@@ -24,12 +24,12 @@ from rxcli.types import (
 
 #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
 MAX_BER_HAT = 0.1
-#: Offset and slope from the log-odds of the posterior to those of being error-free: where the auto-encoder did not run,
-#: where it could not halve the doubt, and where it did, which are the columns it made surer of.
-_CALIBRATION: dict[bool | None, tuple[float, float]] = {
-    None: (1.77, 0.45),
-    False: (2.199, 0.648),
-    True: (-0.212, 0.648),
+#: From the log-odds of the posterior to those of being error-free: offset, slope below zero and slope above it; where
+#: the auto-encoder was asked in no column, where its corrections were not kept, and where they were.
+_CALIBRATION: dict[bool | None, tuple[float, float, float]] = {
+    None: (1.77, 0.45, 0.45),
+    False: (2.49, 0.54, 0.54),
+    True: (-0.578, 1.085, 0.578),
 }
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
@@ -348,12 +348,13 @@ def _packet(
 def _calibrated(log_prob: float, denoised: bool | None) -> float:
     """Share of error-free packets among those whose symbols' log probabilities add up to `log_prob`.
 
-    The light model's likelihoods are tempered, since strips and samples err together; what is left of that is a
-    straight line between log-odds, fitted to packets of `rxcli.benchmark.confidence`. Whatever changes the likelihoods
+    The light model's likelihoods are tempered, since strips and samples err together; what is left of that is a line
+    between log-odds with one bend, fitted to packets of `rxcli.benchmark.confidence`. Whatever changes the likelihoods
     of the light model or the auto-encoder asks for a new fit.
     """
-    offset, slope = _CALIBRATION[denoised]
-    return _probability(offset + slope * _log_odds(log_prob))
+    offset, below, above = _CALIBRATION[denoised]
+    log_odds = _log_odds(log_prob)
+    return _probability(offset + below * min(log_odds, 0.0) + above * max(log_odds, 0.0))
 
 
 def _log_odds(log_prob: float) -> float:
