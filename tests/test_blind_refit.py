@@ -113,3 +113,12 @@ def test_slots_that_explain_nothing_change_nothing() -> None:
     found, moved_slots = blind.refit(strips, estimate, _clock(estimate), np.full_like(lit, 0.5, np.float32))
     assert found is estimate
     assert moved_slots == 0.0
+
+
+def test_the_file_tells_the_least_exposure() -> None:
+    strips, lit = _strips(np.random.default_rng(14), np.zeros(4), False)
+    told = replace(_estimate(np.zeros(4), False), least_exposure_slots=2.0)
+    found, _ = blind.refit(strips, told, _clock(told), lit.astype(np.float32))
+    assert found.exposure_slots == 2.0
+    assert found.exposure_slots_sd == 0.0
+    assert "exposure_s" not in blind.summary(found, 17300.0)

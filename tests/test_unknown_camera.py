@@ -1,0 +1,61 @@
+"""Which of several estimated cameras it is, and pictures of unknown cameras from end to end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_frames import BOTTOM, LEFT, RIGHT, ROWS_PER_SLOT, SCREEN, TOP, write_frame
+
+from rxcli import unknown_camera
+from rxcli.ingest import open_source
+from rxcli.locate import Camera, Cameras, Failure, Stages
+from rxcli.pipeline import ReceiverOptions, receive
+from rxcli.profiles import ScreenProfile, parse_profile
+from rxcli.types import Frame
+
+CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
+OPTIONS = ReceiverOptions(screens=(parse_profile(SCREEN, ScreenProfile, "small"),), corners=CORNERS, cae="never")
+
+
+def _frame(folder: Path) -> tuple[Frame, list[str]]:
+    payloads = write_frame(folder / "small.png", 5)
+    return next(iter(open_source(str(folder / "small.png")))), payloads
+
+
+def _camera(rows_per_slot: float) -> tuple[Camera, ReceiverOptions]:
+    return Camera(None, 1e-4 / rows_per_slot, 1e-5, None, "linear"), OPTIONS
+
+
+def _chosen(frame: Frame, found: Cameras, monkeypatch: pytest.MonkeyPatch) -> Camera:
+    monkeypatch.setattr(unknown_camera, "find_cameras", lambda *_: found)
+    return unknown_camera.likely_camera(frame, CORNERS, OPTIONS, Stages())[0]
+
+
+def test_headers_decide_between_estimates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, _ = _frame(tmp_path)
+    right, wrong, other = (_camera(rows) for rows in (ROWS_PER_SLOT, 1.13 * ROWS_PER_SLOT, 0.7 * ROWS_PER_SLOT))
+    assert _chosen(frame, Cameras(wrong, (other, right)), monkeypatch) is right[0]
+    assert _chosen(frame, Cameras(right, (wrong, other)), monkeypatch) is right[0]
+    assert _chosen(frame, Cameras(None, (wrong, right), "nothing"), monkeypatch) is right[0]
+
+
+def test_without_headers_nothing_is_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, _ = _frame(tmp_path)
+    with pytest.raises(Failure, match="too dark"):
+        _chosen(frame, Cameras(None, (_camera(1.13 * ROWS_PER_SLOT),), "too dark"), monkeypatch)
+
+
+@pytest.mark.parametrize("told_exposure_s", [None, 2e-6])
+def test_an_unknown_camera_is_refitted_and_received(tmp_path: Path, told_exposure_s: float | None) -> None:
+    frame, payloads = _frame(tmp_path)
+    frame = replace(frame, metadata=replace(frame.metadata, exposure_s=told_exposure_s))
+    result = next(receive([frame], OPTIONS))
+    assert result.estimated["rows_per_slot"][0] == pytest.approx(ROWS_PER_SLOT, rel=1e-3)
+    assert result.exposure_s is not None
+    assert result.exposure_s >= (told_exposure_s or 0.0)
+    right = [packet.payload == payloads[column.column] for column in result.columns for packet in column.packets]
+    assert len(right) >= 8
+    assert all(right)
