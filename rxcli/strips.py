@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +19,10 @@ from rxcli.types import BoolArray, Float32Array, FloatArray, Frame, Outlines
 
 #: Part of a strip over which pixels are added up before the strip's middle is read.
 _CELL_SHARE = 0.6
-#: Pixels of eight bits in a word, words whose sum 16 bits hold, and rows whose words fit the cache at a time.
-_WORD, _MOST_WORDS, _ROWS_AT_A_TIME = 8, 32, 128
-#: Every other byte of a word, and the factor that adds its four numbers of 16 bits up in the topmost.
-_EVEN, _ADD = np.uint64(0x00FF00FF00FF00FF), np.uint64(0x0001000100010001)
+#: Pixels of eight bits in a half word, half words whose sum 16 bits hold, and rows that fit the cache at a time.
+_HALF, _MOST_HALVES, _ROWS_AT_A_TIME = 4, 64, 128
+#: Pixels from which cells are whole half words: narrower strips would show what is beside them.
+_FROM_HALVES = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +74,7 @@ def sample_strips(frame: Frame, strips: StripMap) -> Float32Array:
     pixels = frame.pixels[strips.first_row : strips.first_row + n_rows]
     pixels = pixels[:, : frame.width // strips.cell_px * strips.cell_px]
     if _has_words(frame, strips.cell_px):
-        cells = _sums_of_words(pixels.view(np.uint64), strips.cell_px // _WORD)
+        cells = _sums(pixels, strips.cell_px)
     else:
         cells = cv2.resize(pixels, (pixels.shape[1] // strips.cell_px, n_rows), interpolation=cv2.INTER_AREA)
     values = cv2.remap(cells, *strips.places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -81,14 +82,16 @@ def sample_strips(frame: Frame, strips: StripMap) -> Float32Array:
 
 
 def _cell_px(wanted: float, frame: Frame) -> int:
-    """Width of a cell: whole words where that is about as many pixels, for they are added up more quickly."""
-    words = min(round(wanted / _WORD), _MOST_WORDS)
-    return words * _WORD if words and _has_words(frame, words * _WORD) else max(int(wanted), 1)
+    """Width of a cell: whole half words where there are some, for they are added up more quickly."""
+    halves = min(round(wanted / _HALF), _MOST_HALVES)
+    if wanted < _FROM_HALVES or not _has_words(frame, halves * _HALF):
+        return max(int(wanted), 1)
+    return halves * _HALF
 
 
 def _has_words(frame: Frame, cell_px: int) -> bool:
-    """Whether cells are whole words, which are added up; of others the mean is taken."""
-    return frame.pixels.dtype == np.uint8 and frame.pixels.strides[1] == 1 and cell_px % _WORD == 0
+    """Whether cells are whole words or half words, which are added up; of others the mean is taken."""
+    return frame.pixels.dtype == np.uint8 and frame.pixels.strides[1] == 1 and cell_px % _HALF == 0
 
 
 def _light_of_values(frame: Frame, light_of: Callable[[FloatArray], FloatArray], scale: int) -> Float32Array:
@@ -98,17 +101,23 @@ def _light_of_values(frame: Frame, light_of: Callable[[FloatArray], FloatArray],
     return np.asarray(coded if frame.linear else light_of(coded), np.float32)
 
 
-def _sums_of_words(words: NDArray[np.uint64], n: int) -> NDArray[np.uint16]:
-    """(R, W) words of eight pixels each -> (R, W / n) sums of the pixels of `n` words.
+def _sums(pixels: NDArray[Any], cell_px: int) -> NDArray[np.uint16]:
+    """(R, W) pixels -> (R, W / cell_px) sums over cells, a multiple of four pixels wide.
 
-    A word's odd and even pixels are added as four numbers of 16 bits at a time, then these four by one multiplication.
+    The odd and the even bytes of a word are added as two or four numbers of 16 bits at a time, then these by one
+    multiplication, which leaves their sum in the topmost.
     """
+    word: Any = np.uint32 if cell_px % 8 else np.uint64
+    size = 4 if cell_px % 8 else 8
+    n, every_byte = cell_px // size, (1 << 8 * size) - 1
+    even, add = word(0x00FF00FF00FF00FF & every_byte), word(0x0001000100010001 & every_byte)
+    words: NDArray[Any] = pixels.view(word)
     sums = np.empty((words.shape[0], words.shape[1] // n), np.uint16)
     for top in range(0, words.shape[0], _ROWS_AT_A_TIME):
         some = words[top : top + _ROWS_AT_A_TIME]
-        pairs = (some & _EVEN) + ((some >> np.uint64(8)) & _EVEN)
+        pairs = (some & even) + ((some >> word(8)) & even)
         cells = pairs[:, ::n].copy()
-        for word in range(1, n):
-            cells += pairs[:, word::n]
-        sums[top : top + _ROWS_AT_A_TIME] = (cells * _ADD) >> np.uint64(48)
+        for place in range(1, n):
+            cells += pairs[:, place::n]
+        sums[top : top + _ROWS_AT_A_TIME] = (cells * add) >> word(8 * size - 16)
     return sums
