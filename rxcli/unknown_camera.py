@@ -19,6 +19,12 @@ _MORE_DOUBT, _LEAST_DOUBT = 1.2, 0.01
 _HEADERS_AT_LEAST = 80.0
 #: Symbols' mean log probability counts so many times beside the headers: half a packet has headers, but no symbols.
 _SAY_OF_SYMBOLS = 40.0
+#: An estimate with rivals that scores less, nats, is none: its headers are not where they should be.
+_LEAST_SCORE = -200.0
+_NO_HEADERS = (
+    "there are stripes but no packet header where it should be; the screen may show less than one packet (move "
+    "closer), the picture may be merged from several exposures (switch HDR off), or the screen is none of those tried"
+)
 
 
 def likely_camera(
@@ -36,8 +42,8 @@ def likely_camera(
         headers, symbols = _look(frame, corners, *rival, stages)
         if headers > _HEADERS_AT_LEAST and headers + symbols > most:
             best, most = rival, headers + symbols
-    if best is None:
-        raise Failure("no_signal", found.reason)
+    if best is None or -np.inf < most < _LEAST_SCORE:
+        raise Failure("no_signal", found.reason or _NO_HEADERS)
     return best
 
 

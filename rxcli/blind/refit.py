@@ -34,6 +34,8 @@ _LOCAL_SLOTS = 25.0
 _BENT_CHI_SQUARE = 120.0
 #: Slots that explain less of the light's local variance were decoded on a wrong clock.
 _LEAST_EXPLAINED = 0.1
+#: The share is of weights that go with the residuals: it may fall a little where the fit is better.
+_NOT_LESS = 0.97
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,7 @@ class _Fit:
 def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Array) -> tuple[BlindEstimate, float]:
     """The estimate from decoded slots, and how far it moves the clock anywhere on the screen, in slots.
 
-    The estimate comes back as it was, moved by nothing, where the slots explain little light, or no more with another.
+    The estimate comes back as it was, moved by nothing, where the slots explain little light, or less with another.
 
     Args:
         strips: as the picture has them.
@@ -66,7 +68,7 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
     if not corrected:
         before = fit.explained_first
         fit = replace(_fit(ordered, first * FLAT, lit, fit.exposure_slots, 2), explained_first=before)
-    if fit.explained <= max(fit.explained_first, _LEAST_EXPLAINED):
+    if fit.explained < max(_NOT_LESS * fit.explained_first, _LEAST_EXPLAINED):
         return estimate, 0.0
     terms = time_terms(ordered)
     moved = np.abs(slot_time(ordered, terms, fit.values) - slot_time(ordered, terms, first)) * ordered.inside
