@@ -24,7 +24,15 @@ from rxcli.dump import dump_stages
 from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock, sample_columns
 from rxcli.options import ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS
-from rxcli.reception import CERTAIN, HOPELESS_WEIGHT, Reception, decode, quick_look, second_opinion
+from rxcli.reception import (
+    CERTAIN,
+    HOPELESS_WEIGHT,
+    Reception,
+    decode,
+    doubtful_columns,
+    quick_look,
+    second_opinion,
+)
 from rxcli.types import (
     BurstPosteriors,
     Clock,
@@ -44,6 +52,8 @@ _HELD, _HELD_LONG = 6, 24
 _WELL_LIT_SNR, _DOUBTFUL, _MUCH_DOUBT = 10.0, -0.05, 0.03
 #: Squared contrast over variance of a slot, at which all copies of a packet together do not give one.
 _DARK_SNR = 0.5
+#: Share of columns that a quick look at a first frame may leave in doubt.
+_QUICK_DOUBT = 0.5
 #: Strips of a column, at most: more tell no more of a picture that is known, and take time.
 _STRIPS = 4
 #: Frames beyond which each one's share of what is known of the picture does not matter.
@@ -313,11 +323,13 @@ class _Clip:
     ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
         """What is received at a lock, columns that the auto-encoder changed, and its report.
 
-        A quick look is enough of a frame that is looked at `again` when the picture is known.
+        A quick look that leaves little doubt is enough of a frame that is looked at `again` when the picture is known.
         """
         if again and self._options.cae != "always":
             with stages("detect"):
-                return quick_look(lock), frozenset(), None
+                seen = quick_look(lock)
+                if doubtful_columns(seen).size <= _QUICK_DOUBT * seen.snr.shape[0]:
+                    return seen, frozenset(), None
         with stages("detect"):
             seen = decode(lock, self._options.skip)
         with stages("denoise"):
