@@ -9,8 +9,8 @@ from threading import Condition, Thread
 
 from rxcli.types import Frame
 
-#: What may wait: pixels of so many bytes, but at least so many frames.
-_MOST_BYTES, _LEAST_FRAMES = 100_000_000, 2
+#: What may wait: pixels of so many bytes, and so many frames at least and at most.
+_MOST_BYTES, _LEAST_FRAMES, _MOST_FRAMES = 100_000_000, 2, 16
 
 
 def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:
@@ -63,7 +63,8 @@ class _Shelf:
 
     @property
     def _has_room(self) -> bool:
-        return len(self._frames) < _LEAST_FRAMES or self._bytes < _MOST_BYTES
+        n = len(self._frames)
+        return n < _LEAST_FRAMES or (n < _MOST_FRAMES and self._bytes < _MOST_BYTES)
 
     def take(self) -> Frame | None:
         """Wait for the next frame; None after the last one.
