@@ -66,11 +66,11 @@ def _log_sum(values: FloatArray, axis: int) -> FloatArray:
     return np.asarray((top + np.log(np.exp(values - top).sum(axis=axis, keepdims=True))).squeeze(axis))
 
 
-def _log_sum_of_few(values: FloatArray) -> FloatArray:
-    """`_log_sum` over a short last axis, where adding slices is quicker than a reduction."""
+def _over_few(combine: np.ufunc, values: FloatArray) -> FloatArray:
+    """Sum or maximum over a short last axis, where going by slices is quicker than a reduction."""
     total = values[..., 0]
     for number in range(1, values.shape[-1]):
-        total = np.logaddexp(total, values[..., number])
+        total = combine(total, values[..., number])
     return total
 
 
@@ -148,11 +148,12 @@ def slot_llr(metrics: FloatArray) -> Float32Array:
     memory = _memory_of(metrics)
     n_slots = metrics.shape[-2] - memory
     total = np.zeros((*metrics.shape[:-2], n_slots))
+    likelihood = np.exp(metrics - _over_few(np.maximum, metrics)[..., None])
     for age in range(memory + 1):
         # Bit `age` of the pattern's number is the slot `age` slots ago.
-        split = metrics[..., age : age + n_slots, :].reshape(*total.shape, -1, 2, 1 << age)
-        dark, lit = (split[..., state, :].reshape(*total.shape, -1) for state in (0, 1))
-        total += _log_sum_of_few(lit) - _log_sum_of_few(dark)
+        split = likelihood[..., age : age + n_slots, :].reshape(*total.shape, -1, 2, 1 << age)
+        dark, lit = (_over_few(np.add, split[..., state, :].reshape(*total.shape, -1)) for state in (0, 1))
+        total += np.log((lit + _TINY) / (dark + _TINY))
     return total.astype(np.float32)
 
 
