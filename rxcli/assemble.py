@@ -24,13 +24,10 @@ from rxcli.types import (
 
 #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
 MAX_BER_HAT = 0.1
-#: From the log-odds of the posterior to those of being error-free: offset, slope below zero and slope above it; where
-#: the auto-encoder was asked in no column, where its corrections were not kept, and where they were.
-_CALIBRATION: dict[bool | None, tuple[float, float, float]] = {
-    None: (1.77, 0.45, 0.45),
-    False: (2.49, 0.54, 0.54),
-    True: (-0.578, 1.085, 0.578),
-}
+#: From the log-odds of the posterior to those of being error-free: offset, slope up to the bend and slope beyond it;
+#: where corrections of the auto-encoder were not kept, and where they were.
+_CALIBRATION = {False: (2.486, 0.592, 0.839), True: (-1.019, 0.81, 0.247)}
+_BEND = 4.0
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
 _CLIP_CALIBRATION = (0.103, 0.477, -0.83)
@@ -63,7 +60,7 @@ def column_results(
     snr: Float32Array,
     samples: SlotSamples,
     min_confidence: float,
-    denoised: frozenset[int] | None = None,
+    denoised: frozenset[int] = frozenset(),
 ) -> tuple[ColumnResult, ...]:
     """Results of every column.
 
@@ -73,7 +70,7 @@ def column_results(
         snr: (C, N) squared contrast over variance of every slot of the grid.
         samples: the samples, for what was visible.
         min_confidence: packets below it are left out.
-        denoised: columns in which corrections of the auto-encoder were kept; None where it did not run.
+        denoised: columns in which corrections of the auto-encoder were kept.
     """
     seen = slots_seen(samples, clock)
     whole = complete(seen)
@@ -91,7 +88,7 @@ def column_results(
             whole[:, column],
             against[column],
             min_confidence,
-            None if denoised is None else column in denoised,
+            column in denoised,
         )
         for column, db in enumerate(snr_db)
     )
@@ -240,7 +237,7 @@ def _column_result(
     whole: BoolArray,
     against: str | None,
     min_confidence: float,
-    denoised: bool | None,
+    denoised: bool,
 ) -> ColumnResult:
     bursts = () if against else np.flatnonzero(whole)
     found = [_packet(int(burst), column, clock, posteriors, seen[burst], denoised=denoised) for burst in bursts]
@@ -252,7 +249,7 @@ def _column_result(
         status=status,
         w=int(posteriors.w[column]) if packets or sure_of_w else None,
         snr_db=snr_db,
-        denoised=bool(denoised),
+        denoised=denoised,
         delay_slots=float(clock.delay_slots[column]),
         packets=packets,
         message=None if packets else against or _why_none(status, snr_db, int(seen.sum()), clock),
@@ -324,7 +321,7 @@ def _packet(
     seen: IntArray,
     number: int | None = None,
     frames: tuple[int, ...] | None = None,
-    denoised: bool | None = None,
+    denoised: bool = False,
 ) -> PacketResult | None:
     """The packet of one burst, None where too many bits are uncertain; `seen` is (packet,)."""
     w = int(posteriors.w[column])
@@ -345,7 +342,7 @@ def _packet(
     )
 
 
-def _calibrated(log_prob: float, denoised: bool | None) -> float:
+def _calibrated(log_prob: float, denoised: bool) -> float:
     """Share of error-free packets among those whose symbols' log probabilities add up to `log_prob`.
 
     The light model's likelihoods are tempered, since strips and samples err together; what is left of that is a line
@@ -354,7 +351,7 @@ def _calibrated(log_prob: float, denoised: bool | None) -> float:
     """
     offset, below, above = _CALIBRATION[denoised]
     log_odds = _log_odds(log_prob)
-    return _probability(offset + below * min(log_odds, 0.0) + above * max(log_odds, 0.0))
+    return _probability(offset + below * min(log_odds, _BEND) + above * max(log_odds - _BEND, 0.0))
 
 
 def _log_odds(log_prob: float) -> float:

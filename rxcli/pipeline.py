@@ -90,9 +90,8 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
             dump_frame(
                 options.dump_dir, frame, corners, lock.profiles, seen.clock, seen.samples, seen.metrics, seen.posteriors
             )
-        kept = denoised if report and report["columns"] else None
         columns = assemble.column_results(
-            seen.clock, seen.posteriors, seen.snr, seen.samples, options.min_confidence, kept
+            seen.clock, seen.posteriors, seen.snr, seen.samples, options.min_confidence, denoised
         )
         if camera.reversed:
             columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
