@@ -137,7 +137,7 @@ def test_slots_off_the_screen_are_not_seen() -> None:
     assert assemble.slots_seen(samples, now)[0, 1, :12].tolist() == [2] * 10 + [1] * 2
 
 
-@pytest.mark.parametrize(("min_confidence", "n_packets"), [(0.0, 1), (0.6, 1), (0.95, 0), (1.0, 0)])
+@pytest.mark.parametrize(("min_confidence", "n_packets"), [(0.0, 1), (0.6, 1), (0.99, 0), (1.0, 0)])
 def test_packets_below_the_confidence_asked_for(min_confidence: float, n_packets: int) -> None:
     posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.9)
     columns = assemble.column_results(
