@@ -24,10 +24,10 @@ from rxcli.types import (
 
 #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
 MAX_BER_HAT = 0.1
-#: From the log-odds of the posterior to those of being error-free: offset, slope up to the bend and slope beyond it;
-#: where corrections of the auto-encoder were not kept, and where they were.
-_CALIBRATION = {False: (2.486, 0.592, 0.839), True: (-1.019, 0.81, 0.247)}
-_BEND = 4.0
+#: Log-odds of the posterior, and those of being error-free that go with them, where corrections of the auto-encoder
+#: were not kept, and where they were; straight lines run between.
+_POSTERIOR_ODDS = (-14.0, 0.0, 4.0, 22.0)
+_CALIBRATION = {False: (-3.51, 1.97, 4.97, 17.2), True: (-14.1, -0.92, 2.34, 6.21)}
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
 _CLIP_CALIBRATION = (0.103, 0.477, -0.83)
@@ -345,13 +345,11 @@ def _packet(
 def _calibrated(log_prob: float, denoised: bool) -> float:
     """Share of error-free packets among those whose symbols' log probabilities add up to `log_prob`.
 
-    The light model's likelihoods are tempered, since strips and samples err together; what is left of that is a line
-    between log-odds with one bend, fitted to packets of `rxcli.benchmark.confidence`. Whatever changes the likelihoods
-    of the light model or the auto-encoder asks for a new fit.
+    The light model's likelihoods are tempered, since strips and samples err together; what is left of that is fitted
+    to packets of `rxcli.benchmark.confidence`. Whatever changes the likelihoods of the light model or the auto-encoder
+    asks for a new fit.
     """
-    offset, below, above = _CALIBRATION[denoised]
-    log_odds = _log_odds(log_prob)
-    return _probability(offset + below * min(log_odds, _BEND) + above * max(log_odds - _BEND, 0.0))
+    return _probability(float(np.interp(_log_odds(log_prob), _POSTERIOR_ODDS, _CALIBRATION[denoised])))
 
 
 def _log_odds(log_prob: float) -> float:
