@@ -25,7 +25,6 @@ from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corner
 from rxcli.options import ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS
 from rxcli.reception import (
-    CERTAIN,
     HOPELESS_WEIGHT,
     Reception,
     decode,
@@ -46,6 +45,8 @@ from rxcli.types import (
 )
 
 #: Frames at the start that are looked at once more when the picture is known better; and where many columns that are
+#: A burst of a column all of whose symbols have at least this log probability is not decoded again.
+_CERTAIN = -1e-4
 #: well lit are still in doubt, for compression has taken much, how many are waited for.
 _HELD, _HELD_LONG = 6, 24
 #: Squared contrast over variance of a slot that is well lit, log probability of a packet in doubt, and much doubt.
@@ -651,7 +652,7 @@ class _Clip:
         if unknown.any():
             candidates[unknown] = detect.plausible_weights(metrics[:, unknown], HOPELESS_WEIGHT)
         posteriors = detect.detect(metrics, candidates)
-        certain = posteriors.log_prob.min(axis=2) >= CERTAIN
+        certain = posteriors.log_prob.min(axis=2) >= _CERTAIN
         self._bursts.note(numbers[bursts], columns, posteriors, certain)
         self._note_weights(columns, posteriors, certain)
 

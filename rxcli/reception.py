@@ -18,8 +18,9 @@ from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSa
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
 _COARSE, _FINE = 2, 4
 _MAX_ITERATIONS = 3
-#: A column all of whose symbols have at least this log probability is not looked at again.
-CERTAIN = -1e-4
+#: A column all of whose symbols have at least this log probability is not looked at again. Of 1192 packets that a quick
+#: look leaves so 3 are wrong, with a tenth of this 2 of 1039; in depth no more are right.
+_CERTAIN = -1e-3
 #: A column whose slots stand out less than this has no light to speak of.
 _DARK_SNR_DB = -3.0
 #: Weights that a quick look finds this much less likely than the best are dropped, nats.
@@ -66,7 +67,7 @@ def decode(lock: Lock, skip: frozenset[str]) -> Reception:
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
     """
     seen = quick_look(lock)
-    doubtful = _doubtful(seen, CERTAIN) if "certain_columns" in skip else np.ones(seen.snr.shape[0], bool)
+    doubtful = _doubtful(seen, _CERTAIN) if "certain_columns" in skip else np.ones(seen.snr.shape[0], bool)
     if not doubtful.any():
         return replace(seen, skipped={"certain_columns": seen.snr.shape[0]})
     lock = lock.in_depth(np.flatnonzero(doubtful))
@@ -101,7 +102,7 @@ def iterate(lock: Lock, seen: Reception, skip: frozenset[str]) -> Reception:
     """
     every = np.ones(seen.snr.shape[0], bool)
     wanted = ~_dark(seen.snr) if "dark_columns" in skip else every
-    doubtful = _doubtful(seen, CERTAIN) if "certain_columns" in skip else every
+    doubtful = _doubtful(seen, _CERTAIN) if "certain_columns" in skip else every
     skipped = {"dark_columns": int((~wanted).sum()), "certain_columns": 0}
     for iteration in range(_MAX_ITERATIONS):
         columns = np.flatnonzero(wanted & doubtful)
@@ -181,7 +182,7 @@ def _unsettled(seen: Reception, before: NDArray[np.int64], iteration: int, skip:
     """(C,) which columns are worth another iteration."""
     if "certain_columns" not in skip:
         return np.ones(seen.snr.shape[0], bool)
-    doubtful = _doubtful(seen, CERTAIN)
+    doubtful = _doubtful(seen, _CERTAIN)
     index = seen.posteriors.index
     if iteration and before.shape == index.shape:
         # What does not change any more will not do so later.
