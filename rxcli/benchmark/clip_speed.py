@@ -125,6 +125,7 @@ def options_for(camera: str, screen: str) -> ReceiverOptions:
 
 def measure(clip: Path, options: ReceiverOptions, runs: int) -> Speed:
     """The quickest of `runs` bare decodes and receptions by turns."""
+    from rxcli.benchmark.stages import bare_video
     from rxcli.ingest import open_source
     from rxcli.pipeline import receive
 
@@ -132,7 +133,7 @@ def measure(clip: Path, options: ReceiverOptions, runs: int) -> Speed:
         return sum(1 for _ in receive(open_source(clip), options))
 
     n_frames, duration_s = _extent(clip)
-    turns = [(_timed(lambda: _decode(clip)), _timed(received)) for _ in range(runs)]
+    turns = [(_timed(lambda: bare_video(clip, threaded=True)), _timed(received)) for _ in range(runs)]
     bare, whole = ((min(t[0] for t in one), min(t[1] for t in one)) for one in zip(*turns, strict=True))
     return Speed(clip.name, n_frames, duration_s, bare, whole)
 
@@ -145,17 +146,6 @@ def _extent(clip: Path) -> tuple[int, float]:
         video = container.streams.video[0]
         n_frames = sum(packet.size > 0 for packet in container.demux(video))
         return n_frames, n_frames / float(video.average_rate)
-
-
-def _decode(clip: Path) -> int:
-    """The bare decode: every luma plane as a view."""
-    import av
-    import numpy as np
-
-    with av.open(str(clip)) as container:
-        video = container.streams.video[0]
-        video.codec_context.thread_type, video.codec_context.thread_count = "FRAME", 0
-        return sum(np.frombuffer(frame.planes[0], np.uint8).size > 0 for frame in container.decode(video))
 
 
 def _timed(work: Callable[[], object]) -> tuple[float, float]:

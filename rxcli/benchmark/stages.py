@@ -114,7 +114,7 @@ def bare_decode(path: Path) -> Callable[[], int]:
     """A function that decodes the file on one thread, nothing else, and returns the number of frames."""
     if path.suffix == ".dng":
         return lambda: _bare_raw(path)
-    return (lambda: _bare_video(path)) if path.suffix == ".mp4" else lambda: _bare_jpeg(path)
+    return (lambda: bare_video(path)) if path.suffix == ".mp4" else lambda: _bare_jpeg(path)
 
 
 def _bare_jpeg(path: Path) -> int:
@@ -131,13 +131,14 @@ def _bare_raw(path: Path) -> int:
         return int(raw.raw_image.ndim > 0)
 
 
-def _bare_video(path: Path) -> int:
+def bare_video(path: Path, *, threaded: bool = False) -> int:
+    """Decode every luma plane as a view, on one thread or on as many as FFmpeg takes; returns the number of frames."""
     import av
     import numpy as np
 
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        stream.thread_type, stream.codec_context.thread_count = "NONE", 1
+        stream.thread_type, stream.codec_context.thread_count = ("FRAME", 0) if threaded else ("NONE", 1)
         return sum(np.frombuffer(frame.planes[0], np.uint8).size > 0 for frame in container.decode(stream))
 
 
