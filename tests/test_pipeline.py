@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rxcli import reception
+from rxcli.benchmark.trial import simulate_trial
 from rxcli.locate import Stages, find_camera, find_corners, find_lock
 from rxcli.pipeline import ReceiverOptions, receive
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
@@ -364,3 +366,19 @@ def test_stages_are_timed() -> None:
     timing = received(frame_of(taken), options_for(taken)).timing_ms
     assert {"geometry", "sampling", "clock", "detect", "total"} <= timing.keys()
     assert timing["total"] >= max(value for name, value in timing.items() if name != "total")
+
+
+def test_rows_that_developing_mixes_are_told_from_the_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 1.7 rows a slot demosaicing blurs a slot more than an exposure of 0.4 slots does."""
+    base = preset("phone-plain", "paper-17k3")
+    scene = base.scaled(700 / base.sensor.width, 1.7 / base.rows_per_slot, keep_readout=True)
+    exposure_s = 0.4 / scene.screen.slot_rate_hz
+    light = scene.light_e_per_s * scene.exposure_s / exposure_s
+    trial = simulate_trial(replace(scene, exposure_s=exposure_s, light_e_per_s=light, picture="coffee", n_frames=1), 0)
+    _, told = trial.receive(trial.options(cae="never"))
+    monkeypatch.setattr(reception, "_MIXED_ROWS", (0.0,))
+    _, nominal = trial.receive(trial.options(cae="never"))
+    assert told.expected == 20
+    assert told.error_free >= 15
+    assert told.false == 0
+    assert nominal.error_free <= told.error_free / 2
