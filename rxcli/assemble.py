@@ -24,10 +24,11 @@ from rxcli.types import (
 
 #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
 MAX_BER_HAT = 0.1
-#: Log-odds of the posterior, and those of being error-free that go with them, where corrections of the auto-encoder
-#: were not kept, and where they were; straight lines run between.
-_POSTERIOR_ODDS = (-14.0, 0.0, 4.0, 22.0)
-_CALIBRATION = {False: (-3.51, 1.97, 4.97, 17.2), True: (-14.1, -0.92, 2.34, 6.21)}
+#: Log-odds of being error-free: offset, and slopes of the posterior's log-odds up to a bend and beyond it, of whether
+#: corrections of the auto-encoder were kept, and of the logarithms of what payload slots say against the packet, all
+#: together, and of what half of them say for it at least, nats.
+_CALIBRATION = (2.95, 0.79, 0.28, -0.72, -0.85, -0.82)
+_BEND = 4.0
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
 _CLIP_CALIBRATION = (0.103, 0.477, -0.83)
@@ -59,6 +60,7 @@ def column_results(
     posteriors: BurstPosteriors,
     snr: Float32Array,
     samples: SlotSamples,
+    support: Float32Array,
     min_confidence: float,
     denoised: frozenset[int] = frozenset(),
 ) -> tuple[ColumnResult, ...]:
@@ -68,12 +70,14 @@ def column_results(
         clock: the clock.
         posteriors: of B bursts and C columns.
         snr: (C, N) squared contrast over variance of every slot of the grid.
+        support: (C, N) what the light says for every slot as decided, see `detect.slot_support`.
         samples: the samples, for what was visible.
         min_confidence: packets below it are left out.
         denoised: columns in which corrections of the auto-encoder were kept.
     """
     seen = slots_seen(samples, clock)
     whole = complete(seen)
+    payload = _payload_slots(clock)
     snr_db = _snr_db_of_columns(snr)
     headerless = posteriors.header_llr.sum(axis=0) < (_CONTRADICTED if _headers_show(posteriors) else np.inf)
     echoes: BoolArray = np.any(_echoes(posteriors, snr_db) & whole, axis=0)
@@ -86,12 +90,21 @@ def column_results(
             db,
             seen[:, column],
             whole[:, column],
+            support[column] * payload,
             against[column],
             min_confidence,
             column in denoised,
         )
         for column, db in enumerate(snr_db)
     )
+
+
+def _payload_slots(clock: Clock) -> BoolArray:
+    """(B, N) which slots of the grid are payload of each burst's packet."""
+    slot = np.arange(clock.first_slot, clock.first_slot + clock.n_slots)
+    payload = slot % clock.packet_slots >= PREAMBLE_SLOTS
+    bursts = np.arange(int(clock.burst.max()) + 1)
+    return np.asarray(payload & (clock.burst[slot // clock.packet_slots] == bursts[:, None]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +119,8 @@ class BurstInClip:
     #: (C, packet) how often each slot was seen, over all frames.
     seen: IntArray
     frames: tuple[int, ...]
+    #: (C, payload) what the light says for every slot as decided, see `detect.slot_support`.
+    support: Float32Array
     #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
     #: received like photographs.
     against: Float32Array | None = None
@@ -235,12 +250,16 @@ def _column_result(
     snr_db: float | None,
     seen: IntArray,
     whole: BoolArray,
+    support: Float32Array,
     against: str | None,
     min_confidence: float,
     denoised: bool,
 ) -> ColumnResult:
     bursts = () if against else np.flatnonzero(whole)
-    found = [_packet(int(burst), column, clock, posteriors, seen[burst], denoised=denoised) for burst in bursts]
+    found = [
+        _packet(int(burst), column, clock, posteriors, seen[burst], support[burst], denoised=denoised)
+        for burst in bursts
+    ]
     packets = tuple(packet for packet in found if packet and packet.confidence >= min_confidence)
     sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
@@ -302,7 +321,8 @@ def _clip_packet(column: int, clock: Clock, burst: BurstInClip) -> PacketResult 
     What slots say against the codeword that was decided shows it.
     """
     posteriors = burst.posteriors
-    packet = _packet(0, column, clock, posteriors, burst.seen[column], burst.number, burst.frames)
+    seen, support = burst.seen[column], burst.support[column]
+    packet = _packet(0, column, clock, posteriors, seen, support, burst.number, burst.frames)
     if packet is None or burst.against is None:
         return packet
     log_odds = _log_odds(float(posteriors.log_prob[0, column].sum()))
@@ -319,37 +339,54 @@ def _packet(
     clock: Clock,
     posteriors: BurstPosteriors,
     seen: IntArray,
+    support: Float32Array,
     number: int | None = None,
     frames: tuple[int, ...] | None = None,
     denoised: bool = False,
 ) -> PacketResult | None:
-    """The packet of one burst, None where too many bits are uncertain; `seen` is (packet,)."""
+    """The packet of one burst, None where too many bits are uncertain.
+
+    `seen` is (packet,), `support` that of its payload slots in any order, 0 where nothing is seen.
+    """
     w = int(posteriors.w[column])
     llr = posteriors.bit_llr[burst, column, :, : bits_per_symbol(w)]
     ber_hat = float(np.mean(1 / (1 + np.exp(np.abs(llr)))))
     if ber_hat > MAX_BER_HAT:
         return None
     bits = indices_to_bits(posteriors.index[burst, column], w)
+    evidence = _evidence(float(posteriors.log_prob[burst, column].sum()), support, denoised)
     return PacketResult(
         first_row=_header_row(int(np.flatnonzero(clock.burst == burst)[0]), column, clock),
         copies=float(seen.sum() / clock.packet_slots),
         payload_bits=int(bits.size),
         payload=bits_to_hex(bits),
-        confidence=_calibrated(float(posteriors.log_prob[burst, column].sum()), denoised),
+        confidence=_probability(float(np.dot(_CALIBRATION, evidence))),
         ber_hat=ber_hat,
         burst=number,
         frames=frames,
+        evidence=evidence,
     )
 
 
-def _calibrated(log_prob: float, denoised: bool) -> float:
-    """Share of error-free packets among those whose symbols' log probabilities add up to `log_prob`.
+def _evidence(log_prob: float, support: Float32Array, denoised: bool) -> tuple[float, ...]:
+    """What the confidence of a packet is made of, in the order of `_CALIBRATION`.
 
-    The light model's likelihoods are tempered, since strips and samples err together; what is left of that is fitted
-    to packets of `rxcli.benchmark.confidence`. Whatever changes the likelihoods of the light model or the auto-encoder
-    asks for a new fit.
+    The light model's likelihoods are tempered, since strips and samples err together; still they are too sure where
+    picture or camera are not as the model has them. There single slots speak against the packet. The weights are a
+    logistic regression on packets of `rxcli.benchmark.confidence`; whatever changes the likelihoods of the light model
+    or the auto-encoder asks for a new fit.
+
+    Args:
+        log_prob: log probabilities of its symbols, added.
+        support: what the light says for every payload slot as decided, nats; 0 where nothing is seen.
+        denoised: whether corrections of the auto-encoder were kept.
     """
-    return _probability(float(np.interp(_log_odds(log_prob), _POSTERIOR_ODDS, _CALIBRATION[denoised])))
+    log_odds = _log_odds(log_prob)
+    heard = support[support != 0]
+    against = float(-heard[heard < 0].sum())
+    most = max(float(np.median(heard)), 1.0) if heard.size else 1.0
+    low, high = min(log_odds, _BEND), max(log_odds - _BEND, 0.0)
+    return 1.0, low, high, float(denoised), log(against + _AGAINST_AT_LEAST), log(most)
 
 
 def _log_odds(log_prob: float) -> float:

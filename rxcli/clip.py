@@ -808,7 +808,9 @@ class _Clip:
             going_on = np.intersect1d(waiting.numbers, following.numbers)
         first = waiting.numbers[0]
         ended = [
-            assemble.BurstInClip(b.number, int(b.number - first), b.posteriors, b.seen, b.frames, _against(b))
+            assemble.BurstInClip(
+                b.number, int(b.number - first), b.posteriors, b.seen, b.frames, _support(b), _against(b)
+            )
             for b in self._bursts.close(np.setdiff1d(waiting.numbers, going_on))
         ]
         known = [p for p in (self._bursts.known(int(n)) for n in going_on if self._bursts.is_open(int(n))) if p]
@@ -874,6 +876,11 @@ def _bursts_of(frame: Frame, seen: Reception) -> tracking.FrameBursts:
     by_copy = replace(seen.clock, burst=np.arange(seen.clock.n_copies))
     shown = np.minimum(assemble.slots_seen(seen.samples, by_copy), 1)
     return tracking.FrameBursts(frame.index, 0, seen.clock, seen.metrics, shown)
+
+
+def _support(burst: tracking.ClosedBurst) -> Float32Array:
+    """(C, payload) what the light says for every slot as decided, all copies and frames together."""
+    return detect.slot_support(burst.metrics, burst.posteriors.lit[0] > 0.5)[:, PREAMBLE_SLOTS:]
 
 
 def _against(burst: tracking.ClosedBurst) -> Float32Array | None:

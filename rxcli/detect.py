@@ -157,6 +157,28 @@ def slot_llr(metrics: FloatArray) -> Float32Array:
     return total.astype(np.float32)
 
 
+def slot_support(metrics: FloatArray, decided: NDArray[np.bool_]) -> Float32Array:
+    """What the light says for every slot as decided against the other way, all other slots as decided, nats.
+
+    It is what a single slot has to say; a packet may be sure as a whole and yet have slots that say much against it.
+
+    Args:
+        metrics: (..., N + memory, patterns).
+        decided: (..., N) whether each slot is lit; those around them are taken to be dark.
+
+    Returns:
+        (..., N) float32, 0 where nothing is seen.
+    """
+    memory, n_slots = _memory_of(metrics), decided.shape[-1]
+    around = [(0, 0)] * (decided.ndim - 1)
+    pattern = _pattern_index(np.pad(decided, [*around, (memory, memory)]).astype(np.uint8), memory)
+    support = np.zeros(decided.shape)
+    for age in range(memory + 1):
+        seen, shown = metrics[..., age : age + n_slots, :], pattern[..., age : age + n_slots, None]
+        support += (np.take_along_axis(seen, shown, -1) - np.take_along_axis(seen, shown ^ (1 << age), -1))[..., 0]
+    return support.astype(np.float32)
+
+
 def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
     """Weights that stand up to a quick look, (C, 9): the best one and those within `margin` nats of it.
 

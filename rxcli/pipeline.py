@@ -19,7 +19,7 @@ from rxcli import assemble, denoise
 from rxcli.dump import dump_frame
 from rxcli.locate import Camera, Failure, Stages, find_camera, find_corners, find_lock, too_small
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
-from rxcli.reception import decode, doubtful_columns, second_opinion
+from rxcli.reception import decode, doubtful_columns, second_opinion, support
 from rxcli.types import Frame, FrameResult
 from rxcli.unknown_camera import likely_camera, with_refitted_camera
 
@@ -91,7 +91,7 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
                 options.dump_dir, frame, corners, lock.profiles, seen.clock, seen.samples, seen.metrics, seen.posteriors
             )
         columns = assemble.column_results(
-            seen.clock, seen.posteriors, seen.snr, seen.samples, options.min_confidence, denoised
+            seen.clock, seen.posteriors, seen.snr, seen.samples, support(seen), options.min_confidence, denoised
         )
         if camera.reversed:
             columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)

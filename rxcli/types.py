@@ -214,6 +214,8 @@ class PacketResult:
     burst: int | None = None
     #: Frames of the clip in which the burst was seen; None for stills.
     frames: tuple[int, ...] | None = None
+    #: What the confidence was made of, see `rxcli.assemble`; for fits, not for reports.
+    evidence: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

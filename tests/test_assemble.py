@@ -67,12 +67,23 @@ def snr(n_slots: int, value: float = 100.0, n_columns: int = 2) -> NDArray[np.fl
     return np.full((n_columns, n_slots), value, np.float32)
 
 
+def results_of(
+    now: Clock,
+    posteriors: BurstPosteriors,
+    snr: NDArray[np.float32],
+    samples: SlotSamples,
+    min_confidence: float = 0.0,
+    support: float | NDArray[np.float32] = 10.0,
+) -> tuple[ColumnResult, ...]:
+    """Results where every slot of the grid has the same support unless told otherwise."""
+    told = np.broadcast_to(np.asarray(support, np.float32), snr.shape)
+    return assemble.column_results(now, posteriors, snr, samples, told, min_confidence)
+
+
 def test_a_sure_packet() -> None:
     w = [5, 8]
     index = indices(w)
-    columns = assemble.column_results(
-        clock_of(120, 30, [0, 0, 0]), posteriors_of(w, index), snr(120), samples_of(120), 0
-    )
+    columns = results_of(clock_of(120, 30, [0, 0, 0]), posteriors_of(w, index), snr(120), samples_of(120), 0)
     assert [c.status for c in columns] == ["ok", "ok"]
     assert [c.column for c in columns] == [0, 1]
     assert [c.w for c in columns] == w
@@ -91,7 +102,7 @@ def test_a_sure_packet() -> None:
 
 def test_first_row_is_where_the_exposure_of_the_header_starts() -> None:
     """Grid slot 0 is slot 30 of its packet; row0 has it in the middle of its exposure of 1.2 slots of 5 rows."""
-    columns = assemble.column_results(
+    columns = results_of(
         clock_of(120, 30, [0, 0, 0]), posteriors_of([5, 5], indices([5, 5])), snr(120), samples_of(120), 0
     )
     rows = [c.packets[0].first_row for c in columns]
@@ -101,7 +112,7 @@ def test_first_row_is_where_the_exposure_of_the_header_starts() -> None:
 def test_one_entry_a_burst_in_time_order() -> None:
     index = indices([5, 5], n_bursts=2)
     now = clock_of(180, 0, [0, 0, 1, 1])
-    columns = assemble.column_results(now, posteriors_of([5, 5], index), snr(180), samples_of(180), 0)
+    columns = results_of(now, posteriors_of([5, 5], index), snr(180), samples_of(180), 0)
     for column, result in enumerate(columns):
         payloads = [bits_to_hex(indices_to_bits(index[burst, column], 5)) for burst in range(2)]
         assert [packet.payload for packet in result.packets] == payloads
@@ -113,15 +124,13 @@ def test_a_payload_slot_that_was_never_seen_is_no_packet() -> None:
     """37 slots of the second burst are seen: some of its payload is not."""
     now = clock_of(137, 0, [0, 0, 1])
     index = indices([5, 5], n_bursts=2)
-    columns = assemble.column_results(now, posteriors_of([5, 5], index), snr(137), samples_of(137), 0)
+    columns = results_of(now, posteriors_of([5, 5], index), snr(137), samples_of(137), 0)
     assert [len(c.packets) for c in columns] == [1, 1]
 
 
 def test_a_cut_copy_completes_another() -> None:
     """The end of one copy and the beginning of the next hold every slot once: 60 slots from slot 25 on."""
-    columns = assemble.column_results(
-        clock_of(60, 25, [0, 0]), posteriors_of([5, 5], indices([5, 5])), snr(60), samples_of(60), 0
-    )
+    columns = results_of(clock_of(60, 25, [0, 0]), posteriors_of([5, 5], indices([5, 5])), snr(60), samples_of(60), 0)
     assert [c.packets[0].copies for c in columns] == pytest.approx([1.2, 1.2])
 
 
@@ -131,7 +140,7 @@ def test_slots_off_the_screen_are_not_seen() -> None:
     valid[0, :, 30 * Q : 32 * Q] = 0
     valid[1, 0, 30 * Q : 32 * Q] = 0
     samples = replace(samples, valid=valid)
-    columns = assemble.column_results(now, posteriors_of([5, 5], indices([5, 5])), snr(60), samples, 0)
+    columns = results_of(now, posteriors_of([5, 5], indices([5, 5])), snr(60), samples, 0)
     assert [len(c.packets) for c in columns] == [0, 1]
     assert assemble.slots_seen(samples, now)[0, 0, 28:34].tolist() == [1, 1, 0, 0, 1, 1]
     assert assemble.slots_seen(samples, now)[0, 1, :12].tolist() == [2] * 10 + [1] * 2
@@ -140,9 +149,7 @@ def test_slots_off_the_screen_are_not_seen() -> None:
 @pytest.mark.parametrize(("min_confidence", "n_packets"), [(0.0, 1), (0.6, 1), (0.99, 0), (1.0, 0)])
 def test_packets_below_the_confidence_asked_for(min_confidence: float, n_packets: int) -> None:
     posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.9)
-    columns = assemble.column_results(
-        clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), min_confidence
-    )
+    columns = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), min_confidence)
     assert [len(c.packets) for c in columns] == [n_packets] * 2
 
 
@@ -152,7 +159,7 @@ def test_packets_below_the_confidence_asked_for(min_confidence: float, n_packets
 def test_status_follows_the_confidence(probability: float, status: str | None) -> None:
     """Below a half: weak, or nothing where too many bits are uncertain."""
     posteriors = posteriors_of([5, 5], indices([5, 5]), probability=probability)
-    (first, _) = assemble.column_results(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+    (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
     assert first.status == status or (status is None and first.status in {"weak", "no_packet"})
     for packet in first.packets:
         assert packet.ber_hat <= 0.2
@@ -161,7 +168,7 @@ def test_status_follows_the_confidence(probability: float, status: str | None) -
 def test_a_packet_of_low_confidence_is_weak() -> None:
     posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.95)
     posteriors = replace(posteriors, log_prob=np.full((1, 2, N_SYMBOLS), np.log(0.1)))
-    (first, _) = assemble.column_results(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+    (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
     assert first.status == "weak"
     assert 0 < first.packets[0].confidence < 0.5
 
@@ -171,17 +178,35 @@ def test_confidence_grows_with_the_log_probability_and_stays_below_one() -> None
     for log_prob in (-800.0, -10.0, -1.0, -0.1, -1e-3, -1e-12, 0.0):
         posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.999)
         posteriors = replace(posteriors, log_prob=np.full((1, 2, N_SYMBOLS), log_prob / N_SYMBOLS))
-        (first, _) = assemble.column_results(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+        (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
         confidences.append(first.packets[0].confidence)
     assert confidences == sorted(confidences)
     assert confidences[0] >= 0
     assert confidences[-1] < 1
 
 
+def test_slots_that_speak_against_a_packet_make_it_less_sure() -> None:
+    """Slots of its own payload only: the header, dimming symbol and other bursts have no say."""
+    now = clock_of(180, 0, [0, 0, 1, 1])
+    posteriors = posteriors_of([5, 5], indices([5, 5], n_bursts=2))
+
+    def confidences(slots: list[int]) -> list[float]:
+        support = np.full((2, 180), 10.0, np.float32)
+        support[0, slots] = -9.0
+        (first, _) = results_of(now, posteriors, snr(180), samples_of(180), support=support)
+        return [packet.confidence for packet in first.packets]
+
+    sure = confidences([])
+    assert confidences([3, 12, 53, 104]) == sure
+    one, two = confidences([25]), confidences([25, 77])
+    assert two[0] < one[0] < sure[0]
+    assert two[1] == one[1] == sure[1]
+
+
 def test_a_header_that_is_contradicted_stands_for_no_packet() -> None:
     posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.9999)
     posteriors = replace(posteriors, header_llr=np.array([[-20.0, 40.0]]))
-    first, second = assemble.column_results(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+    first, second = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
     assert not first.packets
     assert first.w is None
     assert first.status == "no_packet"
@@ -194,14 +219,14 @@ def test_nothing_decoded_says_why() -> None:
     unsure = posteriors_of([5, 5], indices([5, 5]), probability=0.5001)
     now, samples = clock_of(120, 0, [0, 0, 0]), samples_of(120)
     light = np.stack([snr(120)[0], snr(120, 0.01)[0]])
-    bright, dark = assemble.column_results(now, unsure, light, samples, 0)
+    bright, dark = results_of(now, unsure, light, samples, 0)
     assert (bright.status, dark.status) == ("no_packet", "dark")
     assert bright.message is not None
     assert "20.0 dB" in bright.message
     assert dark.message is not None
     assert "too little light" in dark.message
     short = clock_of(30, 0, [0])
-    (few, _) = assemble.column_results(short, unsure, snr(30), samples_of(30), 0)
+    (few, _) = results_of(short, unsure, snr(30), samples_of(30), 0)
     assert few.message is not None
     assert "30 slots of the column are visible, a packet has 50" in few.message
     for column in (bright, dark, few):
@@ -210,7 +235,7 @@ def test_nothing_decoded_says_why() -> None:
 
 
 def test_a_column_never_seen_is_dark() -> None:
-    (first, _) = assemble.column_results(
+    (first, _) = results_of(
         clock_of(120, 0, [0, 0, 0]),
         posteriors_of([5, 5], indices([5, 5]), probability=0.5001),
         snr(120, 0.0),
@@ -223,7 +248,7 @@ def test_a_column_never_seen_is_dark() -> None:
 @pytest.mark.parametrize(("w_probability", "known"), [(0.999, True), (0.6, False)])
 def test_an_unsure_weight_is_not_reported_alone(w_probability: float, known: bool) -> None:
     unsure = posteriors_of([6, 5], indices([6, 5]), probability=0.5001, w_probability=w_probability)
-    (first, _) = assemble.column_results(clock_of(120, 0, [0, 0, 0]), unsure, snr(120), samples_of(120), 0)
+    (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), unsure, snr(120), samples_of(120), 0)
     assert first.w == (6 if known else None)
 
 
@@ -269,6 +294,6 @@ def test_a_column_that_shows_its_neighbour_has_no_packet(
     index[:, list(same)] = 50
     snr = np.full((4, now.n_slots), 100.0, np.float32)
     snr[quieter] = 30.0
-    results = assemble.column_results(now, posteriors_of(w, index), snr, samples_of(now.n_slots, 4), 0.0)
+    results = results_of(now, posteriors_of(w, index), snr, samples_of(now.n_slots, 4), 0.0)
     assert [c.column for c in results if not c.packets] == expected
     assert all("the column beside it" in (results[column].message or "") for column in expected)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli.benchmark.confidence import bin_outcomes, calibration, fit_exponent, fit_scaling, packets_of, rows
+from rxcli.benchmark.confidence import bin_outcomes, calibration, fit_scaling, logistic_regression, packets_of, rows
 
 
 def _outcomes(n: int, truth: NDArray[np.float64], seed: int = 0) -> NDArray[np.bool_]:
@@ -27,7 +27,6 @@ def test_calibrated_confidence_is_found_so(confidence: NDArray[np.float64]) -> N
     scaling = fit_scaling(confidence, right)
     assert scaling is not None
     assert (scaling.offset, scaling.slope) == pytest.approx((0, 1), abs=0.1)
-    assert fit_exponent(confidence, right) == pytest.approx(1.0, abs=0.08)
 
 
 def test_overconfidence_is_found_and_scaled_away(confidence: NDArray[np.float64]) -> None:
@@ -38,14 +37,18 @@ def test_overconfidence_is_found_and_scaled_away(confidence: NDArray[np.float64]
     assert scaling is not None
     assert (scaling.offset, scaling.slope) == pytest.approx((-2, 0.5), abs=0.15)
     assert sum(b.calibrated for b in bin_outcomes(scaling(confidence), right) if b.n > 100) >= 3
-    exponent = fit_exponent(confidence, _outcomes(6000, confidence**3))
-    assert exponent == pytest.approx(3.0, rel=0.1)
+
+
+def test_weights_of_evidence_are_found_again() -> None:
+    terms = np.concatenate([np.ones((8000, 1)), np.random.default_rng(7).normal(size=(8000, 2))], axis=1)
+    weights = np.array([0.5, 1.5, -0.8])
+    found = logistic_regression(terms, _outcomes(8000, 1 / (1 + np.exp(-terms @ weights))))
+    assert found == pytest.approx(weights, abs=0.1)
 
 
 def test_outcomes_all_alike_suggest_nothing() -> None:
     ones = np.full(5, 1.0)
     assert fit_scaling(ones, np.ones(5, bool)) is None
-    assert fit_exponent(ones, np.zeros(5, bool)) is None
     assert bin_outcomes(ones, np.ones(5, bool))[-1].right == 5
 
 
@@ -58,3 +61,4 @@ def test_a_simulated_frame_gives_packets_with_outcomes() -> None:
     for packet in record["packets"]:
         assert 0 <= packet["confidence"] <= 1
         assert packet["bit_errors"] >= 0
+        assert len(packet["evidence"]) == 6

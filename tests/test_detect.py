@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli.detect import detect, doubtful_words, plausible_weights, weight_evidence
+from rxcli.detect import detect, doubtful_words, plausible_weights, slot_support, weight_evidence
 from rxcli.protocol import (
     HEADER,
     WEIGHTS,
@@ -309,6 +309,25 @@ def test_doubtful_words_are_those_of_the_posterior(memory: int) -> None:
     np.testing.assert_array_equal(words[:, 0], best)
     assert (np.diff(log_prob, axis=1) <= 0).all()
     assert (words.sum(axis=2) == w[places[:, 1], None]).all()
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_support_is_what_turning_a_single_slot_costs(memory: int) -> None:
+    rng = np.random.default_rng(5)
+    decided = rng.random((2, 3, 12)) < 0.5
+    metrics = rng.normal(size=(2, 3, 12 + memory, 1 << (memory + 1)))
+
+    def total(slots: NDArray[np.bool_]) -> float:
+        padded = np.pad(slots.astype(np.int64), (memory, memory))
+        patterns = [sum(padded[n + memory - back] << back for back in range(memory + 1)) for n in range(12 + memory)]
+        return float(metrics[1, 2, np.arange(12 + memory), patterns].sum())
+
+    support = slot_support(metrics, decided)
+    assert support.shape == decided.shape
+    for slot in range(12):
+        turned = decided[1, 2].copy()
+        turned[slot] = not turned[slot]
+        assert support[1, 2, slot] == pytest.approx(total(decided[1, 2]) - total(turned), abs=1e-5)
 
 
 def test_no_word_is_doubtful_where_all_are_sure() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import ceil
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,8 @@ _SCREENS = ("paper-8k65", "paper-17k3", "paper-34k6")
 _PRESETS = ("video-1080p", "phone-plain", "xs10-still")
 #: Sensor widths, pixels: few, because thousands of frames are wanted, and each is to hold packets in doubt.
 _WIDTH_PX = (100.0, 320.0)
+#: Share of the frames with few rows a slot, how many, and widths of those: small pictures anyway.
+_FEW_ROWS_SHARE, _FEW_ROWS, _FEW_ROWS_WIDTH_PX = 0.4, (1.5, 5.0), (100.0, 900.0)
 #: Powers of ten of the light against that of the preset: clean at one end, hopeless at the other, most about where
 #: packets begin to fail.
 _LIGHT = (-1.4, 0.1)
@@ -79,15 +80,18 @@ class Calibration:
     error: float
     #: None where all packets have the same outcome.
     scaling: Scaling | None
-    #: Exponent g for which confidence ** g is likeliest: the temperature of the log-probabilities is 1 / g.
-    exponent: float | None
+    #: Weights of what the confidences are made of that fit these packets best; None where not all packets tell it.
+    weights: tuple[float, ...] | None
 
 
 def scene_of(seed: int) -> Scene:
     """A small, quick scene of random quality: from clean to hopeless."""
     rng = np.random.default_rng([seed, 5])
     base = preset(str(rng.choice(_PRESETS)), str(rng.choice(_SCREENS)))
-    base = base.scaled(rng.uniform(*_WIDTH_PX) / base.sensor.width, 1.0)
+    few_rows = rng.random() < _FEW_ROWS_SHARE
+    rows = np.exp(rng.uniform(*np.log(_FEW_ROWS))) / base.rows_per_slot if few_rows else 1.0
+    width_px = rng.uniform(*(_FEW_ROWS_WIDTH_PX if few_rows else _WIDTH_PX))
+    base = base.scaled(width_px / base.sensor.width, float(min(rows, 1.0)), keep_readout=True)
     exposure_slots = rng.choice([0.5, 1.0, 1.5, 2.0]) * rng.uniform(0.8, 1.2)
     exposure_s = max(float(exposure_slots) / base.screen.slot_rate_hz, 1 / 32000)
     return replace(
@@ -100,6 +104,7 @@ def scene_of(seed: int) -> Scene:
         blur_px=rng.uniform(0.4, 2.5),
         slot_rate_error_ppm=rng.uniform(-100, 100),
         column_delay_slots=float(rng.choice([0.0, rng.uniform(0, 2)])),
+        isp=replace(base.isp, sharpen=rng.uniform(0, 0.8), denoise_px=rng.uniform(0, 0.6)),
         n_frames=1,
         output="raw" if base.sensor.pattern is not None and rng.random() < 0.3 else "developed",
     )
@@ -140,6 +145,7 @@ def reported_packets(result: FrameResult, sent_w: Sequence[int]) -> list[Record]
             "tx_w": sent_w[column.column],
             "snr_db": column.snr_db,
             "denoised": column.denoised,
+            "evidence": packet.evidence,
         }
         for column in result.columns
         for packet in column.packets
@@ -170,8 +176,14 @@ def calibration(records: Sequence[Record], n_bins: int = N_BINS) -> Calibration:
         brier_scaled=float(((scaling(confidence) - right) ** 2).sum() / n) if scaling else float("nan"),
         error=sum(abs(b.reported * b.n - b.right) for b in bins) / n,
         scaling=scaling,
-        exponent=fit_exponent(confidence, right),
+        weights=_fitted_weights(packets, right),
     )
+
+
+def _fitted_weights(packets: Sequence[Record], right: NDArray[np.bool_]) -> tuple[float, ...] | None:
+    if right.all() or not right.any() or not all(packet.get("evidence") for packet in packets):
+        return None
+    return tuple(logistic_regression(np.array([packet["evidence"] for packet in packets]), right).tolist())
 
 
 def bin_outcomes(confidence: FloatArray, right: NDArray[np.bool_], n_bins: int = N_BINS) -> tuple[Bin, ...]:
@@ -197,45 +209,39 @@ def _logit(p: FloatArray) -> FloatArray:
     return np.asarray(np.log(kept) - np.log1p(-kept))
 
 
-def fit_scaling(confidence: FloatArray, right: NDArray[np.bool_], iterations: int = 50) -> Scaling | None:
-    """Logistic regression of the outcome on the logit of the confidence (Platt), by Newton's method.
-
-    A tiny prior towards the identity keeps it finite where the outcomes can be separated. None where all are alike.
-    """
+def fit_scaling(confidence: FloatArray, right: NDArray[np.bool_]) -> Scaling | None:
+    """Logistic regression of the outcome on the logit of the confidence (Platt); None where all outcomes are alike."""
     if right.all() or not right.any():
         return None
-    x = np.stack([np.ones_like(confidence), _logit(confidence)])
-    theta, identity = np.array([0.0, 1.0]), np.array([0.0, 1.0])
+    offset, slope = logistic_regression(
+        np.stack([np.ones_like(confidence), _logit(confidence)], axis=1), right, np.array([0.0, 1.0])
+    )
+    return Scaling(float(offset), float(slope))
+
+
+def logistic_regression(
+    terms: FloatArray, right: NDArray[np.bool_], prior: FloatArray | None = None, iterations: int = 100
+) -> FloatArray:
+    """Weights (k,) that make the outcomes likeliest, by Newton's method.
+
+    A tiny pull towards `prior` keeps them finite where the outcomes can be separated.
+
+    Args:
+        terms: (n, k).
+        right: (n,) outcomes.
+        prior: (k,), 0 by default.
+        iterations: steps at most.
+    """
+    prior = np.zeros(terms.shape[1]) if prior is None else prior
+    weights = prior.copy()
     for _ in range(iterations):
-        p = 1 / (1 + np.exp(-theta @ x))
-        gradient = x @ (right - p) - 1e-3 * (theta - identity)
-        step = np.linalg.solve((x * (p * (1 - p))) @ x.T + 1e-3 * np.eye(2), gradient)
-        theta = theta + np.clip(step, -1, 1)
+        p = 1 / (1 + np.exp(-np.clip(terms @ weights, -50, 50)))
+        gradient = terms.T @ (right - p) - 1e-3 * (weights - prior)
+        step = np.linalg.solve((terms.T * (p * (1 - p))) @ terms + 1e-3 * np.eye(weights.size), gradient)
+        weights = weights + np.clip(step, -1, 1)
         if np.abs(step).max() < 1e-9:
             break
-    return Scaling(float(theta[0]), float(theta[1]))
-
-
-def fit_exponent(confidence: FloatArray, right: NDArray[np.bool_]) -> float | None:
-    """Exponent g that makes confidence ** g the likeliest probability of the outcomes; None where all are alike."""
-    if right.all() or not right.any():
-        return None
-    log_p = np.log(np.clip(confidence, 1e-300, 1 - _EDGE))
-
-    def cost(log_g: float) -> float:
-        scaled = np.maximum(np.exp(log_g) * log_p, -700.0)
-        return -float(scaled[right].sum() + np.log(-np.expm1(scaled[~right])).sum())
-
-    return float(np.exp(_minimum(cost, -4.0, 4.0)))
-
-
-def _minimum(cost: Any, low: float, high: float) -> float:
-    """Place of the minimum of a function with one valley, by golden section."""
-    ratio = (np.sqrt(5) - 1) / 2
-    for _ in range(ceil(np.log(1e-6 / (high - low)) / np.log(ratio))):
-        left, right = high - ratio * (high - low), low + ratio * (high - low)
-        low, high = (low, right) if cost(left) < cost(right) else (left, high)
-    return (low + high) / 2
+    return weights
 
 
 def rows(result: Calibration) -> list[dict[str, Any]]:
@@ -262,5 +268,5 @@ def details(result: Calibration) -> dict[str, Any]:
         "brier": result.brier,
         "brier_scaled": result.brier_scaled if result.scaling else None,
         "scaling": {"offset": result.scaling.offset, "slope": result.scaling.slope} if result.scaling else None,
-        "temperature": 1 / result.exponent if result.exponent else None,
+        "weights": result.weights,
     }

@@ -122,12 +122,13 @@ def _calibration_notes(result: Calibration) -> list[str]:
         f"{result.n_packets} packets of {result.n_frames} frames; calibration error {format_value(result.error)}, "
         f"Brier score {format_value(result.brier)}"
     ]
-    if result.scaling and result.exponent:
+    if result.scaling:
         lines.append(
             f"likeliest scaling: logistic({result.scaling.offset:+.3f} {result.scaling.slope:+.3f} * "
-            f"logit(confidence)), Brier score {format_value(result.brier_scaled)}; as one temperature of the "
-            f"log-probabilities: {1 / result.exponent:.2f}"
+            f"logit(confidence)), Brier score {format_value(result.brier_scaled)}"
         )
+    if result.weights:
+        lines.append("likeliest weights of the evidence: " + " ".join(f"{weight:+.3f}" for weight in result.weights))
     return lines
 
 
