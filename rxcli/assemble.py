@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import exp, expm1, log
+from math import exp, log
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from rxcli.types import (
     ColumnResult,
     ColumnStatus,
     Float32Array,
+    FloatArray,
     FrameStatus,
     IntArray,
     PacketResult,
@@ -26,8 +27,8 @@ from rxcli.types import (
 MAX_BER_HAT = 0.1
 #: Log-odds of being error-free: offset, and slopes of the posterior's log-odds up to a bend and beyond it, of whether
 #: corrections of the auto-encoder were kept, and of the logarithms of what payload slots say against the packet, all
-#: together, and of what half of them say for it at least, nats.
-_CALIBRATION = (2.95, 0.79, 0.28, -0.72, -0.85, -0.82)
+#: together, and of what they say for it on average, nats.
+_CALIBRATION = (3.26, 0.76, 0.29, -0.79, -0.81, -0.92)
 _BEND = 4.0
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
@@ -77,7 +78,8 @@ def column_results(
     """
     seen = slots_seen(samples, clock)
     whole = complete(seen)
-    payload = _payload_slots(clock)
+    told = np.isin(np.arange(len(snr)), list(denoised))
+    known = evidence(posteriors, slot_support_by_burst(support, clock), told)
     snr_db = _snr_db_of_columns(snr)
     headerless = posteriors.header_llr.sum(axis=0) < (_CONTRADICTED if _headers_show(posteriors) else np.inf)
     echoes: BoolArray = np.any(_echoes(posteriors, snr_db) & whole, axis=0)
@@ -90,21 +92,13 @@ def column_results(
             db,
             seen[:, column],
             whole[:, column],
-            support[column] * payload,
+            known[:, column],
             against[column],
             min_confidence,
-            column in denoised,
+            bool(told[column]),
         )
         for column, db in enumerate(snr_db)
     )
-
-
-def _payload_slots(clock: Clock) -> BoolArray:
-    """(B, N) which slots of the grid are payload of each burst's packet."""
-    slot = np.arange(clock.first_slot, clock.first_slot + clock.n_slots)
-    payload = slot % clock.packet_slots >= PREAMBLE_SLOTS
-    bursts = np.arange(int(clock.burst.max()) + 1)
-    return np.asarray(payload & (clock.burst[slot // clock.packet_slots] == bursts[:, None]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +113,8 @@ class BurstInClip:
     #: (C, packet) how often each slot was seen, over all frames.
     seen: IntArray
     frames: tuple[int, ...]
-    #: (C, payload) what the light says for every slot as decided, see `detect.slot_support`.
-    support: Float32Array
+    #: (C, 6) see `evidence`.
+    evidence: FloatArray
     #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
     #: received like photographs.
     against: Float32Array | None = None
@@ -250,16 +244,13 @@ def _column_result(
     snr_db: float | None,
     seen: IntArray,
     whole: BoolArray,
-    support: Float32Array,
+    evidence: FloatArray,
     against: str | None,
     min_confidence: float,
     denoised: bool,
 ) -> ColumnResult:
     bursts = () if against else np.flatnonzero(whole)
-    found = [
-        _packet(int(burst), column, clock, posteriors, seen[burst], support[burst], denoised=denoised)
-        for burst in bursts
-    ]
+    found = [_packet(int(burst), column, clock, posteriors, seen[burst], evidence[burst]) for burst in bursts]
     packets = tuple(packet for packet in found if packet and packet.confidence >= min_confidence)
     sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
@@ -321,11 +312,12 @@ def _clip_packet(column: int, clock: Clock, burst: BurstInClip) -> PacketResult 
     What slots say against the codeword that was decided shows it.
     """
     posteriors = burst.posteriors
-    seen, support = burst.seen[column], burst.support[column]
-    packet = _packet(0, column, clock, posteriors, seen, support, burst.number, burst.frames)
+    packet = _packet(
+        0, column, clock, posteriors, burst.seen[column], burst.evidence[column], burst.number, burst.frames
+    )
     if packet is None or burst.against is None:
         return packet
-    log_odds = _log_odds(float(posteriors.log_prob[0, column].sum()))
+    log_odds = float(_log_odds(posteriors.log_prob[0, column].sum()))
     offset, slope, slope_against = _CLIP_CALIBRATION
     log_odds = offset + slope * log_odds + slope_against * log(float(burst.against[column]) + _AGAINST_AT_LEAST)
     at_evens = max(_WRONG_AT_EVENS / packet.payload_bits, _BER_AT_EVENS)
@@ -339,37 +331,32 @@ def _packet(
     clock: Clock,
     posteriors: BurstPosteriors,
     seen: IntArray,
-    support: Float32Array,
+    evidence: FloatArray,
     number: int | None = None,
     frames: tuple[int, ...] | None = None,
-    denoised: bool = False,
 ) -> PacketResult | None:
-    """The packet of one burst, None where too many bits are uncertain.
-
-    `seen` is (packet,), `support` that of its payload slots in any order, 0 where nothing is seen.
-    """
+    """The packet of one burst, None where too many bits are uncertain; `seen` is (packet,), `evidence` (6,)."""
     w = int(posteriors.w[column])
     llr = posteriors.bit_llr[burst, column, :, : bits_per_symbol(w)]
     ber_hat = float(np.mean(1 / (1 + np.exp(np.abs(llr)))))
     if ber_hat > MAX_BER_HAT:
         return None
     bits = indices_to_bits(posteriors.index[burst, column], w)
-    evidence = _evidence(float(posteriors.log_prob[burst, column].sum()), support, denoised)
     return PacketResult(
         first_row=_header_row(int(np.flatnonzero(clock.burst == burst)[0]), column, clock),
         copies=float(seen.sum() / clock.packet_slots),
         payload_bits=int(bits.size),
         payload=bits_to_hex(bits),
-        confidence=_probability(float(np.dot(_CALIBRATION, evidence))),
+        confidence=float(confidence(evidence)),
         ber_hat=ber_hat,
         burst=number,
         frames=frames,
-        evidence=evidence,
+        evidence=tuple(evidence.tolist()),
     )
 
 
-def _evidence(log_prob: float, support: Float32Array, denoised: bool) -> tuple[float, ...]:
-    """What the confidence of a packet is made of, in the order of `_CALIBRATION`.
+def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolArray) -> FloatArray:
+    """What the confidence of packets is made of, (B, C, 6), in the order of `_CALIBRATION`.
 
     The light model's likelihoods are tempered, since strips and samples err together; still they are too sure where
     picture or camera are not as the model has them. There single slots speak against the packet. The weights are a
@@ -377,21 +364,41 @@ def _evidence(log_prob: float, support: Float32Array, denoised: bool) -> tuple[f
     or the auto-encoder asks for a new fit.
 
     Args:
-        log_prob: log probabilities of its symbols, added.
-        support: what the light says for every payload slot as decided, nats; 0 where nothing is seen.
-        denoised: whether corrections of the auto-encoder were kept.
+        posteriors: of B bursts and C columns.
+        support: (B, C, n) what the light says for payload slots of the packets as decided, nats; 0 where nothing is
+            seen; see `slot_support_by_burst`.
+        denoised: (C,) whether corrections of the auto-encoder were kept.
     """
-    log_odds = _log_odds(log_prob)
-    heard = support[support != 0]
-    against = float(-heard[heard < 0].sum())
-    most = max(float(np.median(heard)), 1.0) if heard.size else 1.0
-    low, high = min(log_odds, _BEND), max(log_odds - _BEND, 0.0)
-    return 1.0, low, high, float(denoised), log(against + _AGAINST_AT_LEAST), log(most)
+    log_odds = _log_odds(posteriors.log_prob.sum(axis=2))
+    heard = np.maximum((support != 0).sum(axis=2), 1)
+    terms = (
+        np.ones_like(log_odds),
+        np.minimum(log_odds, _BEND),
+        np.maximum(log_odds - _BEND, 0),
+        np.broadcast_to(denoised, log_odds.shape),
+        np.log(_AGAINST_AT_LEAST - np.minimum(support, 0).sum(axis=2)),
+        np.log(np.maximum(support.sum(axis=2) / heard, 1)),
+    )
+    return np.stack(terms, axis=2).astype(np.float64)
 
 
-def _log_odds(log_prob: float) -> float:
-    at_most = min(max(log_prob, -_MOST_DOUBT), -_LEAST_DOUBT)
-    return at_most - log(-expm1(at_most))
+def confidence(evidence: FloatArray) -> FloatArray:
+    """Probability (...) that packets are error-free, from their evidence (..., 6)."""
+    return np.asarray(1 / (1 + np.exp(-(evidence @ np.array(_CALIBRATION)))))
+
+
+def slot_support_by_burst(support: Float32Array, clock: Clock) -> Float32Array:
+    """(B, C, N) the support (C, N) of the payload slots of each burst, 0 for the other slots of the grid."""
+    slot = np.arange(clock.first_slot, clock.first_slot + clock.n_slots)
+    payload = slot % clock.packet_slots >= PREAMBLE_SLOTS
+    bursts = np.arange(int(clock.burst.max()) + 1)
+    payload_of = payload & (clock.burst[slot // clock.packet_slots] == bursts[:, None])
+    return np.asarray(payload_of[:, None] * support)
+
+
+def _log_odds(log_prob: FloatArray) -> FloatArray:
+    at_most = np.clip(log_prob, -_MOST_DOUBT, -_LEAST_DOUBT)
+    return np.asarray(at_most - np.log(-np.expm1(at_most)))
 
 
 def _probability(log_odds: float) -> float:

@@ -809,7 +809,7 @@ class _Clip:
         first = waiting.numbers[0]
         ended = [
             assemble.BurstInClip(
-                b.number, int(b.number - first), b.posteriors, b.seen, b.frames, _support(b), _against(b)
+                b.number, int(b.number - first), b.posteriors, b.seen, b.frames, _evidence(b), _against(b)
             )
             for b in self._bursts.close(np.setdiff1d(waiting.numbers, going_on))
         ]
@@ -878,9 +878,11 @@ def _bursts_of(frame: Frame, seen: Reception) -> tracking.FrameBursts:
     return tracking.FrameBursts(frame.index, 0, seen.clock, seen.metrics, shown)
 
 
-def _support(burst: tracking.ClosedBurst) -> Float32Array:
-    """(C, payload) what the light says for every slot as decided, all copies and frames together."""
-    return detect.slot_support(burst.metrics, burst.posteriors.lit[0] > 0.5)[:, PREAMBLE_SLOTS:]
+def _evidence(burst: tracking.ClosedBurst) -> FloatArray:
+    """(C, 6) what the confidence of packets is made of, all copies and frames together."""
+    support = detect.slot_support(burst.metrics[None], burst.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
+    evidence: FloatArray = assemble.evidence(burst.posteriors, support, np.zeros(support.shape[1], bool))[0]
+    return evidence
 
 
 def _against(burst: tracking.ClosedBurst) -> Float32Array | None:
