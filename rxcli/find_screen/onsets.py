@@ -124,11 +124,13 @@ def _bend(
     middle, half = float(onsets.t.mean()), max(float(np.ptp(onsets.t)) / 2, 1.0)
     along = (onsets.t - middle) / half
     fit = np.array([line[0] * half, line[0] * middle + line[1]])
-    near = onsets.usable
+    near = np.zeros_like(onsets.usable)
     for _ in range(4):
         beyond = depth - np.polyval(fit, along)
         # Late beginnings pull a line inwards, nothing pulls it outwards.
-        near = onsets.usable & (beyond > -2 * tolerance) & (beyond < tolerance)
+        before, near = near, onsets.usable & (beyond > -2 * tolerance) & (beyond < tolerance)
+        if np.array_equal(near, before):
+            break
         covered = np.count_nonzero(np.bincount((along[near] * 3).round().astype(np.int64) + 3))
         if near.sum() < 5 or covered < 2:
             break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -97,6 +98,12 @@ def corners_of(sides: list[Side], width: int, height: int) -> FloatArray:
     return np.array(found)
 
 
+@lru_cache(maxsize=1)
+def _tries() -> FloatArray:
+    """(2, _TRIES) which of the places make a pair, as shares of their number."""
+    return np.random.default_rng(1).integers(0, 1 << 32, (2, _TRIES), np.uint32) / (1 << 32)
+
+
 def outermost_line(
     t: FloatArray,
     depth: FloatArray,
@@ -126,7 +133,7 @@ def outermost_line(
     candidates = np.flatnonzero(weight)
     if candidates.size < 5:
         return None
-    i, j = np.random.default_rng(1).choice(candidates, (2, _TRIES))
+    i, j = candidates[(_tries() * candidates.size).astype(np.int64)]
     far = np.abs(t[i] - t[j]) > _PAIR_APART * np.ptp(t)
     i, j = i[far], j[far]
     slopes = (depth[j] - depth[i]) / (t[j] - t[i])
