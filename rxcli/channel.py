@@ -74,8 +74,9 @@ _WORD_RIDGE = 0.05
 
 #: Samples worked on at a time: what fits the cache.
 _SAMPLES_AT_A_TIME = 60_000
-#: NumPy works outside the interpreter's lock; more threads than this gain nothing on a few columns.
-_THREADS = 2
+#: NumPy works outside the interpreter's lock; more threads than this gain nothing on a few columns. Of fewer parts
+#: than these threads spend more on waiting for that lock than they gain.
+_THREADS, _MANY_PARTS = 2, 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +190,7 @@ def _by_pattern(taps: FloatArray, n: int, of_levels: Callable[[Float32Array], Fl
     sums = []
     for levels in slot_patterns(memory) @ taps.T:
         # Sample i belongs to metric (i + lead) // q.
-        values = of_levels(np.resize(np.roll(levels, -(lead % q)), n).astype(np.float32))
+        values = of_levels(np.tile(np.roll(levels, -(lead % q)).astype(np.float32), -(-n // q))[:n])
         sums.append(_by_slot(np.pad(values, ((0, 0), (lead, memory * q - lead))), q))
     return np.stack(sums, axis=2).astype(np.float64)
 
@@ -297,8 +298,11 @@ def slot_likelihoods(
     if n_parts == 1:
         return of_part(np.arange(columns.size))
     parts = np.array_split(np.arange(columns.size), n_parts)
-    with ThreadPoolExecutor(_THREADS) as pool:
-        done = list(pool.map(of_part, parts))
+    if n_parts < _MANY_PARTS:
+        done = [of_part(part) for part in parts]
+    else:
+        with ThreadPoolExecutor(_THREADS) as pool:
+            done = list(pool.map(of_part, parts))
     return SlotLikelihoods(
         np.concatenate([d.metrics for d in done]),
         np.concatenate([d.snr for d in done]),
@@ -342,10 +346,11 @@ def _shape_on_grid(lit: Float32Array, model: LightModel) -> Float32Array:
     """(C, N * Q) mean of the exposure over the expected slots; unknown slots beyond the grid are half lit."""
     memory, q = model.memory, model.taps.shape[0]
     padded = np.pad(lit, ((0, 0), (memory, memory)), constant_values=0.5)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, memory + 1, axis=1)
-    shape = (windows @ model.taps.T.astype(np.float32)).reshape(lit.shape[0], -1)
+    shape = np.zeros((lit.shape[0], lit.shape[1] + memory, q), np.float32)
+    for age, weights in enumerate(model.taps.T[::-1].astype(np.float32)):
+        shape += padded[:, memory - age : padded.shape[1] - age, None] * weights
     skip = memory * q // 2
-    return np.ascontiguousarray(shape[:, skip : skip + lit.shape[1] * q])
+    return np.ascontiguousarray(shape.reshape(lit.shape[0], -1)[:, skip : skip + lit.shape[1] * q])
 
 
 def _from_neighbours(shape: Float32Array, model: LightModel, clock: Clock, columns: NDArray[np.int64]) -> Float32Array:

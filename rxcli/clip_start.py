@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli import clock
-from rxcli.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, noise_of, sample_columns
+from rxcli.locate import Camera, Failure, Lock, Reading, Stages, find_camera, find_corners, noise_of, sample_columns
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import SLOTS_PER_SYMBOL
@@ -86,7 +86,7 @@ def lock_at(start: Start, frame: Frame, profiles: RowProfiles, camera: Camera) -
     n_slots = int(np.ceil((rows[-1] - rows[0] + 1) / rows_per_slot)) + 1
     top = float(profiles.rows[rows[0]]) - 0.5
     now = start.time.clock_at(frame.index, frame.time_s, template, n_slots, top)
-    return None if now is None else Lock(screen, profiles, now)
+    return None if now is None else Lock(screen, Reading(profiles), now)
 
 
 def _phase(

@@ -44,9 +44,8 @@ _MAX_CORRECTION = 0.25
 
 
 def pooled_strips(profiles: RowProfiles) -> RowProfiles:
-    """Profiles of a few strips a column, to search the clock: pooled in pairs, in fours where there are eight."""
-    pooled = halved_strips(profiles)
-    return halved_strips(pooled) if pooled.light.shape[1] >= _MANY_STRIPS else pooled
+    """Profiles of a few strips a column, to search the clock: pooled in pairs where there are four or more."""
+    return halved_strips(profiles) if profiles.light.shape[1] >= _MANY_STRIPS else profiles
 
 
 def halved_strips(profiles: RowProfiles) -> RowProfiles:
@@ -60,6 +59,18 @@ def halved_strips(profiles: RowProfiles) -> RowProfiles:
         inside=profiles.inside[:, ::2] & profiles.inside[:, 1::2],
         sensor_row=None if rows is None else (rows[:, ::2] + rows[:, 1::2]) / 2,
         count=profiles.count[:, ::2] + profiles.count[:, 1::2],
+    )
+
+
+def doubled_strips(profiles: RowProfiles) -> RowProfiles:
+    """Profiles with every strip taken for two of half the pixels; copies."""
+    rows = profiles.sensor_row
+    return replace(
+        profiles,
+        light=np.repeat(profiles.light, 2, axis=1),
+        inside=np.repeat(profiles.inside, 2, axis=1),
+        sensor_row=None if rows is None else np.repeat(rows, 2, axis=1),
+        count=np.repeat(profiles.count / 2, 2, axis=1),
     )
 
 
@@ -158,7 +169,10 @@ def contrast(
     high = cv2.dilate(smooth, window).reshape(light.shape)
     low = cv2.erode(smooth, window).reshape(light.shape)
     span = high - low
-    value = (2 * light - high - low) / (span + np.float32(3 * sigma))
+    high += low
+    high *= np.float32(0.5)
+    value = light - high
+    value /= span * np.float32(0.5) + np.float32(1.5 * sigma)
     np.square(span, out=span)
     weight = span / (span + np.float32((_CONTRAST_SIGMAS * sigma) ** 2))
     weight *= valid

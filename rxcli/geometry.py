@@ -116,7 +116,13 @@ def screen_to_picture(points: FloatArray, corners: FloatArray, lens: Lens | None
 
 
 def column_outlines(
-    corners: FloatArray, n_columns: int, n_strips: int, width: int, height: int, lens: Lens | None = None
+    corners: FloatArray,
+    n_columns: int,
+    n_strips: int,
+    width: int,
+    height: int,
+    lens: Lens | None = None,
+    columns: slice | None = None,
 ) -> Outlines:
     """Outlines of `n_columns` columns of `n_strips` strips on a picture of `width` x `height`.
 
@@ -127,8 +133,10 @@ def column_outlines(
         width: pixels a row.
         height: rows.
         lens: lens model of the picture.
+        columns: which of them to outline, with a start and a stop; all by default.
     """
-    u = np.linspace(0, 1, n_columns * n_strips + 1)
+    first_column, n_outlined = (0, n_columns) if columns is None else (columns.start, columns.stop - columns.start)
+    u = np.linspace(0, 1, n_columns * n_strips + 1)[first_column * n_strips :][: n_outlined * n_strips + 1]
     v = np.linspace(-_OVERHANG, 1 + _OVERHANG, _OUTLINE_POINTS)
     points = screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens)
     first, last = _row_range(corners, height)
@@ -141,23 +149,11 @@ def column_outlines(
     if knot_x.min() < 0 or knot_x.max() > width - 1:
         in_picture = (edges_x >= 0) & (edges_x <= width - 1)
         inside &= in_picture[1:] & in_picture[:-1]
-    shape = (n_columns, n_strips, rows.size)
+    shape = (n_outlined, n_strips, rows.size)
     sensor_row = None
     if lens is not None and lens.corrected:
         sensor_row = _between_knots(_sensor_rows(knot_x, knots, lens), knots, rows).reshape(shape)
     return Outlines(rows, edges_x, inside.reshape(shape), sensor_row)
-
-
-def some_columns(outlines: Outlines, columns: slice) -> Outlines:
-    """Outlines of neighbouring columns alone; `columns` has a start and a stop."""
-    n_strips = outlines.inside.shape[1]
-    rows = outlines.sensor_row
-    return Outlines(
-        rows=outlines.rows,
-        edges_x=outlines.edges_x[columns.start * n_strips : columns.stop * n_strips + 1],
-        inside=outlines.inside[columns],
-        sensor_row=None if rows is None else rows[columns],
-    )
 
 
 def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:

@@ -19,6 +19,8 @@ from rxcli.types import Clock, Float32Array, FloatArray, Frame, Lens, Outlines, 
 _DEFAULT_TONE = "srgb"
 #: A header peak less than this times the strongest rival is no lock.
 _MIN_LOCK = 1.6
+#: Of so many strips a column a quick look reads pairs; what tells screens by their columns needs some.
+_MANY_STRIPS = 4
 #: Orientations in which the readout runs along the columns' width.
 _PORTRAIT = (5, 6, 7, 8)
 
@@ -71,24 +73,55 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True)
+class Reading:
+    """What was read of the columns of a screen."""
+
+    profiles: RowProfiles
+    #: Whether strips were read in pairs, as a quick look takes them.
+    in_pairs: bool = False
+    #: Reads all strips of some columns pixel by pixel, given the noise model, where the profiles are of a quick look;
+    #: None where they are not.
+    read: Callable[[slice, tuple[float, float]], RowProfiles] | None = None
+
+    def halved(self) -> RowProfiles:
+        """Strips pooled in pairs."""
+        return self.profiles if self.in_pairs else clock.halved_strips(self.profiles)
+
+    def in_depth(self, columns: NDArray[np.int64]) -> Reading:
+        """The same with some columns read pixel by pixel, strip by strip."""
+        if self.read is None or not columns.size:
+            return self
+        every = clock.doubled_strips(self.profiles) if self.in_pairs else self.profiles
+        names = [name for name in ("light", "inside", "count", "sensor_row") if getattr(every, name) is not None]
+        arrays = {name: getattr(every, name).copy() for name in names}
+        for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
+            part = slice(int(run[0]), int(run[-1]) + 1)
+            read = self.read(part, (every.noise_floor, every.noise_slope))
+            for name, array in arrays.items():
+                array[part] = getattr(read, name)
+        return Reading(replace(every, **arrays), read=self.read)
+
+
+@dataclass(frozen=True, slots=True)
 class Lock:
     """A screen whose clock was found."""
 
     screen: ScreenProfile
-    profiles: RowProfiles
+    reading: Reading
     clock: Clock
-    #: Reads some columns pixel by pixel where the profiles are a quick look; None where they are not.
-    read: Callable[[slice], RowProfiles] | None = None
+
+    @property
+    def profiles(self) -> RowProfiles:
+        return self.reading.profiles
+
+    def in_pairs(self) -> Lock:
+        """The lock with strips pooled in pairs."""
+        return replace(self, reading=Reading(self.reading.halved(), in_pairs=True))
 
     def in_depth(self, columns: NDArray[np.int64]) -> Lock:
-        """The lock with some columns read pixel by pixel."""
-        if self.read is None or not columns.size:
-            return self
-        light = self.profiles.light.copy()
-        for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
-            part = slice(int(run[0]), int(run[-1]) + 1)
-            light[part] = self.read(part).light
-        return replace(self, profiles=replace(self.profiles, light=light))
+        """The lock with some columns read pixel by pixel, strip by strip."""
+        reading = self.reading.in_depth(columns)
+        return self if reading is self.reading else replace(self, reading=reading)
 
 
 def _camera_of(frame: Frame, options: ReceiverOptions) -> Camera | None:
@@ -232,9 +265,9 @@ def find_lock(
     """
     n_columns = min(screen.columns for screen in options.screens)
     with stages("sampling"):
-        profiles, read = _read_columns(frame, corners, camera, n_columns, quick=quick)
+        reading = _read_columns(frame, corners, camera, n_columns, quick=quick)
     with stages("clock"):
-        pooled = clock.pooled_strips(profiles)
+        pooled = clock.pooled_strips(reading.halved())
         rates = {(s.slot_rate_hz, s.packet_slots): s for s in options.screens}
         clocks = {rate: found for rate, screen in rates.items() if (found := _clock_of(screen, pooled, camera))}
         clocks = {rate: found for rate, found in clocks.items() if found.lock >= _MIN_LOCK}
@@ -242,14 +275,14 @@ def find_lock(
             raise Failure("no_signal", _why_no_signal(frame, corners, camera, options))
         rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(pooled, clocks[r]))
     alike = [screen for screen in options.screens if (screen.slot_rate_hz, screen.packet_slots) == rate]
-    locks = [Lock(alike[0], profiles, clocks[rate], read)] if alike[0].columns == n_columns else []
+    locks = [Lock(alike[0], reading, clocks[rate])] if alike[0].columns == n_columns else []
     for screen in alike[len(locks) :]:
         with stages("sampling"):
-            finer, read = _read_columns(frame, corners, camera, screen.columns, quick=quick)
+            finer = _read_columns(frame, corners, camera, screen.columns, quick=quick)
         with stages("clock"):
-            found = _clock_of(screen, clock.pooled_strips(finer), camera)
+            found = _clock_of(screen, clock.pooled_strips(finer.halved()), camera)
         if found:
-            locks.append(Lock(screen, finer, found, read))
+            locks.append(Lock(screen, finer, found))
     if not locks:
         raise Failure("no_signal", _why_no_signal(frame, corners, camera, options))
     return locks[0] if len(locks) == 1 else _with_likely_columns(locks)
@@ -269,29 +302,37 @@ def _with_likely_columns(locks: list[Lock]) -> Lock:
     return next(lock for lock in locks if lock.screen is likely)
 
 
+def _n_strips(corners: FloatArray, n_columns: int) -> int:
+    return sampling.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
+
+
 def _outlines(frame: Frame, corners: FloatArray, lens: Lens | None, n_columns: int) -> Outlines:
-    column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
-    n_strips = sampling.strips_per_column(column_px)
+    n_strips = _n_strips(corners, n_columns)
     return geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
 
 
 def sample_columns(frame: Frame, corners: FloatArray, camera: Camera, n_columns: int) -> RowProfiles:
     """Row profiles of a screen of `n_columns` columns, in the order of time."""
-    return _read_columns(frame, corners, camera, n_columns, quick=False)[0]
+    return _read_columns(frame, corners, camera, n_columns, quick=False).profiles
 
 
-def _read_columns(
-    frame: Frame, corners: FloatArray, camera: Camera, n_columns: int, *, quick: bool
-) -> tuple[RowProfiles, Callable[[slice], RowProfiles] | None]:
-    """Row profiles of all columns; after a quick look, what reads some of them pixel by pixel."""
-    outlines = _outlines(frame, corners, camera.lens, n_columns)
+def _read_columns(frame: Frame, corners: FloatArray, camera: Camera, n_columns: int, *, quick: bool) -> Reading:
+    """All columns; after a quick look, with what reads some of them pixel by pixel."""
+    quick = quick and sampling.is_coded(frame)
+    n_strips = _n_strips(corners, n_columns)
+    in_pairs = quick and n_strips >= _MANY_STRIPS and n_strips % 2 == 0
 
-    def read(columns: slice, quick: bool = False) -> RowProfiles:
-        part = geometry.some_columns(outlines, columns)
-        profiles = sampling.sample_rows(frame, part, camera.tone, quick=quick)
+    def read(
+        columns: slice, noise: tuple[float, float] | None, n_strips: int = n_strips, quick: bool = False
+    ) -> RowProfiles:
+        outlines = geometry.column_outlines(
+            corners, n_columns, n_strips, frame.width, frame.height, camera.lens, columns
+        )
+        profiles = sampling.sample_rows(frame, outlines, camera.tone, quick=quick, noise=noise)
         return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
 
-    return read(slice(0, n_columns), quick), read if quick and sampling.is_coded(frame) else None
+    profiles = read(slice(0, n_columns), None, n_strips // 2 if in_pairs else n_strips, quick)
+    return Reading(profiles, in_pairs, read if quick else None)
 
 
 def _clock_of(screen: ScreenProfile, profiles: RowProfiles, camera: Camera) -> Clock | None:

@@ -81,7 +81,7 @@ def decode(lock: Lock, skip: frozenset[str]) -> Reception:
 
 def quick_look(lock: Lock) -> Reception:
     """One pass over the strips pooled in pairs, from the first guess."""
-    lock = replace(lock, profiles=clock.halved_strips(lock.profiles))
+    lock = lock.in_pairs()
     now = lock.clock
     samples = clock.sample_slots(lock.profiles, now, _COARSE)
     model = _light_model(lock, samples)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from typing import Any, cast
 
 import numpy as np
@@ -30,8 +31,6 @@ _BAND_PIXELS = 900_000
 #: One row in this many is kept for the noise model, and of those as many as hold this many cells.
 _NOISE_ROW_STEP = 16
 _NOISE_CELLS = 10_000
-#: OpenCV and NumPy work outside the interpreter's lock.
-_THREADS = 2
 _NOISE_BINS = 24
 #: Edges that enclose less than this many values have no light between them.
 _LEAST_ENCLOSED = 0.1
@@ -65,7 +64,9 @@ def is_coded(frame: Frame) -> bool:
     return frame.mosaic is None and frame.pixels.dtype == np.uint8 and not frame.linear
 
 
-def sample_rows(frame: Frame, outlines: Outlines, tone: str, *, quick: bool = False) -> RowProfiles:
+def sample_rows(
+    frame: Frame, outlines: Outlines, tone: str, *, quick: bool = False, noise: tuple[float, float] | None = None
+) -> RowProfiles:
     """Mean linear light of every strip on every row.
 
     Args:
@@ -73,6 +74,7 @@ def sample_rows(frame: Frame, outlines: Outlines, tone: str, *, quick: bool = Fa
         outlines: where the strips lie.
         tone: the curve to undo, see `tone_to_light`; a mosaic is linear already.
         quick: linearise means, not pixels, where the frame `is_coded`.
+        noise: floor and slope of the noise model, where they are known.
     """
     edges = outlines.edges_x
     reader = _reader(frame, edges, tone, quick=quick)
@@ -89,12 +91,12 @@ def sample_rows(frame: Frame, outlines: Outlines, tone: str, *, quick: bool = Fa
         return noise_cells
 
     bands = range(0, n_rows, band_rows)
-    if len(bands) == 1:
-        noise_cells = [read_band(0)]
+    if len(bands) == 1 or reader.threads == 1:
+        noise_cells = [read_band(band) for band in bands]
     else:
-        with ThreadPoolExecutor(_THREADS) as pool:
+        with ThreadPoolExecutor(reader.threads) as pool:
             noise_cells = list(pool.map(read_band, bands))
-    floor, slope = _noise_model(np.concatenate(noise_cells))
+    floor, slope = noise or _noise_model(np.concatenate(noise_cells), reader.cell_px)
     inside = outlines.inside
     light = light.reshape(inside.shape)
     light *= inside
@@ -104,8 +106,8 @@ def sample_rows(frame: Frame, outlines: Outlines, tone: str, *, quick: bool = Fa
         rows=outlines.rows,
         sensor_row=outlines.sensor_row,
         count=np.median(enclosed[:, ::_NOISE_ROW_STEP], axis=1).reshape(inside.shape[:2]),
-        noise_floor=floor * reader.cell_px,
-        noise_slope=slope * reader.cell_px,
+        noise_floor=floor,
+        noise_slope=slope,
     )
 
 
@@ -117,6 +119,9 @@ def _reader(frame: Frame, edges: Float32Array, tone: str, *, quick: bool) -> _Re
 
 class _Reader(ABC):
     """Reads rows of a frame by way of cells: mean light of runs of `cell_px` pixels."""
+
+    #: OpenCV and NumPy work outside the interpreter's lock.
+    threads = 2
 
     def __init__(self, frame: Frame, edges: Float32Array, cell_px: int) -> None:
         self.cell_px = cell_px
@@ -156,8 +161,7 @@ class _DevelopedReader(_Reader):
     def __init__(self, frame: Frame, edges: Float32Array, tone: str) -> None:
         strip_px = float(np.median(np.abs(np.diff(edges[:, edges.shape[1] // 2]))))
         super().__init__(frame, edges, int(np.clip(strip_px // _CELLS_PER_STRIP, 1, min(16, frame.width))))
-        values = np.arange(np.iinfo(frame.pixels.dtype).max + 1, dtype=np.float64)
-        self._table = _light_of(values, frame, tone)
+        self._table = _light_table(int(np.iinfo(frame.pixels.dtype).max), 1, *_curve(frame, tone))
 
     def _cells(self, first: int, last: int) -> Float32Array:
         return self._cells_of(self._pixels[first:last])
@@ -173,9 +177,12 @@ class _DevelopedReader(_Reader):
 class _CodedReader(_DevelopedReader):
     """A developed picture of 8 bits, the tone curve of its strips' means undone."""
 
+    #: Its steps are so short that two threads would but wait for the interpreter's lock.
+    threads = 1
+
     def __init__(self, frame: Frame, edges: Float32Array, tone: str) -> None:
         super().__init__(frame, edges, tone)
-        self._fine_table = _light_of(np.arange(255 * _FINE_STEPS + 1) / _FINE_STEPS, frame, tone)
+        self._fine_table = _light_table(255, _FINE_STEPS, *_curve(frame, tone))
 
     def read(self, first: int, last: int, edges: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
         import cv2
@@ -211,10 +218,16 @@ class _MosaicReader(_Reader):
         return out
 
 
-def _light_of(values: FloatArray, frame: Frame, tone: str) -> Float32Array:
-    """Linear light of pixel values of a developed frame."""
-    encoded = np.clip((values - frame.black) / (frame.white - frame.black), 0, 1)
-    return tone_to_light("linear" if frame.linear else tone, encoded).astype(np.float32)
+def _curve(frame: Frame, tone: str) -> tuple[float, float, str]:
+    """Black, white and tone of a developed frame."""
+    return frame.black, frame.white, "linear" if frame.linear else tone
+
+
+@lru_cache(maxsize=8)
+def _light_table(last: int, steps: int, black: float, white: float, tone: str) -> Float32Array:
+    """Linear light of the pixel values 0 to `last`, at so many steps a value."""
+    encoded = np.clip((np.arange(last * steps + 1) / steps - black) / (white - black), 0, 1)
+    return tone_to_light(tone, encoded).astype(np.float32)
 
 
 def _mosaic_weights(mosaic: Mosaic) -> tuple[Float32Array, Float32Array, bool]:
@@ -271,14 +284,14 @@ def _between_edges(area: NDArray[Any], edges: Float32Array) -> tuple[Float32Arra
     return mean, enclosed
 
 
-def _noise_model(cells: Float32Array) -> tuple[float, float]:
-    """Variance of a cell as floor + slope * light, from differences of adjacent cells.
+def _noise_model(cells: Float32Array, cell_px: int) -> tuple[float, float]:
+    """Variance of a pixel as floor + slope * light, from differences of adjacent cells of so many pixels.
 
     Medians over bins of equal light ignore the picture's edges; a straight line through the bins with floor and slope
     not below zero.
     """
     if cells.shape[1] < 2:
-        return 1e-6, 0.0
+        return 1e-6 * cell_px, 0.0
     rows = cells[:: max(1, cells.size // _NOISE_CELLS)]
     difference = np.abs(np.diff(rows, axis=1)).ravel()
     light = ((rows[:, 1:] + rows[:, :-1]) / 2).ravel()
@@ -288,7 +301,7 @@ def _noise_model(cells: Float32Array) -> tuple[float, float]:
     x = np.median(light[bins], axis=1)
     # For a normal difference of two cells of variance s2: median |d| = 0.6745 sqrt(2 s2).
     y = np.median(difference[bins], axis=1) ** 2 / (2 * 0.6745**2)
-    return _floor_and_slope(x, y)
+    return _floor_and_slope(x, cell_px * y)
 
 
 def _floor_and_slope(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[float, float]:

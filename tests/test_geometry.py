@@ -255,7 +255,7 @@ def test_a_screen_beside_the_picture_has_nothing_inside(top: float) -> None:
 def test_outlines_of_some_columns(of: str | None) -> None:
     corrected = None if of is None else lens(corrected=True)
     whole = geometry.column_outlines(PERSPECTIVE, 5, 2, WIDTH, HEIGHT, corrected)
-    part = geometry.some_columns(whole, slice(1, 4))
+    part = geometry.column_outlines(PERSPECTIVE, 5, 2, WIDTH, HEIGHT, corrected, slice(1, 4))
     np.testing.assert_array_equal(part.edges_x, whole.edges_x[2:9])
     np.testing.assert_array_equal(part.inside, whole.inside[1:4])
     assert (part.sensor_row is None) == (whole.sensor_row is None)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli import reception
+from rxcli import reception, sampling
 from rxcli.benchmark.trial import simulate_trial
 from rxcli.locate import Stages, find_camera, find_corners, find_lock
 from rxcli.pipeline import ReceiverOptions, receive
@@ -147,7 +147,9 @@ def test_the_right_screen_among_all_is_told() -> None:
     assert score_of(result, taken).error_free == 20
 
 
-def test_columns_in_doubt_are_read_pixel_by_pixel() -> None:
+@pytest.mark.parametrize("n_strips", [2, 3, 4, 8])
+def test_columns_in_doubt_are_read_pixel_by_pixel(n_strips: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "strips_per_column", lambda _: n_strips)
     taken = clean()
     frame, options = frame_of(taken), options_for(taken)
     corners = find_corners(frame, options)
@@ -159,7 +161,8 @@ def test_columns_in_doubt_are_read_pixel_by_pixel() -> None:
     light = quick.in_depth(asked).profiles.light
     np.testing.assert_allclose(light[asked], exact.profiles.light[asked], atol=1e-3)
     others = np.setdiff1d(np.arange(20), asked)
-    np.testing.assert_array_equal(light[others], quick.profiles.light[others])
+    assert quick.reading.in_pairs == (n_strips >= 4)
+    np.testing.assert_array_equal(light[others], quick.profiles.light[others].repeat(1 + (n_strips >= 4), axis=1))
     assert quick.in_depth(asked[:0]) is quick
     assert exact.in_depth(asked) is exact
 
