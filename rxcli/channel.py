@@ -346,11 +346,13 @@ def _shape_on_grid(lit: Float32Array, model: LightModel) -> Float32Array:
     """(C, N * Q) mean of the exposure over the expected slots; unknown slots beyond the grid are half lit."""
     memory, q = model.memory, model.taps.shape[0]
     padded = np.pad(lit, ((0, 0), (memory, memory)), constant_values=0.5)
-    shape = np.zeros((lit.shape[0], lit.shape[1] + memory, q), np.float32)
-    for age, weights in enumerate(model.taps.T[::-1].astype(np.float32)):
-        shape += padded[:, memory - age : padded.shape[1] - age, None] * weights
+    n_metrics = lit.shape[1] + memory
+    repeated = np.repeat(padded, q, axis=1)
+    shape = np.zeros((lit.shape[0], n_metrics * q), np.float32)
+    for place, weights in enumerate(model.taps.T.astype(np.float32)):
+        shape += repeated[:, place * q :][:, : n_metrics * q] * np.tile(weights, n_metrics)
     skip = memory * q // 2
-    return np.ascontiguousarray(shape.reshape(lit.shape[0], -1)[:, skip : skip + lit.shape[1] * q])
+    return np.ascontiguousarray(shape[:, skip : skip + lit.shape[1] * q])
 
 
 def _from_neighbours(shape: Float32Array, model: LightModel, clock: Clock, columns: NDArray[np.int64]) -> Float32Array:

@@ -113,12 +113,16 @@ def _forward_backward(metrics: FloatArray, w: int, memory: int) -> _Packets:
 
 
 def _recursions(step: FloatArray, start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Log-likelihood of each state before and after every symbol, (n, N, states), from the steps between states."""
-    before, after = [start], [end]
-    for symbol in range(step.shape[1] - 1):
-        before.append(_log_sum(before[-1][:, :, None] + step[:, symbol], axis=1))
-        after.append(_log_sum(step[:, -1 - symbol] + after[-1][:, None, :], axis=2))
-    return np.stack(before, axis=1), np.stack(after[::-1], axis=1)
+    """Log-likelihood of each state before and after every symbol, (n, N, states), from the steps between states.
+
+    Both recursions take as many steps and run side by side: what counts is the number of calls.
+    """
+    steps = np.concatenate([step[:, :-1], step[:, :0:-1].swapaxes(2, 3)])
+    states = [np.concatenate([start, end])]
+    for symbol in range(steps.shape[1]):
+        states.append(_log_sum(states[-1][:, :, None] + steps[:, symbol], axis=1))
+    before, after = np.split(np.stack(states, axis=1), 2)
+    return before, after[:, ::-1]
 
 
 def _scaled(log_values: FloatArray) -> NDArray[np.float32]:

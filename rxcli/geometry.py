@@ -24,6 +24,8 @@ _OVERHANG = 0.02
 _OUTLINE_POINTS = 65
 #: No lens moves a point of the picture by more than this many focal lengths.
 _LARGEST_MOVE = 10.0
+#: The inverse of the lens is found when a step moves no point by this many pixels.
+_LEAST_STEP = 1e-8
 #: Edges are straight to a thousandth of a pixel over this many rows.
 _KNOT_ROWS = 32
 
@@ -79,13 +81,15 @@ def undistort(points: FloatArray, lens: Lens, iterations: int = 20) -> FloatArra
     Args:
         points: (..., 2) pixels.
         lens: the lens model.
-        iterations: steps; 20 reach 1e-6 px for the distortion of ordinary lenses.
+        iterations: steps, at most; 20 reach 1e-6 px for the distortion of ordinary lenses.
     """
     reach = _LARGEST_MOVE * np.abs(lens.camera_matrix[0, 0])
     found = points.copy()
     for _ in range(iterations):
         step = found + points - distort(found, lens)
-        found = np.where((np.abs(step - points) <= reach).all(axis=-1, keepdims=True), step, points)
+        before, found = found, np.where((np.abs(step - points) <= reach).all(axis=-1, keepdims=True), step, points)
+        if np.abs(found - before).max(initial=0.0) < _LEAST_STEP:
+            break
     return found
 
 

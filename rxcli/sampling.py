@@ -31,6 +31,8 @@ _BAND_PIXELS = 900_000
 #: One row in this many is kept for the noise model, and of those as many as hold this many cells.
 _NOISE_ROW_STEP = 16
 _NOISE_CELLS = 10_000
+#: Fewer bands than these are read sooner than threads for them are started.
+_MANY_BANDS = 4
 _NOISE_BINS = 24
 #: Edges that enclose less than this many values have no light between them.
 _LEAST_ENCLOSED = 0.1
@@ -91,7 +93,7 @@ def sample_rows(
         return noise_cells
 
     bands = range(0, n_rows, band_rows)
-    if len(bands) == 1 or reader.threads == 1:
+    if len(bands) < _MANY_BANDS or reader.threads == 1:
         noise_cells = [read_band(band) for band in bands]
     else:
         with ThreadPoolExecutor(reader.threads) as pool:
