@@ -191,7 +191,9 @@ def _by_pattern(taps: FloatArray, n: int, of_levels: Callable[[Float32Array], Fl
     for levels in slot_patterns(memory) @ taps.T:
         # Sample i belongs to metric (i + lead) // q.
         values = of_levels(np.tile(np.roll(levels, -(lead % q)).astype(np.float32), -(-n // q))[:n])
-        sums.append(_by_slot(np.pad(values, ((0, 0), (lead, memory * q - lead))), q))
+        padded = np.zeros((values.shape[0], n + memory * q), np.float32)
+        padded[:, lead : lead + n] = values
+        sums.append(_by_slot(padded, q))
     return np.stack(sums, axis=2).astype(np.float64)
 
 
@@ -203,7 +205,12 @@ def metrics_of(llr: Float32Array, memory: int) -> FloatArray:
 
 def lit_on_grid(posteriors: BurstPosteriors, clock: Clock) -> Float32Array:
     """(C, N) probability that each slot of the grid is lit."""
-    copies = posteriors.lit[clock.burst].transpose(1, 0, 2)
+    return on_grid(posteriors.lit, clock)
+
+
+def on_grid(lit: Float32Array, clock: Clock) -> Float32Array:
+    """(C, N) slots of the grid from those of bursts (B, C, packet)."""
+    copies = lit[clock.burst].transpose(1, 0, 2)
     flat = copies.reshape(copies.shape[0], -1)
     return flat[:, clock.first_slot : clock.first_slot + clock.n_slots]
 
@@ -345,7 +352,8 @@ def _timing(
 def _shape_on_grid(lit: Float32Array, model: LightModel) -> Float32Array:
     """(C, N * Q) mean of the exposure over the expected slots; unknown slots beyond the grid are half lit."""
     memory, q = model.memory, model.taps.shape[0]
-    padded = np.pad(lit, ((0, 0), (memory, memory)), constant_values=0.5)
+    padded = np.full((lit.shape[0], lit.shape[1] + 2 * memory), 0.5, np.float32)
+    padded[:, memory : memory + lit.shape[1]] = lit
     n_metrics = lit.shape[1] + memory
     repeated = np.repeat(padded, q, axis=1)
     shape = np.zeros((lit.shape[0], n_metrics * q), np.float32)

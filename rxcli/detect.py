@@ -193,9 +193,21 @@ def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
         metrics: (B, C, packet + memory, patterns) log-likelihoods of B bursts.
         margin: nats.
     """
-    memory = _memory_of(metrics)
-    llr = np.clip(slot_llr(metrics)[:, :, : metrics.shape[2] - memory], -_SURE_LLR, _SURE_LLR)
-    symbols = llr.reshape(*llr.shape[:2], -1, SLOTS_PER_SYMBOL)
+    score = _weight_scores(_symbols_llr(metrics))
+    # The metrics that a slot shares with its neighbours were counted for each of them.
+    lead = margin * (_memory_of(metrics) + 1) / 2
+    return np.asarray(score >= score.max(axis=1, keepdims=True) - lead)
+
+
+def _symbols_llr(metrics: FloatArray) -> Float32Array:
+    """(B, C, symbols, 10) log-likelihood ratios of the slots of packets, header first."""
+    llr = slot_llr(metrics)[:, :, : metrics.shape[2] - _memory_of(metrics)]
+    return llr.reshape(*llr.shape[:2], -1, SLOTS_PER_SYMBOL)
+
+
+def _weight_scores(symbols: Float32Array) -> FloatArray:
+    """(C, 9) log-likelihood of every weight from the log-likelihood ratios (B, C, symbols, 10) of slots."""
+    symbols = np.clip(symbols, -_SURE_LLR, _SURE_LLR)
     payload = symbols[:, :, 2:]
     coefficients = np.zeros((*payload.shape[:3], SLOTS_PER_SYMBOL + 1))
     coefficients[..., 0] = 1.0
@@ -203,10 +215,29 @@ def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
         coefficients[..., 1:] += coefficients[..., :-1] * slot[..., None]
     words = np.array([comb(SLOTS_PER_SYMBOL, w) for w in WEIGHTS])
     score = np.log(coefficients[..., 1:SLOTS_PER_SYMBOL] / words).sum(axis=(0, 2))
-    score += np.cumsum(symbols[:, :, 1], axis=2)[..., : len(WEIGHTS)].sum(axis=0)
-    # The metrics that a slot shares with its neighbours were counted for each of them.
-    lead = margin * (memory + 1) / 2
-    return np.asarray(score >= score.max(axis=1, keepdims=True) - lead)
+    return np.asarray(score + np.cumsum(symbols[:, :, 1], axis=2)[..., : len(WEIGHTS)].sum(axis=0))
+
+
+def first_guess(metrics: FloatArray) -> Float32Array:
+    """Probability of every slot of B bursts being lit, (B, C, packet), every symbol by itself.
+
+    What slots share with their neighbours is told by `slot_llr` alone, so that no trellis is needed; as a start for the
+    light model that is as good where an exposure is hardly longer than a slot.
+
+    Args:
+        metrics: (B, C, packet + memory, patterns) log-likelihoods.
+    """
+    symbols = _symbols_llr(metrics)
+    weights = _weight_scores(symbols).argmax(axis=1) + 1
+    lit = np.empty_like(symbols)
+    for w in np.unique(weights):
+        columns = np.flatnonzero(weights == w)
+        lit[:, columns, :2] = np.stack([np.array(HEADER), dimming_symbol(int(w))])
+        words = codebook(int(w)).astype(np.float32)
+        score = symbols[:, columns, 2:] @ words.T
+        likely = np.exp(score - score.max(axis=3, keepdims=True))
+        lit[:, columns, 2:] = likely @ words / likely.sum(axis=3, keepdims=True)
+    return lit.reshape(*lit.shape[:2], -1)
 
 
 def weight_evidence(metrics: FloatArray, candidates: NDArray[np.bool_]) -> FloatArray:

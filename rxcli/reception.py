@@ -88,14 +88,20 @@ def quick_look(lock: Lock) -> Reception:
     contrast = clock.contrast(samples.light, samples.valid, _COARSE, model.sigma)
     first = channel.first_metrics(*contrast, model.taps)
     now = clock.assign_bursts(now, detect.slot_llr(first), lock.screen.repeats)
-    posteriors = _detect(first, now, margin=0.0)
+    lit = channel.on_grid(_first_guess(_by_burst(first, now), model.memory), now)
     columns = np.arange(samples.light.shape[0])
-    lit = channel.lit_on_grid(posteriors, now)
     likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
     now = clock.assign_bursts(now, detect.slot_llr(likelihoods.metrics), lock.screen.repeats)
     now = clock.corrected(now, likelihoods.timing)
     posteriors = _detect(likelihoods.metrics, now)
     return Reception(now, samples, posteriors, likelihoods.snr, model, likelihoods.metrics)
+
+
+def _first_guess(metrics: FloatArray, memory: int) -> Float32Array:
+    """(B, C, packet) slots of bursts by the first guess of the metrics; longer exposures need the trellis."""
+    if memory == 1:
+        return detect.first_guess(metrics)
+    return detect.detect(metrics, detect.plausible_weights(metrics, 0.0)).lit
 
 
 def _likeliest_mix(lock: Lock) -> Reception:
@@ -350,9 +356,9 @@ def _doubtful(seen: Reception, certain: float) -> NDArray[np.bool_]:
     return np.asarray(((assemble.confidence(evidence) < certain) & complete).any(axis=0))
 
 
-def _detect(metrics: FloatArray, now: Clock, margin: float = HOPELESS_WEIGHT) -> BurstPosteriors:
+def _detect(metrics: FloatArray, now: Clock) -> BurstPosteriors:
     bursts = _by_burst(metrics, now)
-    return detect.detect(bursts, detect.plausible_weights(bursts, margin))
+    return detect.detect(bursts, detect.plausible_weights(bursts, HOPELESS_WEIGHT))
 
 
 def _by_burst(metrics: FloatArray, now: Clock) -> FloatArray:

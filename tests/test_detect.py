@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli.detect import detect, doubtful_words, plausible_weights, slot_support, weight_evidence
+from rxcli.channel import metrics_of
+from rxcli.detect import (
+    detect,
+    doubtful_words,
+    first_guess,
+    plausible_weights,
+    slot_support,
+    weight_evidence,
+)
 from rxcli.protocol import (
     HEADER,
     WEIGHTS,
@@ -226,6 +234,30 @@ def test_hopeless_weights_are_dropped_and_a_wide_margin_keeps_all() -> None:
     metrics = sent_through(rng.integers(0, 128, (20, 11)), 5, WHITE, 0.1, rng)
     assert plausible_weights(metrics, 20.0).sum() == 20
     assert plausible_weights(metrics, 1e9).all()
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_the_first_guess_is_exact_where_slots_are_independent(memory: int) -> None:
+    rng = np.random.default_rng(memory)
+    w = np.array([3, 5, 8])
+    tx = np.stack([packet_and_next(rng.integers(0, 1 << bits_per_symbol(i), (1, 4)), i, 0)[0] for i in w])
+    llr = (4 * (2 * tx - 1) + rng.normal(0, 3, (2, *tx.shape))).astype(np.float32)
+    metrics = np.stack([metrics_of(burst, memory) for burst in llr])
+    guess = first_guess(metrics)
+    found = detect(metrics, np.array(WEIGHTS) == w[:, None])
+    np.testing.assert_allclose(guess, found.lit, atol=1e-4)
+    assert 0.01 < np.abs(guess[..., 20:] - tx[:, 20:]).mean() < 0.2
+
+
+@pytest.mark.parametrize(("exposure_slots", "memory"), [(0.4, 1), (1.08, 1), (1.3, 1)])
+@pytest.mark.parametrize("w", WEIGHTS)
+def test_the_first_guess_of_clean_slots_is_what_was_sent(w: int, exposure_slots: float, memory: int) -> None:
+    rng = np.random.default_rng([w, memory])
+    tx = rng.integers(0, 1 << bits_per_symbol(w), (40, 5))
+    guess = first_guess(sent_through(tx, w, box_exposure(exposure_slots, memory), 0.02, rng))
+    sent = packet_and_next(tx, w, 0)
+    assert guess.shape == (1, *sent.shape)
+    assert np.abs(guess[0] - sent).max() < 0.05
 
 
 @pytest.mark.parametrize("memory", [1, 3])

@@ -195,8 +195,9 @@ def _half_way(energy: FloatArray, start: NDArray[np.int64]) -> NDArray[np.int64]
 
 def agreeing(place: FloatArray, tolerance: float) -> BoolArray:
     """Places that two segments out of four close by share: noise stands alone."""
-    padded = np.pad(place, 3, constant_values=np.inf)
     n = place.size
+    padded = np.full(n + 6, np.inf)
+    padded[3 : n + 3] = place
     close = [np.abs(padded[shift : shift + n] - place) <= tolerance for shift in (0, 1, 5, 6)]
     return np.asarray(np.sum(close, axis=0) >= 2, np.bool_)
 
@@ -258,8 +259,11 @@ def _row_noise(outside: FloatArray, limit: FloatArray) -> FloatArray:
 
 def _ahead(values: FloatArray, box: int) -> FloatArray:
     """(K, N + 2 box) mean of the `box` values from each place on; the last value goes on."""
-    padded = np.pad(values.astype(np.float64), ((0, 0), (0, 3 * box)), mode="edge")
-    total = np.cumsum(np.pad(padded, ((0, 0), (1, 0))), axis=1)
+    n = values.shape[1]
+    padded = np.zeros((values.shape[0], 1 + n + 3 * box))
+    padded[:, 1 : n + 1] = values
+    padded[:, n + 1 :] = values[:, -1:]
+    total = np.cumsum(padded, axis=1)
     return np.asarray((total[:, box:] - total[:, :-box]) / box)
 
 
