@@ -53,15 +53,17 @@ class Rectangle:
 
     def project(self, pose: FloatArray) -> FloatArray:
         """(..., 4, 2) corners of (..., 8) poses, pixels, before distortion."""
-        tilt, yaw, roll, right, down, width, focal, _ = np.moveaxis(np.asarray(pose)[..., None, :], -1, 0)
+        tilt, yaw, roll, right, down, width, focal, _ = (pose[..., i, None] for i in range(_N))
         x = np.array([-0.5, 0.5, 0.5, -0.5])
         y = np.array([-0.5, -0.5, 0.5, 0.5]) / self.aspect
         x, y = x * np.cos(roll) - y * np.sin(roll), x * np.sin(roll) + y * np.cos(roll)
         x, z = x * np.cos(yaw), x * np.sin(yaw)
         y, z = y * np.cos(tilt) - z * np.sin(tilt), y * np.sin(tilt) + z * np.cos(tilt)
         scale = np.exp(width)
-        near = 1 + z * scale * np.exp(-focal)
-        return np.stack([(x * scale + right) / near, (y * scale + down) / near], axis=-1) * self.width + self.middle
+        near = (1 + z * scale * np.exp(-focal)) / self.width
+        corners = np.empty((*near.shape, 2))
+        corners[..., 0], corners[..., 1] = (x * scale + right) / near, (y * scale + down) / near
+        return corners + self.middle
 
     def side_at(self, corners: FloatArray, distortion: FloatArray, side: int, t: FloatArray) -> FloatArray:
         """(..., n) places of a side at (n,) `t`, for (..., 4, 2) corners and (...,) distortions."""
