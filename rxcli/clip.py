@@ -9,8 +9,10 @@ shows its burst, so results come a frame late.
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,11 +31,11 @@ from rxcli.reception import (
     Reception,
     decode,
     doubtful_columns,
+    of_columns,
     quick_look,
     second_opinion,
 )
 from rxcli.types import (
-    BurstPosteriors,
     Clock,
     ColumnResult,
     Float32Array,
@@ -57,6 +59,8 @@ _DARK_SNR = 0.5
 _QUICK_DOUBT = 0.5
 #: Strips of a column, at most: more tell no more of a picture that is known, and take time.
 _STRIPS = 4
+#: Threads that measure frames again: by then the decoder may have little left to do.
+_THREADS = min(2, os.cpu_count() or 1)
 #: Frames beyond which each one's share of what is known of the picture does not matter.
 _MANY_VIEWS = 12
 #: Frames that find their clock together where each shows little.
@@ -135,7 +139,7 @@ class _View:
     #: Where the strips were then.
     map: strips.StripMap | None = None
     flat: known_picture.ColumnLight | None = None
-    #: Kept only while the frame is held back to be looked at once more.
+    #: Kept only while the frame is held back, of those that came before the screen's place was looked at again.
     frame: Frame | None = None
 
 
@@ -313,7 +317,7 @@ class _Clip:
         lit = channel.lit_on_grid(seen.posteriors, seen.clock)
         if can_track:
             with stages("sampling"):
-                self._start_tracking(frame, corners, camera, lock, seen)
+                self._start_tracking(frame, corners, camera, lock, seen, before)
                 view.light, view.map = self._strips(frame), self._place.map if self._place else None
             self._learn(view, lit)
         self._last = view
@@ -353,12 +357,14 @@ class _Clip:
             and not camera.reversed
         )
 
-    def _start_tracking(self, frame: Frame, corners: FloatArray, camera: Camera, lock: Lock, seen: Reception) -> None:
-        self._place = _Place(
-            corners,
-            _map(frame, corners, camera, lock),
-            deque([corners], maxlen=_LOOKS),
-        )
+    def _start_tracking(
+        self, frame: Frame, corners: FloatArray, camera: Camera, lock: Lock, seen: Reception, before: _Place | None
+    ) -> None:
+        """Begin a picture; the strips stay those of the place before, where the screen is still there."""
+        n_columns = lock.screen.columns
+        there = before is not None and corners is before.corners and before.map.inside.shape[0] == n_columns
+        strip_map = before.map if before is not None and there else _map(frame, corners, camera, lock)
+        self._place = _Place(corners, strip_map, deque([corners], maxlen=_LOOKS))
         self._model = lock, seen.model.floor
         self._picture = self._new_picture(*self._model)
 
@@ -436,7 +442,7 @@ class _Clip:
             expected = fit.response.expected(lit, positions, exposure_slots)
             flat = picture.solve_again(light, expected, now.rows_per_slot)
             fit = known_picture.fit_response(flat, slots)
-        if fit.response.centre < _FADED:
+        if thorough and fit.response.centre < _FADED:
             flat = known_picture.evened(flat, slots)
             fit = known_picture.fit_response(flat, slots)
         if abs(fit.late) > _LATE:
@@ -543,7 +549,7 @@ class _Clip:
         self._link.last_time_s = frame.time_s
         view.bursts = replace(view.bursts, first_copy=first_copy)
         self._waiting.append(waiting)
-        if self._n_held == _HELD and view.light is not None:
+        if self._n_held == _HELD and self._place is not None and self._place.n_frames < _FIRST_LOOKS - 1:
             view.frame = frame
         with stages("detect"):
             if not self._link.phase.settled:
@@ -611,26 +617,37 @@ class _Clip:
         self._bursts.add(view.bursts, waiting.numbers, channel.by_burst(view.bursts.metrics, now, view.memory))
         return waiting.numbers
 
-    def _freshen(self, waiting: _Waiting) -> None:
-        """Detect the bursts of a frame that were added to since they were looked at."""
-        assert waiting.numbers is not None
-        stale = [n for n in waiting.numbers if self._bursts.is_stale(int(n))]
-        self._detect_bursts(waiting, np.array(stale, np.int64), dark_too=bool(self._n_held))
+    def _freshen(self, *frames: _Waiting) -> None:
+        """Detect the bursts of frames that were added to since they were looked at."""
+        asked: list[tuple[_Waiting, IntArray]] = []
+        stale: set[int] = set()
+        for waiting in frames:
+            assert waiting.numbers is not None
+            numbers = [int(n) for n in waiting.numbers if self._bursts.is_stale(int(n)) and int(n) not in stale]
+            stale.update(numbers)
+            asked.append((waiting, np.array(numbers, np.int64)))
+        self._detect_bursts(asked, dark_too=bool(self._n_held))
 
-    def _detect_bursts(self, waiting: _Waiting, numbers: IntArray, dark_too: bool) -> None:
-        """Detect bursts of a frame as far as they are open, in columns that are neither certain nor, unless they are
-        to be tried too, dark."""
-        assert waiting.view is not None
-        still_open = np.array([n for n in numbers if self._bursts.is_open(int(n))], np.int64)
-        if still_open.size == 0:
-            return
-        certain = self._bursts.certain(still_open)
-        if "certain_columns" not in self._options.skip:
-            certain[:] = False
-        dark = ~certain & (self._dark(waiting.view) & (not dark_too))
-        self._skip(waiting, "certain_columns", int(certain.sum()))
-        self._skip(waiting, "dark_columns", int(dark.sum()))
-        self._detect_open(still_open, ~certain & ~dark)
+    def _detect_bursts(self, asked: list[tuple[_Waiting, IntArray]], dark_too: bool) -> None:
+        """Detect bursts of frames as far as they are open, in columns that are neither certain nor, unless they are to
+        be tried too, dark."""
+        found: list[tuple[IntArray, NDArray[np.bool_]]] = []
+        for waiting, numbers in asked:
+            assert waiting.view is not None
+            still_open = np.array([n for n in numbers if self._bursts.is_open(int(n))], np.int64)
+            if still_open.size == 0:
+                continue
+            certain = self._bursts.certain(still_open)
+            if "certain_columns" not in self._options.skip:
+                certain[:] = False
+            dark = ~certain & (self._dark(waiting.view) & (not dark_too))
+            self._skip(waiting, "certain_columns", int(certain.sum()))
+            self._skip(waiting, "dark_columns", int(dark.sum()))
+            self._bursts.looked_at(still_open)
+            if not (certain | dark).all():
+                found.append((still_open, ~certain & ~dark))
+        if found:
+            self._detect_open(found)
 
     def _dark(self, view: _View) -> NDArray[np.bool_]:
         """(C,) columns of a tracked frame with too little light to try; now and then they are tried all the same."""
@@ -639,30 +656,43 @@ class _Clip:
             return np.zeros(view.snr.shape[0], bool)
         return np.asarray(np.median(view.snr, axis=1) < _DARK_SNR)
 
-    def _detect_open(self, numbers: IntArray, wanted: NDArray[np.bool_]) -> None:
-        """Detect the wanted columns, (B, C), of open bursts."""
-        bursts, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
-        self._bursts.looked_at(numbers)
-        if bursts.size == 0:
-            return
-        metrics = self._bursts.metrics(numbers[bursts])[:, columns]
-        none = np.zeros((columns.size, len(WEIGHTS)), bool)
-        candidates = self._weights[columns] if self._weights is not None else none
-        unknown = ~candidates.any(axis=1)
-        if unknown.any():
-            candidates[unknown] = detect.plausible_weights(metrics[:, unknown], HOPELESS_WEIGHT)
-        posteriors = detect.detect(metrics, candidates)
-        certain = posteriors.log_prob.min(axis=2) >= _CERTAIN
-        self._bursts.note(numbers[bursts], columns, posteriors, certain)
-        self._note_weights(columns, posteriors, certain)
+    def _detect_open(self, found: list[tuple[IntArray, NDArray[np.bool_]]]) -> None:
+        """Detect the columns wanted, (B, C), of the open bursts of some frames.
 
-    def _note_weights(self, columns: IntArray, posteriors: BurstPosteriors, certain: NDArray[np.bool_]) -> None:
-        """Weights of columns that were certain are the only ones tried next, until they are not certain any more."""
+        All at once, for each symbol's turn costs the same; only the weights are settled frame by frame.
+        """
         if self._weights is None or self._weights.shape[0] != self._bursts.n_columns:
             self._weights = np.zeros((self._bursts.n_columns, len(WEIGHTS)), bool)
-        self._weights[columns] = False
-        sure = certain.any(axis=0)
-        self._weights[columns[sure], posteriors.w[sure] - 1] = True
+        places = [np.nonzero(wanted) for _, wanted in found]
+        metrics = [self._bursts.metrics(numbers) for numbers, _ in found]
+        weights = [self._settled_weights(m, wanted) for m, (_, wanted) in zip(metrics, found, strict=True)]
+        number = np.concatenate([numbers[burst] for (numbers, _), (burst, _) in zip(found, places, strict=True)])
+        column = np.concatenate([c for _, c in places])
+        posteriors = detect.detect(
+            np.concatenate([m[place] for m, place in zip(metrics, places, strict=True)])[None],
+            np.concatenate([w[c] for w, (_, c) in zip(weights, places, strict=True)]),
+        )
+        certain = posteriors.log_prob[0].min(axis=1) >= _CERTAIN
+        for one in np.unique(number):
+            mine = np.flatnonzero(number == one)
+            self._bursts.note(int(one), column[mine], of_columns(posteriors, mine), certain[mine])
+        # Weights of columns that were certain are the only ones tried next, until they are not certain any more.
+        self._weights[column] = False
+        self._weights[column[certain], posteriors.w[certain] - 1] = True
+
+    def _settled_weights(self, metrics: FloatArray, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(C, 9) the weight of each column, by all bursts (B, C, ...) of a frame; only of those wanted, (B, C)."""
+        assert self._weights is not None
+        bursts, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
+        weights = self._weights.copy()
+        unknown = columns[~weights[columns].any(axis=1)]
+        if unknown.size:
+            weights[unknown] = detect.plausible_weights(metrics[bursts][:, unknown], HOPELESS_WEIGHT)
+        several = columns[weights[columns].sum(axis=1) > 1]
+        if several.size:
+            evidence = detect.weight_evidence(metrics[bursts][:, several], weights[several])
+            weights[several] = np.arange(len(WEIGHTS)) == evidence.argmax(axis=1)[:, None]
+        return weights
 
     def _learn(
         self, view: _View, lit: Float32Array, keep: float = known_picture.MEMORY
@@ -678,8 +708,7 @@ class _Clip:
         now = view.bursts.clock
         positions = known_picture.row_positions(self._rows, now)
         slots = known_picture.exposed(lit, positions, now.exposure_slots)
-        doubt = known_picture.exposed(lit * (1 - lit), positions, now.exposure_slots)
-        trust = np.clip(1 - 8 * doubt, 0, 1).astype(np.float32)
+        trust = known_picture.trusted(lit, positions, now.exposure_slots)
         picture.learn(view.light, slots, trust, keep)
         return slots, trust
 
@@ -709,26 +738,29 @@ class _Clip:
         """Learn the picture anew from all frames held, and measure those in doubt by what the others say of it."""
         assert self._place is not None
         assert self._model is not None
+        self._freshen(*held)
         known = [self._grid(waiting) for waiting in held]
-        doubtful = [self._n_held == _HELD or self._doubts(waiting)[0] > 0 for waiting in held]
+        doubtful = [self._doubts(waiting)[0] > 0 for waiting in held]
         views = [waiting.view for waiting in held if waiting.view is not None]
         for view in views:
-            if view.frame is not None:
+            if view.frame is not None and view.map is not self._place.map:
                 view.light, view.map = self._strips(view.frame), self._place.map
         lock, floor = self._model
         self._picture = self._new_picture(lock, self._dark_light(views, floor))
         lessons = [self._learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
-        for waiting, lesson, needed in zip(held, lessons, doubtful, strict=True):
-            if needed and waiting.view is not None:
-                self._measure_again(waiting.view, lesson if len(held) <= _MANY_VIEWS else None)
+        alone = len(held) <= _MANY_VIEWS
+        some = [(v, a if alone else None) for v, a, needed in zip(views, lessons, doubtful, strict=True) if needed]
+        with ThreadPoolExecutor(_THREADS) as pool:
+            list(pool.map(self._measure_again, *zip(*some, strict=True)))
 
     def _detect_again(self) -> None:
         """The bursts of all frames that wait, each once: in the last frame that shows it."""
         self._bursts = tracking.Bursts()
         waiting = [w for w in self._waiting if w.view is not None and w.numbers is not None]
         numbers = [self._add(w) for w in waiting]
-        for now, mine, following in zip(waiting, numbers, [*numbers[1:], numbers[0][:0]], strict=True):
-            self._detect_bursts(now, np.setdiff1d(mine, following), dark_too=False)
+        after = [*numbers[1:], numbers[0][:0]]
+        ended = [np.setdiff1d(mine, following) for mine, following in zip(numbers, after, strict=True)]
+        self._detect_bursts(list(zip(waiting, ended, strict=True)), dark_too=False)
         tracked = [w.view for w in waiting if w.view is not None and w.view.flat is not None]
         self._last = tracked[-1] if tracked else self._last
 
@@ -744,7 +776,7 @@ class _Clip:
         """Measure a frame by the picture, less what the frame itself has shown of it where that is given."""
         assert self._picture is not None
         assert view.light is not None
-        picture = self._picture if lesson is None else self._picture.without(view.light, *lesson)
+        picture = self._picture.same() if lesson is None else self._picture.without(view.light, *lesson)
         flat = picture.solve(view.light)
         refined = self._refined(picture, view.light, flat, view.bursts.clock, view.memory, thorough=True)
         if refined is not None:

@@ -47,6 +47,8 @@ _TABLE = 256
 #: Rows of columns, about, from which a response is measured, more would tell no more; and the golden ratio, whose
 #: multiples fall evenly between whole numbers.
 _SAMPLES_OF_RESPONSE, _GOLDEN = 9000, 0.6180339887
+#: A slot that is lit, or dark, but for this probability is sure.
+_SURE = 1e-4
 #: Slots beyond the grid that a position may reach.
 _BEYOND_SLOTS = 8
 #: Slots of the header between which it is dark, and rows of a strip, over all frames, from which its light is known.
@@ -137,6 +139,13 @@ class KnownPicture:
         other._system, other._excess = None, self._excess.copy()
         return other
 
+    def same(self) -> KnownPicture:
+        """The same picture; what is found of the columns' noise in one is not known in the other."""
+        self._settled()
+        other = copy(self)
+        other._excess = self._excess.copy()
+        return other
+
     def _lesson(
         self, light: Float32Array, slots: Float32Array, trust: Float32Array
     ) -> tuple[Float32Array, Float32Array]:
@@ -152,9 +161,13 @@ class KnownPicture:
         Args:
             light: (C, S, R).
         """
+        return self._solved(light, self._settled())
+
+    def _settled(self) -> _System:
+        """The equations of the picture as it is, made when first needed."""
         if self._system is None:
             self._system = self._factor()
-        return self._solved(light, self._system)
+        return self._system
 
     def solve_again(self, light: Float32Array, expected: Float32Array, rows_per_slot: float) -> ColumnLight:
         """The columns' own light once more, strips trusted as far as they show what is expected of other slots nearby.
@@ -166,8 +179,7 @@ class KnownPicture:
             expected: (C, R) light that the slots decided so far give.
             rows_per_slot: rows per slot.
         """
-        if self._system is None:
-            self._system = self._factor()
+        self._settled()
         foreseen = self._picture * (self._spread @ _with_neighbours(expected))
         error = light - self._floor - foreseen
         error *= error
@@ -341,6 +353,19 @@ def exposed(slots: Float32Array, positions: FloatArray, exposure_slots: float) -
     return _Light(slots).between(positions, exposure_slots / 2) / np.float32(exposure_slots)
 
 
+def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
+    """(C, R) 0..1 how far rows can be learned from whose slots are lit with probability `lit`; see `exposed`."""
+    doubt = lit * (1 - lit)
+    each: IntArray = np.arange(len(lit))
+    if len(positions) == 1:  # columns without doubt are alike
+        unsure = np.flatnonzero(doubt.max(axis=1) > _SURE)
+        each = np.zeros(len(lit), np.int64)
+        each[unsure] = 1 + np.arange(unsure.size)
+        doubt = np.concatenate([np.zeros_like(doubt[:1]), doubt[unsure]])
+    trust = np.clip(1 - 8 * exposed(doubt, positions, exposure_slots), 0, 1)
+    return np.asarray(trust[each], np.float32)
+
+
 class _Light:
     """Slots (C, N), half lit beyond, and what they add up to.
 
@@ -402,14 +427,22 @@ class Response:
 
     def expected(self, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
         """(C, R) light that slots give; arguments as for `exposed`."""
-        light, half = _Light(lit), exposure_slots / 2
-        out = light.between(positions, half)
-        out *= np.float32(self.centre / exposure_slots)
-        beside = light.between(positions - _SIDE, half)
-        beside += light.between(positions + _SIDE, half)
-        beside *= np.float32(self.side / exposure_slots)
-        out += beside
-        out += np.float32(self.offset)
+        groups = _alike_columns(positions)
+        return np.concatenate(
+            [self._of_rows(lit[g], at, exposure_slots) for g, at in zip(groups, positions, strict=True)]
+        )
+
+    def _of_rows(self, lit: Float32Array, centre: FloatArray, exposure_slots: float) -> Float32Array:
+        """(C, R) light that slots give to rows at `centre` (R,)."""
+        reach = exposure_slots / 2 + (_SIDE if self.side else 0)
+        slots = np.floor(centre - reach).astype(np.intp)[:, None] + np.arange(int(np.ceil(2 * reach)) + 1)
+        share = _shares(centre, slots, exposure_slots, self)
+        beyond = _BEYOND_SLOTS
+        padded = np.pad(lit, ((0, 0), (beyond, beyond)), constant_values=np.float32(0.5))
+        slots = np.clip(slots + beyond, 0, padded.shape[1] - 1)
+        out = np.full((lit.shape[0], centre.size), self.offset, np.float32)
+        for place in range(slots.shape[1]):
+            out += share[:, place] * padded.take(slots[:, place], axis=1)
         return out
 
 
@@ -597,12 +630,16 @@ def pattern_metrics(
         lit: (C, N) present idea of the slots, for what reaches beyond the memory.
     """
     value = seen.value - expected
-    groups = [slice(None)] if positions.shape[0] == 1 else [slice(c, c + 1) for c in range(positions.shape[0])]
     parts = [
         _row_metrics(value[group], seen.precision[group], centre, clock, memory, response, lit[group])
-        for group, centre in zip(groups, positions, strict=True)
+        for group, centre in zip(_alike_columns(positions), positions, strict=True)
     ]
     return np.concatenate(parts).astype(np.float64)
+
+
+def _alike_columns(positions: FloatArray) -> list[slice]:
+    """The columns that each row of `positions`, (C, R) or (1, R), is for."""
+    return [slice(None)] if len(positions) == 1 else [slice(c, c + 1) for c in range(len(positions))]
 
 
 def _row_metrics(

@@ -182,7 +182,7 @@ def _replaced(every: BurstPosteriors, columns: NDArray[np.int64], some: BurstPos
     return BurstPosteriors(*(merged(field.name) for field in fields(BurstPosteriors)))
 
 
-def _of(every: BurstPosteriors, columns: NDArray[np.int64]) -> BurstPosteriors:
+def of_columns(every: BurstPosteriors, columns: NDArray[np.int64]) -> BurstPosteriors:
     """Posteriors of some columns."""
     return BurstPosteriors(*(getattr(every, f.name)[_in_columns(f.name, columns)] for f in fields(BurstPosteriors)))
 
@@ -237,11 +237,11 @@ def second_opinion(
     metrics = seen.metrics[columns] + channel.metrics_of(corrections, seen.model.memory)
     metrics = _words_weighed(seen, seen.scene, columns, metrics)
     posteriors = _detect(metrics, seen.clock)
-    before, after = (p.log_prob.sum(axis=(0, 2)) for p in (_of(seen.posteriors, columns), posteriors))
+    before, after = (p.log_prob.sum(axis=(0, 2)) for p in (of_columns(seen.posteriors, columns), posteriors))
     better = np.flatnonzero(after > before)
     kept = columns[better]
     # The network is told where headers are; whether they show there, the light alone must say.
-    corrected = replace(_of(posteriors, better), header_llr=seen.posteriors.header_llr[:, kept])
+    corrected = replace(of_columns(posteriors, better), header_llr=seen.posteriors.header_llr[:, kept])
     of_all = seen.metrics.copy()
     of_all[kept] = metrics[better]
     report.update(model=denoiser.name, kept=kept.size)

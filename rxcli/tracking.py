@@ -301,12 +301,11 @@ class Bursts:
         half = np.full(entries[0].seen.shape, 0.5, np.float32)
         return np.stack([half if e.posteriors is None else e.posteriors.lit[0] for e in entries])
 
-    def note(self, numbers: IntArray, columns: IntArray, posteriors: BurstPosteriors, certain: BoolArray) -> None:
-        """Keep what was detected of some columns of open bursts; `certain` is (B, columns)."""
-        for burst, number in enumerate(numbers):
-            entry = self._open[int(number)]
-            entry.posteriors = _merged(entry.posteriors, _one_burst(posteriors, burst), columns, entry.seen.shape[0])
-            entry.certain[columns] = certain[burst]
+    def note(self, number: int, columns: IntArray, posteriors: BurstPosteriors, certain: BoolArray) -> None:
+        """Keep what was detected of some columns of an open burst; `certain` is (columns,)."""
+        entry = self._open[number]
+        entry.posteriors = _merged(entry.posteriors, posteriors, columns, entry.seen.shape[0])
+        entry.certain[columns] = certain
 
     def known(self, number: int) -> BurstPosteriors | None:
         """What was last detected of an open burst."""
@@ -324,18 +323,6 @@ class Bursts:
             for number, entry in entries
             if entry is not None and entry.posteriors is not None
         ]
-
-
-def _one_burst(posteriors: BurstPosteriors, burst: int) -> BurstPosteriors:
-    part = slice(burst, burst + 1)
-    return replace(
-        posteriors,
-        lit=posteriors.lit[part],
-        index=posteriors.index[part],
-        log_prob=posteriors.log_prob[part],
-        bit_llr=posteriors.bit_llr[part],
-        header_llr=posteriors.header_llr[part],
-    )
 
 
 def _nothing_known(like: BurstPosteriors, n: int) -> BurstPosteriors:

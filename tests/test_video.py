@@ -396,7 +396,7 @@ def test_columns_not_yet_tried_are_unknown() -> None:
     bursts.add(FrameBursts(0, 0, clock, metrics[0], shown), np.array([7]), metrics)
     tried = np.array([0, 2])
     found = detect(metrics[:, tried])
-    bursts.note(np.array([7]), tried, found, np.ones((1, 2), bool))
+    bursts.note(7, tried, found, np.ones(2, bool))
     known = bursts.known(7)
     assert known is not None
     assert (known.index[:, tried] == found.index).all()

@@ -10,7 +10,7 @@ from threading import Condition, Thread
 from rxcli.types import Frame
 
 #: What may wait: pixels of so many bytes, and so many frames at least and at most.
-_MOST_BYTES, _LEAST_FRAMES, _MOST_FRAMES = 100_000_000, 2, 16
+_MOST_BYTES, _LEAST_FRAMES, _MOST_FRAMES = 60_000_000, 2, 16
 
 
 def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:
