@@ -677,35 +677,45 @@ def _process_likelihood(
     noise = np.float32(_PAIR_NOISE) * (np.float32(model.sigma**2) + np.float32(model.shot) * gain)
     residual = np.where(seen, halves.light[index] - gain, np.float32(0))
     gain = np.where(seen, gain, np.float32(0))
-    kinds = [_innovations(residual, gain, noise, *kind) for kind in _PICTURE_KINDS]
+    kinds = _innovations(residual, gain, noise, _PICTURE_KINDS)
     return np.asarray(np.logaddexp.reduce(kinds, axis=0).sum(axis=1), np.float64)
 
 
 def _innovations(
-    residual: Float32Array, gain: Float32Array, noise: Float32Array, deviation: float, length: float
+    residual: Float32Array, gain: Float32Array, noise: Float32Array, kinds: tuple[tuple[float, float], ...]
 ) -> Float32Array:
-    """(R, S) log-likelihood, up to a constant, of light that follows the picture's deviation from its mean.
+    """(kinds, R, S) log-likelihood, up to a constant, of light that follows the picture's deviation from its mean.
 
     Args:
         residual: (W, R, S) light less that of the mean picture.
         gain: (W, R, S) light per unit of relative deviation; 0 where nothing is seen.
         noise: (W, R, S) variance of the light.
-        deviation: standard deviation of the process.
-        length: slots after which it is another one.
+        kinds: standard deviation of the process, and slots after which it is another one, of every kind of picture.
     """
-    keep, power = np.float32(np.exp(-0.5 / length)), np.float32(deviation**2)
-    state, variance = np.zeros_like(residual[0]), np.full_like(residual[0], power)
-    total = np.zeros_like(state)
+    deviation, length = np.array(kinds, np.float32).T[:, :, None, None]
+    keep, power = np.exp(np.float32(-0.5) / length), np.square(deviation)
+    state = np.zeros((len(kinds), *residual.shape[1:]), np.float32)
+    variance, total = state + power, state.copy()
     for light, slope, error in zip(residual, gain, noise, strict=True):
         shared = slope * variance
-        spread = shared * slope + error
+        spread = shared * slope
+        spread += error
         innovation = light - slope * state
         step = innovation / spread
-        total += step * innovation
+        innovation *= step
+        total += innovation
         total += np.log(spread)
-        state = (state + shared * step) * keep
-        variance = (variance - shared * shared / spread - power) * (keep * keep) + power
-    return np.asarray(total * np.float32(-0.5))
+        np.divide(shared, spread, out=spread)
+        step *= shared
+        state += step
+        state *= keep
+        shared *= spread
+        variance -= shared
+        variance -= power
+        variance *= keep * keep
+        variance += power
+    total *= np.float32(-0.5)
+    return total
 
 
 def _as_slots(score: FloatArray, words: NDArray[np.uint8], likely: NDArray[np.bool_]) -> FloatArray:

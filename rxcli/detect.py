@@ -9,6 +9,7 @@ the sum over all paths is the evidence for `w`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from math import comb
@@ -277,6 +278,13 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
     Raises:
         ValueError: shapes do not fit.
     """
+    _check(metrics)
+    if candidates is None:
+        candidates = np.ones((metrics.shape[1], len(WEIGHTS)), bool)
+    return _posteriors(metrics, _weights(metrics, candidates))
+
+
+def _check(metrics: FloatArray) -> None:
     if metrics.ndim != 4 or metrics.shape[-1] not in {1 << (m + 1) for m in range(1, MAX_MEMORY + 1)}:
         raise ValueError(
             f"metrics must be (bursts, columns, slots, 2**(memory+1)) with memory 1..{MAX_MEMORY} (got {metrics.shape})"
@@ -284,39 +292,56 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
     n_payload = metrics.shape[2] - _memory_of(metrics) - PREAMBLE_SLOTS
     if n_payload <= 0 or n_payload % SLOTS_PER_SYMBOL:
         raise ValueError(f"metrics must hold whole packets and memory slots after them (got {metrics.shape})")
-    if candidates is None:
-        candidates = np.ones((metrics.shape[1], len(WEIGHTS)), bool)
-    return _posteriors(metrics, _weights(metrics, candidates))
 
 
-def doubtful_words(
-    metrics: FloatArray, w: NDArray[np.int64], certain: float, most: int
-) -> tuple[NDArray[np.int64], NDArray[np.uint8], FloatArray]:
-    """Symbols whose best word is not sure, and their likeliest words.
+@dataclass(frozen=True, slots=True)
+class DoubtfulWords:
+    """Symbols whose best word is not sure, and their K likeliest words."""
+
+    #: (J, 3) burst, column and number of each symbol.
+    places: NDArray[np.int64]
+    #: (J, K, 10), best first.
+    words: NDArray[np.uint8]
+    #: (J, K).
+    log_prob: FloatArray
+
+
+def detect_with_words(
+    metrics: FloatArray, candidates: NDArray[np.bool_], certain: float, most: int
+) -> tuple[BurstPosteriors, DoubtfulWords]:
+    """Weights and symbols as `detect` gives them, and the words between which it was in doubt.
 
     Args:
-        metrics: (B, C, packet + memory, patterns) log-likelihoods of B bursts.
-        w: (C,) weight of each column.
+        metrics: as for `detect`.
+        candidates: likewise.
         certain: log probability from which on a word is sure.
         most: words to give of each symbol, K; every code has eight.
 
-    Returns:
-        (J, 3) burst, column and number of each symbol; (J, K, 10) its words, best first; (J, K) their log probability.
+    Raises:
+        ValueError: shapes do not fit.
     """
-    memory = _memory_of(metrics)
-    places, words, log_prob = [np.zeros((0, 3), np.int64)], [np.zeros((0, most, 10), np.uint8)], [np.zeros((0, most))]
-    for weight in np.unique(w):
-        columns = np.flatnonzero(w == weight)
-        chosen = metrics[:, columns].reshape(-1, *metrics.shape[2:])
-        posterior = _forward_backward(chosen, int(weight), memory).word
-        posterior = posterior.reshape(len(metrics), columns.size, *posterior.shape[1:])
-        at = np.argwhere(posterior.max(axis=3) < np.exp(certain))
-        found = posterior[tuple(at.T)]
-        order = np.argsort(-found, axis=1)[:, :most]
-        places.append(np.stack([at[:, 0], columns[at[:, 1]], at[:, 2]], axis=1))
-        words.append(codebook(int(weight))[order])
-        log_prob.append(np.log(np.take_along_axis(found, order, axis=1) + _TINY))
-    return np.concatenate(places), np.concatenate(words), np.concatenate(log_prob)
+    _check(metrics)
+    found: list[DoubtfulWords] = []
+
+    def heed(w: int, columns: NDArray[np.int64], word: FloatArray) -> None:
+        by_burst = word.reshape(len(metrics), columns.size, *word.shape[1:])
+        found.append(_in_doubt(by_burst, w, columns, certain, most))
+
+    posteriors = _posteriors(metrics, _weights(metrics, candidates), heed)
+    return posteriors, DoubtfulWords(
+        np.concatenate([f.places for f in found]),
+        np.concatenate([f.words for f in found]),
+        np.concatenate([f.log_prob for f in found]),
+    )
+
+
+def _in_doubt(word: FloatArray, w: int, columns: NDArray[np.int64], certain: float, most: int) -> DoubtfulWords:
+    """Symbols in doubt of columns of one weight, from the probability of every word, (B, columns, N, words)."""
+    at = np.argwhere(word.max(axis=3) < np.exp(certain))
+    doubtful = word[tuple(at.T)]
+    order = np.argsort(-doubtful, axis=1)[:, :most]
+    places = np.stack([at[:, 0], columns[at[:, 1]], at[:, 2]], axis=1)
+    return DoubtfulWords(places, codebook(w)[order], np.log(np.take_along_axis(doubtful, order, axis=1) + _TINY))
 
 
 def _weights(metrics: FloatArray, candidates: NDArray[np.bool_]) -> FloatArray:
@@ -328,7 +353,12 @@ def _weights(metrics: FloatArray, candidates: NDArray[np.bool_]) -> FloatArray:
     return np.asarray(log_prob - _log_sum(log_prob, 1)[:, None])
 
 
-def _posteriors(metrics: FloatArray, w_log_prob: FloatArray) -> BurstPosteriors:
+def _posteriors(
+    metrics: FloatArray,
+    w_log_prob: FloatArray,
+    heed: Callable[[int, NDArray[np.int64], FloatArray], None] | None = None,
+) -> BurstPosteriors:
+    """Posteriors given the weights; `heed` is told weight, columns and probability of each word, (B * C, N, words)."""
     n_bursts, n_columns, length, _ = metrics.shape
     memory = _memory_of(metrics)
     n_symbols = (length - memory - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL
@@ -341,6 +371,8 @@ def _posteriors(metrics: FloatArray, w_log_prob: FloatArray) -> BurstPosteriors:
         columns = np.flatnonzero(weights == w)
         chosen = metrics[:, columns].reshape(n_bursts * columns.size, *metrics.shape[2:])
         posterior = _forward_backward(chosen, int(w), memory).word
+        if heed is not None:
+            heed(int(w), columns, posterior)
         words = codebook(int(w))
         preamble = np.concatenate([np.array(HEADER), dimming_symbol(int(w))])
         lit[:, columns, :PREAMBLE_SLOTS] = preamble

@@ -37,6 +37,9 @@ _BEYOND_REPAIR = -1.0
 #: Of symbols in doubt, so many words are weighed, down to so many nats below the best; not where even that is less
 #: likely than this, a log probability: there is nothing to choose from.
 _WORDS, _WORD_MARGIN, _HOPELESS_WORD = 4, 5.0, -1.4
+#: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least sure,
+#: have their words weighed alone.
+_MOST_SHOWN = 58_000
 #: A column whose symbols have a mean log probability below this may have settled on a wrong weight: it starts again,
 #: after so many quick rounds.
 _LOST, _FRESH_ROUNDS = -0.3, 2
@@ -231,7 +234,9 @@ def second_opinion(
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
     try:
         denoiser = _denoiser()
-        corrections = denoiser.slot_corrections(seen.scene, columns)
+        corrections = np.zeros((columns.size, seen.clock.n_slots), np.float32)
+        shown = np.arange(columns.size) if options.cae == "always" else _worth_showing(seen, seen.scene, columns)
+        corrections[shown] = denoiser.slot_corrections(seen.scene, columns[shown])
     except ReceiverError as error:
         return seen, frozenset(), {**report, "columns": 0, "message": str(error)}
     metrics = seen.metrics[columns] + channel.metrics_of(corrections, seen.model.memory)
@@ -249,20 +254,30 @@ def second_opinion(
     return seen, frozenset(kept.tolist()), report
 
 
+def _worth_showing(seen: Reception, scene: denoise.Scene, columns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Places in `columns` of those that the network is shown: the surest, and no more than its time allows."""
+    _, n_strips, _ = scene.samples.light.shape
+    most = max(_MOST_SHOWN // (n_strips * seen.clock.n_slots), 1)
+    return np.sort(np.argsort(-_best_packet(seen)[columns], kind="stable")[:most])
+
+
 def _words_weighed(
     seen: Reception, scene: denoise.Scene, columns: NDArray[np.int64], metrics: FloatArray
 ) -> FloatArray:
     """Metrics of some columns with the likeliest words of every symbol in doubt weighed as a whole."""
-    now, posteriors = seen.clock, _detect(metrics, seen.clock)
-    places, words, log_prob = detect.doubtful_words(_by_burst(metrics, now), posteriors.w, _DOUBTFUL_WORD, _WORDS)
-    asked = log_prob[:, 0] > _HOPELESS_WORD
+    now = seen.clock
+    bursts = _by_burst(metrics, now)
+    candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
+    posteriors, doubtful = detect.detect_with_words(bursts, candidates, _DOUBTFUL_WORD, _WORDS)
+    asked = doubtful.log_prob[:, 0] > _HOPELESS_WORD
+    places, words, log_prob = doubtful.places[asked], doubtful.words[asked], doubtful.log_prob[asked]
     model = channel.LightModel(
         scene.floor, scene.sigma, scene.shot, scene.spread, _taps(now, scene.samples.samples_per_slot)
     )
     samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
     lit = channel.lit_on_grid(_replaced(seen.posteriors, columns, posteriors), now)
-    likely = log_prob[asked] > log_prob[asked, :1] - _WORD_MARGIN
-    corrections = channel.word_corrections(samples, now, model, lit, columns, places[asked], words[asked], likely)
+    likely = log_prob > log_prob[:, :1] - _WORD_MARGIN
+    corrections = channel.word_corrections(samples, now, model, lit, columns, places, words, likely)
     return metrics + channel.metrics_of(corrections, seen.model.memory)
 
 

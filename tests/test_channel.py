@@ -312,7 +312,7 @@ def test_innovations_are_those_of_a_gaussian_process(deviation: float, length: f
     residual = rng.multivariate_normal(np.zeros(n), covariance)
     density = -(residual @ np.linalg.solve(covariance, residual) + np.linalg.slogdet(covariance)[1]) / 2
     by_time = (values.astype(np.float32)[:, None, None] for values in (residual, gain, noise))
-    found = channel._innovations(*by_time, deviation, length)
+    (found,) = channel._innovations(*by_time, ((deviation, length),))
     assert found[0, 0] == pytest.approx(density, rel=1e-4, abs=1e-3)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rxcli.channel import metrics_of
 from rxcli.detect import (
     detect,
-    doubtful_words,
+    detect_with_words,
     first_guess,
     plausible_weights,
     slot_support,
@@ -331,8 +331,9 @@ def test_doubtful_words_are_those_of_the_posterior(memory: int) -> None:
     w = np.array([5, 1, 5])
     candidates = np.zeros((3, 9), bool)
     candidates[np.arange(3), w - 1] = True
-    found = detect(metrics, candidates)
-    places, words, log_prob = doubtful_words(metrics, w, -0.3, 4)
+    found, doubtful = detect_with_words(metrics, candidates, -0.3, 4)
+    places, words, log_prob = doubtful.places, doubtful.words, doubtful.log_prob
+    np.testing.assert_array_equal(found.index, detect(metrics, candidates).index)
     at = tuple(places.T)
     assert {tuple(place) for place in places} == {tuple(place) for place in np.argwhere(found.log_prob < -0.3)}
     assert 0 < len(places) < found.log_prob.size
@@ -366,4 +367,5 @@ def test_no_word_is_doubtful_where_all_are_sure() -> None:
     metrics = np.zeros((1, 2, 41, 4))
     metrics[..., 1::2] = 30.0 * np.tile(codebook(5)[3], 5)[:41, None][:, :1]
     metrics[..., ::2] = -metrics[..., 1::2]
-    assert [len(part) for part in doubtful_words(metrics, np.array([5, 5]), -10.0, 4)] == [0, 0, 0]
+    _, doubtful = detect_with_words(metrics, only(5, 2), -10.0, 4)
+    assert [len(part) for part in (doubtful.places, doubtful.words, doubtful.log_prob)] == [0, 0, 0]
