@@ -9,10 +9,8 @@ shows its burst, so results come a frame late.
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
@@ -59,8 +57,6 @@ _DARK_SNR = 0.5
 _QUICK_DOUBT = 0.5
 #: Strips of a column, at most: more tell no more of a picture that is known, and take time.
 _STRIPS = 4
-#: Threads that measure frames again: by then the decoder may have little left to do.
-_THREADS = min(2, os.cpu_count() or 1)
 #: Frames beyond which each one's share of what is known of the picture does not matter.
 _MANY_VIEWS = 12
 #: Frames that find their clock together where each shows little.
@@ -749,9 +745,9 @@ class _Clip:
         self._picture = self._new_picture(lock, self._dark_light(views, floor))
         lessons = [self._learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
         alone = len(held) <= _MANY_VIEWS
-        some = [(v, a if alone else None) for v, a, needed in zip(views, lessons, doubtful, strict=True) if needed]
-        with ThreadPoolExecutor(_THREADS) as pool:
-            list(pool.map(self._measure_again, *zip(*some, strict=True)))
+        for view, lesson, needed in zip(views, lessons, doubtful, strict=True):
+            if needed:
+                self._measure_again(view, lesson if alone else None)
 
     def _detect_again(self) -> None:
         """The bursts of all frames that wait, each once: in the last frame that shows it."""
@@ -776,7 +772,7 @@ class _Clip:
         """Measure a frame by the picture, less what the frame itself has shown of it where that is given."""
         assert self._picture is not None
         assert view.light is not None
-        picture = self._picture.same() if lesson is None else self._picture.without(view.light, *lesson)
+        picture = self._picture if lesson is None else self._picture.without(view.light, *lesson)
         flat = picture.solve(view.light)
         refined = self._refined(picture, view.light, flat, view.bursts.clock, view.memory, thorough=True)
         if refined is not None:

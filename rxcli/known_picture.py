@@ -139,13 +139,6 @@ class KnownPicture:
         other._system, other._excess = None, self._excess.copy()
         return other
 
-    def same(self) -> KnownPicture:
-        """The same picture; what is found of the columns' noise in one is not known in the other."""
-        self._settled()
-        other = copy(self)
-        other._excess = self._excess.copy()
-        return other
-
     def _lesson(
         self, light: Float32Array, slots: Float32Array, trust: Float32Array
     ) -> tuple[Float32Array, Float32Array]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli import reception, sampling
+from rxcli import denoise, reception, sampling
 from rxcli.benchmark.trial import simulate_trial
 from rxcli.locate import Stages, find_camera, find_corners, find_lock
 from rxcli.pipeline import ReceiverOptions, receive
@@ -209,6 +209,32 @@ def test_overexposure_gives_nothing_that_is_believed() -> None:
     wrong = [p.confidence for p in packets if p.bit_errors != 0]
     assert max(wrong, default=0) < 0.9
     assert sum(confidence >= 0.5 for confidence in wrong) <= 1
+
+
+@pytest.mark.parametrize(("budget", "least", "most"), [(1, 1, 1), (10**9, 10, 20)])
+def test_the_network_is_shown_what_its_time_allows(
+    monkeypatch: pytest.MonkeyPatch, budget: int, least: int, most: int
+) -> None:
+    """Columns beyond that still have their words weighed: they are asked, but not shown."""
+    shown: list[int] = []
+    denoiser = denoise.load_denoiser()
+
+    class Recording:
+        name = denoiser.name
+
+        def slot_corrections(self, scene: denoise.Scene, columns: NDArray[np.int64]) -> NDArray[np.float32]:
+            shown.append(columns.size)
+            return denoiser.slot_corrections(scene, columns)
+
+    monkeypatch.setattr(reception, "_denoiser", Recording)
+    monkeypatch.setattr(reception, "_MOST_SHOWN", budget)
+    scene = small_scene("paper-34k6")
+    taken = simulate_frame(replace(scene, sensor=replace(scene.sensor, full_scale_e=130.0)), 1)
+    report = received(frame_of(taken), options_for(taken)).denoiser
+    assert report is not None
+    assert report["columns"] >= 10
+    assert len(shown) == 1
+    assert least <= shown[0] <= most
 
 
 def test_weights_that_differ_by_column() -> None:
