@@ -28,8 +28,15 @@ _PORTRAIT = (5, 6, 7, 8)
 class Failure(Exception):
     """Reception ends here, with a status and a message; never leaves this module."""
 
-    def __init__(self, status: Literal["no_screen", "no_signal"], message: str) -> None:
+    def __init__(
+        self,
+        status: Literal["no_screen", "no_signal"],
+        message: str,
+        estimated: dict[str, tuple[float, float]] | None = None,
+    ) -> None:
         super().__init__(message)
+        #: What was estimated of the camera all the same.
+        self.estimated = estimated or {}
         self.status = status
         self.message = message
 
@@ -165,6 +172,8 @@ class Cameras:
     #: Estimates that are worth a look too, best first.
     rivals: tuple[tuple[Camera, ReceiverOptions], ...] = ()
     reason: str = ""
+    #: What the picture tells of its camera even where nothing can be received.
+    estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, stages: Stages) -> Cameras:
@@ -177,7 +186,8 @@ def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, st
     with stages("blind"):
         found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
     first = _with_screens(found.estimate, strips, options) if found.estimate else None
-    return Cameras(first, tuple(_with_screens(rival, strips, options) for rival in found.rivals), found.reason)
+    rivals = tuple(_with_screens(rival, strips, options) for rival in found.rivals)
+    return Cameras(first, rivals, found.reason, blind.summary_of_rows(found.by_edges) if found.by_edges else {})
 
 
 def _with_screens(

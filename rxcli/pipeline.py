@@ -101,7 +101,8 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
             result = replace(result, message=too_small(frame, corners, camera, lock.screen) or _NO_PACKET)
     except Failure as failure:
         skipped = {"no_screen": 1} if failure.status == "no_screen" else {}
-        result = replace(result, status=failure.status, message=failure.message, skipped=skipped)
+        estimated = failure.estimated or result.estimated
+        result = replace(result, status=failure.status, message=failure.message, skipped=skipped, estimated=estimated)
     return replace(result, timing_ms=stages.total())
 
 

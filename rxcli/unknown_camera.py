@@ -43,7 +43,7 @@ def likely_camera(
         if headers > _HEADERS_AT_LEAST and headers + symbols > most:
             best, most = rival, headers + symbols
     if best is None or -np.inf < most < _LEAST_SCORE:
-        raise Failure("no_signal", found.reason or _NO_HEADERS)
+        raise Failure("no_signal", found.reason or _NO_HEADERS, found.estimated)
     return best
 
 

@@ -6,9 +6,10 @@ Six steps on the row profiles, none of which needs to know the camera.
    the stripes. Where a camera has taken the distortion out of its picture, the sensor row of a point p is the y of
    K distort(K^-1 p); with any focal length in K the same map comes out for other coefficients, so that one width is
    taken and k1 k2 p1 p2 are what is sought.
-2. **Scan.** Light between its local extremes, averaged over columns, shows the header wherever a packet starts; and a
-   packet sent again shows in every column's autocorrelation. Both are looked up over a grid of rows per slot for each
-   length of packet. The header read backwards, 1100011100, is its own complement, so the sign tells the direction.
+2. **Scan.** Light between its local extremes, averaged over columns, shows the header where a packet starts; a packet
+   sent again shows in every column's autocorrelation; and edges fall between slots, so that their power has a line at
+   the rate of the slots. All are looked up over a grid of rows per slot for each length of packet. The header read
+   backwards, 1100011100, is its own complement, so the sign tells the direction.
 3. **Trial.** The best hypotheses are sliced into slots; header, dimming symbol and the constant weight of all symbols
    decide between them: a wrong one may show a header by chance, but never twenty columns of constant weight.
 4. **Slots.** Light of neighbouring slots overlaps through the exposure, and nobody told its levels: each column is read
@@ -17,12 +18,13 @@ Six steps on the row profiles, none of which needs to know the camera.
    What is missing is the derivative with respect to time: least squares over all strips gives row and period of the
    clock and the bend at once, with standard deviations from the spread between columns.
 6. **Once more.** The receiver's own light model and codebook know the slots better than step 4. With those it has
-   decoded the least squares of step 5 are done again (`refit`), and the picture received again where that matters.
+   decoded the least squares of step 5 are done again (`refit`), with what rows see of them worked out for sensor rows
+   (`rows`) and the texture of the picture foretold, and the picture received again where that matters.
 """
 
 from rxcli.blind.advice import stripe_likeness, why_not
 from rxcli.blind.bend import bend_terms, estimate_bend, straightened
-from rxcli.blind.camera import camera_profile, in_time_order, lens_of, summary
+from rxcli.blind.camera import camera_profile, in_time_order, lens_of, summary, summary_of_rows
 from rxcli.blind.columns import likely_columns
 from rxcli.blind.refit import refit
 from rxcli.blind.scan import Hypothesis, find_clocks
@@ -54,5 +56,6 @@ __all__ = [
     "strips_of",
     "structure_evidence",
     "summary",
+    "summary_of_rows",
     "why_not",
 ]

@@ -40,13 +40,17 @@ def summary(estimate: BlindEstimate, slot_rate_hz: float) -> dict[str, tuple[flo
     """What was estimated: name -> (value, standard deviation)."""
     line_delay_s = 1 / (estimate.rows_per_slot * slot_rate_hz)
     relative = estimate.rows_per_slot_sd / estimate.rows_per_slot
-    out = {
-        "rows_per_slot": (estimate.rows_per_slot, estimate.rows_per_slot_sd),
-        "line_delay_s": (line_delay_s, line_delay_s * relative),
-        "readout_reversed": (float(estimate.reversed), 0.0),
-    }
+    out = summary_of_rows(estimate)
+    out["line_delay_s"] = (line_delay_s, line_delay_s * relative)
+    out["readout_reversed"] = (float(estimate.reversed), 0.0)
     if estimate.exposure_slots_sd > 0:
         out["exposure_s"] = (estimate.exposure_slots / slot_rate_hz, estimate.exposure_slots_sd / slot_rate_hz)
+    return out
+
+
+def summary_of_rows(estimate: BlindEstimate) -> dict[str, tuple[float, float]]:
+    """What of it needs no screen's slot rate: name -> (value, standard deviation)."""
+    out = {"rows_per_slot": (estimate.rows_per_slot, estimate.rows_per_slot_sd)}
     if estimate.corrected:
         names = ("k1", "k2", "p1", "p2")
         out |= {n: (float(v), float(sd)) for n, v, sd in zip(names, estimate.bend, estimate.bend_sd, strict=True)}

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.blind.bend import reversed_bend
+from rxcli.blind.rows import fit_rows
 from rxcli.blind.strips import Strips, in_readout_order
 from rxcli.blind.timing import (
     FLAT,
@@ -30,6 +31,8 @@ _STEPS = 6
 _EXPOSURE_STEPS = (0, 2)
 #: Slots over which the picture is taken as constant.
 _LOCAL_SLOTS = 25.0
+#: Rows by which the picture's texture in a row is foretold.
+_ORDER = 4
 #: Chi-square of a bend beyond doubt: with slots as received, unbent pictures reach 52, bent ones have 295 and more.
 _BENT_CHI_SQUARE = 120.0
 #: Slots that explain less of the light's local variance were decoded on a wrong clock.
@@ -63,11 +66,12 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
     ordered = thinned(in_readout_order(strips) if estimate.reversed else strips, estimate.rows_per_slot)
     bend = reversed_bend(estimate.bend) if estimate.reversed else estimate.bend
     first = np.concatenate([[clock.row0, clock.rows_per_slot], bend if estimate.corrected else np.zeros(4)])
-    fit = _fit(ordered, first, lit, clock.exposure_slots, 6)
+    shutter = estimate.least_exposure_slots
+    fit = _fit(ordered, first, lit, clock.exposure_slots, 6, shutter)
     corrected = bend_chi_square(fit.values, fit.covariance) > _BENT_CHI_SQUARE
     if not corrected:
         before = fit.explained_first
-        fit = replace(_fit(ordered, first * FLAT, lit, fit.exposure_slots, 2), explained_first=before)
+        fit = replace(_fit(ordered, first * FLAT, lit, fit.exposure_slots, 2, shutter), explained_first=before)
     if fit.explained < max(_NOT_LESS * fit.explained_first, _LEAST_EXPLAINED):
         return estimate, 0.0
     terms = time_terms(ordered)
@@ -87,16 +91,27 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
     return found, float(moved.max())
 
 
-def _fit(strips: Strips, values: FloatArray, lit: Float32Array, exposure_slots: float, n_free: int) -> _Fit:
+def _fit(
+    strips: Strips,
+    values: FloatArray,
+    lit: Float32Array,
+    exposure_slots: float,
+    n_free: int,
+    shutter_slots: float = 0.0,
+) -> _Fit:
     """Gauss-Newton on the first `n_free` values of the row-time map, with slots that stay."""
     terms = time_terms(strips)
+    pitch = float(strips.rows[1] - strips.rows[0])
     exposure, exposure_sd, explained_first = exposure_slots, 0.0, 0.0
     for step in range(_STEPS):
         time = slot_time(strips, terms, values)
+        slots = fitted(lit, max(int(time.max()) + 3, lit.shape[1]))
         if step in _EXPOSURE_STEPS:
             exposure, exposure_sd = exposure_of_known(column_waves(strips, time, values[1]), lit, exposure)
-        slots = fitted(lit, max(int(time.max()) + 3, lit.shape[1]))
-        change, covariance, explained = gauss_newton(strips, terms, values, time, slots, exposure, n_free, _LOCAL_SLOTS)
+            window = round(_LOCAL_SLOTS * values[1] / pitch)
+            rows = fit_rows(strips, time, values, slots, exposure, window, shutter_slots)
+        seen = rows.seen(strips, time, values, slots)
+        change, covariance, explained = gauss_newton(strips, terms, values, time, seen, n_free, _LOCAL_SLOTS, _ORDER)
         explained_first = explained_first or explained
         values = values + change
     return _Fit(values, covariance, exposure, exposure_sd, explained_first, explained)

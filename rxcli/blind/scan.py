@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.blind.edges import edge_power
 from rxcli.blind.strips import SAMPLES, Noise, Strips, levelled
 from rxcli.blind.structure import structure_evidence
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
@@ -24,6 +25,14 @@ HALF_WIDTH = (0.5, 1.8)
 
 #: Copies further apart than this many slots are not compared: the grid of rows per slot would have to be too fine.
 _SCAN_SLOTS = 700
+
+#: Steps of the scan, slots over the picture.
+_SCAN_STEP = 2.0
+
+#: Most that the slots' line in the edges' power counts, nats; and its places a slot over the picture.
+_MOST_FOR_LINE, _LINE_FINE = 30.0, 4
+#: A nat of it beside the height of the headers.
+_SAY_OF_LINE = 0.03
 
 #: Rows per slot this close, relative, are one hypothesis.
 _ALIKE_ROWS = 0.015
@@ -64,6 +73,20 @@ class _Octave:
     high: float
     #: (R',) deviation of the autocorrelation at every lag from chance, in standard deviations.
     repeats: FloatArray
+    #: Nats by which the edges keep to a grid, over chance, for every quarter of a slot more over the whole picture.
+    line: FloatArray
+
+    def line_at(self, rows_per_slot: float) -> float:
+        """Nats by which edges keep to a grid of slots."""
+        return float(np.interp(self._line_place(rows_per_slot), np.arange(self.line.size), self.line))
+
+    def line_near(self, rows_per_slot: float, slots: float) -> float:
+        """The most of `line_at` within so many slots over the whole picture."""
+        middle, reach = self._line_place(rows_per_slot), _LINE_FINE * slots
+        return float(self.line[max(int(middle - reach), 0) : int(middle + reach) + 2].max(initial=0.0))
+
+    def _line_place(self, rows_per_slot: float) -> float:
+        return float(_LINE_FINE * self.columns.shape[1] * self.rows / rows_per_slot)
 
 
 def _octaves(strips: Strips) -> list[_Octave]:
@@ -87,9 +110,8 @@ def _octaves(strips: Strips) -> list[_Octave]:
         width = half_width(correlation) * rows
         least, most = max(least, width / HALF_WIDTH[1]), min(most, width / HALF_WIDTH[0])
         if least < most:
-            out.append(
-                _Octave(columns, rows, least, most, _surprise(correlation, round(PREAMBLE_SLOTS * least / rows)))
-            )
+            surprise = _surprise(correlation, round(PREAMBLE_SLOTS * least / rows))
+            out.append(_Octave(columns, rows, least, most, surprise, _slot_line(columns)))
     return out
 
 
@@ -133,6 +155,16 @@ def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:
     out = np.maximum(scaled - middle, 0) / spread
     out[-10:] = 0
     return np.asarray(out)
+
+
+def _slot_line(columns: Float32Array) -> FloatArray:
+    """Spectrum of the edges' power, nats over chance, by slots over the whole picture times _LINE_FINE.
+
+    It tells rows per slot where there is but one header, or where those drown.
+    """
+    power = edge_power(columns).sum(axis=0, dtype=np.float64)
+    spectrum = np.abs(np.fft.rfft(power, _LINE_FINE * columns.shape[1])) ** 2
+    return np.asarray(np.minimum(spectrum / max(float(power @ power), 1e-30), _MOST_FOR_LINE))
 
 
 def _header_response(total: FloatArray, rows_per_slot: float) -> FloatArray:
@@ -207,13 +239,14 @@ def _scan_octave(octave: _Octave, n_rows: int, packet_lengths: Sequence[int]) ->
         spread = 1.4826 * float(np.median(np.abs(response[0]))) + 1e-6
         # The largest response within a slot: the grid may then miss copies by a slot.
         near = cv2.dilate(response, around)
+        line = 2 * octave.line_near(rows_per_slot, _SCAN_STEP / 2)
         for packet_slots in packet_lengths:
             repeats = _repeats_near(octave, rows_per_slot, packet_slots)
             for number, (score, sample) in enumerate(zip(*_comb(near, packet_slots), strict=True)):
                 start = (float(sample) / SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
-                evidence = float(score / spread) ** 2 + repeats**2
+                evidence = float(score / spread) ** 2 + repeats**2 + line
                 out.append(Hypothesis(rows_per_slot, packet_slots, start, number == 1, evidence))
-        rows_per_slot *= 1 + 2.0 / min(n_rows / rows_per_slot, _SCAN_SLOTS)
+        rows_per_slot *= 1 + _SCAN_STEP / min(n_rows / rows_per_slot, _SCAN_SLOTS)
     return out
 
 
@@ -263,6 +296,7 @@ def _fine_clock(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
         response = _header_response(total, rows_per_slot / octave.rows)[sign : sign + 1]
         (score,), (sample,) = _comb(response, hypothesis.packet_slots)
         score += 0.03 * _repeats_at(octave, rows_per_slot, hypothesis.packet_slots)
+        score += _SAY_OF_LINE * octave.line_at(rows_per_slot)
         if score > best_score:
             start = (float(sample) / SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
             best = replace(hypothesis, rows_per_slot=float(rows_per_slot), start_row=float(start))

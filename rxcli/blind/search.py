@@ -9,6 +9,7 @@ import numpy as np
 
 from rxcli.blind.advice import why_not
 from rxcli.blind.bend import estimate_bend, straightened
+from rxcli.blind.edges import by_edges
 from rxcli.blind.scan import Hypothesis, alike, find_clocks, same_slots
 from rxcli.blind.strips import Strips
 from rxcli.blind.timing import _ALIKE, BlindEstimate, refine
@@ -44,6 +45,8 @@ class BlindSearch:
     reason: str = ""
     #: Other estimates that are worth a look, most plausible first; none where the estimate is beyond doubt.
     rivals: tuple[BlindEstimate, ...] = ()
+    #: Where nothing was estimated: what the edges tell of rows per slot and bend all the same.
+    by_edges: BlindEstimate | None = None
 
 
 def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None) -> BlindSearch:
@@ -75,7 +78,7 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     estimates.sort(key=lambda estimate: -_plausibility(estimate, strips, rows_per_slot))
     best = estimates[0] if estimates else None
     if best is None or best.evidence < MIN_EVIDENCE or best.explained < _LEAST_EXPLAINED:
-        return BlindSearch(None, why_not(strips), _worth_a_look(estimates))
+        return BlindSearch(None, why_not(strips), _worth_a_look(estimates), by_edges(strips, estimates))
     return BlindSearch(best, rivals=() if best.evidence > _BEYOND_DOUBT else _worth_a_look(estimates[1:]))
 
 

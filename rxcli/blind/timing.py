@@ -14,6 +14,7 @@ from rxcli.blind.structure import repeat_evidence
 from rxcli.blind.waves import (
     LOCAL_SLOTS,
     Grid,
+    Moments,
     Slots,
     column_shares,
     column_waves,
@@ -55,6 +56,12 @@ _BENT_CHI_SQUARE = 160.0
 
 #: Keeps the clock of a row-time map and drops its bend.
 FLAT = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+
+#: Share of what a row leaves that is its own; and the least of the mean spread that is left anywhere.
+_WHITE, _LEAST_SPREAD = 1e-3, 0.2
+
+#: How far the light per unit of the wave differs from its usual share of the mean light.
+_GAIN_SD = 0.5
 
 #: Rows of one block of the normal equations; the bend is straight within, which in longer ones changes the period.
 BLOCK_ROWS = 16
@@ -200,7 +207,8 @@ def _descend(
             exposure, exposure_sd = (exposure, exposure_sd) if exposure > exposure_slots else (exposure_slots, 0.0)
         slots = decide(waves, exposure, grid, slots)
         free = n_free if step >= _RIGID_STEPS or values[2:].any() else 2
-        change, covariance, explained = gauss_newton(strips, terms, values, time, slots.lit, exposure, free)
+        seen = seen_by_strips(strips, time, slots.lit, exposure)
+        change, covariance, explained = gauss_newton(strips, terms, values, time, seen, free)
         values = values + change
         moved = float(np.abs(slot_time(strips, terms, values)[:, ::BLOCK_ROWS] - time[:, ::BLOCK_ROWS]).max())
         if moved < _CONVERGED and step >= _AGAIN_STEP:
@@ -231,37 +239,96 @@ def slot_time(strips: Strips, terms: FloatArray, values: FloatArray) -> Float32A
     return np.asarray((strips.rows + bent - start) / rows_per_slot, np.float32)
 
 
+def seen_by_strips(
+    strips: Strips, time: Float32Array, lit: Float32Array, exposure_slots: float
+) -> tuple[Float32Array, Float32Array]:
+    """(M, R) light 0..1 of slots (C, N) in every strip at slot positions; and its change per slot."""
+    mixed = np.asarray(column_shares(strips) @ lit, np.float32)
+    return seen_through(mixed, time, np.arange(mixed.shape[0]), exposure_slots)
+
+
 def gauss_newton(
     strips: Strips,
     terms: FloatArray,
     values: FloatArray,
     time: Float32Array,
-    lit: Float32Array,
-    exposure_slots: float,
+    seen: tuple[Float32Array, Float32Array],
     n_free: int,
     local_slots: float = LOCAL_SLOTS,
+    order: int = 0,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Step of the row-time map, its covariance, and the share of variance explained before the step."""
-    mixed = np.asarray(column_shares(strips) @ lit, np.float32)
-    wave, slope = seen_through(mixed, time, np.arange(mixed.shape[0]), exposure_slots)
+    """Step of the row-time map, its covariance, and the share of variance explained before the step.
+
+    Args:
+        strips: in readout order.
+        terms: see `time_terms`.
+        values: (6,) the row-time map.
+        time: (M, R) its slot positions.
+        seen: (M, R) light 0..1 that the slots give, and its change per slot.
+        n_free: values that are fitted, the first ones.
+        local_slots: slots over which the picture may be taken as constant.
+        order: rows by which what is left of a row is foretold; the picture's texture is alike in neighbouring rows.
+    """
+    wave, slope = seen
     pitch = float(strips.rows[1] - strips.rows[0])
     window = round(local_slots * values[1] / pitch)
     inside = strips.inside
     near = local_moments(strips.light, wave, inside, window)
+    noise = strips.noise.variance(near.value)
     gain = near.gain
-    residual = (strips.light - near.value - gain * (wave - near.wave)) * inside
-    spread = local_mean(residual * residual, window) / near.share + strips.noise.variance(near.value)
-    power = gain * slope
+    for _ in range(2):
+        residual = (strips.light - near.value - gain * (wave - near.wave)) * inside
+        spread = local_mean(residual * residual, window) / near.share + noise
+        gain = _likely_gain(near, spread, window)
     weight = inside / spread
+    light_power = float((gain * gain * near.variance * weight).sum())
+    left = float((residual * residual * weight).sum())
+    power = gain * slope
+    if order:
+        residual, power, weight = _whitened(residual, power, weight, order, window)
     fit = residual * weight * power
     blocks = np.arange(0, strips.rows.size, BLOCK_ROWS)
     information = np.add.reduceat(weight * power * power, blocks, axis=1).astype(np.float64)
     pull = np.add.reduceat(fit, blocks, axis=1).astype(np.float64)
     jacobian = _jacobian(terms, values, time, blocks)
     step, covariance_matrix = _solve(jacobian, information, pull, values, strips.n_columns, n_free)
-    light_power = float((gain * gain * near.variance * weight).sum())
-    left = float((residual * residual * weight).sum())
     return step, covariance_matrix, light_power / max(light_power + left, 1e-9)
+
+
+def _likely_gain(near: Moments, spread: Float32Array, window: int) -> Float32Array:
+    """Light per unit of the wave where it is told poorly: as much of the mean light as elsewhere, give or take half."""
+    weight = near.share / spread
+    light = np.maximum(near.value, 0)
+    told = float((weight * light * light * near.variance).sum())
+    usual = np.float32(max(float((weight * light * near.covariance).sum()), 0.0) / max(told, 1e-12)) * light
+    trust = np.float32(window) * near.share * np.maximum(near.variance, 0) / spread
+    prior = 1 / (np.float32(_GAIN_SD) * usual + np.float32(1e-6)) ** 2
+    raw = near.covariance / (near.variance + np.float32(0.02))
+    return np.asarray(np.maximum((trust * raw + prior * usual) / (trust + prior), 0), np.float32)
+
+
+def _whitened(
+    residual: Float32Array, power: Float32Array, weight: Float32Array, order: int, window: int
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Residuals less what those of the rows before foretell, the derivatives alike, and their weights."""
+    scale = np.sqrt(weight)
+    inside = (weight > 0).astype(np.float32)
+    residual, n = residual * scale, residual.shape[1]
+    alike = [float((residual[:, k:] * residual[:, : n - k]).sum()) for k in range(order + 1)]
+    lags = np.abs(np.subtract.outer(np.arange(order), np.arange(order)))
+    known = np.array(alike)[lags] + (_WHITE * alike[0] + 1e-9) * np.eye(order)
+    foretold = np.linalg.solve(known, alike[1:]).astype(np.float32)
+    out_residual, out_power, counted = residual.copy(), power * scale, inside.copy()
+    power = out_power.copy()
+    counted[:, :order] = 0
+    for k, share in enumerate(foretold, 1):
+        out_residual[:, k:] -= share * residual[:, : n - k]
+        out_power[:, k:] -= share * power[:, : n - k]
+        counted[:, k:] *= inside[:, : n - k]
+    square = out_residual * out_residual * counted
+    spread = local_mean(square, window) / (local_mean(counted, window) + np.float32(1e-3))
+    least = np.float32(_LEAST_SPREAD * float(square.sum()) / max(float(counted.sum()), 1.0) + 1e-9)
+    return out_residual, out_power, np.asarray(counted / np.maximum(spread, least), np.float32)
 
 
 def _jacobian(terms: FloatArray, values: FloatArray, time: Float32Array, blocks: NDArray[np.int64]) -> FloatArray:

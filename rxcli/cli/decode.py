@@ -232,7 +232,7 @@ class _Run:
 
     def _keep_estimate(self, result: FrameResult) -> None:
         best = self._estimated
-        if result.estimated and (best is None or _n_packets(result) > _n_packets(best)):
+        if "line_delay_s" in result.estimated and (best is None or _n_packets(result) > _n_packets(best)):
             self._estimated = result
 
     def _save_camera(self, path: Path) -> None:
