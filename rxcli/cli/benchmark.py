@@ -115,6 +115,23 @@ def confidence(
     _say_written(paths)
 
 
+@benchmark.command()
+@click.option("--count", type=click.IntRange(1), default=100, show_default=True, help="Random phones, a picture each.")
+@click.option("--cae", type=click.Choice(["auto", "always", "never"]), default="auto", show_default=True)
+@_JOBS
+@_common
+def phones(count: int, cae: str, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
+    """Simulated phones received without a camera profile: rows per slot, and wrong packets by confidence."""
+    from rxcli.benchmark import phones as work
+    from rxcli.benchmark.tables import titled, write_outputs
+
+    records = work.run(count, _journal(out, "phones", fresh), seed=seed, cae=cae, jobs=jobs, quiet=quiet)
+    rows, missed = work.rows(records), work.missed(records)
+    bound = f"rows per slot within {100 * work.BOUND:g} %"
+    click.echo(titled([(bound, rows), ("phones further off", missed)]))
+    _say_written(write_outputs(out, "phones", rows, missed))
+
+
 def _calibration_notes(result: Calibration) -> list[str]:
     from rxcli.benchmark.tables import format_value
 
