@@ -33,7 +33,7 @@ _EXPOSURE_STEPS = (0, 2)
 _LOCAL_SLOTS = 25.0
 #: Rows by which the picture's texture in a row is foretold.
 _ORDER = 4
-#: Chi-square of a bend beyond doubt: with slots as received, unbent pictures reach 205, bent ones have 441 and more, but
+#: Chi-square of a bend beyond doubt: with slots as received, unbent pictures reach 205, bent ones have 441 and more but
 #: for those that are all but black or hardly bent.
 _BENT_CHI_SQUARE = 240.0
 #: Slots that explain less of the light's local variance were decoded on a wrong clock.
