@@ -97,6 +97,10 @@ def _worth_refining(found: list[tuple[Hypothesis, FloatArray]]) -> list[tuple[Hy
     best = found[0][0].evidence
     close = [pair for pair in found[: 4 * _REFINED] if pair[0].evidence >= _CLOSE_EVIDENCE * best]
     chosen = _distinct(close, _REFINED) or found[:1]
+    # With the same slots a packet may have any length: they differ in where other headers would be.
+    for pair in close:
+        if same_slots(pair[0], found[0][0]) and all(pair[0].packet_slots != one.packet_slots for one, _ in chosen):
+            chosen.append(pair)
     if best < _WEAK_EVIDENCE:
         chosen = _distinct([*chosen, *sorted(found, key=lambda pair: -pair[0].salience)], _REFINED_IF_WEAK)
     return chosen
