@@ -34,7 +34,7 @@ _LOCAL_SLOTS = 25.0
 #: Rows by which the picture's texture in a row is foretold.
 _ORDER = 4
 #: Chi-square of a bend beyond doubt: with slots as received, unbent pictures reach 205, bent ones have 441 and more but
-#: for those that are all but black or hardly bent.
+#: for star fields, few slots at long exposures, and a bend next to none.
 _BENT_CHI_SQUARE = 240.0
 #: Slots that explain less of the light's local variance were decoded on a wrong clock.
 _LEAST_EXPLAINED = 0.1
