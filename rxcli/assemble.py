@@ -25,11 +25,12 @@ from rxcli.types import (
 
 #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
 MAX_BER_HAT = 0.1
-#: Log-odds of being error-free: offset, and slopes of the posterior's log-odds up to a bend and beyond it, of whether
-#: corrections of the auto-encoder were kept, and of the logarithms of what payload slots say against the packet, all
-#: together, and of what they say for it on average, nats.
-_CALIBRATION = (3.26, 0.76, 0.29, -0.79, -0.81, -0.92)
-_BEND = 4.0
+#: Log-odds of being error-free: offset, and weights of the posterior's log-odds up to a limit, of whether corrections
+#: of the auto-encoder were kept, of the logarithms of what payload slots say against the packet, all together, and of
+#: what they say for it on average, nats; and of the first times the third: where slots speak against it, the posterior
+#: counts less.
+_CALIBRATION = (4.43, 0.93, -1.78, -0.67, -1.03, -0.07)
+_MOST_ODDS = 5.0
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
 _CLIP_CALIBRATION = (0.103, 0.477, -0.83)
@@ -369,16 +370,12 @@ def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolA
             seen; see `slot_support_by_burst`.
         denoised: (C,) whether corrections of the auto-encoder were kept.
     """
-    log_odds = _log_odds(posteriors.log_prob.sum(axis=2))
+    log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), _MOST_ODDS)
+    against = np.log(_AGAINST_AT_LEAST - np.minimum(support, 0).sum(axis=2))
     heard = np.maximum((support != 0).sum(axis=2), 1)
-    terms = (
-        np.ones_like(log_odds),
-        np.minimum(log_odds, _BEND),
-        np.maximum(log_odds - _BEND, 0),
-        np.broadcast_to(denoised, log_odds.shape),
-        np.log(_AGAINST_AT_LEAST - np.minimum(support, 0).sum(axis=2)),
-        np.log(np.maximum(support.sum(axis=2) / heard, 1)),
-    )
+    average = np.log(np.maximum(support.sum(axis=2) / heard, 1))
+    told = np.broadcast_to(denoised, log_odds.shape)
+    terms = (np.ones_like(log_odds), log_odds, told, against, average, against * log_odds)
     return np.stack(terms, axis=2).astype(np.float64)
 
 

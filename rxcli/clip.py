@@ -160,6 +160,10 @@ class _Place:
     n_frames: int = 0
 
 
+#: Place, picture, last view, what the picture began with, and how often it was learned.
+_Scene = tuple[_Place | None, known_picture.KnownPicture | None, _View | None, tuple[Lock, float] | None, int]
+
+
 @dataclass(slots=True, eq=False)
 class _Link:
     """The link's time, as long as it is not lost."""
@@ -199,6 +203,7 @@ class _Clip:
         #: (C, 9) the weight that a column was last certain of, alone; None before any.
         self._weights: NDArray[np.bool_] | None = None
         self._last: _View | None = None
+        self._scene_before = self._scene
 
     # -- one frame ---------------------------------------------------------------------------------------------
 
@@ -285,6 +290,22 @@ class _Clip:
         self._waiting.clear()
         return done
 
+    def _finish_scene_before(self) -> list[FrameResult]:
+        """The results of the scene that the last search found to be over, by what was known of it."""
+        begun, self._scene = self._scene, self._scene_before
+        done = self._finish()
+        self._scene = begun
+        return done
+
+    @property
+    def _scene(self) -> _Scene:
+        """What is known of the scene in view."""
+        return self._place, self._picture, self._last, self._model, self._n_lessons
+
+    @_scene.setter
+    def _scene(self, scene: _Scene) -> None:
+        self._place, self._picture, self._last, self._model, self._n_lessons = scene
+
     def _forget(self) -> None:
         self._place = self._picture = self._last = None
 
@@ -293,6 +314,7 @@ class _Clip:
     def _search(self, frame: Frame, result: FrameResult, stages: Stages) -> tuple[_View, FrameResult]:
         """Receive a frame like a photograph; only the camera is taken from the frames before."""
         before = self._place
+        self._scene_before = self._scene
         self._forget()
         with stages("geometry"):
             found, self._found = self._found, None
@@ -536,7 +558,7 @@ class _Clip:
         done: list[FrameResult] = []
         first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock) if self._link else None
         if first_copy is None:
-            done = self._finish() if self._link is not None else []
+            done = self._finish_scene_before() if self._link is not None else []
             self._begin_link(view, frame)
             assert self._link is not None
             first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock)

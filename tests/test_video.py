@@ -229,6 +229,16 @@ def test_another_scene_is_searched_anew(clip: Clip) -> None:
     assert numbers == sorted(numbers)
 
 
+def test_another_scene_while_frames_are_held_back(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frames held back are looked at again by their own picture, and leave that of the new scene alone."""
+    monkeypatch.setattr("rxcli.clip._MUCH_DOUBT", -1.0)
+    other = simulate(8, 8, "chelsea")
+    moved = tuple(replace(frame, index=6 + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames))
+    got = list(receive((*clip.frames[:6], *moved), clip.options))
+    _, score = scored([replace(result, frame=result.frame - 6) for result in got[6:]], other.truth)
+    assert score.error_free >= 0.9 * score.expected
+
+
 def test_parts_of_packets_are_put_together() -> None:
     """No frame shows a whole packet: what two frames show of one burst makes it."""
     few = simulate(5, 16, height=0.51, repeats=4, frame_rate_hz=53.7)
