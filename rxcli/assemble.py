@@ -30,7 +30,7 @@ MAX_BER_HAT = 0.1
 #: what they say for it on average, nats; and of the first times the third: where slots speak against it, the posterior
 #: counts less.
 _CALIBRATION = (4.43, 0.93, -1.78, -0.67, -1.03, -0.07)
-_MOST_ODDS = 5.0
+_MOST_ODDS, _MOST_AVERAGE = 5.0, 30.0
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
 _CLIP_CALIBRATION = (0.103, 0.477, -0.83)
@@ -373,7 +373,7 @@ def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolA
     log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), _MOST_ODDS)
     against = np.log(_AGAINST_AT_LEAST - np.minimum(support, 0).sum(axis=2))
     heard = np.maximum((support != 0).sum(axis=2), 1)
-    average = np.log(np.maximum(support.sum(axis=2) / heard, 1))
+    average = np.log(np.clip(support.sum(axis=2) / heard, 1, _MOST_AVERAGE))
     told = np.broadcast_to(denoised, log_odds.shape)
     terms = (np.ones_like(log_odds), log_odds, told, against, average, against * log_odds)
     return np.stack(terms, axis=2).astype(np.float64)
