@@ -27,10 +27,10 @@ from rxcli.types import (
 MAX_BER_HAT = 0.1
 #: Log-odds of being error-free: offset, and weights of the posterior's log-odds up to a limit, of whether corrections
 #: of the auto-encoder were kept, of the logarithms of what payload slots say against the packet, all together, and of
-#: what they say for it on average, nats; and of the first times the third: where slots speak against it, the posterior
-#: counts less.
-_CALIBRATION = (4.43, 0.93, -1.78, -0.67, -1.03, -0.07)
-_MOST_ODDS, _MOST_AVERAGE = 5.0, 30.0
+#: what they say for it on average up to a limit, nats; and of both of these times the first: the posterior counts less
+#: where slots speak against it, and where they say much: there it is the picture that is in doubt, not the light.
+_CALIBRATION = (3.84, 1.47, -1.74, -0.64, -0.70, -0.06, -0.35)
+_MOST_ODDS, _MOST_AVERAGE = 5.0, 10.0
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
 _CLIP_CALIBRATION = (0.103, 0.477, -0.83)
@@ -114,7 +114,7 @@ class BurstInClip:
     #: (C, packet) how often each slot was seen, over all frames.
     seen: IntArray
     frames: tuple[int, ...]
-    #: (C, 6) see `evidence`.
+    #: (C, 7) see `evidence`.
     evidence: FloatArray
     #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
     #: received like photographs.
@@ -336,7 +336,7 @@ def _packet(
     number: int | None = None,
     frames: tuple[int, ...] | None = None,
 ) -> PacketResult | None:
-    """The packet of one burst, None where too many bits are uncertain; `seen` is (packet,), `evidence` (6,)."""
+    """The packet of one burst, None where too many bits are uncertain; `seen` is (packet,), `evidence` (7,)."""
     w = int(posteriors.w[column])
     llr = posteriors.bit_llr[burst, column, :, : bits_per_symbol(w)]
     ber_hat = float(np.mean(1 / (1 + np.exp(np.abs(llr)))))
@@ -357,7 +357,7 @@ def _packet(
 
 
 def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolArray) -> FloatArray:
-    """What the confidence of packets is made of, (B, C, 6), in the order of `_CALIBRATION`.
+    """What the confidence of packets is made of, (B, C, 7), in the order of `_CALIBRATION`.
 
     The light model's likelihoods are tempered, since strips and samples err together; still they are too sure where
     picture or camera are not as the model has them. There single slots speak against the packet. The weights are a
@@ -375,12 +375,12 @@ def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolA
     heard = np.maximum((support != 0).sum(axis=2), 1)
     average = np.log(np.clip(support.sum(axis=2) / heard, 1, _MOST_AVERAGE))
     told = np.broadcast_to(denoised, log_odds.shape)
-    terms = (np.ones_like(log_odds), log_odds, told, against, average, against * log_odds)
+    terms = (np.ones_like(log_odds), log_odds, told, against, average, against * log_odds, average * log_odds)
     return np.stack(terms, axis=2).astype(np.float64)
 
 
 def confidence(evidence: FloatArray) -> FloatArray:
-    """Probability (...) that packets are error-free, from their evidence (..., 6)."""
+    """Probability (...) that packets are error-free, from their evidence (..., 7)."""
     return np.asarray(1 / (1 + np.exp(-(evidence @ np.array(_CALIBRATION)))))
 
 

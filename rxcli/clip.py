@@ -929,7 +929,7 @@ def _bursts_of(frame: Frame, seen: Reception) -> tracking.FrameBursts:
 
 
 def _evidence(burst: tracking.ClosedBurst) -> FloatArray:
-    """(C, 6) what the confidence of packets is made of, all copies and frames together."""
+    """(C, 7) what the confidence of packets is made of, all copies and frames together."""
     support = detect.slot_support(burst.metrics[None], burst.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
     evidence: FloatArray = assemble.evidence(burst.posteriors, support, np.zeros(support.shape[1], bool))[0]
     return evidence
