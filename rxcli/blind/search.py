@@ -34,6 +34,8 @@ _REFINED, _CLOSE_EVIDENCE = 3, 0.3
 _PLAIN_EVIDENCE, _RIVAL = 150.0, 0.7
 #: Below this evidence, more of them.
 _WEAK_EVIDENCE, _REFINED_IF_WEAK = 120.0, 6
+#: What doubling the length of a packet costs, nats.
+_LONGER_PACKET = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +117,10 @@ def _distinct(found: list[tuple[Hypothesis, FloatArray]], most: int) -> list[tup
 
 
 def _plausibility(estimate: BlindEstimate, strips: Strips, rows_per_slot: float) -> float:
-    """Evidence of the slots' structure and of the light that they explain, nats; of about so many rows a slot."""
+    """Evidence of the slots' structure and of the light that they explain, nats; of about so many rows a slot.
+
+    A packet twice as long fits wherever no second header is in view to contradict it.
+    """
     slots = strips.n_columns * strips.rows.size / rows_per_slot
-    return estimate.evidence - 0.5 * slots / _ALIKE * float(np.log(max(1 - estimate.explained, 1e-3)))
+    light = -0.5 * slots / _ALIKE * float(np.log(max(1 - estimate.explained, 1e-3)))
+    return estimate.evidence + light - _LONGER_PACKET * float(np.log2(estimate.packet_slots))
