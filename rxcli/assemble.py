@@ -72,8 +72,8 @@ def column_results(
         clock: the clock.
         posteriors: of B bursts and C columns.
         snr: (C, N) squared contrast over variance of every slot of the grid.
-        support: (C, N) what the light says for every slot as decided, see `detect.slot_support`.
         samples: the samples, for what was visible.
+        support: (C, N) what the light says for every slot as decided, see `detect.slot_support`.
         min_confidence: packets below it are left out.
         denoised: columns in which corrections of the auto-encoder were kept.
     """
@@ -323,7 +323,7 @@ def _clip_packet(column: int, clock: Clock, burst: BurstInClip) -> PacketResult 
     log_odds = offset + slope * log_odds + slope_against * log(float(burst.against[column]) + _AGAINST_AT_LEAST)
     at_evens = max(_WRONG_AT_EVENS / packet.payload_bits, _BER_AT_EVENS)
     ber_hat = max(packet.ber_hat, min(at_evens * exp(-_BER_EXPONENT * log_odds), 0.5))
-    return None if ber_hat > MAX_BER_HAT else replace(packet, confidence=_probability(log_odds), ber_hat=ber_hat)
+    return None if ber_hat > MAX_BER_HAT else replace(packet, confidence=float(_probability(log_odds)), ber_hat=ber_hat)
 
 
 def _packet(
@@ -381,7 +381,7 @@ def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolA
 
 def confidence(evidence: FloatArray) -> FloatArray:
     """Probability (...) that packets are error-free, from their evidence (..., 7)."""
-    return np.asarray(1 / (1 + np.exp(-(evidence @ np.array(_CALIBRATION)))))
+    return _probability(evidence @ np.array(_CALIBRATION))
 
 
 def slot_support_by_burst(support: Float32Array, clock: Clock) -> Float32Array:
@@ -398,8 +398,8 @@ def _log_odds(log_prob: FloatArray) -> FloatArray:
     return np.asarray(at_most - np.log(-np.expm1(at_most)))
 
 
-def _probability(log_odds: float) -> float:
-    return 1 / (1 + exp(-log_odds))
+def _probability(log_odds: FloatArray | float) -> FloatArray:
+    return np.asarray(1 / (1 + np.exp(-log_odds)))
 
 
 def _header_row(copy: int, column: int, clock: Clock) -> float:

@@ -44,9 +44,9 @@ from rxcli.types import (
     RowProfiles,
 )
 
-#: Frames at the start that are looked at once more when the picture is known better; and where many columns that are
 #: A burst of a column all of whose symbols have at least this log probability is not decoded again.
 _CERTAIN = -1e-4
+#: Frames at the start that are looked at once more when the picture is known better; and where many columns that are
 #: well lit are still in doubt, for compression has taken much, how many are waited for.
 _HELD, _HELD_LONG = 6, 24
 #: Squared contrast over variance of a slot that is well lit, log probability of a packet in doubt, and much doubt.

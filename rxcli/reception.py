@@ -77,7 +77,7 @@ def decode(lock: Lock, skip: frozenset[str]) -> Reception:
     if not doubtful.any():
         return replace(seen, skipped={"certain_columns": seen.snr.shape[0]})
     lock = lock.in_depth(np.flatnonzero(doubtful))
-    seen = iterate(lock, seen, skip)
+    seen = iterate(lock, seen, doubtful, skip)
     columns = doubtful_columns(seen)
     return without_row_light(lock, seen, columns) if columns.size else seen
 
@@ -112,20 +112,19 @@ def _likeliest_mix(lock: Lock) -> Reception:
 
     They tell on a slot of few rows: one of 1.5 rows that is exposed for 0.4 slots is seen as if for 1.2 and more.
     """
-    now = lock.clock
+    lock, now = lock.in_pairs(), lock.clock
     widths = (np.hypot(now.exposure_slots, mixed / now.rows_per_slot) for mixed in _MIXED_ROWS)
     looks = [quick_look(replace(lock, clock=replace(now, exposure_slots=float(width)))) for width in widths]
     return max(looks, key=lambda seen: float(_evidence(seen.metrics, seen.clock).sum()))
 
 
-def iterate(lock: Lock, seen: Reception, skip: frozenset[str]) -> Reception:
+def iterate(lock: Lock, seen: Reception, doubtful: NDArray[np.bool_], skip: frozenset[str]) -> Reception:
     """Light model and detection in turn, until every column is certain or nothing more is to be expected.
 
-    Columns in doubt are looked at on the coarse grid once, and those that still are on the fine one.
+    Columns in doubt, (C,), are looked at on the coarse grid once, and those that still are on the fine one.
     """
     every = np.ones(seen.snr.shape[0], bool)
     wanted = ~_dark(seen.snr) if "dark_columns" in skip else every
-    doubtful = _doubtful(seen, _CERTAIN) if "certain_columns" in skip else every
     skipped = {"dark_columns": int((~wanted).sum()), "certain_columns": 0}
     for iteration in range(_MAX_ITERATIONS):
         columns = np.flatnonzero(wanted & doubtful)
