@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import exp, log
 
 import numpy as np
 
-from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, bits_per_symbol, bits_to_hex, indices_to_bits
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, bits_to_hex, indices_to_bits
 from rxcli.types import (
     BoolArray,
     BurstPosteriors,
@@ -80,10 +79,11 @@ def column_results(
     seen = slots_seen(samples, clock)
     whole = complete(seen)
     told = np.isin(np.arange(len(snr)), list(denoised))
-    known = evidence(posteriors, slot_support_by_burst(support, clock), told)
+    doubts = _doubts(posteriors, evidence(posteriors, slot_support_by_burst(support, clock), told))
     snr_db = _snr_db_of_columns(snr)
     headerless = posteriors.header_llr.sum(axis=0) < (_CONTRADICTED if _headers_show(posteriors) else np.inf)
     echoes: BoolArray = np.any(_echoes(posteriors, snr_db) & whole, axis=0)
+    reported = whole & doubts.reported(min_confidence)
     against = [_HEADERLESS if h else _ECHO if e else None for h, e in zip(headerless, echoes, strict=True)]
     return tuple(
         _column_result(
@@ -92,10 +92,9 @@ def column_results(
             posteriors,
             db,
             seen[:, column],
-            whole[:, column],
-            known[:, column],
+            reported[:, column],
+            doubts,
             against[column],
-            min_confidence,
             bool(told[column]),
         )
         for column, db in enumerate(snr_db)
@@ -134,17 +133,20 @@ def clip_results(
         min_confidence: packets below it are left out.
     """
     snr_db = _snr_db_of_columns(snr)
-    complete_ones = [complete(burst.seen[None])[0] & ~_echoes(burst.posteriors, snr_db)[0] for burst in bursts]
+    doubts = [_clip_doubts(burst) for burst in bursts]
+    reported = [
+        complete(burst.seen[None])[0] & ~_echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]
+        for burst, doubt in zip(bursts, doubts, strict=True)
+    ]
     own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
     out = []
     for column in range(snr.shape[0]):
-        whole = [(b, c) for b, c, done in zip(bursts, own, complete_ones, strict=True) if done[column]]
-        packets = [
-            packet
-            for burst, now in whole
-            if (packet := _clip_packet(column, now, burst)) and packet.confidence >= min_confidence
-        ]
-        out.append(_clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], tuple(packets)))
+        packets = tuple(
+            _packet(0, column, now, burst.posteriors, burst.seen[column], doubt, burst.number, burst.frames)
+            for burst, now, doubt, shown in zip(bursts, own, doubts, reported, strict=True)
+            if shown[column]
+        )
+        out.append(_clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], packets))
     return tuple(out)
 
 
@@ -244,15 +246,13 @@ def _column_result(
     posteriors: BurstPosteriors,
     snr_db: float | None,
     seen: IntArray,
-    whole: BoolArray,
-    evidence: FloatArray,
+    reported: BoolArray,
+    doubts: _Doubts,
     against: str | None,
-    min_confidence: float,
     denoised: bool,
 ) -> ColumnResult:
-    bursts = () if against else np.flatnonzero(whole)
-    found = [_packet(int(burst), column, clock, posteriors, seen[burst], evidence[burst]) for burst in bursts]
-    packets = tuple(packet for packet in found if packet and packet.confidence >= min_confidence)
+    bursts = () if against else np.flatnonzero(reported)
+    packets = tuple(_packet(int(burst), column, clock, posteriors, seen[burst], doubts) for burst in bursts)
     sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
     return ColumnResult(
@@ -306,24 +306,42 @@ def _why_none(status: ColumnStatus, snr_db: float | None, n_seen: int, clock: Cl
     return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
 
 
-def _clip_packet(column: int, clock: Clock, burst: BurstInClip) -> PacketResult | None:
-    """The packet of a burst of a clip, None where too many bits are uncertain.
+@dataclass(frozen=True, slots=True)
+class _Doubts:
+    """How sure the packets of B bursts and C columns are."""
+
+    #: (B, C) probability that they are error-free, and expected share of wrong bits.
+    confidence: FloatArray
+    ber_hat: FloatArray
+    #: (B, C, 7) see `evidence`.
+    evidence: FloatArray
+
+    def reported(self, min_confidence: float) -> BoolArray:
+        """(B, C) packets that are sure enough to be reported."""
+        return np.asarray((self.ber_hat <= MAX_BER_HAT) & (self.confidence >= min_confidence))
+
+
+def _doubts(posteriors: BurstPosteriors, evidence: FloatArray) -> _Doubts:
+    unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of few bits are filled up with NaN
+    return _Doubts(confidence(evidence), np.nanmean(unsure, axis=(2, 3)), evidence)
+
+
+def _clip_doubts(burst: BurstInClip) -> _Doubts:
+    """How sure the packets of a burst of a clip are.
 
     Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
     What slots say against the codeword that was decided shows it.
     """
-    posteriors = burst.posteriors
-    packet = _packet(
-        0, column, clock, posteriors, burst.seen[column], burst.evidence[column], burst.number, burst.frames
-    )
-    if packet is None or burst.against is None:
-        return packet
-    log_odds = float(_log_odds(posteriors.log_prob[0, column].sum()))
+    doubts = _doubts(burst.posteriors, burst.evidence[None])
+    if burst.against is None:
+        return doubts
     offset, slope, slope_against = _CLIP_CALIBRATION
-    log_odds = offset + slope * log_odds + slope_against * log(float(burst.against[column]) + _AGAINST_AT_LEAST)
-    at_evens = max(_WRONG_AT_EVENS / packet.payload_bits, _BER_AT_EVENS)
-    ber_hat = max(packet.ber_hat, min(at_evens * exp(-_BER_EXPONENT * log_odds), 0.5))
-    return None if ber_hat > MAX_BER_HAT else replace(packet, confidence=float(_probability(log_odds)), ber_hat=ber_hat)
+    log_odds = _log_odds(burst.posteriors.log_prob.sum(axis=2))
+    log_odds = offset + slope * log_odds + slope_against * np.log(burst.against + _AGAINST_AT_LEAST)
+    n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
+    at_evens = np.maximum(_WRONG_AT_EVENS / n_bits, _BER_AT_EVENS)
+    wrong = np.minimum(at_evens * np.exp(-_BER_EXPONENT * log_odds), 0.5)
+    return replace(doubts, confidence=_probability(log_odds), ber_hat=np.maximum(doubts.ber_hat, wrong))
 
 
 def _packet(
@@ -332,27 +350,22 @@ def _packet(
     clock: Clock,
     posteriors: BurstPosteriors,
     seen: IntArray,
-    evidence: FloatArray,
+    doubts: _Doubts,
     number: int | None = None,
     frames: tuple[int, ...] | None = None,
-) -> PacketResult | None:
-    """The packet of one burst, None where too many bits are uncertain; `seen` is (packet,), `evidence` (7,)."""
-    w = int(posteriors.w[column])
-    llr = posteriors.bit_llr[burst, column, :, : bits_per_symbol(w)]
-    ber_hat = float(np.mean(1 / (1 + np.exp(np.abs(llr)))))
-    if ber_hat > MAX_BER_HAT:
-        return None
-    bits = indices_to_bits(posteriors.index[burst, column], w)
+) -> PacketResult:
+    """The packet of one burst; `seen` is (packet,)."""
+    bits = indices_to_bits(posteriors.index[burst, column], int(posteriors.w[column]))
     return PacketResult(
         first_row=_header_row(int(np.flatnonzero(clock.burst == burst)[0]), column, clock),
         copies=float(seen.sum() / clock.packet_slots),
         payload_bits=int(bits.size),
         payload=bits_to_hex(bits),
-        confidence=float(confidence(evidence)),
-        ber_hat=ber_hat,
+        confidence=float(doubts.confidence[burst, column]),
+        ber_hat=float(doubts.ber_hat[burst, column]),
         burst=number,
         frames=frames,
-        evidence=tuple(evidence.tolist()),
+        evidence=tuple(doubts.evidence[burst, column].tolist()),
     )
 
 

@@ -9,7 +9,7 @@ the sum over all paths is the evidence for `w`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from math import comb
@@ -27,6 +27,8 @@ _NEVER = -1e9
 _SURE_LLR = 12.0
 #: Probabilities below this are not told apart.
 _TINY = 1e-30
+#: Packets that are detected together: more leave the processor's cache, fewer take more calls.
+_AT_ONCE = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -367,22 +369,29 @@ def _posteriors(
     index = np.empty((n_bursts, n_columns, n_symbols), np.int64)
     log_prob = np.empty((n_bursts, n_columns, n_symbols))
     bit_llr = np.full((n_bursts, n_columns, n_symbols, 7), np.nan)
-    for w in np.unique(weights):
-        columns = np.flatnonzero(weights == w)
+    for w, columns in _batches(weights, n_bursts):
         chosen = metrics[:, columns].reshape(n_bursts * columns.size, *metrics.shape[2:])
-        posterior = _forward_backward(chosen, int(w), memory).word
+        posterior = _forward_backward(chosen, w, memory).word
         if heed is not None:
-            heed(int(w), columns, posterior)
-        words = codebook(int(w))
-        preamble = np.concatenate([np.array(HEADER), dimming_symbol(int(w))])
+            heed(w, columns, posterior)
+        words = codebook(w)
+        preamble = np.concatenate([np.array(HEADER), dimming_symbol(w)])
         lit[:, columns, :PREAMBLE_SLOTS] = preamble
         lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ words).reshape(n_bursts, columns.size, -1)
         best = posterior.argmax(axis=2)
         index[:, columns] = best.reshape(n_bursts, columns.size, n_symbols)
         log_prob[:, columns] = _log_of_best(posterior, best).reshape(n_bursts, columns.size, n_symbols)
-        k = bits_per_symbol(int(w))
+        k = bits_per_symbol(w)
         bit_llr[:, columns, :, :k] = _bit_llr(posterior, k).reshape(n_bursts, columns.size, n_symbols, k)
     return BurstPosteriors(weights, w_log_prob, lit, index, log_prob, bit_llr, _header_llr(metrics))
+
+
+def _batches(weights: NDArray[np.int64], n_bursts: int) -> Iterator[tuple[int, NDArray[np.int64]]]:
+    """Each weight with columns that have it; as many at a time as are quick to detect."""
+    for w in np.unique(weights):
+        columns = np.flatnonzero(weights == w)
+        for batch in np.array_split(columns, min(-(-columns.size * n_bursts // _AT_ONCE), columns.size)):
+            yield int(w), batch
 
 
 def _header_llr(metrics: FloatArray) -> FloatArray:

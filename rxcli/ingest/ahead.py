@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections import deque
 from collections.abc import Generator
-from contextlib import closing
-from threading import Condition, Thread
+from contextlib import closing, suppress
+from threading import Condition, Thread, get_native_id
 
 from rxcli.types import Frame
 
 #: What may wait: pixels of so many bytes, and so many frames at least and at most.
 _MOST_BYTES, _LEAST_FRAMES, _MOST_FRAMES = 60_000_000, 2, 16
+#: How much nicer to others the thread is than the process.
+_NICER = 2
 
 
 def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:
@@ -31,6 +35,7 @@ def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, N
 
 
 def _fill(frames: Generator[Frame, None, None], shelf: _Shelf) -> None:
+    _give_way()
     try:
         with closing(frames):
             for frame in frames:
@@ -40,6 +45,17 @@ def _fill(frames: Generator[Frame, None, None], shelf: _Shelf) -> None:
         shelf.end(error)
     else:
         shelf.end(None)
+
+
+def _give_way() -> None:
+    """Let this thread, and those that a decoder starts from it, come after the one that looks at the frames.
+
+    On as many cores as a decoder fills by itself, each frame otherwise has to wait among those that come after it.
+    """
+    if sys.platform == "linux":  # elsewhere priorities are those of whole processes
+        me = get_native_id()
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + _NICER)
 
 
 class _Shelf:

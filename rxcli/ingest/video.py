@@ -30,6 +30,8 @@ _LIMITED_BLACK, _LIMITED_WHITE = 16, 235
 #: A clip is cut where its last frame starts more than this many frames before its stated end; times are rounded.
 _END_TOLERANCE = 1.5
 _MJPEG_THREADS = min(4, os.cpu_count() or 1)
+#: Threads of the other decoders: one more than FFmpeg takes, for theirs wait for one another.
+_DECODER_THREADS = min((os.cpu_count() or 1) + 2, 16)
 
 
 @dataclass(slots=True)
@@ -129,7 +131,7 @@ def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
     import av
 
     codec = stream.codec_context
-    codec.thread_type, codec.thread_count = "FRAME", 0
+    codec.thread_type, codec.thread_count = "FRAME", _DECODER_THREADS
     for packet in _packets(container, stream, progress):
         try:
             frames = codec.decode(packet)
