@@ -16,7 +16,7 @@ DATA = BASE | {"rxcli.types", "rxcli.protocol", "rxcli.profiles"}
 PIPELINE_STAGES = ("ingest", "find_screen", "geometry", "blind", "sampling", "clock", "channel", "denoise", "detect")
 PIPELINE_STAGES += ("assemble", "strips", "known_picture", "tracking")
 #: What puts the stages together.
-WIRING = {"pipeline", "locate", "unknown_camera", "reception", "clip", "clip_start", "options"}
+WIRING = {"pipeline", "locate", "unknown_camera", "reception", "clip", "options"}
 #: Too heavy to be loaded by a module that does not need it at once (milliseconds each on import: 70 to 1000).
 HEAVY = {"cv2", "rawpy", "av", "onnxruntime", "matplotlib", "scipy", "skimage", "simplejpeg", "tifffile"}
 HEAVY |= {"distributed", "dask", "pyarrow", "torch", "onnx", "lensfunpy", "pillow_heif", "tqdm"}

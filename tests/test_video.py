@@ -203,7 +203,7 @@ def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypa
         inside.append(threads())
         return [None]
 
-    monkeypatch.setattr("rxcli.clip._Clip.take", take)
+    monkeypatch.setattr("rxcli.clip.receiver._Clip.take", take)
     with blas.limit(limits=2, user_api="blas"):
         if max(threads(), default=0) < 2:
             pytest.skip("this numpy's BLAS has one thread")
@@ -231,12 +231,26 @@ def test_another_scene_is_searched_anew(clip: Clip) -> None:
 
 def test_another_scene_while_frames_are_held_back(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
     """The frames held back are looked at again by their own picture, and leave that of the new scene alone."""
-    monkeypatch.setattr("rxcli.clip._MUCH_DOUBT", -1.0)
+    monkeypatch.setattr("rxcli.clip.receiver._MUCH_DOUBT", -1.0)
     other = simulate(8, 8, "chelsea")
     moved = tuple(replace(frame, index=6 + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames))
     got = list(receive((*clip.frames[:6], *moved), clip.options))
     _, score = scored([replace(result, frame=result.frame - 6) for result in got[6:]], other.truth)
     assert score.error_free >= 0.9 * score.expected
+
+
+def test_frames_before_and_after_an_occlusion_are_looked_at_again(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[list[int]] = []
+
+    def measure_again(_scene: object, views: list[Any], *_: object) -> None:
+        measured.append([view.bursts.frame for view in views])
+
+    monkeypatch.setattr("rxcli.clip.scene.Scene.measure_again", measure_again)
+    dark = replace(clip.frames[3], pixels=np.full_like(clip.frames[3].pixels, 2))
+    got = list(receive((*clip.frames[:3], dark, *clip.frames[4:]), clip.options))
+    assert [result.frame for result in got] == [frame.index for frame in clip.frames]
+    assert got[3].status in ("no_signal", "no_screen")
+    assert measured[:2] == [[0, 1, 2], [4, 5, 6, 7, 8, 9]]
 
 
 def test_parts_of_packets_are_put_together() -> None:
@@ -457,10 +471,10 @@ def test_the_screen_may_come_nearer(clip: Clip, monkeypatch: pytest.MonkeyPatch)
         return SimpleNamespace(corners=start + np.array([[-1, 0], [1, 0], [1, 0], [-1, 0]]) * 4.0 * next(looks))
 
     numbers = itertools.count(2)
-    monkeypatch.setattr("rxcli.clip._LOOK_EVERY", 3)
+    monkeypatch.setattr("rxcli.clip.scene._LOOK_EVERY", 3)
     monkeypatch.setattr("rxcli.find_screen.track_screen", nearer)
-    monkeypatch.setattr("rxcli.clip.find_corners", lambda *_: start)
-    monkeypatch.setattr("rxcli.clip.sampling.strips_per_column", lambda _px: next(numbers))
+    monkeypatch.setattr("rxcli.clip.receiver.find_corners", lambda *_: start)
+    monkeypatch.setattr("rxcli.clip.scene.sampling.strips_per_column", lambda _px: next(numbers))
     got = list(receive(clip.frames[:8], replace(clip.options, corners=None)))
     assert [result.frame for result in got] == list(range(8))
     assert next(looks) == 4  # after the first frame's: the second's and every third
