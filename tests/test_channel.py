@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from row_profiles import Link, Shot, random_link, row_profiles, sigma_of, slot_odds
 
 from rxcli import channel, clock
+from rxcli.channel.words import _innovations
 from rxcli.protocol import slot_patterns
 from rxcli.types import Clock, SlotSamples
 
@@ -312,7 +313,7 @@ def test_innovations_are_those_of_a_gaussian_process(deviation: float, length: f
     residual = rng.multivariate_normal(np.zeros(n), covariance)
     density = -(residual @ np.linalg.solve(covariance, residual) + np.linalg.slogdet(covariance)[1]) / 2
     by_time = (values.astype(np.float32)[:, None, None] for values in (residual, gain, noise))
-    (found,) = channel._innovations(*by_time, ((deviation, length),))
+    (found,) = _innovations(*by_time, ((deviation, length),))
     assert found[0, 0] == pytest.approx(density, rel=1e-4, abs=1e-3)
 
 

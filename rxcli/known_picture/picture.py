@@ -1,0 +1,307 @@
+"""The picture without stripes, learned frame by frame, and the columns' light through it."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+
+from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
+
+#: Share of its weight that a frame keeps with every frame after it.
+MEMORY = 0.95
+#: Weight of the picture around a row against one frame's look at the row itself at full light.
+_SMOOTH = 0.05
+#: Share of a strip's light in doubt, inverse, from which it says nothing of the picture.
+_DOUBT = 4.0
+#: Rows around, in each direction, from which the picture of a row that was never lit is taken.
+_AROUND_ROWS = 4
+#: Relative error of a picture taken from the rows around, and of one that was looked at well.
+_AROUND_ERROR, _LEAST_ERROR = 0.3, 0.02
+#: A slot's light is at 0.5 with this precision before anything is seen.
+PRIOR = 4.0
+#: Rows of a slot err alike; their log-likelihoods count this much.
+_TEMPER = 0.5
+#: Error of a column's light, in parts of full light, that no pooling removes.
+_COMMON_ERROR = 0.04
+#: Slots around, in each direction, over which a strip's error is averaged, and those of them left out as its own.
+_ERROR_SLOTS, _OWN_SLOTS = 20.0, 1.3
+#: A column's light further than this beyond dark or lit is not to be trusted.
+_BEYOND = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnLight:
+    """Light of C columns on R rows, between 0, dark, and 1, lit."""
+
+    #: (C, R) float32.
+    value: Float32Array
+    #: (C, R) float32: inverse of the variance; 0 where nothing is seen.
+    precision: Float32Array
+    #: (C, R) float32: the value drawn to 0.5 where little is seen.
+    shrunk: Float32Array
+
+
+@dataclass(frozen=True, slots=True)
+class _System:
+    """The normal equations of all rows, factored; see `_factor`. Arrays (C, R)."""
+
+    #: (C, S, R): what a strip's light is multiplied with.
+    gain: Float32Array
+    diagonal: Float32Array
+    next: Float32Array
+    next_but_one: Float32Array
+    precision: Float32Array
+
+
+class KnownPicture:
+    """The picture without stripes, learned frame by frame.
+
+    Args:
+        inside: (C, S, R) the strip is on the screen there.
+        spread: (S, 3) share of the light of columns -1, 0, +1 in each strip.
+        floor: light of a dark slot, one for all or (C, S).
+        variance: of a strip's light where it is dark.
+        shot: variance per unit of light.
+    """
+
+    def __init__(
+        self, inside: BoolArray, spread: FloatArray, floor: float | Float32Array, variance: float, shot: float
+    ) -> None:
+        self._inside = inside.astype(np.float32)
+        self._spread = spread.astype(np.float32)
+        self._floor = np.asarray(floor, np.float32)[..., None]
+        self._variance, self._shot = np.float32(variance), np.float32(shot)
+        self._light: Float32Array = np.zeros(inside.shape, np.float32)
+        self._seen: Float32Array = np.zeros(inside.shape, np.float32)
+        self._system: _System | None = None
+        self._of_one: Float32Array | None = None
+        self._picture = self._error = self._light
+        #: (C,) variance of the columns' light over what was foreseen.
+        self._excess = np.ones(inside.shape[0], np.float32)
+
+    def learn(self, light: Float32Array, slots: Float32Array, trust: Float32Array, keep: float = MEMORY) -> None:
+        """Take a frame whose slots are known into the picture.
+
+        Args:
+            light: (C, S, R).
+            slots: (C, R) exposure-averaged slots, 0..1.
+            trust: (C, R) 0..1.
+            keep: share of their weight that the frames before keep.
+        """
+        lit, seen = self._lesson(light, slots, trust)
+        self._light = self._light * np.float32(keep) + lit
+        self._seen = self._seen * np.float32(keep) + seen
+        self._system = None
+
+    def without(self, light: Float32Array, slots: Float32Array, trust: Float32Array) -> KnownPicture:
+        """What the other frames say alone, for a frame that was learned last or with nothing forgotten since.
+
+        A picture learned from a frame's own light bears out whatever was decided there, wrong or right.
+
+        Args:
+            light: (C, S, R) as it was learned.
+            slots: (C, R) likewise.
+            trust: (C, R) likewise.
+        """
+        lit, seen = self._lesson(light, slots, trust)
+        other = copy(self)
+        other._light, other._seen = self._light - lit, np.maximum(self._seen - seen, 0)
+        other._system, other._excess = None, self._excess.copy()
+        return other
+
+    def _lesson(
+        self, light: Float32Array, slots: Float32Array, trust: Float32Array
+    ) -> tuple[Float32Array, Float32Array]:
+        """Light and light expected of a picture of 1, each weighted with the latter."""
+        expected = self._spread @ _with_neighbours(slots)
+        doubt = self._spread @ (1 - _with_neighbours(trust, 1.0))
+        weighted = expected * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * self._inside
+        return weighted * (light - self._floor), weighted * expected
+
+    def solve(self, light: Float32Array) -> ColumnLight:
+        """The columns' own light in a frame.
+
+        Args:
+            light: (C, S, R).
+        """
+        return self._solved(light, self._settled())
+
+    def _settled(self) -> _System:
+        """The equations of the picture as it is, made when first needed."""
+        if self._system is None:
+            self._system = self._factor()
+        return self._system
+
+    def solve_again(self, light: Float32Array, expected: Float32Array, rows_per_slot: float) -> ColumnLight:
+        """The columns' own light once more, strips trusted as far as they show what is expected of other slots nearby.
+
+        Were a slot's own error counted, whatever was decided of it would bear itself out.
+
+        Args:
+            light: (C, S, R).
+            expected: (C, R) light that the slots decided so far give.
+            rows_per_slot: rows per slot.
+        """
+        self._settled()
+        foreseen = self._picture * (self._spread @ _with_neighbours(expected))
+        error = light - self._floor - foreseen
+        error *= error
+        error *= self._inside
+        around = np.maximum(_around(error, rows_per_slot), 0)
+        around *= self._share_of_one(rows_per_slot)
+        return self._solved(light, self._factor(around))
+
+    def _share_of_one(self, rows_per_slot: float) -> Float32Array:
+        """(C, S, R) inverse of how many rows `_around` adds up."""
+        if self._of_one is None:
+            self._of_one = np.float32(1) / (_around(self._inside, rows_per_slot) + np.float32(1e-3))
+        return self._of_one
+
+    def _solved(self, light: Float32Array, system: _System) -> ColumnLight:
+        seen = self._spread.T @ (system.gain * (light - self._floor))
+        right = seen[:, 1] + np.float32(PRIOR / 2)
+        right[1:] += seen[:-1, 2]
+        right[:-1] += seen[1:, 0]
+        shrunk = _solve(system, right)
+        precision = np.maximum(system.precision - np.float32(PRIOR), 0)
+        value = shrunk + (shrunk - np.float32(0.5)) * (np.float32(PRIOR) / np.maximum(precision, np.float32(1e-3)))
+        return ColumnLight(value, self._tempered(value, precision), shrunk)
+
+    def judge(self, seen: ColumnLight, expected: Float32Array, share: float) -> tuple[ColumnLight, float]:
+        """Compare columns with what was decided; they are trusted accordingly, now and, in part, from now on.
+
+        Args:
+            seen: as `solve` gave it.
+            expected: (C, R) what the decided slots give.
+            share: weight of this frame against those before, 0..1.
+
+        Returns:
+            The light with its precision put right; and the median over the columns of the squared error over the
+            variance foreseen.
+        """
+        error = np.square(seen.value - expected) * seen.precision
+        ratio = error.sum(axis=1) / np.maximum((seen.precision > 0).sum(axis=1), 1) / np.float32(_TEMPER)
+        now = np.clip(self._excess * ratio, 0.25, 100.0)
+        self._excess += np.float32(share) * (now - self._excess)
+        better = ColumnLight(seen.value, seen.precision / np.maximum(ratio, 0.5)[:, None], seen.shrunk)
+        return better, float(np.median(ratio))
+
+    def moved(self, row_of: FloatArray, inside: BoolArray) -> None:
+        """Follow the screen to another place.
+
+        Args:
+            row_of: (C, R) index of the row, before, of what each row shows now.
+            inside: (C, S, R) as for the class, now.
+        """
+        n_before = self._light.shape[-1]
+        place = np.clip(row_of, 0, n_before - 1.001)[:, None]
+        left: IntArray = place.astype(np.int64)
+        part = (place - left).astype(np.float32)
+        for name in ("_light", "_seen"):
+            values = getattr(self, name)
+            before = np.take_along_axis(values, left, 2)
+            after = np.take_along_axis(values, left + 1, 2)
+            setattr(self, name, before + (after - before) * part)
+        self._inside = inside.astype(np.float32)
+        self._system = self._of_one = None
+
+    def _tempered(self, value: Float32Array, precision: Float32Array) -> Float32Array:
+        variance = self._excess[:, None] / np.maximum(precision, np.float32(1e-6)) + np.float32(_COMMON_ERROR**2)
+        beyond = np.maximum(np.abs(value - np.float32(0.5)) - np.float32(0.5 + _BEYOND), 0)
+        variance += 4 * beyond * beyond
+        return np.where(precision > 1e-3, np.float32(_TEMPER) / variance, np.float32(0))
+
+    def picture(self) -> tuple[Float32Array, Float32Array]:
+        """The picture and its relative variance, (C, S, R) each."""
+        around = _box(self._light, _AROUND_ROWS) / (_box(self._seen, _AROUND_ROWS) + np.float32(1e-3))
+        total = self._seen + np.float32(_SMOOTH)
+        picture = np.maximum(self._light + np.float32(_SMOOTH) * around, 0) / total
+        unseen = np.float32(_SMOOTH * _AROUND_ERROR) / total
+        return picture, unseen * unseen + np.float32(_LEAST_ERROR**2)
+
+    def _factor(self, measured: Float32Array | None = None) -> _System:
+        """Normal equations A m = b of every row, A symmetric with two bands: A = L D L', and the diagonal of A^-1."""
+        if self._system is None:
+            self._picture, self._error = self.picture()
+        picture = self._picture
+        half = np.float32(0.5) * picture
+        variance = self._variance + half * (self._shot + half * self._error)
+        if measured is not None:
+            variance += measured
+        gain = picture * self._inside / variance
+        left, own, right = self._spread.T
+        products = np.stack([own * own, left * left, right * right, own * right, left * own, left * right])
+        power = products @ (gain * picture)
+        middle = power[:, 0] + np.float32(PRIOR)
+        middle[:-1] += power[1:, 1]
+        middle[1:] += power[:-1, 2]
+        beside, beyond = np.zeros_like(middle), np.zeros_like(middle)
+        beside[:-1] = power[:-1, 3] + power[1:, 4]
+        beyond[:-2] = power[1:-1, 5]
+        return _System(gain, *_factored(middle, beside, beyond))
+
+
+def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
+    """(C, 3, R): each column between its neighbours."""
+    padded = np.pad(columns, ((1, 1), (0, 0)), constant_values=edge)
+    return np.stack([padded[:-2], padded[1:-1], padded[2:]], axis=1)
+
+
+def _around(values: Float32Array, rows_per_slot: float) -> Float32Array:
+    """Sum over the slots around, a row's own left out; last axis."""
+    near, far = (int(slots * rows_per_slot) for slots in (_OWN_SLOTS, _ERROR_SLOTS))
+    return _box(values, far) - _box(values, near)
+
+
+def _box(values: Float32Array, half: int) -> Float32Array:
+    """Sum over the rows at most `half` away; last axis."""
+    import cv2
+
+    flat = values.reshape(-1, values.shape[-1])
+    summed = cv2.boxFilter(flat, -1, (2 * half + 1, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(summed).reshape(values.shape)
+
+
+def _factored(
+    middle: Float32Array, beside: Float32Array, beyond: Float32Array
+) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array]:
+    """D, the two bands of L, and the inverse of the diagonal of A^-1, of R symmetric systems (C, R) with two bands.
+
+    A^-1 by the recursion of Takahashi, Fagan and Chin (1973): from the last column up.
+    """
+    n, _ = middle.shape
+    diagonal, first, second = middle.copy(), np.zeros_like(middle), np.zeros_like(middle)
+    for i in range(n):
+        if i >= 1:
+            diagonal[i] -= first[i - 1] ** 2 * diagonal[i - 1]
+        if i >= 2:
+            diagonal[i] -= second[i - 2] ** 2 * diagonal[i - 2]
+        first[i] = beside[i]
+        if i >= 1:
+            first[i] -= second[i - 1] * first[i - 1] * diagonal[i - 1]
+        first[i] /= diagonal[i]
+        second[i] = beyond[i] / diagonal[i]
+    inverse, near = np.zeros((n + 2, middle.shape[1]), np.float32), np.zeros((n + 2, middle.shape[1]), np.float32)
+    for i in range(n - 1, -1, -1):
+        far = -first[i] * near[i + 1] - second[i] * inverse[i + 2]
+        near[i] = -first[i] * inverse[i + 1] - second[i] * near[i + 1]
+        inverse[i] = 1 / diagonal[i] - first[i] * near[i] - second[i] * far
+    return diagonal, first, second, np.asarray(1 / inverse[:n], np.float32)
+
+
+def _solve(system: _System, right: Float32Array) -> Float32Array:
+    """The solution of every row, (C, R)."""
+    n = right.shape[0]
+    out = right.copy()
+    for i in range(1, n):
+        out[i] -= system.next[i - 1] * out[i - 1]
+        if i >= 2:
+            out[i] -= system.next_but_one[i - 2] * out[i - 2]
+    out /= system.diagonal
+    for i in range(n - 2, -1, -1):
+        out[i] -= system.next[i] * out[i + 1]
+        if i + 2 < n:
+            out[i] -= system.next_but_one[i] * out[i + 2]
+    return out
