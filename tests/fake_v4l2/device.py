@@ -51,7 +51,7 @@ class DriverError(Exception):
 class Faults:
     """What goes wrong, and when; None: never."""
 
-    #: S_FMT says EBUSY for the first so many seconds.
+    #: S_FMT says EBUSY for so many seconds from the first time it is asked.
     busy_s: float = 0.0
     #: After so many frames the camera is gone ...
     unplug_after: int | None = None
@@ -94,7 +94,7 @@ class FakeCamera:
         self.started_s = 0.0
         self.n_frames = 0
         self.gone_s: float | None = None
-        self.born_s = time.monotonic()
+        self.asked_s: float | None = None
         with self.node.open("wb") as file:
             file.truncate(BUFFER_BYTES * MAX_BUFFERS)
         with self.node.open("r+b") as file:
@@ -221,7 +221,8 @@ class FakeCamera:
     def _set_format(self, a: bytearray) -> None:
         if struct.unpack_from("<I", a)[0] != 1:
             raise DriverError(errno.EINVAL)
-        if time.monotonic() - self.born_s < self.faults.busy_s:
+        self.asked_s = self.asked_s if self.asked_s is not None else time.monotonic()
+        if time.monotonic() - self.asked_s < self.faults.busy_s:
             raise DriverError(errno.EBUSY)
         asked = struct.unpack_from("<I", a, 16)[0].to_bytes(4, "little").decode("latin-1")
         asked = self.faults.force_format or asked
