@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError
-from rxcli.ingest.image import BT601, BT709, Luma, luma_of
+from rxcli.ingest.luma import BT601, BT709, Luma, luma_of
 from rxcli.ingest.metadata import exif_metadata
 from rxcli.ingest.orientation import as_stored, orientation_of
 from rxcli.ingest.sniff import check_size, reason_of

@@ -18,15 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError
+from rxcli.ingest.luma import Luma, luma_of
 from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
 from rxcli.ingest.sniff import Kind, check_size, read_bytes, reason_of
 from rxcli.types import Frame, Metadata
-
-Luma = NDArray[np.uint8] | NDArray[np.uint16]
-
-#: Luma weights of red, green, blue (ITU-R BT.601 and BT.709).
-BT601 = (0.299, 0.587, 0.114)
-BT709 = (0.2126, 0.7152, 0.0722)
 
 
 def read_image(path: Path, kind: Kind) -> Frame:
@@ -47,20 +42,6 @@ def read_image(path: Path, kind: Kind) -> Frame:
 
         return _frame(path, *read_heif(data, path))
     return _frame(path, _read_with_pillow(data, path), Metadata())
-
-
-def luma_of(pixels: NDArray[Any], weights: tuple[float, float, float] = BT601) -> NDArray[Any]:
-    """Luma (height, width) of grey or RGB(A) `pixels` of uint8, uint16 or float32; alpha is left out."""
-    if pixels.ndim == 2:
-        return pixels
-    if pixels.shape[2] < 3:
-        return np.ascontiguousarray(pixels[:, :, 0])
-    import cv2
-
-    rgb = np.ascontiguousarray(pixels[:, :, :3])
-    if weights == BT601:
-        return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
-    return np.asarray(cv2.transform(rgb, np.array([weights], np.float32)))
 
 
 def _frame(path: Path, luma: Luma, metadata: Metadata, linear: bool = False) -> Frame:
