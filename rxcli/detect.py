@@ -261,6 +261,24 @@ def weight_evidence(metrics: FloatArray, candidates: NDArray[np.bool_]) -> Float
     return out
 
 
+def free_evidence(metrics: FloatArray, share: FloatArray) -> FloatArray:
+    """(C,) log evidence of slots that are no packets: each is lit on its own.
+
+    Args:
+        metrics: (C, n, patterns) log-likelihoods of the slots.
+        share: (C,) probability that a slot is lit.
+    """
+    n_columns, _, n_patterns = metrics.shape
+    prior = np.log(np.stack([1 - share, share], axis=1))
+    # A pattern is the state, the slots before, and the slot itself; the next state drops the oldest of them.
+    steps = metrics.reshape(n_columns, -1, n_patterns // 2, 2) + prior[:, None, None]
+    state = np.full((n_columns, n_patterns // 2), -np.log(n_patterns // 2))
+    for step in steps.transpose(1, 0, 2, 3):
+        pattern = (state[..., None] + step).reshape(n_columns, 2, -1)
+        state = np.logaddexp(pattern[:, 0], pattern[:, 1])
+    return np.asarray(np.logaddexp.reduce(state, axis=1))
+
+
 def _memory_of(metrics: FloatArray) -> int:
     return int(metrics.shape[-1]).bit_length() - 2
 

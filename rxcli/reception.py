@@ -13,6 +13,7 @@ from rxcli import assemble, channel, clock, denoise, detect
 from rxcli.errors import ReceiverError
 from rxcli.locate import Lock, noise_of
 from rxcli.options import ReceiverOptions
+from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
@@ -317,6 +318,17 @@ def _evidence(metrics: FloatArray, now: Clock) -> FloatArray:
     bursts = _by_burst(metrics, now)
     candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
     return np.asarray(np.logaddexp.reduce(detect.weight_evidence(bursts, candidates), axis=1))
+
+
+def packet_evidence(seen: Reception) -> float:
+    """Log-likelihood ratio of all columns' slots being packets, on the clock they were received with, over any slots.
+
+    Copies that differ and words that are not in the codebook speak against it, headers or not.
+    """
+    packets = _evidence(seen.metrics, seen.clock) - np.log(len(WEIGHTS))
+    free = detect.free_evidence(seen.metrics, seen.posteriors.w / SLOTS_PER_SYMBOL)
+    # The light model is surer than it should be: a column that fits poorly, or is dark, says nothing.
+    return float(np.logaddexp(packets - free, 0.0).sum())
 
 
 def doubtful_columns(seen: Reception) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ import numpy as np
 from rxcli import channel
 from rxcli.locate import Camera, Failure, Lock, Stages, find_cameras, find_lock, refitted_camera
 from rxcli.options import ReceiverOptions
-from rxcli.reception import Reception, decode, quick_look
+from rxcli.reception import Reception, decode, packet_evidence, quick_look
 from rxcli.types import FloatArray, Frame
 
 #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
@@ -15,8 +15,8 @@ _MATTERS_SLOTS = 0.05
 _MOST_REFITS = 3
 #: Symbols' mean log probabilities this many times lower, and lower by that, are more doubt.
 _MORE_DOUBT, _LEAST_DOUBT = 1.2, 0.01
-#: Headers, all columns and bursts together, that another than the most plausible estimate must show, nats.
-_HEADERS_AT_LEAST = 80.0
+#: Headers and packets, all columns together, that another than the most plausible estimate must show, nats.
+_PACKETS_AT_LEAST = 80.0
 #: Symbols' mean log probability counts so many times beside the headers: half a packet has headers, but no symbols.
 _SAY_OF_SYMBOLS = 40.0
 #: An estimate with rivals that scores less, nats, is none: its headers are not where they should be.
@@ -35,14 +35,16 @@ def likely_camera(
     Where several estimates are left, each has a quick look: the one under which headers and symbols show best is it.
     """
     found = find_cameras(frame, corners, options, stages)
+    if found.first is not None and not found.rivals:
+        return found.first
     best, most = found.first, -np.inf
-    if found.first is not None and found.rivals:
+    if found.first is not None:
         most = sum(_look(frame, corners, *found.first, stages))
     for rival in found.rivals:
-        headers, symbols = _look(frame, corners, *rival, stages)
-        if headers > _HEADERS_AT_LEAST and headers + symbols > most:
-            best, most = rival, headers + symbols
-    if best is None or -np.inf < most < _LEAST_SCORE:
+        packets, symbols = _look(frame, corners, *rival, stages)
+        if packets > _PACKETS_AT_LEAST and packets + symbols > most:
+            best, most = rival, packets + symbols
+    if best is None or most < _LEAST_SCORE:
         raise Failure("no_signal", found.reason or _NO_HEADERS, found.estimated)
     return best
 
@@ -50,14 +52,15 @@ def likely_camera(
 def _look(
     frame: Frame, corners: FloatArray, camera: Camera, options: ReceiverOptions, stages: Stages
 ) -> tuple[float, float]:
-    """What a quick look says of a camera: log-likelihood ratio of the headers, and how sure the symbols are, nats."""
+    """What a quick look says of a camera: evidence of headers and packets, and how sure the symbols are, nats."""
     try:
         lock = find_lock(frame, corners, camera, options, stages, quick=True)
     except Failure:
         return -np.inf, 0.0
     with stages("detect"):
-        posteriors = quick_look(lock).posteriors
-    return float(posteriors.header_llr.sum()), _SAY_OF_SYMBOLS * float(posteriors.log_prob.mean())
+        seen = quick_look(lock)
+        packets = float(seen.posteriors.header_llr.sum()) + packet_evidence(seen)
+    return packets, _SAY_OF_SYMBOLS * float(seen.posteriors.log_prob.mean())
 
 
 def with_refitted_camera(

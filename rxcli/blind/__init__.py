@@ -11,7 +11,8 @@ Six steps on the row profiles, none of which needs to know the camera.
    the rate of the slots. All are looked up over a grid of rows per slot for each length of packet. The header read
    backwards, 1100011100, is its own complement, so the sign tells the direction.
 3. **Trial.** The best hypotheses are sliced into slots; header, dimming symbol and the constant weight of all symbols
-   decide between them: a wrong one may show a header by chance, but never twenty columns of constant weight.
+   decide between them: a wrong one may show a header by chance, but never twenty columns of constant weight. Where that
+   decides little, slots are read first, knowing nothing of packets, and packets are sought among them (`reading`).
 4. **Slots.** Light of neighbouring slots overlaps through the exposure, and nobody told its levels: each column is read
    at the levels that every weight would give, by forward-backward, and levels and slots then follow from one another.
 5. **Refinement.** The slots, as probabilities seen through the exposure, predict the light of every strip on every row.

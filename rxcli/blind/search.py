@@ -10,6 +10,7 @@ import numpy as np
 from rxcli.blind.advice import why_not
 from rxcli.blind.bend import estimate_bend, straightened
 from rxcli.blind.edges import by_edges
+from rxcli.blind.reading import read
 from rxcli.blind.scan import Hypothesis, alike, find_clocks, same_slots
 from rxcli.blind.strips import Strips
 from rxcli.blind.timing import _ALIKE, BlindEstimate, refine
@@ -69,6 +70,8 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     bends = [bend] if gain > _BEND_GAINS[1] else [np.zeros(4), bend] if gain > _BEND_GAINS[0] else [np.zeros(4)]
     found = [(clock, b) for b in bends for clock in find_clocks(straightened(strips, b), sorted(rates))]
     found.sort(key=lambda pair: -pair[0].evidence)
+    if found and found[0][0].evidence < _WEAK_EVIDENCE:
+        found = read(strips, found, sorted(rates))
     estimates: list[BlindEstimate] = []
     for clock, b in _worth_refining(found):
         plain = any(estimate.evidence > _PLAIN_EVIDENCE for estimate in estimates)

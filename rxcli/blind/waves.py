@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rxcli.blind.strips import EXTREMES_SLOTS, SAMPLES, Strips, levelled
 from rxcli.blind.trellis import lit_probability, pattern_light
-from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook
 from rxcli.types import Float32Array, FloatArray
 
 #: Exposures that are compared, slots; and those near one, as factors.
@@ -25,6 +25,14 @@ _ROUNDS, _LEVEL_SLOTS = 1, 31
 _GAIN_PRIOR = np.float32(0.05)
 #: Log-odds of known slots; and the say of a sample, as samples of a slot err alike.
 _KNOWN, _TEMPER = 6.0, 0.5
+#: (10, 10) share of the codewords that are lit, by weight (nothing for 0) and place. The codebook is the first part of
+#: all words in ascending order: early slots are dark more often than late ones, of weights 2 to 5 the first one nearly
+#: always. None is surer than a header's.
+WORD_SHARES: FloatArray = np.clip(
+    [np.full(SLOTS_PER_SYMBOL, 0.5), *(codebook(w).mean(axis=0) for w in WEIGHTS)], 0.01, 0.99
+)
+#: Rounds of levels and slots that are read freely; and the share of them that may be lit.
+_FREE_ROUNDS, _FREE_DUTY = 2, (0.15, 0.85)
 #: Noise that is expected of levelled light before any is known.
 _FIRST_POWER = 0.3
 #: Rounds of weights and how many columns have them.
@@ -42,9 +50,9 @@ class Grid:
     packet_slots: int
 
     def log_odds(self, w: NDArray[np.int64], n: int) -> FloatArray:
-        """(C, n) prior log-odds of slots 0..n: headers and dimming symbols are known, others are lit by the weight."""
+        """(C, n) prior log-odds of slots 0..n: headers and dimming symbols are known, others lit as in codewords."""
         position = (np.arange(n) + self.first_slot) % self.packet_slots
-        out = np.log(w / (SLOTS_PER_SYMBOL - w))[:, None] + np.zeros(n)
+        out = _log_odds(WORD_SHARES)[w][:, position % SLOTS_PER_SYMBOL]
         preamble = position < PREAMBLE_SLOTS
         symbol = np.arange(SLOTS_PER_SYMBOL) < w[:, None]
         known = np.concatenate([np.broadcast_to(np.array(HEADER, bool), symbol.shape), symbol], axis=1)
@@ -113,6 +121,27 @@ def first_slots(waves: Waves, exposure_slots: float, grid: Grid) -> Slots:
     return Slots(lit.reshape(len(WEIGHTS), n_columns, n)[best, np.arange(n_columns)], np.array(WEIGHTS)[best])
 
 
+def free_log_odds(waves: Waves, exposure_slots: float) -> FloatArray:
+    """(C, N) what the light says for every slot being lit, read without knowing anything of packets."""
+    pattern = pattern_light(exposure_slots, SAMPLES)
+    shape = (waves.value.shape[0], waves.value.shape[1] // SAMPLES)
+    levels = _expected_levels(SLOTS_PER_SYMBOL // 2, exposure_slots)
+    gain, offset = (np.full_like(waves.value, level) for level in levels)
+    power = np.full((shape[0], 1), _FIRST_POWER, np.float32)
+    prior = np.zeros(shape)
+    lit, _ = lit_probability(_pattern_metric(waves, gain, offset, power, pattern), prior)
+    for _ in range(_FREE_ROUNDS):
+        gain, offset, residual = _levels(waves, lit, exposure_slots)
+        duty = np.clip(lit.mean(axis=1, keepdims=True, dtype=np.float64), *_FREE_DUTY)
+        prior = _log_odds(duty) + np.zeros(shape)
+        lit, _ = lit_probability(_pattern_metric(waves, gain, offset, _power(waves, residual), pattern), prior)
+    return _log_odds(np.clip(lit.astype(np.float64), 1e-4, 1 - 1e-4)) - prior
+
+
+def _log_odds(share: FloatArray) -> FloatArray:
+    return np.asarray(np.log(share / (1 - share)))
+
+
 def _shared_weights(evidence: FloatArray) -> NDArray[np.int64]:
     """(C,) most probable weight of each column, where weights that many columns have are more probable."""
     prior = np.full((evidence.shape[0], 1), 1 / evidence.shape[0])
@@ -173,7 +202,7 @@ def _expected_levels(w: int, exposure_slots: float) -> tuple[float, float]:
 
 
 def _duty_log_odds(w: NDArray[np.int64]) -> FloatArray:
-    return np.asarray(np.log(w / (SLOTS_PER_SYMBOL - w)))
+    return _log_odds(w / SLOTS_PER_SYMBOL)
 
 
 def _power(waves: Waves, residual: Float32Array) -> Float32Array:

@@ -1,0 +1,112 @@
+"""Hypotheses tried by reading their slots: whatever packet they hold, and wherever it starts, must show in them.
+
+The scan looks for headers in the light as it is, and a trial slices it. Where long exposures or a dark picture blur
+both, slots are read through the exposure first, knowing nothing of packets. The codebook then says where symbols begin
+(their first slots are dark more often than lit), headers and dimming symbols say where packets do: every start in
+every length of packet is a matter of sums.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rxcli.blind.bend import reversed_bend
+from rxcli.blind.scan import Hypothesis, same_slots
+from rxcli.blind.strips import Strips, in_readout_order
+from rxcli.blind.timing import slot_time, thinned, time_terms
+from rxcli.blind.waves import WORD_SHARES, column_waves, free_log_odds
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
+from rxcli.types import FloatArray
+
+#: Exposure that slots are read through while none is known, slots.
+_EXPOSURE = 1.2
+#: Share of the slots of headers and dimming symbols that may read wrongly, and the most that a slot says, nats.
+_WRONG, _MOST = 0.02, 6.0
+#: Different clocks that are read.
+_READ = 24
+
+
+def read(
+    strips: Strips, found: Sequence[tuple[Hypothesis, FloatArray]], packet_lengths: Sequence[int]
+) -> list[tuple[Hypothesis, FloatArray]]:
+    """The hypotheses that stood out in the scan, each with every length of packet, where it starts if it is one.
+
+    Args:
+        strips: as the picture has them.
+        found: hypotheses and the bends they were found with.
+        packet_lengths: slots of a packet, of every screen in question.
+
+    Returns:
+        Hypotheses and bends, best first; the evidence is that of headers, dimming symbols and codewords over slots of
+        any kind.
+    """
+    different: list[tuple[Hypothesis, FloatArray]] = []
+    for clock, bend in sorted(found, key=lambda pair: -pair[0].salience):
+        if not any(same_slots(clock, other) and bend is b for other, b in different):
+            different.append((clock, bend))
+    out = [(one, bend) for clock, bend in different[:_READ] for one in _read(strips, clock, bend, packet_lengths)]
+    return sorted(out, key=lambda pair: -pair[0].evidence)
+
+
+def _read(strips: Strips, clock: Hypothesis, bend: FloatArray, packet_lengths: Sequence[int]) -> list[Hypothesis]:
+    ordered, bend = (in_readout_order(strips), reversed_bend(bend)) if clock.reversed else (strips, bend)
+    ordered = thinned(ordered, clock.rows_per_slot)
+    first_row = ordered.rows[0] - 0.5 * (ordered.rows[1] - ordered.rows[0])
+    start = clock.start_row % clock.rows_per_slot - 2 * clock.rows_per_slot
+    values = np.concatenate([[first_row + start, clock.rows_per_slot], bend])
+    time = slot_time(ordered, time_terms(ordered), values)
+    log_odds = free_log_odds(column_waves(ordered, time, clock.rows_per_slot), _EXPOSURE)
+    out = []
+    for packet_slots in packet_lengths:
+        evidence = start_evidence(log_odds, packet_slots)
+        at = int(evidence.argmax())
+        start_row = start + at * clock.rows_per_slot
+        out.append(replace(clock, packet_slots=packet_slots, start_row=start_row, evidence=float(evidence[at])))
+    return out
+
+
+def start_evidence(log_odds: FloatArray, packet_slots: int) -> FloatArray:
+    """(packet_slots,) evidence that packets start at a slot and every packet after it, over slots of any kind, nats.
+
+    Args:
+        log_odds: (C, N) what the light says for every slot being lit.
+        packet_slots: slots of a packet.
+    """
+    n_columns, n = log_odds.shape
+    odds = np.exp(np.clip(log_odds, -_MOST, _MOST))[:, None]
+    duty = np.array(WEIGHTS)[:, None] / SLOTS_PER_SYMBOL
+    free = np.log(1 - duty + duty * odds)
+
+    def over_free(shares: FloatArray) -> FloatArray:
+        """(places, C, 9, N) evidence of every slot being at a place of a symbol, from shares (9, places)."""
+        return np.stack([np.log(1 - share + share * odds) - free for share in shares.T[..., None]])
+
+    in_words = over_free(WORD_SHARES[1:])
+    slot = np.arange(n)
+    # Words that start at slots 0 to 9, over all slots.
+    places = (slot - np.arange(SLOTS_PER_SYMBOL)[:, None]) % SLOTS_PER_SYMBOL
+    words = np.stack([in_words[place, :, :, slot].sum(axis=0) for place in places])
+    # What a preamble says more than words, by where it starts: at most its length before slot 0.
+    known = over_free(_preamble_shares())
+    n_starts = -(-(n + PREAMBLE_SLOTS) // packet_slots) * packet_slots
+    more = np.zeros((n_columns, len(WEIGHTS), n_starts))
+    for place in range(PREAMBLE_SLOTS):
+        first = PREAMBLE_SLOTS - place
+        more[..., first : first + n] += known[place] - in_words[place % SLOTS_PER_SYMBOL]
+    by_start = more.reshape(n_columns, len(WEIGHTS), -1, packet_slots).sum(axis=2)
+    start = np.arange(packet_slots)
+    total = by_start[..., (start + PREAMBLE_SLOTS) % packet_slots] + words[start % SLOTS_PER_SYMBOL].transpose(1, 2, 0)
+    every = free.sum(axis=2)
+    by_column = np.logaddexp.reduce(total + every[..., None], axis=1) - np.logaddexp.reduce(every, axis=1)[:, None]
+    # A column may be too dark to say anything.
+    return np.asarray((np.logaddexp(by_column, 0.0) - np.log(2.0)).sum(axis=0))
+
+
+def _preamble_shares() -> FloatArray:
+    """(9, 20) probability that slots of header and dimming symbol are lit, for every weight."""
+    header = np.tile(HEADER, (len(WEIGHTS), 1))
+    dimming = np.arange(SLOTS_PER_SYMBOL) < np.array(WEIGHTS)[:, None]
+    return np.asarray(np.clip(np.concatenate([header, dimming], axis=1), _WRONG, 1 - _WRONG))
