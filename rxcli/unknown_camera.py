@@ -15,12 +15,11 @@ _MATTERS_SLOTS = 0.05
 _MOST_REFITS = 3
 #: Symbols' mean log probabilities this many times lower, and lower by that, are more doubt.
 _MORE_DOUBT, _LEAST_DOUBT = 1.2, 0.01
-#: Headers and packets, all columns together, that another than the most plausible estimate must show, nats.
+#: Headers and packets, all columns together, that an estimate with rivals must show, nats: wrong ones have next to none
+#: of one or of the other.
 _PACKETS_AT_LEAST = 80.0
 #: Symbols' mean log probability counts so many times beside the headers: half a packet has headers, but no symbols.
 _SAY_OF_SYMBOLS = 40.0
-#: An estimate with rivals that scores less, nats, is none: its headers are not where they should be.
-_LEAST_SCORE = -200.0
 _NO_HEADERS = (
     "there are stripes but no packet header where it should be; the screen may show less than one packet (move "
     "closer), the picture may be merged from several exposures (switch HDR off), or the screen is none of those tried"
@@ -37,14 +36,12 @@ def likely_camera(
     found = find_cameras(frame, corners, options, stages)
     if found.first is not None and not found.rivals:
         return found.first
-    best, most = found.first, -np.inf
-    if found.first is not None:
-        most = sum(_look(frame, corners, *found.first, stages))
-    for rival in found.rivals:
-        packets, symbols = _look(frame, corners, *rival, stages)
+    best, most = None, -np.inf
+    for camera in ([found.first] if found.first else []) + list(found.rivals):
+        packets, symbols = _look(frame, corners, *camera, stages)
         if packets > _PACKETS_AT_LEAST and packets + symbols > most:
-            best, most = rival, packets + symbols
-    if best is None or most < _LEAST_SCORE:
+            best, most = camera, packets + symbols
+    if best is None:
         raise Failure("no_signal", found.reason or _NO_HEADERS, found.estimated)
     return best
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from rxcli import blind, geometry, sampling
+from rxcli.blind.bend import BEND_PRECISION
 from rxcli.ingest import open_source
 from rxcli.pipeline import ReceiverOptions, receive
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile, shipped_profiles
@@ -125,6 +126,18 @@ def test_bend_terms_are_the_lens_model_at_any_focal_length() -> None:
     scaled = coefficients * (width / focal) ** np.array([2, 4, 1, 1])
     terms = blind.bend_terms(points[:, 0], points[:, 1], width, height)
     np.testing.assert_allclose(scaled @ terms, moved, rtol=1e-9, atol=1e-9)
+
+
+def test_lenses_are_expected_to_bend_back() -> None:
+    def surprise(*coefficients: float) -> float:
+        bend = np.array(coefficients)
+        return float(bend @ BEND_PRECISION @ bend)
+
+    for k1 in (-0.2, 0.2):
+        assert surprise(k1, -k1, 0, 0) == pytest.approx((k1 / 0.3) ** 2)
+        assert surprise(k1, -k1, 0, 0) < surprise(k1, 0, 0, 0) < surprise(k1, k1, 0, 0)
+    np.testing.assert_allclose(BEND_PRECISION, BEND_PRECISION.T)
+    assert np.linalg.eigvalsh(BEND_PRECISION).min() > 0
 
 
 def test_structure_evidence_knows_packets_from_other_bits() -> None:

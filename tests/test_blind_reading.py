@@ -45,7 +45,7 @@ def _brute(log_odds: FloatArray, start: int, packet_slots: int) -> float:
 @pytest.mark.parametrize(("packet_slots", "n"), [(70, 95), (70, 61), (130, 240), (260, 245)])
 def test_evidence_is_that_of_every_slot_on_its_own(packet_slots: int, n: int) -> None:
     log_odds = np.clip(np.random.default_rng(n).normal(0, 2, (3, n)), -5, 5)
-    found = start_evidence(log_odds, packet_slots)
+    (found,) = start_evidence(log_odds, [packet_slots])
     assert found.shape == (packet_slots,)
     for start in (0, 1, 9, 37, 50, 69, packet_slots - 1):
         assert found[start] == pytest.approx(_brute(log_odds, start, packet_slots), abs=1e-9)
@@ -56,13 +56,13 @@ def test_packets_start_where_they_were_sent(n_symbols: int, first: int) -> None:
     rng = np.random.default_rng(first)
     sent = _sent(rng, [3, 4, 5, 5, 6, 7], n_symbols, first, 340)
     log_odds = 2.0 * (2 * sent - 1) + rng.normal(0, 2.0, sent.shape)
-    evidence = {length: start_evidence(log_odds, length) for length in LENGTHS}
+    evidence = dict(zip(LENGTHS, start_evidence(log_odds, LENGTHS), strict=True))
     right = PREAMBLE_SLOTS + 10 * n_symbols
     assert max(evidence, key=lambda length: float(evidence[length].max())) == right
     assert int(evidence[right].argmax()) == -first % right
     assert evidence[right].max() > 60
     noise = rng.normal(0, 2.0, sent.shape)
-    assert max(start_evidence(noise, length).max() for length in LENGTHS) < 20
+    assert max(one.max() for one in start_evidence(noise, LENGTHS)) < 20
 
 
 def test_first_slots_of_words_are_dark_more_often() -> None:

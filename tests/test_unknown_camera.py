@@ -48,6 +48,28 @@ def test_without_headers_nothing_is_chosen(tmp_path: Path, monkeypatch: pytest.M
         _chosen(frame, Cameras(None, (_camera(1.13 * ROWS_PER_SLOT),), "too dark"), monkeypatch)
 
 
+def test_an_estimate_without_a_lock_is_none_where_it_has_rivals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_lock(*_: object, **__: object) -> None:
+        raise Failure("no_signal", "nothing there")
+
+    frame, _ = _frame(tmp_path)
+    right, wrong = _camera(ROWS_PER_SLOT), _camera(1.13 * ROWS_PER_SLOT)
+    monkeypatch.setattr(unknown_camera, "find_lock", no_lock)
+    assert _chosen(frame, Cameras(right), monkeypatch) is right[0]
+    with pytest.raises(Failure, match="no packet header"):
+        _chosen(frame, Cameras(right, (wrong,)), monkeypatch)
+
+
+def test_packets_are_seen_on_their_own_clock_alone(tmp_path: Path) -> None:
+    frame, _ = _frame(tmp_path)
+    clocks = (ROWS_PER_SLOT, 1.004 * ROWS_PER_SLOT)
+    right, wrong = (unknown_camera._look(frame, CORNERS, *_camera(rows), Stages()) for rows in clocks)
+    assert right[0] > 100
+    assert sum(wrong) < 0.8 * sum(right)
+
+
 @pytest.mark.parametrize("told_exposure_s", [None, 2e-6])
 def test_an_unknown_camera_is_refitted_and_received(tmp_path: Path, told_exposure_s: float | None) -> None:
     frame, payloads = _frame(tmp_path)

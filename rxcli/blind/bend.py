@@ -12,6 +12,11 @@ from rxcli.types import Float32Array, FloatArray
 
 #: Scale of the coefficients k1 k2 p1 p2 for a focal length of one picture width, as a camera may have them.
 BEND_SCALE = np.array([0.3, 0.6, 1.5e-3, 1.5e-3])
+#: Lenses bend back further out: k2 is about -k1 for such a focal length, give or take so much.
+_BACK = 0.2
+#: (4, 4) inverse covariance of the coefficients before the picture was seen.
+BEND_PRECISION: FloatArray = np.diag(BEND_SCALE**-2 * [1, 0, 1, 1])
+BEND_PRECISION[:2, :2] += _BACK**-2
 
 #: Distances of compared strips, in columns; a column's light reaches over its neighbours.
 _BEND_DISTANCES = (0.5, 1.0, 2.0)
@@ -101,15 +106,15 @@ def _at_lag(correlation: Float32Array, lag: FloatArray) -> tuple[FloatArray, Flo
 
 def _likeness(bend: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float) -> float:
     total = sum(float(_at_lag(c, np.tensordot(bend, terms, 1))[0].sum()) for c, terms in lags)
-    return weight * total - 0.5 * float(((bend / BEND_SCALE) ** 2).sum())
+    return weight * total - 0.5 * float(bend @ BEND_PRECISION @ bend)
 
 
 def _climb(bend: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float, steps: int = 8) -> FloatArray:
-    """Newton's method on the likeness, with the prior of `BEND_SCALE`; never downhill."""
+    """Newton's method on the likeness, with the prior of `BEND_PRECISION`; never downhill."""
     best, score = bend, _likeness(bend, lags, weight)
     step = 1.0
     for _ in range(steps):
-        gradient, hessian = -best / BEND_SCALE**2, np.diag(1 / BEND_SCALE**2)
+        gradient, hessian = -BEND_PRECISION @ best, BEND_PRECISION.copy()
         for correlation, terms in lags:
             _, slope, curvature = _at_lag(correlation, np.tensordot(best, terms, 1))
             flat = terms.reshape(4, -1)

@@ -18,7 +18,7 @@ from rxcli.blind.scan import Hypothesis, same_slots
 from rxcli.blind.strips import Strips, in_readout_order
 from rxcli.blind.timing import slot_time, thinned, time_terms
 from rxcli.blind.waves import WORD_SHARES, column_waves, free_log_odds
-from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, dimming_symbol
 from rxcli.types import FloatArray
 
 #: Exposure that slots are read through while none is known, slots.
@@ -27,6 +27,8 @@ _EXPOSURE = 1.2
 _WRONG, _MOST = 0.02, 6.0
 #: Different clocks that are read.
 _READ = 24
+#: (9, 20) whether slots of header and dimming symbol are lit, for every weight.
+_PREAMBLES = np.array([[*HEADER, *dimming_symbol(w)] for w in WEIGHTS], bool)
 
 
 def read(
@@ -60,53 +62,48 @@ def _read(strips: Strips, clock: Hypothesis, bend: FloatArray, packet_lengths: S
     time = slot_time(ordered, time_terms(ordered), values)
     log_odds = free_log_odds(column_waves(ordered, time, clock.rows_per_slot), _EXPOSURE)
     out = []
-    for packet_slots in packet_lengths:
-        evidence = start_evidence(log_odds, packet_slots)
+    for packet_slots, evidence in zip(packet_lengths, start_evidence(log_odds, packet_lengths), strict=True):
         at = int(evidence.argmax())
         start_row = start + at * clock.rows_per_slot
         out.append(replace(clock, packet_slots=packet_slots, start_row=start_row, evidence=float(evidence[at])))
     return out
 
 
-def start_evidence(log_odds: FloatArray, packet_slots: int) -> FloatArray:
-    """(packet_slots,) evidence that packets start at a slot and every packet after it, over slots of any kind, nats.
+def start_evidence(log_odds: FloatArray, packet_lengths: Sequence[int]) -> list[FloatArray]:
+    """Evidence that packets start at a slot and every packet after it, over slots of any kind, nats.
 
     Args:
         log_odds: (C, N) what the light says for every slot being lit.
-        packet_slots: slots of a packet.
+        packet_lengths: slots of a packet, several to be compared.
+
+    Returns:
+        (packet_slots,) for every length.
     """
-    n_columns, n = log_odds.shape
     odds = np.exp(np.clip(log_odds, -_MOST, _MOST))[:, None]
     duty = np.array(WEIGHTS)[:, None] / SLOTS_PER_SYMBOL
     free = np.log(1 - duty + duty * odds)
-
-    def over_free(shares: FloatArray) -> FloatArray:
-        """(places, C, 9, N) evidence of every slot being at a place of a symbol, from shares (9, places)."""
-        return np.stack([np.log(1 - share + share * odds) - free for share in shares.T[..., None]])
-
-    in_words = over_free(WORD_SHARES[1:])
-    slot = np.arange(n)
-    # Words that start at slots 0 to 9, over all slots.
+    # (places, C, 9, N): every slot at every place of a codeword, and of header and dimming symbol.
+    in_words = np.stack([np.log(1 - share + share * odds) - free for share in WORD_SHARES[1:].T[..., None]])
+    dark, lit = (np.log(1 - share + share * odds) - free for share in (_WRONG, 1 - _WRONG))
+    in_preamble = np.where(_PREAMBLES.T[:, None, :, None], lit, dark)
+    slot = np.arange(log_odds.shape[1])
+    # (10, C, 9): words that start at slots 0 to 9, over all slots.
     places = (slot - np.arange(SLOTS_PER_SYMBOL)[:, None]) % SLOTS_PER_SYMBOL
     words = np.stack([in_words[place, :, :, slot].sum(axis=0) for place in places])
-    # What a preamble says more than words, by where it starts: at most its length before slot 0.
-    known = over_free(_preamble_shares())
-    n_starts = -(-(n + PREAMBLE_SLOTS) // packet_slots) * packet_slots
-    more = np.zeros((n_columns, len(WEIGHTS), n_starts))
+    # (C, 9, N + 20): what a preamble says more than words, by where it starts: at most its length before slot 0.
+    more = np.zeros((*in_words.shape[1:3], slot.size + PREAMBLE_SLOTS))
     for place in range(PREAMBLE_SLOTS):
         first = PREAMBLE_SLOTS - place
-        more[..., first : first + n] += known[place] - in_words[place % SLOTS_PER_SYMBOL]
-    by_start = more.reshape(n_columns, len(WEIGHTS), -1, packet_slots).sum(axis=2)
+        more[..., first : first + slot.size] += in_preamble[place] - in_words[place % SLOTS_PER_SYMBOL]
+    return [_over_columns(words, more, free.sum(axis=2), packet_slots) for packet_slots in packet_lengths]
+
+
+def _over_columns(words: FloatArray, more: FloatArray, free: FloatArray, packet_slots: int) -> FloatArray:
+    """(packet_slots,) evidence of every start from that of words (10, C, 9), preambles (C, 9, n) and slots (C, 9)."""
     start = np.arange(packet_slots)
-    total = by_start[..., (start + PREAMBLE_SLOTS) % packet_slots] + words[start % SLOTS_PER_SYMBOL].transpose(1, 2, 0)
-    every = free.sum(axis=2)
-    by_column = np.logaddexp.reduce(total + every[..., None], axis=1) - np.logaddexp.reduce(every, axis=1)[:, None]
+    padded = np.pad(more, ((0, 0), (0, 0), (0, -more.shape[2] % packet_slots)))
+    preambles = padded.reshape(*more.shape[:2], -1, packet_slots).sum(axis=2)
+    total = preambles[..., (start + PREAMBLE_SLOTS) % packet_slots] + words[start % SLOTS_PER_SYMBOL].transpose(1, 2, 0)
+    over_free = np.logaddexp.reduce(total + free[..., None], axis=1) - np.logaddexp.reduce(free, axis=1)[:, None]
     # A column may be too dark to say anything.
-    return np.asarray((np.logaddexp(by_column, 0.0) - np.log(2.0)).sum(axis=0))
-
-
-def _preamble_shares() -> FloatArray:
-    """(9, 20) probability that slots of header and dimming symbol are lit, for every weight."""
-    header = np.tile(HEADER, (len(WEIGHTS), 1))
-    dimming = np.arange(SLOTS_PER_SYMBOL) < np.array(WEIGHTS)[:, None]
-    return np.asarray(np.clip(np.concatenate([header, dimming], axis=1), _WRONG, 1 - _WRONG))
+    return np.asarray((np.logaddexp(over_free, 0.0) - np.log(2.0)).sum(axis=0))

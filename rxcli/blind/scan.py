@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,7 +37,7 @@ _SAY_OF_LINE = 0.03
 #: Rows per slot this close, relative, are one hypothesis.
 _ALIKE_ROWS = 0.015
 
-#: Hypotheses that are tried.
+#: Hypotheses that are tried: so many of different clocks or packets, and so many of different clocks.
 _TRIALS = 24
 
 #: Steps of the header, dark before and after.
@@ -211,11 +211,21 @@ def find_clocks(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesi
     octaves = _octaves(strips)
     found = [(h, o) for o in octaves for h in _scan_octave(o, strips.rows.size, packet_lengths)]
     found.sort(key=lambda pair: -pair[0].evidence)
-    distinct: list[tuple[Hypothesis, _Octave]] = []
-    for one, octave in found:
-        if len(distinct) < _TRIALS and not any(alike(one, other) for other, _ in distinct):
-            distinct.append((one, octave))
-    return sorted((_try(*pair) for pair in distinct), key=lambda hypothesis: -hypothesis.evidence)
+    chosen = {**_distinct(found, alike), **_distinct(found, same_slots)}
+    return sorted((_try(*found[n]) for n in chosen), key=lambda hypothesis: -hypothesis.evidence)
+
+
+def _distinct(
+    found: list[tuple[Hypothesis, _Octave]], same: Callable[[Hypothesis, Hypothesis], bool]
+) -> dict[int, Hypothesis]:
+    """The first hypotheses that are not the same, by their places."""
+    out: dict[int, Hypothesis] = {}
+    for place, (one, _) in enumerate(found):
+        if not any(same(one, other) for other in out.values()):
+            out[place] = one
+        if len(out) == _TRIALS:
+            break
+    return out
 
 
 def alike(one: Hypothesis, other: Hypothesis) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.blind.bend import BEND_SCALE, bend_terms, reversed_bend
+from rxcli.blind.bend import BEND_PRECISION, BEND_SCALE, bend_terms, reversed_bend
 from rxcli.blind.scan import Hypothesis
 from rxcli.blind.strips import Strips, in_readout_order
 from rxcli.blind.structure import repeat_evidence
@@ -29,7 +29,8 @@ from rxcli.blind.waves import (
 from rxcli.types import Float32Array, FloatArray
 
 #: Of the prior: next to nothing is known of start and period, which slots that tell nothing leave as they are.
-_PRECISION = np.concatenate([[1e-6, 1e-6], BEND_SCALE**-2])
+_PRECISION: FloatArray = np.diag([1e-6] * 6)
+_PRECISION[2:, 2:] = BEND_PRECISION
 
 #: Samples of a slot and strips of a column err alike: so many of them say what one would.
 _ALIKE = 10.0
@@ -348,14 +349,13 @@ def _solve(
     """Step and covariance; the spread of the columns' pulls stands for all that makes residuals alike."""
     free = jacobian[:n_free]
     flat = free.reshape(n_free, -1)
-    prior = (_ALIKE * _PRECISION)[:n_free]
-    hessian = (flat * information.ravel()) @ flat.T + np.diag(prior)
+    prior = _ALIKE * _PRECISION[:n_free, :n_free]
+    hessian = (flat * information.ravel()) @ flat.T + prior
     inverse = np.linalg.inv(hessian)
     by_column = (free * pull).reshape(n_free, n_columns, -1).sum(axis=2)
     spread = by_column - by_column.mean(axis=1, keepdims=True)
     step, covariance = np.zeros(6), np.zeros((6, 6))
-    towards = prior * values[:n_free]
-    towards[:2] = 0
+    towards = prior[:, 2:] @ values[2:n_free]
     step[:n_free] = inverse @ (flat @ pull.ravel() - towards)
     covariance[:n_free, :n_free] = inverse @ (spread @ spread.T) @ inverse * n_columns / max(n_columns - 1, 1)
     return step, covariance
