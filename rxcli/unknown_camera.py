@@ -31,8 +31,8 @@ def likely_camera(
 ) -> tuple[Camera, ReceiverOptions]:
     """The camera, known or estimated, and the options with the screens that remain.
 
-    Where several estimates are left, each has a quick look: the one under which headers, packets and symbols show best is
-    it, and without packets none.
+    Where several estimates are left, each has a quick look: the one under which headers, packets and
+    symbols show best is it, and without packets none.
     """
     found = find_cameras(frame, corners, options, stages)
     if found.first is not None and not found.rivals:
