@@ -27,12 +27,13 @@ from rxcli.blind.advice import stripe_likeness, why_not
 from rxcli.blind.bend import bend_terms, estimate_bend, straightened
 from rxcli.blind.camera import camera_profile, in_time_order, lens_of, summary, summary_of_rows
 from rxcli.blind.columns import likely_columns
+from rxcli.blind.estimates import BlindEstimate, Hypothesis
 from rxcli.blind.refit import refit
-from rxcli.blind.scan import Hypothesis, find_clocks
+from rxcli.blind.scan import find_clocks
 from rxcli.blind.search import MIN_EVIDENCE, BlindSearch, estimate_camera
 from rxcli.blind.strips import Noise, Strips, in_readout_order, strips_of
 from rxcli.blind.structure import structure_evidence
-from rxcli.blind.timing import BlindEstimate, refine
+from rxcli.blind.timing import refine
 
 __all__ = [
     "MIN_EVIDENCE",

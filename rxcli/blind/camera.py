@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rxcli.blind.timing import BlindEstimate
+from rxcli.blind.estimates import BlindEstimate
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.types import Lens, RowProfiles
 

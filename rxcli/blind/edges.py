@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from rxcli.blind.bend import bend_terms
+from rxcli.blind.estimates import BlindEstimate
 from rxcli.blind.strips import EXTREMES_SLOTS, Strips, levelled
 from rxcli.blind.waves import local_mean
 from rxcli.types import Float32Array, FloatArray
-
-if TYPE_CHECKING:
-    from rxcli.blind.timing import BlindEstimate
 
 #: Rows over which the edges' power is levelled.
 LOCAL_ROWS = 41

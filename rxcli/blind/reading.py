@@ -14,7 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.blind.bend import reversed_bend
-from rxcli.blind.scan import Hypothesis, same_slots
+from rxcli.blind.estimates import Hypothesis
+from rxcli.blind.scan import same_slots
 from rxcli.blind.strips import Strips, in_readout_order
 from rxcli.blind.timing import slot_time, thinned, time_terms
 from rxcli.blind.waves import WORD_SHARES, column_waves, free_log_odds

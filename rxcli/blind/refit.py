@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.blind.bend import reversed_bend
+from rxcli.blind.estimates import BlindEstimate
 from rxcli.blind.rows import fit_rows
 from rxcli.blind.strips import Strips, in_readout_order
 from rxcli.blind.timing import (
     FLAT,
     UNDERSTATED,
-    BlindEstimate,
     bend_chi_square,
     gauss_newton,
     slot_time,

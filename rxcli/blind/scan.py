@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.blind.edges import edge_power
+from rxcli.blind.estimates import Hypothesis
 from rxcli.blind.strips import SAMPLES, Noise, Strips, levelled
 from rxcli.blind.structure import structure_evidence
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
@@ -42,22 +43,6 @@ _TRIALS = 24
 
 #: Steps of the header, dark before and after.
 _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
-
-
-@dataclass(frozen=True, slots=True)
-class Hypothesis:
-    """A clock that a picture may show."""
-
-    rows_per_slot: float
-    packet_slots: int
-    #: Where a header starts: rows from the upper edge of the first of the strips' rows, in readout order.
-    start_row: float
-    #: True where the picture's rows run against the readout.
-    reversed: bool
-    #: Log-likelihood ratio of header and weights over chance; of the scan while it was not tried.
-    evidence: float
-    #: How much headers and repeats stood out in the scan.
-    salience: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,11 @@ import numpy as np
 from rxcli.blind.advice import why_not
 from rxcli.blind.bend import estimate_bend, straightened
 from rxcli.blind.edges import by_edges
+from rxcli.blind.estimates import BlindEstimate, Hypothesis
 from rxcli.blind.reading import read
-from rxcli.blind.scan import Hypothesis, alike, find_clocks, same_slots
+from rxcli.blind.scan import alike, find_clocks, same_slots
 from rxcli.blind.strips import Strips
-from rxcli.blind.timing import _ALIKE, BlindEstimate, refine
+from rxcli.blind.timing import ALIKE, refine
 from rxcli.profiles import ScreenProfile
 from rxcli.types import FloatArray
 
@@ -125,5 +126,5 @@ def _plausibility(estimate: BlindEstimate, strips: Strips, rows_per_slot: float)
     A packet twice as long fits wherever no second header is in view to contradict it.
     """
     slots = strips.n_columns * strips.rows.size / rows_per_slot
-    light = -0.5 * slots / _ALIKE * float(np.log(max(1 - estimate.explained, 1e-3)))
+    light = -0.5 * slots / ALIKE * float(np.log(max(1 - estimate.explained, 1e-3)))
     return estimate.evidence + light - _LONGER_PACKET * float(np.log2(estimate.packet_slots))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.blind.bend import BEND_PRECISION, BEND_SCALE, bend_terms, reversed_bend
-from rxcli.blind.scan import Hypothesis
+from rxcli.blind.estimates import BlindEstimate, Hypothesis
 from rxcli.blind.strips import Strips, in_readout_order
 from rxcli.blind.structure import repeat_evidence
 from rxcli.blind.waves import (
@@ -33,7 +33,7 @@ _PRECISION: FloatArray = np.diag([1e-6] * 6)
 _PRECISION[2:, 2:] = BEND_PRECISION
 
 #: Samples of a slot and strips of a column err alike: so many of them say what one would.
-_ALIKE = 10.0
+ALIKE = 10.0
 
 #: Slots that are wrong are wrong in neighbouring columns alike: the spread between columns says this much too little.
 UNDERSTATED = 3.0
@@ -66,29 +66,6 @@ _GAIN_SD = 0.5
 
 #: Rows of one block of the normal equations; the bend is straight within, which in longer ones changes the period.
 BLOCK_ROWS = 16
-
-
-@dataclass(frozen=True, slots=True)
-class BlindEstimate:
-    """What was estimated of a camera, with standard deviations."""
-
-    rows_per_slot: float
-    rows_per_slot_sd: float
-    packet_slots: int
-    reversed: bool
-    exposure_slots: float
-    exposure_slots_sd: float
-    #: (4,) k1 k2 p1 p2 for a focal length of one picture width, of a picture that was corrected in the camera.
-    bend: FloatArray
-    bend_sd: FloatArray
-    #: True where the stripes are bent beyond doubt.
-    corrected: bool
-    #: Log-likelihood ratio of header and weights over chance.
-    evidence: float
-    #: Share of the local variance of the light that the slots explain.
-    explained: float
-    #: Exposure that the file tells, 0 where it does not.
-    least_exposure_slots: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,7 +326,7 @@ def _solve(
     """Step and covariance; the spread of the columns' pulls stands for all that makes residuals alike."""
     free = jacobian[:n_free]
     flat = free.reshape(n_free, -1)
-    prior = _ALIKE * _PRECISION[:n_free, :n_free]
+    prior = ALIKE * _PRECISION[:n_free, :n_free]
     hessian = (flat * information.ravel()) @ flat.T + prior
     inverse = np.linalg.inv(hessian)
     by_column = (free * pull).reshape(n_free, n_columns, -1).sum(axis=2)

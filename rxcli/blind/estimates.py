@@ -1,0 +1,46 @@
+"""What may be, and what was estimated of a camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rxcli.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A clock that a picture may show."""
+
+    rows_per_slot: float
+    packet_slots: int
+    #: Where a header starts: rows from the upper edge of the first of the strips' rows, in readout order.
+    start_row: float
+    #: True where the picture's rows run against the readout.
+    reversed: bool
+    #: Log-likelihood ratio of header and weights over chance; of the scan while it was not tried.
+    evidence: float
+    #: How much headers and repeats stood out in the scan.
+    salience: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class BlindEstimate:
+    """What was estimated of a camera, with standard deviations."""
+
+    rows_per_slot: float
+    rows_per_slot_sd: float
+    packet_slots: int
+    reversed: bool
+    exposure_slots: float
+    exposure_slots_sd: float
+    #: (4,) k1 k2 p1 p2 for a focal length of one picture width, of a picture that was corrected in the camera.
+    bend: FloatArray
+    bend_sd: FloatArray
+    #: True where the stripes are bent beyond doubt.
+    corrected: bool
+    #: Log-likelihood ratio of header and weights over chance.
+    evidence: float
+    #: Share of the local variance of the light that the slots explain.
+    explained: float
+    #: Exposure that the file tells, 0 where it does not.
+    least_exposure_slots: float = 0.0
