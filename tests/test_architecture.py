@@ -86,6 +86,14 @@ def test_stages_import_the_data_model_and_never_each_other(part: str) -> None:
         assert own(imports(MODULES[name])) <= allowed, name
 
 
+def test_no_module_imports_itself_through_others() -> None:
+    below = {name: own(imports(tree)) - {name} for name, tree in MODULES.items()}
+    while leaves := [name for name, found in below.items() if not found & below.keys()]:
+        for name in leaves:
+            del below[name]
+    assert not below, "in circles, or above them"
+
+
 @pytest.mark.parametrize("name", ["rxcli.protocol", "rxcli.types", "rxcli.errors", "rxcli.resources"])
 def test_the_base_stands_on_nothing(name: str) -> None:
     assert own(imports(MODULES[name])) <= BASE - {name}
