@@ -284,8 +284,6 @@ class _Clip:
         self._link.last_time_s = frame.time_s
         view.bursts = replace(view.bursts, first_copy=first_copy)
         self._waiting.append(waiting)
-        if self._n_held == _HELD and self._scene is not None and self._scene.may_move_yet:
-            view.frame = frame
         with stages("detect"):
             if not self._link.phase.settled:
                 self._compare(view)
@@ -350,7 +348,7 @@ class _Clip:
     # -- a second look at the first frames ---------------------------------------------------------------------------
 
     def _look_again(self, at_last: bool) -> None:
-        """The first frames once more: by then it is known better where the screen is, and what is on it.
+        """The first frames once more: by then it is known better what is on the screen.
 
         Where that leaves doubt, more frames are waited for, unless it is `at_last`.
         """
@@ -360,9 +358,6 @@ class _Clip:
         if len(held) > 1:
             self._measure_again(held)
             self._detect_again()
-        for waiting in held:
-            assert waiting.view is not None
-            waiting.view.frame = None
         doubtful, whole = np.sum([self._bursts.doubts(waiting) for waiting in held], axis=0) if held else (0, 0)
         wait = self._n_held < _HELD_LONG and not at_last and doubtful > _MUCH_DOUBT * whole
         self._hold(_HELD_LONG if wait else 0)

@@ -18,8 +18,8 @@ from rxcli.types import Clock, Float32Array, FloatArray, Frame, IntArray, RowPro
 _STRIPS = 4
 #: Frames beyond which each one's share of what is known of the picture does not matter.
 _MANY_VIEWS = 12
-#: Frames whose corners are averaged at the start; how often they are looked at from then on.
-_FIRST_LOOKS, _LOOK_EVERY = 2, 30
+#: How often the corners are looked at.
+_LOOK_EVERY = 30
 #: Looks whose median is where the corners are.
 _LOOKS = 5
 #: A screen found anew whose corners are closer than this to where they were, in screen widths, is where it was.
@@ -90,11 +90,6 @@ class Scene:
         """(R,) sensor rows that are read."""
         return self.map.first_row + np.arange(self.map.inside.shape[2], dtype=np.float64)
 
-    @property
-    def may_move_yet(self) -> bool:
-        """Whether the first looks at where the screen is are not over."""
-        return self._n_frames < _FIRST_LOOKS - 1
-
     def strips(self, frame: Frame) -> Float32Array:
         """(C, S, R) light of the strips in a frame."""
         return strips.sample_strips(frame, self.map)
@@ -108,7 +103,7 @@ class Scene:
     def follow(self, frame: Frame, may_move: bool) -> bool:
         """Look where the screen is, now and then; returns whether it moved."""
         self._n_frames += 1
-        if not may_move or not (self._n_frames < _FIRST_LOOKS or self._n_frames % _LOOK_EVERY == 0):
+        if not may_move or self._n_frames % _LOOK_EVERY:
             return False
         from rxcli.find_screen import track_screen
 
@@ -276,8 +271,8 @@ class Scene:
         return slots, trust
 
     def can_measure_again(self, view: View) -> bool:
-        """Whether a frame's strips are, or can be, read where the screen is known to be by now."""
-        return view.frame is not None or (view.light is not None and view.map is self.map)
+        """Whether a frame's strips were read where the screen is now."""
+        return view.light is not None and view.map is self.map
 
     def measure_again(self, views: Sequence[View], known: Sequence[Float32Array], doubtful: Sequence[bool]) -> None:
         """Learn the picture anew from frames, and measure those in doubt by what the others say of it.
@@ -287,9 +282,6 @@ class Scene:
             known: (C, N) of each, probability that each slot is lit.
             doubtful: of each, whether it is to be measured.
         """
-        for view in views:
-            if view.frame is not None and view.map is not self.map:
-                view.light, view.map = self.strips(view.frame), self.map
         self._n_lessons = 0
         self._picture = self._new_picture(self._dark_light(views))
         lessons = [self.learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]

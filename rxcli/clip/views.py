@@ -8,7 +8,7 @@ from rxcli import strips
 from rxcli.known_picture import ColumnLight
 from rxcli.locate import Camera, Lock
 from rxcli.tracking import FrameBursts
-from rxcli.types import Float32Array, Frame, FrameResult, IntArray
+from rxcli.types import Float32Array, FrameResult, IntArray
 
 
 @dataclass(slots=True, eq=False)
@@ -30,8 +30,6 @@ class View:
     map: strips.StripMap | None = None
     #: The columns' own light; None where the frame was received like a photograph.
     flat: ColumnLight | None = None
-    #: Kept only while the frame is held back, of those that came before the screen's place was looked at again.
-    frame: Frame | None = None
 
 
 @dataclass(slots=True, eq=False)
