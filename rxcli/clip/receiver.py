@@ -25,6 +25,8 @@ from rxcli.types import FloatArray, Frame, FrameResult, IntArray
 #: Frames at the start of a scene that are looked at once more when the picture is known better; how many are waited for
 #: where compression has taken much; and the share of the well lit packets that are then in doubt.
 _HELD, _HELD_LONG, _MUCH_DOUBT = 6, 24, 0.03
+#: Share in doubt, before the first of these looks, that it would not mend: it is left out.
+_TOO_MUCH_DOUBT = 0.25
 #: Share of columns that a quick look at a first frame may leave in doubt.
 _QUICK_DOUBT = 0.5
 #: Frames that find their clock together where each shows little.
@@ -355,12 +357,16 @@ class _Clip:
         held = [
             w for w in self._waiting if w.view is not None and w.numbers is not None and self._can_look_again(w.view)
         ]
-        if len(held) > 1:
+        may_wait = self._n_held < _HELD_LONG and not at_last
+        if len(held) > 1 and not (may_wait and self._doubt(held) > _TOO_MUCH_DOUBT):
             self._measure_again(held)
             self._detect_again()
+        self._hold(_HELD_LONG if may_wait and self._doubt(held) > _MUCH_DOUBT else 0)
+
+    def _doubt(self, held: list[Waiting]) -> float:
+        """Share of the well lit packets of some frames that is in doubt."""
         doubtful, whole = np.sum([self._bursts.doubts(waiting) for waiting in held], axis=0) if held else (0, 0)
-        wait = self._n_held < _HELD_LONG and not at_last and doubtful > _MUCH_DOUBT * whole
-        self._hold(_HELD_LONG if wait else 0)
+        return float(doubtful / max(whole, 1))
 
     def _can_look_again(self, view: View) -> bool:
         return self._scene is not None and self._scene.can_measure_again(view)
