@@ -14,7 +14,7 @@ from rxcli.types import Frame
 #: What may wait: pixels of so many bytes, and so many frames at least and at most.
 _MOST_BYTES, _LEAST_FRAMES, _MOST_FRAMES = 60_000_000, 2, 16
 #: How much nicer to others the thread is than the process.
-_NICER = 2
+_NICER = 5
 
 
 def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:
