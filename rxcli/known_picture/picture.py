@@ -14,7 +14,7 @@ MEMORY = 0.95
 #: Weight of the picture around a row against one frame's look at the row itself at full light.
 _SMOOTH = 0.05
 #: Share of a strip's light in doubt, inverse, from which it says nothing of the picture.
-_DOUBT = 4.0
+_DOUBT = 1.4
 #: Rows around, in each direction, from which the picture of a row that was never lit is taken.
 _AROUND_ROWS = 4
 #: Relative error of a picture taken from the rows around, and of one that was looked at well.
