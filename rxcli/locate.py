@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +77,16 @@ class Camera:
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
     #: The estimate and the strips it is of, for `refitted_camera`; None for a camera from a profile.
     guess: tuple[blind.BlindEstimate, blind.Strips] | None = None
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What a result says of it, by the names of its fields."""
+        return {
+            "camera_profile": self.profile,
+            "line_delay_s": self.line_delay_s,
+            "exposure_s": self.exposure_s,
+            "estimated": self.estimated,
+        }
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,13 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import chain
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli import assemble, denoise
 from rxcli.dump import dump_frame
-from rxcli.locate import Camera, Failure, Stages, find_camera, find_corners, find_lock, too_small
+from rxcli.locate import Failure, Stages, find_camera, find_corners, find_lock, too_small
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.reception import decode, doubtful_columns, second_opinion, support
 from rxcli.types import Frame, FrameResult
@@ -76,14 +75,14 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
             corners = find_corners(frame, options)
         result = replace(result, corners=corners)
         camera, options = likely_camera(frame, corners, options, stages)
-        result = replace(result, **_of_camera(camera))
+        result = replace(result, **camera.facts)
         lock = find_lock(frame, corners, camera, options, stages, quick=True)
         result = replace(result, screen_profile=lock.screen.name)
         with stages("detect"):
             seen = decode(lock, options.skip)
         if camera.guess is not None:
             camera, lock, seen = with_refitted_camera(frame, corners, camera, lock, seen, options, stages)
-            result = replace(result, **_of_camera(camera))
+            result = replace(result, **camera.facts)
         with stages("denoise"):
             seen, denoised, report = second_opinion(lock, seen, options)
         if options.dump_dir is not None:
@@ -104,13 +103,3 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
         estimated = failure.estimated or result.estimated
         result = replace(result, status=failure.status, message=failure.message, skipped=skipped, estimated=estimated)
     return replace(result, timing_ms=stages.total())
-
-
-def _of_camera(camera: Camera) -> dict[str, Any]:
-    """What a result says of the camera."""
-    return {
-        "camera_profile": camera.profile,
-        "line_delay_s": camera.line_delay_s,
-        "exposure_s": camera.exposure_s,
-        "estimated": camera.estimated,
-    }

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 from rxcli.types import FloatArray
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,3 +48,14 @@ class BlindEstimate:
     explained: float
     #: Exposure that the file tells, 0 where it does not.
     least_exposure_slots: float = 0.0
+
+
+def distinct(found: Iterable[T], same: Callable[[T, T], bool], most: int) -> list[T]:
+    """The first of what was found that are not the same as one before, `most` of them at most."""
+    chosen: list[T] = []
+    for one in found:
+        if len(chosen) == most:
+            break
+        if not any(same(one, other) for other in chosen):
+            chosen.append(one)
+    return chosen

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.blind.bend import reversed_bend
-from rxcli.blind.estimates import Hypothesis
+from rxcli.blind.estimates import Hypothesis, distinct
 from rxcli.blind.scan import same_slots
 from rxcli.blind.strips import Strips, in_readout_order
 from rxcli.blind.timing import slot_time, thinned, time_terms
@@ -46,11 +46,9 @@ def read(
         Hypotheses and bends, best first; the evidence is that of headers, dimming symbols and codewords over slots of
         any kind.
     """
-    different: list[tuple[Hypothesis, FloatArray]] = []
-    for clock, bend in sorted(found, key=lambda pair: -pair[0].salience):
-        if not any(same_slots(clock, other) and bend is b for other, b in different):
-            different.append((clock, bend))
-    out = [(one, bend) for clock, bend in different[:_READ] for one in _read(strips, clock, bend, packet_lengths)]
+    outstanding = sorted(found, key=lambda pair: -pair[0].salience)
+    different = distinct(outstanding, lambda one, other: same_slots(one[0], other[0]) and one[1] is other[1], _READ)
+    out = [(one, bend) for clock, bend in different for one in _read(strips, clock, bend, packet_lengths)]
     return sorted(out, key=lambda pair: -pair[0].evidence)
 
 

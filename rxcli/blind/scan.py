@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.blind.edges import edge_power
-from rxcli.blind.estimates import Hypothesis
+from rxcli.blind.estimates import Hypothesis, distinct
 from rxcli.blind.strips import SAMPLES, Noise, Strips, levelled
 from rxcli.blind.structure import structure_evidence
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
@@ -196,21 +196,10 @@ def find_clocks(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesi
     octaves = _octaves(strips)
     found = [(h, o) for o in octaves for h in _scan_octave(o, strips.rows.size, packet_lengths)]
     found.sort(key=lambda pair: -pair[0].evidence)
-    chosen = {**_distinct(found, alike), **_distinct(found, same_slots)}
-    return sorted((_try(*found[n]) for n in chosen), key=lambda hypothesis: -hypothesis.evidence)
-
-
-def _distinct(
-    found: list[tuple[Hypothesis, _Octave]], same: Callable[[Hypothesis, Hypothesis], bool]
-) -> dict[int, Hypothesis]:
-    """The first hypotheses that are not the same, by their places."""
-    out: dict[int, Hypothesis] = {}
-    for place, (one, _) in enumerate(found):
-        if not any(same(one, other) for other in out.values()):
-            out[place] = one
-        if len(out) == _TRIALS:
-            break
-    return out
+    places = range(len(found))
+    chosen = distinct(places, lambda n, m: alike(found[n][0], found[m][0]), _TRIALS)
+    chosen += distinct(places, lambda n, m: same_slots(found[n][0], found[m][0]), _TRIALS)
+    return sorted((_try(*found[n]) for n in dict.fromkeys(chosen)), key=lambda hypothesis: -hypothesis.evidence)
 
 
 def alike(one: Hypothesis, other: Hypothesis) -> bool:

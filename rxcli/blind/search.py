@@ -10,7 +10,7 @@ import numpy as np
 from rxcli.blind.advice import why_not
 from rxcli.blind.bend import estimate_bend, straightened
 from rxcli.blind.edges import by_edges
-from rxcli.blind.estimates import BlindEstimate, Hypothesis
+from rxcli.blind.estimates import BlindEstimate, Hypothesis, distinct
 from rxcli.blind.reading import read
 from rxcli.blind.scan import alike, find_clocks, same_slots
 from rxcli.blind.strips import Strips
@@ -102,22 +102,19 @@ def _worth_refining(found: list[tuple[Hypothesis, FloatArray]]) -> list[tuple[Hy
         return []
     best = found[0][0].evidence
     close = [pair for pair in found[: 4 * _REFINED] if pair[0].evidence >= _CLOSE_EVIDENCE * best]
-    chosen = _distinct(close, _REFINED) or found[:1]
+    chosen = distinct(close, _alike, _REFINED) or found[:1]
     # With the same slots a packet may have any length: they differ in where other headers would be.
     for pair in close:
         if same_slots(pair[0], found[0][0]) and all(pair[0].packet_slots != one.packet_slots for one, _ in chosen):
             chosen.append(pair)
     if best < _WEAK_EVIDENCE:
-        chosen = _distinct([*chosen, *sorted(found, key=lambda pair: -pair[0].salience)], _REFINED_IF_WEAK)
+        chosen = distinct([*chosen, *sorted(found, key=lambda pair: -pair[0].salience)], _alike, _REFINED_IF_WEAK)
     return chosen
 
 
-def _distinct(found: list[tuple[Hypothesis, FloatArray]], most: int) -> list[tuple[Hypothesis, FloatArray]]:
-    chosen: list[tuple[Hypothesis, FloatArray]] = []
-    for clock, bend in found:
-        if len(chosen) < most and not any(alike(clock, other) and bend is b for other, b in chosen):
-            chosen.append((clock, bend))
-    return chosen
+def _alike(one: tuple[Hypothesis, FloatArray], other: tuple[Hypothesis, FloatArray]) -> bool:
+    """Whether two hypotheses, each with its bend, are about the same."""
+    return alike(one[0], other[0]) and one[1] is other[1]
 
 
 def _plausibility(estimate: BlindEstimate, strips: Strips, rows_per_slot: float) -> float:

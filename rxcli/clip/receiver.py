@@ -148,7 +148,12 @@ class _Clip:
             else:
                 view, waiting.result = self._search(frame, waiting.result, stages)
             waiting.view = view
-            waiting.result = replace(waiting.result, **results.facts(view), corners=self._corners)
+            waiting.result = replace(
+                waiting.result,
+                **view.camera.facts,
+                screen_profile=view.lock.screen.name,
+                corners=self._corners,
+            )
             done = self._enter(waiting, frame, stages)
         except Failure as failure:
             self._scene = None
@@ -329,8 +334,8 @@ class _Clip:
         numbers, view = self._add(waiting), waiting.view
         if "certain_columns" not in self._options.skip or self._options.stop_when_certain:
             self._bursts.freshen(waiting)
-        tracked = view is not None and view.flat is not None
-        if view is not None and tracked and self._scene is not None and self._bursts.open.is_open(int(numbers[-1])):
+        tracked = view is not None and view.flat is not None and self._bursts.open.is_open(int(numbers[-1]))
+        if self._scene is not None and view is not None and tracked:
             self._scene.take(view, lambda: self._bursts.lit(waiting))
 
     def _add(self, waiting: Waiting) -> IntArray:

@@ -15,18 +15,6 @@ from rxcli.tracking import ClosedBurst
 from rxcli.types import ColumnResult, Float32Array, FloatArray, IntArray
 
 
-def facts(view: View) -> dict[str, Any]:
-    """What a result says of camera and screen."""
-    camera = view.camera
-    return {
-        "camera_profile": camera.profile,
-        "line_delay_s": camera.line_delay_s,
-        "exposure_s": camera.exposure_s,
-        "estimated": camera.estimated,
-        "screen_profile": view.lock.screen.name,
-    }
-
-
 def bursts_of(closed: Sequence[ClosedBurst], first: int) -> list[assemble.BurstInClip]:
     """Bursts that end in a frame, for `assemble`; `first` is the number of the frame's first burst."""
     return [
