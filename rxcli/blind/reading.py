@@ -26,8 +26,10 @@ from rxcli.types import FloatArray
 _EXPOSURE = 1.2
 #: Share of the slots of headers and dimming symbols that may read wrongly, and the most that a slot says, nats.
 _WRONG, _MOST = 0.02, 6.0
-#: Different clocks that are read.
-_READ = 24
+#: Different clocks that are read; of how many of them the neighbours are read too, and how far those are off by the end
+#: of the picture, slots.
+_READ, _READ_AROUND = 24, 4
+_OFF_SLOTS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)
 #: (9, 20) whether slots of header and dimming symbol are lit, for every weight.
 _PREAMBLES = np.array([[*HEADER, *dimming_symbol(w)] for w in WEIGHTS], bool)
 
@@ -47,9 +49,29 @@ def read(
         any kind.
     """
     outstanding = sorted(found, key=lambda pair: -pair[0].salience)
-    different = distinct(outstanding, lambda one, other: same_slots(one[0], other[0]) and one[1] is other[1], _READ)
-    out = [(one, bend) for clock, bend in different for one in _read(strips, clock, bend, packet_lengths)]
-    return sorted(out, key=lambda pair: -pair[0].evidence)
+    read_once = _read_all(strips, distinct(outstanding, _same, _READ), packet_lengths)
+    best = distinct(sorted(read_once, key=_by_evidence), _same, _READ_AROUND)
+    n_rows = float(strips.rows[-1] - strips.rows[0])
+    near = [
+        (replace(clock, rows_per_slot=clock.rows_per_slot * (1 + off * clock.rows_per_slot / n_rows)), bend)
+        for clock, bend in best
+        for off in _OFF_SLOTS
+    ]
+    return sorted(read_once + _read_all(strips, near, packet_lengths), key=_by_evidence)
+
+
+def _same(one: tuple[Hypothesis, FloatArray], other: tuple[Hypothesis, FloatArray]) -> bool:
+    return same_slots(one[0], other[0]) and one[1] is other[1]
+
+
+def _by_evidence(pair: tuple[Hypothesis, FloatArray]) -> float:
+    return -pair[0].evidence
+
+
+def _read_all(
+    strips: Strips, clocks: Sequence[tuple[Hypothesis, FloatArray]], packet_lengths: Sequence[int]
+) -> list[tuple[Hypothesis, FloatArray]]:
+    return [(one, bend) for clock, bend in clocks for one in _read(strips, clock, bend, packet_lengths)]
 
 
 def _read(strips: Strips, clock: Hypothesis, bend: FloatArray, packet_lengths: Sequence[int]) -> list[Hypothesis]:
