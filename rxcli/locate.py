@@ -192,7 +192,8 @@ def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, st
     if known is not None:
         return Cameras((known, options))
     with stages("sampling"):
-        strips = _unbent_strips(frame, corners, min(screen.columns for screen in options.screens))
+        sides = _sides_of(frame, corners)
+        strips = _unbent_strips(frame, corners, min(screen.columns for screen in options.screens), sides)
     with stages("blind"):
         found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
     first = _with_screens(found.estimate, strips, options) if found.estimate else None
@@ -210,12 +211,22 @@ def _with_screens(
     return _estimated_camera(estimate, strips, rate), replace(options, screens=remaining)
 
 
-def _unbent_strips(frame: Frame, corners: FloatArray, n_columns: int) -> blind.Strips:
-    """Strips of a picture whose camera is not known."""
-    outlines = _outlines(frame, corners, None, n_columns)
+def _sides_of(frame: Frame, corners: FloatArray) -> tuple[float, float] | None:
+    """The distortion that the screen's sides show, see `find_screen.measure_bow`."""
+    from rxcli.find_screen import measure_bow
+
+    return measure_bow(frame.pixels, corners, **_levels_of(frame))
+
+
+def _unbent_strips(
+    frame: Frame, corners: FloatArray, n_columns: int, sides: tuple[float, float] | None
+) -> blind.Strips:
+    """Strips of a picture whose camera is not known, along sides that show some distortion."""
+    lens = blind.bowing_lens(sides, frame.width, frame.height) if blind.is_bowed(sides) else None
+    outlines = _outlines(frame, corners, lens, n_columns)
     centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
     profiles = sampling.sample_rows(frame, outlines, _DEFAULT_TONE)
-    return blind.strips_of(profiles, centre_x, frame.width, frame.height)
+    return blind.strips_of(profiles, centre_x, frame.width, frame.height, sides, frame.mosaic is not None)
 
 
 def _estimated_camera(estimate: blind.BlindEstimate, strips: blind.Strips, rate: float) -> Camera:
@@ -239,7 +250,7 @@ def refitted_camera(
         return camera, 0.0
     estimate, strips = camera.guess
     if strips.n_columns != lock.screen.columns:
-        strips = _unbent_strips(frame, corners, lock.screen.columns)
+        strips = _unbent_strips(frame, corners, lock.screen.columns, strips.sides)
     found, moved_slots = blind.refit(strips, estimate, now, lit)
     return _estimated_camera(found, strips, lock.screen.slot_rate_hz), moved_slots
 
@@ -247,6 +258,14 @@ def refitted_camera(
 def _exposure_of(frame: Frame, mode: ReadoutMode) -> float:
     exposure = frame.metadata.exposure_s or mode.exposure_s
     return exposure if exposure else 5 * mode.line_delay_s
+
+
+def _levels_of(frame: Frame) -> dict[str, Any]:
+    """What pixel values mean, for `find_screen`."""
+    levels = frame.mosaic
+    if levels is None:
+        return {"black": frame.black, "white": frame.white}
+    return {"black": float(np.mean(levels.black)), "white": levels.white, "mosaic_period": levels.pattern.shape[1]}
 
 
 def find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
@@ -261,10 +280,7 @@ def find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
         return options.corners
     from rxcli.find_screen import find_screen
 
-    levels = frame.mosaic
-    black, white = (float(np.mean(levels.black)), levels.white) if levels else (frame.black, frame.white)
-    period = levels.pattern.shape[1] if levels else 1
-    found = find_screen(frame.pixels, black=black, white=white, mosaic_period=period)
+    found = find_screen(frame.pixels, **_levels_of(frame))
     corners = found.corners
     if corners is None and "no_screen" in options.skip:
         raise Failure("no_screen", f"no screen found: {found.reason}; give its place with --corners")

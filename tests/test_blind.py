@@ -196,6 +196,26 @@ def _flat_strips(light: FloatArray) -> blind.Strips:
     )
 
 
+@pytest.mark.parametrize(
+    ("sides", "mosaic", "correction"),
+    [
+        (None, False, "unknown"),
+        (None, True, "no"),
+        ((0.2, 0.1), False, "unknown"),
+        ((0.02, 0.01), False, "likely"),
+        ((0.02, 0.01), True, "no"),
+        ((-0.2, 0.01), False, "no"),
+        ((0.2, 0.05), False, "no"),
+    ],
+)
+def test_sides_and_mosaics_say_whether_a_picture_was_corrected(
+    sides: tuple[float, float] | None, mosaic: bool, correction: str
+) -> None:
+    strips = replace(_flat_strips(np.ones((20, 40))), sides=sides, mosaic=mosaic)
+    assert strips.correction == correction
+    assert strips.bow == (sides if sides and abs(sides[0]) > 0.1 and sides[1] < 0.06 else None)
+
+
 def _striped(rng: np.random.Generator, n_rows: int) -> FloatArray:
     slots = rng.integers(0, 2, (20, n_rows // 4 + 1)).astype(np.float64)
     return np.repeat(np.repeat(slots, 4, axis=1)[:, :n_rows], 4, axis=0) * 0.3

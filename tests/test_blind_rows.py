@@ -85,4 +85,5 @@ def test_an_estimate_that_edges_do_not_keep_to_is_none() -> None:
     harmonic = replace(right, rows_per_slot=ROWS_PER_SLOT / 2)
     assert by_edges(strips, [wrong, right]) is right
     assert by_edges(strips, [wrong, harmonic]) is None
-    assert set(blind.summary_of_rows(right)) == {"rows_per_slot", "k1", "k2", "p1", "p2"}
+    bend = {"k1", "k2", "p1", "p2", "distortion_corrected"}
+    assert set(blind.summary_of_rows(right)) == {"rows_per_slot", *bend}

@@ -25,13 +25,13 @@ Six steps on the row profiles, none of which needs to know the camera.
 
 from rxcli.blind.advice import stripe_likeness, why_not
 from rxcli.blind.bend import bend_terms, estimate_bend, straightened
-from rxcli.blind.camera import camera_profile, in_time_order, lens_of, summary, summary_of_rows
+from rxcli.blind.camera import bowing_lens, camera_profile, in_time_order, lens_of, summary, summary_of_rows
 from rxcli.blind.columns import likely_columns
 from rxcli.blind.estimates import BlindEstimate, Hypothesis
 from rxcli.blind.refit import refit
 from rxcli.blind.scan import find_clocks
 from rxcli.blind.search import MIN_EVIDENCE, BlindSearch, estimate_camera
-from rxcli.blind.strips import Noise, Strips, in_readout_order, strips_of
+from rxcli.blind.strips import Noise, Strips, in_readout_order, is_bowed, strips_of
 from rxcli.blind.structure import structure_evidence
 from rxcli.blind.timing import refine
 
@@ -43,12 +43,14 @@ __all__ = [
     "Noise",
     "Strips",
     "bend_terms",
+    "bowing_lens",
     "camera_profile",
     "estimate_bend",
     "estimate_camera",
     "find_clocks",
     "in_readout_order",
     "in_time_order",
+    "is_bowed",
     "lens_of",
     "likely_columns",
     "refine",

@@ -8,15 +8,26 @@ import numpy as np
 
 from rxcli.blind.estimates import BlindEstimate
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
-from rxcli.types import Lens, RowProfiles
+from rxcli.types import FloatArray, Lens, RowProfiles
 
 
 def lens_of(estimate: BlindEstimate, width: int, height: int) -> Lens | None:
-    """The lens model of a picture that was corrected in the camera; None where no bend was seen."""
-    if not estimate.corrected:
+    """The lens model of a picture; None where neither sides nor stripes were seen to be bent."""
+    if estimate.corrected:
+        return Lens(_one_width(width, height), np.append(estimate.bend, 0.0), corrected=True)
+    return bowing_lens(estimate.bow, width, height)
+
+
+def bowing_lens(bow: tuple[float, float] | None, width: int, height: int) -> Lens | None:
+    """The lens that bows the sides of the screen; None where they are not bowed."""
+    if bow is None:
         return None
-    matrix = np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1.0]])
-    return Lens(matrix, np.append(estimate.bend, 0.0), corrected=True)
+    return Lens(_one_width(width, height), np.array([bow[0], -bow[0], 0.0, 0.0, 0.0]), corrected=False)
+
+
+def _one_width(width: int, height: int) -> FloatArray:
+    """The camera matrix of a focal length of one picture width."""
+    return np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1.0]])
 
 
 def in_time_order(profiles: RowProfiles, height: int) -> RowProfiles:
@@ -54,6 +65,10 @@ def summary_of_rows(estimate: BlindEstimate) -> dict[str, tuple[float, float]]:
     if estimate.corrected:
         names = ("k1", "k2", "p1", "p2")
         out |= {n: (float(v), float(sd)) for n, v, sd in zip(names, estimate.bend, estimate.bend_sd, strict=True)}
+        out["distortion_corrected"] = (1.0, 0.0)
+    elif estimate.bow:
+        k1, sd = estimate.bow
+        out |= {"k1": (k1, sd), "k2": (-k1, sd), "distortion_corrected": (0.0, 0.0)}
     return out
 
 
@@ -75,15 +90,14 @@ def camera_profile(
     """
     lens = None
     if "k1" in estimated:
-        k = tuple(estimated[key][0] for key in ("k1", "k2", "p1", "p2"))
-        centre_x, centre_y, focal = (width - 1) / 2, (height - 1) / 2, float(width)
-        matrix = ((focal, 0.0, centre_x), (0.0, focal, centre_y), (0.0, 0.0, 1.0))
+        k = tuple(estimated.get(key, (0.0, 0.0))[0] for key in ("k1", "k2", "p1", "p2"))
+        top, middle, bottom = (tuple(row) for row in _one_width(width, height).tolist())
         lens = LensModel(
             width=width,
             height=height,
-            camera_matrix=matrix,
+            camera_matrix=(top, middle, bottom),
             dist_coeffs=(*k, 0.0),
-            distortion_already_corrected=True,
+            distortion_already_corrected=bool(estimated["distortion_corrected"][0]),
         )
     line_delay_s, sd = estimated["line_delay_s"]
     mode = ReadoutMode(

@@ -48,6 +48,8 @@ class BlindEstimate:
     explained: float
     #: Exposure that the file tells, 0 where it does not.
     least_exposure_slots: float = 0.0
+    #: k1 of the lens that bows the screen's sides, and its standard deviation; None where none was seen to.
+    bow: tuple[float, float] | None = None
 
 
 def distinct(found: Iterable[T], same: Callable[[T, T], bool], most: int) -> list[T]:

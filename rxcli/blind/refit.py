@@ -13,7 +13,7 @@ import numpy as np
 from rxcli.blind.bend import reversed_bend
 from rxcli.blind.estimates import BlindEstimate
 from rxcli.blind.rows import fit_rows
-from rxcli.blind.strips import Strips, in_readout_order
+from rxcli.blind.strips import Correction, Strips, in_readout_order
 from rxcli.blind.timing import (
     FLAT,
     UNDERSTATED,
@@ -33,9 +33,9 @@ _EXPOSURE_STEPS = (0, 2)
 _LOCAL_SLOTS = 25.0
 #: Rows by which the picture's texture in a row is foretold.
 _ORDER = 4
-#: Chi-square of a bend beyond doubt: with slots as received, unbent pictures reach 205, bent ones have 441 and more but
-#: for star fields, few slots at long exposures, and a bend next to none.
-_BENT_CHI_SQUARE = 240.0
+#: Chi-square of a bend beyond doubt, by whether the picture was corrected: with slots as received, unbent ones reach
+#: 205, bent ones have 441 and more but for star fields, few slots at long exposures, and a bend next to none.
+_BENT_CHI_SQUARE: dict[Correction, float] = {"no": np.inf, "likely": 30.0, "unknown": 240.0}
 #: Slots that explain less of the light's local variance were decoded on a wrong clock.
 _LEAST_EXPLAINED = 0.1
 #: The share is of weights that go with the residuals: it may fall a little where the fit is better.
@@ -68,9 +68,10 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
     bend = reversed_bend(estimate.bend) if estimate.reversed else estimate.bend
     first = np.concatenate([[clock.row0, clock.rows_per_slot], bend if estimate.corrected else np.zeros(4)])
     shutter = estimate.least_exposure_slots
-    fit = _fit(ordered, first, lit, clock.exposure_slots, 6, shutter)
-    corrected = bend_chi_square(fit.values, fit.covariance) > _BENT_CHI_SQUARE
-    if not corrected:
+    may_bend = strips.correction != "no"
+    fit = _fit(ordered, first, lit, clock.exposure_slots, 6 if may_bend else 2, shutter)
+    corrected = may_bend and bend_chi_square(fit.values, fit.covariance) > _BENT_CHI_SQUARE[strips.correction]
+    if may_bend and not corrected:
         before = fit.explained_first
         fit = replace(_fit(ordered, first * FLAT, lit, fit.exposure_slots, 2, shutter), explained_first=before)
     if fit.explained < max(_NOT_LESS * fit.explained_first, _LEAST_EXPLAINED):

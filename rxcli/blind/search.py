@@ -67,7 +67,7 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     if not screens:
         raise ValueError("screens must name at least one screen (got none)")
     rates = {screen.packet_slots: screen.slot_rate_hz for screen in reversed(screens)}
-    bend, gain = estimate_bend(strips)
+    bend, gain = (np.zeros(4), 0.0) if strips.correction == "no" else estimate_bend(strips)
     bends = [bend] if gain > _BEND_GAINS[1] else [np.zeros(4), bend] if gain > _BEND_GAINS[0] else [np.zeros(4)]
     found = [(clock, b) for b in bends for clock in find_clocks(straightened(strips, b), sorted(rates))]
     found.sort(key=lambda pair: -pair[0].evidence)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -16,6 +17,10 @@ EXTREMES_SLOTS = 19
 
 #: Samples a slot while the clock is sought.
 SAMPLES = 4
+#: Sides are bowed from so many standard deviations on; and such a standard deviation tells straight ones from those.
+_BOWED, _TELLING = 3.0, 0.03
+#: Whether the camera took the distortion out of a picture.
+Correction = Literal["no", "likely", "unknown"]
 #: Of light that is nothing but rounding.
 _LEAST_VARIANCE = 1e-10
 
@@ -52,16 +57,47 @@ class Strips:
     #: Size of the picture.
     width: int
     height: int
+    #: k1 of the lens that would bow the screen's sides as they are seen (focal length of one width, k2 = -k1) and its
+    #: standard deviation; None where they do not show.
+    sides: tuple[float, float] | None = None
+    #: Whether the picture is a mosaic, which no camera corrects.
+    mosaic: bool = False
+
+    @property
+    def bow(self) -> tuple[float, float] | None:
+        """k1 and its standard deviation where the sides are bowed without doubt."""
+        return self.sides if is_bowed(self.sides) else None
+
+    @property
+    def correction(self) -> Correction:
+        """Whether the camera took the distortion out of the picture, which straightens sides and bends stripes."""
+        if self.mosaic or self.bow:
+            return "no"
+        return "likely" if self.sides and self.sides[1] < _TELLING else "unknown"
 
 
-def strips_of(profiles: RowProfiles, centre_x: FloatArray, width: int, height: int) -> Strips:
+def is_bowed(sides: tuple[float, float] | None) -> bool:
+    """Whether sides that show k1, with such a standard deviation, are not straight."""
+    return sides is not None and abs(sides[0]) > _BOWED * sides[1]
+
+
+def strips_of(
+    profiles: RowProfiles,
+    centre_x: FloatArray,
+    width: int,
+    height: int,
+    sides: tuple[float, float] | None = None,
+    mosaic: bool = False,
+) -> Strips:
     """Strips for the functions below, from row profiles that were sampled without a lens.
 
     Args:
-        profiles: C columns, S strips, R rows; `sensor_row` None.
+        profiles: C columns, S strips, R rows; `sensor_row` None. Bowed sides must have been followed.
         centre_x: (C*S, R) picture x of the strips' middles.
         width: of the picture, pixels.
         height: of the picture, rows.
+        sides: k1 that the screen's sides show, and its standard deviation.
+        mosaic: whether the picture is a mosaic.
     """
     n_columns, n_strips, n_rows = profiles.light.shape
     join = n_strips // _STRIPS if n_strips % _STRIPS == 0 else 1
@@ -77,6 +113,8 @@ def strips_of(profiles: RowProfiles, centre_x: FloatArray, width: int, height: i
         noise=Noise(profiles.noise_floor / pixels, profiles.noise_slope / pixels),
         width=width,
         height=height,
+        sides=sides,
+        mosaic=mosaic,
     )
 
 

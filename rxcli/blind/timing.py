@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rxcli.blind.bend import BEND_PRECISION, BEND_SCALE, bend_terms, reversed_bend
 from rxcli.blind.estimates import BlindEstimate, Hypothesis
-from rxcli.blind.strips import Strips, in_readout_order
+from rxcli.blind.strips import Correction, Strips, in_readout_order
 from rxcli.blind.structure import repeat_evidence
 from rxcli.blind.waves import (
     LOCAL_SLOTS,
@@ -51,9 +51,9 @@ _AGAIN_STEP, _FAR = 5, 0.4
 #: The descent ends when no row moves by more slots than this.
 _CONVERGED = 0.003
 
-#: Chi-square of the four coefficients that a bend beyond doubt has. Columns share too much for it to be taken at its
-#: word: unbent pictures reach 150.
-_BENT_CHI_SQUARE = 160.0
+#: Chi-square of the four coefficients that a bend beyond doubt has, by whether the picture was corrected. Columns share
+#: too much for it to be taken at its word: unbent pictures reach 150.
+_BENT_CHI_SQUARE: dict[Correction, float] = {"no": np.inf, "likely": 30.0, "unknown": 160.0}
 
 #: Keeps the clock of a row-time map and drops its bend.
 FLAT = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
@@ -114,6 +114,7 @@ def refine(
         evidence=timing.evidence,
         explained=timing.explained,
         least_exposure_slots=least_exposure_slots,
+        bow=strips.bow,
     )
 
 
@@ -147,8 +148,8 @@ def _fit_timing(
     start = first_row + hypothesis.start_row - before * hypothesis.rows_per_slot
     grid = Grid(-before % hypothesis.packet_slots, hypothesis.packet_slots)
     values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
-    bent = _descend(strips, grid, values, least_exposure_slots, n_free=6)
-    if sure or bend_chi_square(bent.values, bent.covariance) > _BENT_CHI_SQUARE:
+    bent = _descend(strips, grid, values, least_exposure_slots, n_free=2 if strips.correction == "no" else 6)
+    if sure or bend_chi_square(bent.values, bent.covariance) > _BENT_CHI_SQUARE[strips.correction]:
         return bent, True
     values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else bent.values * FLAT
     flat = _descend(strips, grid, values, bent.exposure_slots, n_free=2, slots=bent.slots)

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rxcli.find_screen.bow import measure_bow
 from rxcli.find_screen.edges import refine
 from rxcli.find_screen.onsets import Reach, fit_side
 from rxcli.find_screen.picture import Picture, Pixels, Plane, reduce
@@ -30,7 +31,7 @@ from rxcli.find_screen.sides import INWARD, SIDE_NAMES, Side, corners_of, extent
 from rxcli.find_screen.stripes import Stripes, coarse_sides, find_stripes
 from rxcli.types import FloatArray
 
-__all__ = ["ScreenSearch", "find_screen", "track_screen"]
+__all__ = ["ScreenSearch", "find_screen", "measure_bow", "track_screen"]
 
 #: Least share of a side's segments that must agree on a line.
 _MIN_SUPPORT = 0.06

@@ -51,7 +51,7 @@ _CORNER_SD, _GUESS_SD, _POSE_SD = 0.01, 0.002, 0.001
 
 
 @dataclass(frozen=True, slots=True)
-class _Steps:
+class Steps:
     """Where light steps up across one side: (K,) places along it and across it, which were found, what they count."""
 
     t: FloatArray
@@ -75,7 +75,7 @@ def refine(
     """
     corners = corners_of(guess, picture.width, picture.height)
     size = float(np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3])) / 2
-    steps = [_steps_of(picture, guess, side, size, fy) for side in range(4)]
+    steps = [steps_of(picture, guess, side, size, fy) for side in range(4)]
     depths = [INWARD[side] * (s.place - guess[side].at(s.t)) for side, s in enumerate(steps)]
     expected = rectangle.project(pose)
     supporters = [_supporters(steps[side], depths[side], side, 1.6 * steps[side].sd, _SKEW, 2.0) for side in range(4)]
@@ -97,13 +97,13 @@ def refine(
     return _meet(pose, own, rectangle), [float(mask.mean()) if mask.size else 0.0 for mask in supporters]
 
 
-def _depths(steps: list[_Steps], pose: FloatArray, rectangle: Rectangle) -> list[FloatArray]:
+def _depths(steps: list[Steps], pose: FloatArray, rectangle: Rectangle) -> list[FloatArray]:
     """How far inside the pose's sides the steps are."""
     corners = rectangle.project(pose)
     return [INWARD[side] * (s.place - rectangle.side_at(corners, pose[-1], side, s.t)) for side, s in enumerate(steps)]
 
 
-def _supporters(steps: _Steps, depth: FloatArray, side: int, tolerance: float, skew: float, window: float) -> BoolArray:
+def _supporters(steps: Steps, depth: FloatArray, side: int, tolerance: float, skew: float, window: float) -> BoolArray:
     """(K,) the steps that lie on the side."""
     none = np.zeros(steps.t.size, np.bool_)
     line = outermost_line(
@@ -125,7 +125,7 @@ def _supporters(steps: _Steps, depth: FloatArray, side: int, tolerance: float, s
     return on_it if enough and np.ptp(steps.t[on_it]) >= _SPAN * np.ptp(steps.t) else none
 
 
-def _places(steps: _Steps, supporters: BoolArray, guess: Side, size: float) -> Places | None:
+def _places(steps: Steps, supporters: BoolArray, guess: Side, size: float) -> Places | None:
     """What a side contributes to the pose; its guess where it does not show at full resolution."""
     if supporters.any():
         return Places(steps.t[supporters], steps.place[supporters], steps.sd)
@@ -136,7 +136,7 @@ def _places(steps: _Steps, supporters: BoolArray, guess: Side, size: float) -> P
 
 
 def _deviation(
-    steps: _Steps, supporters: BoolArray, depth: FloatArray, side: int, sd: float
+    steps: Steps, supporters: BoolArray, depth: FloatArray, side: int, sd: float
 ) -> tuple[FloatArray, float, float]:
     """Offset and slope (per half length) by which a side deviates from the pose, its middle and half length."""
     if not supporters.any():
@@ -167,15 +167,23 @@ def _meet(pose: FloatArray, own: list[tuple[FloatArray, float, float]], rectangl
     return np.asarray(corners, np.float64)
 
 
-def _steps_of(picture: Picture, guess: list[Side], side: int, size: float, fy: int) -> _Steps:
-    """The steps of light across one side."""
+def steps_of(picture: Picture, guess: list[Side], side: int, size: float, fy: int) -> Steps:
+    """The steps of light across one side.
+
+    Args:
+        picture: the picture.
+        guess: the four sides, within half a hundredth of the screen's width or so.
+        side: which of them.
+        size: the screen's width, pixels.
+        fy: rows from row to row of the reduced plane.
+    """
     half = max(_LEAST_HALF_STEP, int(_HALF_STEP * size), picture.period)
     out, inward = max(int(_OUT * size), 3 * half), max(int(_IN * size), 6 * half)
     read = _across if across(side) else _upright
     t, centre, light, threshold, inside = read(picture, guess, side, size, out, inward, half, fy)
     sd = max(_LEAST_TOLERANCE, _TOLERANCE * size, _PERIODS * picture.period)
     if not t.size:
-        return _Steps(t, t, t > 0, t, sd)
+        return Steps(t, t, t > 0, t, sd)
     if picture.period > 1:
         light = _blurred(light, picture.period)
     position, found = _first_step(light, inside, threshold, half)
@@ -184,7 +192,7 @@ def _steps_of(picture: Picture, guess: list[Side], side: int, size: float, fy: i
     found &= inside[:, out // 2]
     found &= agreeing(place, max(4.0, 3 * sd))
     weight = row_trust(place, found, sd) if across(side) else found.astype(np.float64)
-    return _Steps(t, place, found, weight, sd)
+    return Steps(t, place, found, weight, sd)
 
 
 def _blurred(light: Float32Array, period: int) -> Float32Array:

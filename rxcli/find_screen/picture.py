@@ -88,12 +88,16 @@ def apart(fx: int) -> int:
 
 def reduce(picture: Picture) -> Plane:
     """Every n-th row, averaged along the row over whole periods of the mosaic."""
-    period = picture.period
-    fy = period * max(1, round(picture.height / _ROWS / period))
-    fx = period * max(1, round(picture.width / _STRIPS / period))
+    fy = row_step(picture)
+    fx = picture.period * max(1, round(picture.width / _STRIPS / picture.period))
     light = _averaged(picture, 0, picture.width // fx, fx, fy)
     wedge = _wedge(light) if picture.developed else None
     return Plane(light, fx, fy, wedge, picture.width, picture.height)
+
+
+def row_step(picture: Picture) -> int:
+    """Rows from row to row of the reduced plane."""
+    return picture.period * max(1, round(picture.height / _ROWS / picture.period))
 
 
 def fine_step(picture: Picture) -> int:
