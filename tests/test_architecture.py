@@ -159,13 +159,3 @@ def test_commands_load_quickly(name: str) -> None:
     found = imports_at_load(MODULES[name])
     assert not {other for other in found if other.split(".")[0] == "numpy"}
     assert own(found) <= {"rxcli", "rxcli.errors", *modules_of("cli")}
-
-
-def test_there_is_no_import_cycle() -> None:
-    graph = {name: own(imports_at_load(tree)) & MODULES.keys() for name, tree in MODULES.items()}
-    remaining = dict(graph)
-    while remaining:
-        free = [name for name, needs in remaining.items() if not needs & remaining.keys() - {name}]
-        assert free, f"cycle among {sorted(remaining)}"
-        for name in free:
-            del remaining[name]
