@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import cv2
 import pytest
 from small_frames import N_COLUMNS, W, write_frame, write_profiles
 
@@ -204,3 +205,19 @@ def test_an_estimated_camera_is_kept_as_a_profile(tmp_path: Path) -> None:
     assert 'name = "my-phone"' in profile.read_text()
     assert run(["decode", str(sample), *screen, "--quiet", "--camera", str(profile), "--json", str(again)]) == 0
     assert json.loads(again.read_text())["camera"]["profile"] == "my-phone"
+
+
+def test_a_camera_is_not_kept_where_nothing_was_received(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The lower half of the picture is lost: the camera is estimated, but no packet shows."""
+    sample = Path(__file__).resolve().parents[1] / "sample_frames" / "phone_chelsea_17k3.jpg"
+    picture, profile, out = tmp_path / "part.png", tmp_path / "mine.toml", tmp_path / "out.jsonl"
+    pixels = cv2.imread(str(sample), cv2.IMREAD_GRAYSCALE)
+    assert pixels is not None
+    pixels[1900:] = 0
+    cv2.imwrite(str(picture), pixels)
+    corners = ["--corners", "260,477", "3926,485", "3927,2636", "177,2499"]
+    options = [*corners, "--json", str(out), "--save-camera", str(profile)]
+    assert run(["decode", str(picture), "--quiet", "--camera", "auto", *options]) == 1
+    assert "line_delay_s" in json.loads(out.read_text())["estimated"]
+    assert "no packet was received with an estimated camera" in capsys.readouterr().err
+    assert not profile.exists()

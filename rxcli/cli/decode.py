@@ -231,8 +231,9 @@ class _Run:
             self._summaries.append(summary)
 
     def _keep_estimate(self, result: FrameResult) -> None:
-        best = self._estimated
-        if "line_delay_s" in result.estimated and (best is None or _n_packets(result) > _n_packets(best)):
+        most = _n_packets(self._estimated) if self._estimated else 0
+        # An estimate that received nothing may be wrong, and a profile is not doubted.
+        if "line_delay_s" in result.estimated and _n_packets(result) > most:
             self._estimated = result
 
     def _save_camera(self, path: Path) -> None:
@@ -241,7 +242,7 @@ class _Run:
         from rxcli.profiles import dump_profile
 
         if self._estimated is None:
-            click.echo(f"vlc-rx: {path} was not written: no unknown camera was estimated", err=True)
+            click.echo(f"vlc-rx: {path} was not written: no packet was received with an estimated camera", err=True)
             return
         frame = next(iter(open_source(self._estimated.source)))
         about = frame.metadata
