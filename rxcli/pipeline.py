@@ -20,7 +20,7 @@ from rxcli.locate import Failure, Stages, find_camera, find_corners, find_lock, 
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.reception import decode, doubtful_columns, second_opinion, support
 from rxcli.types import Frame, FrameResult
-from rxcli.unknown_camera import likely_camera, with_refitted_camera
+from rxcli.unknown_camera import likely_camera, with_refitted_camera, without_estimate
 
 __all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "denoiser_case", "receive", "receive_frame"]
 
@@ -98,6 +98,7 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
         result = replace(result, columns=columns, status=assemble.frame_status(columns))
         if result.status == "no_signal":
             result = replace(result, message=too_small(frame, corners, camera, lock.screen) or _NO_PACKET)
+            result = without_estimate(result, camera, seen)
     except Failure as failure:
         skipped = {"no_screen": 1} if failure.status == "no_screen" else {}
         estimated = failure.estimated or result.estimated

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from rxcli import channel
+from rxcli import blind, channel
 from rxcli.locate import Camera, Failure, Lock, Stages, find_cameras, find_lock, refitted_camera
 from rxcli.options import ReceiverOptions
 from rxcli.reception import Reception, decode, packet_evidence, quick_look
-from rxcli.types import FloatArray, Frame
+from rxcli.types import FloatArray, Frame, FrameResult
 
 #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
 _MATTERS_SLOTS = 0.05
@@ -18,6 +20,8 @@ _MORE_DOUBT, _LEAST_DOUBT = 1.2, 0.01
 #: Headers and packets, all columns together, that an estimate with rivals must show, nats: wrong ones have next to none
 #: of one or of the other.
 _PACKETS_AT_LEAST = 80.0
+#: Packets that an estimate must show under which none is received, nats: wrong ones show less than 10, right ones 80.
+_PACKETS_IF_NONE_RECEIVED = 30.0
 #: Symbols' mean log probability counts so many times beside the headers: half a packet has headers, but no symbols.
 _SAY_OF_SYMBOLS = 40.0
 _NO_HEADERS = (
@@ -90,3 +94,13 @@ def with_refitted_camera(
             break
         lock, seen = again, then
     return camera, lock, seen
+
+
+def without_estimate(result: FrameResult, camera: Camera, seen: Reception) -> FrameResult:
+    """A result without packets, the camera's estimate taken out where neither packets nor edges bear it out."""
+    if camera.guess is None or packet_evidence(seen) >= _PACKETS_IF_NONE_RECEIVED:
+        return result
+    estimate, strips = camera.guess
+    if blind.by_edges(strips, [estimate]):
+        return result
+    return replace(result, line_delay_s=None, exposure_s=None, estimated={}, message=_NO_HEADERS)

@@ -11,10 +11,11 @@ from small_frames import BOTTOM, LEFT, RIGHT, ROWS_PER_SLOT, SCREEN, TOP, write_
 
 from rxcli import unknown_camera
 from rxcli.ingest import open_source
-from rxcli.locate import Camera, Cameras, Failure, Stages
+from rxcli.locate import Camera, Cameras, Failure, Stages, find_cameras, find_lock
 from rxcli.pipeline import ReceiverOptions, receive
 from rxcli.profiles import ScreenProfile, parse_profile
-from rxcli.types import Frame
+from rxcli.reception import decode
+from rxcli.types import Frame, FrameResult
 
 CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
 OPTIONS = ReceiverOptions(screens=(parse_profile(SCREEN, ScreenProfile, "small"),), corners=CORNERS, cae="never")
@@ -81,3 +82,29 @@ def test_an_unknown_camera_is_refitted_and_received(tmp_path: Path, told_exposur
     right = [packet.payload == payloads[column.column] for column in result.columns for packet in column.packets]
     assert len(right) >= 8
     assert all(right)
+
+
+def test_an_estimate_that_neither_packets_nor_edges_bear_out_is_taken_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame, _ = _frame(tmp_path)
+
+    found = find_cameras(frame, CORNERS, OPTIONS, Stages()).first
+    assert found is not None
+    right = found[0]
+    assert right.guess is not None
+    estimate, strips = right.guess
+    wrong = replace(right, guess=(replace(estimate, rows_per_slot=1.03 * ROWS_PER_SLOT), strips))
+    lock = find_lock(frame, CORNERS, right, found[1], Stages(), quick=True)
+    seen = decode(lock, OPTIONS.skip)
+    result = FrameResult("small", 0, None, "no_signal", message="none", **right.facts)
+
+    def after(camera: Camera, packets: float) -> FrameResult:
+        monkeypatch.setattr(unknown_camera, "packet_evidence", lambda _: packets)
+        return unknown_camera.without_estimate(result, camera, seen)
+
+    assert after(wrong, 100.0) == after(right, 0.0) == after(replace(wrong, guess=None), 0.0) == result
+    doubted = after(wrong, 0.0)
+    assert not doubted.estimated
+    assert doubted.line_delay_s is None
+    assert "no packet header" in (doubted.message or "")

@@ -27,6 +27,7 @@ from rxcli.blind.advice import stripe_likeness, why_not
 from rxcli.blind.bend import bend_terms, estimate_bend, straightened
 from rxcli.blind.camera import bowing_lens, camera_profile, in_time_order, lens_of, summary, summary_of_rows
 from rxcli.blind.columns import likely_columns
+from rxcli.blind.edges import by_edges
 from rxcli.blind.estimates import BlindEstimate, Hypothesis
 from rxcli.blind.refit import refit
 from rxcli.blind.scan import find_clocks
@@ -44,6 +45,7 @@ __all__ = [
     "Strips",
     "bend_terms",
     "bowing_lens",
+    "by_edges",
     "camera_profile",
     "estimate_bend",
     "estimate_camera",
