@@ -193,7 +193,11 @@ def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, st
         return Cameras((known, options))
     with stages("sampling"):
         sides = _sides_of(frame, corners)
-        strips = _unbent_strips(frame, corners, min(screen.columns for screen in options.screens), sides)
+        n_columns = min(screen.columns for screen in options.screens)
+        strips = _unbent_strips(frame, corners, n_columns, sides)
+        if strips.bow and blind.stripes_are_bent(strips):
+            # Lenses that are left in a picture do not bend stripes: what looked like its sides are others.
+            strips = _unbent_strips(frame, corners, n_columns, None)
     with stages("blind"):
         found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
     first = _with_screens(found.estimate, strips, options) if found.estimate else None

@@ -134,8 +134,12 @@ def test_a_picture_with_bowed_sides_is_followed_reported_and_kept() -> None:
     assert _columns_off(trial.corners, again, trial) < 0.02 < 0.08 < _columns_off(trial.corners, None, trial)
 
 
-def test_stripes_are_bent_in_a_corrected_picture_alone() -> None:
+@pytest.mark.parametrize("mistaken", [False, True])
+def test_stripes_are_bent_in_a_corrected_picture(mistaken: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bent stripes are believed, also where something else was taken for bowed sides."""
     trial = take(0.2, corrected=True)
+    if mistaken:
+        monkeypatch.setattr("rxcli.locate._sides_of", lambda *_: (-0.1, 0.01))
     options = ReceiverOptions(screens=tuple(shipped_profiles(ScreenProfile)), corners=trial.corners, cae="never")
     estimated = next(receive([trial.frame], options)).estimated
     assert estimated["distortion_corrected"][0] == 1

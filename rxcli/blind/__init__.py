@@ -31,7 +31,7 @@ from rxcli.blind.edges import by_edges
 from rxcli.blind.estimates import BlindEstimate, Hypothesis
 from rxcli.blind.refit import refit
 from rxcli.blind.scan import find_clocks
-from rxcli.blind.search import MIN_EVIDENCE, BlindSearch, estimate_camera
+from rxcli.blind.search import MIN_EVIDENCE, BlindSearch, estimate_camera, stripes_are_bent
 from rxcli.blind.strips import Noise, Strips, in_readout_order, is_bowed, strips_of
 from rxcli.blind.structure import structure_evidence
 from rxcli.blind.timing import refine
@@ -59,6 +59,7 @@ __all__ = [
     "refit",
     "straightened",
     "stripe_likeness",
+    "stripes_are_bent",
     "strips_of",
     "structure_evidence",
     "summary",

@@ -17,8 +17,8 @@ EXTREMES_SLOTS = 19
 
 #: Samples a slot while the clock is sought.
 SAMPLES = 4
-#: Sides are bowed from so many standard deviations on; and such a standard deviation tells straight ones from those.
-_BOWED, _TELLING = 3.0, 0.03
+#: Sides are straight up to so many standard deviations, where these are small enough to tell; bowed from so many on.
+_STRAIGHT, _TELLING, _BOWED = 1.5, 0.03, 3.0
 #: Whether the camera took the distortion out of a picture.
 Correction = Literal["no", "likely", "unknown"]
 #: Of light that is nothing but rounding.
@@ -73,7 +73,8 @@ class Strips:
         """Whether the camera took the distortion out of the picture, which straightens sides and bends stripes."""
         if self.mosaic or self.bow:
             return "no"
-        return "likely" if self.sides and self.sides[1] < _TELLING else "unknown"
+        straight = self.sides and abs(self.sides[0]) < _STRAIGHT * self.sides[1] and self.sides[1] < _TELLING
+        return "likely" if straight else "unknown"
 
 
 def is_bowed(sides: tuple[float, float] | None) -> bool:
