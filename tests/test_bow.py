@@ -97,6 +97,36 @@ def test_where_no_sides_show_nothing_is_told(pixels: NDArray[Any], corners: list
     assert measure_bow(pixels, np.array(corners, float), **BLACK_AND_WHITE) is None
 
 
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [[0, 0], [0, 0], [0, 0], [0, 0]],
+        [[0, 0], [100, 0], [200, 0], [300, 0]],
+        [[50, 0], [50, 100], [50, 200], [50, 300]],
+        [[100, 100], [1100, 700], [1100, 100], [100, 700]],
+        [[-90000, -90000], [90000, -90000], [90000, 90000], [-90000, 90000]],
+        [[5000, 5000], [6000, 5000], [6000, 5500], [5000, 5500]],
+        [[900, 50], [950, 900], [400, 910], [380, 60]],
+        [[10, 10], [12, 10], [12, 11], [10, 11]],
+    ],
+)
+def test_corners_that_are_no_screens_tell_nothing(corners: list[list[int]]) -> None:
+    rng = np.random.default_rng(1)
+    stripes = np.repeat(rng.integers(0, 256, (HEIGHT, 1)), WIDTH, axis=1).astype(np.uint8)
+    assert measure_bow(stripes, np.array(corners, float), **BLACK_AND_WHITE) is None
+
+
+def test_any_corners_on_any_pixels_end_well() -> None:
+    rng = np.random.default_rng(4)
+    for turn in range(150):
+        width, height = rng.integers(96, 400, 2)
+        pixels = rng.integers(0, 256, (height, width if turn % 3 else 1)).astype(np.uint8)
+        pixels = np.ascontiguousarray(np.broadcast_to(pixels, (height, width)))
+        corners = rng.uniform(-1, 2, (4, 2)) if turn % 2 else np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9]])
+        found = measure_bow(pixels, (corners + rng.normal(0, 0.04, (4, 2))) * [width, height], **BLACK_AND_WHITE)
+        assert found is None or (np.isfinite(found).all() and found[1] > 0)
+
+
 def test_noise_has_no_sides() -> None:
     rng = np.random.default_rng(2)
     corners = np.array([[100.0, 100.0], [1100, 110], [1090, 700], [105, 690]])

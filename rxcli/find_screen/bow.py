@@ -12,7 +12,7 @@ import numpy as np
 
 from rxcli.find_screen.edges import Steps, steps_of
 from rxcli.find_screen.picture import Picture, Pixels, row_step
-from rxcli.find_screen.sides import Side, across
+from rxcli.find_screen.sides import BOTTOM, LEFT, RIGHT, TOP, Side, across
 from rxcli.types import FloatArray
 
 #: Coefficients around which steps of light are looked for, and those tried around each.
@@ -22,6 +22,9 @@ _TRIED = np.linspace(-0.075, 0.075, 16)
 _LEAST_SUPPORT = 0.25
 #: Sides that must say something, and the places, as a number and as a share of all, by which one does.
 _LEAST_SIDES, _LEAST_PLACES, _LEAST_SHARE = 2, 6, 0.1
+#: Squared distance of a corner from the picture's middle, widths, up to which a lens has an inverse; the shortest side,
+#: pixels; and how far a side may lean.
+_FURTHEST, _SHORTEST_PX, _LEANING = 0.8, 32.0, 0.5
 #: Coefficients that lenses have, and how far off a corner may be, screen widths.
 _SD, _CORNER_SD = 0.15, 7e-4
 #: Places further from an arc than so many of their own tolerances are none of the side's.
@@ -50,10 +53,12 @@ def measure_bow(
 
     Returns:
         k1 for a focal length of one picture width, with k2 = -k1, and its standard deviation; None where too little of
-        the sides shows.
+        the sides shows, or the corners are no upright screen's in or about the picture.
     """
     picture = Picture(pixels, black, white, mosaic_period)
     corners = _clockwise(corners)
+    if not _have_sides(corners, picture):
+        return None
     size = float(np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3])) / 2
     support, k1, steps = max(
         (_best_around(picture, corners, guess, size) for guess in _GUESSES), key=lambda one: one[0]
@@ -67,6 +72,18 @@ def _clockwise(corners: FloatArray) -> FloatArray:
     turn = edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0]
     corners = corners if turn > 0 else corners[::-1]
     return np.roll(corners, -int(np.argmin(corners.sum(axis=1))), axis=0)
+
+
+def _have_sides(corners: FloatArray, picture: Picture) -> bool:
+    """Whether arcs can be drawn between the corners: from side to side clockwise, and not far outside the picture."""
+    edges = np.roll(corners, -1, axis=0) - corners
+    along, leaning = edges[[TOP, RIGHT, BOTTOM, LEFT], [0, 1, 0, 1]], edges[[TOP, RIGHT, BOTTOM, LEFT], [1, 0, 1, 0]]
+    offset = (corners - [picture.width / 2, picture.height / 2]) / picture.width
+    return bool(
+        (along * [1, 1, -1, -1] > _SHORTEST_PX).all()
+        and (np.abs(leaning) < _LEANING * np.abs(along)).all()
+        and (offset**2).sum(axis=1).max() < _FURTHEST
+    )
 
 
 def _arcs(picture: Picture, corners: FloatArray, k1: float) -> list[Side]:
