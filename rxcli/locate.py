@@ -191,12 +191,14 @@ def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, st
     known = _camera_of(frame, options)
     if known is not None:
         return Cameras((known, options))
+    n_columns = min(screen.columns for screen in options.screens)
     with stages("sampling"):
-        sides = _sides_of(frame, corners)
-        n_columns = min(screen.columns for screen in options.screens)
-        strips = _unbent_strips(frame, corners, n_columns, sides)
-        if strips.bow and blind.stripes_are_bent(strips):
-            # Lenses that are left in a picture do not bend stripes: what looked like its sides are others.
+        strips = _unbent_strips(frame, corners, n_columns, _sides_of(frame, corners))
+    with stages("blind"):
+        contradicted = strips.bow is not None and blind.stripes_are_bent(strips)
+    if contradicted:
+        # Lenses that are left in a picture do not bend stripes: what looked like its sides are others.
+        with stages("sampling"):
             strips = _unbent_strips(frame, corners, n_columns, None)
     with stages("blind"):
         found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
@@ -219,14 +221,14 @@ def _sides_of(frame: Frame, corners: FloatArray) -> tuple[float, float] | None:
     """The distortion that the screen's sides show, see `find_screen.measure_bow`."""
     from rxcli.find_screen import measure_bow
 
-    return measure_bow(frame.pixels, corners, **_levels_of(frame))
+    return measure_bow(frame.pixels, corners, **levels_of(frame))
 
 
 def _unbent_strips(
     frame: Frame, corners: FloatArray, n_columns: int, sides: tuple[float, float] | None
 ) -> blind.Strips:
     """Strips of a picture whose camera is not known, along sides that show some distortion."""
-    lens = blind.bowing_lens(sides, frame.width, frame.height) if blind.is_bowed(sides) else None
+    lens = blind.bowing_lens(blind.bow_of(sides), frame.width, frame.height)
     outlines = _outlines(frame, corners, lens, n_columns)
     centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
     profiles = sampling.sample_rows(frame, outlines, _DEFAULT_TONE)
@@ -264,8 +266,8 @@ def _exposure_of(frame: Frame, mode: ReadoutMode) -> float:
     return exposure if exposure else 5 * mode.line_delay_s
 
 
-def _levels_of(frame: Frame) -> dict[str, Any]:
-    """What pixel values mean, for `find_screen`."""
+def levels_of(frame: Frame) -> dict[str, Any]:
+    """What pixel values mean, by the names of the arguments of `find_screen` and `measure_bow`."""
     levels = frame.mosaic
     if levels is None:
         return {"black": frame.black, "white": frame.white}
@@ -284,7 +286,7 @@ def find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
         return options.corners
     from rxcli.find_screen import find_screen
 
-    found = find_screen(frame.pixels, **_levels_of(frame))
+    found = find_screen(frame.pixels, **levels_of(frame))
     corners = found.corners
     if corners is None and "no_screen" in options.skip:
         raise Failure("no_screen", f"no screen found: {found.reason}; give its place with --corners")

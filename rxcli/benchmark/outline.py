@@ -14,6 +14,7 @@ import numpy as np
 from rxcli.benchmark.tables import Row, format_table
 from rxcli.benchmark.trial import Trial, simulate_trial
 from rxcli.find_screen import find_screen
+from rxcli.locate import levels_of
 from rxcli.simulate.optics import View
 from rxcli.simulate.pictures import GENERATED, PHOTOS
 from rxcli.simulate.scenes import PRESETS, Scene, preset
@@ -95,10 +96,7 @@ def corner_error(found: FloatArray, truth: FloatArray) -> float:
 def search(trial: Trial) -> float:
     """`corner_error` of the screen that is found in a trial's frame; NaN where none is."""
     frame = trial.frame
-    levels = frame.mosaic
-    black, white = (float(np.mean(levels.black)), levels.white) if levels else (frame.black, frame.white)
-    period = levels.pattern.shape[1] if levels else 1
-    found = find_screen(frame.pixels, black=black, white=white, mosaic_period=period)
+    found = find_screen(frame.pixels, **levels_of(frame))
     return float("nan") if found.corners is None else corner_error(found.corners, trial.corners)
 
 

@@ -1,6 +1,8 @@
 """What a picture says of the camera that took it: rows per slot, direction of readout, exposure, bend of the stripes.
 
-Six steps on the row profiles, none of which needs to know the camera.
+Six steps on the row profiles, none of which needs to know the camera. Before them the screen's sides are looked at
+(`find_screen.measure_bow`): bowed ones mean that the lens's distortion is still in the picture, whose stripes are then
+straight, and straight ones that the camera took it out (`Strips.correction`).
 
 1. **Bend.** Neighbouring strips show the same slots, so the lag between them, over all of the picture, is the slope of
    the stripes. Where a camera has taken the distortion out of its picture, the sensor row of a point p is the y of
@@ -32,7 +34,7 @@ from rxcli.blind.estimates import BlindEstimate, Hypothesis
 from rxcli.blind.refit import refit
 from rxcli.blind.scan import find_clocks
 from rxcli.blind.search import MIN_EVIDENCE, BlindSearch, estimate_camera, stripes_are_bent
-from rxcli.blind.strips import Noise, Strips, in_readout_order, is_bowed, strips_of
+from rxcli.blind.strips import Noise, Strips, bow_of, in_readout_order, strips_of
 from rxcli.blind.structure import structure_evidence
 from rxcli.blind.timing import refine
 
@@ -44,6 +46,7 @@ __all__ = [
     "Noise",
     "Strips",
     "bend_terms",
+    "bow_of",
     "bowing_lens",
     "by_edges",
     "camera_profile",
@@ -52,7 +55,6 @@ __all__ = [
     "find_clocks",
     "in_readout_order",
     "in_time_order",
-    "is_bowed",
     "lens_of",
     "likely_columns",
     "refine",

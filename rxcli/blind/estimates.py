@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from rxcli.types import FloatArray
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +25,10 @@ class Hypothesis:
     evidence: float
     #: How much headers and repeats stood out in the scan.
     salience: float = 0.0
+
+
+#: A clock, and the bend of the stripes that it was found with.
+BentHypothesis = tuple[Hypothesis, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +56,17 @@ class BlindEstimate:
     bow: tuple[float, float] | None = None
 
 
-def distinct(found: Iterable[T], same: Callable[[T, T], bool], most: int) -> list[T]:
+def distinct(found: Iterable[_T], same: Callable[[_T, _T], bool], most: int) -> list[_T]:
     """The first of what was found that are not the same as one before, `most` of them at most."""
-    chosen: list[T] = []
+    chosen: list[_T] = []
     for one in found:
         if len(chosen) == most:
             break
         if not any(same(one, other) for other in chosen):
             chosen.append(one)
     return chosen
+
+
+def on_one_bend(same: Callable[[Hypothesis, Hypothesis], bool]) -> Callable[[BentHypothesis, BentHypothesis], bool]:
+    """The comparison of hypotheses as one of hypotheses with the bends they were found with, which must be one."""
+    return lambda one, other: same(one[0], other[0]) and one[1] is other[1]

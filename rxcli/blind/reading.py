@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.blind.bend import reversed_bend
-from rxcli.blind.estimates import Hypothesis, distinct
+from rxcli.blind.estimates import BentHypothesis, Hypothesis, distinct, on_one_bend
 from rxcli.blind.scan import same_slots
 from rxcli.blind.strips import Strips, in_readout_order
 from rxcli.blind.timing import slot_time, thinned, time_terms
@@ -34,9 +34,7 @@ _OFF_SLOTS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)
 _PREAMBLES = np.array([[*HEADER, *dimming_symbol(w)] for w in WEIGHTS], bool)
 
 
-def read(
-    strips: Strips, found: Sequence[tuple[Hypothesis, FloatArray]], packet_lengths: Sequence[int]
-) -> list[tuple[Hypothesis, FloatArray]]:
+def read(strips: Strips, found: Sequence[BentHypothesis], packet_lengths: Sequence[int]) -> list[BentHypothesis]:
     """The hypotheses that stood out in the scan, each with every length of packet, where it starts if it is one.
 
     Args:
@@ -49,8 +47,8 @@ def read(
         any kind.
     """
     outstanding = sorted(found, key=lambda pair: -pair[0].salience)
-    read_once = _read_all(strips, distinct(outstanding, _same, _READ), packet_lengths)
-    best = distinct(sorted(read_once, key=_by_evidence), _same, _READ_AROUND)
+    read_once = _read_all(strips, distinct(outstanding, on_one_bend(same_slots), _READ), packet_lengths)
+    best = distinct(sorted(read_once, key=_by_evidence), on_one_bend(same_slots), _READ_AROUND)
     n_rows = float(strips.rows[-1] - strips.rows[0])
     near = [
         (replace(clock, rows_per_slot=clock.rows_per_slot * (1 + off * clock.rows_per_slot / n_rows)), bend)
@@ -60,17 +58,11 @@ def read(
     return sorted(read_once + _read_all(strips, near, packet_lengths), key=_by_evidence)
 
 
-def _same(one: tuple[Hypothesis, FloatArray], other: tuple[Hypothesis, FloatArray]) -> bool:
-    return same_slots(one[0], other[0]) and one[1] is other[1]
-
-
-def _by_evidence(pair: tuple[Hypothesis, FloatArray]) -> float:
+def _by_evidence(pair: BentHypothesis) -> float:
     return -pair[0].evidence
 
 
-def _read_all(
-    strips: Strips, clocks: Sequence[tuple[Hypothesis, FloatArray]], packet_lengths: Sequence[int]
-) -> list[tuple[Hypothesis, FloatArray]]:
+def _read_all(strips: Strips, clocks: Sequence[BentHypothesis], packet_lengths: Sequence[int]) -> list[BentHypothesis]:
     return [(one, bend) for clock, bend in clocks for one in _read(strips, clock, bend, packet_lengths)]
 
 

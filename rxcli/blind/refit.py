@@ -70,7 +70,7 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
     shutter = estimate.least_exposure_slots
     may_bend = strips.correction != "no"
     fit = _fit(ordered, first, lit, clock.exposure_slots, 6 if may_bend else 2, shutter)
-    corrected = may_bend and bend_chi_square(fit.values, fit.covariance) > _BENT_CHI_SQUARE[strips.correction]
+    corrected = bend_chi_square(fit.values, fit.covariance) > _BENT_CHI_SQUARE[strips.correction]
     if may_bend and not corrected:
         before = fit.explained_first
         fit = replace(_fit(ordered, first * FLAT, lit, fit.exposure_slots, 2, shutter), explained_first=before)

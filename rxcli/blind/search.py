@@ -10,13 +10,12 @@ import numpy as np
 from rxcli.blind.advice import why_not
 from rxcli.blind.bend import estimate_bend, straightened
 from rxcli.blind.edges import by_edges
-from rxcli.blind.estimates import BlindEstimate, Hypothesis, distinct
+from rxcli.blind.estimates import BentHypothesis, BlindEstimate, distinct, on_one_bend
 from rxcli.blind.reading import read
 from rxcli.blind.scan import alike, find_clocks, same_slots
 from rxcli.blind.strips import Strips
 from rxcli.blind.timing import ALIKE, refine
 from rxcli.profiles import ScreenProfile
-from rxcli.types import FloatArray
 
 #: Log-likelihood ratio of header and weights, over chance, that a clock must reach.
 MIN_EVIDENCE = 45.0
@@ -99,7 +98,7 @@ def _worth_a_look(estimates: list[BlindEstimate]) -> tuple[BlindEstimate, ...]:
     return tuple(estimate for estimate in estimates if estimate.explained >= _LEAST_EXPLAINED)
 
 
-def _worth_refining(found: list[tuple[Hypothesis, FloatArray]]) -> list[tuple[Hypothesis, FloatArray]]:
+def _worth_refining(found: list[BentHypothesis]) -> list[BentHypothesis]:
     """The best hypothesis, and others of another period, packet, direction or bend that come close.
 
     Where slots cannot be told by eye (dark pictures, long exposures) those that stood out in the scan come too.
@@ -108,19 +107,15 @@ def _worth_refining(found: list[tuple[Hypothesis, FloatArray]]) -> list[tuple[Hy
         return []
     best = found[0][0].evidence
     close = [pair for pair in found[: 4 * _REFINED] if pair[0].evidence >= _CLOSE_EVIDENCE * best]
-    chosen = distinct(close, _alike, _REFINED) or found[:1]
+    chosen = distinct(close, on_one_bend(alike), _REFINED) or found[:1]
     # With the same slots a packet may have any length: they differ in where other headers would be.
     for pair in close:
         if same_slots(pair[0], found[0][0]) and all(pair[0].packet_slots != one.packet_slots for one, _ in chosen):
             chosen.append(pair)
     if best < _WEAK_EVIDENCE:
-        chosen = distinct([*chosen, *sorted(found, key=lambda pair: -pair[0].salience)], _alike, _REFINED_IF_WEAK)
+        outstanding = sorted(found, key=lambda pair: -pair[0].salience)
+        chosen = distinct([*chosen, *outstanding], on_one_bend(alike), _REFINED_IF_WEAK)
     return chosen
-
-
-def _alike(one: tuple[Hypothesis, FloatArray], other: tuple[Hypothesis, FloatArray]) -> bool:
-    """Whether two hypotheses, each with its bend, are about the same."""
-    return alike(one[0], other[0]) and one[1] is other[1]
 
 
 def _plausibility(estimate: BlindEstimate, strips: Strips, rows_per_slot: float) -> float:

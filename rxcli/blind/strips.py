@@ -66,7 +66,7 @@ class Strips:
     @property
     def bow(self) -> tuple[float, float] | None:
         """k1 and its standard deviation where the sides are bowed without doubt."""
-        return self.sides if is_bowed(self.sides) else None
+        return bow_of(self.sides)
 
     @property
     def correction(self) -> Correction:
@@ -77,9 +77,9 @@ class Strips:
         return "likely" if straight else "unknown"
 
 
-def is_bowed(sides: tuple[float, float] | None) -> bool:
-    """Whether sides that show k1, with such a standard deviation, are not straight."""
-    return sides is not None and abs(sides[0]) > _BOWED * sides[1]
+def bow_of(sides: tuple[float, float] | None) -> tuple[float, float] | None:
+    """k1 that sides show and its standard deviation, None where they may be straight."""
+    return sides if sides and abs(sides[0]) > _BOWED * sides[1] else None
 
 
 def strips_of(
@@ -90,10 +90,10 @@ def strips_of(
     sides: tuple[float, float] | None = None,
     mosaic: bool = False,
 ) -> Strips:
-    """Strips for the functions below, from row profiles that were sampled without a lens.
+    """Strips for the functions below, from row profiles that were sampled without a lens or with one that bows sides.
 
     Args:
-        profiles: C columns, S strips, R rows; `sensor_row` None. Bowed sides must have been followed.
+        profiles: C columns, S strips, R rows; `sensor_row` None.
         centre_x: (C*S, R) picture x of the strips' middles.
         width: of the picture, pixels.
         height: of the picture, rows.

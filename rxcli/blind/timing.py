@@ -148,12 +148,12 @@ def _fit_timing(
     start = first_row + hypothesis.start_row - before * hypothesis.rows_per_slot
     grid = Grid(-before % hypothesis.packet_slots, hypothesis.packet_slots)
     values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
-    bent = _descend(strips, grid, values, least_exposure_slots, n_free=2 if strips.correction == "no" else 6)
-    if sure or bend_chi_square(bent.values, bent.covariance) > _BENT_CHI_SQUARE[strips.correction]:
-        return bent, True
-    values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else bent.values * FLAT
-    flat = _descend(strips, grid, values, bent.exposure_slots, n_free=2, slots=bent.slots)
-    return replace(flat, exposure_sd=bent.exposure_sd), False
+    first = _descend(strips, grid, values, least_exposure_slots, n_free=2 if strips.correction == "no" else 6)
+    if sure or bend_chi_square(first.values, first.covariance) > _BENT_CHI_SQUARE[strips.correction]:
+        return first, True
+    values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else first.values * FLAT
+    flat = _descend(strips, grid, values, first.exposure_slots, n_free=2, slots=first.slots)
+    return replace(flat, exposure_sd=first.exposure_sd), False
 
 
 def _descend(

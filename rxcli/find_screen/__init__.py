@@ -13,6 +13,8 @@ edges. Four steps, each on less of the picture:
 4. Along the four lines pixels are read at full resolution (`edges`), and a flat screen of known aspect before one lens
    is fitted to all sides together (`pose`).
 
+Where the camera is unknown, `bow` asks afterwards what lens bows the sides between the corners.
+
 A side that shows nothing (black, or outside the picture) is put where a flat screen of known aspect must have it.
 """
 
@@ -27,7 +29,7 @@ from rxcli.find_screen.edges import refine
 from rxcli.find_screen.onsets import Reach, fit_side
 from rxcli.find_screen.picture import Picture, Pixels, Plane, reduce
 from rxcli.find_screen.pose import Places, Rectangle, fit_pose, misfit, pose_of
-from rxcli.find_screen.sides import INWARD, SIDE_NAMES, Side, corners_of, extent, straight
+from rxcli.find_screen.sides import INWARD, SIDE_NAMES, Side, corners_of, extent, from_top_left, straight
 from rxcli.find_screen.stripes import Stripes, coarse_sides, find_stripes
 from rxcli.types import FloatArray
 
@@ -153,7 +155,7 @@ def _search(
     trouble = _implausible(corners_of(sides, plane.width, plane.height), plane, aspect)
     if trouble:
         return ScreenSearch(None, 0.0, trouble)
-    corners, support = refine(picture, sides, pose, rectangle, plane.fy)
+    corners, support = refine(picture, sides, pose, rectangle)
     return _judged(corners, sides, support, stripes, plane, aspect)
 
 
@@ -166,9 +168,8 @@ def _judged(
     score = float(np.mean([side.support for side in sides])) ** 0.5 * stripes.share_inside(corners)
     if score < _MIN_SCORE:
         return ScreenSearch(None, score, _NO_OUTLINE)
-    start = int(np.argmin(corners.sum(axis=1)))
     names = tuple(SIDE_NAMES[i] for i, side in enumerate(sides) if not side.support and not support[i])
-    return ScreenSearch(np.roll(corners, -start, axis=0), min(score, 1.0), "", names)
+    return ScreenSearch(from_top_left(corners), min(score, 1.0), "", names)
 
 
 def _agreed(

@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.find_screen.edges import Steps, steps_of
-from rxcli.find_screen.picture import Picture, Pixels, row_step
-from rxcli.find_screen.sides import BOTTOM, LEFT, RIGHT, TOP, Side, across
+from rxcli.find_screen.picture import Picture, Pixels
+from rxcli.find_screen.pose import INDEPENDENT
+from rxcli.find_screen.sides import BOTTOM, LEFT, RIGHT, TOP, Side, across, from_top_left, width_of
 from rxcli.types import FloatArray
 
 #: Coefficients around which steps of light are looked for, and those tried around each.
@@ -29,8 +30,6 @@ _FURTHEST, _SHORTEST_PX, _LEANING = 0.8, 32.0, 0.5
 _SD, _CORNER_SD = 0.15, 7e-4
 #: Places further from an arc than so many of their own tolerances are none of the side's.
 _TOLERANCES = 2.0
-#: Neighbouring places of a side err together: this many count as one observation each, more add nothing.
-_INDEPENDENT = 30
 #: Places err alike along the sides: how much too sure the least squares are, by straight sides.
 _UNDERSTATED = 1.6
 _ROUNDS = 3
@@ -56,10 +55,10 @@ def measure_bow(
         the sides shows, or the corners are no upright screen's in or about the picture.
     """
     picture = Picture(pixels, black, white, mosaic_period)
-    corners = _clockwise(corners)
+    corners = from_top_left(_clockwise(corners))
     if not _have_sides(corners, picture):
         return None
-    size = float(np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3])) / 2
+    size = width_of(corners)
     support, k1, steps = max(
         (_best_around(picture, corners, guess, size) for guess in _GUESSES), key=lambda one: one[0]
     )
@@ -67,11 +66,10 @@ def measure_bow(
 
 
 def _clockwise(corners: FloatArray) -> FloatArray:
-    """The corners in the order of `find_screen`, which the sides' names go by."""
+    """Corners by turns either way, clockwise in the picture."""
     edges = np.roll(corners, -1, axis=0) - corners
     turn = edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0]
-    corners = corners if turn > 0 else corners[::-1]
-    return np.roll(corners, -int(np.argmin(corners.sum(axis=1))), axis=0)
+    return corners if turn > 0 else corners[::-1]
 
 
 def _have_sides(corners: FloatArray, picture: Picture) -> bool:
@@ -111,7 +109,7 @@ def _arcs(picture: Picture, corners: FloatArray, k1: float) -> list[Side]:
 def _best_around(picture: Picture, corners: FloatArray, guess: float, size: float) -> tuple[float, float, list[Steps]]:
     """The support of the best coefficient near a guess, that coefficient, and the steps found along the guess."""
     arcs = _arcs(picture, corners, guess)
-    steps = [steps_of(picture, arcs, side, size, row_step(picture)) for side in range(4)]
+    steps = [steps_of(picture, arcs, side, size) for side in range(4)]
     supports = [(_support(steps, _arcs(picture, corners, k1)), k1) for k1 in (guess + _TRIED).tolist()]
     return *max(supports), steps
 
@@ -155,7 +153,7 @@ def _said_by(seen: Steps, arc: Side, next_arc: Side, size: float) -> tuple[float
     t, left = seen.t[on_it], left[on_it]
     bow = (next_arc.at(t) - arc.at(t)) / _STEP
     terms = np.stack([bow, np.ones_like(t), (t - arc.middle) / arc.half])
-    weight = seen.sd**-2 / max(t.size / _INDEPENDENT, 1)
+    weight = seen.sd**-2 / max(t.size / INDEPENDENT, 1)
     normal, pull = weight * terms @ terms.T, weight * terms @ left
     shared = np.linalg.solve(normal[1:, 1:] + np.eye(2) / (_CORNER_SD * size) ** 2, normal[1:, 0])
     return float(normal[0, 0] - shared @ normal[1:, 0]), float(pull[0] - shared @ pull[1:])

@@ -16,9 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.find_screen.onsets import agreeing, row_trust
-from rxcli.find_screen.picture import Picture, Pixels
-from rxcli.find_screen.pose import Places, Rectangle, fit_pose
-from rxcli.find_screen.sides import BOTTOM, INWARD, LEFT, RIGHT, TOP, Side, across, corners_of, outermost_line
+from rxcli.find_screen.picture import Picture, Pixels, row_step
+from rxcli.find_screen.pose import INDEPENDENT, Places, Rectangle, fit_pose
+from rxcli.find_screen.sides import (
+    BOTTOM,
+    INWARD,
+    LEFT,
+    RIGHT,
+    TOP,
+    Side,
+    across,
+    corners_of,
+    outermost_line,
+    width_of,
+)
 from rxcli.find_screen.stripes import LAG
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
@@ -62,7 +73,7 @@ class Steps:
 
 
 def refine(
-    picture: Picture, guess: list[Side], pose: FloatArray, rectangle: Rectangle, fy: int
+    picture: Picture, guess: list[Side], pose: FloatArray, rectangle: Rectangle
 ) -> tuple[FloatArray, list[float]]:
     """Corners (4, 2) from pixels at full resolution, and the share of each side that supports them.
 
@@ -71,11 +82,10 @@ def refine(
         guess: the four sides, within half a hundredth of the screen's width or so.
         pose: (8,) the pose that fits them.
         rectangle: picture and screen.
-        fy: rows from row to row of the reduced plane.
     """
     corners = corners_of(guess, picture.width, picture.height)
-    size = float(np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3])) / 2
-    steps = [steps_of(picture, guess, side, size, fy) for side in range(4)]
+    size = width_of(corners)
+    steps = [steps_of(picture, guess, side, size) for side in range(4)]
     depths = [INWARD[side] * (s.place - guess[side].at(s.t)) for side, s in enumerate(steps)]
     expected = rectangle.project(pose)
     supporters = [_supporters(steps[side], depths[side], side, 1.6 * steps[side].sd, _SKEW, 2.0) for side in range(4)]
@@ -144,7 +154,7 @@ def _deviation(
     middle, half = float(steps.t.mean()), max(float(np.ptp(steps.t)) / 2, 1.0)
     along = (steps.t[supporters] - middle) / half
     terms = np.stack([np.ones_like(along), along])
-    weight = steps.sd**-2.0 / (1 + along.size / 30)
+    weight = steps.sd**-2.0 / (1 + along.size / INDEPENDENT)
     normal = weight * terms @ terms.T + np.eye(2) / sd**2
     own = np.linalg.solve(normal, weight * terms @ depth[supporters])
     return np.asarray(INWARD[side] * own, np.float64), middle, half
@@ -167,7 +177,7 @@ def _meet(pose: FloatArray, own: list[tuple[FloatArray, float, float]], rectangl
     return np.asarray(corners, np.float64)
 
 
-def steps_of(picture: Picture, guess: list[Side], side: int, size: float, fy: int) -> Steps:
+def steps_of(picture: Picture, guess: list[Side], side: int, size: float) -> Steps:
     """The steps of light across one side.
 
     Args:
@@ -175,12 +185,11 @@ def steps_of(picture: Picture, guess: list[Side], side: int, size: float, fy: in
         guess: the four sides, within half a hundredth of the screen's width or so.
         side: which of them.
         size: the screen's width, pixels.
-        fy: rows from row to row of the reduced plane.
     """
     half = max(_LEAST_HALF_STEP, int(_HALF_STEP * size), picture.period)
     out, inward = max(int(_OUT * size), 3 * half), max(int(_IN * size), 6 * half)
     read = _across if across(side) else _upright
-    t, centre, light, threshold, inside = read(picture, guess, side, size, out, inward, half, fy)
+    t, centre, light, threshold, inside = read(picture, guess, side, size, out, inward, half)
     sd = max(_LEAST_TOLERANCE, _TOLERANCE * size, _PERIODS * picture.period)
     if not t.size:
         return Steps(t, t, t > 0, t, sd)
@@ -213,9 +222,7 @@ def _ends(guess: list[Side], side: int, size: float, limit: int) -> tuple[float,
     return max(before.at(middle) + 0.004 * size, 0.0), min(after.at(middle) - 0.004 * size, limit - 1.0)
 
 
-def _across(
-    picture: Picture, guess: list[Side], side: int, size: float, out: int, inward: int, half: int, fy: int
-) -> _Read:
+def _across(picture: Picture, guess: list[Side], side: int, size: float, out: int, inward: int, half: int) -> _Read:
     """Top and bottom: light of strips of some pixels, from outside to inside."""
     strip = picture.period * max(1, round(_STRIP_PX / picture.period))
     first, last = _ends(guess, side, size, picture.width)
@@ -235,13 +242,11 @@ def _across(
     return t, centre.astype(np.float64), light, threshold, inside
 
 
-def _upright(
-    picture: Picture, guess: list[Side], side: int, size: float, out: int, inward: int, half: int, fy: int
-) -> _Read:
+def _upright(picture: Picture, guess: list[Side], side: int, size: float, out: int, inward: int, half: int) -> _Read:
     """Left and right: the share of the inside's changes that pixels show, from outside to inside, in bands of rows."""
     first, last = _ends(guess, side, size, picture.height)
     step = picture.period * max(1, round((last - first) / _ROWS / picture.period))
-    lag = max(1, round(LAG * fy / step))
+    lag = max(1, round(LAG * row_step(picture) / step))
     n = int((last - first) / step - lag) // _BAND_ROWS
     if n < _SUPPORTERS:
         return _nothing(out + inward)

@@ -20,7 +20,7 @@ _TURN_SD = np.deg2rad(5)
 _LOG_FOCAL, _LOG_FOCAL_SD = float(np.log(1.6)), 0.5
 _DISTORTION_SD = 0.03
 #: Neighbouring places of a side err together: this many count as one observation each, more add nothing.
-_INDEPENDENT = 30
+INDEPENDENT = 30
 _N, _TILT, _YAW, _FOCAL, _DISTORTION = 8, 0, 1, 6, 7
 _EPSILON = 1e-6
 #: Weight against a step of what the sides say little of: turn, focal length and distortion make up for one another.
@@ -101,7 +101,7 @@ def misfit(places: list[Places | None], pose: FloatArray, rectangle: Rectangle) 
     for side, seen in enumerate(places):
         if seen is not None:
             left = seen.place - rectangle.side_at(corners, pose[_DISTORTION], side, seen.t)
-            total += float((left**2).mean()) * min(seen.t.size, _INDEPENDENT) / seen.sd**2
+            total += float((left**2).mean()) * min(seen.t.size, INDEPENDENT) / seen.sd**2
     return total
 
 
@@ -127,7 +127,7 @@ def fit_pose(
         terms = [(projected.reshape(_N + 1, -1), corners.ravel(), sd**-2.0)]
         for side, seen in enumerate(places):
             if seen is not None:
-                weight = seen.sd**-2.0 / (1 + seen.t.size / _INDEPENDENT)
+                weight = seen.sd**-2.0 / (1 + seen.t.size / INDEPENDENT)
                 terms.append((rectangle.side_at(projected, poses[:, _DISTORTION], side, seen.t), seen.place, weight))
         for model, observed, weight in terms:
             slopes = (model[1:] - model[0]) / _EPSILON

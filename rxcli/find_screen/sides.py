@@ -104,6 +104,16 @@ def _tries() -> FloatArray:
     return np.random.default_rng(1).integers(0, 1 << 32, (2, _TRIES), np.uint32) / (1 << 32)
 
 
+def width_of(corners: FloatArray) -> float:
+    """Width of the screen in pixels, from its (4, 2) corners by turns."""
+    return float(np.linalg.norm(corners[1] - corners[0] + corners[2] - corners[3])) / 2
+
+
+def from_top_left(corners: FloatArray) -> FloatArray:
+    """(4, 2) corners by turns, from that of smallest x + y on, which the sides' names go by."""
+    return np.roll(corners, -int(np.argmin(corners.sum(axis=1))), axis=0)
+
+
 def outermost_line(
     t: FloatArray,
     depth: FloatArray,
