@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, bits_to_hex, indices_to_bits
+from rxcli.protocol import PREAMBLE_SLOTS, bits_to_hex, indices_to_bits
 from rxcli.types import (
     BoolArray,
     BurstPosteriors,
@@ -62,6 +62,7 @@ def column_results(
     snr: Float32Array,
     samples: SlotSamples,
     support: Float32Array,
+    headerless: BoolArray,
     min_confidence: float,
     denoised: frozenset[int] = frozenset(),
 ) -> tuple[ColumnResult, ...]:
@@ -73,6 +74,7 @@ def column_results(
         snr: (C, N) squared contrast over variance of every slot of the grid.
         samples: the samples, for what was visible.
         support: (C, N) what the light says for every slot as decided, see `detect.slot_support`.
+        headerless: (C,) columns that show no packets, whatever was decided of their slots, see `without_header`.
         min_confidence: packets below it are left out.
         denoised: columns in which corrections of the auto-encoder were kept.
     """
@@ -81,7 +83,6 @@ def column_results(
     told = np.isin(np.arange(len(snr)), list(denoised))
     doubts = _doubts(posteriors, evidence(posteriors, slot_support_by_burst(support, clock), told))
     snr_db = _snr_db_of_columns(snr)
-    headerless = posteriors.header_llr.sum(axis=0) < (_CONTRADICTED if _headers_show(posteriors) else np.inf)
     echoes: BoolArray = np.any(_echoes(posteriors, snr_db) & whole, axis=0)
     reported = whole & doubts.reported(min_confidence)
     against = [_HEADERLESS if h else _ECHO if e else None for h, e in zip(headerless, echoes, strict=True)]
@@ -163,8 +164,7 @@ def _clip_column(
         status = "ok"
     message = None
     if not packets:
-        n_seen = max((int(burst.seen[column].sum()) for burst in bursts), default=0)
-        message = _why_none_here(status, snr_db, n_seen, clock, bool(bursts))
+        message = _why_none_here(status, snr_db, [burst.seen[column] for burst in bursts])
     return ColumnResult(
         column=column,
         status=status,
@@ -191,10 +191,10 @@ def _weight_of_best(column: int, packets: Sequence[PacketResult], bursts: Sequen
     return next(int(burst.posteriors.w[column]) for burst in bursts if burst.number == number)
 
 
-def _why_none_here(status: ColumnStatus, snr_db: float | None, n_seen: int, clock: Clock, any_burst: bool) -> str:
-    if status == "ok" or not any_burst:
+def _why_none_here(status: ColumnStatus, snr_db: float | None, seen: list[IntArray]) -> str:
+    if status == "ok" or not seen:
         return "its burst goes on in the next frame and is reported there"
-    return _why_none(status, snr_db, n_seen, clock)
+    return _cut_off(np.stack(seen)) or _why_none(status, snr_db)
 
 
 def _snr_db(snr: Float32Array) -> float | None:
@@ -210,6 +210,12 @@ def all_dark(snr: Float32Array) -> bool:
 def clip_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
     """`ok` when every lit column has a packet, here or in a frame to come; `partial` when some have none."""
     return "ok" if all(column.status in ("ok", "weak", "dark") for column in columns) else "partial"
+
+
+def why_no_packet(columns: tuple[ColumnResult, ...]) -> str:
+    """What a frame without packets says: why its clearest column has none."""
+    clearest = max(columns, key=lambda column: -np.inf if column.snr_db is None else column.snr_db)
+    return f"no column gave a packet; column {clearest.column} is the clearest: {clearest.message}"
 
 
 def frame_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
@@ -263,7 +269,7 @@ def _column_result(
         denoised=denoised,
         delay_slots=float(clock.delay_slots[column]),
         packets=packets,
-        message=None if packets else against or _why_none(status, snr_db, int(seen.sum()), clock),
+        message=None if packets else _cut_off(seen) or against or _why_none(status, snr_db),
     )
 
 
@@ -284,9 +290,10 @@ def _echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> Bool
     return np.asarray(two & beside)
 
 
-def _headers_show(posteriors: BurstPosteriors) -> bool:
-    """Whether the columns together bear out that there are headers: no light, no packet."""
-    return bool(posteriors.header_llr.sum() > _HEADERS_AT_LEAST)
+def without_header(posteriors: BurstPosteriors) -> BoolArray:
+    """(C,) columns whose header does not show; all where the columns together show none: no light, no packet."""
+    together = posteriors.header_llr.sum() > _HEADERS_AT_LEAST
+    return np.asarray(posteriors.header_llr.sum(axis=0) < (_CONTRADICTED if together else np.inf))
 
 
 def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:
@@ -295,12 +302,18 @@ def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> C
     return "dark" if snr_db is None or snr_db < _DARK_SNR_DB else "no_packet"
 
 
-def _why_none(status: ColumnStatus, snr_db: float | None, n_seen: int, clock: Clock) -> str:
-    if n_seen < clock.packet_slots - SLOTS_PER_SYMBOL:
-        return (
-            f"{n_seen} slots of the column are visible, a packet has {clock.packet_slots}; "
-            "move closer so that the screen fills more of the height"
-        )
+def _cut_off(seen: IntArray) -> str | None:
+    """How much is missing of the packet that is nearest to whole; None where one is. `seen` is (B, packet)."""
+    missing = int((seen[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
+    if not missing:
+        return None
+    return (
+        f"no packet is in view as a whole: of {seen.shape[1]} slots {missing} are missing; move closer so that the "
+        "screen fills more of the height, or take another picture"
+    )
+
+
+def _why_none(status: ColumnStatus, snr_db: float | None) -> str:
     if status == "dark" or snr_db is None:
         return "too little light under this column; show a brighter picture or raise the exposure"
     return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"

@@ -18,13 +18,11 @@ from rxcli import assemble, denoise
 from rxcli.dump import dump_frame
 from rxcli.locate import Failure, Stages, find_camera, find_corners, find_lock, too_small
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
-from rxcli.reception import decode, doubtful_columns, second_opinion, support
+from rxcli.reception import decode, doubtful_columns, headerless, second_opinion, support
 from rxcli.types import Frame, FrameResult
 from rxcli.unknown_camera import likely_camera, with_refitted_camera, without_estimate
 
 __all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "denoiser_case", "receive", "receive_frame"]
-
-_NO_PACKET = "no column gave a packet, though headers were found; each column says why: see --json"
 
 
 def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
@@ -83,6 +81,8 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
         if camera.guess is not None:
             camera, lock, seen = with_refitted_camera(frame, corners, camera, lock, seen, options, stages)
             result = replace(result, **camera.facts)
+        with stages("detect"):
+            no_header = headerless(seen)
         with stages("denoise"):
             seen, denoised, report = second_opinion(lock, seen, options)
         if options.dump_dir is not None:
@@ -90,14 +90,22 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
                 options.dump_dir, frame, corners, lock.profiles, seen.clock, seen.samples, seen.metrics, seen.posteriors
             )
         columns = assemble.column_results(
-            seen.clock, seen.posteriors, seen.snr, seen.samples, support(seen), options.min_confidence, denoised
+            seen.clock,
+            seen.posteriors,
+            seen.snr,
+            seen.samples,
+            support(seen),
+            no_header,
+            options.min_confidence,
+            denoised,
         )
         if camera.reversed:
             columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
         result = replace(result, denoiser=report, skipped=seen.skipped)
         result = replace(result, columns=columns, status=assemble.frame_status(columns))
         if result.status == "no_signal":
-            result = replace(result, message=too_small(frame, corners, camera, lock.screen) or _NO_PACKET)
+            too_few_rows = too_small(frame, corners, camera, lock.screen)
+            result = replace(result, message=too_few_rows or assemble.why_no_packet(columns))
             result = without_estimate(result, camera, seen)
     except Failure as failure:
         skipped = {"no_screen": 1} if failure.status == "no_screen" else {}

@@ -41,6 +41,8 @@ _WORDS, _WORD_MARGIN, _HOPELESS_WORD = 4, 5.0, -1.4
 #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least sure,
 #: have their words weighed alone.
 _MOST_SHOWN = 58_000
+#: A column whose slots are so much likelier packets than any slots, nats, has packets whether its header shows or not.
+_PACKETS_WITHOUT_HEADER = 40.0
 #: A column whose symbols have a mean log probability below this may have settled on a wrong weight: it starts again,
 #: after so many quick rounds.
 _LOST, _FRESH_ROUNDS = -0.3, 2
@@ -325,10 +327,26 @@ def packet_evidence(seen: Reception) -> float:
 
     Copies that differ and words that are not in the codebook speak against it, headers or not.
     """
-    packets = _evidence(seen.metrics, seen.clock) - np.log(len(WEIGHTS))
-    free = detect.free_evidence(seen.metrics, seen.posteriors.w / SLOTS_PER_SYMBOL)
     # The light model is surer than it should be: a column that fits poorly, or is dark, says nothing.
-    return float(np.logaddexp(packets - free, 0.0).sum())
+    return float(np.logaddexp(_packets_over_any(seen, np.arange(seen.snr.shape[0])), 0.0).sum())
+
+
+def _packets_over_any(seen: Reception, columns: NDArray[np.int64]) -> FloatArray:
+    """Log-likelihood ratio of each column's slots being packets, over slots that are anything."""
+    metrics = seen.metrics[columns]
+    packets = _evidence(metrics, seen.clock) - np.log(len(WEIGHTS))
+    return np.asarray(packets - detect.free_evidence(metrics, seen.posteriors.w[columns] / SLOTS_PER_SYMBOL))
+
+
+def headerless(seen: Reception) -> NDArray[np.bool_]:
+    """(C,) columns that show no packets: no header where it should be, and not so many words of the codebook.
+
+    With few rows a slot or at the screen's edge light is not as the model has it, and headers are the first to tell.
+    """
+    out = assemble.without_header(seen.posteriors)
+    if out.any():
+        out[out] = _packets_over_any(seen, np.flatnonzero(out)) < _PACKETS_WITHOUT_HEADER
+    return out
 
 
 def doubtful_columns(seen: Reception) -> NDArray[np.int64]:

@@ -77,7 +77,8 @@ def results_of(
 ) -> tuple[ColumnResult, ...]:
     """Results where every slot of the grid has the same support unless told otherwise."""
     told = np.broadcast_to(np.asarray(support, np.float32), snr.shape)
-    return assemble.column_results(now, posteriors, snr, samples, told, min_confidence)
+    headerless = assemble.without_header(posteriors)
+    return assemble.column_results(now, posteriors, snr, samples, told, headerless, min_confidence)
 
 
 def test_a_sure_packet() -> None:
@@ -228,7 +229,7 @@ def test_nothing_decoded_says_why() -> None:
     short = clock_of(30, 0, [0])
     (few, _) = results_of(short, unsure, snr(30), samples_of(30), 0)
     assert few.message is not None
-    assert "30 slots of the column are visible, a packet has 50" in few.message
+    assert "of 50 slots 20 are missing" in few.message
     for column in (bright, dark, few):
         assert "\n" not in (column.message or "")
         assert "; " in (column.message or "")

@@ -411,3 +411,16 @@ def test_rows_that_developing_mixes_are_told_from_the_light(monkeypatch: pytest.
     assert told.error_free >= 15
     assert told.false == 0
     assert nominal.error_free <= told.error_free / 2
+
+
+def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:
+    taken = clean()
+    frame, options = frame_of(taken), options_for(taken)
+    corners = find_corners(frame, options)
+    camera, options = find_camera(frame, corners, options, Stages())
+    seen = reception.decode(find_lock(frame, corners, camera, options, Stages()), options.skip)
+    assert not reception.headerless(seen).any()
+    unseen = replace(seen.posteriors, header_llr=np.full_like(seen.posteriors.header_llr, -30.0))
+    assert not reception.headerless(replace(seen, posteriors=unseen)).any()
+    moved = replace(seen, posteriors=unseen, metrics=np.roll(seen.metrics, 3, axis=1))
+    assert reception.headerless(moved).all()
