@@ -225,14 +225,16 @@ def _sides_of(frame: Frame, corners: FloatArray) -> tuple[float, float] | None:
 
 
 def _unbent_strips(
-    frame: Frame, corners: FloatArray, n_columns: int, sides: tuple[float, float] | None
+    frame: Frame, corners: FloatArray, n_columns: int, sides: tuple[float, float] | None, tone: str = _DEFAULT_TONE
 ) -> blind.Strips:
     """Strips of a picture whose camera is not known, along sides that show some distortion."""
     lens = blind.bowing_lens(blind.bow_of(sides), frame.width, frame.height)
     outlines = _outlines(frame, corners, lens, n_columns)
     centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
-    profiles = sampling.sample_rows(frame, outlines, _DEFAULT_TONE)
-    return blind.strips_of(profiles, centre_x, frame.width, frame.height, sides, frame.mosaic is not None)
+    profiles = sampling.sample_rows(frame, outlines, tone)
+    mosaic = frame.mosaic is not None
+    undone = None if mosaic or frame.linear else tone
+    return blind.strips_of(profiles, centre_x, frame.width, frame.height, sides, mosaic, undone)
 
 
 def _estimated_camera(estimate: blind.BlindEstimate, strips: blind.Strips, rate: float) -> Camera:
@@ -241,7 +243,7 @@ def _estimated_camera(estimate: blind.BlindEstimate, strips: blind.Strips, rate:
         line_delay_s=1 / (estimate.rows_per_slot * rate),
         exposure_s=estimate.exposure_slots / rate,
         lens=blind.lens_of(estimate, strips.width, strips.height),
-        tone=_DEFAULT_TONE,
+        tone=strips.tone or _DEFAULT_TONE,
         reversed=estimate.reversed,
         estimated=blind.summary(estimate, rate),
         guess=(estimate, strips),
@@ -256,9 +258,33 @@ def refitted_camera(
         return camera, 0.0
     estimate, strips = camera.guess
     if strips.n_columns != lock.screen.columns:
-        strips = _unbent_strips(frame, corners, lock.screen.columns, strips.sides)
+        strips = _unbent_strips(frame, corners, lock.screen.columns, strips.sides, camera.tone)
     found, moved_slots = blind.refit(strips, estimate, now, lit)
     return _estimated_camera(found, strips, lock.screen.slot_rate_hz), moved_slots
+
+
+def linear_camera(
+    frame: Frame, corners: FloatArray, camera: Camera, lock: Lock, now: Clock, lit: Float32Array
+) -> Camera:
+    """An estimated camera refitted to values taken as they are, where light bends over the slots as if they were light.
+
+    The same camera where it does not; without an exponent where that is not borne out by the values as they are.
+    """
+    if camera.guess is None or camera.tone != _DEFAULT_TONE or not blind.is_linear(camera.guess[0].tone):
+        return camera
+    estimate, strips = camera.guess
+    as_stored = _unbent_strips(frame, corners, lock.screen.columns, strips.sides, "linear")
+    found, _ = blind.refit(as_stored, estimate, now, lit)
+    if blind.is_linear(found.tone):
+        return _estimated_camera(found, as_stored, lock.screen.slot_rate_hz)
+    return without_tone(camera, lock)
+
+
+def without_tone(camera: Camera, lock: Lock) -> Camera:
+    """An estimated camera of which no exponent is told."""
+    assert camera.guess is not None
+    estimate, strips = camera.guess
+    return _estimated_camera(replace(estimate, tone=None), strips, lock.screen.slot_rate_hz)
 
 
 def _exposure_of(frame: Frame, mode: ReadoutMode) -> float:

@@ -7,7 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli import blind, channel
-from rxcli.locate import Camera, Failure, Lock, Stages, find_cameras, find_lock, refitted_camera
+from rxcli.locate import (
+    Camera,
+    Failure,
+    Lock,
+    Stages,
+    find_cameras,
+    find_lock,
+    linear_camera,
+    refitted_camera,
+    without_tone,
+)
 from rxcli.options import ReceiverOptions
 from rxcli.reception import Reception, decode, packet_evidence, quick_look
 from rxcli.types import FloatArray, Frame, FrameResult
@@ -76,24 +86,55 @@ def with_refitted_camera(
 ) -> tuple[Camera, Lock, Reception]:
     """The camera that the slots tell, and what is received with it, until that moves the clock no more.
 
-    Where it leaves more doubt, what was received before stays.
+    Where it leaves more doubt, what was received before stays. Values that seem to be light are received as such.
     """
+    camera, lock, seen = _refitted(frame, corners, camera, lock, seen, options, stages)
+    with stages("blind"):
+        lit = channel.lit_on_grid(seen.posteriors, seen.clock)
+        linear = linear_camera(frame, corners, camera, lock, seen.clock, lit)
+    if linear.tone == camera.tone:
+        return linear, lock, seen
+    found = _received(frame, corners, linear, seen, options, stages)
+    if found is None:
+        return without_tone(camera, lock), lock, seen
+    return _refitted(frame, corners, linear, *found, options, stages)
+
+
+def _refitted(
+    frame: Frame,
+    corners: FloatArray,
+    camera: Camera,
+    lock: Lock,
+    seen: Reception,
+    options: ReceiverOptions,
+    stages: Stages,
+) -> tuple[Camera, Lock, Reception]:
+    """The camera from slots as received, and what is received with it, in turn."""
     for _ in range(_MOST_REFITS):
         with stages("blind"):
             lit = channel.lit_on_grid(seen.posteriors, seen.clock)
             camera, moved_slots = refitted_camera(frame, corners, camera, lock, seen.clock, lit)
         if moved_slots < _MATTERS_SLOTS:
             break
-        try:
-            again = find_lock(frame, corners, camera, options, stages, quick=True)
-        except Failure:
+        found = _received(frame, corners, camera, seen, options, stages)
+        if found is None:
             break
-        with stages("detect"):
-            then = decode(again, options.skip)
-        if then.posteriors.log_prob.mean() < _MORE_DOUBT * seen.posteriors.log_prob.mean() - _LEAST_DOUBT:
-            break
-        lock, seen = again, then
+        lock, seen = found
     return camera, lock, seen
+
+
+def _received(
+    frame: Frame, corners: FloatArray, camera: Camera, before: Reception, options: ReceiverOptions, stages: Stages
+) -> tuple[Lock, Reception] | None:
+    """What is received with a camera; None where it leaves more doubt than what was received before."""
+    try:
+        lock = find_lock(frame, corners, camera, options, stages, quick=True)
+    except Failure:
+        return None
+    with stages("detect"):
+        seen = decode(lock, options.skip)
+    doubted = seen.posteriors.log_prob.mean() < _MORE_DOUBT * before.posteriors.log_prob.mean() - _LEAST_DOUBT
+    return None if doubted else (lock, seen)
 
 
 def without_estimate(result: FrameResult, camera: Camera, seen: Reception) -> FrameResult:

@@ -115,6 +115,27 @@ def test_slots_that_explain_nothing_change_nothing() -> None:
     assert moved_slots == 0.0
 
 
+@pytest.mark.parametrize(("tone", "power", "exponent"), [("srgb", 1.0, 2.2), ("srgb", 2.2, 1.0), ("linear", 1.0, 1.0)])
+def test_light_that_bends_over_the_slots_tells_the_tone_curve(tone: str, power: float, exponent: float) -> None:
+    strips, lit = _strips(np.random.default_rng(15), np.zeros(4), False)
+    estimate = _estimate(np.zeros(4), False)
+    bent = replace(strips, light=np.maximum(strips.light, 0) ** np.float32(power), tone=tone)
+    found, _ = blind.refit(bent, estimate, _clock(estimate), lit.astype(np.float32))
+    assert found.tone is not None
+    assert found.tone[0] == pytest.approx(exponent, rel=0.2)
+    assert abs(found.tone[0] - exponent) < 2 * found.tone[1]
+    assert blind.is_linear(found.tone) == (exponent < 1.5)
+    assert blind.summary(found, 17300.0)["tone_exponent"] == found.tone
+
+
+def test_values_that_are_known_to_be_light_tell_no_tone_curve() -> None:
+    strips, lit = _strips(np.random.default_rng(15), np.zeros(4), False)
+    estimate = _estimate(np.zeros(4), False)
+    found, _ = blind.refit(strips, estimate, _clock(estimate), lit.astype(np.float32))
+    assert found.tone is None
+    assert "tone_exponent" not in blind.summary(found, 17300.0)
+
+
 def test_the_file_tells_the_least_exposure() -> None:
     strips, lit = _strips(np.random.default_rng(14), np.zeros(4), False)
     told = replace(_estimate(np.zeros(4), False), least_exposure_slots=2.0)

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from small_frames import BOTTOM, LEFT, RIGHT, ROWS_PER_SLOT, SCREEN, TOP, write_frame
 
-from rxcli import unknown_camera
+from rxcli import blind, unknown_camera
+from rxcli.benchmark.trial import Trial, score_result, simulate_trial
 from rxcli.ingest import open_source
-from rxcli.locate import Camera, Cameras, Failure, Stages, find_cameras, find_lock
+from rxcli.locate import Camera, Cameras, Failure, Lock, Stages, find_cameras, find_lock
 from rxcli.pipeline import ReceiverOptions, receive
-from rxcli.profiles import ScreenProfile, parse_profile
+from rxcli.profiles import ScreenProfile, load_profile, parse_profile, shipped_profiles
 from rxcli.reception import decode
-from rxcli.types import Frame, FrameResult
+from rxcli.simulate.isp import Isp, Tone
+from rxcli.simulate.optics import Lens, Pose
+from rxcli.simulate.scenes import preset
+from rxcli.simulate.sensor import Sensor
+from rxcli.types import FloatArray, Frame, FrameResult
 
 CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
 OPTIONS = ReceiverOptions(screens=(parse_profile(SCREEN, ScreenProfile, "small"),), corners=CORNERS, cae="never")
@@ -108,3 +114,42 @@ def test_an_estimate_that_neither_packets_nor_edges_bear_out_is_taken_back(
     assert not doubted.estimated
     assert doubted.line_delay_s is None
     assert "no packet header" in (doubted.message or "")
+
+
+def _small_phone(tone: Tone) -> tuple[Trial, Frame]:
+    """A simulated phone's picture of a bright photograph, without metadata."""
+    profile = load_profile("paper-17k3", ScreenProfile)
+    line_delay_s = 1 / (3.7 * profile.slot_rate_hz)
+    scene = replace(
+        preset("phone-plain", profile),
+        sensor=Sensor(1280, 960, line_delay_s, "bayer", full_scale_e=260.0, black_level=64, white_level=1023),
+        lens=Lens(0.8, (0.0, 0.0, 0.0, 0.0, 0.0)),
+        pose=Pose(fill=0.92, roll_deg=0.6),
+        isp=Isp(tone=tone, gain=2.0),
+        exposure_s=0.9 / profile.slot_rate_hz,
+        light_e_per_s=1.4e6 * profile.slot_rate_hz / 20000,
+        picture="chelsea",
+    )
+    trial = simulate_trial(scene, 5)
+    return trial, Frame(np.asarray(trial.capture.pixels, np.uint8), "phone")
+
+
+@pytest.mark.parametrize("tone", ["srgb", "linear"])
+def test_a_picture_whose_values_follow_light_is_read_as_one(tone: Tone, monkeypatch: pytest.MonkeyPatch) -> None:
+    trial, frame = _small_phone(tone)
+    options = ReceiverOptions(screens=tuple(shipped_profiles(ScreenProfile)), corners=trial.corners, cae="never")
+    read: list[str] = []
+
+    def noting_the_tone(frame: Frame, corners: FloatArray, camera: Camera, *rest: Any, **more: Any) -> Lock:
+        read.append(camera.tone)
+        return find_lock(frame, corners, camera, *rest, **more)
+
+    monkeypatch.setattr(unknown_camera, "find_lock", noting_the_tone)
+    result = next(receive([frame], options))
+    exponent, sd = result.estimated["tone_exponent"]
+    assert abs(exponent - (1.0 if tone == "linear" else 2.2)) < 2 * sd
+    assert ("linear" in read) == (tone == "linear")
+    _, score = score_result(result, trial.truth)
+    assert score.error_free >= 15
+    profile = blind.camera_profile(result.estimated, "mine", None, None, frame.width, frame.height)
+    assert profile.tone == ("linear" if tone == "linear" else "auto")

@@ -37,6 +37,7 @@ from rxcli.blind.search import MIN_EVIDENCE, BlindSearch, estimate_camera, strip
 from rxcli.blind.strips import Noise, Strips, bow_of, in_readout_order, strips_of
 from rxcli.blind.structure import structure_evidence
 from rxcli.blind.timing import refine
+from rxcli.blind.tone import is_linear
 
 __all__ = [
     "MIN_EVIDENCE",
@@ -55,6 +56,7 @@ __all__ = [
     "find_clocks",
     "in_readout_order",
     "in_time_order",
+    "is_linear",
     "lens_of",
     "likely_columns",
     "refine",

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.blind.estimates import BlindEstimate
+from rxcli.blind.tone import is_linear
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.types import FloatArray, Lens, RowProfiles
 
@@ -56,6 +57,8 @@ def summary(estimate: BlindEstimate, slot_rate_hz: float) -> dict[str, tuple[flo
     out["readout_reversed"] = (float(estimate.reversed), 0.0)
     if estimate.exposure_slots_sd > 0:
         out["exposure_s"] = (estimate.exposure_slots / slot_rate_hz, estimate.exposure_slots_sd / slot_rate_hz)
+    if estimate.tone:
+        out["tone_exponent"] = estimate.tone
     return out
 
 
@@ -115,5 +118,6 @@ def camera_profile(
         models=(model,) if model else (),
         modes=(mode,),
         lens=lens,
+        tone="linear" if is_linear(estimated.get("tone_exponent")) else "auto",
         description=f"estimated from one picture; line delay to {100 * sd / line_delay_s:.2g} %",
     )

@@ -54,6 +54,8 @@ class BlindEstimate:
     least_exposure_slots: float = 0.0
     #: k1 of the lens that bows the screen's sides, and its standard deviation; None where none was seen to.
     bow: tuple[float, float] | None = None
+    #: Exponent that makes light of the picture's values, and its standard deviation; None while it was not measured.
+    tone: tuple[float, float] | None = None
 
 
 def distinct(found: Iterable[_T], same: Callable[[_T, _T], bool], most: int) -> list[_T]:

@@ -23,6 +23,7 @@ from rxcli.blind.timing import (
     thinned,
     time_terms,
 )
+from rxcli.blind.tone import tone_exponent
 from rxcli.blind.waves import column_waves, exposure_of_known, fitted
 from rxcli.types import Clock, Float32Array, FloatArray
 
@@ -51,6 +52,7 @@ class _Fit:
     #: Share of the local variance that the slots explain: at the start, and now.
     explained_first: float
     explained: float
+    tone: tuple[float, float] | None
 
 
 def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Array) -> tuple[BlindEstimate, float]:
@@ -89,6 +91,7 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
         bend_sd=sd[2:],
         corrected=corrected,
         explained=fit.explained,
+        tone=fit.tone,
     )
     return found, float(moved.max())
 
@@ -116,4 +119,6 @@ def _fit(
         change, covariance, explained = gauss_newton(strips, terms, values, time, seen, n_free, _LOCAL_SLOTS, _ORDER)
         explained_first = explained_first or explained
         values = values + change
-    return _Fit(values, covariance, exposure, exposure_sd, explained_first, explained)
+    return _Fit(
+        values, covariance, exposure, exposure_sd, explained_first, explained, tone_exponent(strips, seen[0], window)
+    )

@@ -62,6 +62,8 @@ class Strips:
     sides: tuple[float, float] | None = None
     #: Whether the picture is a mosaic, which no camera corrects.
     mosaic: bool = False
+    #: The tone curve that was undone; None where values are known to follow light.
+    tone: str | None = None
 
     @property
     def bow(self) -> tuple[float, float] | None:
@@ -89,6 +91,7 @@ def strips_of(
     height: int,
     sides: tuple[float, float] | None = None,
     mosaic: bool = False,
+    tone: str | None = None,
 ) -> Strips:
     """Strips for the functions below, from row profiles that were sampled without a lens or with one that bows sides.
 
@@ -99,6 +102,7 @@ def strips_of(
         height: of the picture, rows.
         sides: k1 that the screen's sides show, and its standard deviation.
         mosaic: whether the picture is a mosaic.
+        tone: the curve that was undone; None where values are known to follow light.
     """
     n_columns, n_strips, n_rows = profiles.light.shape
     join = n_strips // _STRIPS if n_strips % _STRIPS == 0 else 1
@@ -116,6 +120,7 @@ def strips_of(
         height=height,
         sides=sides,
         mosaic=mosaic,
+        tone=tone,
     )
 
 
