@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli import geometry, sampling
+from rxcli import assemble, blind, geometry, sampling
 from rxcli.errors import InputError, UsageError
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.protocol import bits_per_symbol, encode_packet, hex_to_bits
@@ -73,15 +73,25 @@ def _figures(
     column_px = float(np.linalg.norm(result.corners[1] - result.corners[0])) / screen.columns
     n_strips = sampling.strips_per_column(column_px)
     outlines = geometry.column_outlines(result.corners, screen.columns, n_strips, frame.width, frame.height, lens)
-    tone = "srgb" if camera is None or camera.tone == "auto" else camera.tone
     yield "photo", photo_figure(frame, result, outlines)
     if result.columns:
         yield "confidence", confidence_figure(result)
-    profiles = sampling.sample_rows(frame, outlines, tone)
-    for first in range(0, len(result.columns), _COLUMNS_PER_PICTURE):
-        chosen = result.columns[first : first + _COLUMNS_PER_PICTURE]
+    tone = "srgb" if camera is None or camera.tone == "auto" else camera.tone
+    profiles, columns = in_readout_order(frame, result, sampling.sample_rows(frame, outlines, tone))
+    for first in range(0, len(columns), _COLUMNS_PER_PICTURE):
+        chosen = columns[first : first + _COLUMNS_PER_PICTURE]
         last = chosen[-1].column
         yield f"profiles-{chosen[0].column:03}-{last:03}", profile_figure(profiles, result, chosen, screen)
+
+
+def in_readout_order(
+    frame: Frame, result: FrameResult, profiles: RowProfiles
+) -> tuple[RowProfiles, tuple[ColumnResult, ...]]:
+    """Row profiles and columns with rows counted as they were read out, not as software may have turned them."""
+    if not result.estimated.get("readout_reversed", (0.0, 0.0))[0]:
+        return profiles, result.columns
+    columns = tuple(assemble.in_stored_rows(column, frame.height) for column in result.columns)
+    return blind.in_time_order(profiles, frame.height), columns
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -170,8 +180,10 @@ def profile_figure(
         rows_seen += [float(rows[0]), float(rows[-1])] if rows.size else []
         if result.line_delay_s:
             rows_per_slot = 1 / (screen.slot_rate_hz * result.line_delay_s)
+            # A packet starts on the row whose exposure starts with it; a slot shows most where exposures are half over.
+            half_exposure = (result.exposure_s or 0.0) / result.line_delay_s / 2
             for start, slots in decided_slots(column, screen, rows_per_slot, rows):
-                _shade(axes, start, rows_per_slot, slots)
+                _shade(axes, start - half_exposure, rows_per_slot, slots)
         axes.set_ylabel(f"{column.column}", rotation=0, ha="right")
         axes.set_yticks([])
         axes.set_title(f"{column.status}, w {column.w}", loc="right", fontsize=7, pad=1)

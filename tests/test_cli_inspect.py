@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from small_frames import BOTTOM, N_COLUMNS, ROWS_PER_SLOT, TOP, W, write_frame, write_profiles
 
+from rxcli import pictures
 from rxcli.cli.common import receiver_options
 from rxcli.cli.main import run
 from rxcli.ingest import open_source
 from rxcli.pictures import column_light, decided_slots
 from rxcli.pipeline import receive
+
+SAMPLE = Path(__file__).parents[1] / "sample_frames" / "phone_chelsea_17k3.jpg"
 
 pytest.importorskip("matplotlib", reason="matplotlib is not installed (extra plot)")
 
@@ -88,3 +93,33 @@ def test_the_shaded_slots_are_where_the_light_is(tmp_path: Path) -> None:
         shown = (number >= 0) & (number < slots.size)
         assert shown.mean() > 0.6
         assert np.corrcoef(light[shown], slots[number[shown]])[0, 1] > 0.8
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_slots_of_an_unknown_camera_are_shaded_along_bent_stripes(
+    turned: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import cv2
+
+    seen: list[tuple[Any, ...]] = []
+    figure, drawn = pictures.new_figure(1, 1), pictures.profile_figure
+    monkeypatch.setattr(pictures, "profile_figure", lambda *arguments: seen.append(arguments) or figure)
+    stored = cv2.imread(str(SAMPLE), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(tmp_path / "phone.png"), stored[::-1, ::-1] if turned else stored)
+    assert run(["inspect", str(tmp_path / "phone.png"), "--screen", "paper-17k3"]) == 0
+    [(profiles, result, columns, screen)] = seen
+    assert result.camera_profile is None
+    shaded: list[tuple[float, NDArray[np.uint8]]] = []
+    monkeypatch.setattr(pictures, "_shade", lambda axes, start, rows_per_slot, slots: shaded.append((start, slots)))
+    rows_per_slot = 1 / (screen.slot_rate_hz * result.line_delay_s)
+    agreement = []
+    for column in columns:
+        rows, light = column_light(profiles, column.column)
+        drawn(profiles, result, (column,), screen)
+        for start, slots in shaded:
+            number = np.floor((rows - start) / rows_per_slot).astype(int)
+            shown = (number >= 0) & (number < slots.size)
+            agreement.append(np.corrcoef(light[shown], slots[number[shown]])[0, 1])
+        shaded.clear()
+    assert len(agreement) >= 18
+    assert np.median(agreement) > 0.7

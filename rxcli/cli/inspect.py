@@ -33,7 +33,7 @@ def inspect(path: str, frame: int, out: Path | None, truth: str | None, **option
     configured = receiver_options(**options)
     picture = _frame_of(path, frame)
     result = _scored(_receive(picture, configured), path, truth)
-    screen, camera = _profiles_of(result, configured)
+    screen, camera = _profiles_of(picture, result, configured)
     folder = out if out is not None else Path(f"{path}.inspect")
     click.echo(write_pictures(folder, picture, result, screen, camera))
     received = any(column.packets for column in result.columns)
@@ -62,7 +62,13 @@ def _scored(result: FrameResult, path: str, truth: str | None) -> FrameResult:
     return Scorer(load_truth(found)).add(result) if found else result
 
 
-def _profiles_of(result: FrameResult, options: ReceiverOptions) -> tuple[ScreenProfile | None, CameraProfile | None]:
+def _profiles_of(
+    picture: Frame, result: FrameResult, options: ReceiverOptions
+) -> tuple[ScreenProfile | None, CameraProfile | None]:
+    from rxcli.blind import camera_profile
+
     screen = next((s for s in options.screens if s.name == result.screen_profile), None)
     camera = next((c for c in options.cameras if c.name == result.camera_profile), None)
+    if camera is None and "line_delay_s" in result.estimated:
+        camera = camera_profile(result.estimated, "estimated", None, None, picture.width, picture.height)
     return screen, camera
