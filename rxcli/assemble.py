@@ -39,8 +39,9 @@ _AGAINST_AT_LEAST = 0.5
 _WRONG_AT_EVENS, _BER_AT_EVENS, _BER_EXPONENT = 1.4, 0.018, 0.85
 #: Headers of a column, all bursts together, less likely than this against slots that are anything, nats, are none.
 _CONTRADICTED = -2.0
-#: Together the columns' headers must be this much more likely than slots that are anything; one good header gives 12.
-_HEADERS_AT_LEAST = 6.0
+#: Together the columns' headers must be this much more likely than slots that are anything; one good header gives 12,
+#: and a bad one takes no more than a good one gives.
+_HEADERS_AT_LEAST, _GOOD_HEADER = 6.0, 12.0
 _HEADERLESS = (
     "the header does not show where it should; check for overexposure, or give the screen's place with --corners"
 )
@@ -292,8 +293,9 @@ def _echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> Bool
 
 def without_header(posteriors: BurstPosteriors) -> BoolArray:
     """(C,) columns whose header does not show; all where the columns together show none: no light, no packet."""
-    together = posteriors.header_llr.sum() > _HEADERS_AT_LEAST
-    return np.asarray(posteriors.header_llr.sum(axis=0) < (_CONTRADICTED if together else np.inf))
+    by_column = posteriors.header_llr.sum(axis=0)
+    together = np.maximum(by_column, -_GOOD_HEADER).sum() > _HEADERS_AT_LEAST
+    return np.asarray(by_column < (_CONTRADICTED if together else np.inf))
 
 
 def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:

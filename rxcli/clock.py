@@ -196,7 +196,17 @@ def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot
 def find_clock(
     profiles: RowProfiles, rows_per_slot: float, exposure_slots: float, packet_slots: int, sigma: float
 ) -> Clock | None:
-    """The clock of a picture whose rows per slot are known, bursts still unknown; None where too little is seen.
+    """The likeliest of `find_clocks`, None where there is none."""
+    return next(iter(find_clocks(profiles, rows_per_slot, exposure_slots, packet_slots, sigma)), None)
+
+
+def find_clocks(
+    profiles: RowProfiles, rows_per_slot: float, exposure_slots: float, packet_slots: int, sigma: float
+) -> tuple[Clock, ...]:
+    """Clocks of a picture whose rows per slot are known, bursts still unknown; none where too little is seen.
+
+    Mostly it is one. Where columns seem to be spread in time, which columns that show next to nothing do as well, the
+    second one is that of columns which are not.
 
     Args:
         profiles: row profiles of the screen.
@@ -209,36 +219,41 @@ def find_clock(
     step = rows_per_slot / _SEARCH_SAMPLES
     n = int((bottom - top) / step)
     if n < SLOTS_PER_SYMBOL * _SEARCH_SAMPLES:
-        return None
+        return ()
     light, valid = resample(profiles, top, step, n)
     pooled, weight = contrast(light, valid, _SEARCH_SAMPLES, sigma / np.sqrt(max(step, 1.0)))
     response = header_response(pooled, weight, _SEARCH_SAMPLES)
     start, lock = _comb(response, packet_slots * _SEARCH_SAMPLES)
     if not np.isfinite(start):
-        return None
+        return ()
     delays = _delays(pooled, weight, start, packet_slots)
+    starts = [(start, delays)]
     many_delays = np.count_nonzero(delays) > delays.size * _MANY
     if lock < _SURE_LOCK or many_delays:
-        spread = _spread_comb(pooled, weight, packet_slots * _SEARCH_SAMPLES)
-        if spread[1] > lock or many_delays:
-            start, delays = spread[0], spread[2]
-            lock = max(lock, spread[1])
-    row0 = top + start * step
-    before = int(np.ceil((row0 - top) / rows_per_slot))
-    n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))
-    first_slot = -before % packet_slots
-    n_copies = -(-(first_slot + n_slots) // packet_slots)
-    return Clock(
-        rows_per_slot=rows_per_slot,
-        exposure_slots=exposure_slots,
-        packet_slots=packet_slots,
-        row0=row0 - before * rows_per_slot,
-        n_slots=n_slots,
-        first_slot=first_slot,
-        burst=np.zeros(n_copies, np.int64),
-        delay_slots=delays,
-        lock=lock,
-    )
+        spread_start, spread_lock, spread_delays = _spread_comb(pooled, weight, packet_slots * _SEARCH_SAMPLES)
+        if spread_lock > lock or many_delays:
+            starts = [(spread_start, spread_delays), (start, np.zeros_like(delays))]
+            lock = max(lock, spread_lock)
+
+    def clock_from(start: float, delays: FloatArray) -> Clock:
+        row0 = top + start * step
+        before = int(np.ceil((row0 - top) / rows_per_slot))
+        n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))
+        first_slot = -before % packet_slots
+        n_copies = -(-(first_slot + n_slots) // packet_slots)
+        return Clock(
+            rows_per_slot=rows_per_slot,
+            exposure_slots=exposure_slots,
+            packet_slots=packet_slots,
+            row0=row0 - before * rows_per_slot,
+            n_slots=n_slots,
+            first_slot=first_slot,
+            burst=np.zeros(n_copies, np.int64),
+            delay_slots=delays,
+            lock=lock,
+        )
+
+    return tuple(clock_from(*found) for found in starts)
 
 
 def _row_span(profiles: RowProfiles) -> tuple[float, float]:
@@ -395,12 +410,16 @@ def assign_bursts(clock: Clock, llr: Float32Array, repeats: int) -> Clock:
         repeats: copies of a burst.
     """
     likeness = copy_likeness(llr, clock)
-    copies = np.arange(clock.n_copies)
-    scores = []
-    for phase in range(repeats):
-        burst = (copies + phase) // repeats
-        scores.append(float(np.where(burst[1:] == burst[:-1], likeness, -likeness).sum()))
-    burst = (copies + int(np.argmax(scores))) // repeats
+
+    def score(now: Clock) -> float:
+        return float(np.where(now.burst[1:] == now.burst[:-1], likeness, -likeness).sum())
+
+    return max((in_bursts(clock, repeats, phase) for phase in range(repeats)), key=score)
+
+
+def in_bursts(clock: Clock, repeats: int, phase: int) -> Clock:
+    """The clock with its copies in bursts of `repeats`; the first one seen is number `phase` of its burst, from 0."""
+    burst = (np.arange(clock.n_copies) + phase) // repeats
     return replace(clock, burst=burst - burst[0])
 
 

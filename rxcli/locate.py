@@ -126,6 +126,10 @@ class Lock:
     screen: ScreenProfile
     reading: Reading
     clock: Clock
+    #: Another that it may be: of columns which are not spread in time, where they seem to be.
+    rival: Clock | None = None
+    #: Which copy of its burst the first one seen is, from 0; None where the light is to tell.
+    phase: int | None = None
 
     @property
     def profiles(self) -> RowProfiles:
@@ -337,23 +341,27 @@ def find_lock(
     with stages("clock"):
         pooled = clock.pooled_strips(reading.halved())
         rates = {(s.slot_rate_hz, s.packet_slots): s for s in options.screens}
-        clocks = {rate: found for rate, screen in rates.items() if (found := _clock_of(screen, pooled, camera))}
-        clocks = {rate: found for rate, found in clocks.items() if found.lock >= _MIN_LOCK}
+        clocks = {rate: found for rate, screen in rates.items() if (found := _clocks_of(screen, pooled, camera))}
+        clocks = {rate: found for rate, found in clocks.items() if found[0].lock >= _MIN_LOCK}
         if not clocks:
             raise Failure("no_signal", _why_no_signal(frame, corners, camera, options))
-        rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(pooled, clocks[r]))
+        rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(pooled, clocks[r][0]))
     alike = [screen for screen in options.screens if (screen.slot_rate_hz, screen.packet_slots) == rate]
-    locks = [Lock(alike[0], reading, clocks[rate])] if alike[0].columns == n_columns else []
+    locks = [_locked(alike[0], reading, clocks[rate])] if alike[0].columns == n_columns else []
     for screen in alike[len(locks) :]:
         with stages("sampling"):
             finer = _read_columns(frame, corners, camera, screen.columns, quick=quick)
         with stages("clock"):
-            found = _clock_of(screen, clock.pooled_strips(finer.halved()), camera)
+            found = _clocks_of(screen, clock.pooled_strips(finer.halved()), camera)
         if found:
-            locks.append(Lock(screen, finer, found))
+            locks.append(_locked(screen, finer, found))
     if not locks:
         raise Failure("no_signal", _why_no_signal(frame, corners, camera, options))
     return locks[0] if len(locks) == 1 else _with_likely_columns(locks)
+
+
+def _locked(screen: ScreenProfile, reading: Reading, clocks: tuple[Clock, ...]) -> Lock:
+    return Lock(screen, reading, clocks[0], rival=clocks[1] if len(clocks) > 1 else None)
 
 
 def _structure(profiles: RowProfiles, now: Clock) -> float:
@@ -403,10 +411,10 @@ def _read_columns(frame: Frame, corners: FloatArray, camera: Camera, n_columns: 
     return Reading(profiles, in_pairs, read if quick else None)
 
 
-def _clock_of(screen: ScreenProfile, profiles: RowProfiles, camera: Camera) -> Clock | None:
+def _clocks_of(screen: ScreenProfile, profiles: RowProfiles, camera: Camera) -> tuple[Clock, ...]:
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
     exposure_slots = camera.exposure_s * screen.slot_rate_hz
-    return clock.find_clock(profiles, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(profiles))
+    return clock.find_clocks(profiles, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(profiles))
 
 
 def _why_no_signal(frame: Frame, corners: FloatArray, camera: Camera, options: ReceiverOptions) -> str:

@@ -18,7 +18,7 @@ from rxcli import assemble, denoise
 from rxcli.dump import dump_frame
 from rxcli.locate import Failure, Stages, find_camera, find_corners, find_lock, too_small
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
-from rxcli.reception import decode, doubtful_columns, headerless, second_opinion, support
+from rxcli.reception import decode, decode_likeliest, doubtful_columns, headerless, second_opinion, support
 from rxcli.types import Frame, FrameResult
 from rxcli.unknown_camera import likely_camera, with_refitted_camera, without_estimate
 
@@ -77,7 +77,7 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
         lock = find_lock(frame, corners, camera, options, stages, quick=True)
         result = replace(result, screen_profile=lock.screen.name)
         with stages("detect"):
-            seen = decode(lock, options.skip)
+            seen = decode_likeliest(lock, options.skip)
         if camera.guess is not None:
             camera, lock, seen = with_refitted_camera(frame, corners, camera, lock, seen, options, stages)
             result = replace(result, **camera.facts)

@@ -41,11 +41,14 @@ _WORDS, _WORD_MARGIN, _HOPELESS_WORD = 4, 5.0, -1.4
 #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least sure,
 #: have their words weighed alone.
 _MOST_SHOWN = 58_000
-#: A column whose slots are so much likelier packets than any slots, nats, has packets whether its header shows or not.
-_PACKETS_WITHOUT_HEADER = 40.0
+#: A column whose slots are so much likelier packets than any slots, nats, has packets whether its header shows or not:
+#: on wrong clocks columns show 74 at most.
+_PACKETS_WITHOUT_HEADER = 100.0
 #: A column whose symbols have a mean log probability below this may have settled on a wrong weight: it starts again,
 #: after so many quick rounds.
 _LOST, _FRESH_ROUNDS = -0.3, 2
+#: Bursts are doubted where less than this share of the columns has packets of such a confidence.
+_CLEAR_COLUMNS, _CLEAR = 0.9, 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +71,33 @@ class Reception:
     skipped: dict[str, int] = field(default_factory=dict)
 
 
+def decode_likeliest(lock: Lock, skip: frozenset[str]) -> Reception:
+    """What is decoded on the clock, and with the bursts, by which slots are packets most.
+
+    Bursts are told apart by how alike copies are. Where symbols stay in doubt that may be why: copies of two packets,
+    taken for one, decode to neither.
+
+    Args:
+        lock: the clock, perhaps another that it may be, and the row profiles.
+        skip: shortcuts in use, see `rxcli.options.SKIPS`.
+    """
+    if lock.rival is not None:
+        either = (replace(lock, clock=now, rival=None) for now in (lock.clock, lock.rival))
+        return max((decode_likeliest(one, skip) for one in either), key=packet_evidence)
+    seen = decode(lock, skip)
+    confidence = np.where(_complete(seen), _confidence(seen), 0.0).max(axis=0)
+    if not confidence.any() or (confidence > _CLEAR).mean() >= _CLEAR_COLUMNS:
+        return seen
+    phases = range(lock.screen.repeats)
+    bursts = {clock.in_bursts(seen.clock, lock.screen.repeats, phase).burst.tobytes(): phase for phase in phases}
+    looks = [_first_look(replace(lock, phase=phase)) for phase in bursts.values()]
+    likeliest = max(looks, key=packet_evidence).clock.burst
+    if np.array_equal(likeliest, seen.clock.burst):
+        return seen
+    again = decode(replace(lock, phase=bursts[likeliest.tobytes()]), skip)
+    return max(seen, again, key=packet_evidence)
+
+
 def decode(lock: Lock, skip: frozenset[str]) -> Reception:
     """A quick look first; where that leaves doubt, the light model in depth.
 
@@ -75,7 +105,7 @@ def decode(lock: Lock, skip: frozenset[str]) -> Reception:
         lock: the clock and the row profiles.
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
     """
-    seen = quick_look(lock) if lock.clock.rows_per_slot >= _FEW_ROWS else _likeliest_mix(lock)
+    seen = _first_look(lock)
     doubtful = _doubtful(seen, _CERTAIN) if "certain_columns" in skip else np.ones(seen.snr.shape[0], bool)
     if not doubtful.any():
         return replace(seen, skipped={"certain_columns": seen.snr.shape[0]})
@@ -83,6 +113,10 @@ def decode(lock: Lock, skip: frozenset[str]) -> Reception:
     seen = iterate(lock, seen, doubtful, skip)
     columns = doubtful_columns(seen)
     return without_row_light(lock, seen, columns) if columns.size else seen
+
+
+def _first_look(lock: Lock) -> Reception:
+    return quick_look(lock) if lock.clock.rows_per_slot >= _FEW_ROWS else _likeliest_mix(lock)
 
 
 def quick_look(lock: Lock) -> Reception:
@@ -93,11 +127,11 @@ def quick_look(lock: Lock) -> Reception:
     model = _light_model(lock, samples)
     contrast = clock.contrast(samples.light, samples.valid, _COARSE, model.sigma)
     first = channel.first_metrics(*contrast, model.taps)
-    now = clock.assign_bursts(now, detect.slot_llr(first), lock.screen.repeats)
+    now = _in_bursts(lock, now, detect.slot_llr(first))
     lit = channel.on_grid(_first_guess(_by_burst(first, now), model.memory), now)
     columns = np.arange(samples.light.shape[0])
     likelihoods = channel.slot_likelihoods(samples, now, model, lit, columns, thorough=False)
-    now = clock.assign_bursts(now, detect.slot_llr(likelihoods.metrics), lock.screen.repeats)
+    now = _in_bursts(lock, now, detect.slot_llr(likelihoods.metrics))
     now = clock.corrected(now, likelihoods.timing)
     posteriors = _detect(likelihoods.metrics, now)
     return Reception(now, samples, posteriors, likelihoods.snr, model, likelihoods.metrics)
@@ -137,7 +171,7 @@ def iterate(lock: Lock, seen: Reception, doubtful: NDArray[np.bool_], skip: froz
         before = seen.posteriors.index
         seen, timing = _look_again(lock, seen, columns, _COARSE if iteration == 0 else _FINE)
         if iteration == 0:
-            seen = _with_bursts_of(seen, detect.slot_llr(seen.metrics), lock.screen.repeats)
+            seen = _with_bursts_of(lock, seen, detect.slot_llr(seen.metrics))
             seen = replace(seen, clock=clock.corrected(seen.clock, timing))
         doubtful = _unsettled(seen, before, iteration, skip)
     return replace(seen, skipped={name: count for name, count in skipped.items() if count})
@@ -361,8 +395,18 @@ def support(seen: Reception) -> Float32Array:
 
 def _best_packet(seen: Reception) -> FloatArray:
     """(C,) mean log probability of the symbols of each column's surest packet that could be reported."""
-    complete = assemble.complete(assemble.slots_seen(seen.samples, seen.clock))
-    return np.asarray(np.where(complete, seen.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0))
+    return np.asarray(np.where(_complete(seen), seen.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0))
+
+
+def _complete(seen: Reception) -> NDArray[np.bool_]:
+    """(B, C) packets that could be reported."""
+    return assemble.complete(assemble.slots_seen(seen.samples, seen.clock))
+
+
+def _confidence(seen: Reception) -> FloatArray:
+    """(B, C) confidence of packets, the auto-encoder not yet asked."""
+    by_burst = assemble.slot_support_by_burst(support(seen), seen.clock)
+    return assemble.confidence(assemble.evidence(seen.posteriors, by_burst, np.zeros(seen.snr.shape[0], bool)))
 
 
 @lru_cache(maxsize=1)
@@ -384,9 +428,15 @@ def _scene_of(seen: Reception, samples: SlotSamples, model: channel.LightModel) 
     )
 
 
-def _with_bursts_of(seen: Reception, log_odds: Float32Array, repeats: int) -> Reception:
+def _in_bursts(lock: Lock, now: Clock, log_odds: Float32Array) -> Clock:
+    if lock.phase is not None:
+        return clock.in_bursts(now, lock.screen.repeats, lock.phase)
+    return clock.assign_bursts(now, log_odds, lock.screen.repeats)
+
+
+def _with_bursts_of(lock: Lock, seen: Reception, log_odds: Float32Array) -> Reception:
     """Bursts told apart by log-odds that no copy has lent to another; symbols detected anew where that moves them."""
-    now = clock.assign_bursts(seen.clock, log_odds, repeats)
+    now = _in_bursts(lock, seen.clock, log_odds)
     if np.array_equal(now.burst, seen.clock.burst):
         return seen
     return replace(seen, clock=now, posteriors=_detect(seen.metrics, now))
@@ -394,11 +444,8 @@ def _with_bursts_of(seen: Reception, log_odds: Float32Array, repeats: int) -> Re
 
 def _doubtful(seen: Reception, certain: float) -> NDArray[np.bool_]:
     """(C,) whether a packet that could be reported has less than the confidence `certain`."""
-    complete = assemble.complete(assemble.slots_seen(seen.samples, seen.clock))
-    by_burst = assemble.slot_support_by_burst(support(seen), seen.clock)
-    evidence = assemble.evidence(seen.posteriors, by_burst, np.zeros(seen.snr.shape[0], bool))
-    doubtful = (assemble.confidence(evidence) < certain) & (seen.posteriors.log_prob.min(axis=2) < _BEYOND_DOUBT)
-    return np.asarray((doubtful & complete).any(axis=0))
+    doubtful = (_confidence(seen) < certain) & (seen.posteriors.log_prob.min(axis=2) < _BEYOND_DOUBT)
+    return np.asarray((doubtful & _complete(seen)).any(axis=0))
 
 
 def _detect(metrics: FloatArray, now: Clock) -> BurstPosteriors:

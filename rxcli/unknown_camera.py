@@ -19,7 +19,7 @@ from rxcli.locate import (
     without_tone,
 )
 from rxcli.options import ReceiverOptions
-from rxcli.reception import Reception, decode, packet_evidence, quick_look
+from rxcli.reception import Reception, decode_likeliest, packet_evidence, quick_look
 from rxcli.types import FloatArray, Frame, FrameResult
 
 #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
@@ -132,7 +132,7 @@ def _received(
     except Failure:
         return None
     with stages("detect"):
-        seen = decode(lock, options.skip)
+        seen = decode_likeliest(lock, options.skip)
     doubted = seen.posteriors.log_prob.mean() < _MORE_DOUBT * before.posteriors.log_prob.mean() - _LEAST_DOUBT
     return None if doubted else (lock, seen)
 

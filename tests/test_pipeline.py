@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli import denoise, reception, sampling
+from rxcli import clock, denoise, reception, sampling
 from rxcli.benchmark.trial import simulate_trial
-from rxcli.locate import Stages, find_camera, find_corners, find_lock
+from rxcli.locate import Lock, Stages, find_camera, find_corners, find_lock
 from rxcli.pipeline import ReceiverOptions, receive
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
 from rxcli.simulate.capture import Capture, simulate_frame
@@ -413,12 +413,40 @@ def test_rows_that_developing_mixes_are_told_from_the_light(monkeypatch: pytest.
     assert nominal.error_free <= told.error_free / 2
 
 
-def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:
-    taken = clean()
+def lock_of(taken: Capture) -> tuple[Lock, ReceiverOptions]:
     frame, options = frame_of(taken), options_for(taken)
     corners = find_corners(frame, options)
     camera, options = find_camera(frame, corners, options, Stages())
-    seen = reception.decode(find_lock(frame, corners, camera, options, Stages()), options.skip)
+    return find_lock(frame, corners, camera, options, Stages()), options
+
+
+def test_of_two_clocks_the_one_with_packets_is_received() -> None:
+    lock, options = lock_of(clean())
+    wrong = replace(lock.clock, row0=lock.clock.row0 - 7 * lock.clock.rows_per_slot)
+    for either in (replace(lock, rival=wrong), replace(lock, clock=wrong, rival=lock.clock)):
+        seen = reception.decode_likeliest(either, options.skip)
+        assert abs(seen.clock.row0 - lock.clock.row0) < 0.5 * lock.clock.rows_per_slot
+
+
+def test_copies_of_two_packets_taken_for_one_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = replace(small_scene("paper-17k3", "phone-plain"), start_slot=300.0)
+    lock, options = lock_of(simulate_frame(scene, 1))
+    right = reception.decode_likeliest(lock, options.skip)
+    assert right.clock.burst.max() > 0
+    repeats = lock.screen.repeats
+    phases = [clock.in_bursts(right.clock, repeats, phase) for phase in range(repeats)]
+    others = [now.burst for now in phases if not np.array_equal(now.burst, right.clock.burst)]
+    for burst in others:
+        monkeypatch.setattr(clock, "assign_bursts", lambda now, *_, burst=burst: replace(now, burst=burst))
+        assert np.array_equal(reception.decode(lock, options.skip).clock.burst, burst)
+        again = reception.decode_likeliest(lock, options.skip)
+        assert again.clock.burst.tolist() == right.clock.burst.tolist()
+        np.testing.assert_array_equal(again.posteriors.index, right.posteriors.index)
+
+
+def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:
+    lock, options = lock_of(clean())
+    seen = reception.decode(lock, options.skip)
     assert not reception.headerless(seen).any()
     unseen = replace(seen.posteriors, header_llr=np.full_like(seen.posteriors.header_llr, -30.0))
     assert not reception.headerless(replace(seen, posteriors=unseen)).any()
