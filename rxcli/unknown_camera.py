@@ -25,8 +25,8 @@ from rxcli.types import FloatArray, Frame, FrameResult
 #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
 _MATTERS_SLOTS = 0.05
 _MOST_REFITS = 3
-#: Symbols' mean log probabilities this many times lower, and lower by that, are more doubt.
-_MORE_DOUBT, _LEAST_DOUBT = 1.2, 0.01
+#: What is received with a refitted camera shows packets as well as before from this share of the evidence on.
+_KEPT_EVIDENCE = 0.9
 #: Headers and packets, all columns together, that an estimate with rivals must show, nats: wrong ones have next to none
 #: of one or of the other.
 _PACKETS_AT_LEAST = 80.0
@@ -86,7 +86,7 @@ def with_refitted_camera(
 ) -> tuple[Camera, Lock, Reception]:
     """The camera that the slots tell, and what is received with it, until that moves the clock no more.
 
-    Where it leaves more doubt, what was received before stays. Values that seem to be light are received as such.
+    Where packets show less then, what was received before stays. Values that seem to be light are received as such.
     """
     camera, lock, seen = _refitted(frame, corners, camera, lock, seen, options, stages)
     with stages("blind"):
@@ -126,15 +126,14 @@ def _refitted(
 def _received(
     frame: Frame, corners: FloatArray, camera: Camera, before: Reception, options: ReceiverOptions, stages: Stages
 ) -> tuple[Lock, Reception] | None:
-    """What is received with a camera; None where it leaves more doubt than what was received before."""
+    """What is received with a camera; None where packets show less than in what was received before."""
     try:
         lock = find_lock(frame, corners, camera, options, stages, quick=True)
     except Failure:
         return None
     with stages("detect"):
         seen = decode_likeliest(lock, options.skip)
-    doubted = seen.posteriors.log_prob.mean() < _MORE_DOUBT * before.posteriors.log_prob.mean() - _LEAST_DOUBT
-    return None if doubted else (lock, seen)
+    return (lock, seen) if packet_evidence(seen) >= _KEPT_EVIDENCE * packet_evidence(before) else None
 
 
 def without_estimate(result: FrameResult, camera: Camera, seen: Reception) -> FrameResult:
