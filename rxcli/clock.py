@@ -409,18 +409,25 @@ def assign_bursts(clock: Clock, llr: Float32Array, repeats: int) -> Clock:
         llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
         repeats: copies of a burst.
     """
+    return possible_bursts(clock, llr, repeats)[0][0]
+
+
+def possible_bursts(clock: Clock, llr: Float32Array, repeats: int) -> list[tuple[Clock, float]]:
+    """The clock with its copies in bursts of `repeats` in every way, and how likely each is, nats; likeliest first.
+
+    Args:
+        clock: the clock.
+        llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
+        repeats: copies of a burst.
+    """
     likeness = copy_likeness(llr, clock)
-
-    def score(now: Clock) -> float:
-        return float(np.where(now.burst[1:] == now.burst[:-1], likeness, -likeness).sum())
-
-    return max((in_bursts(clock, repeats, phase) for phase in range(repeats)), key=score)
-
-
-def in_bursts(clock: Clock, repeats: int, phase: int) -> Clock:
-    """The clock with its copies in bursts of `repeats`; the first one seen is number `phase` of its burst, from 0."""
-    burst = (np.arange(clock.n_copies) + phase) // repeats
-    return replace(clock, burst=burst - burst[0])
+    out: dict[bytes, tuple[Clock, float]] = {}
+    for phase in range(repeats):
+        burst = (np.arange(clock.n_copies) + phase) // repeats
+        score = float(np.where(burst[1:] == burst[:-1], likeness, -likeness).sum())
+        burst -= burst[0]
+        out.setdefault(burst.tobytes(), (replace(clock, burst=burst), score))
+    return sorted(out.values(), key=lambda one: -one[1])
 
 
 def copy_likeness(llr: Float32Array, clock: Clock) -> FloatArray:

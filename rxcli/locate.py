@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rxcli import blind, clock, geometry, sampling
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ReadoutMode, ScreenProfile, match_camera
-from rxcli.types import Clock, Float32Array, FloatArray, Frame, Lens, Outlines, RowProfiles
+from rxcli.types import Clock, Float32Array, FloatArray, Frame, IntArray, Lens, Outlines, RowProfiles
 
 _DEFAULT_TONE = "srgb"
 #: A header peak less than this times the strongest rival is no lock.
@@ -128,8 +128,8 @@ class Lock:
     clock: Clock
     #: Another that it may be: of columns which are not spread in time, where they seem to be.
     rival: Clock | None = None
-    #: Which copy of its burst the first one seen is, from 0; None where the light is to tell.
-    phase: int | None = None
+    #: (n_copies,) burst of every copy; None where the light is to tell.
+    burst: IntArray | None = None
 
     @property
     def profiles(self) -> RowProfiles:

@@ -47,8 +47,9 @@ _PACKETS_WITHOUT_HEADER = 100.0
 #: A column whose symbols have a mean log probability below this may have settled on a wrong weight: it starts again,
 #: after so many quick rounds.
 _LOST, _FRESH_ROUNDS = -0.3, 2
-#: Bursts are doubted where less than this share of the columns has packets of such a confidence.
-_CLEAR_COLUMNS, _CLEAR = 0.9, 0.9
+#: Bursts are doubted where less than this share of the columns has packets of such a confidence, and where they are
+#: not so much likelier than others by how alike copies are, nats.
+_CLEAR_COLUMNS, _CLEAR, _PLAIN_BURSTS = 0.9, 0.9, 300.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,14 +89,15 @@ def decode_likeliest(lock: Lock, skip: frozenset[str]) -> Reception:
     confidence = np.where(_complete(seen), _confidence(seen), 0.0).max(axis=0)
     if not confidence.any() or (confidence > _CLEAR).mean() >= _CLEAR_COLUMNS:
         return seen
-    phases = range(lock.screen.repeats)
-    bursts = {clock.in_bursts(seen.clock, lock.screen.repeats, phase).burst.tobytes(): phase for phase in phases}
-    looks = [_first_look(replace(lock, phase=phase)) for phase in bursts.values()]
+    possible = clock.possible_bursts(seen.clock, detect.slot_llr(seen.metrics), lock.screen.repeats)
+    plain = len(possible) == 1 or possible[0][1] - possible[1][1] > _PLAIN_BURSTS
+    if plain and np.array_equal(possible[0][0].burst, seen.clock.burst):
+        return seen
+    looks = [_first_look(replace(lock, burst=now.burst)) for now, _ in possible]
     likeliest = max(looks, key=packet_evidence).clock.burst
     if np.array_equal(likeliest, seen.clock.burst):
         return seen
-    again = decode(replace(lock, phase=bursts[likeliest.tobytes()]), skip)
-    return max(seen, again, key=packet_evidence)
+    return max(seen, decode(replace(lock, burst=likeliest), skip), key=packet_evidence)
 
 
 def decode(lock: Lock, skip: frozenset[str]) -> Reception:
@@ -429,8 +431,8 @@ def _scene_of(seen: Reception, samples: SlotSamples, model: channel.LightModel) 
 
 
 def _in_bursts(lock: Lock, now: Clock, log_odds: Float32Array) -> Clock:
-    if lock.phase is not None:
-        return clock.in_bursts(now, lock.screen.repeats, lock.phase)
+    if lock.burst is not None:
+        return replace(now, burst=lock.burst)
     return clock.assign_bursts(now, log_odds, lock.screen.repeats)
 
 

@@ -199,12 +199,22 @@ def test_columns_that_show_nothing_do_not_hide_the_clock_of_those_that_do() -> N
     assert twice >= 3
 
 
-@pytest.mark.parametrize(("phase", "burst"), [(0, [0, 0, 0, 1, 1]), (1, [0, 0, 1, 1, 1]), (2, [0, 1, 1, 1, 2])])
-def test_bursts_by_the_number_of_the_first_copy(phase: int, burst: list[int]) -> None:
+def test_bursts_in_every_way_likeliest_first() -> None:
     rng = np.random.default_rng(4)
     shot = Shot(n_rows=5 * 70 * 4)
     now = found_clock(row_profiles(random_link(rng, [5] * 3, 5), shot, rng), shot, 70)
-    assert clock.in_bursts(replace(now, burst=np.zeros(5, np.int64)), REPEATS, phase).burst.tolist() == burst
+    now = replace(now, first_slot=0, n_slots=350, burst=np.zeros(5, np.int64))
+    sent = rng.choice([-4.0, 4.0], (2, 3, 70)).astype(np.float32)
+    llr = np.concatenate([sent[0], sent[0], sent[1], sent[1], sent[1]], axis=1)
+    possible = clock.possible_bursts(now, llr, REPEATS)
+    assert possible[0][0].burst.tolist() == [0, 0, 1, 1, 1]
+    assert sorted(one.burst.tolist() for one, _ in possible) == [[0, 0, 0, 1, 1], [0, 0, 1, 1, 1], [0, 1, 1, 1, 2]]
+    scores = [score for _, score in possible]
+    assert scores == sorted(scores, reverse=True)
+    assert scores[0] - scores[1] > 100
+    assert clock.assign_bursts(now, llr, REPEATS).burst.tolist() == [0, 0, 1, 1, 1]
+    alone = replace(now, n_slots=70, burst=np.zeros(1, np.int64))
+    assert len(clock.possible_bursts(alone, llr[:, :70], REPEATS)) == 1
 
 
 @pytest.mark.parametrize("n_rows", [1, 5, 30])
