@@ -88,6 +88,11 @@ class Camera:
             "estimated": self.estimated,
         }
 
+    def without_tone(self) -> Camera:
+        """The camera, its tone curve not told."""
+        told = {name: found for name, found in self.estimated.items() if name != "tone_exponent"}
+        return replace(self, estimated=told)
+
 
 @dataclass(frozen=True, slots=True)
 class Reading:
@@ -281,14 +286,7 @@ def linear_camera(
     found, _ = blind.refit(as_stored, estimate, now, lit)
     if blind.is_linear(found.tone):
         return _estimated_camera(found, as_stored, lock.screen.slot_rate_hz)
-    return without_tone(camera, lock)
-
-
-def without_tone(camera: Camera, lock: Lock) -> Camera:
-    """An estimated camera of which no exponent is told."""
-    assert camera.guess is not None
-    estimate, strips = camera.guess
-    return _estimated_camera(replace(estimate, tone=None), strips, lock.screen.slot_rate_hz)
+    return camera.without_tone()
 
 
 def _exposure_of(frame: Frame, mode: ReadoutMode) -> float:

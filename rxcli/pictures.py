@@ -77,14 +77,14 @@ def _figures(
     if result.columns:
         yield "confidence", confidence_figure(result)
     tone = "srgb" if camera is None or camera.tone == "auto" else camera.tone
-    profiles, columns = in_readout_order(frame, result, sampling.sample_rows(frame, outlines, tone))
+    profiles, columns = _in_time_order(frame, result, sampling.sample_rows(frame, outlines, tone))
     for first in range(0, len(columns), _COLUMNS_PER_PICTURE):
         chosen = columns[first : first + _COLUMNS_PER_PICTURE]
         last = chosen[-1].column
         yield f"profiles-{chosen[0].column:03}-{last:03}", profile_figure(profiles, result, chosen, screen)
 
 
-def in_readout_order(
+def _in_time_order(
     frame: Frame, result: FrameResult, profiles: RowProfiles
 ) -> tuple[RowProfiles, tuple[ColumnResult, ...]]:
     """Row profiles and columns with rows counted as they were read out, not as software may have turned them."""

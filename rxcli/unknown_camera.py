@@ -7,17 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli import blind, channel
-from rxcli.locate import (
-    Camera,
-    Failure,
-    Lock,
-    Stages,
-    find_cameras,
-    find_lock,
-    linear_camera,
-    refitted_camera,
-    without_tone,
-)
+from rxcli.locate import Camera, Failure, Lock, Stages, find_cameras, find_lock, linear_camera, refitted_camera
 from rxcli.options import ReceiverOptions
 from rxcli.reception import Reception, decode_likeliest, packet_evidence, quick_look
 from rxcli.types import FloatArray, Frame, FrameResult
@@ -88,28 +78,6 @@ def with_refitted_camera(
 
     Where packets show less then, what was received before stays. Values that seem to be light are received as such.
     """
-    camera, lock, seen = _refitted(frame, corners, camera, lock, seen, options, stages)
-    with stages("blind"):
-        lit = channel.lit_on_grid(seen.posteriors, seen.clock)
-        linear = linear_camera(frame, corners, camera, lock, seen.clock, lit)
-    if linear.tone == camera.tone:
-        return linear, lock, seen
-    found = _received(frame, corners, linear, seen, options, stages)
-    if found is None:
-        return without_tone(camera, lock), lock, seen
-    return _refitted(frame, corners, linear, *found, options, stages)
-
-
-def _refitted(
-    frame: Frame,
-    corners: FloatArray,
-    camera: Camera,
-    lock: Lock,
-    seen: Reception,
-    options: ReceiverOptions,
-    stages: Stages,
-) -> tuple[Camera, Lock, Reception]:
-    """The camera from slots as received, and what is received with it, in turn."""
     for _ in range(_MOST_REFITS):
         with stages("blind"):
             lit = channel.lit_on_grid(seen.posteriors, seen.clock)
@@ -120,7 +88,15 @@ def _refitted(
         if found is None:
             break
         lock, seen = found
-    return camera, lock, seen
+    with stages("blind"):
+        lit = channel.lit_on_grid(seen.posteriors, seen.clock)
+        linear = linear_camera(frame, corners, camera, lock, seen.clock, lit)
+    if linear.tone == camera.tone:
+        return linear, lock, seen
+    found = _received(frame, corners, linear, seen, options, stages)
+    if found is None:
+        return camera.without_tone(), lock, seen
+    return with_refitted_camera(frame, corners, linear, *found, options, stages)
 
 
 def _received(

@@ -52,7 +52,9 @@ class _Fit:
     #: Share of the local variance that the slots explain: at the start, and now.
     explained_first: float
     explained: float
-    tone: tuple[float, float] | None
+    #: (M, R) light 0..1 that the slots give, and the rows over which the picture was taken as constant.
+    wave: Float32Array
+    window: int
 
 
 def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Array) -> tuple[BlindEstimate, float]:
@@ -91,7 +93,7 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
         bend_sd=sd[2:],
         corrected=corrected,
         explained=fit.explained,
-        tone=fit.tone,
+        tone=tone_exponent(ordered, fit.wave, fit.window),
     )
     return found, float(moved.max())
 
@@ -119,6 +121,4 @@ def _fit(
         change, covariance, explained = gauss_newton(strips, terms, values, time, seen, n_free, _LOCAL_SLOTS, _ORDER)
         explained_first = explained_first or explained
         values = values + change
-    return _Fit(
-        values, covariance, exposure, exposure_sd, explained_first, explained, tone_exponent(strips, seen[0], window)
-    )
+    return _Fit(values, covariance, exposure, exposure_sd, explained_first, explained, seen[0], window)

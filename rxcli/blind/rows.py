@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.blind.strips import Strips
-from rxcli.blind.waves import column_shares, local_mean, local_moments, seen_through
+from rxcli.blind.waves import column_shares, local_mean, local_moments, residual_of, seen_through
 from rxcli.types import Float32Array, FloatArray, IntArray
 
 #: Weights of a row, of its two neighbours together, and of the two next to those: of developed pictures in general, and
@@ -129,10 +129,9 @@ def _mixed(table: Float32Array, low: IntArray, fraction: Float32Array) -> Float3
 def _fit_kernel(strips: Strips, parts: Float32Array, kernel: FloatArray, window: int) -> tuple[FloatArray, float]:
     """The kernel by least squares, with gains and levels of another one; and the share of the light that it leaves."""
     inside = strips.inside
-    near = local_moments(strips.light, np.tensordot(kernel.astype(np.float32), parts, 1), inside, window)
     wave = np.tensordot(kernel.astype(np.float32), parts, 1)
-    residual = (strips.light - near.value - near.gain * (wave - near.wave)) * inside
-    spread = local_mean(residual * residual, window) / near.share + strips.noise.variance(near.value)
+    near = local_moments(strips.light, wave, inside, window)
+    _, spread = residual_of(strips, near, near.gain, wave, window)
     weight = inside / np.sqrt(spread)
     basis = np.stack(
         [((part - local_mean(part * inside, window) / near.share) * near.gain * weight).ravel() for part in parts]

@@ -24,6 +24,7 @@ from rxcli.blind.waves import (
     local_mean,
     local_moments,
     packet_evidence,
+    residual_of,
     seen_through,
 )
 from rxcli.types import Float32Array, FloatArray
@@ -253,11 +254,9 @@ def gauss_newton(
     window = round(local_slots * values[1] / pitch)
     inside = strips.inside
     near = local_moments(strips.light, wave, inside, window)
-    noise = strips.noise.variance(near.value)
     gain = near.gain
     for _ in range(2):
-        residual = (strips.light - near.value - gain * (wave - near.wave)) * inside
-        spread = local_mean(residual * residual, window) / near.share + noise
+        residual, spread = residual_of(strips, near, gain, wave, window)
         gain = _likely_gain(near, spread, window)
     weight = inside / spread
     light_power = float((gain * gain * near.variance * weight).sum())

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.blind.strips import Strips
-from rxcli.blind.waves import local_mean, local_moments
+from rxcli.blind.waves import local_mean, local_moments, residual_of
 from rxcli.types import Float32Array, FloatArray
 
 #: Exponent that makes light of values, as nearly as a power of them does, by the tone curve.
@@ -38,8 +38,7 @@ def tone_exponent(strips: Strips, wave: Float32Array, window: int) -> tuple[floa
         return None
     inside = strips.inside
     near = local_moments(strips.light, wave, inside, window)
-    residual = (strips.light - near.value - near.gain * (wave - near.wave)) * inside
-    spread = local_mean(residual * residual, window) / near.share + strips.noise.variance(near.value)
+    _, spread = residual_of(strips, near, near.gain, wave, window)
     weight = inside / spread
 
     def about(values: Float32Array) -> Float32Array:

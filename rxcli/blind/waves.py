@@ -307,6 +307,15 @@ def local_moments(
     return Moments(share, mean_value, mean_wave, covariance, variance)
 
 
+def residual_of(
+    strips: Strips, near: Moments, gain: Float32Array, wave: Float32Array, window: int
+) -> tuple[Float32Array, Float32Array]:
+    """(M, R) light that a wave of some gain leaves over; and its variance thereabouts, the noise's with it."""
+    residual = (strips.light - near.value - gain * (wave - near.wave)) * strips.inside
+    spread = local_mean(residual * residual, window) / near.share + strips.noise.variance(near.value)
+    return residual, spread
+
+
 def estimate_exposure(waves: Waves, grid: Grid, slots: Slots, near: float | None = None) -> tuple[float, float, Slots]:
     """Exposure in slots by the blur of the slots' edges.
 
