@@ -26,9 +26,9 @@ from rxcli.types import (
 MAX_BER_HAT = 0.1
 #: Log-odds of being error-free: offset, and weights of the posterior's log-odds up to a limit, of whether corrections
 #: of the auto-encoder were kept, of the logarithms of what payload slots say against the packet, all together, and of
-#: what they say for it on average up to a limit, nats; and of both of these times the first: the posterior counts less
-#: where slots speak against it, and where they say much: there it is the picture that is in doubt, not the light.
-_CALIBRATION = (3.84, 1.47, -1.74, -0.64, -0.70, -0.06, -0.35)
+#: what they say for it on average up to a limit, nats, and of the latter times the posterior's; of the logarithm of a
+#: column's strips, and of it times the posterior's: strips err together, so the more they are the less it counts.
+_CALIBRATION = (3.33, 0.74, -1.97, -0.43, -0.54, 0.14, -0.71, -0.15)
 _MOST_ODDS, _MOST_AVERAGE = 5.0, 10.0
 #: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
 #: is most against its codeword, nats; packets of `rxcli.benchmark.clip_confidence`.
@@ -82,7 +82,8 @@ def column_results(
     seen = slots_seen(samples, clock)
     whole = complete(seen)
     told = np.isin(np.arange(len(snr)), list(denoised))
-    doubts = _doubts(posteriors, evidence(posteriors, slot_support_by_burst(support, clock), told))
+    of_bursts = slot_support_by_burst(support, clock)
+    doubts = _doubts(posteriors, evidence(posteriors, of_bursts, told, samples.light.shape[1]))
     snr_db = _snr_db_of_columns(snr)
     echoes: BoolArray = np.any(_echoes(posteriors, snr_db) & whole, axis=0)
     reported = whole & doubts.reported(min_confidence)
@@ -115,7 +116,7 @@ class BurstInClip:
     #: (C, packet) how often each slot was seen, over all frames.
     seen: IntArray
     frames: tuple[int, ...]
-    #: (C, 7) see `evidence`.
+    #: (C, 8) see `evidence`.
     evidence: FloatArray
     #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
     #: received like photographs.
@@ -328,7 +329,7 @@ class _Doubts:
     #: (B, C) probability that they are error-free, and expected share of wrong bits.
     confidence: FloatArray
     ber_hat: FloatArray
-    #: (B, C, 7) see `evidence`.
+    #: (B, C, 8) see `evidence`.
     evidence: FloatArray
 
     def reported(self, min_confidence: float) -> BoolArray:
@@ -384,31 +385,32 @@ def _packet(
     )
 
 
-def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolArray) -> FloatArray:
-    """What the confidence of packets is made of, (B, C, 7), in the order of `_CALIBRATION`.
+def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolArray, n_strips: int) -> FloatArray:
+    """What the confidence of packets is made of, (B, C, 8), in the order of `_CALIBRATION`.
 
     The light model's likelihoods are tempered, since strips and samples err together; still they are too sure where
     picture or camera are not as the model has them. There single slots speak against the packet. The weights are a
-    logistic regression on packets of `rxcli.benchmark.confidence`; whatever changes the likelihoods of the light model
-    or the auto-encoder asks for a new fit.
+    logistic regression on packets of `rxcli.benchmark.confidence` and of `rxcli.benchmark.phones`; whatever changes the
+    likelihoods of the light model or the auto-encoder asks for a new fit.
 
     Args:
         posteriors: of B bursts and C columns.
         support: (B, C, n) what the light says for payload slots of the packets as decided, nats; 0 where nothing is
             seen; see `slot_support_by_burst`.
         denoised: (C,) whether corrections of the auto-encoder were kept.
+        n_strips: strips of a column in a quick look.
     """
     log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), _MOST_ODDS)
     against = np.log(_AGAINST_AT_LEAST - np.minimum(support, 0).sum(axis=2))
     heard = np.maximum((support != 0).sum(axis=2), 1)
     average = np.log(np.clip(support.sum(axis=2) / heard, 1, _MOST_AVERAGE))
-    told = np.broadcast_to(denoised, log_odds.shape)
-    terms = (np.ones_like(log_odds), log_odds, told, against, average, against * log_odds, average * log_odds)
-    return np.stack(terms, axis=2).astype(np.float64)
+    strips = np.log(n_strips)
+    terms = (1.0, log_odds, denoised, against, average, average * log_odds, strips, strips * log_odds)
+    return np.stack([np.broadcast_to(term, log_odds.shape) for term in terms], axis=2).astype(np.float64)
 
 
 def confidence(evidence: FloatArray) -> FloatArray:
-    """Probability (...) that packets are error-free, from their evidence (..., 7)."""
+    """Probability (...) that packets are error-free, from their evidence (..., 8)."""
     return _probability(evidence @ np.array(_CALIBRATION))
 
 

@@ -105,6 +105,12 @@ class Reading:
     #: None where they are not.
     read: Callable[[slice, tuple[float, float]], RowProfiles] | None = None
 
+    @property
+    def n_quick_strips(self) -> int:
+        """Strips of a column that a quick look takes: see `clock.halved_strips`."""
+        n_strips: int = self.profiles.light.shape[1]
+        return n_strips if self.in_pairs or n_strips % 2 else n_strips // 2
+
     def halved(self) -> RowProfiles:
         """Strips pooled in pairs."""
         return self.profiles if self.in_pairs else clock.halved_strips(self.profiles)

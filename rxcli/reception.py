@@ -408,7 +408,8 @@ def _complete(seen: Reception) -> NDArray[np.bool_]:
 def _confidence(seen: Reception) -> FloatArray:
     """(B, C) confidence of packets, the auto-encoder not yet asked."""
     by_burst = assemble.slot_support_by_burst(support(seen), seen.clock)
-    return assemble.confidence(assemble.evidence(seen.posteriors, by_burst, np.zeros(seen.snr.shape[0], bool)))
+    n_columns, n_strips = seen.samples.light.shape[:2]
+    return assemble.confidence(assemble.evidence(seen.posteriors, by_burst, np.zeros(n_columns, bool), n_strips))
 
 
 @lru_cache(maxsize=1)

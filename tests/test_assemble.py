@@ -204,6 +204,17 @@ def test_slots_that_speak_against_a_packet_make_it_less_sure() -> None:
     assert two[1] == one[1] == sure[1]
 
 
+def test_the_more_strips_a_column_has_the_less_its_posterior_counts() -> None:
+    """Strips err together: each adds to the posterior what it says alone."""
+    w, support = [5], np.full((1, 1, PACKET), 10.0, np.float32)
+    sure = posteriors_of(w, indices(w), 0.999)
+    found = [
+        float(assemble.confidence(assemble.evidence(sure, support, np.zeros(1, bool), n_strips)).squeeze())
+        for n_strips in (1, 2, 4, 7)
+    ]
+    assert 1 > found[0] > found[1] > found[2] > found[3] > 0.9
+
+
 def test_a_header_that_is_contradicted_stands_for_no_packet() -> None:
     posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.9999)
     posteriors = replace(posteriors, header_llr=np.array([[-20.0, 40.0]]))

@@ -25,6 +25,26 @@ def test_confidence_writes_table_and_details(tmp_path: Path) -> None:
     assert (tmp_path / "confidence.journal.jsonl").read_text().count("\n") == 1
 
 
+def test_confidence_counts_packets_of_earlier_journals_too(tmp_path: Path) -> None:
+    entries = [
+        {
+            "key": str(number),
+            "record": {"packets": [{"confidence": 0.95, "bit_errors": number, "evidence": [1.0, 2.0]}]},
+        }
+        for number in range(2)
+    ]
+    earlier = tmp_path / "phones.journal.jsonl"
+    earlier.write_text("".join(json.dumps(entry) + "\n" for entry in entries))
+    arguments = ["confidence", "--frames", "1", "--seed", "5", "--out", str(tmp_path)]
+    alone = CliRunner().invoke(benchmark, arguments)
+    both = CliRunner().invoke(benchmark, [*arguments, "--also", str(earlier)])
+    assert alone.exit_code == both.exit_code == 0, both.output
+    counts = [int(result.output.split(" packets of ")[0].splitlines()[-1]) for result in (alone, both)]
+    assert counts[1] == counts[0] + 2
+    # Their evidence is of other terms: an earlier receiver's journal gives no weights.
+    assert "weights" not in both.output
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -61,4 +61,4 @@ def test_a_simulated_frame_gives_packets_with_outcomes() -> None:
     for packet in record["packets"]:
         assert 0 <= packet["confidence"] <= 1
         assert packet["bit_errors"] >= 0
-        assert len(packet["evidence"]) == 7
+        assert len(packet["evidence"]) == 8

@@ -181,7 +181,8 @@ def calibration(records: Sequence[Record], n_bins: int = N_BINS) -> Calibration:
 
 
 def _fitted_weights(packets: Sequence[Record], right: NDArray[np.bool_]) -> tuple[float, ...] | None:
-    if right.all() or not right.any() or not all(packet.get("evidence") for packet in packets):
+    terms = {len(packet.get("evidence", ())) for packet in packets}
+    if right.all() or not right.any() or len(terms) > 1 or 0 in terms:
         return None
     return tuple(logistic_regression(np.array([packet["evidence"] for packet in packets]), right).tolist())
 

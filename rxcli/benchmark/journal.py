@@ -57,6 +57,11 @@ class Journal:
     def __getitem__(self, key: str) -> Record:
         return self._records[key]
 
+    @property
+    def records(self) -> list[Record]:
+        """All of them, in the order in which they were added."""
+        return list(self._records.values())
+
     def add(self, key: str, record: Record) -> None:
         """Keep the record of a finished task."""
         self._records[key] = record

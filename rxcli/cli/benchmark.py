@@ -91,19 +91,37 @@ def benchmark(context: click.Context, quick: bool, jobs: int, out: Path, seed: i
     "--clips", type=click.IntRange(1), help="Random compressed clips in place of frames, some 70 packets each."
 )
 @click.option("--cae", type=click.Choice(["auto", "always", "never"]), default="auto", show_default=True)
+@click.option(
+    "--also",
+    "journals",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    multiple=True,
+    metavar="JOURNAL",
+    help="Count the packets of an earlier run's journal too, of phones for instance; may be given several times.",
+)
 @_JOBS
 @_common
 def confidence(
-    frames: int, clips: int | None, cae: str, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool
+    frames: int,
+    clips: int | None,
+    cae: str,
+    journals: tuple[Path, ...],
+    jobs: int,
+    out: Path,
+    seed: int,
+    fresh: bool,
+    quiet: bool,
 ) -> None:
     """Share of error-free packets in ten bins of reported confidence."""
     from rxcli.benchmark import clip_confidence, plots
     from rxcli.benchmark import confidence as work
+    from rxcli.benchmark.journal import Journal
     from rxcli.benchmark.tables import format_table, write_outputs
 
+    earlier = [record for path in journals for record in Journal(path).records]
     journal = _journal(out, "confidence", fresh)
     run = work.run if clips is None else clip_confidence.run
-    records = run(clips or frames, journal, seed=seed, cae=cae, jobs=jobs, quiet=quiet)
+    records = run(clips or frames, journal, seed=seed, cae=cae, jobs=jobs, quiet=quiet) + earlier
     result = work.calibration(records)
     rows = work.rows(result)
     click.echo(format_table(rows))

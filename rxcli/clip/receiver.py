@@ -423,7 +423,7 @@ class _Clip:
         if following is not None and following.numbers is not None:
             going_on = np.intersect1d(waiting.numbers, following.numbers)
         closed = bursts.open.close(np.setdiff1d(waiting.numbers, going_on))
-        ended = results.bursts_of(closed, int(waiting.numbers[0]))
+        ended = results.bursts_of(closed, int(waiting.numbers[0]), view)
         columns = results.columns_of(view, ended, bursts.confidence(going_on), self._options.min_confidence)
         if self._options.dump_dir is not None:
             found = results.taps(waiting, view, ended)

@@ -15,11 +15,20 @@ from rxcli.tracking import ClosedBurst
 from rxcli.types import ColumnResult, Float32Array, FloatArray, IntArray
 
 
-def bursts_of(closed: Sequence[ClosedBurst], first: int) -> list[assemble.BurstInClip]:
-    """Bursts that end in a frame, for `assemble`; `first` is the number of the frame's first burst."""
+def bursts_of(closed: Sequence[ClosedBurst], first: int, view: View) -> list[assemble.BurstInClip]:
+    """Bursts that end in the frame of a view, for `assemble`; `first` is the number of the frame's first burst."""
+    n_strips = view.lock.reading.n_quick_strips
     return [
-        assemble.BurstInClip(b.number, int(b.number - first), b.posteriors, b.seen, b.frames, _evidence(b), _against(b))
-        for b in closed
+        assemble.BurstInClip(
+            number=burst.number,
+            index=int(burst.number - first),
+            posteriors=burst.posteriors,
+            seen=burst.seen,
+            frames=burst.frames,
+            evidence=_evidence(burst, n_strips),
+            against=_against(burst),
+        )
+        for burst in closed
     ]
 
 
@@ -55,11 +64,11 @@ def taps(waiting: Waiting, view: View, ended: Sequence[assemble.BurstInClip]) ->
     return found | {f"detect.{burst.number}": burst.posteriors for burst in ended}
 
 
-def _evidence(burst: ClosedBurst) -> FloatArray:
-    """(C, 7) what the confidence of packets is made of, all copies and frames together."""
+def _evidence(burst: ClosedBurst, n_strips: int) -> FloatArray:
+    """(C, 8) what the confidence of packets is made of, all copies and frames together."""
     support = detect.slot_support(burst.metrics[None], burst.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
-    evidence: FloatArray = assemble.evidence(burst.posteriors, support, np.zeros(support.shape[1], bool))[0]
-    return evidence
+    evidence = assemble.evidence(burst.posteriors, support, np.zeros(support.shape[1], bool), n_strips)
+    return np.asarray(evidence[0])
 
 
 def _against(burst: ClosedBurst) -> Float32Array | None:
