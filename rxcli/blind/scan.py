@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.blind.edges import edge_power
-from rxcli.blind.estimates import Hypothesis, distinct
+from rxcli.blind.estimates import BlindEstimate, Hypothesis, distinct
 from rxcli.blind.strips import SAMPLES, Noise, Strips, levelled
 from rxcli.blind.structure import structure_evidence
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
@@ -206,7 +206,7 @@ def alike(one: Hypothesis, other: Hypothesis) -> bool:
     return one.packet_slots == other.packet_slots and same_slots(one, other)
 
 
-def same_slots(one: Hypothesis, other: Hypothesis) -> bool:
+def same_slots(one: Hypothesis | BlindEstimate, other: Hypothesis | BlindEstimate) -> bool:
     near = abs(np.log(one.rows_per_slot / other.rows_per_slot)) < _ALIKE_ROWS
     return near and one.reversed == other.reversed
 

@@ -22,8 +22,9 @@ MIN_EVIDENCE = 45.0
 #: Share of the light's local variance that slots must explain; those of wrong clocks on random stripes reach a fifth.
 _LEAST_EXPLAINED = 0.22
 
-#: An estimate with this evidence has no rivals.
-_BEYOND_DOUBT = 250.0
+#: An estimate with this evidence has no rivals but those of its own slots in packets of another length, which may be as
+#: plausible where less than two packets are in view: so many nats less at most.
+_BEYOND_DOUBT, _ANOTHER_LENGTH = 250.0, 60.0
 
 #: A bend that fits this many nats better than none is tried; from the second on, it alone: stripes of pictures whose
 #: sides are bowed reach 12.
@@ -85,7 +86,12 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     best = estimates[0] if estimates else None
     if best is None or best.evidence < MIN_EVIDENCE or best.explained < _LEAST_EXPLAINED:
         return BlindSearch(None, why_not(strips), _worth_a_look(estimates), by_edges(strips, estimates))
-    return BlindSearch(best, rivals=() if best.evidence > _BEYOND_DOUBT else _worth_a_look(estimates[1:]))
+    rivals = _worth_a_look(estimates[1:])
+    if best.evidence > _BEYOND_DOUBT:
+        least = _plausibility(best, strips, rows_per_slot) - _ANOTHER_LENGTH
+        alike_slots = (one for one in rivals if same_slots(one, best) and one.packet_slots != best.packet_slots)
+        rivals = tuple(one for one in alike_slots if _plausibility(one, strips, rows_per_slot) > least)
+    return BlindSearch(best, rivals=rivals)
 
 
 def stripes_are_bent(strips: Strips) -> bool:
