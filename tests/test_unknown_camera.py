@@ -50,10 +50,13 @@ def test_headers_decide_between_estimates(tmp_path: Path, monkeypatch: pytest.Mo
     assert _chosen(frame, Cameras(None, (wrong, right), "nothing"), monkeypatch) is right[0]
 
 
-def test_the_length_of_packets_is_told_by_their_words_where_less_than_two_are_in_view() -> None:
-    """A bent picture exposed for two slots: longer packets, without a second header, fit its light as well."""
-    packets = phone_record({"seed": 777, "number": 71, "cae": "never"})["packets"]
-    assert sum(packet["bit_errors"] == 0 for packet in packets) >= 10
+@pytest.mark.parametrize(("seed", "number", "n_packets"), [(777, 71, 10), (2024, 25, 8)])
+def test_packets_of_long_exposures_are_received(seed: int, number: int, n_packets: int) -> None:
+    """Two slots, bent: longer packets, without a second header, fit the light as well. 1.8 slots before coins: so do
+    wrong clocks, until slots are read.
+    """
+    packets = phone_record({"seed": seed, "number": number, "cae": "never"})["packets"]
+    assert sum(packet["bit_errors"] == 0 for packet in packets) >= n_packets
 
 
 def test_without_headers_nothing_is_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,6 +35,8 @@ _REFINED, _CLOSE_EVIDENCE = 3, 0.3
 
 #: After an estimate of this evidence, others need this share of the first one's.
 _PLAIN_EVIDENCE, _RIVAL = 150.0, 0.7
+#: Below this evidence slots are read first: wrong clocks on textured pictures reach 201.
+_READ_FIRST = 220.0
 #: Below this evidence, more of them.
 _WEAK_EVIDENCE, _REFINED_IF_WEAK = 120.0, 6
 #: What doubling the length of a packet costs, nats.
@@ -72,7 +74,7 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     bends = [bend] if gain > _BEND_GAINS[1] else [np.zeros(4), bend] if gain > _BEND_GAINS[0] else [np.zeros(4)]
     found = [(clock, b) for b in bends for clock in find_clocks(straightened(strips, b), sorted(rates))]
     found.sort(key=lambda pair: -pair[0].evidence)
-    if found and found[0][0].evidence < _WEAK_EVIDENCE:
+    if found and found[0][0].evidence < _READ_FIRST:
         found = read(strips, found, sorted(rates))
     estimates: list[BlindEstimate] = []
     for clock, b in _worth_refining(found):
