@@ -199,6 +199,8 @@ class Cameras:
     reason: str = ""
     #: What the picture tells of its camera even where nothing can be received.
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
+    #: Whether the first is beyond doubt but for the length of its packets.
+    sure: bool = False
 
 
 def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, stages: Stages) -> Cameras:
@@ -219,7 +221,8 @@ def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, st
         found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
     first = _with_screens(found.estimate, strips, options) if found.estimate else None
     rivals = tuple(_with_screens(rival, strips, options) for rival in found.rivals)
-    return Cameras(first, rivals, found.reason, blind.summary_of_rows(found.by_edges) if found.by_edges else {})
+    by_edges = blind.summary_of_rows(found.by_edges) if found.by_edges else {}
+    return Cameras(first, rivals, found.reason, by_edges, found.sure)
 
 
 def _with_screens(

@@ -36,12 +36,12 @@ def likely_camera(
     """The camera, known or estimated, and the options with the screens that remain.
 
     Where several estimates are left, each has a quick look: the one under which headers, packets and
-    symbols show best is it, and without packets none.
+    symbols show best is it, and without packets none, unless the first is beyond doubt.
     """
     found = find_cameras(frame, corners, options, stages)
     if found.first is not None and not found.rivals:
         return found.first
-    best, most = None, -np.inf
+    best, most = found.first if found.sure else None, -np.inf
     for camera in ([found.first] if found.first else []) + list(found.rivals):
         packets, symbols = _look(frame, corners, *camera, stages)
         if packets > _PACKETS_AT_LEAST and packets + symbols > most:

@@ -59,6 +59,14 @@ def test_packets_of_long_exposures_are_received(seed: int, number: int, n_packet
     assert sum(packet["bit_errors"] == 0 for packet in packets) >= n_packets
 
 
+def test_an_estimate_beyond_doubt_needs_no_packets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, _ = _frame(tmp_path)
+    first, other = _camera(1.13 * ROWS_PER_SLOT), _camera(0.7 * ROWS_PER_SLOT)
+    assert _chosen(frame, Cameras(first, (other,), sure=True), monkeypatch) is first[0]
+    with pytest.raises(Failure, match="no packet header"):
+        _chosen(frame, Cameras(first, (other,)), monkeypatch)
+
+
 def test_without_headers_nothing_is_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, _ = _frame(tmp_path)
     with pytest.raises(Failure, match="too dark"):

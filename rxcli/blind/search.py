@@ -50,10 +50,12 @@ class BlindSearch:
     estimate: BlindEstimate | None
     #: Why not: thing, reason and next step. Empty where an estimate was found.
     reason: str = ""
-    #: Other estimates that are worth a look, most plausible first; none where the estimate is beyond doubt.
+    #: Other estimates that are worth a look, most plausible first.
     rivals: tuple[BlindEstimate, ...] = ()
     #: Where nothing was estimated: what the edges tell of rows per slot and bend all the same.
     by_edges: BlindEstimate | None = None
+    #: Whether the estimate is beyond doubt but for the length of its packets; rivals are of other lengths then.
+    sure: bool = False
 
 
 def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None) -> BlindSearch:
@@ -89,11 +91,12 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     if best is None or best.evidence < MIN_EVIDENCE or best.explained < _LEAST_EXPLAINED:
         return BlindSearch(None, why_not(strips), _worth_a_look(estimates), by_edges(strips, estimates))
     rivals = _worth_a_look(estimates[1:])
-    if best.evidence > _BEYOND_DOUBT:
-        least = _plausibility(best, strips, rows_per_slot) - _ANOTHER_LENGTH
-        alike_slots = (one for one in rivals if same_slots(one, best) and one.packet_slots != best.packet_slots)
-        rivals = tuple(one for one in alike_slots if _plausibility(one, strips, rows_per_slot) > least)
-    return BlindSearch(best, rivals=rivals)
+    if best.evidence <= _BEYOND_DOUBT:
+        return BlindSearch(best, rivals=rivals)
+    least = _plausibility(best, strips, rows_per_slot) - _ANOTHER_LENGTH
+    alike_slots = (one for one in rivals if same_slots(one, best) and one.packet_slots != best.packet_slots)
+    rivals = tuple(one for one in alike_slots if _plausibility(one, strips, rows_per_slot) > least)
+    return BlindSearch(best, rivals=rivals, sure=True)
 
 
 def stripes_are_bent(strips: Strips) -> bool:
