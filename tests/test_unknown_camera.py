@@ -52,8 +52,9 @@ def test_headers_decide_between_estimates(tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize(("seed", "number", "n_packets"), [(777, 71, 10), (2024, 25, 8)])
 def test_packets_of_long_exposures_are_received(seed: int, number: int, n_packets: int) -> None:
-    """Two slots, bent: longer packets, without a second header, fit the light as well. 1.8 slots before coins: so do
-    wrong clocks, until slots are read.
+    """The first shows less than two packets, so that longer ones fit its light as well, without a second header.
+
+    Of the second, whose picture has much texture, wrong clocks fit as well until its slots are read.
     """
     packets = phone_record({"seed": seed, "number": number, "cae": "never"})["packets"]
     assert sum(packet["bit_errors"] == 0 for packet in packets) >= n_packets

@@ -54,8 +54,11 @@ class BlindSearch:
     rivals: tuple[BlindEstimate, ...] = ()
     #: Where nothing was estimated: what the edges tell of rows per slot and bend all the same.
     by_edges: BlindEstimate | None = None
-    #: Whether the estimate is beyond doubt but for the length of its packets; rivals are of other lengths then.
-    sure: bool = False
+
+    @property
+    def sure(self) -> bool:
+        """Whether the estimate is beyond doubt but for the length of its packets; rivals are of other lengths then."""
+        return self.estimate is not None and self.estimate.evidence > _BEYOND_DOUBT
 
 
 def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None) -> BlindSearch:
@@ -91,12 +94,11 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     if best is None or best.evidence < MIN_EVIDENCE or best.explained < _LEAST_EXPLAINED:
         return BlindSearch(None, why_not(strips), _worth_a_look(estimates), by_edges(strips, estimates))
     rivals = _worth_a_look(estimates[1:])
-    if best.evidence <= _BEYOND_DOUBT:
-        return BlindSearch(best, rivals=rivals)
-    least = _plausibility(best, strips, rows_per_slot) - _ANOTHER_LENGTH
-    alike_slots = (one for one in rivals if same_slots(one, best) and one.packet_slots != best.packet_slots)
-    rivals = tuple(one for one in alike_slots if _plausibility(one, strips, rows_per_slot) > least)
-    return BlindSearch(best, rivals=rivals, sure=True)
+    if best.evidence > _BEYOND_DOUBT:
+        least = _plausibility(best, strips, rows_per_slot) - _ANOTHER_LENGTH
+        of_other_length = (one for one in rivals if same_slots(one, best) and one.packet_slots != best.packet_slots)
+        rivals = tuple(one for one in of_other_length if _plausibility(one, strips, rows_per_slot) > least)
+    return BlindSearch(best, rivals=rivals)
 
 
 def stripes_are_bent(strips: Strips) -> bool:
