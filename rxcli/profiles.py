@@ -24,7 +24,7 @@ from rxcli.resources import data_dir
 PositiveInt = Annotated[int, Meta(gt=0, le=1_000_000)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 Seconds = Annotated[float, Meta(gt=0, lt=1)]
-#: Names of the tone curves that `rxcli.sampling.tone_to_light` can undo.
+#: Names of the tone curves that `rxcli.receiver.sampling.rows.tone_to_light` can undo.
 ToneName = Literal["linear", "srgb", "bt709", "auto"]
 Triple = tuple[float, float, float]
 

@@ -214,7 +214,7 @@ class PacketResult:
     burst: int | None = None
     #: Frames of the clip in which the burst was seen; None for stills.
     frames: tuple[int, ...] | None = None
-    #: What the confidence was made of, see `rxcli.assemble`; for fits, not for reports.
+    #: What the confidence was made of, see `rxcli.receiver.decode.assemble`; for fits, not for reports.
     evidence: tuple[float, ...] = ()
 
 
@@ -236,7 +236,7 @@ class ColumnResult:
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """What became of one frame; `rxcli.report` turns it into JSON and tables."""
+    """What became of one frame; `rxcli.results.report` turns it into JSON and tables."""
 
     source: str
     frame: int

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.batch import Decoder
 from rxcli.errors import InputError, UsageError
+from rxcli.runs.batch import Decoder
 from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
 
 N_COLUMNS = 3

@@ -13,10 +13,12 @@ ROOT = Path(rxcli.__file__).parent
 #: What everything may import.
 BASE = {"rxcli", "rxcli.errors", "rxcli.resources"}
 DATA = BASE | {"rxcli.types", "rxcli.protocol", "rxcli.profiles"}
-PIPELINE_STAGES = ("ingest", "find_screen", "geometry", "blind", "sampling", "clock", "channel", "denoise", "detect")
-PIPELINE_STAGES += ("assemble", "strips", "known_picture", "tracking")
-#: What puts the stages together.
-WIRING = {"pipeline", "locate", "unknown_camera", "reception", "clip", "options"}
+#: What every stage may stand on beside the data model.
+GROUND = DATA | {"rxcli.numerics"}
+#: Rooms of the receiver that turn one thing into the next, and know nothing of one another.
+STAGES = ("screen", "sampling", "camera", "sync", "channel", "decode")
+#: Rooms and files of `rxcli/`: the listing alone shows the way of the data.
+MOST_FOLDERS, MOST_FILES = 9, 9
 #: Too heavy to be loaded by a module that does not need it at once (milliseconds each on import: 70 to 1000).
 HEAVY = {"cv2", "rawpy", "av", "onnxruntime", "matplotlib", "scipy", "skimage", "simplejpeg", "tifffile"}
 HEAVY |= {"distributed", "dask", "pyarrow", "torch", "onnx", "lensfunpy", "pillow_heif", "tqdm"}
@@ -66,24 +68,54 @@ def part_of(name: str) -> str:
     return name.split(".")[1] if "." in name else ""
 
 
-def modules_of(part: str) -> list[str]:
-    return sorted(name for name in MODULES if part_of(name) == part)
+def stage_of(name: str) -> str | None:
+    """The stage that a module belongs to; None outside the receiver and for what wires it."""
+    parts = name.split(".")
+    return parts[2] if parts[1:2] == ["receiver"] and len(parts) > 2 and parts[2] in STAGES else None
+
+
+def below(*folders: str) -> list[str]:
+    """Modules in some folders, named as they are imported."""
+    return sorted(name for name in MODULES for folder in folders if f"{name}.".startswith(f"rxcli.{folder}."))
 
 
 def test_the_walk_sees_imports_of_every_form() -> None:
     tree = ast.parse(
-        "import rxcli.clock\nfrom rxcli import detect\ndef f():\n    from rxcli.types import Frame\n    import cv2"
+        "import rxcli.profiles\nfrom rxcli import protocol\ndef f():\n    from rxcli.types import Frame\n    import cv2"
     )
-    known = {"rxcli.clock", "rxcli.types", "cv2"} | ({"rxcli.detect"} if "rxcli.detect" in MODULES else {"rxcli"})
+    known = {"rxcli.profiles", "rxcli.protocol", "rxcli.types", "cv2"}
     assert imports(tree) == known
     assert imports_at_load(tree) == known - {"rxcli.types", "cv2"}
 
 
-@pytest.mark.parametrize("part", PIPELINE_STAGES)
-def test_stages_import_the_data_model_and_never_each_other(part: str) -> None:
-    for name in modules_of(part):
-        allowed = DATA | {other for other in MODULES if part_of(other) == part}
-        assert own(imports(MODULES[name])) <= allowed, name
+def test_the_listing_is_short() -> None:
+    shown = [path for path in ROOT.iterdir() if path.name != "__pycache__" and not path.name.startswith("_data")]
+    assert sum(path.is_dir() for path in shown) <= MOST_FOLDERS
+    assert sum(path.is_file() for path in shown) <= MOST_FILES
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_stages_stand_on_the_ground_and_never_on_each_other(stage: str) -> None:
+    for name in below(f"receiver.{stage}"):
+        assert own(imports(MODULES[name])) <= GROUND | set(below(f"receiver.{stage}")), name
+
+
+@pytest.mark.parametrize(
+    ("room", "allowed"),
+    [
+        ("ingest", ()),
+        ("link", ()),
+        ("receiver", ("ingest", "results.dump", "link")),
+        ("results", ("receiver", "ingest", "link")),
+        ("runs", ("receiver", "ingest", "results", "link")),
+        ("calibrate", ("receiver", "ingest")),
+    ],
+)
+def test_data_flows_down_the_listing(room: str, allowed: tuple[str, ...]) -> None:
+    """A room uses those before it; the laboratory and the command line use them all."""
+    for name in below(room):
+        beside = own(imports(MODULES[name])) - GROUND - {"rxcli.options"} - set(below(room, *allowed))
+        assert not beside, (name, beside)
 
 
 def test_no_module_imports_itself_through_others() -> None:
@@ -108,14 +140,13 @@ def test_protocol_is_pure() -> None:
 def test_the_simulator_shares_only_protocol_and_profiles_with_the_receiver() -> None:
     """A wrong equation shared by both would cancel in every round trip."""
     allowed = BASE | {"rxcli.protocol", "rxcli.profiles"}
-    for name in modules_of("simulate"):
-        found = {other for other in own(imports(MODULES[name])) if part_of(other) != "simulate"}
-        assert found <= allowed, name
+    for name in below("lab.simulate"):
+        assert own(imports(MODULES[name])) - set(below("lab.simulate")) <= allowed, name
 
 
 def test_only_training_imports_torch() -> None:
     for name, tree in MODULES.items():
-        if part_of(name) != "training":
+        if name not in below("lab.training"):
             assert not {found for found in imports(tree) if found.split(".")[0] == "torch"}, name
 
 
@@ -129,24 +160,17 @@ def test_nothing_below_imports_the_command_line() -> None:
 
 @pytest.mark.parametrize("part", ["report", "truth"])
 def test_reports_know_results_only(part: str) -> None:
-    assert own(imports(MODULES[f"rxcli.{part}"])) <= DATA
+    assert own(imports(MODULES[f"rxcli.results.{part}"])) <= DATA
 
 
 def test_only_those_above_it_call_the_pipeline() -> None:
-    callers = {part_of(name) for name, tree in MODULES.items() if "rxcli.pipeline" in imports(tree)}
-    assert callers <= {"cli", "benchmark", "batch", "training"}
-
-
-def test_only_the_wiring_puts_stages_together() -> None:
-    for name, tree in MODULES.items():
-        stages = {part_of(other) for other in own(imports(tree))} & set(PIPELINE_STAGES)
-        if part_of(name) not in WIRING | {"cli", "benchmark", "training", "batch", "pictures", "undistort"}:
-            assert stages <= {part_of(name)}, name
+    callers = {part_of(name) for name, tree in MODULES.items() if "rxcli.receiver.pipeline" in imports(tree)}
+    assert callers <= {"", "cli", "lab", "runs"}
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))
 def test_heavy_libraries_are_imported_where_they_are_used(name: str) -> None:
-    if part_of(name) == "training":
+    if name in below("lab.training"):
         pytest.skip("training is loaded by `vlc-rx train` alone")
     found = {other.split(".")[0] for other in imports_at_load(MODULES[name])} & HEAVY
     readers = {"rxcli.ingest.jpeg", "rxcli.ingest.raw", "rxcli.ingest.video"}  # loaded when a file of their kind comes
@@ -158,4 +182,4 @@ def test_commands_load_quickly(name: str) -> None:
     """numpy, and what brings it, would more than double the time of `vlc-rx --help`."""
     found = imports_at_load(MODULES[name])
     assert not {other for other in found if other.split(".")[0] == "numpy"}
-    assert own(found) <= {"rxcli", "rxcli.errors", *modules_of("cli")}
+    assert own(found) <= {"rxcli", "rxcli.errors", *below("cli")}

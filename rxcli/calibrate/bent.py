@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from rxcli.calibrate.shutter import ShutterCalibration, weighted_mean
-from rxcli.locate import Failure, Stages, find_camera, find_corners
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
+from rxcli.receiver.locate import Failure, Stages, find_camera, find_corners
 from rxcli.types import Frame
 
 _NOTE = (

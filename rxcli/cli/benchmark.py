@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 if TYPE_CHECKING:
-    from rxcli.benchmark.confidence import Calibration
-    from rxcli.benchmark.journal import Journal
-    from rxcli.benchmark.sweeps import Summary
+    from rxcli.lab.benchmark.confidence import Calibration
+    from rxcli.lab.benchmark.journal import Journal
+    from rxcli.lab.benchmark.sweeps import Summary
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -39,7 +39,7 @@ def _common(command: _F) -> _F:
 
 
 def _journal(out: Path, name: str, fresh: bool) -> Journal:
-    from rxcli.benchmark.journal import Journal
+    from rxcli.lab.benchmark.journal import Journal
 
     path = out / f"{name}.journal.jsonl"
     if fresh:
@@ -48,7 +48,7 @@ def _journal(out: Path, name: str, fresh: bool) -> Journal:
 
 
 def _check_sweeps(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
-    from rxcli.benchmark.sweeps import SWEEPS
+    from rxcli.lab.benchmark.sweeps import SWEEPS
 
     for name in names:
         if name not in SWEEPS:
@@ -74,8 +74,8 @@ def benchmark(context: click.Context, quick: bool, jobs: int, out: Path, seed: i
     if not quick:
         click.echo(context.get_help())
         return
-    from rxcli.benchmark import quick as work
-    from rxcli.benchmark.tables import titled, write_text
+    from rxcli.lab.benchmark import quick as work
+    from rxcli.lab.benchmark.tables import titled, write_text
 
     headline = work.run(out / "media", _journal(out, "quick", fresh), seed=seed, jobs=jobs, quiet=quiet)
     text = titled(headline.sections)
@@ -113,10 +113,10 @@ def confidence(
     quiet: bool,
 ) -> None:
     """Share of error-free packets in ten bins of reported confidence."""
-    from rxcli.benchmark import clip_confidence, plots
-    from rxcli.benchmark import confidence as work
-    from rxcli.benchmark.journal import Journal
-    from rxcli.benchmark.tables import format_table, write_outputs
+    from rxcli.lab.benchmark import clip_confidence, plots
+    from rxcli.lab.benchmark import confidence as work
+    from rxcli.lab.benchmark.journal import Journal
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
     earlier = [record for path in journals for record in Journal(path).records]
     journal = _journal(out, "confidence", fresh)
@@ -140,8 +140,8 @@ def confidence(
 @_common
 def phones(count: int, cae: str, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
     """Simulated phones received without a camera profile: rows per slot, and wrong packets by confidence."""
-    from rxcli.benchmark import phones as work
-    from rxcli.benchmark.tables import titled, write_outputs
+    from rxcli.lab.benchmark import phones as work
+    from rxcli.lab.benchmark.tables import titled, write_outputs
 
     records = work.run(count, _journal(out, "phones", fresh), seed=seed, cae=cae, jobs=jobs, quiet=quiet)
     rows, missed = work.rows(records), work.missed(records)
@@ -151,7 +151,7 @@ def phones(count: int, cae: str, jobs: int, out: Path, seed: int, fresh: bool, q
 
 
 def _calibration_notes(result: Calibration) -> list[str]:
-    from rxcli.benchmark.tables import format_value
+    from rxcli.lab.benchmark.tables import format_value
 
     lines = [
         f"{result.n_packets} packets of {result.n_frames} frames; calibration error {format_value(result.error)}, "
@@ -180,8 +180,8 @@ def _say_written(paths: Sequence[Path]) -> None:
 @_common
 def sweep(only: tuple[str, ...], frames: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
     """Error and run time over slot rate, light, exposure, picture, tilt, camera, and the receiver's variants."""
-    from rxcli.benchmark import sweeps
-    from rxcli.benchmark.tables import format_table, write_outputs
+    from rxcli.lab.benchmark import sweeps
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
     names = only or tuple(sweeps.SWEEPS)
     journal = _journal(out, "sweep", fresh)
@@ -193,7 +193,7 @@ def sweep(only: tuple[str, ...], frames: int, jobs: int, out: Path, seed: int, f
 
 
 def _plot_sweeps(summaries: Sequence[Summary], out: Path) -> list[Path]:
-    from rxcli.benchmark import plots, sweeps
+    from rxcli.lab.benchmark import plots, sweeps
 
     if not plots.available():
         return []
@@ -217,9 +217,9 @@ def stages(repeats: int, only: tuple[str, ...], growth: bool, out: Path, seed: i
     """Time per stage against the bare decode, peak memory, growth with pixels and columns."""
     from tqdm import tqdm
 
-    from rxcli.benchmark import plots
-    from rxcli.benchmark import stages as work
-    from rxcli.benchmark.tables import format_table, write_outputs
+    from rxcli.lab.benchmark import plots
+    from rxcli.lab.benchmark import stages as work
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
     media = [medium for medium in work.MEDIA if not only or medium.name in only]
     if not media:
@@ -269,9 +269,9 @@ def stability(scenes: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: 
 
     Exit code 1 where something was found.
     """
-    from rxcli.benchmark import stability as work
-    from rxcli.benchmark.tables import format_table, format_value, write_outputs
     from rxcli.errors import ExitCode
+    from rxcli.lab.benchmark import stability as work
+    from rxcli.lab.benchmark.tables import format_table, format_value, write_outputs
 
     verdict = work.run(scenes, _journal(out, "stability", fresh), seed=seed, jobs=jobs, quiet=quiet)
     rows = work.rows(verdict)
@@ -311,8 +311,8 @@ def captures(
 
     Beside both stands the bound, on the sensor's electrons and on the delivered file.
     """
-    from rxcli.benchmark import captures as work
-    from rxcli.benchmark.tables import format_table, write_outputs
+    from rxcli.lab.benchmark import captures as work
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
     found = work.find_captures(folder, pictures)
     wanted = [one for one in found if not only or any(text in one.path.name for text in only)]
@@ -334,9 +334,9 @@ def folder(files: int, bad: int, kills: int, out: Path, seed: int) -> int:
 
     Exit code 1 unless all good files give packets, all bad ones a reason, and all runs the same results.
     """
-    from rxcli.benchmark import folder as work
-    from rxcli.benchmark.tables import format_table, write_outputs
     from rxcli.errors import ExitCode
+    from rxcli.lab.benchmark import folder as work
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
     if bad >= files:
         raise click.BadParameter(f"--bad must be below --files, {files} (got {bad})")
@@ -354,8 +354,8 @@ def folder(files: int, bad: int, kills: int, out: Path, seed: int) -> int:
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("benchmark-results"))
 def memory(frames: int, out: Path) -> None:
     """Memory of `vlc-rx decode` over a long clip."""
-    from rxcli.benchmark import long_clip as work
-    from rxcli.benchmark.tables import format_table, write_outputs
+    from rxcli.lab.benchmark import long_clip as work
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
     clip = work.make_clip(out / "media", frames)
     places = tuple(sorted({max(round(frames * share), 1) for share in (0.1, 0.2, 0.5, 1.0)}))

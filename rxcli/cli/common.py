@@ -13,8 +13,8 @@ import click
 from rxcli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from rxcli.pipeline import ReceiverOptions
     from rxcli.profiles import CameraProfile, ScreenProfile
+    from rxcli.receiver.pipeline import ReceiverOptions
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 AUTO = "auto"
@@ -38,7 +38,7 @@ class _Point(click.ParamType[tuple[float, float]]):
 
 
 def _check_skip(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
-    from rxcli.pipeline import SKIPS
+    from rxcli.receiver.pipeline import SKIPS
 
     for name in names:
         if name not in SKIPS:
@@ -120,7 +120,7 @@ def receiver_options(
     """
     import numpy as np
 
-    from rxcli.pipeline import SKIPS, ReceiverOptions
+    from rxcli.receiver.pipeline import SKIPS, ReceiverOptions
 
     named = [name for name in cameras if name != AUTO]
     return ReceiverOptions(

@@ -15,9 +15,9 @@ from rxcli.cli.common import receiver_arguments, receiver_options
 from rxcli.errors import ExitCode, InputError, UsageError
 
 if TYPE_CHECKING:
-    from rxcli.batch import Decoded, Decoder, Source
-    from rxcli.summary import SourceSummary
-    from rxcli.truth import Scorer
+    from rxcli.results.summary import SourceSummary
+    from rxcli.results.truth import Scorer
+    from rxcli.runs.batch import Decoded, Decoder, Source
     from rxcli.types import FrameResult
 
 _FILE = click.Path(dir_okay=False, path_type=Path, allow_dash=False)
@@ -63,13 +63,13 @@ def decode(paths: tuple[str, ...], **options: Any) -> int:
             "stop_when_certain",
         )
     }
-    from rxcli.batch import standard_decoder
+    from rxcli.runs.batch import standard_decoder
 
     configured = receiver_options(**receiver)
     _make_folders(options)
     tap = None
     if options["save_undistorted"]:
-        from rxcli.undistort import UndistortedWriter
+        from rxcli.results.undistort import UndistortedWriter
 
         tap = UndistortedWriter(options["save_undistorted"], configured.cameras, configured.force_camera)
     with _stdin_as_file(paths) as sources:
@@ -78,7 +78,7 @@ def decode(paths: tuple[str, ...], **options: Any) -> int:
 
 def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
     """Refuse what makes no sense before the long work starts."""
-    from rxcli.summary import check_summary_path
+    from rxcli.results.summary import check_summary_path
 
     json_file = options["json_path"] not in (None, "-")
     if options["resume"] and not json_file:
@@ -112,8 +112,8 @@ def _stdin_as_file(paths: tuple[str, ...]) -> Iterator[list[Source]]:
     """The sources that `paths` name, with what comes from stdin put into a file for as long as it is needed."""
     from tempfile import NamedTemporaryFile
 
-    from rxcli.batch import Source, collect_sources
     from rxcli.ingest import KNOWN_SUFFIXES
+    from rxcli.runs.batch import Source, collect_sources
 
     with ExitStack() as stack:
         sources = collect_sources([path for path in paths if path != "-"], frozenset(KNOWN_SUFFIXES))
@@ -129,7 +129,7 @@ class _Run:
     """One run over many sources: where results go, and what is kept for the summary."""
 
     def __init__(self, decoder: Decoder, options: dict[str, Any]) -> None:
-        from rxcli.summary import Limits
+        from rxcli.results.summary import Limits
 
         self._decoder = decoder
         self._options = options
@@ -140,7 +140,7 @@ class _Run:
         self._estimated: FrameResult | None = None
 
     def run(self, sources: list[Source]) -> ExitCode:
-        from rxcli.summary import exit_code
+        from rxcli.results.summary import exit_code
 
         if self._options["truth"] not in (None, "auto") and len(sources) != 1:
             raise UsageError(
@@ -159,7 +159,7 @@ class _Run:
 
     def _recover(self) -> set[str]:
         """Take the results of an earlier run into the summary; returns the names of its complete sources."""
-        from rxcli.batch import recover
+        from rxcli.runs.batch import recover
 
         done = set()
         for name, results in recover(Path(self._options["json_path"])):
@@ -175,7 +175,7 @@ class _Run:
         if self._to_stdout:
             return _print_json
         if self._options["json_path"]:
-            from rxcli.batch import Journal
+            from rxcli.runs.batch import Journal
 
             journal = Journal(Path(self._options["json_path"]), self._options["resume"])
             stack.callback(journal.close)
@@ -198,10 +198,10 @@ class _Run:
                 progress.finished(summary.n_frames)
 
     def _decoded(self, sources: list[Source]) -> Iterator[Decoded]:
-        from rxcli.batch import decode_here, decode_in_processes
+        from rxcli.runs.batch import decode_here, decode_in_processes
 
         if self._options["cluster"]:
-            from rxcli.cluster import decode_on_cluster
+            from rxcli.runs.cluster import decode_on_cluster
 
             return decode_on_cluster(sources, self._decoder, self._options["cluster"])
         if self._options["workers"] > 1 and len(sources) > 1:
@@ -209,8 +209,8 @@ class _Run:
         return decode_here(sources, self._decoder)
 
     def _begin(self, name: str) -> tuple[SourceSummary, Scorer | None]:
-        from rxcli.summary import SourceSummary
-        from rxcli.truth import Scorer, find_truth, load_truth
+        from rxcli.results.summary import SourceSummary
+        from rxcli.results.truth import Scorer, find_truth, load_truth
 
         summary = SourceSummary(name)
         truth = self._options["truth"]
@@ -237,9 +237,9 @@ class _Run:
             self._estimated = result
 
     def _save_camera(self, path: Path) -> None:
-        from rxcli.blind import camera_profile
         from rxcli.ingest import open_source
         from rxcli.profiles import dump_profile
+        from rxcli.receiver.camera import camera_profile
 
         if self._estimated is None:
             click.echo(f"vlc-rx: {path} was not written: no packet was received with an estimated camera", err=True)
@@ -254,7 +254,7 @@ class _Run:
             raise UsageError(f"--save-camera {path}: {error.strerror}", "name another file") from None
 
     def _conclude(self) -> None:
-        from rxcli.summary import format_summary, write_junit, write_summary
+        from rxcli.results.summary import format_summary, write_junit, write_summary
 
         if self._summaries and not self._options["quiet"]:
             click.echo(format_summary(self._summaries, self._limits), err=self._to_stdout)
@@ -276,14 +276,14 @@ def _order(names: list[str]) -> Any:
 
 
 def _print_json(result: FrameResult) -> None:
-    from rxcli.report import to_json_line
+    from rxcli.results.report import to_json_line
 
     sys.stdout.write(to_json_line(result) + "\n")
     sys.stdout.flush()
 
 
 def _print_table(result: FrameResult) -> None:
-    from rxcli.report import format_frame
+    from rxcli.results.report import format_frame
 
     click.echo(format_frame(result) + "\n")
 

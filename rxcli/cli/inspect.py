@@ -12,8 +12,8 @@ from rxcli.cli.common import receiver_arguments, receiver_options
 from rxcli.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
-    from rxcli.pipeline import ReceiverOptions
     from rxcli.profiles import CameraProfile, ScreenProfile
+    from rxcli.receiver.pipeline import ReceiverOptions
     from rxcli.types import Frame, FrameResult
 
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.option("--truth", metavar="FILE|auto", help="Count wrong bits against this truth.")
 def inspect(path: str, frame: int, out: Path | None, truth: str | None, **options: Any) -> int:
     """Write pictures of every stage of PATH, and an HTML page that shows them; prints the page's path."""
-    from rxcli.pictures import new_figure, write_pictures
+    from rxcli.results.plots import new_figure, write_pictures
 
     new_figure(1, 1)  # a missing extra is told before the work, not after it
     configured = receiver_options(**options)
@@ -50,13 +50,13 @@ def _frame_of(path: str, number: int) -> Frame:
 
 
 def _receive(picture: Frame, options: ReceiverOptions) -> FrameResult:
-    from rxcli.pipeline import receive
+    from rxcli.receiver.pipeline import receive
 
     return next(iter(receive([picture], options)))
 
 
 def _scored(result: FrameResult, path: str, truth: str | None) -> FrameResult:
-    from rxcli.truth import Scorer, find_truth, load_truth
+    from rxcli.results.truth import Scorer, find_truth, load_truth
 
     found = find_truth(path) if truth == "auto" else truth
     return Scorer(load_truth(found)).add(result) if found else result
@@ -65,7 +65,7 @@ def _scored(result: FrameResult, path: str, truth: str | None) -> FrameResult:
 def _profiles_of(
     picture: Frame, result: FrameResult, options: ReceiverOptions
 ) -> tuple[ScreenProfile | None, CameraProfile | None]:
-    from rxcli.blind import camera_profile
+    from rxcli.receiver.camera import camera_profile
 
     screen = next((s for s in options.screens if s.name == result.screen_profile), None)
     camera = next((c for c in options.cameras if c.name == result.camera_profile), None)

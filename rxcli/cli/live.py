@@ -65,7 +65,7 @@ def live(device: Path, **options: Any) -> int:
     names = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
     configured = receiver_options(**{name: options[name] for name in names})
     from rxcli.ingest.v4l2 import LiveSource
-    from rxcli.pipeline import receive
+    from rxcli.receiver.pipeline import receive
 
     source = LiveSource(device, _settings(options), on_lost=lambda reason: _say(f"waiting: {reason}"))
     with ExitStack() as stack:
@@ -116,7 +116,7 @@ def _limited(source: LiveSource, n_frames: int | None, duration_s: float | None)
 
 def _writer(json_path: str | None, stack: ExitStack) -> Callable[[FrameResult], None]:
     """What is done with a result: a JSON line for each frame, or a table for those with packets."""
-    from rxcli.report import format_frame, to_json_line
+    from rxcli.results.report import format_frame, to_json_line
 
     def show(result: FrameResult) -> None:
         if any(column.packets for column in result.columns):

@@ -11,9 +11,9 @@ import click
 from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
-    from rxcli.simulate.capture import Take
-    from rxcli.simulate.scenes import Scene
-    from rxcli.simulate.transmitter import Weights
+    from rxcli.lab.simulate.capture import Take
+    from rxcli.lab.simulate.scenes import Scene
+    from rxcli.lab.simulate.transmitter import Weights
 
 _STILLS = ("jpeg", "dng", "dng14", "png", "png16", "tiff", "tiff16")
 _CODECS = ("h264", "h264-10", "hevc", "hevc-10", "mjpeg")
@@ -111,7 +111,7 @@ _SCENE_OPTIONS = (
 )
 def simulate(out: Path, **options: Any) -> None:
     """Simulate a capture of a mini-LED screen and write it to OUT, with OUT's name .truth.json beside it."""
-    from rxcli.simulate.capture import prepare
+    from rxcli.lab.simulate.capture import prepare
 
     if not out.parent.is_dir():
         raise UsageError(f"{out.parent}: no such folder", "create it first")
@@ -130,7 +130,7 @@ def simulate(out: Path, **options: Any) -> None:
 def _list(context: click.Context, wanted: bool) -> None:
     """Print the names of pictures and end."""
     if wanted:
-        from rxcli.simulate.pictures import picture_names
+        from rxcli.lab.simulate.pictures import picture_names
 
         click.echo("\n".join(picture_names()))
         context.exit()
@@ -145,7 +145,7 @@ def _format_of(out: Path) -> str:
 
 def _scene(options: dict[str, Any], file_format: str) -> Scene:
     """The preset with what the options change."""
-    from rxcli.simulate.scenes import preset
+    from rxcli.lab.simulate.scenes import preset
 
     scene = preset(options["preset"], options["screen"])
     scene = replace(scene, picture=options["picture"], dimming=options["dimming"], **_given(options, _SCENE_OPTIONS))
@@ -266,7 +266,7 @@ def _payload(text: str) -> bytes | None:
 
 def _write(take: Take, out: Path, file_format: str, bit_rate: int | None) -> Path:
     """Write the capture and its truth; returns the truth's path."""
-    from rxcli.simulate.truth import write_truth
+    from rxcli.lab.simulate.truth import write_truth
 
     if file_format in _CODECS:
         _write_clip(take, out, file_format, bit_rate)
@@ -277,9 +277,9 @@ def _write(take: Take, out: Path, file_format: str, bit_rate: int | None) -> Pat
 
 def _write_extras(take: Take, options: dict[str, Any]) -> None:
     """Camera profile and waveforms, where they are asked for."""
+    from rxcli.lab.simulate.transmitter import export_waveforms
+    from rxcli.lab.simulate.truth import build_camera_profile
     from rxcli.profiles import dump_profile
-    from rxcli.simulate.transmitter import export_waveforms
-    from rxcli.simulate.truth import build_camera_profile
 
     last = take.exposure(take.scene.n_frames - 1)
     if options["camera_profile"] is not None:
@@ -290,9 +290,9 @@ def _write_extras(take: Take, options: dict[str, Any]) -> None:
 
 
 def _write_still(take: Take, out: Path, file_format: str) -> None:
-    from rxcli.simulate.files import write_png
-    from rxcli.simulate.isp import develop
-    from rxcli.simulate.tiff import write_dng, write_tiff
+    from rxcli.lab.simulate.files import write_png
+    from rxcli.lab.simulate.isp import develop
+    from rxcli.lab.simulate.tiff import write_dng, write_tiff
 
     capture = take.frame(0)
     if file_format == "jpeg":
@@ -308,8 +308,8 @@ def _write_still(take: Take, out: Path, file_format: str) -> None:
 def _write_clip(take: Take, out: Path, codec: str, bit_rate: int | None) -> None:
     from tqdm import tqdm
 
-    from rxcli.simulate.isp import develop
-    from rxcli.simulate.video import CODECS, write_video
+    from rxcli.lab.simulate.isp import develop
+    from rxcli.lab.simulate.video import CODECS, write_video
 
     scene, bits = take.scene, 16 if CODECS[codec].bits > 8 else 8
     numbers = tqdm(range(scene.n_frames), desc=out.name, unit="frame", leave=False, disable=None)

@@ -56,8 +56,8 @@ def train(
     for package in ("torch", "onnx", "matplotlib"):
         if find_spec(package) is None:
             raise UsageError(f"training needs {package}, which is not installed", "run: pip install 'vlc-rx[train]'")
-    from rxcli.training import dataset, export, fit
-    from rxcli.training.network import Shape, n_parameters
+    from rxcli.lab.training import dataset, export, fit
+    from rxcli.lab.training.network import Shape, n_parameters
 
     data, progress = cache or out / "data", not quiet
     recipe = fit.Recipe(shape=Shape(strip_width=strip_width, column_width=column_width), steps=steps, seed=seed)

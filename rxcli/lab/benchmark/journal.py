@@ -1,0 +1,172 @@
+"""Long runs that survive an interruption: a journal of JSON lines, one per finished task, and workers that fill it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from rxcli.errors import InputError, UsageError
+
+Record = dict[str, Any]
+#: A task is what its work needs, as JSON values; its key says what makes it the same task in another run.
+Task = dict[str, Any]
+Work = Callable[[Task], Record]
+
+
+class Journal:
+    """Records of finished tasks, in memory and, where a path is given, on disk.
+
+    Args:
+        path: JSON lines file that is appended to; None keeps the records in memory only.
+    """
+
+    def __init__(self, path: Path | None = None) -> None:
+        self._path = path
+        self._records: dict[str, Record] = {}
+        if path is not None and path.exists():
+            self._load(path)
+
+    def _load(self, path: Path) -> None:
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: cannot be read as a journal ({error})", "name another file") from None
+        lines = text.splitlines(keepends=True)
+        for number, line in enumerate(lines, 1):
+            if not line.endswith("\n"):
+                # The run was killed while it wrote this line: its task is simply done again.
+                path.write_text("".join(lines[:-1]), encoding="utf-8")
+                break
+            self._load_line(line, path, number)
+
+    def _load_line(self, line: str, path: Path, number: int) -> None:
+        try:
+            entry = json.loads(line)
+            self._records[entry["key"]] = entry["record"]
+        except (ValueError, KeyError, TypeError):
+            raise InputError(f"{path}: line {number} is no journal entry", "name another file") from None
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._records
+
+    def __getitem__(self, key: str) -> Record:
+        return self._records[key]
+
+    @property
+    def records(self) -> list[Record]:
+        """All of them, in the order in which they were added."""
+        return list(self._records.values())
+
+    def add(self, key: str, record: Record) -> None:
+        """Keep the record of a finished task."""
+        self._records[key] = record
+        if self._path is None:
+            return
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"key": key, "record": record}, separators=(",", ":")) + "\n")
+        except OSError as error:
+            raise UsageError(
+                f"{self._path}: cannot be written ({error.strerror})", "name another folder with --out"
+            ) from None
+
+
+def task_key(task: Task) -> str:
+    """What tells tasks apart: their values in canonical order."""
+    return json.dumps(task, sort_keys=True, separators=(",", ":"))
+
+
+@lru_cache(maxsize=1)
+def code_fingerprint() -> str:
+    """Hash of the package's source: what an earlier version has found is not taken for what this one does."""
+    root = Path(__file__).resolve().parents[2]
+    digest = sha256()
+    for path in sorted(root.rglob("*.py")):
+        if path.parent.name != "cli":
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def run_tasks(
+    tasks: Sequence[Task], work: Work, journal: Journal, *, jobs: int = 1, label: str = "", quiet: bool = False
+) -> list[Record]:
+    """Do those of `tasks` that the journal lacks; returns the records of all, in order.
+
+    Args:
+        tasks: JSON values each.
+        work: a function of a module, so that other processes find it.
+        journal: what is done already; it grows task by task.
+        jobs: processes; each uses one thread.
+        label: of the progress bar.
+        quiet: show no progress bar.
+    """
+    from tqdm import tqdm
+
+    code = code_fingerprint()
+    keys = [task_key({**task, "code": code}) for task in tasks]
+    missing = [(key, task) for key, task in zip(keys, tasks, strict=True) if key not in journal]
+    bar = tqdm(total=len(tasks), initial=len(tasks) - len(missing), desc=label, disable=quiet or None, leave=False)
+    with bar:
+        for key, record in _each(missing, work, jobs):
+            journal.add(key, record)
+            bar.update()
+    return [journal[key] for key in keys]
+
+
+def _each(tasks: Sequence[tuple[str, Task]], work: Work, jobs: int) -> Iterator[tuple[str, Record]]:
+    if jobs <= 1 or len(tasks) <= 1:
+        with _OneThread():
+            for key, task in tasks:
+                yield key, work(task)
+        return
+    yield from _in_processes(tasks, work, jobs)
+
+
+def _in_processes(tasks: Sequence[tuple[str, Task]], work: Work, jobs: int) -> Iterator[tuple[str, Record]]:
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from multiprocessing import get_context
+
+    # Libraries read these when they are loaded, which in a spawned worker is later than here.
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_use_one_thread) as pool:
+            futures = {pool.submit(work, task): key for key, task in tasks}
+            try:
+                for future in as_completed(futures):
+                    yield futures[future], future.result()
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def _use_one_thread() -> None:
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+class _OneThread:
+    """OpenCV on one thread for a while, so that times mean the same on every machine."""
+
+    def __enter__(self) -> None:
+        import cv2
+
+        self._threads = cv2.getNumThreads()
+        cv2.setNumThreads(1)
+
+    def __exit__(self, *_: object) -> None:
+        import cv2
+
+        cv2.setNumThreads(self._threads)

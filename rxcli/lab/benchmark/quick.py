@@ -1,0 +1,106 @@
+"""The headline: error beside both yardsticks, run time beside the bare decode, and stability, in three minutes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rxcli.lab.benchmark import stability, stages, sweeps
+from rxcli.lab.benchmark.journal import Journal
+
+#: Frames of each point, and runs whose median counts.
+_FRAMES, _REPEATS = 2, 3
+_MEDIA = ("jpeg-26mp", "raw-26mp")
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Headline:
+    """The tables of a quick run."""
+
+    errors: list[Row]
+    times: list[Row]
+    checks: list[Row]
+
+    @property
+    def sections(self) -> list[tuple[str, Sequence[Row]]]:
+        """Titles and tables."""
+        return [
+            ("bit error rate, lost packets included: receiver, bound, the paper's pipeline", self.errors),
+            ("wall time on two threads, against the bare decode of the file on one", self.times),
+            ("checks", self.checks),
+        ]
+
+
+def points() -> list[sweeps.Point]:
+    """The paper's three rates on its two pictures, a dim photo, a phone and a clip."""
+    paper = [point for point in sweeps.SWEEPS["rate"]() if point.slot_rate_hz <= 34600]
+    dim = replace(next(iter(sweeps.SWEEPS["picture"]())), picture="coffee", light=0.3, label="coffee x 0.3")
+    cameras = [p for p in sweeps.SWEEPS["camera"]() if p.camera in ("phone-corrected", "video-4k")]
+    return [*paper, dim, *cameras]
+
+
+def run(folder: Path, journal: Journal, *, seed: int = 0, jobs: int = 2, quiet: bool = False) -> Headline:
+    """Measure the headline.
+
+    Args:
+        folder: of the media that are timed.
+        journal: of the trials.
+        seed: of the scenes.
+        jobs: processes for the trials.
+        quiet: no progress bars.
+    """
+    summaries = sweeps.run(points(), _FRAMES, journal, seed=seed, jobs=jobs, quiet=quiet)
+    verdict = stability.run(0, journal, seed=seed, jobs=jobs, quiet=quiet)
+    return Headline(error_rows(summaries), _time_rows(folder, seed), _check_rows(verdict))
+
+
+def error_rows(summaries: Sequence[sweeps.Summary]) -> list[Row]:
+    """One row a point: error of the receiver and of both yardsticks."""
+    table = []
+    for point in dict.fromkeys(summary.point for summary in summaries):
+        mine = {summary.method: summary for summary in summaries if summary.point == point}
+        receiver = mine["receiver"]
+        table.append(
+            {
+                "scene": point.label,
+                "kb/s": point.rate_kbps,
+                "packets": receiver.score.expected,
+                "receiver": receiver.score.ber,
+                "receiver95": receiver.ber_interval,
+                "bound": mine[sweeps.BOUND].score.ber,
+                "paper": mine[sweeps.PAPER].score.ber,
+                "error_free": receiver.score.error_free,
+                "false": receiver.score.false,
+            }
+        )
+    return table
+
+
+def _time_rows(folder: Path, seed: int) -> list[Row]:
+    table = []
+    for medium in (medium for medium in stages.MEDIA if medium.name in _MEDIA):
+        timing = stages.time_medium(medium, stages.make_medium(medium, folder, seed), 2, _REPEATS)
+        table.append(
+            {
+                "medium": medium.name,
+                "bare_ms": timing.bare_ms,
+                "total_ms": timing.total_ms,
+                "ratio": timing.ratio,
+                "target": stages.TARGETS[medium.name],
+                "status": timing.status,
+            }
+        )
+    return table
+
+
+def _check_rows(verdict: stability.Verdict) -> list[Row]:
+    failed = [name for name, problems in verdict.cases.items() if problems]
+    start = stages.help_times(3)
+    return [
+        {"check": f"{len(verdict.cases)} hostile cases", "result": f"failed: {', '.join(failed)}" if failed else "ok"},
+        *({"check": name, "result": f"{ms:.0f} ms"} for name, ms in start.items()),
+    ]

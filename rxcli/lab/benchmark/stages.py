@@ -1,0 +1,354 @@
+"""Time per stage against the bare decode of the file, peak memory, and growth with pixels and columns.
+
+Every measurement runs in a process of its own, which prints one JSON object: so thread counts, warm caches and peak
+memory of one do not touch another.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from rxcli.errors import ReceiverError
+from rxcli.lab.benchmark.statistics import power_law
+from rxcli.lab.simulate.scenes import Scene, preset
+from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile
+from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.types import Frame, FrameResult
+
+#: What a whole reception may take of the bare one-thread decode, on two cores.
+TARGETS = {"jpeg-26mp": 1.6, "raw-26mp": 2.5}
+#: Megapixels and columns over which growth is measured.
+MEGAPIXELS = (2.0, 4.0, 8.0, 16.0, 26.0, 50.0)
+COLUMNS = (20, 50, 100, 200)
+#: Size at which columns are varied, megapixels.
+_COLUMNS_AT_MP = 26.0
+_XS10_MP = 26.0
+#: Sums of stages, which are no stages themselves.
+_SUMS = ("total",)
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class Medium:
+    """One kind of file whose reception is timed."""
+
+    name: str
+    camera: str
+    screen: str
+    suffix: str
+    n_frames: int = 1
+    bit_rate: int | None = None
+
+
+MEDIA = (
+    Medium("jpeg-26mp", "xs10-still", "paper-34k6", ".jpg"),
+    Medium("raw-26mp", "xs10-still", "paper-34k6", ".dng"),
+    Medium("jpeg-12mp", "phone-plain", "paper-17k3", ".jpg"),
+    Medium("video-4k", "video-4k", "paper-34k6", ".mp4", 8, 108_000_000),
+    Medium("video-1080p", "video-1080p", "paper-17k3", ".mp4", 16, 20_000_000),
+)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Medians of repeated receptions of one file, milliseconds a frame."""
+
+    medium: str
+    threads: int
+    #: Bare decode of the file on one thread.
+    bare_ms: float
+    total_ms: float
+    stages_ms: dict[str, float]
+    status: str
+
+    @property
+    def ratio(self) -> float:
+        """Whole reception over bare decode."""
+        return self.total_ms / self.bare_ms
+
+
+def make_medium(medium: Medium, folder: Path, seed: int = 0) -> Path:
+    """The medium's file in `folder`, simulated unless it is there already, beside its camera profile."""
+    path = folder / f"{medium.name}{medium.suffix}"
+    if not (path.exists() and _profile_path(path).exists()):
+        scene = replace(preset(medium.camera, medium.screen), n_frames=medium.n_frames)
+        _write_capture(scene, path, seed, medium.bit_rate)
+    return path
+
+
+def _profile_path(path: Path) -> Path:
+    return path.with_name(path.stem + ".camera.toml")
+
+
+def _write_capture(scene: Scene, path: Path, seed: int, bit_rate: int | None = None) -> None:
+    from rxcli.lab.simulate.capture import prepare
+    from rxcli.lab.simulate.tiff import write_dng
+    from rxcli.lab.simulate.truth import build_camera_profile, write_truth
+    from rxcli.lab.simulate.video import write_video
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    raw = path.suffix == ".dng"
+    scene = replace(scene, output="raw" if raw else "developed")
+    take = prepare(scene, seed)
+    if path.suffix == ".mp4":
+        frames = (take.frame(number).rgb for number in range(scene.n_frames))
+        write_video(frames, path, "h264", scene.frame_rate_hz, bit_rate)
+    elif raw:
+        write_dng(take.frame().raw, scene, path)
+    else:
+        path.write_bytes(take.frame().jpeg)
+    write_truth(take.truth(path.name), path)
+    _profile_path(path).write_text(dump_profile(build_camera_profile(scene, take.exposure())), encoding="utf-8")
+
+
+def bare_decode(path: Path) -> Callable[[], int]:
+    """A function that decodes the file on one thread, nothing else, and returns the number of frames."""
+    if path.suffix == ".dng":
+        return lambda: _bare_raw(path)
+    return (lambda: bare_video(path)) if path.suffix == ".mp4" else lambda: _bare_jpeg(path)
+
+
+def _bare_jpeg(path: Path) -> int:
+    import simplejpeg
+
+    simplejpeg.decode_jpeg(path.read_bytes(), colorspace="GRAY")
+    return 1
+
+
+def _bare_raw(path: Path) -> int:
+    import rawpy
+
+    with rawpy.imread(str(path)) as raw:
+        return int(raw.raw_image.ndim > 0)
+
+
+def bare_video(path: Path, *, threaded: bool = False) -> int:
+    """Decode every luma plane as a view, on one thread or on as many as FFmpeg takes; returns the number of frames."""
+    import av
+    import numpy as np
+
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        stream.thread_type, stream.codec_context.thread_count = ("FRAME", 0) if threaded else ("NONE", 1)
+        return sum(np.frombuffer(frame.planes[0], np.uint8).size > 0 for frame in container.decode(stream))
+
+
+class _Reception:
+    """One file, received again and again, every stage timed."""
+
+    def __init__(self, path: Path, screen: ScreenProfile) -> None:
+        camera = load_profile(str(_profile_path(path)), CameraProfile)
+        self._path = path
+        self._options = ReceiverOptions(screens=(screen,), cameras=(camera,), force_camera=True)
+        self._ingest_s = 0.0
+
+    def __call__(self) -> tuple[float, dict[str, float], list[FrameResult]]:
+        """Wall time (ms a frame), stages (ms a frame), results."""
+        self._ingest_s = 0.0
+        start = time.perf_counter()
+        results = list(receive(self._frames(), self._options))
+        wall = 1e3 * (time.perf_counter() - start) / len(results)
+        stages = {"ingest": 1e3 * self._ingest_s / len(results)}
+        for name in dict.fromkeys(name for result in results for name in result.timing_ms):
+            if name not in _SUMS:
+                stages[name] = sum(result.timing_ms.get(name, 0.0) for result in results) / len(results)
+        return wall, stages, results
+
+    def _frames(self) -> Iterator[Frame]:
+        from rxcli.ingest import open_source
+
+        source = iter(open_source(self._path))
+        while True:
+            start = time.perf_counter()
+            frame = next(source, None)
+            self._ingest_s += time.perf_counter() - start
+            if frame is None:
+                return
+            yield frame
+
+
+def _work_timing(task: dict[str, Any]) -> dict[str, Any]:
+    """Medians over repeats of the bare decode and of the whole reception, by turns, after a warm-up."""
+    import cv2
+
+    path, repeats = Path(task["path"]), int(task["repeats"])
+    cv2.setNumThreads(int(task["threads"]))
+    bare, reception = bare_decode(path), _Reception(path, load_profile(task["screen"], ScreenProfile))
+    bare(), reception()
+    bare_ms: list[float] = []
+    walls: list[float] = []
+    stages: list[dict[str, float]] = []
+    results: list[FrameResult] = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        n = bare()
+        bare_ms.append(1e3 * (time.perf_counter() - start) / n)
+        wall, by_stage, results = reception()
+        walls.append(wall)
+        stages.append(by_stage)
+    return {
+        "bare_ms": median(bare_ms),
+        "total_ms": median(walls),
+        "stages_ms": {name: median(s[name] for s in stages) for name in stages[0]},
+        "status": results[-1].status,
+    }
+
+
+def _work_memory(task: dict[str, Any]) -> dict[str, Any]:
+    """Peak memory of one reception in a fresh process, and of the imports alone."""
+    import cv2
+
+    cv2.setNumThreads(int(task["threads"]))
+    reception = _Reception(Path(task["path"]), load_profile(task["screen"], ScreenProfile))
+    idle = peak_memory_mb()
+    reception()
+    return {"idle_mb": idle, "peak_mb": peak_memory_mb()}
+
+
+def _work_growth(task: dict[str, Any]) -> dict[str, Any]:
+    """Median time of the processor in the stages after ingest on one simulated frame, outline handed over."""
+    import cv2
+
+    from rxcli.lab.benchmark.trial import simulate_trial
+
+    trial = simulate_trial(growth_scene(task["megapixels"], task["columns"]), 0, threads=2)
+    frame, options = trial.frame, trial.options()
+    cv2.setNumThreads(1)
+    totals = []
+    for _ in range(int(task["repeats"]) + 1):
+        start = time.process_time()
+        result = next(iter(receive([frame], options)))
+        totals.append(1e3 * (time.process_time() - start))
+    return {"total_ms": median(totals[1:]), "status": result.status, "pixels": frame.pixels.size}
+
+
+def growth_scene(megapixels: float, columns: int) -> Scene:
+    """A still of a screen of `columns` columns with `megapixels`, which shows the same time at any size."""
+    import msgspec
+
+    screen = load_profile("paper-17k3", ScreenProfile)
+    scene = preset("xs10-still", msgspec.structs.replace(screen, columns=columns))
+    scene = replace(scene, picture="sky")
+    factor = (megapixels / _XS10_MP) ** 0.5
+    return scene.scaled(factor, keep_readout=True) if factor != 1 else scene
+
+
+def peak_memory_mb() -> float:
+    """Peak resident memory of this process so far."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        # The kernel hands ru_maxrss of a parent on to its children; this figure is our own.
+        lines = status.read_text(encoding="ascii", errors="replace").splitlines()
+        return float(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) / 1024
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+
+
+_WORK = {"timing": _work_timing, "memory": _work_memory, "growth": _work_growth}
+
+
+def in_process(task: dict[str, Any]) -> dict[str, Any]:
+    """Do one measurement in a process of its own; `task["work"]` names it, `task["threads"]` limits its threads.
+
+    Raises:
+        ReceiverError: it failed.
+    """
+    environment = {**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(task.get("threads", 1)))}
+    root = str(Path(__file__).resolve().parents[3])
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, (root, environment.get("PYTHONPATH"))))
+    command = [sys.executable, "-m", "rxcli.lab.benchmark.stages", json.dumps(task)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        reason = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
+        raise ReceiverError(f"measurement {task['work']} failed: {reason[0]}", "run it again, or report it")
+    record: dict[str, Any] = json.loads(done.stdout)
+    return record
+
+
+def time_medium(medium: Medium, path: Path, threads: int, repeats: int) -> Timing:
+    """Time the reception of one file."""
+    task = {"work": "timing", "path": str(path), "screen": medium.screen, "threads": threads, "repeats": repeats}
+    return Timing(medium.name, threads, **in_process(task))
+
+
+def memory_of(medium: Medium, path: Path) -> dict[str, float]:
+    """Peak memory, MB: `idle_mb` after the imports, `peak_mb` after one reception."""
+    return in_process({"work": "memory", "path": str(path), "screen": medium.screen, "threads": 1})
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How the time after ingest grows with one thing."""
+
+    axis: str
+    x: tuple[float, ...]
+    ms: tuple[float, ...]
+
+    @property
+    def exponent(self) -> float:
+        """Of the power law nearest to the points."""
+        return power_law(self.x, self.ms)[0]
+
+
+def growth(axis: str, repeats: int, tick: Callable[[], None] = lambda: None) -> Growth:
+    """Measure growth over "megapixels" or "columns"; `tick` is called after every point."""
+    x, ms = [], []
+    for value in MEGAPIXELS if axis == "megapixels" else COLUMNS:
+        place = {"megapixels": _COLUMNS_AT_MP, "columns": 20, axis: value}
+        record = in_process({"work": "growth", "repeats": repeats, "threads": 1, **place})
+        x.append(float(value))
+        ms.append(float(record["total_ms"]))
+        tick()
+    return Growth(axis, tuple(x), tuple(ms))
+
+
+def help_times(repeats: int = 7) -> dict[str, float]:
+    """Milliseconds of bare Python and of `vlc-rx --help`, medians."""
+    commands = {"bare python": ["-c", "pass"], "vlc-rx --help": ["-m", "rxcli.cli.main", "--help"]}
+    root = Path(__file__).resolve().parents[3]
+    times: dict[str, list[float]] = {name: [] for name in commands}
+    for _ in range(repeats):
+        for name, arguments in commands.items():
+            start = time.perf_counter()
+            subprocess.run([sys.executable, *arguments], cwd=root, capture_output=True, check=True)
+            times[name].append(1e3 * (time.perf_counter() - start))
+    return {name: median(values) for name, values in times.items()}
+
+
+def timing_rows(timings: Sequence[Timing]) -> list[dict[str, Any]]:
+    """Stages as ratios to the bare decode; a table."""
+    names = list(dict.fromkeys(name for timing in timings for name in timing.stages_ms))
+    return [
+        {
+            "medium": t.medium,
+            "threads": t.threads,
+            "bare_ms": t.bare_ms,
+            "total_ms": t.total_ms,
+            **{name: t.stages_ms[name] / t.bare_ms if name in t.stages_ms else None for name in names},
+            "ratio": t.ratio,
+            "target": TARGETS.get(t.medium) if t.threads > 1 else None,
+            "status": t.status,
+        }
+        for t in timings
+    ]
+
+
+def main() -> None:
+    """Do the measurement that the command line gives as JSON; print the record."""
+    task = json.loads(sys.argv[1])
+    print(json.dumps(_WORK[task["work"]](task)))
+
+
+if __name__ == "__main__":
+    main()

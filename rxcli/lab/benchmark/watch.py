@@ -1,0 +1,86 @@
+"""Looks over the shoulder of the numeric stages: every value that a public function of theirs returns is checked."""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from functools import wraps
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from rxcli.receiver import channel, sampling, sync
+from rxcli.receiver.decode import detect
+from rxcli.receiver.screen import geometry
+
+STAGES = (geometry, sampling, sync, channel, detect)
+#: Fields that hold NaN by their contract.
+_NAN_ALLOWED = frozenset({"bit_llr"})
+
+
+def problems_in(value: Any, name: str) -> Iterator[str]:
+    """Places in `value` that hold NaN or positive infinity; -inf is the logarithm of an impossible event."""
+    if is_dataclass(value) and not isinstance(value, type):
+        for part in fields(value):
+            if part.name not in _NAN_ALLOWED:
+                yield from problems_in(getattr(value, part.name), f"{name}.{part.name}")
+    elif isinstance(value, (tuple, list)):
+        for number, part in enumerate(value):
+            yield from problems_in(part, f"{name}[{number}]")
+    elif isinstance(value, dict):
+        for key, part in value.items():
+            yield from problems_in(part, f"{name}[{key!r}]")
+    elif isinstance(value, (float, np.ndarray, np.floating)):
+        yield from _bad_numbers(np.asarray(value), name)
+
+
+def _bad_numbers(array: np.ndarray[Any, Any], name: str) -> Iterator[str]:
+    if array.dtype.kind == "f":
+        if np.isnan(array).any():
+            yield f"{name} holds NaN"
+        if np.isposinf(array).any():
+            yield f"{name} holds infinity"
+
+
+@contextmanager
+def watched() -> Iterator[list[str]]:
+    """While this lasts, problems of the stages' outputs and all warnings are gathered in the list it gives."""
+    found: list[str] = []
+    originals = [(module, name, function) for module in STAGES for name, function in _public(module)]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for module, name, function in originals:
+            setattr(module, name, _watch(function, f"{module.__name__.rpartition('.')[2]}.{name}", found))
+        try:
+            yield found
+        finally:
+            for module, name, function in originals:
+                setattr(module, name, function)
+            found += [f"{w.category.__name__}: {w.message} ({_place(w)})" for w in caught]
+
+
+def _place(warning: warnings.WarningMessage) -> str:
+    return f"{warning.filename.rpartition('/')[2]}:{warning.lineno}"
+
+
+def _public(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
+    members = inspect.getmembers(module, inspect.isfunction)
+    # What a package hands on is defined in its files.
+    own = [(name, f) for name, f in members if f"{f.__module__}.".startswith(f"{module.__name__}.")]
+    return [(name, f) for name, f in own if not name.startswith("_")]
+
+
+def _watch(function: Callable[..., Any], name: str, found: list[str]) -> Callable[..., Any]:
+    @wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        result = function(*args, **kwargs)
+        for problem in problems_in(result, name):
+            if problem not in found:
+                found.append(problem)
+        return result
+
+    return call

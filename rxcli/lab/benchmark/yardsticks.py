@@ -1,0 +1,215 @@
+"""Two yardsticks on the receiver's own frames: what no receiver can beat, and the paper's pipeline taken literally."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.lab.benchmark.trial import SOURCE, Trial, score_result
+from rxcli.lab.simulate.bound import Oracle
+from rxcli.profiles import CameraProfile, ScreenProfile
+from rxcli.protocol import (
+    HEADER,
+    PREAMBLE_SLOTS,
+    SLOTS_PER_SYMBOL,
+    WEIGHTS,
+    bits_to_hex,
+    codebook,
+    indices_to_bits,
+    payload_bits,
+)
+from rxcli.receiver.screen.geometry import lens_for
+from rxcli.receiver.screen.geometry import undistort as undistort_points
+from rxcli.results.truth import Score, Truth
+from rxcli.results.undistort import undistorted
+from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, Lens, PacketResult
+
+#: A header is taken for one where at least this share of its rows agrees with the template.
+_HEADER_AGREEMENT = 0.9
+#: Two headers belong to one packet where their distance is this close to a packet's length.
+_LENGTH_TOLERANCE = 0.02
+#: The threshold is the mean over this many slots, of which any two symbols are lit in their constant share. On easy
+#: scenes three symbols gave the fewest errors of one to four.
+_THRESHOLD_SLOTS = 3 * SLOTS_PER_SYMBOL
+#: Share of a slot, in its middle, whose rows vote for its state.
+_SLOT_MIDDLE = 0.5
+
+
+def bound_score(trial: Trial) -> Score:
+    """Score of the genie, who knows outline, clock, light, picture and all other slots, and decides symbol by symbol.
+
+    Args:
+        trial: simulated with its oracle.
+    """
+    oracle = trial.capture.oracle
+    assert oracle is not None, "the bound needs a trial with oracle=True"
+    return genie_score(oracle, trial.truth)
+
+
+def genie_score(oracle: Oracle, truth: Truth) -> Score:
+    """Score of a genie on one frame, by the statistics that it was given."""
+    columns = []
+    for column, w in enumerate(truth.w):
+        packets = []
+        for burst in truth.frames[0].bursts:
+            decided, _, seen = oracle.decide(column, burst.burst)
+            if seen.all():
+                packets.append(_packet(decided, w))
+        columns.append(ColumnResult(column, "ok", w=w, packets=tuple(packets)))
+    return score_result(_result(columns), truth)[1]
+
+
+def paper_score(trial: Trial) -> Score:
+    """Score of the paper's pipeline, given the outline and the camera."""
+    result = paper_pipeline(trial.frame, trial.corners, trial.camera, trial.capture.scene.screen)
+    return score_result(result, trial.truth)[1]
+
+
+def paper_pipeline(frame: Frame, corners: FloatArray, camera: CameraProfile, screen: ScreenProfile) -> FrameResult:
+    """The paper's receiver, step by step, on pixel values as they are stored.
+
+    Undistort the whole frame, rectify the screen, average every column's pixels, threshold against the local mean, take
+    what lies between two headers one packet apart, and choose the codeword of least Hamming distance.
+
+    Args:
+        frame: the picture.
+        corners: (4, 2) of the screen on the stored picture, top-left first, clockwise for a viewer.
+        camera: profile with a readout mode for the picture's size.
+        screen: what is sent.
+    """
+    waves, rows_per_slot = column_waves(frame, corners, camera, screen)
+    lit = threshold(waves, rows_per_slot)
+    columns = [
+        ColumnResult(column, "ok" if packets else "no_packet", packets=packets)
+        for column, row in enumerate(lit)
+        for packets in [tuple(_between_headers(row, rows_per_slot, screen))]
+    ]
+    return _result(columns)
+
+
+def column_waves(
+    frame: Frame, corners: FloatArray, camera: CameraProfile, screen: ScreenProfile
+) -> tuple[FloatArray, float]:
+    """Mean pixel value of every column on every row of the rectified screen, in readout order.
+
+    Returns:
+        (columns, rows) float64; rows per slot, by the camera's line delay.
+    """
+    import cv2
+
+    mode = camera.mode_for(frame.width, frame.height)
+    assert mode is not None, "the camera must have a mode for the picture's size"
+    lens = lens_for(camera.lens, frame.width, frame.height) if camera.lens else None
+    picture = undistorted(frame, lens or _straight(frame))
+    plane = corners if lens is None or lens.corrected else undistort_points(corners, lens)
+    top_left, top_right, bottom_right, bottom_left = plane
+    width = max(round(float(np.linalg.norm(top_right - top_left))), screen.columns)
+    height = max(round(float(np.linalg.norm(bottom_left - top_left))), 2)
+    target = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float32)
+    matrix = cv2.getPerspectiveTransform(plane.astype(np.float32), target)
+    rectified = cv2.warpPerspective(picture, matrix, (width, height), flags=cv2.INTER_LINEAR)
+    edges = np.linspace(0, width, screen.columns + 1).round().astype(int)
+    waves = np.stack([rectified[:, a:b].mean(axis=1) for a, b in pairwise(edges)])
+    upside_down = bottom_left[1] < top_left[1]
+    sensor_rows = float(abs(bottom_left[1] + bottom_right[1] - top_left[1] - top_right[1])) / 2
+    rows_per_slot = height / max(sensor_rows, 1.0) / (mode.line_delay_s * screen.slot_rate_hz)
+    return waves[:, ::-1] if upside_down else waves, rows_per_slot
+
+
+def _straight(frame: Frame) -> Lens:
+    return Lens(np.eye(3), np.zeros(5), corrected=True)
+
+
+def threshold(waves: FloatArray, rows_per_slot: float) -> NDArray[np.bool_]:
+    """Rows brighter than the mean of their surroundings; (columns, rows)."""
+    import cv2
+
+    length = 2 * int(_THRESHOLD_SLOTS * rows_per_slot / 2) + 1
+    return np.asarray(waves > cv2.blur(waves, (length, 1), borderType=cv2.BORDER_REFLECT))
+
+
+def _between_headers(lit: NDArray[np.bool_], rows_per_slot: float, screen: ScreenProfile) -> Iterator[PacketResult]:
+    """Packets between headers one packet length apart: the pair that agrees best, and those in step with it."""
+    starts, agreement = find_headers(lit, rows_per_slot)
+    length = screen.packet_slots * rows_per_slot
+    first, end = np.meshgrid(np.arange(starts.size), np.arange(starts.size), indexing="ij")
+    first, end = (
+        side[np.abs(starts[end] - starts[first] - length) <= _LENGTH_TOLERANCE * length] for side in (first, end)
+    )
+    if first.size == 0:
+        return
+    best = starts[first[(agreement[first] + agreement[end]).argmax()]]
+    steps = (starts[first] - best) / length
+    for pair in np.flatnonzero(np.abs(steps - steps.round()) <= _LENGTH_TOLERANCE):
+        slots = _read_slots(lit, starts[first[pair]], starts[end[pair]], screen.packet_slots)
+        yield _nearest_packet(slots, screen.payload_symbols)
+
+
+def find_headers(lit: NDArray[np.bool_], rows_per_slot: float) -> tuple[FloatArray, FloatArray]:
+    """Rows at which a header starts, ascending, and its agreement with the template, 0..1; (n,) float64 each."""
+    edges = np.arange(0, SLOTS_PER_SYMBOL * rows_per_slot)
+    template = np.array(HEADER)[np.minimum((edges / rows_per_slot).astype(int), SLOTS_PER_SYMBOL - 1)]
+    if template.size > lit.size:
+        return np.empty(0), np.empty(0)
+    agreement = 0.5 + np.correlate(lit - 0.5, template - 0.5, "valid") * 2 / template.size
+    reach = max(round(2 * rows_per_slot), 1)
+    highest = np.lib.stride_tricks.sliding_window_view(np.pad(agreement, reach), 2 * reach + 1).max(axis=1)
+    places = np.flatnonzero((agreement >= _HEADER_AGREEMENT) & (agreement == highest))
+    # A flat top is one header: its middle.
+    groups = [g for g in np.split(places, np.flatnonzero(np.diff(places) > reach) + 1) if g.size]
+    return np.array([g.mean() for g in groups]), np.array([agreement[g[0]] for g in groups])
+
+
+def _read_slots(lit: NDArray[np.bool_], first: float, end: float, n_slots: int) -> NDArray[np.uint8]:
+    """Majority of the rows in the middle of each of the slots between two headers."""
+    step = (end - first) / n_slots
+    offsets = np.linspace(-_SLOT_MIDDLE / 2, _SLOT_MIDDLE / 2, 5) * step
+    rows = first + (np.arange(n_slots)[:, None] + 0.5) * step - 0.5 + offsets
+    values = lit[np.clip(rows.round().astype(int), 0, lit.size - 1)]
+    lit_slots: NDArray[np.uint8] = (values.mean(axis=1) > 0.5).astype(np.uint8)
+    return lit_slots
+
+
+def _nearest_packet(slots: NDArray[np.uint8], payload_symbols: int) -> PacketResult:
+    w = int(np.clip(slots[SLOTS_PER_SYMBOL:PREAMBLE_SLOTS].sum(), WEIGHTS[0], WEIGHTS[-1]))
+    symbols = slots[PREAMBLE_SLOTS:].reshape(payload_symbols, SLOTS_PER_SYMBOL)
+    distance = (symbols[:, None] != codebook(w)).sum(axis=2)
+    return _packet(distance.argmin(axis=1), w)
+
+
+def _packet(index: NDArray[np.int64], w: int) -> PacketResult:
+    bits = indices_to_bits(index, w)
+    return PacketResult(
+        first_row=0.0,
+        copies=1.0,
+        payload_bits=payload_bits(w, index.size),
+        payload=bits_to_hex(bits),
+        confidence=1.0,
+        ber_hat=0.0,
+    )
+
+
+def _result(columns: list[ColumnResult]) -> FrameResult:
+    return FrameResult(SOURCE, 0, 0.0, "ok", columns=tuple(columns))
+
+
+@dataclass(frozen=True)
+class Yardsticks:
+    """Scores of both yardsticks, and the wall time of the paper's pipeline."""
+
+    bound: Score
+    paper: Score
+    paper_ms: float
+
+
+def measure(trial: Trial) -> Yardsticks:
+    """Both yardsticks on one trial."""
+    from time import perf_counter
+
+    start = perf_counter()
+    paper = paper_score(trial)
+    return Yardsticks(bound_score(trial), paper, 1e3 * (perf_counter() - start))

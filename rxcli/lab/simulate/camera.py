@@ -1,0 +1,350 @@
+"""The camera: what light reaches every pixel during its row's exposure.
+
+Electrons of a pixel are `T(u, v) * sum over columns c of K_c(u, v) * m_c(row) + room`. `T` is the picture (sharp),
+`K_c` the light of column `c` (smooth, so it is evaluated on a coarse grid), `m_c` the share of the row's exposure in
+which the column was lit (exact). Focus blur is applied to `T`: it mixes places, and one row remains one instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.lab.simulate.optics import View
+from rxcli.lab.simulate.sensor import Sensor, count_electrons, pick_colours, repeat_gains, to_raw
+from rxcli.lab.simulate.shutter import flicker, lit_share
+from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+
+#: Pitch of the coarse grid in rows, and rows of one band of work (a multiple of it).
+_GRID_ROWS = 32
+_BAND_ROWS = 256
+#: Texture pixels of black around the panel, so that blur can run out of it.
+_TEXTURE_MARGIN = 12
+#: Breadth of the dark frame around the panel, in screen widths.
+_BEZEL_WIDTHS = 0.035
+
+
+@dataclass(frozen=True)
+class Room:
+    """Light that does not come from the screen, in electrons per second of a green pixel seeing white paper."""
+
+    light_e_per_s: float = 0.0
+    #: Mains flicker: twice 50 or 60 Hz, and its depth 0..1.
+    flicker_hz: float = 100.0
+    flicker_depth: float = 0.3
+    #: Share of the room's light that the dark panel throws back.
+    panel_reflectance: float = 0.12
+    wall_reflectance: float = 0.3
+    bezel_reflectance: float = 0.03
+    #: A lamp mirrored in the panel: its strength against white paper, and its place (u, v) and size (in screen widths).
+    lamp: float = 0.0
+    lamp_place: tuple[float, float] = (0.7, 0.3)
+    lamp_size: float = 0.12
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One picture to be taken: scene, clock and light, ready to be computed band by band."""
+
+    view: View
+    drive: Drive
+    link: Link
+    sensor: Sensor
+    room: Room
+    exposure_s: float
+    #: Electrons per second of a green pixel that sees white at the screen's full average light.
+    light_e_per_s: float
+    #: Standard deviation of the focus blur, sensor pixels.
+    blur_px: float
+    #: Depth of the panel's pixel structure, 0..1.
+    lcd_grid: float
+    #: Loss of light in the picture's corners, 0..1.
+    vignetting: float
+    #: Slot of the common clock at which row 0 starts to integrate.
+    start_slot: float
+    #: Slots a second, error included.
+    slot_rate_hz: float
+    #: (columns,) delay of every column in slots.
+    delays: FloatArray
+    #: Time of row 0 against the room's mains, seconds.
+    start_s: float = 0.0
+
+    @cached_property
+    def row_start_slots(self) -> FloatArray:
+        """(height,) slot of the common clock at which every row starts to integrate."""
+        rows = np.arange(self.sensor.height, dtype=np.float64)
+        return np.asarray(self.start_slot + rows * (self.sensor.line_delay_s * self.slot_rate_hz))
+
+    @property
+    def exposure_slots(self) -> float:
+        """Exposure in slots."""
+        return self.exposure_s * self.slot_rate_hz
+
+    @cached_property
+    def lit(self) -> FloatArray:
+        """(height, columns) share of every row's exposure in which a column is lit."""
+        starts = self.row_start_slots
+        first = int(np.floor(starts[0] - self.delays.max())) - 1
+        last = int(np.ceil(starts[-1] + self.exposure_slots - self.delays.min())) + 1
+        slots = self.link.slots(first, last)
+        shares = [
+            lit_share(s, starts - delay - first, self.exposure_slots)
+            for s, delay in zip(slots, self.delays, strict=True)
+        ]
+        return np.stack(shares, axis=1)
+
+    @cached_property
+    def room_rows(self) -> FloatArray:
+        """(height,) electrons of a green pixel that sees white paper in the room's light."""
+        starts = self.start_s + np.arange(self.sensor.height, dtype=np.float64) * self.sensor.line_delay_s
+        wave = flicker(starts, self.exposure_s, self.room.flicker_hz, self.room.flicker_depth, 0.0)
+        return wave * (self.room.light_e_per_s * self.exposure_s)
+
+    @cached_property
+    def grid_pitch(self) -> int:
+        """Pixels between nodes of the coarse grid across: a sixth of the light spread, a power of two."""
+        sigma_px = max(self.link.screen.light_spread, 0.1) * self.view.pixels_per_width / self.link.screen.columns
+        return int(2 ** np.clip(np.floor(np.log2(max(sigma_px / 6, 1))), 0, 4))
+
+    @cached_property
+    def grid_rows(self) -> int:
+        """Rows between nodes of the coarse grid."""
+        sigma_px = max(self.link.screen.light_spread, 0.1) * self.view.pixels_per_height / self.link.screen.segment_rows
+        return int(2 ** np.clip(np.floor(np.log2(max(sigma_px / 6, 1))), 0, np.log2(_GRID_ROWS)))
+
+    @cached_property
+    def texture(self) -> Float32Array:
+        """(h, w, 3) electrons of the sensor's colours per unit of green light, blurred, with a black margin."""
+        return panel_texture(self)
+
+    @cached_property
+    def texture_scale(self) -> tuple[int, int]:
+        """Texture pixels per panel pixel, down and across."""
+        return texture_scale(self)
+
+
+def texture_scale(exposure: Exposure) -> tuple[int, int]:
+    """Texture pixels per panel pixel: three where its colour stripes can be resolved, one otherwise."""
+    magnification = exposure.view.pixels_per_width / exposure.drive.grey.shape[1]
+    return (3, 3) if exposure.lcd_grid > 0 and magnification > 1.2 else (1, 1)
+
+
+def panel_texture(exposure: Exposure) -> Float32Array:
+    """The panel's transmittance in the sensor's colours, with pixel structure and blur."""
+    import cv2
+
+    down, across = exposure.texture_scale
+    light = exposure.drive.transmittance
+    fine = np.repeat(np.repeat(light, down, axis=0), across, axis=1)
+    if across > 1:
+        _draw_pixel_structure(fine, exposure.lcd_grid)
+    sensed = cv2.transform(fine, exposure.sensor.colour_matrix.astype(np.float32))
+    m = _TEXTURE_MARGIN
+    sensed = cv2.copyMakeBorder(sensed, m, m, m, m, cv2.BORDER_CONSTANT, value=0)
+    # A sensor pixel is a box of side 1, whose variance 1/12 the Gaussian takes along.
+    sigma_px = np.sqrt(exposure.blur_px**2 + 1 / 12)
+    per_pixel = (
+        light.shape[1] * across / exposure.view.pixels_per_width,
+        light.shape[0] * down / exposure.view.pixels_per_height,
+    )
+    sigmas = [max(sigma_px * scale, 1e-3) for scale in per_pixel]
+    return np.asarray(cv2.GaussianBlur(sensed, (0, 0), sigmaX=sigmas[0], sigmaY=sigmas[1]), np.float32)
+
+
+def _draw_pixel_structure(fine: Float32Array, depth: float) -> None:
+    """Colour stripes and the dark line below each pixel; every colour keeps its mean."""
+    for colour in range(3):
+        for stripe in range(3):
+            fine[:, stripe::3, colour] *= np.float32(1 - depth + (3 * depth if stripe == colour else 0))
+    for line, gain in enumerate((1 + 0.5 * depth, 1 + 0.5 * depth, 1 - depth)):
+        fine[line::3] *= np.float32(gain)
+
+
+def column_light(exposure: Exposure, x: FloatArray, y: FloatArray) -> Float32Array:
+    """Electrons that each column's light gives a green pixel behind clear panel, lit for the whole exposure.
+
+    Args:
+        exposure: the picture to be taken.
+        x: (nx,) sensor columns.
+        y: (ny,) sensor rows.
+
+    Returns:
+        (ny, columns, nx) float32.
+    """
+    screen = exposure.link.screen
+    pixels = np.stack(np.meshgrid(x, y), axis=-1)
+    place = exposure.view.pixels_to_screen(pixels)
+    gain = exposure.light_e_per_s * exposure.exposure_s * _vignette(exposure, pixels)
+    along = light_spread(place[..., 1], screen.segment_rows, screen.light_spread) @ exposure.drive.lit_light
+    along *= light_spread(place[..., 0], screen.columns, screen.light_spread)
+    along *= gain[..., None]
+    return np.ascontiguousarray(along.transpose(0, 2, 1), np.float32)
+
+
+def _vignette(exposure: Exposure, pixels: FloatArray) -> FloatArray:
+    half = np.array([exposure.sensor.width, exposure.sensor.height]) / 2
+    radius2 = (((pixels - half) / half) ** 2).sum(axis=-1) / 2
+    return np.asarray(1 - exposure.vignetting * radius2)
+
+
+def bands(height: int) -> Iterator[tuple[int, int]]:
+    """Row ranges of the bands of work."""
+    for top in range(0, height, _BAND_ROWS):
+        yield top, min(top + _BAND_ROWS, height)
+
+
+@dataclass(frozen=True)
+class Band:
+    """Expected light of some rows."""
+
+    top: int
+    #: (rows, width[, 3]) picture as the sensor's colours see it, per unit of green light.
+    picture: Float32Array
+    #: (rows, width) electrons of green light from all columns.
+    backlight: Float32Array
+    #: (rows, width[, 3]) electrons of the room's light.
+    room: Float32Array
+
+    @cached_property
+    def mean_e(self) -> Float32Array:
+        """(rows, width[, 3]) expected electrons."""
+        light = self.backlight if self.picture.ndim == 2 else self.backlight[..., None]
+        return np.asarray(self.picture * light + self.room)
+
+
+def grid_nodes(width: int, pitch: int) -> FloatArray:
+    """Nodes that `cv2.resize` by `pitch` lays on pixel centres, with one cell to spare on either side."""
+    return np.arange(-1, -(-width // pitch) + 1, dtype=np.float64) * pitch + (pitch - 1) / 2
+
+
+def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
+    """Expected light of the sensor rows `top` to `bottom`."""
+    height, width = bottom - top, exposure.sensor.width
+    columns, texture_x, texture_y = _texture_places(exposure, top, bottom)
+    picture = _look_up(exposure.texture, texture_x, texture_y)
+    picture = pick_colours(picture, exposure.sensor.pattern, top)
+    backlight = np.empty((height, width), np.float32)
+    _enlarge_across(_backlight_nodes(exposure, columns, top, bottom), exposure.grid_pitch, backlight)
+    return Band(top, picture, backlight, _room_light(exposure, top, bottom))
+
+
+def _texture_places(exposure: Exposure, top: int, bottom: int) -> tuple[FloatArray, Float32Array, Float32Array]:
+    """Nodes across, and for every pixel the place in the texture, interpolated between nodes."""
+    import cv2
+
+    pitch = 16
+    x, y = grid_nodes(exposure.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
+    place = exposure.view.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
+    down, across = exposure.texture_scale
+    panel_height, panel_width = exposure.drive.grey.shape[:2]
+    scale = np.array([panel_width * across, panel_height * down])
+    nodes = np.clip(place * scale - 0.5 + _TEXTURE_MARGIN, -1e4, 1e5).astype(np.float32)
+    full = cv2.resize(nodes, (x.size * pitch, y.size * pitch), interpolation=cv2.INTER_LINEAR)
+    inner = full[pitch : pitch + bottom - top, pitch : pitch + exposure.sensor.width]
+    return grid_nodes(exposure.sensor.width, exposure.grid_pitch), inner[..., 0], inner[..., 1]
+
+
+def _look_up(texture: Float32Array, x: Float32Array, y: Float32Array) -> Float32Array:
+    import cv2
+
+    places = (np.ascontiguousarray(x), np.ascontiguousarray(y))
+    return np.asarray(cv2.remap(texture, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
+
+
+def _backlight_nodes(exposure: Exposure, x: FloatArray, top: int, bottom: int) -> Float32Array:
+    """(rows, nodes) electrons of green light: the columns' light, interpolated along rows, times lit shares."""
+    pitch = exposure.grid_rows
+    n_cells = -(-(bottom - top) // pitch)
+    light = column_light(exposure, x, top + pitch * np.arange(n_cells + 1.0))
+    padded = np.zeros((n_cells * pitch, exposure.lit.shape[1]), np.float32)
+    padded[: bottom - top] = exposure.lit[top:bottom]
+    lit = padded.reshape(n_cells, pitch, -1)
+    share = (np.arange(pitch, dtype=np.float32) / pitch)[None, :, None]
+    both = np.concatenate([lit * (1 - share), lit * share], axis=2)
+    pairs = np.concatenate([light[:-1], light[1:]], axis=1)
+    nodes: Float32Array = np.matmul(both, pairs).reshape(n_cells * pitch, -1)
+    return nodes[: bottom - top]
+
+
+def _enlarge_across(nodes: Float32Array, pitch: int, out: Float32Array) -> None:
+    import cv2
+
+    full = cv2.resize(nodes, (nodes.shape[1] * pitch, nodes.shape[0]), interpolation=cv2.INTER_LINEAR)
+    out[:] = full[:, pitch : pitch + out.shape[1]]
+
+
+def _room_light(exposure: Exposure, top: int, bottom: int) -> Float32Array:
+    """Electrons of the room's light, from walls, bezel, panel and a mirrored lamp."""
+    seen = _room_seen(exposure, top, bottom) * exposure.room_rows[top:bottom, None].astype(np.float32)
+    response = np.array(exposure.sensor.response, np.float32)
+    pattern = exposure.sensor.pattern
+    if pattern is None:
+        return np.asarray(seen[..., None] * response)
+    cell = response[pattern][:, np.arange(seen.shape[1]) % pattern.shape[1]]
+    seen *= cell[np.arange(top, bottom) % pattern.shape[0]]
+    return seen
+
+
+def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:
+    """(rows, width) share of the room's light that every pixel sees, against white paper."""
+    import cv2
+
+    pitch, room, screen = 8, exposure.room, exposure.link.screen
+    x, y = grid_nodes(exposure.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
+    place = exposure.view.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
+    # Pixels outside the screen's edge, negative inside; edges are ramps two nodes wide, as the grid can carry them.
+    beyond = ((np.abs(place - 0.5) - 0.5) * [1.0, 1 / screen.aspect]).max(axis=-1) * exposure.view.pixels_per_width
+    bezel_px = _BEZEL_WIDTHS * exposure.view.pixels_per_width
+    on_wall, off_panel = (np.clip((beyond - edge) / (2 * pitch) + 0.5, 0, 1) for edge in (bezel_px, 0.0))
+    from_lamp = (place - np.array(room.lamp_place)) * [1.0, 1 / screen.aspect]
+    panel = room.panel_reflectance + room.lamp * np.exp(-0.5 * (from_lamp**2).sum(axis=-1) / room.lamp_size**2)
+    frame = room.bezel_reflectance + (room.wall_reflectance - room.bezel_reflectance) * on_wall
+    seen = (panel + (frame - panel) * off_panel).astype(np.float32)
+    full = cv2.resize(seen, (x.size * pitch, y.size * pitch), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(full[pitch : pitch + bottom - top, pitch : pitch + exposure.sensor.width])
+
+
+BandVisitor = Callable[[Band, Float32Array], None]
+
+
+def take_picture(
+    exposure: Exposure, seed: int, threads: int = 2, visit: BandVisitor | None = None
+) -> NDArray[np.uint16]:
+    """Expose and read out one picture.
+
+    Args:
+        exposure: what is taken.
+        seed: of all noise; the same seed gives the same pixels, whatever the number of threads.
+        threads: bands computed at the same time.
+        visit: called with every band and the electrons read of it, for those who need the truth behind the pixels.
+
+    Returns:
+        (height, width) uint16 mosaic, or (height, width, 3) where the sensor has no filter array.
+    """
+    sensor = exposure.sensor
+    shape = (sensor.height, sensor.width) if sensor.pattern is not None else (sensor.height, sensor.width, 3)
+    raw = np.empty(shape, np.uint16)
+    gains = sensor.pixel_gains()
+    # Shared by all bands: made once, before threads ask for them.
+    _ = exposure.texture, exposure.lit, exposure.room_rows, exposure.grid_pitch, exposure.grid_rows
+
+    def work(rows: tuple[int, int]) -> None:
+        band = render_band(exposure, *rows)
+        rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, rows[0]])))
+        mean = band.mean_e * repeat_gains(gains, rows[0], band.mean_e.shape)
+        electrons = count_electrons(mean, sensor, rng)
+        raw[rows[0] : rows[1]] = to_raw(electrons, sensor)
+        if visit is not None:
+            visit(band, electrons)
+
+    with ThreadPoolExecutor(max_workers=max(threads, 1)) as pool:
+        list(pool.map(work, bands(sensor.height)))
+    return raw

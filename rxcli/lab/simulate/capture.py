@@ -1,0 +1,192 @@
+"""From a scene to captures in memory: the entry points of the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.lab.simulate.bound import Oracle, OracleRecorder
+from rxcli.lab.simulate.camera import Exposure, take_picture
+from rxcli.lab.simulate.isp import develop
+from rxcli.lab.simulate.optics import Pose, View
+from rxcli.lab.simulate.pictures import load_picture, picture_names
+from rxcli.lab.simulate.scenes import Scene
+from rxcli.lab.simulate.transmitter import Dimming, Drive, Link, Weights, drive_screen
+from rxcli.lab.simulate.truth import build_truth
+from rxcli.profiles import ScreenProfile
+
+FloatArray = NDArray[np.float64]
+#: Slots before the first row, so that delayed columns already send.
+_LEAD_SLOTS = 8
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One frame in memory, with all that is known of it."""
+
+    scene: Scene
+    exposure: Exposure
+    frame: int
+    #: Presentation time, seconds.
+    time_s: float
+    #: (height, width) uint16 mosaic, or (height, width, 3) where the sensor has no filter array.
+    raw: NDArray[np.uint16]
+    #: What the genie-aided bound needs; None where it was not asked for.
+    oracle: Oracle | None = None
+
+    @cached_property
+    def rgb(self) -> NDArray[np.uint8]:
+        """(height, width, 3) uint8 developed picture, red first, before any compression."""
+        return np.asarray(develop(self.raw, self.scene.sensor, self.scene.isp, self.exposure.view), np.uint8)
+
+    @cached_property
+    def jpeg(self) -> bytes:
+        """The developed picture as a JPEG file with metadata."""
+        from rxcli.lab.simulate.files import encode_jpeg
+
+        return encode_jpeg(self.rgb, self.scene)
+
+    @cached_property
+    def pixels(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """(height, width) what a receiver is given: luma of the JPEG, or the mosaic of a raw scene."""
+        if self.is_mosaic:
+            return self.raw
+        import simplejpeg
+
+        return np.asarray(simplejpeg.decode_jpeg(self.jpeg, colorspace="GRAY")[..., 0], np.uint8)
+
+    @property
+    def is_mosaic(self) -> bool:
+        """Whether `pixels` is the sensor's mosaic."""
+        return self.scene.is_mosaic
+
+    @cached_property
+    def truth(self) -> dict[str, Any]:
+        """The truth of this frame alone, as in `NAME.truth.json`; its frame number is 0."""
+        return build_truth(self.scene, [self.exposure], f"memory-{self.frame}")
+
+
+@dataclass(frozen=True)
+class Take:
+    """A scene with all that was open decided: frames can be taken from it in any order."""
+
+    scene: Scene
+    drive: Drive
+    link: Link
+    seed: int
+    start_slot: float
+    delays: FloatArray
+
+    @property
+    def slot_rate_hz(self) -> float:
+        """Slots per second of the camera's clock."""
+        return self.scene.screen.slot_rate_hz * (1 + self.scene.slot_rate_error_ppm * 1e-6)
+
+    def exposure(self, frame: int = 0) -> Exposure:
+        """What frame number `frame` is about to see."""
+        scene, time_s = self.scene, frame / self.scene.frame_rate_hz
+        sensor = scene.sensor
+        pose = shaken(scene.pose, scene.shake_px, time_s, self.seed, (sensor.width, sensor.height))
+        view = View(scene.screen, scene.lens, pose, sensor.width, sensor.height, sensor.pixel_aspect)
+        return Exposure(
+            view=view,
+            drive=self.drive,
+            link=self.link,
+            sensor=sensor,
+            room=scene.room,
+            exposure_s=scene.exposure_s,
+            light_e_per_s=scene.light_e_per_s,
+            blur_px=scene.blur_px,
+            lcd_grid=scene.lcd_grid,
+            vignetting=scene.vignetting,
+            start_slot=self.start_slot + time_s * self.slot_rate_hz,
+            slot_rate_hz=self.slot_rate_hz,
+            delays=self.delays,
+            start_s=time_s,
+        )
+
+    def frame(self, frame: int = 0, *, oracle: bool = False, threads: int = 2) -> Capture:
+        """Take frame number `frame`."""
+        exposure = self.exposure(frame)
+        recorder = OracleRecorder(exposure) if oracle else None
+        seed = int(np.random.SeedSequence([self.seed, frame]).generate_state(1, np.uint64)[0])
+        raw = take_picture(exposure, seed, threads, recorder.visit if recorder else None)
+        time_s = frame / self.scene.frame_rate_hz
+        return Capture(self.scene, exposure, frame, time_s, raw, recorder.finish() if recorder else None)
+
+    def truth(self, capture: str) -> dict[str, Any]:
+        """The truth of all frames of the scene."""
+        return build_truth(self.scene, [self.exposure(n) for n in range(self.scene.n_frames)], capture)
+
+
+def shaken(pose: Pose, amplitude_px: float, time_s: float, seed: int, size: tuple[int, int]) -> Pose:
+    """The pose at one instant of a hand-held shot: slow sway and tremor, `amplitude_px` each."""
+    if amplitude_px == 0:
+        return pose
+    rng = np.random.default_rng([seed, 11])
+    frequency, phase = rng.uniform([[0.7], [5.0]], [[1.5], [9.0]], (2, 3)), rng.uniform(0, 2 * np.pi, (2, 3))
+    weight = np.array([[1.0], [0.25]])
+    dx, dy, turn = amplitude_px * (weight * np.sin(2 * np.pi * frequency * time_s + phase)).sum(axis=0)
+    if pose.corners is not None:
+        return replace(pose, corners=tuple((x + dx, y + dy) for x, y in pose.corners))
+    return replace(
+        pose,
+        shift_x=pose.shift_x + dx / size[0],
+        shift_y=pose.shift_y + dy / size[1],
+        roll_deg=pose.roll_deg + np.rad2deg(turn / size[0]),
+    )
+
+
+def prepare(scene: Scene, rng: np.random.Generator | int) -> Take:
+    """Decide all that a scene leaves open.
+
+    Args:
+        scene: what to simulate.
+        rng: source of randomness, or a seed; equal ones give equal pixels.
+    """
+    rng = np.random.default_rng(rng)
+    link_seed, noise_seed = (int(s) for s in rng.integers(0, 2**62, 2))
+    drive = _drive(scene)
+    link = Link(scene.screen, drive.weights, link_seed, scene.payload)
+    start = rng.uniform(_LEAD_SLOTS, link.burst_slots) if scene.start_slot is None else scene.start_slot
+    return Take(scene, drive, link, noise_seed, float(start), _delays(scene, rng))
+
+
+def _drive(scene: Scene) -> Drive:
+    if not isinstance(scene.picture, str):
+        return drive_screen(scene.screen, scene.picture, scene.w, scene.dimming)
+    drive = _drive_named if scene.picture in picture_names() else _drive_named.__wrapped__
+    return drive(scene.screen, scene.picture, scene.w, scene.dimming)
+
+
+@lru_cache(maxsize=8)
+def _drive_named(screen: ScreenProfile, name: str, weights: Weights, dimming: Dimming) -> Drive:
+    """Kept for sweeps, which show the same few pictures over and over."""
+    return drive_screen(screen, load_picture(name, screen.width_px, screen.height_px), weights, dimming)
+
+
+def _delays(scene: Scene, rng: np.random.Generator) -> FloatArray:
+    columns = scene.screen.columns
+    drawn = rng.uniform(-1, 1, columns)
+    if isinstance(scene.column_delay_slots, tuple):
+        return np.broadcast_to(np.array(scene.column_delay_slots, np.float64), columns).copy()
+    return drawn * scene.column_delay_slots
+
+
+def simulate_frame(
+    scene: Scene, rng: np.random.Generator | int, *, frame: int = 0, oracle: bool = False, threads: int = 2
+) -> Capture:
+    """Simulate one frame of a scene.
+
+    Args:
+        scene: what to simulate.
+        rng: source of randomness, or a seed; equal ones give equal pixels.
+        frame: number of the frame in the scene's clip.
+        oracle: also record what the genie-aided bound needs.
+        threads: bands of rows computed at the same time; the pixels do not depend on it.
+    """
+    return prepare(scene, rng).frame(frame, oracle=oracle, threads=threads)

@@ -1,0 +1,204 @@
+"""A fast image signal processor of our own: from the sensor's numbers to a developed picture.
+
+Like a camera's, it is not linear and not reversible: cheap demosaicing, white balance, noise reduction, distortion
+correction, tone curve, sharpening, eight bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.lab.simulate.optics import View
+from rxcli.lab.simulate.sensor import PATTERNS, Sensor
+
+Float32Array = NDArray[np.float32]
+Tone = Literal["srgb", "bt709", "gamma", "linear"]
+Subsampling = Literal["444", "422", "420"]
+
+#: Weights of red, green and blue in luma (BT.601).
+LUMA_BT601 = (0.299, 0.587, 0.114)
+#: Tone curves: exponent, gain (offset gain - 1), end and slope of the straight toe.
+_TONES = {
+    "srgb": (1 / 2.4, 1.055, 0.0031308, 12.92),
+    "bt709": (0.45, 1.099, 0.018, 4.5),
+    "gamma": (1 / 2.2, 1.0, 0.0, 0.0),
+}
+#: Rows of a band of work and of its overlap: multiples of the mosaics' unit cells, so that all bands start alike.
+_BAND_ROWS, _HALO_ROWS = 384, 12
+
+
+@dataclass(frozen=True)
+class Isp:
+    """Settings of the development."""
+
+    tone: Tone = "srgb"
+    #: Light that comes out as white is the sensor's full scale over this.
+    gain: float = 1.5
+    #: Strength and radius (pixels) of unsharp masking on luma.
+    sharpen: float = 0.0
+    sharpen_px: float = 1.2
+    #: Standard deviation of the smoothing of luma and of colour, pixels.
+    denoise_px: float = 0.0
+    denoise_colour_px: float = 2.0
+    #: Take the lens's distortion out; the camera matrix stays.
+    correct_distortion: bool = False
+    quality: int = 92
+    subsampling: Subsampling = "420"
+
+
+def tone_curve(light: Float32Array, tone: Tone) -> Float32Array:
+    """Picture values 0..1 of linear light 0..1, any shape."""
+    import cv2
+
+    x: Float32Array = np.clip(light, np.float32(0), np.float32(1))
+    if tone == "linear":
+        return x
+    exponent, gain, toe, slope = _TONES[tone]
+    curve = np.asarray(cv2.pow(np.atleast_2d(x), exponent), np.float32).reshape(x.shape)
+    curve *= np.float32(gain)
+    curve -= np.float32(gain - 1)
+    np.copyto(curve, x * np.float32(slope), where=x < np.float32(toe))
+    return curve
+
+
+def demosaic(raw: NDArray[np.uint16], sensor: Sensor) -> Float32Array:
+    """Full-colour light from the sensor's numbers, black at 0 and white level at 1; (height, width, 3) float32.
+
+    Bayer is bilinear; X-Trans is a normalised convolution, each colour a weighted mean of its nearest samples.
+    """
+    scale = np.float32(1 / (sensor.white_level - sensor.black_level))
+    if sensor.cfa == "bayer":
+        import cv2
+
+        planes = cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2RGB).astype(np.float32)
+    elif sensor.cfa == "xtrans":
+        planes = _demosaic_xtrans(raw)
+    else:
+        planes = raw.astype(np.float32)
+    planes -= np.float32(sensor.black_level)
+    planes *= scale
+    return np.asarray(planes, np.float32)
+
+
+def _demosaic_xtrans(raw: NDArray[np.uint16]) -> Float32Array:
+    import cv2
+
+    pattern = PATTERNS["xtrans"]
+    values = raw.astype(np.float32)
+    planes = np.empty((*raw.shape, 3), np.float32)
+    tiles = (-(-raw.shape[0] // 6), -(-raw.shape[1] // 6))
+    for colour in range(3):
+        mask = np.tile((pattern == colour).astype(np.float32), tiles)[: raw.shape[0], : raw.shape[1]]
+        size, sigma = (3, 0.7) if colour == 1 else (5, 1.1)
+        total = cv2.GaussianBlur(values * mask, (size, size), sigma, borderType=cv2.BORDER_REFLECT_101)
+        total /= cv2.GaussianBlur(mask, (size, size), sigma, borderType=cv2.BORDER_REFLECT_101)
+        planes[..., colour] = total
+    return planes
+
+
+def develop(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp, view: View, bits: int = 8) -> NDArray[Any]:
+    """Develop a picture.
+
+    Args:
+        raw: (height, width) uint16 mosaic, or (height, width, 3).
+        sensor: that made it.
+        isp: settings.
+        view: lens whose distortion is corrected, where the settings ask for it.
+        bits: 8 or 16.
+
+    Returns:
+        (height, width, 3) uint8 or uint16, red first, full range.
+    """
+    planes = np.empty((*raw.shape[:2], 3), np.float32)
+    _in_bands(raw, lambda part: _panel_light(part, sensor, isp), planes)
+    if isp.correct_distortion:
+        planes = correct_distortion(planes, view)
+    picture = np.empty(planes.shape, np.uint8 if bits == 8 else np.uint16)
+    _in_bands(planes, lambda part: _finish(part, isp, bits), picture)
+    return picture
+
+
+def _in_bands(source: NDArray[Any], work: Callable[[NDArray[Any]], NDArray[Any]], out: NDArray[Any]) -> None:
+    """Fill `out` with `work` of overlapping bands of rows of `source`, two at a time."""
+
+    def one(top: int) -> None:
+        begin = max(top - _HALO_ROWS, 0)
+        bottom = min(top + _BAND_ROWS, source.shape[0])
+        out[top:bottom] = work(source[begin : bottom + _HALO_ROWS])[top - begin : bottom - begin]
+
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        list(pool.map(one, range(0, source.shape[0], _BAND_ROWS)))
+
+
+def _panel_light(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp) -> Float32Array:
+    """Linear light in the panel's colours, white balanced, noise reduced."""
+    import cv2
+
+    to_panel = np.linalg.inv(sensor.colour_matrix) * isp.gain
+    return _reduce_noise(cv2.transform(demosaic(raw, sensor), to_panel.astype(np.float32)), isp)
+
+
+def _finish(planes: Float32Array, isp: Isp, bits: int) -> NDArray[Any]:
+    """Tone curve, sharpening, rounding."""
+    import cv2
+
+    planes = tone_curve(planes, isp.tone)
+    if isp.sharpen > 0:
+        grey = luma(planes)
+        planes += (np.float32(isp.sharpen) * (grey - cv2.GaussianBlur(grey, (0, 0), isp.sharpen_px)))[..., None]
+    top = (1 << bits) - 1
+    planes *= np.float32(top)
+    planes += np.float32(0.5)
+    np.clip(planes, 0, top, out=planes)
+    return planes.astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def _reduce_noise(planes: Float32Array, isp: Isp) -> Float32Array:
+    import cv2
+
+    if isp.denoise_colour_px <= 0 and isp.denoise_px <= 0:
+        return planes
+    luma = cv2.transform(planes, np.array([LUMA_BT601], np.float32))
+    colour = planes - luma[..., None]
+    if isp.denoise_colour_px > 0:
+        colour = cv2.blur(colour, (2 * round(isp.denoise_colour_px) + 1,) * 2)
+    if isp.denoise_px > 0:
+        luma = cv2.GaussianBlur(luma, (0, 0), isp.denoise_px)
+    colour += luma[..., None]
+    return np.asarray(colour, np.float32)
+
+
+def correction_map(view: View) -> tuple[Float32Array, Float32Array]:
+    """Sensor places (x, y) that the pixels of a corrected picture are taken from; each (height, width) float32."""
+    import cv2
+
+    pitch = 16
+    nx, ny = -(-view.width // pitch) + 2, -(-view.height // pitch) + 2
+    x = np.arange(-1, nx - 1) * float(pitch) + (pitch - 1) / 2
+    y = np.arange(-1, ny - 1) * float(pitch) + (pitch - 1) / 2
+    matrix = view.camera_matrix
+    ideal = (np.stack(np.meshgrid(x, y), axis=-1) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    nodes = view.ideal_to_pixels(ideal).astype(np.float32)
+    full = cv2.resize(nodes, (nx * pitch, ny * pitch), interpolation=cv2.INTER_LINEAR)
+    inner = full[pitch : pitch + view.height, pitch : pitch + view.width]
+    return np.ascontiguousarray(inner[..., 0]), np.ascontiguousarray(inner[..., 1])
+
+
+def correct_distortion(planes: Float32Array, view: View) -> Float32Array:
+    """A picture without the lens's distortion, on the same camera matrix."""
+    import cv2
+
+    return np.asarray(cv2.remap(planes, *correction_map(view), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+
+
+def luma(rgb: NDArray[Any], weights: tuple[float, float, float] = LUMA_BT601) -> Float32Array:
+    """(height, width) float32 luma of a picture (height, width, 3), red first."""
+    import cv2
+
+    return np.asarray(cv2.transform(rgb.astype(np.float32), np.array([weights], np.float32)))

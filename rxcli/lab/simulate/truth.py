@@ -1,0 +1,124 @@
+"""What was sent and how it was seen, in the format that lies beside a capture as `NAME.truth.json`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
+
+if TYPE_CHECKING:
+    from rxcli.lab.simulate.camera import Exposure
+    from rxcli.lab.simulate.scenes import Scene
+
+
+def visible_bursts(exposure: Exposure) -> list[dict[str, Any]]:
+    """Bursts on the rows between the screen's highest and lowest corner, with the slots seen of each."""
+    heights = exposure.view.corners[:, 1]
+    top, bottom = max(int(np.floor(heights.min())), 0), min(int(np.ceil(heights.max())), exposure.sensor.height - 1)
+    if top >= bottom:
+        return []
+    rate = exposure.sensor.line_delay_s * exposure.slot_rate_hz
+    begin, end = exposure.start_slot + top * rate, exposure.start_slot + bottom * rate
+    length = exposure.link.burst_slots
+    bursts = []
+    for burst in range(max(int(begin // length), 0), int(end // length) + 1):
+        seen = min(end, (burst + 1) * length) - max(begin, burst * length)
+        if seen > 0:
+            bursts.append({"burst": burst, "visible_slots": round(seen, 1)})
+    return bursts
+
+
+def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[str, Any]:
+    """The truth of a capture.
+
+    Args:
+        scene: what was simulated.
+        exposures: one per frame.
+        capture: name of the capture's file.
+    """
+    first = exposures[0]
+    frames = [_frame_truth(number, exposure) for number, exposure in enumerate(exposures)]
+    bursts = sorted({entry["burst"] for frame in frames for entry in frame["bursts"]})
+    return {
+        "capture": capture,
+        "screen": scene.screen.name,
+        "columns": scene.screen.columns,
+        "slot_rate_hz": scene.screen.slot_rate_hz,
+        "payload_symbols": scene.screen.payload_symbols,
+        "repeats": scene.screen.repeats,
+        "camera": _camera_truth(scene, first),
+        "w": first.link.weights.tolist(),
+        "payload_bits": list(first.link.bits_per_column),
+        "corners_sensor_px": first.view.corners.tolist(),
+        "frames": frames,
+        "payload": {str(burst): first.link.payload_hex(burst) for burst in bursts},
+        "orientation": scene.orientation,
+        "tone_curve": "linear" if scene.is_mosaic else scene.isp.tone,
+        "slot_rate_error_ppm": scene.slot_rate_error_ppm,
+        "column_delay_slots": first.delays.tolist(),
+    }
+
+
+def build_camera_profile(scene: Scene, exposure: Exposure) -> CameraProfile:
+    """A camera profile that fits the captures of a scene: what a calibration would find, without its errors."""
+    sensor = scene.sensor
+    top, middle, bottom = (tuple(row) for row in exposure.view.camera_matrix.tolist())
+    mode = ReadoutMode(
+        name="simulated",
+        width=sensor.width,
+        height=sensor.height,
+        line_delay_s=sensor.line_delay_s,
+        exposure_s=scene.exposure_s,
+        frame_rate_hz=scene.frame_rate_hz,
+    )
+    lens = LensModel(
+        width=sensor.width,
+        height=sensor.height,
+        camera_matrix=(top, middle, bottom),
+        dist_coeffs=scene.lens.distortion,
+        distortion_already_corrected=scene.isp.correct_distortion and not scene.is_mosaic,
+    )
+    return CameraProfile(
+        format=1,
+        kind="camera",
+        name=scene.camera_name,
+        make=scene.make,
+        models=(scene.model,),
+        modes=(mode,),
+        lens=lens,
+        description="written by vlc-rx simulate",
+    )
+
+
+def _camera_truth(scene: Scene, exposure: Exposure) -> dict[str, Any]:
+    return {
+        "name": scene.camera_name,
+        "line_delay_s": scene.sensor.line_delay_s,
+        "exposure_s": scene.exposure_s,
+        "width": scene.sensor.width,
+        "height": scene.sensor.height,
+        "frame_rate_hz": scene.frame_rate_hz,
+        "camera_matrix": exposure.view.camera_matrix.tolist(),
+        "dist_coeffs": exposure.view.coefficients.tolist(),
+        "distortion_already_corrected": scene.isp.correct_distortion and not scene.is_mosaic,
+    }
+
+
+def _frame_truth(number: int, exposure: Exposure) -> dict[str, Any]:
+    return {
+        "frame": number,
+        "bursts": visible_bursts(exposure),
+        "corners_sensor_px": exposure.view.corners.tolist(),
+        "start_slot": exposure.start_slot,
+    }
+
+
+def write_truth(truth: dict[str, Any], path: Path) -> Path:
+    """Write the truth beside the capture `path`, as `NAME.truth.json`; returns where."""
+    target = path.with_name(path.stem + ".truth.json")
+    target.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+    return target

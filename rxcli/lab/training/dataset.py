@@ -1,0 +1,212 @@
+"""Data sets: made once, kept in a folder, picked up where an interrupted run left them.
+
+A sample is what the receiver shows the network of the doubtful columns of a frame, with what the light model alone says
+of every word that could have been sent, and the word that was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from rxcli.lab.benchmark.trial import simulate_trial
+from rxcli.lab.simulate.camera import Exposure
+from rxcli.lab.simulate.scenes import Scene as SimulatedScene
+from rxcli.lab.training.fit import MOST_WORDS, UNKNOWN, Sample
+from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_scene
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
+from rxcli.receiver.channel import by_burst
+from rxcli.receiver.channel.denoise import Scene, network_inputs, payload_seen
+from rxcli.receiver.pipeline import denoiser_case
+from rxcli.types import Clock, FloatArray
+
+_SCREENS = ("paper-34k6", "paper-17k3")
+#: Columns of a frame that are learned from; more of one picture tell little more.
+_MOST_COLUMNS = 8
+#: Words are taken to be at most this much less likely than the best, nats.
+_LEAST_SCORE = -60.0
+#: Streams of random numbers.
+_FRAMES, _VALIDATION = 77, 900_000
+
+
+def frame_samples(n_frames: int, seed: int, folder: Path, *, progress: bool = True) -> list[Sample]:
+    """Samples of simulated frames, as the receiver sees them; frames without a doubtful column or a lock give none.
+
+    Args:
+        n_frames: frames to simulate.
+        seed: equal ones give equal samples.
+        folder: cache.
+        progress: show a bar on stderr.
+    """
+
+    def make(number: int) -> list[Sample]:
+        rng = np.random.default_rng([_FRAMES, seed, number])
+        return _simulated(training_scene(rng), int(rng.integers(2**31)))
+
+    return list(_cached(make, n_frames, folder / f"frames-{seed}", "frames", progress))
+
+
+def validation_samples(n_frames: int, folder: Path, *, progress: bool = True) -> list[Sample]:
+    """Samples of pictures and cameras that are not trained on, all scene classes in turn."""
+
+    def make(number: int) -> list[Sample]:
+        kind, turn = SCENE_CLASSES[number % len(SCENE_CLASSES)], number // len(SCENE_CLASSES)
+        return _simulated(validation_scene(kind, _SCREENS[turn % 2], turn // 2), _VALIDATION + number)
+
+    return list(_cached(make, n_frames, folder / "validation", "validation", progress))
+
+
+def _cached(make: Callable[[int], list[Sample]], n: int, folder: Path, what: str, progress: bool) -> Iterator[Sample]:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number in tqdm(range(n), desc=what, disable=not progress):
+        path = folder / f"{number:05d}.npz"
+        samples = _read(path)
+        if samples is None:
+            samples = make(number)
+            _write(path, samples)
+        yield from samples
+
+
+def _write(path: Path, samples: list[Sample]) -> None:
+    arrays = {
+        f"{part.name}{i}": np.asarray(getattr(sample, part.name))
+        for i, sample in enumerate(samples)
+        for part in fields(Sample)
+    }
+    part = path.with_suffix(".part")
+    with part.open("wb") as file:
+        np.savez(file, allow_pickle=False, n=np.array(len(samples)), **arrays)
+    part.replace(path)
+
+
+def _read(path: Path) -> list[Sample] | None:
+    """Samples of a file; None where it is missing or damaged, so that it is made again."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            return [
+                Sample(**{part.name: stored[f"{part.name}{i}"] for part in fields(Sample)})
+                for i in range(int(stored["n"]))
+            ]
+    except (OSError, ValueError, KeyError, BadZipFile, EOFError):
+        return None
+
+
+def _simulated(simulated: SimulatedScene, seed: int) -> list[Sample]:
+    """One frame as a sample; none where the receiver finds no clock, a wrong one, or nothing doubtful."""
+    trial = simulate_trial(simulated, seed)
+    case = denoiser_case(trial.frame, trial.options())
+    if case is None:
+        return []
+    scene, columns = case
+    slots = sent_slots(trial.capture.exposure, scene.clock)
+    if not _headers_fit(slots, scene.clock):
+        return []
+    chosen = np.sort(np.random.default_rng(seed).permutation(columns.size)[:_MOST_COLUMNS])
+    return sample_of(scene, columns[chosen], slots, trial.capture.exposure.link.weights)
+
+
+def sample_of(
+    scene: Scene, columns: NDArray[np.int64], slots: NDArray[np.uint8], weights: NDArray[np.integer]
+) -> list[Sample]:
+    """What is to be learned from some columns of a scene; nothing where the receiver mixed up the bursts.
+
+    Args:
+        scene: what the network is shown.
+        columns: columns to learn from, B of them.
+        slots: (C, N) what was sent on the receiver's grid.
+        weights: (C,) what was sent.
+    """
+    clock = scene.clock
+    memory = scene.metrics.shape[1] - clock.n_slots
+    lit, dark = (_by_packet(part, clock) for part in (slots[columns], 1 - slots[columns]))
+    if (lit * dark).any():
+        return []
+    bursts = by_burst(scene.metrics[columns], clock, memory)
+    scores, words = [], []
+    for burst in range(bursts.shape[0]):
+        for row, w in enumerate(weights[columns]):
+            sent = (lit[burst, row] > 0).astype(np.uint8)
+            scores.append(_word_scores(bursts[burst, row], sent, int(w)))
+            word = (codebook(int(w)).astype(np.int64) @ _payload(sent).T).argmax(axis=0)
+            words.append(np.where(_payload(lit[burst, row] + dark[burst, row]).all(axis=1), word, UNKNOWN))
+    shape = (*bursts.shape[:2], len(words[0]))
+    strips, features = network_inputs(scene, columns)
+    return [
+        Sample(
+            strips=strips.astype(np.float16),
+            columns=features.astype(np.float16),
+            seen=payload_seen(scene)[columns].astype(np.float16),
+            first_slot=np.array(clock.first_slot),
+            packet_slots=np.array(clock.packet_slots),
+            burst=clock.burst,
+            w=np.asarray(weights[columns], np.int64),
+            scores=np.stack(scores).reshape(*shape, MOST_WORDS),
+            words=np.stack(words).reshape(shape),
+        )
+    ]
+
+
+def _by_packet(slots: NDArray[np.uint8], clock: Clock) -> NDArray[np.int64]:
+    """(bursts, B, packet) slots (B, N) of the grid added over the copies of each burst."""
+    length = clock.packet_slots
+    out = np.zeros((int(clock.burst.max()) + 1, slots.shape[0], length), np.int64)
+    grid = np.arange(clock.n_slots) + clock.first_slot
+    for copy, burst in enumerate(clock.burst):
+        here = grid // length == copy
+        out[burst][:, grid[here] % length] += slots[:, here]
+    return out
+
+
+def _payload(packet: NDArray[np.integer]) -> NDArray[np.int64]:
+    """(symbols, 10) slots of a packet."""
+    return packet[PREAMBLE_SLOTS:].reshape(-1, SLOTS_PER_SYMBOL).astype(np.int64)
+
+
+def _word_scores(metrics: FloatArray, sent: NDArray[np.uint8], w: int) -> NDArray[np.float16]:
+    """(symbols, 128) log-likelihood of every word of weight `w` by the light model, the slots around it being known.
+
+    Against the best word; -inf where there is no word.
+
+    Args:
+        metrics: (packet + memory, patterns), copies added.
+        sent: (packet,) the slots that were sent.
+        w: weight.
+    """
+    memory = metrics.shape[0] - sent.size
+    words = codebook(w)
+    around = np.concatenate([sent, np.array(HEADER[:memory], np.uint8)])
+    out = np.full((len(_payload(sent)), MOST_WORDS), -np.inf)
+    for symbol in range(len(out)):
+        at = PREAMBLE_SLOTS + symbol * SLOTS_PER_SYMBOL
+        slots = np.repeat(around[None, at - memory : at + SLOTS_PER_SYMBOL + memory], len(words), axis=0)
+        slots[:, memory : memory + SLOTS_PER_SYMBOL] = words
+        windows = np.lib.stride_tricks.sliding_window_view(slots.astype(np.int64), memory + 1, axis=1)
+        pattern = windows @ (1 << np.arange(memory, -1, -1))
+        place = np.arange(at, at + SLOTS_PER_SYMBOL + memory)
+        score = metrics[place, pattern].sum(axis=1)
+        out[symbol, : len(words)] = np.maximum(score - score.max(), _LEAST_SCORE)
+    return out.astype(np.float16)
+
+
+def sent_slots(exposure: Exposure, clock: Clock) -> NDArray[np.uint8]:
+    """(C, N) what was sent in every slot of the receiver's grid."""
+    slots_per_row = exposure.sensor.line_delay_s * exposure.slot_rate_hz
+    rows = clock.row0 + clock.delay_slots * clock.rows_per_slot
+    centre = exposure.start_slot + rows * slots_per_row + exposure.exposure_slots / 2
+    first = np.rint(centre - exposure.delays).astype(np.int64)
+    sent = exposure.link.slots(int(first.min()), int(first.max()) + clock.n_slots)
+    index = (first - first.min())[:, None] + np.arange(clock.n_slots)
+    return np.asarray(np.take_along_axis(sent, index, axis=1), np.uint8)
+
+
+def _headers_fit(slots: NDArray[np.uint8], clock: Clock) -> bool:
+    """Whether headers lie where the clock has them: a wrong lock would teach nonsense."""
+    position = (np.arange(clock.n_slots) + clock.first_slot) % clock.packet_slots
+    inside = position < len(HEADER)
+    return bool(inside.any() and (slots[:, inside] == np.array(HEADER)[position[inside]]).mean() > 0.99)

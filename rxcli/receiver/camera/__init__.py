@@ -1,0 +1,72 @@
+"""What a picture says of the camera that took it: rows per slot, direction of readout, exposure, bend of the stripes.
+
+Six steps on the row profiles, none of which needs to know the camera. Before them the screen's sides are looked at
+(`find_screen.measure_bow`): bowed ones mean that the lens's distortion is still in the picture, whose stripes are then
+straight, and straight ones that the camera took it out (`Strips.correction`).
+
+1. **Bend.** Neighbouring strips show the same slots, so the lag between them, over all of the picture, is the slope of
+   the stripes. Where a camera has taken the distortion out of its picture, the sensor row of a point p is the y of
+   K distort(K^-1 p); with any focal length in K the same map comes out for other coefficients, so that one width is
+   taken and k1 k2 p1 p2 are what is sought.
+2. **Scan.** Light between its local extremes, averaged over columns, shows the header where a packet starts; a packet
+   sent again shows in every column's autocorrelation; and edges fall between slots, so that their power has a line at
+   the rate of the slots. All are looked up over a grid of rows per slot for each length of packet. The header read
+   backwards, 1100011100, is its own complement, so the sign tells the direction.
+3. **Trial.** The best hypotheses are sliced into slots; header, dimming symbol and the constant weight of all symbols
+   decide between them: a wrong one may show a header by chance, but never twenty columns of constant weight. Where that
+   decides little, slots are read first, knowing nothing of packets, and packets are sought among them (`reading`).
+4. **Slots.** Light of neighbouring slots overlaps through the exposure, and nobody told its levels: each column is read
+   at the levels that every weight would give, by forward-backward, and levels and slots then follow from one another.
+5. **Refinement.** The slots, as probabilities seen through the exposure, predict the light of every strip on every row.
+   What is missing is the derivative with respect to time: least squares over all strips gives row and period of the
+   clock and the bend at once, with standard deviations from the spread between columns.
+6. **Once more.** The receiver's own light model and codebook know the slots better than step 4. With those it has
+   decoded the least squares of step 5 are done again (`refit`), with what rows see of them worked out for sensor rows
+   (`rows`) and the texture of the picture foretold, and the picture received again where that matters.
+"""
+
+from rxcli.receiver.camera.advice import stripe_likeness, why_not
+from rxcli.receiver.camera.bend import bend_terms, estimate_bend, straightened
+from rxcli.receiver.camera.camera import bowing_lens, camera_profile, in_time_order, lens_of, summary, summary_of_rows
+from rxcli.receiver.camera.columns import likely_columns
+from rxcli.receiver.camera.edges import by_edges
+from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis
+from rxcli.receiver.camera.refit import refit
+from rxcli.receiver.camera.scan import find_clocks
+from rxcli.receiver.camera.search import MIN_EVIDENCE, BlindSearch, estimate_camera, stripes_are_bent
+from rxcli.receiver.camera.strips import Noise, Strips, bow_of, in_readout_order, strips_of
+from rxcli.receiver.camera.structure import structure_evidence
+from rxcli.receiver.camera.timing import refine
+from rxcli.receiver.camera.tone import is_linear
+
+__all__ = [
+    "MIN_EVIDENCE",
+    "BlindEstimate",
+    "BlindSearch",
+    "Hypothesis",
+    "Noise",
+    "Strips",
+    "bend_terms",
+    "bow_of",
+    "bowing_lens",
+    "by_edges",
+    "camera_profile",
+    "estimate_bend",
+    "estimate_camera",
+    "find_clocks",
+    "in_readout_order",
+    "in_time_order",
+    "is_linear",
+    "lens_of",
+    "likely_columns",
+    "refine",
+    "refit",
+    "straightened",
+    "stripe_likeness",
+    "stripes_are_bent",
+    "strips_of",
+    "structure_evidence",
+    "summary",
+    "summary_of_rows",
+    "why_not",
+]

@@ -1,0 +1,67 @@
+"""Why a picture cannot be received: what it looks like, and the next step."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rxcli.receiver.camera.bend import BEND_LEVEL_ROWS, strip_distances
+from rxcli.receiver.camera.scan import HALF_WIDTH, MIN_ROWS_PER_SLOT, autocorrelation, half_width
+from rxcli.receiver.camera.strips import Strips, levelled
+from rxcli.types import BoolArray, Float32Array, FloatArray
+
+#: Likeness of neighbouring strips, over the light's own variance, below which a picture has no stripes.
+_STRIPED = 0.25
+
+#: Share of the screen's height that must be striped.
+_STRIPED_SHARE = 0.7
+
+_LIKENESS_BANDS = 16
+
+
+def why_not(strips: Strips) -> str:
+    """Why no clock was found: what the picture looks like, and the next step."""
+    likeness, lit = stripe_likeness(strips)
+    striped = lit & (likeness > _STRIPED)
+    if not lit.any():
+        return "the screen is dark; show a brighter picture or raise the exposure"
+    if not striped.any():
+        return (
+            "the screen shows no stripes, or too faint ones; check that it sends, show a brighter picture, and take it "
+            "with the electronic shutter, HDR and night mode off (a mechanical or global shutter sees no slots)"
+        )
+    if striped[lit].mean() < _STRIPED_SHARE:
+        return (
+            "only a part of the screen's height shows stripes; the picture may be merged from several exposures or "
+            "taken with flash: switch HDR and flash off, or use a manual-camera app"
+        )
+    level, weight = levelled(strips.light, strips.inside, 38, strips.noise)
+    columns = (level * weight).reshape(strips.n_columns, -1, strips.rows.size).mean(axis=1)
+    width = half_width(autocorrelation(columns))
+    if width < HALF_WIDTH[0] * MIN_ROWS_PER_SLOT:
+        return (
+            f"the stripes are about {width:.1f} rows wide, too few to tell slots apart (at least "
+            f"{MIN_ROWS_PER_SLOT} rows a slot); use the picture in its full size, or a slower slot rate"
+        )
+    return (
+        "there are stripes but no packet header among them; the screen may show less than one packet (move closer), "
+        "the picture may be merged from several exposures (switch HDR off), or the screen is none of those tried"
+    )
+
+
+def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
+    """Correlation of neighbouring strips in bands of rows, 0..1; and whether a band is lit."""
+    level, weight = levelled(strips.light, strips.inside, BEND_LEVEL_ROWS, strips.noise)
+    blocks = np.linspace(0, strips.rows.size, _LIKENESS_BANDS + 1).astype(int)[:-1]
+    step = strip_distances(strips)[0] if strip_distances(strips) else 1
+
+    def summed(values: Float32Array) -> FloatArray:
+        return np.asarray(np.add.reduceat(values, blocks, axis=1), np.float64)
+
+    # Strips without light have no say.
+    level = level * weight
+    product = summed(level[:-step] * level[step:]).sum(axis=0)
+    power = np.sqrt(summed(level[:-step] ** 2).sum(axis=0) * summed(level[step:] ** 2).sum(axis=0))
+    likeness = product / np.maximum(power, 1e-9)
+    lit = summed(weight).max(axis=0) > 0.2 * strips.rows.size / _LIKENESS_BANDS
+    lit |= summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / _LIKENESS_BANDS
+    return np.asarray(likeness), np.asarray(lit)

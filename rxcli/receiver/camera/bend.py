@@ -1,0 +1,153 @@
+"""The bend of the stripes in a picture whose lens distortion was taken out in the camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.receiver.camera.strips import Strips, levelled
+from rxcli.types import Float32Array, FloatArray
+
+#: Scale of the coefficients k1 k2 p1 p2 for a focal length of one picture width, as a camera may have them.
+BEND_SCALE = np.array([0.3, 0.6, 1.5e-3, 1.5e-3])
+#: Lenses bend back further out: k2 is about -k1 for such a focal length, give or take so much.
+_BACK = 0.2
+#: (4, 4) inverse covariance of the coefficients before the picture was seen.
+BEND_PRECISION: FloatArray = np.diag(BEND_SCALE**-2 * [1, 0, 1, 1])
+BEND_PRECISION[:2, :2] += _BACK**-2
+
+#: Distances of compared strips, in columns; a column's light reaches over its neighbours.
+_BEND_DISTANCES = (0.5, 1.0, 2.0)
+
+#: Lags looked at, rows; windows of rows; rows over which light is levelled.
+_BEND_LAGS, _BEND_WINDOWS, BEND_LEVEL_ROWS = 24, 20, 100
+
+
+def reversed_bend(bend: FloatArray) -> FloatArray:
+    """The coefficients of the same bend with rows counted from the other end."""
+    return np.asarray(bend * np.array([1.0, 1.0, -1.0, 1.0]))
+
+
+def bend_terms(x: FloatArray, rows: FloatArray, width: int, height: int) -> FloatArray:
+    """Rows that a unit of k1, k2, p1, p2 moves the sensor row of a point, for a focal length of one width.
+
+    Args:
+        x: (...) picture x.
+        rows: (...) picture rows, broadcast against `x`.
+        width: of the picture.
+        height: of the picture.
+
+    Returns:
+        (4, ...) float64.
+    """
+    across, down = np.broadcast_arrays((x - (width - 1) / 2) / width, (rows - (height - 1) / 2) / width)
+    square = across**2 + down**2
+    return width * np.stack([down * square, down * square**2, square + 2 * down**2, 2 * across * down])
+
+
+def estimate_bend(strips: Strips) -> tuple[FloatArray, float]:
+    """The bend whose sensor rows make neighbouring strips most alike.
+
+    Returns:
+        (4,) k1 k2 p1 p2 for a focal length of one width; and how much better it fits than none, nats.
+    """
+    lags = [_lag_correlations(strips, distance) for distance in strip_distances(strips)]
+    total = sum(float(correlation[_BEND_LAGS].sum()) for correlation, _ in lags)
+    if not lags or total <= 0:
+        return np.zeros(4), 0.0
+    # The sum of correlations is worth about this many nats: rows times strips, many of which say the same.
+    weight = 4000.0 / total
+    k1, share = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.4, 0.4, 25), [0.0, 0.8, 1.8]))
+    guesses = np.stack([k1, -share * k1, 0 * k1, 0 * k1], axis=1)
+    scores = [_likeness(guess, lags[-1:], weight) for guess in guesses]
+    found = _climb(guesses[int(np.argmax(scores))], lags, weight)
+    return found, _likeness(found, lags, weight) - _likeness(np.zeros(4), lags, weight)
+
+
+def strip_distances(strips: Strips) -> list[int]:
+    per_column = strips.light.shape[0] // strips.n_columns
+    steps = {max(1, round(distance * per_column)) for distance in _BEND_DISTANCES}
+    return sorted(step for step in steps if step < strips.light.shape[0])
+
+
+def _lag_correlations(strips: Strips, distance: int) -> tuple[Float32Array, FloatArray]:
+    """Correlation of strips `distance` apart by lag, strip and window of rows; and what lag a unit of bend makes.
+
+    Returns:
+        (lags, strips, windows) float32; (4, strips, windows) float64 rows.
+    """
+    n_rows = strips.light.shape[1]
+    level = levelled(strips.light, strips.inside, BEND_LEVEL_ROWS, strips.noise)[0]
+    borders = np.linspace(_BEND_LAGS, n_rows - _BEND_LAGS, _BEND_WINDOWS + 1).astype(int)
+    middles = (borders[1:] + borders[:-1]) // 2
+    rows, x = strips.rows[middles], strips.x[:, middles]
+    terms = bend_terms(x, rows, strips.width, strips.height)
+    left, right = level[:-distance], level[distance:]
+    inner = left[:, _BEND_LAGS : n_rows - _BEND_LAGS]
+    out = np.empty((2 * _BEND_LAGS + 1, left.shape[0], _BEND_WINDOWS), np.float32)
+    for number, lag in enumerate(range(-_BEND_LAGS, _BEND_LAGS + 1)):
+        product = inner * right[:, _BEND_LAGS - lag : n_rows - _BEND_LAGS - lag]
+        out[number] = np.add.reduceat(product, borders[:-1] - _BEND_LAGS, axis=1)
+    return out, terms[:, distance:] - terms[:, :-distance]
+
+
+def _at_lag(correlation: Float32Array, lag: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Correlation at fractional lags with first and second derivative, by a Catmull-Rom cubic."""
+    place = np.clip(lag + (correlation.shape[0] - 1) / 2, 1, correlation.shape[0] - 2.001)
+    low = place.astype(np.int64)
+    f = place - low
+    a, b, c, d = (np.take_along_axis(correlation, (low + k)[None], 0)[0].astype(np.float64) for k in (-1, 0, 1, 2))
+    linear, square, cubic = (c - a) / 2, a - 2.5 * b + 2 * c - 0.5 * d, 1.5 * (b - c) + 0.5 * (d - a)
+    value = b + f * (linear + f * (square + f * cubic))
+    return value, linear + f * (2 * square + 3 * f * cubic), a - 2 * b + c
+
+
+def _likeness(bend: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float) -> float:
+    total = sum(float(_at_lag(c, np.tensordot(bend, terms, 1))[0].sum()) for c, terms in lags)
+    return weight * total - 0.5 * float(bend @ BEND_PRECISION @ bend)
+
+
+def _climb(bend: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float, steps: int = 8) -> FloatArray:
+    """Newton's method on the likeness, with the prior of `BEND_PRECISION`; never downhill."""
+    best, score = bend, _likeness(bend, lags, weight)
+    step = 1.0
+    for _ in range(steps):
+        gradient, hessian = -BEND_PRECISION @ best, BEND_PRECISION.copy()
+        for correlation, terms in lags:
+            _, slope, curvature = _at_lag(correlation, np.tensordot(best, terms, 1))
+            flat = terms.reshape(4, -1)
+            gradient = gradient + weight * flat @ slope.ravel()
+            hessian = hessian + weight * (flat * np.maximum(-curvature, 0).ravel()) @ flat.T
+        trial = best + step * np.linalg.solve(hessian, gradient)
+        trial_score = _likeness(trial, lags, weight)
+        if trial_score > score:
+            best, score = trial, trial_score
+        else:
+            step /= 2
+    return best
+
+
+def straightened(strips: Strips, bend: FloatArray) -> Strips:
+    """The strips read along the bent stripes: every row of the result is one sensor row."""
+    if not bend.any():
+        return strips
+    moved = np.tensordot(bend, bend_terms(strips.x, strips.rows, strips.width, strips.height), 1)
+    index = np.arange(strips.rows.size)
+    # Row r shows sensor row r + moved(r); sensor row s is found at s - moved(s), to first order of a small slope.
+    back = np.take_along_axis(moved, np.clip(np.rint(index - moved), 0, index[-1]).astype(np.int64), 1)
+    place = np.clip(index - back, 0, index[-1] - 1e-6)
+    low = place.astype(np.int64)
+    f = (place - low).astype(np.float32)
+    light = _between(strips.light, low, f)
+    inside = (_between(strips.inside, low, f) > 0.99) & (np.abs(index - back - place) < 0.5)
+    return replace(strips, light=light * inside, inside=inside.astype(np.float32))
+
+
+def _between(values: Float32Array, low: NDArray[np.int64], f: Float32Array) -> Float32Array:
+    below, above = (
+        np.take_along_axis(values, low, 1),
+        np.take_along_axis(values, np.minimum(low + 1, values.shape[1] - 1), 1),
+    )
+    return np.asarray(below + (above - below) * f, np.float32)

@@ -1,0 +1,54 @@
+"""Rows per slot by the edges alone: they fall between slots, so their power has a line at the rate of the slots."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rxcli.receiver.camera.bend import bend_terms
+from rxcli.receiver.camera.estimates import BlindEstimate
+from rxcli.receiver.camera.strips import EXTREMES_SLOTS, Strips, levelled
+from rxcli.receiver.camera.waves import local_mean
+from rxcli.types import Float32Array, FloatArray
+
+#: Rows over which the edges' power is levelled.
+LOCAL_ROWS = 41
+#: Nats of a line beyond doubt: wrong periods reach 5, right ones 46 and more where the line is seen at all.
+_BEYOND_DOUBT = 20.0
+
+
+def edge_power(columns: Float32Array) -> Float32Array:
+    """(C, R - 1) squared steps of columns (C, R) from row to row, less their mean thereabouts."""
+    steps = np.diff(columns, axis=1)
+    square = np.asarray(steps * steps, np.float32)
+    return square - local_mean(square, LOCAL_ROWS)
+
+
+def line_evidence(strips: Strips, rows_per_slot: float, bend: FloatArray) -> float:
+    """Nats by which edges keep to a grid of some period on stripes of some bend, over chance.
+
+    Args:
+        strips: as the picture has them.
+        rows_per_slot: of the grid.
+        bend: (4,) of the stripes.
+    """
+    level, weight = levelled(strips.light, strips.inside, round(EXTREMES_SLOTS * rows_per_slot), strips.noise)
+    shape = (strips.n_columns, -1, strips.rows.size)
+    power = edge_power((level * weight).reshape(shape).sum(axis=1))
+    rows = strips.rows + np.tensordot(bend, bend_terms(strips.x, strips.rows, strips.width, strips.height), 1)
+    middle = rows.reshape(shape).mean(axis=1)
+    turned = power * np.exp(1j * np.pi / rows_per_slot * (middle[:, 1:] + middle[:, :-1]))
+    return float(np.abs(turned.sum()) ** 2 / max(float((power * power).sum()), 1e-30))
+
+
+def by_edges(strips: Strips, estimates: list[BlindEstimate]) -> BlindEstimate | None:
+    """The estimate whose period the edges keep to beyond doubt, None without one.
+
+    A period twice as long, to which they keep too, has it as its harmonic.
+    """
+    best, most = None, _BEYOND_DOUBT
+    for estimate in estimates:
+        bend = estimate.bend * estimate.corrected
+        nats, double = (line_evidence(strips, n * estimate.rows_per_slot, bend) for n in (1, 2))
+        if nats > most and double < _BEYOND_DOUBT:
+            best, most = estimate, nats
+    return best

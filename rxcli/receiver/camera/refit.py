@@ -1,0 +1,124 @@
+"""The camera once more, from slots that were received with the first estimate of it.
+
+The receiver's light model and codebook know the slots far better than levels and a trellis do. With them as they are,
+what is left is the least squares of the refinement: start, period, bend and exposure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rxcli.receiver.camera.bend import reversed_bend
+from rxcli.receiver.camera.estimates import BlindEstimate
+from rxcli.receiver.camera.rows import fit_rows
+from rxcli.receiver.camera.strips import Correction, Strips, in_readout_order
+from rxcli.receiver.camera.timing import (
+    FLAT,
+    UNDERSTATED,
+    bend_chi_square,
+    gauss_newton,
+    slot_time,
+    thinned,
+    time_terms,
+)
+from rxcli.receiver.camera.tone import tone_exponent
+from rxcli.receiver.camera.waves import column_waves, exposure_of_known, fitted
+from rxcli.types import Clock, Float32Array, FloatArray
+
+_STEPS = 6
+#: Steps before which the exposure is estimated.
+_EXPOSURE_STEPS = (0, 2)
+#: Slots over which the picture is taken as constant.
+_LOCAL_SLOTS = 25.0
+#: Rows by which the picture's texture in a row is foretold.
+_ORDER = 4
+#: Chi-square of a bend beyond doubt, by whether the picture was corrected: with slots as received, unbent ones reach
+#: 205, bent ones have 441 and more but for star fields, few slots at long exposures, and a bend next to none.
+_BENT_CHI_SQUARE: dict[Correction, float] = {"no": np.inf, "likely": 30.0, "unknown": 240.0}
+#: Slots that explain less of the light's local variance were decoded on a wrong clock.
+_LEAST_EXPLAINED = 0.1
+#: The share is of weights that go with the residuals: it may fall a little where the fit is better.
+_NOT_LESS = 0.97
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    values: FloatArray
+    covariance: FloatArray
+    exposure_slots: float
+    exposure_sd: float
+    #: Share of the local variance that the slots explain: at the start, and now.
+    explained_first: float
+    explained: float
+    #: (M, R) light 0..1 that the slots give, and the rows over which the picture was taken as constant.
+    wave: Float32Array
+    window: int
+
+
+def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Array) -> tuple[BlindEstimate, float]:
+    """The estimate from decoded slots, and how far it moves the clock anywhere on the screen, in slots.
+
+    The estimate comes back as it was, moved by nothing, where the slots explain little light, or less with another.
+
+    Args:
+        strips: as the picture has them.
+        estimate: the camera that the slots were received with.
+        clock: on which the slots stand.
+        lit: (C, N) probability that each slot of the clock's grid is lit; C columns of the strips.
+    """
+    ordered = thinned(in_readout_order(strips) if estimate.reversed else strips, estimate.rows_per_slot)
+    bend = reversed_bend(estimate.bend) if estimate.reversed else estimate.bend
+    first = np.concatenate([[clock.row0, clock.rows_per_slot], bend if estimate.corrected else np.zeros(4)])
+    shutter = estimate.least_exposure_slots
+    may_bend = strips.correction != "no"
+    fit = _fit(ordered, first, lit, clock.exposure_slots, 6 if may_bend else 2, shutter)
+    corrected = bend_chi_square(fit.values, fit.covariance) > _BENT_CHI_SQUARE[strips.correction]
+    if may_bend and not corrected:
+        before = fit.explained_first
+        fit = replace(_fit(ordered, first * FLAT, lit, fit.exposure_slots, 2, shutter), explained_first=before)
+    if fit.explained < max(_NOT_LESS * fit.explained_first, _LEAST_EXPLAINED):
+        return estimate, 0.0
+    terms = time_terms(ordered)
+    moved = np.abs(slot_time(ordered, terms, fit.values) - slot_time(ordered, terms, first)) * ordered.inside
+    sd = UNDERSTATED * np.sqrt(np.diag(fit.covariance))
+    found = replace(
+        estimate,
+        rows_per_slot=float(fit.values[1]),
+        rows_per_slot_sd=float(sd[1]),
+        exposure_slots=max(fit.exposure_slots, estimate.least_exposure_slots),
+        exposure_slots_sd=fit.exposure_sd if fit.exposure_slots > estimate.least_exposure_slots else 0.0,
+        bend=reversed_bend(fit.values[2:]) if estimate.reversed else fit.values[2:],
+        bend_sd=sd[2:],
+        corrected=corrected,
+        explained=fit.explained,
+        tone=tone_exponent(ordered, fit.wave, fit.window),
+    )
+    return found, float(moved.max())
+
+
+def _fit(
+    strips: Strips,
+    values: FloatArray,
+    lit: Float32Array,
+    exposure_slots: float,
+    n_free: int,
+    shutter_slots: float = 0.0,
+) -> _Fit:
+    """Gauss-Newton on the first `n_free` values of the row-time map, with slots that stay."""
+    terms = time_terms(strips)
+    pitch = float(strips.rows[1] - strips.rows[0])
+    exposure, exposure_sd, explained_first = exposure_slots, 0.0, 0.0
+    for step in range(_STEPS):
+        time = slot_time(strips, terms, values)
+        slots = fitted(lit, max(int(time.max()) + 3, lit.shape[1]))
+        if step in _EXPOSURE_STEPS:
+            exposure, exposure_sd = exposure_of_known(column_waves(strips, time, values[1]), lit, exposure)
+            window = round(_LOCAL_SLOTS * values[1] / pitch)
+            rows = fit_rows(strips, time, values, slots, exposure, window, shutter_slots)
+        seen = rows.seen(strips, time, values, slots)
+        change, covariance, explained = gauss_newton(strips, terms, values, time, seen, n_free, _LOCAL_SLOTS, _ORDER)
+        explained_first = explained_first or explained
+        values = values + change
+    return _Fit(values, covariance, exposure, exposure_sd, explained_first, explained, seen[0], window)

@@ -1,0 +1,145 @@
+"""What the rows of a picture show of slots that are known.
+
+A sensor row sees its slots through the shutter, at its own instant. What a picture's row holds is a mix of sensor rows:
+demosaicing and noise reduction take in the neighbours, sharpening takes them off again, and the correction of a
+distortion interpolates between two. With two rows a slot that mix is no function of the time of the picture's row: an
+edge between two sensor rows lies where the two meet, wherever it was. So light is worked out for sensor rows and mixed
+as the picture mixes them, by a symmetric kernel that is fitted to all of the picture's light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rxcli.receiver.camera.strips import Strips
+from rxcli.receiver.camera.waves import column_shares, local_mean, local_moments, residual_of, seen_through
+from rxcli.types import Float32Array, FloatArray, IntArray
+
+#: Weights of a row, of its two neighbours together, and of the two next to those: of developed pictures in general, and
+#: how far they differ.
+_KERNEL = np.array([0.75, 0.4, -0.15])
+_KERNEL_SD = 0.3
+#: Samples and strips err alike: so many of them say what one would.
+_ALIKE = 10.0
+#: Shutter times that are tried, as shares of the exposure that is seen: the mix of rows adds to it.
+_SHUTTERS = (0.35, 0.5, 0.65, 0.8, 0.9, 1.0, 1.1)
+_KERNEL_ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class RowModel:
+    """How slots become the light of a picture's rows."""
+
+    #: Slots that a sensor row integrates.
+    shutter_slots: float
+    #: (3,) weights of a sensor row, of its neighbours, and of those next to them; their sum is 1.
+    kernel: FloatArray
+
+    def seen(
+        self, strips: Strips, time: Float32Array, values: FloatArray, lit: Float32Array
+    ) -> tuple[Float32Array, Float32Array]:
+        """(M, R) light 0..1 of every strip's rows, and its change per slot of time.
+
+        Args:
+            strips: in readout order.
+            time: (M, R) slot positions of the strips' rows.
+            values: start and rows per slot of the clock, and more.
+            lit: (C, N) probability that each slot is lit.
+        """
+        light, slope = _parts(strips, time, values, lit, self.shutter_slots)
+        kernel = self.kernel.astype(np.float32)
+        return np.tensordot(kernel, light, 1), np.tensordot(kernel, slope, 1)
+
+
+def fit_rows(
+    strips: Strips,
+    time: Float32Array,
+    values: FloatArray,
+    lit: Float32Array,
+    exposure_slots: float,
+    window: int,
+    shutter_slots: float = 0.0,
+) -> RowModel:
+    """The shutter and the mix of rows that explain the light best.
+
+    Args:
+        strips: in readout order.
+        time: (M, R) slot positions of the strips' rows.
+        values: start and rows per slot of the clock, and more.
+        lit: (C, N) probability that each slot is lit.
+        exposure_slots: exposure as it is seen, all blur taken for exposure.
+        window: rows over which the picture may be taken as constant.
+        shutter_slots: exposure that the file tells, 0 where it does not.
+    """
+    tried = (shutter_slots,) if shutter_slots else [share * exposure_slots for share in _SHUTTERS]
+    fits = []
+    for shutter in tried:
+        light, _ = _parts(strips, time, values, lit, shutter)
+        kernel = _KERNEL
+        for _ in range(_KERNEL_ROUNDS):
+            kernel, misfit = _fit_kernel(strips, light, kernel, window)
+        fits.append((misfit, RowModel(shutter, kernel)))
+    return min(fits, key=lambda fit: fit[0])[1]
+
+
+def _parts(
+    strips: Strips, time: Float32Array, values: FloatArray, lit: Float32Array, shutter_slots: float
+) -> tuple[Float32Array, Float32Array]:
+    """(3, M, R) light of sensor rows at, next to and two from every strip's row; and its change per slot."""
+    start, rows_per_slot = values[:2]
+    join = max(round(float(strips.rows[1] - strips.rows[0])), 1)
+    place: FloatArray = time.astype(np.float64) * rows_per_slot + start - (join - 1) / 2
+    reach = _KERNEL.size - 1
+    first = int(np.floor(place.min())) - reach
+    n = int(np.ceil(place.max())) + 2 + reach - first
+    sensor_time = (first + np.arange(n + join - 1) - start) / rows_per_slot
+    columns = np.arange(lit.shape[0])
+    seen = seen_through(lit, np.broadcast_to(sensor_time, (columns.size, sensor_time.size)), columns, shutter_slots)
+    shares = column_shares(strips).astype(np.float32)
+    place -= first
+    low: IntArray = place.astype(np.int64)
+    fraction = (place - low).astype(np.float32)
+    low += (np.arange(low.shape[0]) * n)[:, None]
+    light, slope = (_mixed(shares @ _joined(table, join), low, fraction) for table in seen)
+    return light, slope
+
+
+def _joined(table: Float32Array, join: int) -> Float32Array:
+    """Means of `join` rows from every row on, as the strips' rows were joined."""
+    n = table.shape[1] - join + 1
+    return np.asarray(sum(table[:, k : k + n] for k in range(join)), np.float32) / np.float32(join)
+
+
+def _mixed(table: Float32Array, low: IntArray, fraction: Float32Array) -> Float32Array:
+    """(3, M, R) values of a table (M, n) between two rows, and of the rows on either side."""
+    out = np.empty((_KERNEL.size, *low.shape), np.float32)
+    for reach in range(_KERNEL.size):
+        either = table
+        if reach:
+            padded = np.pad(table, ((0, 0), (reach, reach)), mode="edge")
+            either = np.asarray((padded[:, : -2 * reach] + padded[:, 2 * reach :]) / 2, np.float32)
+        flat = either.ravel()
+        below = flat.take(low)
+        out[reach] = below + (flat.take(low + 1) - below) * fraction
+    return out
+
+
+def _fit_kernel(strips: Strips, parts: Float32Array, kernel: FloatArray, window: int) -> tuple[FloatArray, float]:
+    """The kernel by least squares, with gains and levels of another one; and the share of the light that it leaves."""
+    inside = strips.inside
+    wave = np.tensordot(kernel.astype(np.float32), parts, 1)
+    near = local_moments(strips.light, wave, inside, window)
+    _, spread = residual_of(strips, near, near.gain, wave, window)
+    weight = inside / np.sqrt(spread)
+    basis = np.stack(
+        [((part - local_mean(part * inside, window) / near.share) * near.gain * weight).ravel() for part in parts]
+    )
+    target = ((strips.light - near.value) * weight).ravel()
+    information, pull = (basis @ basis.T).astype(np.float64), (basis @ target).astype(np.float64)
+    prior = _ALIKE / _KERNEL_SD**2
+    found = np.linalg.solve(information + prior * np.eye(kernel.size), pull + prior * _KERNEL)
+    power = float(target @ target)
+    misfit = (power - 2 * found @ pull + found @ information @ found) / max(power, 1e-9)
+    return found / max(found.sum(), 0.2), float(misfit)

@@ -1,0 +1,293 @@
+"""Clocks that a picture may show: headers and repeated packets over a grid of rows per slot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.receiver.camera.edges import edge_power
+from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis, distinct
+from rxcli.receiver.camera.strips import SAMPLES, Noise, Strips, levelled
+from rxcli.receiver.camera.structure import structure_evidence
+from rxcli.types import Float32Array, FloatArray
+
+#: Rows per slot that are considered.
+MIN_ROWS_PER_SLOT, MAX_ROWS_PER_SLOT = 1.2, 60.0
+
+#: Rows per slot, at one octave's reduction, that its window of this many reduced rows serves.
+_OCTAVE, _OCTAVE_ROWS = (2.4, 4.8), 76
+
+#: Lag, in slots, at which a column is half as like itself: from short exposures to those of three slots.
+HALF_WIDTH = (0.5, 1.8)
+
+#: Copies further apart than this many slots are not compared: the grid of rows per slot would have to be too fine.
+_SCAN_SLOTS = 700
+
+#: Steps of the scan, slots over the picture.
+_SCAN_STEP = 2.0
+
+#: Most that the slots' line in the edges' power counts, nats; and its places a slot over the picture.
+_MOST_FOR_LINE, _LINE_FINE = 30.0, 4
+#: A nat of it beside the height of the headers.
+_SAY_OF_LINE = 0.03
+
+#: Rows per slot this close, relative, are one hypothesis.
+_ALIKE_ROWS = 0.015
+
+#: Hypotheses that are tried: so many of different clocks or packets, and so many of different clocks.
+_TRIALS = 24
+
+#: Steps of the header, dark before and after.
+_HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Octave:
+    """Columns between their local extremes, reduced by a power of two, for an octave of rows per slot."""
+
+    #: (C, R') float32.
+    columns: Float32Array
+    #: Rows of one reduced row.
+    rows: int
+    #: Rows per slot that it serves.
+    low: float
+    high: float
+    #: (R',) deviation of the autocorrelation at every lag from chance, in standard deviations.
+    repeats: FloatArray
+    #: Nats by which the edges keep to a grid, over chance, for every quarter of a slot more over the whole picture.
+    line: FloatArray
+
+    def line_at(self, rows_per_slot: float) -> float:
+        """Nats by which edges keep to a grid of slots."""
+        return float(np.interp(self._line_place(rows_per_slot), np.arange(self.line.size), self.line))
+
+    def line_near(self, rows_per_slot: float, slots: float) -> float:
+        """The most of `line_at` within so many slots over the whole picture."""
+        middle, reach = self._line_place(rows_per_slot), _LINE_FINE * slots
+        return float(self.line[max(int(middle - reach), 0) : int(middle + reach) + 2].max(initial=0.0))
+
+    def _line_place(self, rows_per_slot: float) -> float:
+        return float(_LINE_FINE * self.columns.shape[1] * self.rows / rows_per_slot)
+
+
+def _octaves(strips: Strips) -> list[_Octave]:
+    """All octaves whose slots, by the columns' autocorrelation at short lags, may be of its length."""
+    out = []
+    light, inside, rows = strips.light, strips.inside, 1
+    low, high = _OCTAVE
+    bounds = [(1, MIN_ROWS_PER_SLOT, low)]
+    while low * (1 << (len(bounds) - 1)) < MAX_ROWS_PER_SLOT:
+        reduce = 1 << (len(bounds) - 1)
+        bounds.append((reduce, low * reduce, min(high * reduce, MAX_ROWS_PER_SLOT)))
+    for reduce, least, most in bounds:
+        if reduce > rows:
+            light, inside, rows = _halved(light), _halved(inside), reduce
+        if light.shape[1] * rows < 2 * PREAMBLE_SLOTS * least:
+            break
+        window = round(_OCTAVE_ROWS * most / (_OCTAVE[1] * rows))
+        noise = strips.noise.over(rows)
+        columns = _pooled(light, (inside > 0.99).astype(np.float32), window, noise, strips.n_columns)
+        correlation = autocorrelation(columns)
+        width = half_width(correlation) * rows
+        least, most = max(least, width / HALF_WIDTH[1]), min(most, width / HALF_WIDTH[0])
+        if least < most:
+            surprise = _surprise(correlation, round(PREAMBLE_SLOTS * least / rows))
+            out.append(_Octave(columns, rows, least, most, surprise, _slot_line(columns)))
+    return out
+
+
+def _halved(values: Float32Array) -> Float32Array:
+    even = values.shape[1] // 2 * 2
+    return np.asarray((values[:, 0:even:2] + values[:, 1:even:2]) / 2, np.float32)
+
+
+def _pooled(light: Float32Array, inside: Float32Array, window: int, noise: Noise, n_columns: int) -> Float32Array:
+    """(C, R) mean of the levelled strips of each column, small where little light is behind it."""
+    level, weight = levelled(light, inside, window, noise)
+    total = weight.reshape(n_columns, -1, weight.shape[1]).sum(axis=1)
+    summed = (level * weight).reshape(n_columns, -1, weight.shape[1]).sum(axis=1)
+    return np.asarray(summed / (total + 0.01) * (total / (total + 1)), np.float32)
+
+
+def autocorrelation(columns: Float32Array) -> FloatArray:
+    """(R,) sum over columns of the product with the same column later."""
+    n = columns.shape[1]
+    size = 1 << int(np.ceil(np.log2(2 * n)))
+    spectrum = np.fft.rfft(columns, size, axis=1)
+    return np.asarray(np.fft.irfft((spectrum * spectrum.conj()).real.sum(axis=0), size)[:n])
+
+
+def half_width(correlation: FloatArray) -> float:
+    """Lag at which the correlation falls to half of that at the shortest lag."""
+    top = correlation[1] if correlation.size > 2 else 0.0
+    below = np.flatnonzero(correlation[1:] < top / 2)
+    if top <= 0 or below.size == 0:
+        return 0.0
+    lag = int(below[0]) + 1
+    return float(lag - (top / 2 - correlation[lag]) / max(correlation[lag - 1] - correlation[lag], 1e-12))
+
+
+def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:
+    n = correlation.size
+    scaled = correlation / np.sqrt(np.arange(n, 0, -1))
+    part = scaled[min(shortest, n // 2) : max(n - 10, n // 2 + 1)]
+    middle = float(np.median(part))
+    spread = 1.4826 * float(np.median(np.abs(part - middle))) + 1e-9
+    out = np.maximum(scaled - middle, 0) / spread
+    out[-10:] = 0
+    return np.asarray(out)
+
+
+def _slot_line(columns: Float32Array) -> FloatArray:
+    """Spectrum of the edges' power, nats over chance, by slots over the whole picture times _LINE_FINE.
+
+    It tells rows per slot where there is but one header, or where those drown.
+    """
+    power = edge_power(columns).sum(axis=0, dtype=np.float64)
+    spectrum = np.abs(np.fft.rfft(power, _LINE_FINE * columns.shape[1])) ** 2
+    return np.asarray(np.minimum(spectrum / max(float(power @ power), 1e-30), _MOST_FOR_LINE))
+
+
+def _header_response(total: FloatArray, rows_per_slot: float) -> FloatArray:
+    """Correlation with a header that starts at each quarter of a slot, the first one a header's length before row 0.
+
+    Args:
+        total: (R + 1,) running sum of the columns' mean.
+        rows_per_slot: rows a slot.
+
+    Returns:
+        (2, n): of the light as it is, and of its negative, which shows the header read backwards.
+    """
+    lead = SLOTS_PER_SYMBOL * SAMPLES
+    starts = int((total.size - 1) / rows_per_slot * SAMPLES) + lead
+    grid = np.arange(-lead, starts + 1) * (rows_per_slot / SAMPLES)
+    summed = np.interp(grid, np.arange(total.size), total)
+    out = np.zeros(starts)
+    for edge in np.flatnonzero(_HEADER_STEPS):
+        out -= _HEADER_STEPS[edge] * summed[edge * SAMPLES : edge * SAMPLES + starts]
+    out /= SLOTS_PER_SYMBOL * rows_per_slot
+    return np.stack([out, -out])
+
+
+def _comb(response: FloatArray, packet_slots: int) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Best sums of responses (k, n) over copies of a packet, over the root of their number; and their samples, (k,)."""
+    n_signs, n = response.shape
+    period, lead = packet_slots * SAMPLES, SLOTS_PER_SYMBOL * SAMPLES
+    folded = np.zeros((n_signs, -(-n // period) * period))
+    folded[:, lead : n - lead] = response[:, lead : n - lead]
+    phase = np.arange(period)
+    count = (n - lead - 1 - phase) // period - (lead - 1 - phase) // period
+    score = folded.reshape(n_signs, -1, period).sum(axis=1) / np.sqrt(np.maximum(count, 1))
+    best = score.argmax(axis=1)
+    return score[np.arange(n_signs), best], best
+
+
+def find_clocks(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesis]:
+    """Clocks that the picture may show, best first.
+
+    Args:
+        strips: straightened strips.
+        packet_lengths: slots of a packet, of every screen in question.
+    """
+    octaves = _octaves(strips)
+    found = [(h, o) for o in octaves for h in _scan_octave(o, strips.rows.size, packet_lengths)]
+    found.sort(key=lambda pair: -pair[0].evidence)
+    places = range(len(found))
+    chosen = distinct(places, lambda n, m: alike(found[n][0], found[m][0]), _TRIALS)
+    chosen += distinct(places, lambda n, m: same_slots(found[n][0], found[m][0]), _TRIALS)
+    return sorted((_try(*found[n]) for n in dict.fromkeys(chosen)), key=lambda hypothesis: -hypothesis.evidence)
+
+
+def alike(one: Hypothesis, other: Hypothesis) -> bool:
+    return one.packet_slots == other.packet_slots and same_slots(one, other)
+
+
+def same_slots(one: Hypothesis | BlindEstimate, other: Hypothesis | BlindEstimate) -> bool:
+    near = abs(np.log(one.rows_per_slot / other.rows_per_slot)) < _ALIKE_ROWS
+    return near and one.reversed == other.reversed
+
+
+def _scan_octave(octave: _Octave, n_rows: int, packet_lengths: Sequence[int]) -> list[Hypothesis]:
+    import cv2
+
+    out = []
+    total = _running_mean_sum(octave)
+    rows_per_slot = octave.low
+    around = np.ones((1, 2 * SAMPLES + 1), np.uint8)
+    while rows_per_slot < octave.high:
+        response = _header_response(total, rows_per_slot / octave.rows)
+        spread = 1.4826 * float(np.median(np.abs(response[0]))) + 1e-6
+        # The largest response within a slot: the grid may then miss copies by a slot.
+        near = cv2.dilate(response, around)
+        line = 2 * octave.line_near(rows_per_slot, _SCAN_STEP / 2)
+        for packet_slots in packet_lengths:
+            repeats = _repeats_near(octave, rows_per_slot, packet_slots)
+            for number, (score, sample) in enumerate(zip(*_comb(near, packet_slots), strict=True)):
+                start = (float(sample) / SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
+                evidence = float(score / spread) ** 2 + repeats**2 + line
+                out.append(Hypothesis(rows_per_slot, packet_slots, start, number == 1, evidence))
+        rows_per_slot *= 1 + _SCAN_STEP / min(n_rows / rows_per_slot, _SCAN_SLOTS)
+    return out
+
+
+def _running_mean_sum(octave: _Octave) -> FloatArray:
+    mean = octave.columns.mean(axis=0).astype(np.float64)
+    return np.concatenate([[0.0], np.cumsum(mean)])
+
+
+def _repeats_near(octave: _Octave, rows_per_slot: float, packet_slots: int) -> float:
+    """Surprise of the autocorrelation at lags within a slot of one packet."""
+    lag, slot = rows_per_slot * packet_slots / octave.rows, max(rows_per_slot / octave.rows, 1.0)
+    return float(octave.repeats[int(lag - slot) : int(lag + slot) + 2].max(initial=0.0))
+
+
+def _try(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
+    """The hypothesis with the clock that fits best thereabouts, and the evidence of its slots."""
+    fine = _fine_clock(hypothesis, octave)
+    columns = octave.columns[:, ::-1] if fine.reversed else octave.columns
+    rows_per_slot = fine.rows_per_slot / octave.rows
+    start = fine.start_row / octave.rows
+    if fine.reversed:
+        start = columns.shape[1] - start - SLOTS_PER_SYMBOL * rows_per_slot
+    before = int(start // rows_per_slot)
+    first = start - before * rows_per_slot
+    borders = np.arange(first, columns.shape[1], rows_per_slot)
+    total = np.concatenate([np.zeros((columns.shape[0], 1)), np.cumsum(columns, axis=1)], axis=1)
+    evidence = structure_evidence(_slot_means(total, borders), -before % fine.packet_slots, fine.packet_slots)
+    return replace(fine, start_row=start * octave.rows, evidence=evidence, salience=hypothesis.evidence)
+
+
+def _slot_means(total: FloatArray, borders: FloatArray) -> FloatArray:
+    """(C, N) means between borders, from (C, R + 1) running sums."""
+    place = np.clip(borders, 0, total.shape[1] - 1 - 1e-9)
+    low = place.astype(np.int64)
+    at = total[:, low] + (total[:, low + 1] - total[:, low]) * (place - low)
+    return np.asarray(np.diff(at, axis=1) / np.maximum(np.diff(place), 1e-6))
+
+
+def _fine_clock(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
+    """The clock near the hypothesis with the highest header peaks."""
+    total = _running_mean_sum(octave)
+    sign = int(hypothesis.reversed)
+    n_rows = octave.columns.shape[1] * octave.rows
+    step = 0.3 / min(n_rows / hypothesis.rows_per_slot, _SCAN_SLOTS)
+    best, best_score = hypothesis, -np.inf
+    for rows_per_slot in hypothesis.rows_per_slot * (1 + step * np.arange(-8, 9)):
+        response = _header_response(total, rows_per_slot / octave.rows)[sign : sign + 1]
+        (score,), (sample,) = _comb(response, hypothesis.packet_slots)
+        score += 0.03 * _repeats_at(octave, rows_per_slot, hypothesis.packet_slots)
+        score += _SAY_OF_LINE * octave.line_at(rows_per_slot)
+        if score > best_score:
+            start = (float(sample) / SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
+            best = replace(hypothesis, rows_per_slot=float(rows_per_slot), start_row=float(start))
+            best_score = score
+    return best
+
+
+def _repeats_at(octave: _Octave, rows_per_slot: float, packet_slots: int) -> float:
+    lag = rows_per_slot * packet_slots / octave.rows
+    return float(np.interp(lag, np.arange(octave.repeats.size), octave.repeats, right=0.0))

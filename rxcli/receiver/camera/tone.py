@@ -1,0 +1,68 @@
+"""The tone curve of a picture whose slots are known.
+
+Rows see every share of a slot, and where values follow light their values lie on a line over those shares. A curve that
+was undone wrongly bends that line: light to the power of p is bent by what w^p is above or below w.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rxcli.receiver.camera.strips import Strips
+from rxcli.receiver.camera.waves import local_mean, local_moments, residual_of
+from rxcli.types import Float32Array, FloatArray
+
+#: Exponent that makes light of values, as nearly as a power of them does, by the tone curve.
+_EXPONENTS = {"srgb": 2.2, "linear": 1.0}
+#: Curves of a smaller exponent are nearer to none at all than to sRGB.
+_LINEAR_BELOW = 1.5
+#: How far the bend of a picture whose curve is known is off: textures, sharpening and slots that are wrong.
+_BEND_SD = 0.25
+#: Half of the light is never more than so near to none, whatever the bend.
+_LEAST_HALF = 0.05
+
+
+def tone_exponent(strips: Strips, wave: Float32Array, window: int) -> tuple[float, float] | None:
+    """The exponent that makes light of the picture's values, and its standard deviation.
+
+    Args:
+        strips: in readout order; sampled with the curve `strips.tone` undone.
+        wave: (M, R) share 0..1 of the slots' light that every row sees.
+        window: rows over which the picture may be taken as constant.
+
+    Returns:
+        About 2.2 for sRGB, 1.9 for BT.709 and 1 for values that follow light; of dark pictures more, because sRGB has
+        a straight toe. None where values are known to follow light, or no row sees shares between none and all.
+    """
+    if strips.tone is None:
+        return None
+    inside = strips.inside
+    near = local_moments(strips.light, wave, inside, window)
+    _, spread = residual_of(strips, near, near.gain, wave, window)
+    weight = inside / spread
+
+    def about(values: Float32Array) -> Float32Array:
+        centred: Float32Array = (values - local_mean(values * inside, window) / near.share) * near.gain
+        return centred
+
+    def by_column(values: Float32Array) -> FloatArray:
+        summed: FloatArray = (values * weight).reshape(strips.n_columns, -1).sum(axis=1, dtype=np.float64)
+        return summed
+
+    line, arc, light = about(wave), about(wave * (1 - wave)), strips.light - near.value
+    on_line = by_column(arc * line) / np.maximum(by_column(line * line), 1e-9)
+    pull = by_column(arc * light) - on_line * by_column(line * light)
+    information = by_column(arc * arc) - on_line * by_column(arc * line)
+    if information.sum() <= 0:
+        return None
+    bend = pull.sum() / information.sum()
+    sd = np.hypot(np.linalg.norm(pull - bend * information) / information.sum(), _BEND_SD)
+    half = max(0.5 + bend / 4, _LEAST_HALF)
+    power = -np.log2(half)
+    exponent = _EXPONENTS[strips.tone] / power
+    return float(exponent), float(exponent * sd / (4 * np.log(2) * half * power))
+
+
+def is_linear(tone: tuple[float, float] | None) -> bool:
+    """Whether a picture of some exponent is read as one whose values follow light."""
+    return tone is not None and tone[0] < _LINEAR_BELOW

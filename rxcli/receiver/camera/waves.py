@@ -1,0 +1,365 @@
+"""Light of the columns by slot position, and the slots decided from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook
+from rxcli.receiver.camera.strips import EXTREMES_SLOTS, SAMPLES, Strips, levelled
+from rxcli.receiver.camera.trellis import lit_probability, pattern_light
+from rxcli.types import Float32Array, FloatArray
+
+#: Exposures that are compared, slots; and those near one, as factors.
+_EXPOSURES = np.array([0.3, 0.7, 1.1, 1.5, 1.9, 2.3, 2.8])
+_NEAR_EXPOSURES = np.array([0.8, 1.0, 1.25])
+_AROUND_EXPOSURE = np.array([0.7, 0.85, 1.0, 1.17, 1.37])
+
+#: Reach of a column's light, columns; less than this share of a strip's light is left out.
+_LIGHT_SPREAD, _LEAST_SHARE = 0.45, 0.02
+
+#: Rounds of levels and slots at every step; slots over which levels are taken; weight of a column's own level there.
+_ROUNDS, _LEVEL_SLOTS = 1, 31
+_GAIN_PRIOR = np.float32(0.05)
+#: Log-odds of known slots; and the say of a sample, as samples of a slot err alike.
+_KNOWN, _TEMPER = 6.0, 0.5
+#: (10, 10) share of the codewords that are lit, by weight (nothing for 0) and place. The codebook is the first part of
+#: all words in ascending order: early slots are dark more often than late ones, of weights 2 to 5 the first one nearly
+#: always. None is surer than a header's.
+WORD_SHARES: FloatArray = np.clip(
+    [np.full(SLOTS_PER_SYMBOL, 0.5), *(codebook(w).mean(axis=0) for w in WEIGHTS)], 0.01, 0.99
+)
+#: Rounds of levels and slots that are read freely; and the share of them that may be lit.
+_FREE_ROUNDS, _FREE_DUTY = 2, (0.15, 0.85)
+#: Noise that is expected of levelled light before any is known.
+_FIRST_POWER = 0.3
+#: Rounds of weights and how many columns have them.
+_SHARING_ROUNDS = 5
+
+#: Slots over which the light of a strip may be taken as constant.
+LOCAL_SLOTS = 15
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Where slot 0 stands in its packet."""
+
+    first_slot: int
+    packet_slots: int
+
+    def log_odds(self, w: NDArray[np.int64], n: int) -> FloatArray:
+        """(C, n) prior log-odds of slots 0..n: headers and dimming symbols are known, others lit as in codewords."""
+        position = (np.arange(n) + self.first_slot) % self.packet_slots
+        out = _log_odds(WORD_SHARES)[w][:, position % SLOTS_PER_SYMBOL]
+        preamble = position < PREAMBLE_SLOTS
+        symbol = np.arange(SLOTS_PER_SYMBOL) < w[:, None]
+        known = np.concatenate([np.broadcast_to(np.array(HEADER, bool), symbol.shape), symbol], axis=1)
+        out[:, preamble] = np.where(known[:, position[preamble]], _KNOWN, -_KNOWN)
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Slots:
+    """What is believed of the columns' slots."""
+
+    #: (C, N) float32: probability that a slot is lit.
+    lit: Float32Array
+    #: (C,) int64: weight of every column.
+    w: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Waves:
+    """Light of the columns on a grid of SAMPLES samples a slot."""
+
+    #: (C, n) float32: levelled light, and its weight.
+    value: Float32Array
+    weight: Float32Array
+
+
+def column_shares(strips: Strips) -> FloatArray:
+    """(M, C) share of every column's light in every strip's, for columns that are lit alike."""
+    n_strips = strips.light.shape[0]
+    across = (np.arange(n_strips) + 0.5) / n_strips * strips.n_columns
+    light = np.exp(-((across[:, None] - np.arange(strips.n_columns) - 0.5) ** 2) / (2 * _LIGHT_SPREAD**2))
+    light[light < _LEAST_SHARE * light.max(axis=1, keepdims=True)] = 0
+    return np.asarray(light / light.sum(axis=1, keepdims=True))
+
+
+def column_waves(strips: Strips, time: Float32Array, rows_per_slot: float) -> Waves:
+    """Levelled light of every column by slot position."""
+    window = round(EXTREMES_SLOTS * rows_per_slot / (strips.rows[1] - strips.rows[0]))
+    level, weight = levelled(strips.light, strips.inside, window, strips.noise)
+    n = (int(time.max()) + 2) * SAMPLES
+    per_column = strips.light.shape[0] // strips.n_columns
+    column = np.arange(strips.light.shape[0]) // per_column
+    place = np.clip((time * SAMPLES).astype(np.int64), 0, n - 1) + (column * n)[:, None]
+    total = np.bincount(place.ravel(), weight.ravel(), strips.n_columns * n)
+    summed = np.bincount(place.ravel(), (level * weight).ravel(), strips.n_columns * n)
+    value = (summed / (total + 1e-3)).reshape(strips.n_columns, n)
+    return Waves(value.astype(np.float32), total.reshape(value.shape).astype(np.float32))
+
+
+def first_slots(waves: Waves, exposure_slots: float, grid: Grid) -> Slots:
+    """Slots at the levels that each weight would give, of the weight that explains its column best."""
+    pattern = pattern_light(exposure_slots, SAMPLES)
+    n_columns, n = waves.value.shape[0], waves.value.shape[1] // SAMPLES
+    w = np.repeat(np.array(WEIGHTS), n_columns)
+    known = grid.log_odds(w, n)
+    many = Waves(np.tile(waves.value, (len(WEIGHTS), 1)), np.tile(waves.weight, (len(WEIGHTS), 1)))
+    levels = np.array([_expected_levels(one, exposure_slots) for one in WEIGHTS], np.float32)
+    gain, offset = (np.broadcast_to(np.repeat(one, n_columns)[:, None], many.value.shape) for one in levels.T)
+    power = np.full((w.size, 1), _FIRST_POWER, np.float32)
+    lit, _ = lit_probability(_pattern_metric(many, gain, offset, power, pattern), known)
+    gain, offset, residual = _levels(many, lit, exposure_slots)
+    power = _power(many, residual)
+    lit, evidence = lit_probability(_pattern_metric(many, gain, offset, power, pattern), known)
+    evidence = evidence - 0.5 * _TEMPER * _trust(many).sum(axis=1) * np.log(power[:, 0])
+    best = _shared_weights(evidence.reshape(len(WEIGHTS), n_columns))
+    return Slots(lit.reshape(len(WEIGHTS), n_columns, n)[best, np.arange(n_columns)], np.array(WEIGHTS)[best])
+
+
+def free_log_odds(waves: Waves, exposure_slots: float) -> FloatArray:
+    """(C, N) what the light says for every slot being lit, read without knowing anything of packets."""
+    pattern = pattern_light(exposure_slots, SAMPLES)
+    shape = (waves.value.shape[0], waves.value.shape[1] // SAMPLES)
+    levels = _expected_levels(SLOTS_PER_SYMBOL // 2, exposure_slots)
+    gain, offset = (np.full_like(waves.value, level) for level in levels)
+    power = np.full((shape[0], 1), _FIRST_POWER, np.float32)
+    prior = np.zeros(shape)
+    lit, _ = lit_probability(_pattern_metric(waves, gain, offset, power, pattern), prior)
+    for _ in range(_FREE_ROUNDS):
+        gain, offset, residual = _levels(waves, lit, exposure_slots)
+        duty = np.clip(lit.mean(axis=1, keepdims=True, dtype=np.float64), *_FREE_DUTY)
+        prior = _log_odds(duty) + np.zeros(shape)
+        lit, _ = lit_probability(_pattern_metric(waves, gain, offset, _power(waves, residual), pattern), prior)
+    return _log_odds(np.clip(lit.astype(np.float64), 1e-4, 1 - 1e-4)) - prior
+
+
+def _log_odds(share: FloatArray) -> FloatArray:
+    return np.asarray(np.log(share / (1 - share)))
+
+
+def _shared_weights(evidence: FloatArray) -> NDArray[np.int64]:
+    """(C,) most probable weight of each column, where weights that many columns have are more probable."""
+    prior = np.full((evidence.shape[0], 1), 1 / evidence.shape[0])
+    for _ in range(_SHARING_ROUNDS):
+        posterior = np.exp(evidence - evidence.max(axis=0)) * prior
+        posterior /= posterior.sum(axis=0)
+        prior = posterior.mean(axis=1, keepdims=True) + 0.01
+    return np.asarray(posterior.argmax(axis=0))
+
+
+def decide(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots, rounds: int = _ROUNDS) -> Slots:
+    """Slots by rounds of levels from slots and slots from levels; weights stay.
+
+    Args:
+        waves: light by slot position.
+        exposure_slots: exposure.
+        grid: where the headers are.
+        slots: to start from.
+        rounds: of levels and slots.
+    """
+    n = waves.value.shape[1] // SAMPLES
+    lit = fitted(slots.lit, n)
+    known = grid.log_odds(slots.w, n)
+    pattern = pattern_light(exposure_slots, SAMPLES)
+    for _ in range(rounds):
+        gain, offset, residual = _levels(waves, lit, exposure_slots)
+        lit, _ = lit_probability(_pattern_metric(waves, gain, offset, _power(waves, residual), pattern), known)
+    return Slots(lit, slots.w)
+
+
+def fitted(lit: Float32Array, n: int) -> Float32Array:
+    """Slots cut, or filled with doubt, to a number of `n`."""
+    more = n - lit.shape[1]
+    return lit[:, :n] if more <= 0 else np.pad(lit, ((0, 0), (0, more)), constant_values=0.5)
+
+
+def packet_evidence(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots) -> float:
+    """Log-likelihood ratio of headers and dimming symbols being where they must, over slots of any kind, nats."""
+    n = slots.lit.shape[1]
+    gain, offset, residual = _levels(waves, slots.lit, exposure_slots)
+    metric = _pattern_metric(waves, gain, offset, _power(waves, residual), pattern_light(exposure_slots, SAMPLES))
+    _, known = lit_probability(metric, grid.log_odds(slots.w, n))
+    _, free = lit_probability(metric, _duty_log_odds(slots.w)[:, None] + np.zeros(n))
+    # A column may be too dark to say anything.
+    return float(np.logaddexp(known - free, 0.0).sum() - slots.w.size * np.log(2.0))
+
+
+def _expected_levels(w: int, exposure_slots: float) -> tuple[float, float]:
+    """Gain and offset of levelled light, which has no mean and a variance of one, for symbols of weight `w`."""
+    duty = w / SLOTS_PER_SYMBOL
+    light = pattern_light(exposure_slots, SAMPLES)
+    n_bits = light.shape[0].bit_length() - 1
+    lit = np.array([bin(p).count("1") for p in range(light.shape[0])])
+    share = duty**lit * (1 - duty) ** (n_bits - lit)
+    mean = (share @ light).mean()
+    gain = 1 / np.sqrt((share @ (light - mean) ** 2).mean())
+    return float(gain), float(-gain * mean)
+
+
+def _duty_log_odds(w: NDArray[np.int64]) -> FloatArray:
+    return _log_odds(w / SLOTS_PER_SYMBOL)
+
+
+def _power(waves: Waves, residual: Float32Array) -> Float32Array:
+    """(C, 1) weighted mean of squares that are left."""
+    trust = _trust(waves)
+    total = trust.sum(axis=1, keepdims=True) + np.float32(1e-6)
+    return np.asarray((trust * residual).sum(axis=1, keepdims=True) / total + np.float32(1e-4))
+
+
+def _trust(waves: Waves) -> Float32Array:
+    """(C, n) say of every sample, 0 to 1."""
+    return np.asarray(np.minimum(waves.weight / (np.median(waves.weight, axis=1, keepdims=True) + 1e-6), 1), np.float32)
+
+
+def _pattern_metric(
+    waves: Waves, gain: Float32Array, offset: Float32Array, power: Float32Array, pattern: FloatArray
+) -> Float32Array:
+    """(C, N, patterns) log-likelihood of every slot's samples at given levels and noise, up to a constant."""
+    scale = _trust(waves) * np.float32(_TEMPER / 2) / power
+    shape = (waves.value.shape[0], -1, SAMPLES)
+    value, gain, scale = ((waves.value - offset).reshape(shape), gain.reshape(shape), scale.reshape(shape))
+    light = pattern.astype(np.float32)
+    square = (value * value * scale).sum(axis=2, keepdims=True)
+    return np.asarray(2 * (value * gain * scale) @ light.T - (gain * gain * scale) @ (light * light).T - square)
+
+
+def _levels(waves: Waves, lit: Float32Array, exposure_slots: float) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Of every sample: gain and offset of lit slots thereabouts, and the square that is expected to be left."""
+    centres = np.broadcast_to((np.arange(waves.value.shape[1]) + 0.5) / SAMPLES, waves.value.shape)
+    column = np.arange(lit.shape[0])
+    wave, _ = seen_through(lit, centres, column, exposure_slots)
+    unsure, _ = seen_through(lit * (1 - lit), centres, column, exposure_slots)
+    unsure /= np.float32(max(exposure_slots, 1.0))
+    weight = waves.weight
+    near = local_moments(waves.value, wave, weight, _LEVEL_SLOTS * SAMPLES, unsure)
+    both, power = near.covariance, near.variance
+    total = weight.sum(axis=1, keepdims=True) + np.float32(1e-6)
+    overall = (both * weight).sum(axis=1, keepdims=True) / ((power * weight).sum(axis=1, keepdims=True) + 0.01 * total)
+    gain = (np.maximum(both, 0) + _GAIN_PRIOR * np.maximum(overall, 0)) / (np.maximum(power, 0) + _GAIN_PRIOR)
+    offset = near.value - gain * near.wave
+    return gain, offset, (waves.value - offset - gain * wave) ** 2 + gain * gain * unsure
+
+
+def seen_through(
+    lit: Float32Array, time: FloatArray | Float32Array, column: NDArray[np.int64], exposure_slots: float
+) -> tuple[Float32Array, Float32Array]:
+    """Light 0..1 of slots through the exposure at slot positions (n, m) of columns (n,); and its change per slot."""
+    n = lit.shape[1]
+    total = np.zeros((lit.shape[0], n + 2), np.float32)
+    np.cumsum(lit, axis=1, out=total[:, 1 : n + 1])
+    total[:, n + 1] = total[:, n]
+    flat, base = total.ravel(), (column * (n + 2))[:, None]
+    late, late_slope = _running(flat, base, time + np.float32(exposure_slots / 2), n)
+    early, early_slope = _running(flat, base, time - np.float32(exposure_slots / 2), n)
+    scale = np.float32(1 / exposure_slots)
+    return (late - early) * scale, (late_slope - early_slope) * scale
+
+
+def _running(
+    flat: Float32Array, base: NDArray[np.int64], time: FloatArray | Float32Array, n: int
+) -> tuple[Float32Array, Float32Array]:
+    place: FloatArray = np.clip(np.asarray(time, np.float64), 0, n + 0.999)
+    low = place.astype(np.int64)
+    index = low + base
+    below: Float32Array = np.asarray(flat.take(index), np.float32)
+    step: Float32Array = np.asarray(flat.take(index + 1), np.float32) - below
+    return np.asarray(below + step * (place - low), np.float32), step
+
+
+def local_mean(values: Float32Array, window: int) -> Float32Array:
+    import cv2
+
+    return np.asarray(cv2.blur(values, (window | 1, 1)))
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Weighted means, covariance and variance of light and of the wave that should explain it, thereabouts."""
+
+    #: Share of the window that counts.
+    share: Float32Array
+    value: Float32Array
+    wave: Float32Array
+    covariance: Float32Array
+    #: Of the wave.
+    variance: Float32Array
+
+    @property
+    def gain(self) -> Float32Array:
+        """Light per unit of the wave, never negative."""
+        return np.asarray(np.maximum(self.covariance, 0) / (self.variance + np.float32(0.02)))
+
+
+def local_moments(
+    value: Float32Array, wave: Float32Array, weight: Float32Array, window: int, unsure: Float32Array | float = 0.0
+) -> Moments:
+    """Moments over `window` samples along the last axis; `unsure` is the variance of the wave itself."""
+    share = local_mean(weight, window) + np.float32(1e-3)
+    mean_value, mean_wave = local_mean(value * weight, window) / share, local_mean(wave * weight, window) / share
+    covariance = local_mean(value * wave * weight, window) / share - mean_value * mean_wave
+    variance = local_mean((wave * wave + unsure) * weight, window) / share - mean_wave * mean_wave
+    return Moments(share, mean_value, mean_wave, covariance, variance)
+
+
+def residual_of(
+    strips: Strips, near: Moments, gain: Float32Array, wave: Float32Array, window: int
+) -> tuple[Float32Array, Float32Array]:
+    """(M, R) light that a wave of some gain leaves over; and its variance thereabouts, the noise's with it."""
+    residual = (strips.light - near.value - gain * (wave - near.wave)) * strips.inside
+    spread = local_mean(residual * residual, window) / near.share + strips.noise.variance(near.value)
+    return residual, spread
+
+
+def estimate_exposure(waves: Waves, grid: Grid, slots: Slots, near: float | None = None) -> tuple[float, float, Slots]:
+    """Exposure in slots by the blur of the slots' edges.
+
+    Args:
+        waves: light by slot position.
+        grid: where the headers are.
+        slots: to start from.
+        near: what it is near to; None to try all.
+
+    Returns:
+        The exposure, its standard deviation, and the slots at the exposure tried that is nearest to it.
+    """
+    tried = _EXPOSURES if near is None else near * _NEAR_EXPOSURES
+    found = [decide(waves, exposure, grid, slots) for exposure in tried]
+    errors = np.log([_misfit(waves, exposure, one.lit) for exposure, one in zip(tried, found, strict=True)])
+    exposure, sd = _least(tried, errors, waves)
+    return exposure, sd, found[int(errors.argmin())]
+
+
+def exposure_of_known(waves: Waves, lit: Float32Array, near: float) -> tuple[float, float]:
+    """Exposure near one, by the blur of slots (C, N) that are known; and its standard deviation."""
+    known = fitted(lit, waves.value.shape[1] // SAMPLES)
+    tried = near * _AROUND_EXPOSURE
+    return _least(tried, np.log([_misfit(waves, exposure, known) for exposure in tried]), waves)
+
+
+def _least(tried: FloatArray, errors: FloatArray, waves: Waves) -> tuple[float, float]:
+    """Where the logarithm of the misfit is least, by a parabola, and the standard deviation."""
+    best = int(errors.argmin())
+    inner = int(np.clip(best, 1, tried.size - 2))
+    bend, slope, _ = np.polyfit(tried[inner - 1 : inner + 2], errors[inner - 1 : inner + 2], 2)
+    if bend <= 0:
+        return float(tried[best]), 0.3
+    exposure = float(np.clip(-slope / (2 * bend), tried[inner - 1], tried[inner + 1]))
+    independent = waves.value.size / SAMPLES
+    return exposure, float(np.clip(np.sqrt(1 / (bend * independent)), 0.02, 0.5))
+
+
+def _misfit(waves: Waves, exposure_slots: float, lit: Float32Array) -> float:
+    """Weighted square of what the slots through this exposure leave of the waves, as a share."""
+    centres = np.broadcast_to((np.arange(waves.value.shape[1]) + 0.5) / SAMPLES, waves.value.shape)
+    wave, _ = seen_through(lit, centres, np.arange(lit.shape[0]), exposure_slots)
+    weight = waves.weight
+    near = local_moments(waves.value, wave, weight, LOCAL_SLOTS * SAMPLES)
+    residual = waves.value - near.value - near.gain * (wave - near.wave)
+    total = float((weight * (waves.value - near.value) ** 2).sum())
+    return float((weight * residual * residual).sum()) / max(total, 1e-9)

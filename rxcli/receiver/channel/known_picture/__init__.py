@@ -1,0 +1,33 @@
+"""Slots through a picture that is known from the frames before.
+
+What strip s of column c sees on a row is z = floor + T * sum over k of K[s, k] * m[c + k], with T the picture, K the
+light spread and m the exposure-averaged slots of the columns (see `channel`). In a clip T is known: the sum over
+frames of z against what was expected. Then all columns' m of a row are one small linear system, solved for all rows at
+once: no crosstalk is left, strips are pooled by what they tell, and every column is a single series with a precision.
+
+`picture` learns and solves, `exposure` says what slots give through an exposure, `response` what compression leaves of
+it, `header` where headers show, and `metrics` makes of it all what detection needs.
+"""
+
+from rxcli.receiver.channel.known_picture.exposure import exposed, row_positions, trusted
+from rxcli.receiver.channel.known_picture.header import dark_light, first_decision, header_contrast, header_dark
+from rxcli.receiver.channel.known_picture.metrics import pattern_metrics
+from rxcli.receiver.channel.known_picture.picture import MEMORY, ColumnLight, KnownPicture
+from rxcli.receiver.channel.known_picture.response import evened, exposures, fit_response
+
+__all__ = [
+    "MEMORY",
+    "ColumnLight",
+    "KnownPicture",
+    "dark_light",
+    "evened",
+    "exposed",
+    "exposures",
+    "first_decision",
+    "fit_response",
+    "header_contrast",
+    "header_dark",
+    "pattern_metrics",
+    "row_positions",
+    "trusted",
+]

@@ -1,0 +1,82 @@
+"""First decisions, and what the headers show."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
+from rxcli.receiver.channel.known_picture.exposure import read_between
+from rxcli.receiver.channel.known_picture.picture import PRIOR, ColumnLight
+from rxcli.types import BoolArray, Clock, Float32Array, FloatArray
+
+#: Slots of the header between which it is dark, and rows of a strip, over all frames, from which its light is known.
+_DARK_SLOTS, _LEAST_DARK_ROWS = (5.0, 8.0), 12
+#: Rows of a single column's header that must show, that it be judged.
+_LEAST_ROWS = 40
+
+
+def first_decision(seen: ColumnLight, positions: FloatArray, clock: Clock) -> Float32Array:
+    """(C, N) probability that each slot is lit, from the rows around its middle alone.
+
+    Args:
+        seen: the columns' light.
+        positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
+        clock: the clock.
+    """
+    middles = np.arange(clock.n_slots) + 0.5
+    total = np.zeros((seen.value.shape[0], seen.value.shape[1] + 1))
+    np.cumsum((seen.value - np.float32(0.5)) * seen.precision, axis=1, out=total[:, 1:])
+    step = positions[:, -1:] - positions[:, :1]
+    rows = (middles - positions[:, :1]) * ((positions.shape[1] - 1) / step) + 0.5
+    reach = 0.35 * clock.rows_per_slot
+    llr = read_between(total, rows + reach) - read_between(total, rows - reach)
+    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * llr), np.float32)
+
+
+def header_contrast(seen: ColumnLight, positions: FloatArray, clock: Clock) -> float:
+    """Contrast of the headers where the clock has them, 1 being full and 0 none; 1 where no header shows.
+
+    Args:
+        seen: the columns' light.
+        positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
+        clock: the clock.
+    """
+    place = (np.floor(positions).astype(np.int64) + clock.first_slot) % clock.packet_slots
+    rows = np.flatnonzero((place < SLOTS_PER_SYMBOL).any(axis=0))
+    place = place[:, rows]
+    sign = np.where(place < SLOTS_PER_SYMBOL, 2.0 * np.array(HEADER)[np.minimum(place, SLOTS_PER_SYMBOL - 1)] - 1, 0)
+    value, precision = (values.take(rows, axis=1) for values in (seen.value, seen.precision))
+    weight = np.abs(sign) * np.minimum(precision, np.float32(PRIOR))
+    if weight.sum() < PRIOR * _LEAST_ROWS:
+        return 1.0
+    return float((weight * sign * np.clip(2 * value - 1, -1.5, 1.5)).sum() / weight.sum())
+
+
+def header_dark(positions: FloatArray, clock: Clock) -> BoolArray:
+    """(C, R) or (1, R) rows that see nothing but the three dark slots in the middle of a header."""
+    place = (positions + clock.first_slot) % clock.packet_slots
+    margin = clock.exposure_slots / 2
+    return np.asarray((place >= _DARK_SLOTS[0] + margin) & (place <= _DARK_SLOTS[1] - margin))
+
+
+def dark_light(lights: list[Float32Array], dark: list[BoolArray], inside: BoolArray, usual: float) -> Float32Array:
+    """(C, S) light of the strips where nothing is lit.
+
+    What a black picture or a starved encoder leaves of a strip does not change with the slots: it is no picture.
+
+    Args:
+        lights: (C, S, R) each.
+        dark: (C, R) or (1, R) each, from `header_dark`.
+        inside: (C, S, R) as for `KnownPicture`.
+        usual: what is taken where too few rows tell.
+    """
+    seen = [
+        np.where(np.broadcast_to(rows[:, None], light.shape) & inside, light, np.float32(np.nan))[..., rows.any(axis=0)]
+        for light, rows in zip(lights, dark, strict=True)
+    ]
+    together = np.concatenate(seen, axis=2)
+    few = (~np.isnan(together)).sum(axis=2) < _LEAST_DARK_ROWS
+    if together.shape[2] == 0:
+        return np.full(together.shape[:2], usual, np.float32)
+    together[few] = np.float32(usual)
+    return np.asarray(np.nanmedian(together, axis=2), np.float32)

@@ -1,0 +1,87 @@
+"""Metrics of slot patterns; slots and metrics on the grid of a frame, and by burst."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from rxcli.protocol import slot_patterns
+from rxcli.receiver.channel.picture import by_slot
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray
+
+#: Log-likelihood ratio of a slot that the first guess sees at full contrast in all strips.
+_FIRST_GUESS_LLR = 8.0
+#: Strips of full contrast at which the first guess is as sure as it gets.
+_FIRST_GUESS_STRIPS = 3.0
+
+
+def first_metrics(pooled: Float32Array, weight: Float32Array, taps: FloatArray) -> FloatArray:
+    """First guess of the metrics (C, N + memory, patterns), from contrast alone.
+
+    Args:
+        pooled: (C, N * Q) light between its local extremes, -1 dark to 1 lit.
+        weight: (C, N * Q) strips of full contrast behind it.
+        taps: (Q, memory + 1), see `LightModel`.
+    """
+    # Squared errors, so weighted that a slot seen right in all samples has the log-likelihood ratio of the constant.
+    most = np.float32(_FIRST_GUESS_LLR / 4 / taps.shape[0])
+    trust = np.minimum(weight / np.float32(_FIRST_GUESS_STRIPS), 1) * most
+    value = np.clip(pooled, -1.5, 1.5)
+    return by_pattern(taps, pooled.shape[1], lambda levels: -np.square(value - (2 * levels - 1)) * trust)
+
+
+def by_pattern(taps: FloatArray, n: int, of_levels: Callable[[Float32Array], Float32Array]) -> FloatArray:
+    """(C, N + memory, patterns) sums over the samples of a metric of what (C, n) samples say of every pattern.
+
+    Args:
+        taps: (Q, memory + 1).
+        n: samples.
+        of_levels: from the (n,) levels between dark and lit that a pattern has in every sample, to (C, n).
+    """
+    q, memory = taps.shape[0], taps.shape[1] - 1
+    lead = memory * q // 2
+    sums = []
+    for levels in slot_patterns(memory) @ taps.T:
+        # Sample i belongs to metric (i + lead) // q.
+        values = of_levels(np.tile(np.roll(levels, -(lead % q)).astype(np.float32), -(-n // q))[:n])
+        padded = np.zeros((values.shape[0], n + memory * q), np.float32)
+        padded[:, lead : lead + n] = values
+        sums.append(by_slot(padded, q))
+    return np.stack(sums, axis=2).astype(np.float64)
+
+
+def metrics_of(llr: Float32Array, memory: int) -> FloatArray:
+    """Metrics (C, N + memory, patterns) of slots (C, N) that are independent, given their log-likelihood ratios."""
+    padded = np.pad(llr, ((0, 0), (0, memory)))
+    return np.asarray(padded[..., None] / 2 * (2.0 * slot_patterns(memory)[:, -1] - 1))
+
+
+def lit_on_grid(posteriors: BurstPosteriors, clock: Clock) -> Float32Array:
+    """(C, N) probability that each slot of the grid is lit."""
+    return on_grid(posteriors.lit, clock)
+
+
+def on_grid(lit: Float32Array, clock: Clock) -> Float32Array:
+    """(C, N) slots of the grid from those of bursts (B, C, packet)."""
+    copies = lit[clock.burst].transpose(1, 0, 2)
+    flat = copies.reshape(copies.shape[0], -1)
+    return flat[:, clock.first_slot : clock.first_slot + clock.n_slots]
+
+
+def by_burst(metrics: FloatArray, clock: Clock, memory: int) -> FloatArray:
+    """Metrics of the grid (C, N + memory, patterns) added over the copies of each burst.
+
+    Returns:
+        (B, C, packet + memory, patterns); see `detect.detect`.
+    """
+    n_columns, _, n_patterns = metrics.shape
+    length = clock.packet_slots
+    padded = np.zeros((n_columns, clock.n_copies * length + memory, n_patterns))
+    end = min(clock.first_slot + metrics.shape[1], padded.shape[1])
+    padded[:, clock.first_slot : end] = metrics[:, : end - clock.first_slot]
+    out = np.zeros((int(clock.burst.max()) + 1, n_columns, length + memory, n_patterns))
+    for copy, burst in enumerate(clock.burst):
+        out[burst] += padded[:, copy * length : (copy + 1) * length + memory]
+    out[:, :, :memory] = 0
+    return out

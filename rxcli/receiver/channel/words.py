@@ -1,0 +1,211 @@
+"""Likely words of symbols in doubt, weighed as a whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.receiver.channel.likelihoods import from_neighbours, shape_on_grid
+from rxcli.receiver.channel.model import LightModel
+from rxcli.receiver.channel.picture import box_sums
+from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
+
+#: Kinds of picture, smooth to rough: relative standard deviation about the local mean, and slots after which it is
+#: another one (Ornstein-Uhlenbeck). Each strip may be of any.
+_PICTURE_KINDS = ((0.06, 0.7), (0.25, 2.0), (0.7, 3.0))
+#: The local mean is taken over this many slots on either side; a word is weighed with so many slots around it.
+_MEAN_SLOTS, _AROUND_SLOTS = 10, 3
+#: Variance of the mean of two adjacent samples against that of one: samples are interpolated, so they err alike.
+_PAIR_NOISE = 0.75
+#: Strips of a column err alike: what they say of a word, added, counts so much; and at most so many nats.
+_WORD_TEMPER, _WORD_NATS = 0.3, 12.0
+#: Ridge of the slots' corrections that make up a word's.
+_WORD_RIDGE = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class _Halves:
+    """Light of some columns at two samples a slot; (C, S, 2 N) float32."""
+
+    #: Light over the floor.
+    light: Float32Array
+    #: Mean picture around.
+    mean: Float32Array
+    #: Light of the adjacent columns per unit of picture.
+    others: Float32Array
+    #: Whether both samples are seen.
+    seen: NDArray[np.bool_]
+
+
+def word_corrections(
+    samples: SlotSamples,
+    clock: Clock,
+    model: LightModel,
+    lit: Float32Array,
+    columns: NDArray[np.int64],
+    places: NDArray[np.int64],
+    words: NDArray[np.uint8],
+    likely: NDArray[np.bool_],
+) -> Float32Array:
+    """What to add to the log-likelihood ratio of every slot, so that words count as the light as a whole has them.
+
+    Args:
+        samples: of the columns to look at, S strips, N slots of four samples.
+        clock: the clock.
+        model: the light model.
+        lit: (C, N) probability that each slot is lit, of all columns.
+        columns: which columns the samples are of.
+        places: (J, 3) burst, place in `columns` and number of each symbol in doubt.
+        words: (J, K, 10) its likeliest words, best first.
+        likely: (J, K) which of them to weigh; the first always.
+
+    Returns:
+        (len(columns), N); 0 for symbols that are not in doubt.
+    """
+    out = np.zeros((columns.size, clock.n_slots), np.float32)
+    symbol, start = _occurrences(places, clock)
+    if symbol.size == 0:
+        return out
+    halves = _halves(samples, clock, model, lit, columns)
+    item, word = np.nonzero(likely[symbol])
+    levels = _word_levels(lit[columns[places[symbol[item], 1]]], start[item], words[symbol[item], word], model)
+    seen = _process_likelihood(halves, places[symbol[item], 1], start[item], levels, model)
+    score = np.zeros(likely.shape)
+    np.add.at(score, (symbol[item], word), seen)
+    slots = _as_slots(_WORD_TEMPER * score, words, likely)
+    _share_among_copies(out, slots, symbol, places[symbol, 1], start)
+    return out
+
+
+def _share_among_copies(
+    out: Float32Array,
+    slots: FloatArray,
+    symbol: NDArray[np.int64],
+    column: NDArray[np.int64],
+    start: NDArray[np.int64],
+) -> None:
+    """Put the corrections (J, 10) of symbols on the grid, each shared alike among the copies that show the slot."""
+    at = start[:, None] + np.arange(SLOTS_PER_SYMBOL)
+    inside = (at >= 0) & (at < out.shape[1])
+    count = np.zeros(slots.shape)
+    np.add.at(count, symbol, inside)
+    share = (slots / np.maximum(count, 1))[symbol]
+    rows = np.broadcast_to(column[:, None], at.shape)
+    out[rows[inside], at[inside]] = share[inside]
+
+
+def _occurrences(places: NDArray[np.int64], clock: Clock) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Of every copy of the symbols on the grid: which symbol, and its first slot."""
+    symbol, copy = np.nonzero(places[:, :1] == clock.burst)
+    start = copy * clock.packet_slots + PREAMBLE_SLOTS + SLOTS_PER_SYMBOL * places[symbol, 2] - clock.first_slot
+    there = (start > -SLOTS_PER_SYMBOL) & (start < clock.n_slots)
+    return symbol[there], start[there]
+
+
+def _halves(
+    samples: SlotSamples, clock: Clock, model: LightModel, lit: Float32Array, columns: NDArray[np.int64]
+) -> _Halves:
+    shape, q = shape_on_grid(lit, model), samples.samples_per_slot
+    others = from_neighbours(shape, model, clock, columns)
+    light: Float32Array = (samples.light - np.float32(model.floor)) * samples.valid
+    own = model.spread[None, :, 1, None].astype(np.float32) * shape[columns, None]
+    weight = (others + own) * samples.valid
+    light_around, seen_around = (box_sums(part * weight, _MEAN_SLOTS * q) for part in (light, weight))
+    mean = np.maximum(light_around, np.float32(0)) / np.maximum(seen_around, np.float32(1e-3))
+    return _Halves(_paired(light), _paired(mean.astype(np.float32)), _paired(others), _paired(samples.valid) > 0.9)
+
+
+def _paired(values: Float32Array) -> Float32Array:
+    """Means of the two samples of every half of a slot, last axis."""
+    return np.asarray((values[..., ::2] + values[..., 1::2]) * np.float32(0.5), np.float32)
+
+
+def _word_levels(
+    lit: Float32Array, start: NDArray[np.int64], words: NDArray[np.uint8], model: LightModel
+) -> Float32Array:
+    """(R, W) mean of the exposure over a word and the slots around it, as believed, at two samples a slot.
+
+    Args:
+        lit: (R, N) probability that each slot of the word's column is lit.
+        start: (R,) first slot of the word.
+        words: (R, 10).
+        model: the light model.
+    """
+    lead = _AROUND_SLOTS + model.memory
+    at = start[:, None] + np.arange(-lead, SLOTS_PER_SYMBOL + lead)
+    slots = np.take_along_axis(lit, np.clip(at, 0, lit.shape[1] - 1), axis=1)
+    slots[(at < 0) | (at >= lit.shape[1])] = 0.5
+    slots[:, lead : lead + SLOTS_PER_SYMBOL] = words
+    windows = np.lib.stride_tricks.sliding_window_view(slots, model.memory + 1, axis=1)
+    levels = (windows @ model.taps.T.astype(np.float32)).reshape(start.size, -1)
+    q = model.taps.shape[0]
+    skip = model.memory * q // 2
+    return _paired(np.asarray(levels[:, skip : skip + (SLOTS_PER_SYMBOL + 2 * _AROUND_SLOTS) * q], np.float32))
+
+
+def _process_likelihood(
+    halves: _Halves, column: NDArray[np.int64], start: NDArray[np.int64], levels: Float32Array, model: LightModel
+) -> FloatArray:
+    """(R,) log-likelihood of the light by R words, strips added, whatever kind of picture each shows."""
+    n, width = halves.light.shape[2], levels.shape[1]
+    at = 2 * (start[:, None] - _AROUND_SLOTS) + np.arange(width)
+    index = (column[None, :, None], np.arange(halves.light.shape[1])[None, None], np.clip(at, 0, n - 1).T[:, :, None])
+    # From here on time comes first: (W, R, S).
+    mean, seen = halves.mean[index], halves.seen[index] & ((at >= 0) & (at < n)).T[:, :, None]
+    own = model.spread[None, None, :, 1].astype(np.float32)
+    gain = (halves.others[index] + own * levels.T[:, :, None]) * mean
+    noise = np.float32(_PAIR_NOISE) * (np.float32(model.sigma**2) + np.float32(model.shot) * gain)
+    residual = np.where(seen, halves.light[index] - gain, np.float32(0))
+    gain = np.where(seen, gain, np.float32(0))
+    kinds = _innovations(residual, gain, noise, _PICTURE_KINDS)
+    return np.asarray(np.logaddexp.reduce(kinds, axis=0).sum(axis=1), np.float64)
+
+
+def _innovations(
+    residual: Float32Array, gain: Float32Array, noise: Float32Array, kinds: tuple[tuple[float, float], ...]
+) -> Float32Array:
+    """(kinds, R, S) log-likelihood, up to a constant, of light that follows the picture's deviation from its mean.
+
+    Args:
+        residual: (W, R, S) light less that of the mean picture.
+        gain: (W, R, S) light per unit of relative deviation; 0 where nothing is seen.
+        noise: (W, R, S) variance of the light.
+        kinds: standard deviation of the process, and slots after which it is another one, of every kind of picture.
+    """
+    deviation, length = np.array(kinds, np.float32).T[:, :, None, None]
+    keep, power = np.exp(np.float32(-0.5) / length), np.square(deviation)
+    state = np.zeros((len(kinds), *residual.shape[1:]), np.float32)
+    variance, total = state + power, state.copy()
+    for light, slope, error in zip(residual, gain, noise, strict=True):
+        shared = slope * variance
+        spread = shared * slope
+        spread += error
+        innovation = light - slope * state
+        step = innovation / spread
+        innovation *= step
+        total += innovation
+        total += np.log(spread)
+        np.divide(shared, spread, out=spread)
+        step *= shared
+        state += step
+        state *= keep
+        shared *= spread
+        variance -= shared
+        variance -= power
+        variance *= keep * keep
+        variance += power
+    total *= np.float32(-0.5)
+    return total
+
+
+def _as_slots(score: FloatArray, words: NDArray[np.uint8], likely: NDArray[np.bool_]) -> FloatArray:
+    """(J, 10) least corrections of single slots that add up to what words (J, K) score against the first of them."""
+    score = score - np.where(likely, score, -np.inf).max(axis=1, keepdims=True)
+    score = np.maximum(score, -_WORD_NATS)
+    wanted = (score[:, 1:] - score[:, :1]) * likely[:, 1:]
+    apart = (words[:, 1:].astype(np.float64) - words[:, :1]) * likely[:, 1:, None]
+    across = apart @ apart.transpose(0, 2, 1) + _WORD_RIDGE * np.eye(apart.shape[1])
+    return np.asarray((np.linalg.solve(across, wanted[..., None]).transpose(0, 2, 1) @ apart)[:, 0])

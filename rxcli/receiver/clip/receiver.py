@@ -1,0 +1,444 @@
+"""The frames of a clip, one after the other: what is known is checked and used, or the frame received anew."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rxcli.options import ReceiverOptions
+from rxcli.receiver import channel, sync
+from rxcli.receiver.clip import results
+from rxcli.receiver.clip.bursts import BurstReader
+from rxcli.receiver.clip.scene import Scene
+from rxcli.receiver.clip.start import Start, agree, lock_at, shows_little
+from rxcli.receiver.clip.views import View, Waiting
+from rxcli.receiver.decode import assemble, detect
+from rxcli.receiver.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock, sample_columns
+from rxcli.receiver.still import Reception, decode, doubtful_columns, quick_look, second_opinion
+from rxcli.receiver.sync import tracking
+from rxcli.results.dump import dump_stages
+from rxcli.types import FloatArray, Frame, FrameResult, IntArray
+
+#: Frames at the start of a scene that are looked at once more when the picture is known better; how many are waited for
+#: where compression has taken much; and the share of the well lit packets that are then in doubt.
+_HELD, _HELD_LONG, _MUCH_DOUBT = 6, 24, 0.03
+#: Share in doubt, before the first of these looks, that it would not mend: it is left out.
+_TOO_MUCH_DOUBT = 0.25
+#: Share of columns that a quick look at a first frame may leave in doubt.
+_QUICK_DOUBT = 0.5
+#: Frames that find their clock together where each shows little.
+_TOGETHER = 8
+#: Frames that may wait until it is clear which copies begin a burst.
+_MAX_WAITING = 8
+
+
+def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
+    """Receive the frames of a clip; results come a frame or more late. An error of `frames` comes after all results."""
+    clip, one_thread = _Clip(options), _one_blas_thread()
+    try:
+        for frame in frames:
+            with one_thread():
+                done = clip.take(frame)
+            yield from done
+    except Exception:
+        yield from clip.finish()
+        raise
+    yield from clip.finish()
+
+
+def _one_blas_thread() -> Callable[[], AbstractContextManager[object]]:
+    """Matrix products on one thread for a while.
+
+    Ours are small: further threads only wait for the next one, busily, and take from the decoder's what they need. So
+    they double the time that a clip takes of the processor.
+    """
+    try:
+        from threadpoolctl import ThreadpoolController
+    except ImportError:  # nothing but slower without it
+        return nullcontext
+    controller = ThreadpoolController()
+    return lambda: controller.limit(limits=1, user_api="blas")
+
+
+@dataclass(slots=True, eq=False)
+class _Link:
+    """The link's time, as long as it is not lost."""
+
+    time: tracking.LinkTime
+    phase: tracking.BurstPhase
+    #: Number of burst 0 of this time in the clip.
+    offset: int = 0
+    last_time_s: float = 0.0
+
+
+class _Clip:
+    """What is known of a clip so far."""
+
+    def __init__(self, options: ReceiverOptions) -> None:
+        self._options = options
+        self._waiting: deque[Waiting] = deque()
+        self._bursts = BurstReader(options.skip)
+        self._link: _Link | None = None
+        #: The first frames, until they have agreed on a clock; None when that is done, or not needed.
+        self._first: list[Frame] | None = [] if "tracking" in options.skip else None
+        self._start: Start | None = None
+        self._next_number = 0
+        #: The camera and the options with the screens that remain, and what they were found for.
+        self._camera: tuple[Camera, ReceiverOptions] | None = None
+        self._taken_with: tuple[object, ...] = ()
+        self._corners: FloatArray | None = None
+        #: Number of a frame that is yet to be received, and its corners.
+        self._found: tuple[int, FloatArray] | None = None
+        #: None where nothing is known, or frames cannot be tracked; and the one before the last search.
+        self._scene: Scene | None = None
+        self._scene_before: Scene | None = None
+        self._hold_first()
+
+    def _hold_first(self) -> None:
+        """Hold back the first frames of a scene, to be looked at once more."""
+        self._hold(_HELD if "tracking" in self._options.skip else 0)
+
+    def _hold(self, n_frames: int) -> None:
+        """Hold back so many frames; 0 from then on."""
+        self._n_held = n_frames
+        self._bursts.dark_too = n_frames > 0
+
+    # -- one frame ---------------------------------------------------------------------------------------------
+
+    def take(self, frame: Frame) -> list[FrameResult]:
+        """Receive the next frame; returns the results that are complete."""
+        if self._first is None:
+            return self._take(frame)
+        if self._first or self._shows_little(frame):
+            self._first.append(frame)
+            return self._begin() if len(self._first) == _TOGETHER else []
+        self._first = None
+        return self._take(frame)
+
+    def _shows_little(self, frame: Frame) -> bool:
+        """Whether a frame shows so little that it should find its clock with others."""
+        try:
+            corners = find_corners(frame, self._options)
+        except Failure:
+            return False
+        self._found = frame.index, corners
+        return shows_little(frame, corners, self._options)
+
+    def _begin(self) -> list[FrameResult]:
+        """The first frames, once they have agreed on a clock."""
+        frames, self._first = self._first or [], None
+        self._start = agree(frames, self._options) if len(frames) > 1 else None
+        return [result for frame in frames for result in self._take(frame)]
+
+    def _take(self, frame: Frame) -> list[FrameResult]:
+        stages = Stages()
+        waiting = Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok"))
+        if self._options.stop_when_certain and self._shows_nothing_new(frame):
+            waiting.result = replace(waiting.result, message="its bursts are certain from the frames before")
+            waiting.skip("certain_frames", 1)
+            self._waiting.append(waiting)
+            return self._ready()
+        try:
+            view = self._known(frame, stages)
+            if view is not None:
+                waiting.skip("tracking", 1)
+            else:
+                view, waiting.result = self._search(frame, waiting.result, stages)
+            waiting.view = view
+            waiting.result = replace(
+                waiting.result,
+                **view.camera.facts,
+                screen_profile=view.lock.screen.name,
+                corners=self._corners,
+            )
+            done = self._enter(waiting, frame, stages)
+        except Failure as failure:
+            self._scene = None
+            waiting.result = replace(waiting.result, status=failure.status, message=failure.message)
+            self._waiting.append(waiting)
+            done = self._finish_scene_before()
+        waiting.result = replace(waiting.result, timing_ms=stages.total())
+        return done
+
+    def _shows_nothing_new(self, frame: Frame) -> bool:
+        """Whether all bursts that a frame should show are certain already in all columns that are lit."""
+        link, scene = self._link, self._scene
+        if link is None or scene is None or scene.last is None or not link.phase.settled or self._n_held:
+            return False
+        last, (top, bottom) = scene.last, scene.rows[[0, -1]]
+        slot, rows_per_slot = link.time.foretell(frame.index, frame.time_s), last.lock.clock.rows_per_slot
+        if slot is None:
+            return False
+        ends = (slot + np.array([top, bottom]) / rows_per_slot) // link.time.packet_slots
+        numbers = np.unique(link.phase.burst_of(np.arange(ends[0], ends[1] + 1).astype(np.int64))) + link.offset
+        lit = np.median(last.snr, axis=1) >= 1.0
+        return bool(lit.any()) and all(self._bursts.open.settled(int(number), lit) for number in numbers)
+
+    def finish(self) -> list[FrameResult]:
+        """The results still held back."""
+        done = self._begin() if self._first else []
+        return done + self._finish()
+
+    def _finish(self) -> list[FrameResult]:
+        if self._n_held:
+            self._settle()
+            self._look_again(at_last=True)
+        done = self._settle()
+        done += [self._report(waiting, None) for waiting in self._waiting]
+        self._waiting.clear()
+        return done
+
+    def _finish_scene_before(self) -> list[FrameResult]:
+        """The results of the scene that the last search found to be over, by what was known of it."""
+        begun, self._scene = self._scene, self._scene_before
+        done = self._finish()
+        self._scene = begun
+        self._hold_first()
+        return done
+
+    # -- a frame like a photograph ------------------------------------------------------------------------------
+
+    def _search(self, frame: Frame, result: FrameResult, stages: Stages) -> tuple[View, FrameResult]:
+        """Receive a frame like a photograph; only the camera is taken from the frames before."""
+        self._scene_before, self._scene = self._scene, None
+        with stages("geometry"):
+            found, self._found = self._found, None
+            corners = found[1] if found and found[0] == frame.index else find_corners(frame, self._options)
+            if self._scene_before is not None and self._scene_before.near(corners):
+                corners = self._scene_before.corners
+        self._corners = corners
+        if self._camera is None or self._taken_with != _taken_with(frame) or "tracking" not in self._options.skip:
+            self._camera = find_camera(frame, corners, self._options, stages)
+            self._taken_with = _taken_with(frame)
+        camera, options = self._camera
+        lock = self._foretold(frame, corners, camera, stages) or find_lock(frame, corners, camera, options, stages)
+        can_track = self._can_track(frame, camera, lock)
+        seen, denoised, report = self._decoded(lock, can_track and self._n_held == _HELD, stages)
+        if assemble.all_dark(seen.snr):
+            raise Failure("no_signal", "no light of the screen's columns is seen; something may be in front of it")
+        view = View(camera, lock, _bursts_of(frame, seen), seen.model.memory, frame.height, seen.snr, denoised)
+        if can_track:
+            with stages("sampling"):
+                scene = Scene.of_frame(frame, corners, camera, lock, seen.model.floor, self._scene_before)
+                view.light, view.map = scene.strips(frame), scene.map
+            scene.take(view, lambda: channel.lit_on_grid(seen.posteriors, seen.clock))
+            self._scene = scene
+        return view, replace(result, denoiser=report)
+
+    def _decoded(
+        self, lock: Lock, again: bool, stages: Stages
+    ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
+        """What is received at a lock, columns that the auto-encoder changed, and its report.
+
+        A quick look that leaves little doubt is enough of a frame that is looked at `again` when the picture is known.
+        """
+        if again and self._options.cae != "always":
+            with stages("detect"):
+                seen = quick_look(lock)
+                if doubtful_columns(seen).size <= _QUICK_DOUBT * seen.snr.shape[0]:
+                    return seen, frozenset(), None
+        with stages("detect"):
+            seen = decode(lock, self._options.skip)
+        with stages("denoise"):
+            return second_opinion(lock, seen, self._options)
+
+    def _foretold(self, frame: Frame, corners: FloatArray, camera: Camera, stages: Stages) -> Lock | None:
+        """The lock by the clock that the first frames agreed on, where a frame cannot find its own."""
+        if self._start is None:
+            return None
+        with stages("sampling"):
+            profiles = sample_columns(frame, corners, camera, self._start.screen.columns)
+        return lock_at(self._start, frame, profiles, camera)
+
+    def _can_track(self, frame: Frame, camera: Camera, lock: Lock) -> bool:
+        """Whether a row of the picture is one instant, in the order of time."""
+        return (
+            "tracking" in self._options.skip
+            and frame.mosaic is None
+            and lock.profiles.sensor_row is None
+            and not camera.reversed
+        )
+
+    # -- a frame whose place and picture are known ---------------------------------------------------------------
+
+    def _known(self, frame: Frame, stages: Stages) -> View | None:
+        """The view of a frame by what is known; None where that does not fit."""
+        scene = self._scene
+        if scene is None or self._link is None or self._taken_with != _taken_with(frame):
+            return None
+        with stages("geometry"):
+            if scene.follow(frame, may_move=self._options.corners is None):
+                self._corners = scene.corners
+        return scene.view(frame, self._link.time, self._n_held != _HELD_LONG, stages)
+
+    # -- bursts ---------------------------------------------------------------------------------------------------
+
+    def _enter(self, waiting: Waiting, frame: Frame, stages: Stages) -> list[FrameResult]:
+        view = waiting.view
+        assert view is not None
+        done: list[FrameResult] = []
+        first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock) if self._link else None
+        if first_copy is None:
+            done = self._finish_scene_before() if self._link is not None else []
+            self._begin_link(view, frame)
+            assert self._link is not None
+            first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock)
+            assert first_copy is not None
+        assert self._link is not None
+        self._link.last_time_s = frame.time_s
+        view.bursts = replace(view.bursts, first_copy=first_copy)
+        self._waiting.append(waiting)
+        with stages("detect"):
+            if not self._link.phase.settled:
+                self._compare(view)
+            n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)
+            if self._link.phase.settled or n_unsettled > _MAX_WAITING:
+                self._settle_bursts()
+                if self._n_held and len(self._waiting) >= self._n_held:
+                    self._look_again(at_last=False)
+        return done + self._ready()
+
+    def _begin_link(self, view: View, frame: Frame) -> None:
+        screen = view.lock.screen
+        offset = self._next_number
+        if self._link is not None and offset:
+            offset += int((frame.time_s - self._link.last_time_s) / (screen.packet_s * screen.repeats))
+        time = self._start.time if self._start else tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz)
+        self._link = _Link(time, tracking.BurstPhase(screen.repeats), offset)
+        self._bursts.begin()
+
+    def _compare(self, view: View) -> None:
+        """What the frame says of the phase of the bursts."""
+        assert self._link is not None
+        now = view.bursts.clock
+        llr = detect.slot_llr(view.bursts.metrics)
+        copies = sync.to_copies(llr, now).transpose(1, 0, 2) * (view.bursts.shown > 0)
+        self._link.phase.take(view.bursts.first_copy, np.asarray(copies, np.float64))
+
+    def _settle(self) -> list[FrameResult]:
+        if self._link is not None:
+            self._settle_bursts()
+        return self._ready()
+
+    def _settle_bursts(self) -> None:
+        """Enter all frames that waited for the phase of the bursts."""
+        for waiting in self._waiting:
+            if waiting.view is not None and waiting.numbers is None:
+                self._detect(waiting)
+
+    def _detect(self, waiting: Waiting) -> None:
+        """Add a frame to its bursts, and learn from it; they are detected when somebody asks what they say."""
+        numbers, view = self._add(waiting), waiting.view
+        if "certain_columns" not in self._options.skip or self._options.stop_when_certain:
+            self._bursts.freshen(waiting)
+        tracked = view is not None and view.flat is not None and self._bursts.open.is_open(int(numbers[-1]))
+        if self._scene is not None and view is not None and tracked:
+            self._scene.take(view, lambda: self._bursts.lit(waiting))
+
+    def _add(self, waiting: Waiting) -> IntArray:
+        """Add a frame to its bursts; returns their numbers."""
+        view, link = waiting.view, self._link
+        assert view is not None
+        assert link is not None
+        now = view.bursts.clock
+        bursts = link.phase.burst_of(view.bursts.first_copy + np.arange(now.n_copies))
+        numbers = np.unique(bursts)
+        view.bursts = replace(view.bursts, clock=replace(now, burst=bursts - numbers[0]))
+        waiting.numbers = numbers + link.offset
+        self._next_number = max(self._next_number, int(waiting.numbers[-1]) + 1)
+        self._bursts.add(view, waiting.numbers)
+        return waiting.numbers
+
+    # -- a second look at the first frames ---------------------------------------------------------------------------
+
+    def _look_again(self, at_last: bool) -> None:
+        """The first frames once more: by then it is known better what is on the screen.
+
+        Where that leaves doubt, more frames are waited for, unless it is `at_last`.
+        """
+        held = [
+            w for w in self._waiting if w.view is not None and w.numbers is not None and self._can_look_again(w.view)
+        ]
+        may_wait = self._n_held < _HELD_LONG and not at_last
+        if len(held) > 1 and not (may_wait and self._doubt(held) > _TOO_MUCH_DOUBT):
+            self._measure_again(held)
+            self._detect_again()
+        self._hold(_HELD_LONG if may_wait and self._doubt(held) > _MUCH_DOUBT else 0)
+
+    def _doubt(self, held: list[Waiting]) -> float:
+        """Share of the well lit packets of some frames that is in doubt."""
+        doubtful, whole = np.sum([self._bursts.doubts(waiting) for waiting in held], axis=0) if held else (0, 0)
+        return float(doubtful / max(whole, 1))
+
+    def _can_look_again(self, view: View) -> bool:
+        return self._scene is not None and self._scene.can_measure_again(view)
+
+    def _measure_again(self, held: list[Waiting]) -> None:
+        """Learn the picture anew from all frames held, and measure those in doubt by what the others say of it."""
+        assert self._scene is not None
+        self._bursts.freshen(*held)
+        known = [self._bursts.lit(waiting) for waiting in held]
+        doubtful = [self._bursts.doubts(waiting)[0] > 0 for waiting in held]
+        self._scene.measure_again([w.view for w in held if w.view is not None], known, doubtful)
+
+    def _detect_again(self) -> None:
+        """The bursts of all frames that wait, each once: in the last frame that shows it."""
+        self._bursts.begin()
+        waiting = [w for w in self._waiting if w.view is not None and w.numbers is not None]
+        numbers = [self._add(w) for w in waiting]
+        after = [*numbers[1:], numbers[0][:0]]
+        ended = [np.setdiff1d(mine, following) for mine, following in zip(numbers, after, strict=True)]
+        self._bursts.detect(list(zip(waiting, ended, strict=True)), dark_too=False)
+        tracked = [w.view for w in waiting if w.view is not None and w.view.flat is not None]
+        if self._scene is not None and tracked:
+            self._scene.last = tracked[-1]
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    def _ready(self) -> list[FrameResult]:
+        """Results of the frames whose bursts all ended, oldest first."""
+        done: list[FrameResult] = []
+        if self._n_held:
+            return done
+        while self._waiting:
+            first = self._waiting[0]
+            if first.view is not None:
+                if first.numbers is None or len(self._waiting) < 2:
+                    break
+                if self._waiting[1].view is not None and self._waiting[1].numbers is None:
+                    break
+            self._waiting.popleft()
+            done.append(self._report(first, self._waiting[0] if self._waiting else None))
+        return done
+
+    def _report(self, waiting: Waiting, following: Waiting | None) -> FrameResult:
+        view, bursts = waiting.view, self._bursts
+        if view is None or waiting.numbers is None:
+            return waiting.result
+        bursts.freshen(waiting)
+        going_on = waiting.numbers[:0]
+        if following is not None and following.numbers is not None:
+            going_on = np.intersect1d(waiting.numbers, following.numbers)
+        closed = bursts.open.close(np.setdiff1d(waiting.numbers, going_on))
+        ended = results.bursts_of(closed, int(waiting.numbers[0]), view)
+        columns = results.columns_of(view, ended, bursts.confidence(going_on), self._options.min_confidence)
+        if self._options.dump_dir is not None:
+            found = results.taps(waiting, view, ended)
+            dump_stages(self._options.dump_dir, waiting.result.source, waiting.result.frame, found)
+        return replace(waiting.result, columns=columns, status=assemble.clip_status(columns))
+
+
+def _taken_with(frame: Frame) -> tuple[object, ...]:
+    """What the camera and the place of the picture hang on."""
+    return frame.width, frame.height, frame.pixels.dtype.str, frame.black, frame.white, frame.metadata
+
+
+def _bursts_of(frame: Frame, seen: Reception) -> tracking.FrameBursts:
+    by_copy = replace(seen.clock, burst=np.arange(seen.clock.n_copies))
+    shown = np.minimum(assemble.slots_seen(seen.samples, by_copy), 1)
+    return tracking.FrameBursts(frame.index, 0, seen.clock, seen.metrics, shown)

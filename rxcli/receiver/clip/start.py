@@ -1,0 +1,145 @@
+"""The start of a clip whose frames show less than two packets: its first frames find the clock together.
+
+One such frame may show no whole header, or show payload that looks like one. Over several frames the headers come back
+at the same place in the packet's length, and nothing else does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rxcli.options import ReceiverOptions
+from rxcli.profiles import ScreenProfile
+from rxcli.protocol import SLOTS_PER_SYMBOL
+from rxcli.receiver import sync
+from rxcli.receiver.locate import (
+    Camera,
+    Failure,
+    Lock,
+    Reading,
+    Stages,
+    find_camera,
+    find_corners,
+    noise_of,
+    sample_columns,
+)
+from rxcli.receiver.sync.tracking import LinkTime
+from rxcli.types import Clock, FloatArray, Frame, RowProfiles
+
+#: A frame that shows fewer packets than this finds its clock with others; one that shows more does better alone.
+_FEW_PACKETS = 1.05
+_SAMPLES_PER_SLOT = 4
+#: Errors of the frames' period that are tried, in slots over all frames: times are rounded to milliseconds.
+_DRIFTS = np.linspace(-6, 6, 25)
+#: Lead of the headers' place over the best elsewhere.
+_MIN_LEAD = 1.4
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What the first frames agree on."""
+
+    screen: ScreenProfile
+    time: LinkTime
+
+
+def shows_little(frame: Frame, corners: FloatArray, options: ReceiverOptions) -> bool:
+    """Whether a frame with the screen at the corners (4, 2) shows too few packets to find its clock alone."""
+    try:
+        camera, options = find_camera(frame, corners, options, Stages())
+    except Failure:
+        return False
+    shown = min(float(corners[:, 1].max()), frame.height - 1.0) - max(float(corners[:, 1].min()), 0.0)
+    return shown * camera.line_delay_s < _FEW_PACKETS * min(screen.packet_s for screen in options.screens)
+
+
+def agree(frames: Sequence[Frame], options: ReceiverOptions) -> Start | None:
+    """The clock that the headers of several frames agree on, None where they do not."""
+    try:
+        corners = find_corners(frames[0], options)
+        camera, options = find_camera(frames[0], corners, options, Stages())
+    except Failure:
+        return None
+    best: tuple[float, Start] | None = None
+    for n_columns in sorted({screen.columns for screen in options.screens}):
+        seen = [sample_columns(frame, corners, camera, n_columns) for frame in frames]
+        for screen in (s for s in options.screens if s.columns == n_columns):
+            lead, slot, period = _phase(frames, seen, screen, camera)
+            if lead > _MIN_LEAD and (best is None or lead > best[0]):
+                time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
+                time.begin(frames[0].index, frames[0].time_s, slot, period)
+                best = lead, Start(screen, time)
+    return best[1] if best else None
+
+
+def lock_at(start: Start, frame: Frame, profiles: RowProfiles, camera: Camera) -> Lock | None:
+    """The lock that the clip's clock foretells for a frame; None where nothing of the screen is in the picture."""
+    screen = start.screen
+    rows = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
+    if rows.size == 0:
+        return None
+    rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
+    template = Clock(
+        rows_per_slot=rows_per_slot,
+        exposure_slots=camera.exposure_s * screen.slot_rate_hz,
+        packet_slots=screen.packet_slots,
+        row0=0.0,
+        n_slots=0,
+        first_slot=0,
+        burst=np.zeros(0, np.int64),
+        delay_slots=np.zeros(screen.columns),
+        lock=1.0,
+    )
+    n_slots = int(np.ceil((rows[-1] - rows[0] + 1) / rows_per_slot)) + 1
+    top = float(profiles.rows[rows[0]]) - 0.5
+    now = start.time.clock_at(frame.index, frame.time_s, template, n_slots, top)
+    return None if now is None else Lock(screen, Reading(profiles), now)
+
+
+def _phase(
+    frames: Sequence[Frame], seen: Sequence[RowProfiles], screen: ScreenProfile, camera: Camera
+) -> tuple[float, float, float]:
+    """Lead of the best place of the headers; slot of row 0 of the first frame; slots from frame to frame."""
+    rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
+    responses = [_response(profiles, rows_per_slot) for profiles in seen]
+    times = np.array([frame.time_s for frame in frames])
+    numbers = np.array([frame.index for frame in frames])
+    slope = float(np.polyfit(numbers - numbers[0], times - times[0], 1)[0])
+    most, best = 0.0, (0.0, 0.0, slope * screen.slot_rate_hz)
+    for drift in _DRIFTS:
+        period = slope * screen.slot_rate_hz + drift / max(len(frames) - 1, 1)
+        starts = (numbers - numbers[0]) * period
+        power, lead, place = _fold(responses, starts, screen.packet_slots)
+        if power > most:
+            most, best = power, (lead, -place, period)
+    return best
+
+
+def _response(profiles: RowProfiles, rows_per_slot: float) -> tuple[FloatArray, FloatArray]:
+    """Slots since the exposure of sensor row 0, and how much a header seems to start there."""
+    shown = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
+    if shown.size == 0:
+        return np.zeros(0), np.zeros(0)
+    top, step = float(profiles.rows[shown[0]]) - 0.5, rows_per_slot / _SAMPLES_PER_SLOT
+    light, valid = sync.resample(profiles, top, step, int(shown.size / step))
+    pooled, weight = sync.contrast(light, valid, _SAMPLES_PER_SLOT, noise_of(profiles) / np.sqrt(max(step, 1.0)))
+    response = sync.header_response(pooled, weight, _SAMPLES_PER_SLOT)
+    return top / rows_per_slot + np.arange(response.size) / _SAMPLES_PER_SLOT, np.maximum(response, 0) ** 2
+
+
+def _fold(
+    responses: Sequence[tuple[FloatArray, FloatArray]], starts: FloatArray, packet_slots: int
+) -> tuple[float, float, float]:
+    """Power of the best place of a header in the packet's length, its lead, and that place in slots."""
+    n = packet_slots * _SAMPLES_PER_SLOT
+    score = np.zeros(n)
+    for (slots, response), start in zip(responses, starts, strict=True):
+        place = np.round((slots + start) * _SAMPLES_PER_SLOT).astype(np.int64) % n
+        np.add.at(score, place, response)
+    score = (score + np.roll(score, 1) + np.roll(score, -1)) / 3
+    best = int(score.argmax())
+    away = np.abs((np.arange(n) - best + n // 2) % n - n // 2) > SLOTS_PER_SYMBOL * _SAMPLES_PER_SLOT // 4
+    return float(score[best]), float(score[best] / max(score[away].max(), 1e-12)), best / _SAMPLES_PER_SLOT

@@ -1,0 +1,48 @@
+"""A frame of a clip, as it is seen and as it waits for its result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from rxcli.receiver.channel.known_picture import ColumnLight
+from rxcli.receiver.locate import Camera, Lock
+from rxcli.receiver.sampling import tracked as strips
+from rxcli.receiver.sync.tracking import FrameBursts
+from rxcli.types import Float32Array, FrameResult, IntArray
+
+
+@dataclass(slots=True, eq=False)
+class View:
+    """A frame with a lock."""
+
+    camera: Camera
+    lock: Lock
+    bursts: FrameBursts
+    memory: int
+    height: int
+    #: (C, N) squared contrast over variance of every slot.
+    snr: Float32Array
+    #: Columns that the auto-encoder changed.
+    denoised: frozenset[int] = field(default_factory=frozenset)
+    #: (C, S, R) light of the strips as tracking samples them; None where that cannot be done.
+    light: Float32Array | None = None
+    #: Where the strips were then.
+    map: strips.StripMap | None = None
+    #: The columns' own light; None where the frame was received like a photograph.
+    flat: ColumnLight | None = None
+
+
+@dataclass(slots=True, eq=False)
+class Waiting:
+    """A frame whose result is held back."""
+
+    result: FrameResult
+    view: View | None = None
+    #: (B,) numbers of the frame's bursts, once known.
+    numbers: IntArray | None = None
+
+    def skip(self, name: str, count: int) -> None:
+        """Count what was skipped in the result."""
+        if count:
+            skipped = self.result.skipped
+            self.result = replace(self.result, skipped={**skipped, name: skipped.get(name, 0) + count})

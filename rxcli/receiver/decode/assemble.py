@@ -1,0 +1,444 @@
+"""Posteriors to results: packets with confidence, column status, frame status."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rxcli.protocol import PREAMBLE_SLOTS, bits_to_hex, indices_to_bits
+from rxcli.types import (
+    BoolArray,
+    BurstPosteriors,
+    Clock,
+    ColumnResult,
+    ColumnStatus,
+    Float32Array,
+    FloatArray,
+    FrameStatus,
+    IntArray,
+    PacketResult,
+    SlotSamples,
+)
+
+#: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
+MAX_BER_HAT = 0.1
+#: Log-odds of being error-free: offset, and weights of the posterior's log-odds up to a limit, of whether corrections
+#: of the auto-encoder were kept, of the logarithms of what payload slots say against the packet, all together, and of
+#: what they say for it on average up to a limit, nats, and of the latter times the posterior's; of the logarithm of a
+#: column's strips, and of it times the posterior's: strips err together, so the more they are the less it counts.
+_CALIBRATION = (3.33, 0.74, -1.97, -0.43, -0.54, 0.14, -0.71, -0.15)
+_MOST_ODDS, _MOST_AVERAGE = 5.0, 10.0
+#: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
+#: is most against its codeword, nats; packets of `rxcli.lab.benchmark.clip_confidence`.
+_CLIP_CALIBRATION = (0.103, 0.477, -0.83)
+_AGAINST_AT_LEAST = 0.5
+#: Wrong bits of packets as likely right as wrong, the least share of them, and the power of the odds of being wrong
+#: that it goes with.
+_WRONG_AT_EVENS, _BER_AT_EVENS, _BER_EXPONENT = 1.4, 0.018, 0.85
+#: Headers of a column, all bursts together, less likely than this against slots that are anything, nats, are none.
+_CONTRADICTED = -2.0
+#: Together the columns' headers must be this much more likely than slots that are anything; one good header gives 12,
+#: and a bad one takes no more than a good one gives.
+_HEADERS_AT_LEAST, _GOOD_HEADER = 6.0, 12.0
+_HEADERLESS = (
+    "the header does not show where it should; check for overexposure, or give the screen's place with --corners"
+)
+_ECHO = "it shows nothing but the light of the column beside it; show a brighter picture there"
+#: Doubt that is left in the surest packet, and at most in any, nats.
+_LEAST_DOUBT = 1e-9
+_MOST_DOUBT = 500.0
+#: A column with a packet below this confidence is weak.
+_WEAK_CONFIDENCE = 0.5
+#: A weight is reported from this probability on.
+_MIN_WEIGHT_PROBABILITY = 0.99
+#: A column below this signal-to-noise ratio is too dark to try.
+_DARK_SNR_DB = 0.0
+
+
+def column_results(
+    clock: Clock,
+    posteriors: BurstPosteriors,
+    snr: Float32Array,
+    samples: SlotSamples,
+    support: Float32Array,
+    headerless: BoolArray,
+    min_confidence: float,
+    denoised: frozenset[int] = frozenset(),
+) -> tuple[ColumnResult, ...]:
+    """Results of every column.
+
+    Args:
+        clock: the clock.
+        posteriors: of B bursts and C columns.
+        snr: (C, N) squared contrast over variance of every slot of the grid.
+        samples: the samples, for what was visible.
+        support: (C, N) what the light says for every slot as decided, see `detect.slot_support`.
+        headerless: (C,) columns that show no packets, whatever was decided of their slots, see `without_header`.
+        min_confidence: packets below it are left out.
+        denoised: columns in which corrections of the auto-encoder were kept.
+    """
+    seen = slots_seen(samples, clock)
+    whole = complete(seen)
+    told = np.isin(np.arange(len(snr)), list(denoised))
+    by_burst = slot_support_by_burst(support, clock)
+    doubts = _doubts(posteriors, evidence(posteriors, by_burst, told, samples.light.shape[1]))
+    snr_db = _snr_db_of_columns(snr)
+    echoes: BoolArray = np.any(_echoes(posteriors, snr_db) & whole, axis=0)
+    reported = whole & doubts.reported(min_confidence)
+    against = [_HEADERLESS if h else _ECHO if e else None for h, e in zip(headerless, echoes, strict=True)]
+    return tuple(
+        _column_result(
+            column,
+            clock,
+            posteriors,
+            db,
+            seen[:, column],
+            reported[:, column],
+            doubts,
+            against[column],
+            bool(told[column]),
+        )
+        for column, db in enumerate(snr_db)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class BurstInClip:
+    """A burst of a clip, as the last frame that shows it reports it."""
+
+    #: Number in the clip, and in the clock of the frame.
+    number: int
+    index: int
+    #: Of this burst alone.
+    posteriors: BurstPosteriors
+    #: (C, packet) how often each slot was seen, over all frames.
+    seen: IntArray
+    frames: tuple[int, ...]
+    #: (C, 8) see `evidence`.
+    evidence: FloatArray
+    #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
+    #: received like photographs.
+    against: Float32Array | None = None
+
+
+def clip_results(
+    clock: Clock, bursts: Sequence[BurstInClip], going_on: Float32Array, snr: Float32Array, min_confidence: float
+) -> tuple[ColumnResult, ...]:
+    """Results of every column in a frame of a clip.
+
+    Args:
+        clock: the clock.
+        bursts: those that end in this frame, in time order.
+        going_on: (C,) confidence of the best packet that the next frame will report.
+        snr: (C, N) squared contrast over variance of every slot of the grid.
+        min_confidence: packets below it are left out.
+    """
+    snr_db = _snr_db_of_columns(snr)
+    doubts = [_clip_doubts(burst) for burst in bursts]
+    reported = [
+        complete(burst.seen[None])[0] & ~_echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]
+        for burst, doubt in zip(bursts, doubts, strict=True)
+    ]
+    own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
+    out = []
+    for column in range(snr.shape[0]):
+        packets = tuple(
+            _packet(0, column, now, burst.posteriors, burst.seen[column], doubt, burst.number, burst.frames)
+            for burst, now, doubt, shown in zip(bursts, own, doubts, reported, strict=True)
+            if shown[column]
+        )
+        out.append(_clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], packets))
+    return tuple(out)
+
+
+def _clip_column(
+    column: int,
+    clock: Clock,
+    bursts: Sequence[BurstInClip],
+    going_on: float,
+    snr_db: float | None,
+    packets: tuple[PacketResult, ...],
+) -> ColumnResult:
+    status = _column_status(packets, snr_db)
+    if not packets and going_on >= _WEAK_CONFIDENCE:
+        status = "ok"
+    message = None
+    if not packets:
+        message = _why_none_here(status, snr_db, [burst.seen[column] for burst in bursts])
+    return ColumnResult(
+        column=column,
+        status=status,
+        w=_weight_of_best(column, packets, bursts),
+        snr_db=snr_db,
+        delay_slots=float(clock.delay_slots[column]),
+        packets=packets,
+        message=message,
+    )
+
+
+def _snr_db_of_columns(snr: Float32Array) -> list[float | None]:
+    """Median over the slots of each column that show anything."""
+    if (snr > 0).all():
+        return [float(db) for db in 10 * np.log10(np.maximum(np.median(snr, axis=1), 1e-6))]
+    return [_snr_db(column) for column in snr]
+
+
+def _weight_of_best(column: int, packets: Sequence[PacketResult], bursts: Sequence[BurstInClip]) -> int | None:
+    """The weight of a column's surest packet; without one, known picture and compression may feign any."""
+    if not packets:
+        return None
+    number = max(packets, key=lambda packet: packet.confidence).burst
+    return next(int(burst.posteriors.w[column]) for burst in bursts if burst.number == number)
+
+
+def _why_none_here(status: ColumnStatus, snr_db: float | None, seen: list[IntArray]) -> str:
+    if status == "ok" or not seen:
+        return "its burst goes on in the next frame and is reported there"
+    return _cut_off(np.stack(seen)) or _why_none(status, snr_db)
+
+
+def _snr_db(snr: Float32Array) -> float | None:
+    lit = snr[snr > 0]
+    return float(10 * np.log10(max(float(np.median(lit)), 1e-6))) if lit.size else None
+
+
+def all_dark(snr: Float32Array) -> bool:
+    """Whether no column has light enough; `snr` is (C, N), squared contrast over variance of every slot."""
+    return all(db is None or db < _DARK_SNR_DB for db in _snr_db_of_columns(snr))
+
+
+def clip_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
+    """`ok` when every lit column has a packet, here or in a frame to come; `partial` when some have none."""
+    return "ok" if all(column.status in ("ok", "weak", "dark") for column in columns) else "partial"
+
+
+def why_no_packet(columns: tuple[ColumnResult, ...]) -> str:
+    """What a frame without packets says: why its clearest column has none."""
+    clearest = max(columns, key=lambda column: -np.inf if column.snr_db is None else column.snr_db)
+    return f"no column gave a packet; column {clearest.column} is the clearest: {clearest.message}"
+
+
+def frame_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
+    """`ok` when every lit column gave a packet, `partial` when some did, `no_signal` when none did."""
+    lit = [column for column in columns if column.status != "dark"]
+    with_packet = [column for column in columns if column.packets]
+    if not with_packet:
+        return "no_signal"
+    return "ok" if all(column.packets for column in lit) else "partial"
+
+
+def slots_seen(samples: SlotSamples, clock: Clock) -> IntArray:
+    """How often the middle of each slot of each burst's packet is on the screen and in the picture, (B, C, packet)."""
+    q = samples.samples_per_slot
+    shown = samples.valid[..., q // 2 :: q].max(axis=1) > 0
+    copies = np.zeros((shown.shape[0], clock.n_copies * clock.packet_slots), np.int64)
+    copies[:, clock.first_slot : clock.first_slot + clock.n_slots] = shown
+    by_copy = copies.reshape(shown.shape[0], clock.n_copies, clock.packet_slots)
+    return np.stack([by_copy[:, clock.burst == burst].sum(axis=1) for burst in range(int(clock.burst.max()) + 1)])
+
+
+def complete(seen: IntArray) -> BoolArray:
+    """(B, C) whether every payload slot was seen, so that the packet can be reported.
+
+    Args:
+        seen: (B, C, packet) from `slots_seen`.
+    """
+    return np.asarray((seen[:, :, PREAMBLE_SLOTS:] > 0).all(axis=2))
+
+
+def _column_result(
+    column: int,
+    clock: Clock,
+    posteriors: BurstPosteriors,
+    snr_db: float | None,
+    seen: IntArray,
+    reported: BoolArray,
+    doubts: _Doubts,
+    against: str | None,
+    denoised: bool,
+) -> ColumnResult:
+    bursts = () if against else np.flatnonzero(reported)
+    packets = tuple(_packet(int(burst), column, clock, posteriors, seen[burst], doubts) for burst in bursts)
+    sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
+    status = _column_status(packets, snr_db)
+    return ColumnResult(
+        column=column,
+        status=status,
+        w=int(posteriors.w[column]) if packets or sure_of_w else None,
+        snr_db=snr_db,
+        denoised=denoised,
+        delay_slots=float(clock.delay_slots[column]),
+        packets=packets,
+        message=None if packets else _cut_off(seen) or against or _why_none(status, snr_db),
+    )
+
+
+def _echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolArray:
+    """(B, C) whether a column says word for word what a brighter one beside it says, and no other column does.
+
+    A column under black shows its neighbour's light, blurred; where all columns send the same, more than two agree.
+    """
+    words = np.concatenate(
+        [np.broadcast_to(posteriors.w[:, None], (*posteriors.index.shape[:2], 1)), posteriors.index], 2
+    )
+    alike = (words[:, :, None] == words[:, None]).all(axis=3)
+    two = alike.sum(axis=2) == 2
+    db = np.array([-np.inf if value is None else value for value in snr_db])
+    beside = np.zeros(two.shape, bool)
+    beside[:, 1:] |= alike[:, 1:, :-1].diagonal(axis1=1, axis2=2) & (db[1:] < db[:-1])
+    beside[:, :-1] |= alike[:, :-1, 1:].diagonal(axis1=1, axis2=2) & (db[:-1] < db[1:])
+    return np.asarray(two & beside)
+
+
+def without_header(posteriors: BurstPosteriors) -> BoolArray:
+    """(C,) columns whose header does not show; all where the columns together show none: no light, no packet."""
+    by_column = posteriors.header_llr.sum(axis=0)
+    together = np.maximum(by_column, -_GOOD_HEADER).sum() > _HEADERS_AT_LEAST
+    return np.asarray(by_column < (_CONTRADICTED if together else np.inf))
+
+
+def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:
+    if packets:
+        return "ok" if max(p.confidence for p in packets) >= _WEAK_CONFIDENCE else "weak"
+    return "dark" if snr_db is None or snr_db < _DARK_SNR_DB else "no_packet"
+
+
+def _cut_off(seen: IntArray) -> str | None:
+    """How much is missing of the packet that is nearest to whole; None where one is. `seen` is (B, packet)."""
+    missing = int((seen[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
+    if not missing:
+        return None
+    return (
+        f"no packet is in view as a whole: of {seen.shape[1]} slots {missing} are missing; move closer so that the "
+        "screen fills more of the height, or take another picture"
+    )
+
+
+def _why_none(status: ColumnStatus, snr_db: float | None) -> str:
+    if status == "dark" or snr_db is None:
+        return "too little light under this column; show a brighter picture or raise the exposure"
+    return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
+
+
+@dataclass(frozen=True, slots=True)
+class _Doubts:
+    """How sure the packets of B bursts and C columns are."""
+
+    #: (B, C) probability that they are error-free, and expected share of wrong bits.
+    confidence: FloatArray
+    ber_hat: FloatArray
+    #: (B, C, 8) see `evidence`.
+    evidence: FloatArray
+
+    def reported(self, min_confidence: float) -> BoolArray:
+        """(B, C) packets that are sure enough to be reported."""
+        return np.asarray((self.ber_hat <= MAX_BER_HAT) & (self.confidence >= min_confidence))
+
+
+def _doubts(posteriors: BurstPosteriors, evidence: FloatArray) -> _Doubts:
+    unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of few bits are filled up with NaN
+    return _Doubts(confidence(evidence), np.nanmean(unsure, axis=(2, 3)), evidence)
+
+
+def _clip_doubts(burst: BurstInClip) -> _Doubts:
+    """How sure the packets of a burst of a clip are.
+
+    Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
+    What slots say against the codeword that was decided shows it.
+    """
+    doubts = _doubts(burst.posteriors, burst.evidence[None])
+    if burst.against is None:
+        return doubts
+    offset, slope, slope_against = _CLIP_CALIBRATION
+    log_odds = _log_odds(burst.posteriors.log_prob.sum(axis=2))
+    log_odds = offset + slope * log_odds + slope_against * np.log(burst.against + _AGAINST_AT_LEAST)
+    n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
+    at_evens = np.maximum(_WRONG_AT_EVENS / n_bits, _BER_AT_EVENS)
+    wrong = np.minimum(at_evens * np.exp(-_BER_EXPONENT * log_odds), 0.5)
+    return replace(doubts, confidence=_probability(log_odds), ber_hat=np.maximum(doubts.ber_hat, wrong))
+
+
+def _packet(
+    burst: int,
+    column: int,
+    clock: Clock,
+    posteriors: BurstPosteriors,
+    seen: IntArray,
+    doubts: _Doubts,
+    number: int | None = None,
+    frames: tuple[int, ...] | None = None,
+) -> PacketResult:
+    """The packet of one burst; `seen` is (packet,)."""
+    bits = indices_to_bits(posteriors.index[burst, column], int(posteriors.w[column]))
+    return PacketResult(
+        first_row=_header_row(int(np.flatnonzero(clock.burst == burst)[0]), column, clock),
+        copies=float(seen.sum() / clock.packet_slots),
+        payload_bits=int(bits.size),
+        payload=bits_to_hex(bits),
+        confidence=float(doubts.confidence[burst, column]),
+        ber_hat=float(doubts.ber_hat[burst, column]),
+        burst=number,
+        frames=frames,
+        evidence=tuple(doubts.evidence[burst, column].tolist()),
+    )
+
+
+def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolArray, n_strips: int) -> FloatArray:
+    """What the confidence of packets is made of, (B, C, 8), in the order of `_CALIBRATION`.
+
+    The light model's likelihoods are tempered, since strips and samples err together; still they are too sure where
+    picture or camera are not as the model has them. There single slots speak against the packet. The weights are a
+    logistic regression on packets of `lab.benchmark.confidence` and of `lab.benchmark.phones`; whatever changes the
+    likelihoods of the light model or the auto-encoder asks for a new fit.
+
+    Args:
+        posteriors: of B bursts and C columns.
+        support: (B, C, n) what the light says for payload slots of the packets as decided, nats; 0 where nothing is
+            seen; see `slot_support_by_burst`.
+        denoised: (C,) whether corrections of the auto-encoder were kept.
+        n_strips: strips of a column in a quick look.
+    """
+    log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), _MOST_ODDS)
+    against = np.log(_AGAINST_AT_LEAST - np.minimum(support, 0).sum(axis=2))
+    heard = np.maximum((support != 0).sum(axis=2), 1)
+    average = np.log(np.clip(support.sum(axis=2) / heard, 1, _MOST_AVERAGE))
+    strips = np.log(n_strips)
+    terms = (1.0, log_odds, denoised, against, average, average * log_odds, strips, strips * log_odds)
+    return np.stack([np.broadcast_to(term, log_odds.shape) for term in terms], axis=2).astype(np.float64)
+
+
+def confidence(evidence: FloatArray) -> FloatArray:
+    """Probability (...) that packets are error-free, from their evidence (..., 8)."""
+    return _probability(evidence @ np.array(_CALIBRATION))
+
+
+def slot_support_by_burst(support: Float32Array, clock: Clock) -> Float32Array:
+    """(B, C, N) the support (C, N) of the payload slots of each burst, 0 for the other slots of the grid."""
+    slot = np.arange(clock.first_slot, clock.first_slot + clock.n_slots)
+    payload = slot % clock.packet_slots >= PREAMBLE_SLOTS
+    bursts = np.arange(int(clock.burst.max()) + 1)
+    payload_of = payload & (clock.burst[slot // clock.packet_slots] == bursts[:, None])
+    return np.asarray(payload_of[:, None] * support)
+
+
+def _log_odds(log_prob: FloatArray) -> FloatArray:
+    at_most = np.clip(log_prob, -_MOST_DOUBT, -_LEAST_DOUBT)
+    return np.asarray(at_most - np.log(-np.expm1(at_most)))
+
+
+def _probability(log_odds: FloatArray | float) -> FloatArray:
+    return np.asarray(1 / (1 + np.exp(-log_odds)))
+
+
+def _header_row(copy: int, column: int, clock: Clock) -> float:
+    """Sensor row whose exposure starts with the header of `copy`."""
+    slots = copy * clock.packet_slots - clock.first_slot + clock.delay_slots[column] + clock.exposure_slots / 2
+    return float(clock.row0 + slots * clock.rows_per_slot)
+
+
+def in_stored_rows(column: ColumnResult, height: int) -> ColumnResult:
+    """The column with rows as stored, where they were counted in readout order."""
+    packets = (replace(packet, first_row=height - 1 - packet.first_row) for packet in column.packets)
+    return replace(column, packets=tuple(packets))

@@ -1,0 +1,1 @@
+"""Where the screen is: a frame to corners, column outlines and the sensor row of every place."""

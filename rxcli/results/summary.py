@@ -1,0 +1,257 @@
+"""A run in figures: one row per source and a total, as text, CSV, Parquet, or JUnit's XML; and its exit code."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rxcli.errors import ExitCode, InputError, UsageError, worst
+from rxcli.results.report import format_table, printable
+from rxcli.results.truth import Score
+from rxcli.types import FrameResult
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What every source must keep for the run to pass."""
+
+    #: Highest bit error rate, lost packets included; None: any.
+    max_ber: float | None = None
+    #: Fewest packets.
+    min_packets: int = 1
+
+
+@dataclass(slots=True)
+class SourceSummary:
+    """The figures of one source, gathered frame by frame."""
+
+    source: str
+    n_frames: int = 0
+    n_packets: int = 0
+    confidence_sum: float = 0.0
+    #: Packets that were put together from several frames.
+    n_combined: int = 0
+    statuses: Counter[str] = field(default_factory=Counter)
+    #: Reasons of failure of frames and columns, with how often each came up.
+    reasons: Counter[str] = field(default_factory=Counter)
+    time_ms: float = 0.0
+    #: None where no truth is known.
+    score: Score | None = None
+    #: Why truth that was asked for is not there.
+    truth_problem: str | None = None
+
+    def add(self, result: FrameResult) -> None:
+        """Count one frame."""
+        packets = [packet for column in result.columns for packet in column.packets]
+        self.n_frames += 1
+        self.statuses[result.status] += 1
+        self.n_packets += len(packets)
+        self.confidence_sum += sum(packet.confidence for packet in packets)
+        self.n_combined += sum(packet.frames is not None and len(packet.frames) > 1 for packet in packets)
+        total = result.timing_ms.get("total", math.nan)
+        self.time_ms += total if math.isfinite(total) else 0.0
+        if result.message:
+            self.reasons[result.message] += 1
+        self.reasons.update(column.message for column in result.columns if column.message)
+
+    @property
+    def confidence(self) -> float | None:
+        """Mean confidence of the packets, None where there are none."""
+        return self.confidence_sum / self.n_packets if self.n_packets else None
+
+    @property
+    def reason(self) -> str:
+        """The commonest reason of failure, with how many others there are."""
+        if not self.reasons:
+            return ""
+        common, _ = self.reasons.most_common(1)[0]
+        others = len(self.reasons) - 1
+        return f"{common} (and {others} other reason{'s' * (others > 1)})" if others else common
+
+    def failures(self, limits: Limits) -> list[tuple[ExitCode, str]]:
+        """Why this source does not pass: exit codes with reasons; empty where it does."""
+        found: list[tuple[ExitCode, str]] = []
+        if self.statuses["unreadable"]:
+            found.append((ExitCode.UNREADABLE, self.reason))
+        elif not self.n_packets:
+            found.append((ExitCode.NOT_RECEIVED, f"no packet: {self.reason}" if self.reason else "no packet"))
+        elif self.n_packets < limits.min_packets:
+            found.append((ExitCode.NOT_RECEIVED, f"{self.n_packets} packets, {limits.min_packets} were asked for"))
+        if self.truth_problem:
+            found.append((ExitCode.UNREADABLE, self.truth_problem))
+        if limits.max_ber is not None:
+            found += self._ber_failures(limits.max_ber)
+        return found
+
+    def _ber_failures(self, max_ber: float) -> list[tuple[ExitCode, str]]:
+        if self.score is None or self.score.ber is None:
+            return [(ExitCode.NOT_RECEIVED, "no truth to hold the bit error rate against")]
+        if self.score.ber > max_ber:
+            return [(ExitCode.NOT_RECEIVED, f"bit error rate {self.score.ber:.3g} is above {max_ber:.3g}")]
+        return []
+
+    def row(self, limits: Limits) -> dict[str, Any]:
+        """The figures as plain data; None where unknown."""
+        score = self.score
+        failures = self.failures(limits)
+        return {
+            "source": printable(self.source),
+            "exit_code": int(worst([code for code, _ in failures])),
+            "frames": self.n_frames,
+            "frames_failed": self.n_frames - self.statuses["ok"] - self.statuses["partial"],
+            "packets": self.n_packets,
+            "combined": self.n_combined,
+            "confidence": _finite(self.confidence),
+            "expected": score.expected if score else None,
+            "error_free": score.error_free if score else None,
+            "lost": score.lost if score else None,
+            "false": score.false if score else None,
+            "extra": score.extra if score else None,
+            "wrong_w": score.wrong_w if score else None,
+            "ber": score.ber if score else None,
+            "time_ms": round(self.time_ms, 1),
+            "reason": (failures[0][1] if failures else self.reason).removeprefix(f"{self.source}: "),
+        }
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(value, 6)
+
+
+def total(summaries: Sequence[SourceSummary]) -> SourceSummary:
+    """All sources as one, named "total"; scored over those of which the truth is known."""
+    whole = SourceSummary("total")
+    for summary in summaries:
+        for name in ("n_frames", "n_packets", "confidence_sum", "n_combined", "time_ms"):
+            setattr(whole, name, getattr(whole, name) + getattr(summary, name))
+        whole.statuses.update(summary.statuses)
+        whole.reasons.update(summary.reasons)
+        if summary.score is not None:
+            whole.score = (whole.score or Score()) + summary.score
+    return whole
+
+
+def exit_code(summaries: Sequence[SourceSummary], limits: Limits) -> ExitCode:
+    """The exit code of a run over these sources."""
+    return worst([code for summary in summaries for code, _ in summary.failures(limits)])
+
+
+def format_summary(summaries: Sequence[SourceSummary], limits: Limits) -> str:
+    """One row per source, a total where there are several, and columns for the truth where any is known."""
+    rows = [summary.row(limits) for summary in summaries]
+    scored = any(summary.score is not None for summary in summaries)
+    names = ["source", "frames", "packets", "confidence"]
+    names += ["expected", "error_free", "lost", "false", "ber"] if scored else []
+    cells = [[_text(row[name]) for name in names] + [printable(str(row["reason"]))] for row in rows]
+    if len(summaries) > 1:
+        whole = total(summaries).row(Limits())
+        failed = sum(row["exit_code"] != 0 for row in rows)
+        ending = f"{failed} of {len(rows)} failed" if failed else f"{len(rows)} without failure"
+        cells.append([_text(whole[name]) for name in names] + [ending])
+    return format_table([name.replace("_", "-") for name in names] + [""], cells)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def write_summary(path: Path, summaries: Sequence[SourceSummary], limits: Limits) -> None:
+    """Write one row per source, as CSV or Parquet by the file's suffix.
+
+    Raises:
+        UsageError: the suffix is neither, or the extra for Parquet is not installed.
+        InputError: the file cannot be written.
+    """
+    check_summary_path(path)
+    rows = [summary.row(limits) for summary in summaries]
+    try:
+        if path.suffix.casefold() == ".csv":
+            _write_csv(path, rows)
+        else:
+            _write_parquet(path, rows)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def check_summary_path(path: Path) -> None:
+    """Raise what `write_summary` would, before a long run rather than after it.
+
+    Raises:
+        UsageError: the suffix is neither CSV's nor Parquet's, or the extra for Parquet is not installed.
+    """
+    suffix = path.suffix.casefold()
+    if suffix not in (".csv", ".parquet"):
+        raise UsageError(f"--summary must end in .csv or .parquet (got {str(path)!r})", "name such a file")
+    if suffix == ".parquet":
+        from importlib.util import find_spec
+
+        if find_spec("pyarrow") is None:
+            raise UsageError(
+                f"{path}: Parquet needs the package pyarrow", "pip install 'vlc-rx[parquet]', or name a .csv"
+            )
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(f"{path}: cannot be written ({error.strerror})", "name a file in a folder that can be written")
+
+
+def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, _COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
+    import pyarrow
+    import pyarrow.parquet
+
+    kinds = {"source": pyarrow.string(), "reason": pyarrow.string()}
+    kinds |= dict.fromkeys(("confidence", "ber", "time_ms"), pyarrow.float64())
+    schema = pyarrow.schema([(name, kinds.get(name, pyarrow.int64())) for name in _COLUMNS])
+    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), path)
+
+
+_COLUMNS = tuple(SourceSummary("").row(Limits()))
+
+
+def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) -> None:
+    """Write one test case per source: an error where it could not be read, a failure where it was not received.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    from xml.etree import ElementTree
+
+    suite = ElementTree.Element("testsuite", name="vlc-rx decode", tests=str(len(summaries)))
+    n_failures = n_errors = 0
+    for summary in summaries:
+        seconds = f"{summary.time_ms / 1e3:.3f}"
+        case = ElementTree.SubElement(suite, "testcase", classname="decode", name=_xml(summary.source), time=seconds)
+        for code, reason in summary.failures(limits):
+            kind = "error" if code is ExitCode.UNREADABLE else "failure"
+            ElementTree.SubElement(case, kind, message=_xml(reason), type=code.name.lower())
+        n_errors += case.find("error") is not None
+        n_failures += case.find("error") is None and case.find("failure") is not None
+    suite.set("errors", str(n_errors))
+    suite.set("failures", str(n_failures))
+    suite.set("time", f"{sum(summary.time_ms for summary in summaries) / 1e3:.3f}")
+    root = ElementTree.Element("testsuites")
+    root.append(suite)
+    ElementTree.indent(root)
+    try:
+        ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def _xml(text: str) -> str:
+    """`text` without the characters that XML cannot hold."""
+    return printable(text)

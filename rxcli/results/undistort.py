@@ -1,0 +1,95 @@
+"""Whole pictures without their lens distortion, for people to look at; the receiver itself never warps pixels."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.errors import InputError
+from rxcli.profiles import CameraProfile, match_camera
+from rxcli.receiver.screen.geometry import lens_for
+from rxcli.types import Frame, Lens
+
+log = logging.getLogger(__name__)
+
+
+def undistorted(frame: Frame, lens: Lens) -> NDArray[np.uint8]:
+    """The frame as seen through a lens without distortion, (height, width) uint8 grey; a mosaic becomes grey first.
+
+    Args:
+        frame: a picture as stored.
+        lens: the lens model for pictures of its size.
+    """
+    import cv2
+
+    grey = grey_levels(frame)
+    if lens.corrected:
+        return grey
+    return np.asarray(cv2.undistort(grey, lens.camera_matrix, lens.dist_coeffs), np.uint8)
+
+
+def grey_levels(frame: Frame) -> NDArray[np.uint8]:
+    """The frame as (height, width) uint8 grey levels for the eye: RAW and linear pictures get a display's gamma."""
+    black, white = (frame.black, frame.white) if frame.mosaic is None else (0.0, 1.0)
+    values = _mosaic_grey(frame) if frame.mosaic is not None else frame.pixels.astype(np.float32)
+    share = np.clip((values - black) / (white - black), 0, 1)
+    if frame.linear or frame.mosaic is not None:
+        share **= 1 / 2.2
+    levels: NDArray[np.uint8] = np.round(255 * share).astype(np.uint8)
+    return levels
+
+
+def _mosaic_grey(frame: Frame) -> NDArray[np.float32]:
+    """The mosaic's colours on one scale, 0 to 1, averaged over three by three pixels to hide its pattern."""
+    import cv2
+
+    mosaic = frame.mosaic
+    assert mosaic is not None
+    height, width = mosaic.pattern.shape
+    values = np.empty(frame.pixels.shape, np.float32)
+    for y, x in np.ndindex(height, width):
+        colour = int(mosaic.pattern[y, x])
+        scale = mosaic.gains[colour] / (mosaic.white - mosaic.black[colour])
+        values[y::height, x::width] = (frame.pixels[y::height, x::width] - mosaic.black[colour]) * np.float32(scale)
+    return np.asarray(cv2.blur(values, (3, 3)), np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class UndistortedWriter:
+    """Writes every frame it is given into a folder, undistorted, as PNG; picklable."""
+
+    folder: Path
+    cameras: tuple[CameraProfile, ...]
+    #: Take the first camera whatever the file says of itself.
+    force_camera: bool = False
+
+    def __call__(self, frame: Frame) -> None:
+        """Write `frame`; one whose lens is not known is passed over with a warning.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        lens = self._lens(frame)
+        if lens is None:
+            log.warning(
+                "%s: no camera profile with a lens fits; not undistorted (name one with --camera)", frame.source
+            )
+            return
+        import cv2
+
+        path = self.folder / f"{Path(frame.source).name}.{frame.index:05d}.png"
+        if not cv2.imwrite(str(path), undistorted(frame, lens)):
+            raise InputError(f"{path}: cannot be written", "name another folder with --save-undistorted")
+
+    def _lens(self, frame: Frame) -> Lens | None:
+        meta = frame.metadata
+        camera = (
+            self.cameras[0]
+            if self.force_camera
+            else match_camera(self.cameras, meta.make, meta.model, frame.width, frame.height)
+        )
+        return lens_for(camera.lens, frame.width, frame.height) if camera and camera.lens else None

@@ -1,0 +1,459 @@
+"""Many sources: which files there are, decoding them here or in worker processes, and results that survive a kill.
+
+Results come source by source in the order of the input, whoever decodes them. The file of JSON lines is its own
+journal: every line is written whole, at once, and sources follow one another, so that after a kill at most the last
+source is incomplete; `recover` drops it and the run goes on from there.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from rxcli.errors import InputError, ProfileError, ReceiverError, UsageError
+from rxcli.results.report import from_record, to_json_line
+from rxcli.types import Frame, FrameResult
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+    from multiprocessing.context import SpawnContext
+    from multiprocessing.process import BaseProcess
+
+    from rxcli.receiver.pipeline import ReceiverOptions
+
+log = logging.getLogger(__name__)
+
+OpenSource = Callable[[str], Iterable[Frame]]
+Receive = Callable[[Iterable[Frame], Any], Iterator[FrameResult]]
+#: One source with its results, which are to be taken before the next source is asked for.
+Decoded = tuple["Source", Iterator[FrameResult]]
+
+#: Sources per worker that may be decoded ahead of the one whose results are being taken.
+_AHEAD = 32
+#: What every line of results starts with, so that half of one is told from a foreign file.
+_LINE_START = b'{"source": "'
+_THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A file or device to decode."""
+
+    #: What results and messages call it.
+    name: str
+    #: Where it is opened.
+    path: str
+    #: Why there is nothing to open, None where there is.
+    problem: str | None = None
+
+
+def collect_sources(paths: Iterable[str], suffixes: frozenset[str]) -> list[Source]:
+    """The sources that `paths` name: files as they are, folders recursively and in order of name.
+
+    Each file is taken once. In folders, files of other suffixes and hidden ones are passed over.
+
+    Args:
+        paths: files and folders.
+        suffixes: lower-case suffixes, with the dot, of files to take from folders.
+    """
+    found = [source for path in paths for source in _sources_of(path, suffixes)]
+    return list({os.path.normpath(source.name): source for source in found}.values())
+
+
+def _sources_of(path: str, suffixes: frozenset[str]) -> Iterator[Source]:
+    if not os.path.isdir(path):
+        yield Source(path, path)
+        return
+    files = [name for name in _walk(path) if os.path.splitext(name)[1].casefold() in suffixes]
+    if not files:
+        problem = f"{path}: the folder holds no picture or clip; name files, or a folder with {_listed(suffixes)}"
+        yield Source(path, path, problem)
+    for name in files:
+        yield Source(name, name)
+
+
+def _walk(folder: str) -> Iterator[str]:
+    for parent, folders, files in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        yield from (os.path.join(parent, name) for name in sorted(files) if not name.startswith("."))
+
+
+def _listed(suffixes: frozenset[str]) -> str:
+    return ", ".join(sorted(suffix.lstrip(".") for suffix in suffixes))
+
+
+@dataclass(frozen=True, slots=True)
+class Decoder:
+    """How one source is decoded; picklable where its functions are."""
+
+    options: Any
+    open_source: OpenSource
+    receive: Receive
+    #: Sees every frame before it is received.
+    tap: Callable[[Frame], None] | None = None
+
+    def results(self, source: Source) -> Iterator[FrameResult]:
+        """The results of all frames of `source`, at least one; an input that fails ends in an `unreadable` one.
+
+        Raises:
+            UsageError: the options make no sense, whatever the source.
+            ProfileError: likewise.
+        """
+        failure = _Failure()
+        count = 0
+        try:
+            if source.problem:
+                raise InputError(source.problem)
+            for result in self.receive(failure.guard(self._frames(source)), self.options):
+                yield replace(result, source=source.name)
+                count += 1
+        except (UsageError, ProfileError):
+            raise
+        except Exception as error:
+            failure.note(error)
+        if failure.message or not count:
+            yield unreadable(source, count, failure.message or f"{source.name}: holds no picture; name another file")
+
+    def _frames(self, source: Source) -> Iterator[Frame]:
+        for frame in self.open_source(source.path):
+            if self.tap is not None:
+                self.tap(frame)
+            yield frame
+
+
+class _Failure:
+    """What went wrong with a source. The receiver behind a guarded iterator still gives what it had got till then."""
+
+    def __init__(self) -> None:
+        self.message: str | None = None
+
+    def guard(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """The frames up to the failure, which is noted instead of raised."""
+        try:
+            yield from frames
+        except (UsageError, ProfileError):
+            raise
+        except Exception as error:
+            self.note(error)
+
+    def note(self, error: Exception) -> None:
+        """Keep the message of `error`; one that is no `ReceiverError` is a bug, whose traceback goes to the log."""
+        if isinstance(error, ReceiverError):
+            self.message = str(error)
+            return
+        log.debug("unexpected error", exc_info=error)
+        self.message = f"internal error ({type(error).__name__}: {error}); run again with --verbose and report it"
+
+
+def unreadable(source: Source, frame: int, message: str) -> FrameResult:
+    """The result of a frame that could not be had."""
+    return FrameResult(source=source.name, frame=frame, time_s=0.0, status="unreadable", message=message)
+
+
+def standard_decoder(options: ReceiverOptions, tap: Callable[[Frame], None] | None = None) -> Decoder:
+    """The decoder that reads files and receives them."""
+    from rxcli.ingest import open_source
+    from rxcli.receiver.pipeline import receive
+
+    return Decoder(options, open_source, receive, tap)
+
+
+def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded]:
+    """Decode one source after the other in this process."""
+    for source in sources:
+        yield source, decoder.results(source)
+
+
+def decode_in_processes(sources: Sequence[Source], decoder: Decoder, workers: int) -> Iterator[Decoded]:
+    """Decode sources in worker processes; results as from `decode_here`, in the same order.
+
+    A worker that dies costs the source it had in hand, which ends as unreadable; another worker takes its place.
+
+    Args:
+        sources: what to decode.
+        decoder: how; must be picklable.
+        workers: number of processes, each of which uses one thread.
+    """
+    with _Pool(sources, decoder, min(workers, len(sources))) as pool:
+        for index, source in enumerate(sources):
+            yield source, pool.results(index)
+
+
+@dataclass(slots=True)
+class _Worker:
+    process: BaseProcess
+    connection: Connection
+    #: Index of the source in hand, None while idle.
+    index: int | None = None
+    #: Results it has given of that source.
+    count: int = 0
+
+
+class _Finished:
+    """Sent by a worker after the last result of a source."""
+
+
+@dataclass(slots=True)
+class _Buffer:
+    """Results of one source that have come and were not taken yet."""
+
+    results: deque[FrameResult] = field(default_factory=deque)
+    complete: bool = False
+
+
+class _Pool:
+    def __init__(self, sources: Sequence[Source], decoder: Decoder, n_workers: int) -> None:
+        from multiprocessing import get_context
+
+        self._sources = sources
+        self._decoder = decoder
+        self._n_workers = n_workers
+        #: A fresh interpreter per worker: forking one that has threads can lock up.
+        self._context: SpawnContext = get_context("spawn")
+        self._workers: list[_Worker] = []
+        self._buffers: dict[int, _Buffer] = {}
+        self._next = 0
+        self._taking = 0
+
+    def __enter__(self) -> _Pool:
+        self._fill()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for worker in self._workers:
+            worker.connection.close()
+            worker.process.terminate()
+        for worker in self._workers:
+            worker.process.join()
+
+    def results(self, index: int) -> Iterator[FrameResult]:
+        self._taking = index
+        self._fill()
+        buffer = self._buffers.setdefault(index, _Buffer())
+        while True:
+            while buffer.results:
+                yield buffer.results.popleft()
+            if buffer.complete:
+                del self._buffers[index]
+                return
+            self._wait()
+
+    def _fill(self) -> None:
+        """Give every idle worker a source, and start workers where some are missing."""
+        while len(self._workers) < self._n_workers and self._may_assign():
+            self._workers.append(self._start())
+        for worker in self._workers:
+            if worker.index is None and self._may_assign():
+                self._assign(worker)
+
+    def _may_assign(self) -> bool:
+        return self._next < min(len(self._sources), self._taking + _AHEAD * self._n_workers)
+
+    def _start(self) -> _Worker:
+        ours, theirs = self._context.Pipe()
+        process = self._context.Process(target=_work, args=(theirs, self._decoder, log_level()), daemon=True)
+        with _one_thread_environment():
+            process.start()
+        theirs.close()
+        return _Worker(process, ours)
+
+    def _assign(self, worker: _Worker) -> None:
+        worker.index, worker.count = self._next, 0
+        self._buffers.setdefault(self._next, _Buffer())
+        self._next += 1
+        try:
+            worker.connection.send(self._sources[worker.index])
+        except OSError:
+            log.debug("worker %s is gone", worker.process.pid)  # the next wait finds its connection closed
+
+    def _wait(self) -> None:
+        """Take what the workers send, waiting for the first of it."""
+        from multiprocessing.connection import wait
+
+        busy = {worker.connection: worker for worker in self._workers if worker.index is not None}
+        for connection in wait(list(busy)):
+            worker = busy[connection]  # type: ignore[index]
+            try:
+                self._take(worker, worker.connection.recv())
+            except (EOFError, ConnectionResetError):
+                self._bury(worker)
+        self._fill()
+
+    def _take(self, worker: _Worker, message: object) -> None:
+        if isinstance(message, Exception):
+            raise message
+        assert worker.index is not None
+        buffer = self._buffers[worker.index]
+        if isinstance(message, FrameResult):
+            buffer.results.append(message)
+            worker.count += 1
+        else:
+            buffer.complete = True
+            worker.index = None
+
+    def _bury(self, worker: _Worker) -> None:
+        """Put a dead worker's source down as unreadable."""
+        worker.connection.close()
+        worker.process.join()
+        self._workers.remove(worker)
+        assert worker.index is not None
+        source, buffer = self._sources[worker.index], self._buffers[worker.index]
+        message = f"{source.name}: the process that decoded it {_ending(worker.process.exitcode)}; try it by itself"
+        buffer.results.append(unreadable(source, worker.count, message))
+        buffer.complete = True
+
+
+def _ending(exitcode: int | None) -> str:
+    if exitcode is not None and exitcode < 0:
+        return f"was ended by {signal.Signals(-exitcode).name}"
+    return f"ended with code {exitcode}"
+
+
+def _work(connection: Connection, decoder: Decoder, level: int) -> None:
+    """A worker's life: take a source, send its results, until the other end is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides what an interrupt means
+    logging.basicConfig(level=level)
+    use_one_thread()
+    try:
+        while True:
+            _send_results(connection, decoder, connection.recv())
+    except (EOFError, OSError):
+        return
+
+
+def _send_results(connection: Connection, decoder: Decoder, source: Source) -> None:
+    try:
+        for result in decoder.results(source):
+            connection.send(result)
+    except ReceiverError as error:
+        connection.send(error)
+    else:
+        connection.send(_Finished())
+
+
+def log_level() -> int:
+    """The level that worker processes log at."""
+    return logging.getLogger("rxcli").getEffectiveLevel()
+
+
+def use_one_thread() -> None:
+    """Keep OpenCV to one thread; the other libraries go by the environment that the worker was started with."""
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+@contextmanager
+def _one_thread_environment() -> Iterator[None]:
+    """The environment in which a worker's libraries start no threads of their own."""
+    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+class Journal:
+    """A file of JSON lines that holds whole lines only, whenever the process ends.
+
+    Args:
+        path: the file.
+        resume: keep what is there (after `recover`) and go on behind it.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+
+    def __init__(self, path: Path, resume: bool = False) -> None:
+        self._path = path
+        try:
+            self._file: BinaryIO = path.open("ab" if resume else "wb", buffering=0)
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def write(self, result: FrameResult) -> None:
+        """Append the line of `result`, in one call of the system.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        rest = memoryview(to_json_line(result).encode() + b"\n")
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: OSError) -> InputError:
+        return InputError(f"{self._path}: cannot be written ({error.strerror})", "name a file that can be written")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def recover(path: Path) -> Iterator[tuple[str, list[FrameResult]]]:
+    """Give the complete sources of an earlier run's JSON lines, then cut off the last one, which may be incomplete.
+
+    Exhaust it before the file is written to.
+
+    Raises:
+        UsageError: the file is no output of `vlc-rx decode --json`; it is left as it is.
+        InputError: it cannot be read or cut.
+    """
+    try:
+        with path.open("rb+") as file:
+            start = yield from _complete_sources(file, path)
+            file.truncate(start)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise InputError(f"{path}: cannot be resumed ({error.strerror})", "name another file") from None
+
+
+def _complete_sources(file: BinaryIO, path: Path) -> Generator[tuple[str, list[FrameResult]], None, int]:
+    """Give every source but the last one; returns where the last one starts."""
+    start = offset = 0
+    results: list[FrameResult] = []
+    for number, line in enumerate(file, start=1):
+        if not line.endswith(b"\n") and line[: len(_LINE_START)] == _LINE_START[: len(line)]:
+            break
+        result = _parse_line(line, f"{path} line {number}")
+        if results and result.source != results[0].source:
+            yield results[0].source, results
+            results, start = [], offset
+        results.append(result)
+        offset += len(line)
+    return start
+
+
+def _parse_line(line: bytes, place: str) -> FrameResult:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        raise UsageError(f"{place}: not JSON", "name the file that --json wrote before") from None
+    try:
+        return from_record(record)
+    except UsageError as error:
+        raise UsageError(f"{place}: {error.message}", "name the file that --json wrote before") from None

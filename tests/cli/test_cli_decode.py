@@ -1,0 +1,223 @@
+"""`vlc-rx decode` from end to end: small pictures in, tables, lines, files and exit codes out."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import cv2
+import pytest
+from small_frames import N_COLUMNS, W, write_frame, write_profiles
+
+from rxcli.cli.main import run
+
+Decode = Callable[..., tuple[int, str, str]]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+
+
+@pytest.fixture
+def decode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Decode:
+    """Run `vlc-rx decode` with the profiles of the small pictures; returns exit code, stdout and stderr."""
+    profiles = tmp_path / "profiles"
+    profiles.mkdir()
+    names = write_profiles(profiles)
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        code = run(["decode", *map(str, arguments), *names])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+def without_times(text: str) -> list[dict[str, Any]]:
+    return [json.loads(line) | {"timing_ms": None} for line in text.splitlines()]
+
+
+def test_a_table_for_people(tmp_path: Path, decode: Decode) -> None:
+    payloads = write_frame(tmp_path / "a.png", 1)
+    code, out, err = decode(tmp_path / "a.png", "--truth", "auto")
+    assert (code, err) == (0, "")
+    rows = [line.split() for line in out.splitlines()[2 : 2 + N_COLUMNS]]
+    shown = [(row[0], row[1].removesuffix("*"), row[2], row[6], row[7]) for row in rows]  # *: by the auto-encoder
+    assert shown == [(str(column), "ok", str(W), "0", payload) for column, payload in enumerate(payloads)]
+    assert f"{N_COLUMNS} packets in {N_COLUMNS} of {N_COLUMNS} columns" in out
+
+
+def test_lines_for_programs_and_nothing_else_on_stdout(tmp_path: Path, decode: Decode) -> None:
+    payloads = write_frame(tmp_path / "a.png", 2)
+    code, out, err = decode(tmp_path / "a.png", "--json", "-")
+    assert code == 0
+    [record] = without_times(out)
+    assert [column["packets"][0]["payload"] for column in record["columns"]] == payloads
+    assert record["columns"][0]["packets"][0]["bit_errors"] is None
+    assert "a.png" in err  # the summary
+
+
+def test_quiet_says_nothing(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 2)
+    assert decode(tmp_path / "a.png", "--quiet") == (0, "", "")
+
+
+def test_a_picture_on_stdin(tmp_path: Path, decode: Decode, monkeypatch: pytest.MonkeyPatch) -> None:
+    payloads = write_frame(tmp_path / "a.png", 3)
+
+    class Stdin:
+        buffer = io.BytesIO((tmp_path / "a.png").read_bytes())
+
+    monkeypatch.setattr(sys, "stdin", Stdin)
+    code, out, _ = decode("-", "--json", "-")
+    [record] = without_times(out)
+    assert (code, record["source"]) == (0, "-")
+    assert record["columns"][1]["packets"][0]["payload"] == payloads[1]
+
+
+def test_one_bad_file_never_stops_the_rest(tmp_path: Path, decode: Decode) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    write_frame(folder / "a.png", 1)
+    (folder / "b.png").write_bytes(b"")
+    (folder / "c.jpg").write_bytes(b"\xff\xd8\xff" + bytes(50))
+    write_frame(folder / "d.png", 4)
+    code, out, _ = decode(folder, tmp_path / "missing.png", "--json", "-")
+    assert code == 3
+    records = without_times(out)
+    assert [record["status"] for record in records] == ["ok", "unreadable", "unreadable", "ok", "unreadable"]
+    assert all(record["source"] in record["message"] for record in records if record["status"] == "unreadable")
+
+
+def test_limits_for_continuous_integration(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    path = tmp_path / "a.png"
+    assert decode(path, "--truth", tmp_path / "a.truth.json", "--max-ber", "0")[0] == 0
+    assert decode(path, "--min-packets", N_COLUMNS)[0] == 0
+    assert decode(path, "--min-packets", N_COLUMNS + 1)[0] == 1
+    truth = json.loads((tmp_path / "a.truth.json").read_text())
+    truth["payload"]["0"][0] = f"{int(truth['payload']['0'][0], 16) ^ 1 << 39:010x}"
+    (tmp_path / "a.truth.json").write_text(json.dumps(truth))
+    code, out, _ = decode(path, "--truth", "auto", "--max-ber", "1e-3", "--junit", tmp_path / "j.xml")
+    assert code == 1
+    assert f"bit error rate {1 / (35 * N_COLUMNS):.3g} is above 0.001" in out
+    [[case]] = ElementTree.parse(tmp_path / "j.xml").getroot()
+    assert case.find("failure") is not None
+
+
+def test_a_broken_truth_file_is_told_and_the_packets_are_still_there(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    (tmp_path / "a.truth.json").write_text("{")
+    code, out, _ = decode(tmp_path / "a.png", "--truth", "auto")
+    assert code == 3
+    assert f"{N_COLUMNS} packets in {N_COLUMNS}" in out
+    assert "a.truth.json: cannot be read as truth" in out
+
+
+def test_a_summary_file(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    assert decode(tmp_path / "a.png", "--truth", "auto", "--summary", tmp_path / "s.csv")[0] == 0
+    with (tmp_path / "s.csv").open(newline="") as file:
+        [row] = csv.DictReader(file)
+    assert (row["packets"], row["error_free"], row["ber"]) == (str(N_COLUMNS), str(N_COLUMNS), "0.0")
+
+
+def test_undistorted_pictures_need_a_lens(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    code, _, err = decode(tmp_path / "a.png", "--save-undistorted", tmp_path / "straight")
+    assert code == 0
+    assert "no camera profile with a lens fits" in err
+    with (tmp_path / "profiles" / "camera.toml").open("a") as file:
+        file.write(
+            "\n[lens]\nwidth = 340\nheight = 620\ndist_coeffs = [-0.1, 0.0, 0.0, 0.0]\n"
+            "camera_matrix = [[500.0, 0.0, 169.5], [0.0, 500.0, 309.5], [0.0, 0.0, 1.0]]\n"
+        )
+    decode(tmp_path / "a.png", "--save-undistorted", tmp_path / "straight")
+    [straight] = (tmp_path / "straight").iterdir()
+    assert straight.name == "a.png.00000.png"
+    assert straight.read_bytes() != (tmp_path / "a.png").read_bytes()
+
+
+def test_worker_processes_change_nothing_but_the_time(tmp_path: Path, decode: Decode) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for seed in range(5):
+        write_frame(folder / f"{seed}.png", seed)
+    (folder / "3.png").write_bytes(b"no picture")
+    alone, several = (decode(folder, "--json", "-", "--truth", "auto", "--workers", n) for n in (1, 2))
+    assert alone[0] == several[0] == 3
+    assert without_times(alone[1]) == without_times(several[1])
+
+
+def test_a_large_folder_killed_again_and_again(tmp_path: Path, decode: Decode) -> None:
+    """Forty files, every tenth of them bad; the run is killed at random moments and resumed."""
+    folder, out = tmp_path / "in", tmp_path / "out.jsonl"
+    folder.mkdir()
+    for number in range(40):
+        if number % 10 == 5:
+            (folder / f"{number:02}.jpg").write_bytes(b"\xff\xd8\xff\xe0 cut")
+        elif number < 4:
+            write_frame(folder / f"{number:02}.png", number)
+        else:  # decoding is not what is tested here
+            (folder / f"{number:02}.png").write_bytes((folder / f"{number % 4:02}.png").read_bytes())
+    code, undisturbed, _ = decode(folder, "--json", "-")
+    assert code == 3
+    assert sum(record["status"] == "ok" for record in without_times(undisturbed)) == 36
+    names = write_profiles(tmp_path / "profiles")
+    command = [sys.executable, "-m", "rxcli.cli.main", "decode", str(folder), "--json", str(out), "--resume", *names]
+    generator = random.Random(3)
+    for _ in range(3):
+        before = out.stat().st_size if out.exists() else 0
+        killed = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL)
+        while (out.stat().st_size if out.exists() else 0) <= before:
+            assert killed.poll() is None, "it ended before it could be killed"
+            time.sleep(0.002)
+        time.sleep(generator.uniform(0, 0.1))
+        killed.send_signal(signal.SIGKILL)
+        assert killed.wait() == -signal.SIGKILL
+        assert len(without_times(out.read_text())) < 40
+    code, _, _ = decode(folder, "--json", out, "--resume")
+    assert code == 3
+    assert without_times(out.read_text()) == without_times(undisturbed)
+
+
+def test_reference_photo(shared_captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photo = shared_captures / "xs10_sky_34k6.jpg"
+    code = run(["decode", str(photo), "--screen", "paper-34k6", "--truth", "auto", "--max-ber", "0"])
+    assert "20 packets in 20 of 20 columns" in capsys.readouterr().out
+    assert code == 0
+
+
+def test_an_estimated_camera_is_kept_as_a_profile(tmp_path: Path) -> None:
+    """What was estimated of a camera receives the same picture again, as well as it did."""
+    sample = Path(__file__).resolve().parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
+    profile, again = tmp_path / "my phone.toml", tmp_path / "again.jsonl"
+    screen = ["--screen", "paper-17k3", "--truth", str(sample).replace(".jpg", ".truth.json"), "--max-ber", "0.01"]
+    assert run(["decode", str(sample), *screen, "--quiet", "--camera", "auto", "--save-camera", str(profile)]) == 0
+    assert 'name = "my-phone"' in profile.read_text()
+    assert run(["decode", str(sample), *screen, "--quiet", "--camera", str(profile), "--json", str(again)]) == 0
+    assert json.loads(again.read_text())["camera"]["profile"] == "my-phone"
+
+
+def test_a_camera_is_not_kept_where_nothing_was_received(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The lower half of the picture is lost: the camera is estimated, but no packet shows."""
+    sample = Path(__file__).resolve().parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
+    picture, profile, out = tmp_path / "part.png", tmp_path / "mine.toml", tmp_path / "out.jsonl"
+    pixels = cv2.imread(str(sample), cv2.IMREAD_GRAYSCALE)
+    assert pixels is not None
+    pixels[1900:] = 0
+    cv2.imwrite(str(picture), pixels)
+    corners = ["--corners", "260,477", "3926,485", "3927,2636", "177,2499"]
+    options = [*corners, "--json", str(out), "--save-camera", str(profile)]
+    assert run(["decode", str(picture), "--quiet", "--camera", "auto", *options]) == 1
+    assert "line_delay_s" in json.loads(out.read_text())["estimated"]
+    assert "no packet was received with an estimated camera" in capsys.readouterr().err
+    assert not profile.exists()

@@ -1,0 +1,148 @@
+"""The group of commands: help, version, and errors as one line with an exit code."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import click
+import pytest
+
+from rxcli import __version__
+from rxcli.cli import main as cli_main
+from rxcli.cli.main import run
+from rxcli.errors import InputError
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+COMMAND = [sys.executable, "-m", "rxcli.cli.main"]
+
+
+def test_help_lists_the_commands_there_are_and_no_others(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--help"]) == 0
+    listed = [line.split()[0] for line in capsys.readouterr().out.split("Commands:")[1].splitlines() if line.strip()]
+    assert "decode" in listed
+    assert all(find_spec(f"rxcli.cli.{name}") for name in listed)
+
+
+def test_every_command_has_help_and_verbose(capsys: pytest.CaptureFixture[str]) -> None:
+    group = cli_main.cli
+    for name in group.list_commands(click.Context(group)):
+        assert run([name, "--help"]) == 0, name
+        assert "--verbose" in capsys.readouterr().out, name
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["--version"]) == 0
+    assert capsys.readouterr().out == f"vlc-rx {__version__}\n"
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = "import sys; from rxcli.cli.main import run; run(['--help']); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split("\n")[-2].split())
+    assert "click" in loaded
+    assert not loaded & {"numpy", "msgspec", "cv2", "av", "rawpy", "onnxruntime", "tqdm", "rxcli.receiver.pipeline"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nonsense"], "No such command 'nonsense'; see `vlc-rx --help`"),
+        (["decode"], "Missing argument 'PATH...'; see `vlc-rx decode --help`"),
+        (["decode", "a", "--max-ber", "2"], "Invalid value for '--max-ber'"),
+        (["decode", "a", "--nonsense"], "No such option"),
+        (["decode", "a", "--max-ber", "0.1"], "--max-ber needs the truth; give --truth FILE"),
+        (["decode", "a", "--resume"], "--resume needs the file that --json wrote"),
+        (["decode", "a", "--resume", "--json", "-"], "--resume needs the file that --json wrote"),
+        (["decode", "a", "--workers", "2", "--cluster", "tcp://x"], "--workers and --cluster exclude each other"),
+        (["decode", "-", "--cluster", "tcp://x"], "stdin cannot be sent to a cluster"),
+        (["decode", "a", "--summary", "s.xls"], "--summary must end in .csv or .parquet (got 's.xls')"),
+        (["decode", "a", "--summary", "none/s.csv"], "--summary none/s.csv: there is no such folder"),
+        (["decode", "a", "--dump-dir", "/dev/null/x"], "--dump-dir /dev/null/x: Not a directory"),
+        (["decode", "a", "b", "--truth", "t.json"], "--truth t.json is the truth of one file (2 were given)"),
+        (["decode", "a", "--screen", "nix"], "no profile 'nix' among screens"),
+        (["decode", "a", "--camera", "nix"], "no profile 'nix' among cameras"),
+        (["decode", "a", "--no-skip", "nix"], "'nix' is not one of no_screen"),
+        (["decode", "a", "--corners", "1,2", "3,4", "5", "6,7"], "'5' is not two numbers, such as 120.5,80"),
+        (["decode", "a", "--corners", "1,2", "3,4", "5,nan", "6,7"], "'5,nan' is no position in a picture"),
+        (["decode", "a", "--corners", "0,0", "9,9", "9,0", "0,9"], "--corners must go once round a convex outline"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_exit_code_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("vlc-rx: ")
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+
+
+def with_command(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    """Put a command that raises `error` into the group."""
+
+    @click.command()
+    def fails() -> None:
+        raise error
+
+    monkeypatch.setattr(cli_main.cli, "get_command", lambda context, name: fails)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (InputError("a.jpg: no", "do this"), 3, "vlc-rx: a.jpg: no; do this\n"),
+        (KeyboardInterrupt(), 130, "vlc-rx: interrupted\n"),
+        (ZeroDivisionError("oh"), 1, "vlc-rx: internal error (ZeroDivisionError: oh); run again with --verbose"),
+    ],
+)
+def test_errors_become_a_line_and_a_code(
+    error: BaseException, code: int, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with_command(monkeypatch, error)
+    assert run(["fails"]) == code
+    said = capsys.readouterr().err
+    assert line in said
+    assert "Traceback" not in said
+
+
+def test_verbose_shows_the_traceback_of_an_internal_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with_command(monkeypatch, ZeroDivisionError("oh"))
+    assert run(["--verbose", "fails"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_closed_pipe_ends_the_run_without_a_word(tmp_path: Path) -> None:
+    for number in range(400):
+        (tmp_path / f"{number}.jpg").touch()
+    command = [*COMMAND, "decode", str(tmp_path), "--json", "-"]
+    with subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as started:
+        assert started.stdout is not None
+        assert started.stderr is not None
+        assert started.stdout.readline().startswith(b'{"source"')
+        started.stdout.close()
+        said = started.stderr.read()
+    assert started.returncode == 130
+    assert b"Traceback" not in said
+    assert b"Exception" not in said
+
+
+def test_an_interrupt_is_exit_code_130(tmp_path: Path) -> None:
+    for number in range(1000):  # more lines than a pipe holds: the run cannot end before the interrupt comes
+        (tmp_path / f"{number}.jpg").touch()
+    command = [*COMMAND, "decode", str(tmp_path), "--json", "-"]
+    started = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert started.stdout is not None
+    assert started.stdout.readline().startswith(b'{"source"')
+    started.send_signal(signal.SIGINT)
+    _, said = started.communicate()
+    assert started.returncode == 130
+    assert said.endswith(b"vlc-rx: interrupted\n")
+    assert b"Traceback" not in said

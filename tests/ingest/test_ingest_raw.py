@@ -1,0 +1,247 @@
+"""RAW files: the sensor's mosaic, its crop, pattern, levels and gains; nothing demosaiced, nothing turned."""
+
+from __future__ import annotations
+
+import gc
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from ingest_files import BAYER, XTRANS, write_dng
+from numpy.typing import NDArray
+from PIL import Image
+
+from rxcli.errors import InputError
+from rxcli.ingest import open_source
+from rxcli.ingest.extent import bytes_claimed
+from rxcli.ingest.metadata import raw_metadata
+from rxcli.ingest.raw import default_crop
+from rxcli.types import Frame, Mosaic
+
+SHARED = Path(__file__).resolve().parents[2].parent / "shared"
+HEIGHT, WIDTH = 300, 400
+
+
+@pytest.fixture
+def noise() -> NDArray[np.uint16]:
+    return np.random.default_rng(2).integers(90, 4000, (HEIGHT, WIDTH), dtype=np.uint16)
+
+
+def one_frame(path: Path) -> Frame:
+    (frame,) = open_source(path)
+    return frame
+
+
+def mosaic_of(frame: Frame) -> Mosaic:
+    assert frame.mosaic is not None
+    return frame.mosaic
+
+
+def colours_at(mosaic: Mosaic, height: int, width: int) -> NDArray[np.uint8]:
+    h, w = mosaic.pattern.shape
+    return np.tile(mosaic.pattern, (height // h + 1, width // w + 1))[:height, :width]
+
+
+@pytest.mark.parametrize("pattern", [BAYER, XTRANS], ids=["bayer", "xtrans"])
+class TestMosaic:
+    def test_values_levels_and_gains(
+        self, tmp_path: Path, noise: NDArray[np.uint16], pattern: NDArray[np.uint8]
+    ) -> None:
+        frame = one_frame(write_dng(tmp_path / "a.dng", noise, pattern))
+        mosaic = mosaic_of(frame)
+        np.testing.assert_array_equal(frame.pixels, noise)
+        np.testing.assert_array_equal(mosaic.pattern, pattern)
+        assert mosaic.black == (100, 100, 100)
+        assert mosaic.white == 4000
+        assert mosaic.gains == pytest.approx((1 / 0.55, 1, 1 / 0.65))
+        assert frame.metadata.exposure_s == pytest.approx(1 / 32000)
+        assert (frame.metadata.make, frame.metadata.model) == ("Synthetic", "cam")
+
+    @pytest.mark.parametrize("active", [(0, 0, 290, 390), (4, 6, 290, 390)])
+    @pytest.mark.parametrize("crop", [None, (6, 8, 370, 260), (7, 5, 301, 203)])
+    def test_margins_and_default_crop(
+        self,
+        tmp_path: Path,
+        noise: NDArray[np.uint16],
+        pattern: NDArray[np.uint8],
+        active: tuple[int, int, int, int],
+        crop: tuple[int, int, int, int] | None,
+    ) -> None:
+        more: list[tuple[Any, ...]] = [(50829, "I", 4, active, True)]
+        top, left, bottom, right = active
+        if crop:
+            more += [(50719, "I", 2, crop[:2], True), (50720, "I", 2, crop[2:], True)]
+            top, left = top + crop[1], left + crop[0]
+            bottom, right = top + crop[3], left + crop[2]
+        if pattern.shape == (2, 2):  # LibRaw moves an odd crop of a Bayer sensor inwards, to a whole tile
+            top, left = top + top % 2, left + left % 2
+        frame = one_frame(write_dng(tmp_path / "a.dng", noise, pattern, *more))
+        np.testing.assert_array_equal(frame.pixels, noise[top:bottom, left:right])
+        on_sensor = np.roll(pattern, active[:2], (0, 1))  # a DNG's pattern starts at the active area
+        expected = np.roll(on_sensor, (-top, -left), (0, 1))
+        np.testing.assert_array_equal(mosaic_of(frame).pattern, expected)
+
+    def test_all_zero_is_still_a_frame(
+        self, tmp_path: Path, noise: NDArray[np.uint16], pattern: NDArray[np.uint8]
+    ) -> None:
+        frame = one_frame(write_dng(tmp_path / "a.dng", noise * 0, pattern))
+        assert frame.pixels.shape == noise.shape
+        assert not frame.pixels.any()
+
+    def test_orientation_is_noted_not_applied(
+        self, tmp_path: Path, noise: NDArray[np.uint16], pattern: NDArray[np.uint8]
+    ) -> None:
+        frame = one_frame(write_dng(tmp_path / "a.dng", noise, pattern, (274, "H", 1, 3, True)))
+        np.testing.assert_array_equal(frame.pixels, noise)
+        assert frame.metadata.orientation == 3
+
+
+def test_colours_are_anchored_at_the_crop(tmp_path: Path) -> None:
+    """Each colour has its own level on the sensor; the frame's pattern finds them again after an odd crop."""
+    sensor = np.array([500, 1500, 2500], np.uint16)[np.tile(XTRANS, (50, 67))[:HEIGHT, :WIDTH]]
+    tags = [(50719, "I", 2, (5, 9), True), (50720, "I", 2, (311, 207), True)]
+    frame = one_frame(write_dng(tmp_path / "a.dng", sensor, XTRANS, *tags))
+    colours = colours_at(mosaic_of(frame), frame.height, frame.width)
+    assert [np.unique(frame.pixels[colours == colour]).tolist() for colour in range(3)] == [[500], [1500], [2500]]
+
+
+def test_frame_outlives_the_decoder(tmp_path: Path, noise: NDArray[np.uint16]) -> None:
+    frame = one_frame(write_dng(tmp_path / "a.dng", noise, BAYER))
+    gc.collect()
+    assert not frame.pixels.flags.owndata
+    assert not frame.pixels.flags.writeable
+    np.testing.assert_array_equal(frame.pixels, noise)
+
+
+def test_linear_dng_gives_green(tmp_path: Path, noise: NDArray[np.uint16]) -> None:
+    rgb = np.stack([noise, noise // 2 + 200, noise // 4 + 300], axis=2)
+    path = write_dng(tmp_path / "a.dng", noise, BAYER)
+    tags = [
+        (271, "s", 0, "Synthetic", True),
+        (272, "s", 0, "cam", True),
+        (50706, "B", 4, b"\x01\x04\0\0", True),
+        (50708, "s", 0, "Synthetic cam", True),
+        (50714, "H", 3, (100, 100, 100), True),
+        (50717, "I", 3, (4000, 4000, 4000), True),
+    ]
+    tifffile.imwrite(path, rgb, photometric=34892, planarconfig=1, extratags=tags, metadata=None)
+    frame = one_frame(path)
+    assert frame.mosaic is None
+    assert frame.linear
+    np.testing.assert_array_equal(frame.pixels, rgb[:, :, 1])
+    assert (frame.black, frame.white) == (100, 4000)
+
+
+def test_dng_under_another_name(tmp_path: Path, noise: NDArray[np.uint16]) -> None:
+    write_dng(tmp_path / "a.dng", noise, XTRANS).rename(tmp_path / "a.jpg")
+    np.testing.assert_array_equal(one_frame(tmp_path / "a.jpg").pixels, noise)
+
+
+def test_plain_tiff_under_a_raw_name(tmp_path: Path, noise: NDArray[np.uint16]) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", noise)
+    (tmp_path / "a.tif").rename(tmp_path / "a.dng")
+    frame = one_frame(tmp_path / "a.dng")
+    assert frame.mosaic is None
+    np.testing.assert_array_equal(frame.pixels, noise)
+
+
+def test_cut_file(tmp_path: Path, noise: NDArray[np.uint16]) -> None:
+    path = write_dng(tmp_path / "a.dng", noise, XTRANS)
+    size = path.stat().st_size
+    path.write_bytes(path.read_bytes()[: size // 2])
+    with pytest.raises(InputError, match=rf"a\.dng: the RAW file is cut: {size // 2} of at least {size} bytes"):
+        one_frame(path)
+
+
+@pytest.mark.parametrize("name", ["a.raf", "a.cr3", "a.nef"])
+def test_nonsense_under_a_raw_name(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(np.random.default_rng(3).bytes(5000))
+    with pytest.raises(InputError, match=name):
+        one_frame(tmp_path / name)
+
+
+def _sizes(**changes: int) -> SimpleNamespace:
+    """The X-S10's geometry, as LibRaw gives it."""
+    numbers = {
+        "top_margin": 5,
+        "left_margin": 0,
+        "height": 4176,
+        "width": 6252,
+        "crop_top_margin": 13,
+        "crop_left_margin": 6,
+        "crop_height": 4160,
+        "crop_width": 6240,
+    }
+    return SimpleNamespace(**(numbers | changes))
+
+
+class TestDefaultCrop:
+    def test_xs10(self) -> None:
+        assert default_crop(_sizes()) == (13, 6, 4160, 6240)
+
+    @pytest.mark.parametrize("changes", [{"crop_width": 0}, {"crop_left_margin": 65535}, {"crop_height": 4170}])
+    def test_nonsense_means_the_active_area(self, changes: dict[str, int]) -> None:
+        assert default_crop(_sizes(**changes)) == (5, 0, 4176, 6252)
+
+
+def _raf(exif: bytes, cfa: tuple[int, int] = (0, 0)) -> bytes:
+    jpeg = b"\xff\xd8\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + b"\xff\xda\xff\xd9"
+    head = b"FUJIFILMCCD-RAW 0201FF159502X-S10".ljust(84, b"\0")
+    return head + struct.pack(">II", 160, len(jpeg)) + b"\0" * 8 + struct.pack(">II", *cfa) + b"\0" * 52 + jpeg
+
+
+class TestMetadataOfRaw:
+    def test_raf(self, tmp_path: Path) -> None:
+        exif = Image.Exif()
+        exif[0x010F], exif[0x0110], exif[0x0112] = "FUJIFILM", "X-S10", 3
+        exif.get_ifd(0x8769)[0x829A] = 1 / 32000
+        (tmp_path / "a.raf").write_bytes(_raf(exif.tobytes()))
+        metadata = raw_metadata(tmp_path / "a.raf")
+        assert (metadata.make, metadata.model, metadata.orientation) == ("FUJIFILM", "X-S10", 3)
+        assert metadata.exposure_s == pytest.approx(1 / 32000)
+
+    def test_raf_length(self, tmp_path: Path) -> None:
+        (tmp_path / "a.raf").write_bytes(_raf(b"", cfa=(1000, 50_000_000)))
+        with (tmp_path / "a.raf").open("rb") as file:
+            assert bytes_claimed(file) == 50_001_000
+
+    @pytest.mark.parametrize("wrap", [lambda b: b"IIRO" + b[4:], lambda b: b"IIU\0" + b[4:]], ids=["orf", "rw2"])
+    def test_tiff_with_another_magic_number(self, tmp_path: Path, wrap: Callable[[bytes], bytes]) -> None:
+        exif = Image.Exif()
+        exif.endian = "<"
+        exif[0x010F], exif[0x0110] = "OM Digital", "OM-1"
+        (tmp_path / "a.orf").write_bytes(wrap(exif.tobytes().removeprefix(b"Exif\0\0")))
+        assert raw_metadata(tmp_path / "a.orf").model == "OM-1"
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the folder of real files is not here")
+class TestRealFiles:
+    def test_sony(self) -> None:
+        frame = one_frame(SHARED / "real/raw/_DSC2164.ARW")
+        mosaic = mosaic_of(frame)
+        assert frame.pixels.shape == (3448, 5168)
+        np.testing.assert_array_equal(mosaic.pattern, BAYER)
+        assert mosaic.black == (512, 512, 512)
+        assert (frame.metadata.make, frame.metadata.model) == ("SONY", "ILCE-7RM3")
+        assert frame.metadata.lens == "E 55-210mm F4.5-6.3 OSS"
+        assert (frame.metadata.iso, frame.metadata.exposure_s) == (3200, pytest.approx(1 / 640))
+        assert (frame.metadata.focal_length_mm, frame.metadata.focal_length_35mm) == (129, 193)
+
+    def test_xtrans_capture(self) -> None:
+        frame = one_frame(SHARED / "captures/xs10_flower_34k6.dng")
+        mosaic = mosaic_of(frame)
+        assert frame.pixels.shape == (4160, 6240)
+        np.testing.assert_array_equal(mosaic.pattern, XTRANS)
+        assert (mosaic.black, mosaic.white) == ((1022, 1022, 1022), 16383)
+        assert frame.metadata.model == "xs10"
+
+    def test_cut_sony(self, tmp_path: Path) -> None:
+        data = (SHARED / "real/raw/_DSC2164.ARW").read_bytes()
+        (tmp_path / "a.arw").write_bytes(data[:9_000_000])
+        with pytest.raises(InputError, match="the RAW file is cut"):
+            one_frame(tmp_path / "a.arw")

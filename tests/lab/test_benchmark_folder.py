@@ -1,0 +1,101 @@
+"""A small folder of good and bad files, a run that is killed, and a clip without end."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import av
+import pytest
+from click.testing import CliRunner
+
+from rxcli.cli.benchmark import benchmark
+from rxcli.errors import UsageError
+from rxcli.ingest import open_source
+from rxcli.lab.benchmark import long_clip
+from rxcli.lab.benchmark.folder import BAD, Contents, Outcome, make_folder, passed, reasons, run
+
+N_GOOD = 12
+
+
+@pytest.fixture(scope="module")
+def contents(tmp_path_factory: pytest.TempPathFactory) -> Contents:
+    return make_folder(tmp_path_factory.mktemp("folder"), N_GOOD, len(BAD))
+
+
+def test_the_folder_is_mixed_and_every_good_file_has_its_truth(contents: Contents) -> None:
+    assert len({path.suffix for path in contents.good}) == 7
+    assert all(path.with_name(path.stem + ".truth.json").is_file() for path in contents.good)
+    assert len({path.read_bytes() for path in contents.bad}) == len(BAD) - 1  # two are empty
+
+
+def test_what_is_there_is_kept(contents: Contents) -> None:
+    before = [path.stat().st_mtime_ns for path in contents.good]
+    assert make_folder(contents.folder, N_GOOD, len(BAD)) == contents
+    assert [path.stat().st_mtime_ns for path in contents.good] == before
+
+
+def test_killed_and_resumed_runs_give_the_same_results(contents: Contents, tmp_path: Path) -> None:
+    outcomes = run(contents, tmp_path, n_kills=1, workers=(2,))
+    assert [outcome.n_kills for outcome in outcomes] == [0, 1]
+    assert passed(contents, outcomes), [outcome.as_row() for outcome in outcomes]
+    told = {row["file"]: row["reason"] for row in reasons(contents, tmp_path, workers=2)}
+    assert len(told) == len(BAD)
+    assert "the file is empty" in told["bad-00-empty.jpg"]
+    assert "the picture is black" in told["monday/bad-17-black.png"]
+
+
+@pytest.mark.parametrize(
+    "change", [{"n_good": N_GOOD - 1}, {"n_reasons": 0}, {"same": False}, {"exit_code": 0}], ids=lambda c: next(iter(c))
+)
+def test_a_run_that_misses_anything_does_not_pass(contents: Contents, change: dict[str, int]) -> None:
+    good = {"n_good": N_GOOD, "n_reasons": len(BAD), "same": True, "exit_code": 3}
+    values = {"label": "run", "n_kills": 0, "n_lines": 9, "wall_s": 1.0}
+    assert passed(contents, [Outcome(**good, **values)])
+    assert not passed(contents, [Outcome(**{**good, **change}, **values)])
+
+
+def test_only_bad_files_make_no_folder(tmp_path: Path) -> None:
+    result = CliRunner().invoke(benchmark, ["folder", "--files", "3", "--bad", "3", "--out", str(tmp_path)])
+    assert result.exit_code == 2
+    assert "--bad must be below --files, 3" in result.output
+
+
+def test_bad_files_need_good_ones_to_be_made_of(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"made of 12 good ones \(got 3\)"):
+        make_folder(tmp_path, 3, 1)
+
+
+def test_a_clip_written_several_times_over_is_one_clip(contents: Contents, tmp_path: Path) -> None:
+    short = next(path for path in contents.good if path.suffix == ".mp4")
+    out = tmp_path / "long.mp4"
+    long_clip.repeat_clip(short, out, 3)
+    once, thrice = list(open_source(short)), list(open_source(out))
+    assert len(thrice) == 3 * len(once)
+    steps = {round(b.time_s - a.time_s, 4) for a, b in pairwise(thrice)}
+    assert len(steps) == 1
+    for number, frame in enumerate(thrice):
+        assert (frame.pixels == once[number % len(once)].pixels).all()
+
+
+def test_the_endless_clips_payload_comes_again() -> None:
+    scene = long_clip.clip_scene()
+    slots = scene.n_frames * scene.screen.slot_rate_hz / scene.frame_rate_hz
+    bursts = slots / (scene.screen.packet_slots * scene.screen.repeats)
+    assert bursts == pytest.approx(round(bursts), abs=1e-9)
+    assert scene.payload is not None
+    assert len(scene.payload) * 8 == round(bursts) * scene.screen.columns * 35
+
+
+def test_memory_is_read_at_the_wanted_frames(contents: Contents, tmp_path: Path) -> None:
+    short = next(path for path in contents.good if path.suffix == ".mp4")
+    clip = tmp_path / "clip.mp4"
+    long_clip.repeat_clip(short, clip, 2)
+    camera = (contents.folder / "camera.toml").read_text()
+    (tmp_path / "long.camera.toml").write_text(camera)
+    with av.open(str(clip)) as container:
+        n_frames = container.streams.video[0].frames
+    found = long_clip.measure(clip, (2, n_frames), tmp_path / "out.jsonl")
+    assert found.frames == (2, n_frames)
+    assert found.exit_code in (0, 1)
+    assert found.resident_mb[0] > 20

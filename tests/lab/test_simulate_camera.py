@@ -1,0 +1,270 @@
+"""Optics, shutter and sensor of the simulator against closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.lab.simulate.camera import column_light, render_band
+from rxcli.lab.simulate.capture import prepare, simulate_frame
+from rxcli.lab.simulate.isp import Isp, correction_map, demosaic, develop, tone_curve
+from rxcli.lab.simulate.optics import Lens, Pose, View, distort, undistort
+from rxcli.lab.simulate.scenes import Scene, preset, random_scene
+from rxcli.lab.simulate.sensor import PATTERNS, Sensor, count_electrons, pick_colours, to_raw
+from rxcli.lab.simulate.shutter import flicker, lit_share, overlaps
+from rxcli.lab.simulate.transmitter import light_spread
+from rxcli.profiles import ScreenProfile, load_profile
+
+COEFFICIENTS = [(-0.06, 0.02, 0.0005, -0.0003, 0.0), (0.07, -0.09, 0.0004, 0.0006, 0.01), (0.0, 0.0, 0.0, 0.0, 0.0)]
+
+
+@pytest.fixture(scope="module")
+def small() -> Scene:
+    """A quick scene: tall enough for whole packets, narrow."""
+    return preset("xs10-still", "paper-34k6").scaled(0.08, 0.25)
+
+
+def view_of(scene: Scene) -> View:
+    sensor = scene.sensor
+    return View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect)
+
+
+@pytest.mark.parametrize("coefficients", COEFFICIENTS)
+def test_distortion_is_opencvs_and_its_inverse_is_exact(coefficients: tuple[float, ...]) -> None:
+    import cv2
+
+    rng = np.random.default_rng(1)
+    ideal = rng.uniform(-0.6, 0.6, (500, 2))
+    moved = distort(ideal, np.array(coefficients))
+    np.testing.assert_allclose(undistort(moved, np.array(coefficients)), ideal, atol=1e-9)
+    points = np.column_stack([ideal, np.ones(500)])
+    theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), np.array(coefficients))[0][:, 0]
+    np.testing.assert_allclose(moved, theirs, atol=1e-12)
+
+
+@pytest.mark.parametrize("roll", [0.0, 3.0, 180.0])
+def test_places_go_to_the_sensor_and_back(roll: float) -> None:
+    screen = load_profile("paper-34k6", ScreenProfile)
+    view = View(screen, Lens(0.8, COEFFICIENTS[1]), Pose(0.8, roll, 8.0, -6.0, 0.02, -0.03), 4000, 3000)
+    places = np.random.default_rng(2).uniform(0, 1, (300, 2))
+    np.testing.assert_allclose(view.pixels_to_screen(view.screen_to_pixels(places)), places, atol=1e-9)
+
+
+def test_straight_view_has_the_size_that_was_asked() -> None:
+    screen = load_profile("paper-34k6", ScreenProfile)
+    view = View(screen, Lens(1.5), Pose(fill=0.9), 4000, 3000)
+    np.testing.assert_allclose(view.corners[:, 0].min(), 1999.5 - 1800, atol=1e-6)
+    assert view.pixels_per_width == pytest.approx(3600)
+    assert view.pixels_per_height == pytest.approx(3600 / screen.aspect)
+
+
+def test_upside_down_turns_the_corners_round() -> None:
+    screen = load_profile("paper-34k6", ScreenProfile)
+    corners = View(screen, Lens(1.5), Pose(fill=0.9, roll_deg=180), 4000, 3000).corners
+    assert corners[0, 0] > corners[1, 0]
+    assert corners[0, 1] > corners[3, 1]
+
+
+def test_given_corners_are_met_through_the_lens() -> None:
+    screen = load_profile("paper-34k6", ScreenProfile)
+    corners = ((211.0, 300.5), (3800.0, 280.0), (3700.0, 2600.0), (250.0, 2500.0))
+    view = View(screen, Lens(0.8, COEFFICIENTS[1]), Pose(corners=corners), 4000, 3000)
+    np.testing.assert_allclose(view.corners, corners, atol=1e-6)
+
+
+def brute_share(slots: NDArray[np.uint8], start: float, length: float) -> float:
+    times = start + (np.arange(200_000) + 0.5) / 200_000 * length
+    index = np.floor(times).astype(int)
+    inside = (index >= 0) & (index < slots.size)
+    return float(np.where(inside, slots[np.clip(index, 0, slots.size - 1)], 0).mean())
+
+
+@pytest.mark.parametrize("length", [0.01, 0.25, 1.0, 1.08, 4.3])
+def test_lit_share_is_the_integral_over_the_exposure(length: float) -> None:
+    rng = np.random.default_rng(3)
+    slots = rng.integers(0, 2, 40, dtype=np.uint8)
+    starts = rng.uniform(-3, 41, 20)
+    expected = [brute_share(slots, s, length) for s in starts]
+    np.testing.assert_allclose(lit_share(slots, starts, length), expected, atol=3e-5)
+
+
+@pytest.mark.parametrize("length", [0.3, 1.0, 2.7])
+def test_overlaps_add_up_to_the_lit_share(length: float) -> None:
+    rng = np.random.default_rng(4)
+    slots = rng.integers(0, 2, 60, dtype=np.uint8)
+    starts = rng.uniform(0, 50, 100)
+    first, share = overlaps(starts, length)
+    np.testing.assert_allclose(share.sum(axis=1), 1.0)
+    lit = (share * slots[first[:, None] + np.arange(share.shape[1])]).sum(axis=1)
+    np.testing.assert_allclose(lit, lit_share(slots, starts, length), atol=1e-12)
+
+
+def test_flicker_is_averaged_over_the_exposure() -> None:
+    starts = np.linspace(0, 0.02, 50)
+    times = starts[:, None] + np.linspace(0, 4e-3, 20001)
+    expected = (1 + 0.4 * np.sin(2 * np.pi * 100 * times + 0.3)).mean(axis=1)
+    np.testing.assert_allclose(flicker(starts, 4e-3, 100, 0.4, 0.3), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("mean", [0.2, 3.0, 20.0, 60.0, 5000.0])
+def test_noise_has_the_variance_of_its_parts(mean: float) -> None:
+    sensor = Sensor(read_noise_e=2.0, row_noise_e=0.5)
+    n = 400_000
+    drawn = count_electrons(np.full((400, n // 400), mean, np.float32), sensor, np.random.default_rng(5))
+    # Row noise moves whole rows: within rows shot and read noise are left.
+    within = drawn.var(axis=1, ddof=1).mean()
+    variance = mean + 4.0
+    spread = np.sqrt(2 * variance**2 / n + mean / n)
+    assert abs(within - variance) < 5 * spread
+    assert abs(drawn.mean() - mean) < 5 * np.sqrt(variance / n + 0.25 / 400)
+    rows = drawn.mean(axis=1).var(ddof=1) - variance / (n // 400)
+    assert rows == pytest.approx(0.25, rel=0.4)
+
+
+def test_raw_numbers_keep_black_and_white_level() -> None:
+    sensor = Sensor(full_scale_e=100.0, black_level=512, white_level=4095)
+    raw = to_raw(np.array([[-1e6, 0.0, 50.0, 1e6]], np.float32), sensor)
+    assert raw.tolist() == [[0, 512, round(512 + 3583 / 2 + 1e-6), 4095]]
+
+
+@pytest.mark.parametrize("cfa", ["bayer", "xtrans"])
+def test_mosaic_is_anchored_at_the_sensors_first_pixel(cfa: str) -> None:
+    pattern = PATTERNS[cfa]
+    planes = np.broadcast_to(np.arange(3, dtype=np.float32), (14, 20, 3))
+    expected = np.tile(pattern, (20, 20))[5 : 5 + 14, :20]
+    np.testing.assert_array_equal(pick_colours(np.ascontiguousarray(planes), pattern, 5), expected)
+
+
+def test_xtrans_has_twenty_greens_of_thirty_six_and_red_and_blue_alike() -> None:
+    assert np.bincount(PATTERNS["xtrans"].ravel()).tolist() == [8, 20, 8]
+    # Every row and every column holds all three colours: what the array is known for.
+    assert all(len(set(line)) == 3 for line in [*PATTERNS["xtrans"].tolist(), *PATTERNS["xtrans"].T.tolist()])
+
+
+def test_rendered_light_is_the_model_written_out(small: Scene) -> None:
+    """The banded, interpolated rendering against the plain sum over columns and segment rows, pixel by pixel."""
+    scene = replace(small, picture="white", vignetting=0.0, lens=Lens(3.0), pose=Pose(fill=0.9, roll_deg=0.4))
+    exposure = prepare(scene, 1).exposure()
+    band = render_band(exposure, 256, 512)
+    y, x = np.mgrid[256:512:7, 0 : scene.sensor.width : 3]
+    place = exposure.view.pixels_to_screen(np.stack([x, y], axis=-1).astype(float))
+    screen = scene.screen
+    own = (light_spread(place[..., 1], 8, screen.light_spread) @ exposure.drive.lit_light) * light_spread(
+        place[..., 0], screen.columns, screen.light_spread
+    )
+    expected = (own * exposure.lit[y]).sum(axis=-1) * scene.light_e_per_s * scene.exposure_s
+    inside = (np.abs(place - 0.5) < 0.5).all(axis=-1)
+    error = band.backlight[::7, ::3][inside] - expected[inside]
+    assert np.abs(error).max() < 0.01 * expected[inside].max()
+
+
+def test_a_row_is_an_instant_whatever_the_lens_does(small: Scene) -> None:
+    """Behind a flat picture, a row's light follows the lit shares of that row alone."""
+    scene = replace(small, picture="white", lens=Lens(0.7, (0.2, -0.1, 0, 0, 0)), blur_px=3.0, lcd_grid=0.0)
+    exposure = prepare(scene, 2).exposure()
+    band = render_band(exposure, 512, 768)
+    x = np.arange(scene.sensor.width, dtype=float)
+    light = column_light(exposure, x, np.arange(512.0, 768))
+    expected = np.einsum("rcx,rc->rx", light, exposure.lit[512:768])
+    middle = slice(scene.sensor.width // 4, -scene.sensor.width // 4)
+    np.testing.assert_allclose(band.backlight[:, middle], expected[:, middle], rtol=0.02, atol=0.05)
+
+
+def test_blur_keeps_the_pictures_light(small: Scene) -> None:
+    sharp, soft = (
+        prepare(replace(small, picture="checker", blur_px=blur), 1).exposure().texture.sum() for blur in (0.3, 2.5)
+    )
+    assert soft == pytest.approx(sharp, rel=1e-3)
+
+
+def test_same_seed_same_pixels_whatever_the_threads(small: Scene) -> None:
+    one, two = simulate_frame(small, 7, threads=1), simulate_frame(small, 7, threads=2)
+    np.testing.assert_array_equal(one.raw, two.raw)
+    assert one.truth == two.truth
+    assert one.jpeg == two.jpeg
+    assert (simulate_frame(small, 8).raw != one.raw).any()
+
+
+def test_frames_of_a_take_do_not_depend_on_their_order(small: Scene) -> None:
+    scene = replace(small, n_frames=3, shake_px=2.0)
+    forward = [prepare(scene, 3).frame(n).raw for n in (0, 2)]
+    again = prepare(scene, 3)
+    np.testing.assert_array_equal(again.frame(2).raw, forward[1])
+    np.testing.assert_array_equal(again.frame(0).raw, forward[0])
+
+
+def test_clock_error_and_frame_rate_move_the_start(small: Scene) -> None:
+    scene = replace(small, n_frames=2, frame_rate_hz=50.0, start_slot=20.0, slot_rate_error_ppm=100.0)
+    assert prepare(scene, 0).exposure(1).start_slot == pytest.approx(20 + 0.02 * 34600 * 1.0001)
+
+
+def test_delays_move_columns_by_slots(small: Scene) -> None:
+    rows = 7
+    delay = rows * small.sensor.line_delay_s * small.screen.slot_rate_hz
+    scene = replace(small, start_slot=40.0)
+    plain = prepare(scene, 1).exposure()
+    late = prepare(replace(scene, column_delay_slots=(delay,) + (0.0,) * 19), 1).exposure()
+    np.testing.assert_allclose(late.lit[rows:, 0], plain.lit[:-rows, 0], atol=1e-9)
+    np.testing.assert_allclose(plain.lit[:, 1:], late.lit[:, 1:], atol=1e-9)
+
+
+def test_electrons_over_the_picture_have_the_expected_mean(small: Scene) -> None:
+    scene = replace(small, sensor=replace(small.sensor, full_scale_e=2000.0), output="raw")
+    take = prepare(scene, 4)
+    raw, exposure = take.frame().raw, take.exposure()
+    mean = np.concatenate([render_band(exposure, t, min(t + 256, 1040)).mean_e for t in range(0, 1040, 256)])
+    read = (raw.astype(float) - scene.sensor.black_level) / scene.sensor.raw_per_e
+    assert read.mean() == pytest.approx(mean.mean(), rel=0.01)
+    variance = (mean + scene.sensor.read_noise_e**2 + scene.sensor.row_noise_e**2 + (0.008 * mean) ** 2).mean()
+    assert (read - mean).var() == pytest.approx(variance, rel=0.03)
+
+
+@pytest.mark.parametrize("cfa", ["bayer", "xtrans", "rgb"])
+def test_development_gives_back_a_flat_picture(cfa: str) -> None:
+    sensor = Sensor(96, 90, cfa=cfa, full_scale_e=1000.0)  # type: ignore[arg-type]
+    light = np.full((90, 96, 3), 0.3 * 1000, np.float32) * np.array(sensor.response, np.float32)
+    raw = to_raw(pick_colours(light, sensor.pattern, 0), sensor)
+    view = View(load_profile("paper-34k6", ScreenProfile), Lens(), Pose(), 96, 90)
+    rgb = develop(raw, sensor, Isp(tone="srgb", gain=1.5, sharpen=0.5), view)
+    expected = 255 * (1.055 * 0.45 ** (1 / 2.4) - 0.055)
+    assert np.abs(rgb.astype(float) - expected).max() < 1.01
+
+
+def test_xtrans_demosaicing_keeps_a_smooth_picture() -> None:
+    sensor = Sensor(120, 120, full_scale_e=1000.0)
+    ramp = np.linspace(100, 800, 120, dtype=np.float32)[:, None, None] * np.ones((1, 120, 3), np.float32)
+    planes = demosaic(to_raw(pick_colours(ramp, sensor.pattern, 0), sensor), sensor)
+    np.testing.assert_allclose(planes[6:-6, 6:-6] * 1000, ramp[6:-6, 6:-6] * np.ones(3), atol=12)
+
+
+@pytest.mark.parametrize(
+    ("tone", "light", "value"), [("srgb", 0.2, 0.48453), ("bt709", 0.2, 0.43368), ("linear", 0.2, 0.2)]
+)
+def test_tone_curves_have_their_standard_values(tone: str, light: float, value: float) -> None:
+    dark = 1e-3
+    curve = tone_curve(np.array([[light, 0.0, 1.0, dark, 2.0]], np.float32), tone)[0]  # type: ignore[arg-type]
+    toe = {"srgb": 12.92, "bt709": 4.5, "linear": 1.0}[tone]
+    np.testing.assert_allclose(curve, [value, 0, 1, toe * dark, 1], atol=2e-5)
+
+
+def test_correction_in_the_camera_undoes_the_lens() -> None:
+    screen = load_profile("paper-34k6", ScreenProfile)
+    view = View(screen, Lens(0.8, COEFFICIENTS[1]), Pose(), 800, 600)
+    x, y = correction_map(view)
+    places = np.stack([x[100, 200], y[100, 200]]).astype(float)
+    ideal = view.pixels_to_ideal(places)
+    matrix = view.camera_matrix
+    np.testing.assert_allclose(ideal * matrix[[0, 1], [0, 1]] + matrix[:2, 2], [200, 100], atol=0.02)
+
+
+def test_random_scenes_render_without_a_complaint() -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(6):
+        scene = random_scene(rng, scale=0.05)
+        scene = scene.scaled(1.0, 0.2)
+        pixels = simulate_frame(scene, rng).pixels
+        assert pixels.shape == (scene.sensor.height, scene.sensor.width)
+        assert pixels.std() > 0

@@ -1,0 +1,286 @@
+"""Files, truth, bound and command line of the simulator."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rxcli.cli.simulate import simulate
+from rxcli.errors import ReceiverError, UsageError
+from rxcli.lab.simulate.capture import prepare, simulate_frame
+from rxcli.lab.simulate.scenes import PRESETS, Scene, preset
+from rxcli.lab.simulate.tiff import pack_14bit, write_dng
+from rxcli.profiles import CameraProfile, load_profile
+from rxcli.protocol import codebook
+
+SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "captures"
+SMALL = ["--scale", "0.12", "--keep-readout", "--picture", "sky"]
+
+
+@pytest.fixture(scope="module")
+def small() -> Scene:
+    return preset("xs10-still", "paper-34k6").scaled(0.08, 0.4)
+
+
+def run(*args: str) -> Any:
+    return CliRunner().invoke(simulate, list(args), catch_exceptions=True)
+
+
+@pytest.mark.parametrize("cfa", ["bayer", "xtrans"])
+@pytest.mark.parametrize("bits", [14, 16])
+def test_dng_opens_bit_exact(small: Scene, tmp_path: Path, cfa: str, bits: int) -> None:
+    import rawpy
+
+    sensor = replace(small.sensor, cfa=cfa, width=498, height=300)  # type: ignore[arg-type]
+    raw = np.random.default_rng(1).integers(0, 16384, (300, 498)).astype(np.uint16)
+    path = tmp_path / "a.dng"
+    write_dng(raw, replace(small, sensor=sensor, make="Synthetic", model="xs10", iso=1600), path, bits)
+    with rawpy.imread(str(path)) as file:
+        np.testing.assert_array_equal(file.raw_image_visible, raw)
+        assert file.black_level_per_channel[:3] == [1022] * 3
+        assert file.white_level == 16383
+        colours = (
+            file.raw_colors_visible[:6, :6] % 3
+            if cfa == "xtrans"
+            else np.where(file.raw_colors_visible[:6, :6] == 3, 1, file.raw_colors_visible[:6, :6])
+        )
+        np.testing.assert_array_equal(colours, np.tile(sensor.pattern, (3, 3))[:6, :6])
+        assert file.other.iso_speed == 1600
+        assert file.other.shutter_speed == pytest.approx(1 / 32000)
+        np.testing.assert_allclose(file.camera_whitebalance[:3], [1 / 0.55, 1, 1 / 0.65], rtol=1e-3)
+
+
+def test_fourteen_bits_are_packed_most_significant_first() -> None:
+    assert pack_14bit(np.array([[0x3FFF, 0, 0x2001]], np.uint16)).hex() == "fffc00080040"
+
+
+def test_jpeg_carries_what_a_camera_writes(small: Scene) -> None:
+    import io
+
+    from PIL import Image
+
+    capture = simulate_frame(replace(small, orientation=3, iso=800), 1)
+    with Image.open(io.BytesIO(capture.jpeg)) as picture:
+        exif = picture.getexif()
+        assert picture.size == (small.sensor.width, small.sensor.height)
+        assert (exif[0x10F], exif[0x110], exif[0x112]) == ("FUJIFILM", "X-S10", 3)
+        assert float(exif.get_ifd(0x8769)[0x829A]) == pytest.approx(1 / 32000, rel=1e-6)
+        assert exif.get_ifd(0x8769)[0x8827] == 800
+
+
+def test_truth_counts_the_slots_between_the_corners(small: Scene) -> None:
+    scene = replace(small, start_slot=500.0)
+    truth = simulate_frame(scene, 1).truth
+    heights = np.array(truth["corners_sensor_px"])[:, 1]
+    slots = (heights.max() - heights.min()) * scene.sensor.line_delay_s * 34600
+    bursts = truth["frames"][0]["bursts"]
+    assert sum(entry["visible_slots"] for entry in bursts) == pytest.approx(slots, abs=0.7)
+    assert [entry["burst"] for entry in bursts] == [0, 1]
+    seen = 780 - 500 - heights.min() * scene.sensor.line_delay_s * 34600
+    assert bursts[0]["visible_slots"] == pytest.approx(seen, abs=0.4)
+    assert list(truth["payload"]) == ["0", "1"]
+    assert {len(text) for text in truth["payload"]["0"]} == {42}
+
+
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_truth_has_the_form_of_the_reference_captures(name: str) -> None:
+    if not SHARED.is_dir():
+        pytest.skip("the reference captures are not here")
+    reference = json.loads((SHARED / "phone_coffee_8k65.truth.json").read_text())
+    scene = replace(preset(name, "paper-8k65").scaled(0.05), n_frames=1)
+    truth = json.loads(json.dumps(prepare(scene, 1).truth("x.jpg")))
+    assert_same_form(reference, truth, "truth")
+
+
+def assert_same_form(reference: Any, ours: Any, where: str) -> None:
+    if isinstance(reference, dict):
+        if where != "truth.payload":
+            assert reference.keys() <= ours.keys(), where
+        for key in reference.keys() & ours.keys():
+            assert_same_form(reference[key], ours[key], f"{where}.{key}")
+    elif isinstance(reference, list):
+        assert isinstance(ours, list), where
+        if reference and ours:
+            assert_same_form(reference[0], ours[0], f"{where}[0]")
+    elif isinstance(reference, (int, float)) and not isinstance(reference, bool):
+        assert isinstance(ours, (int, float)), where
+    else:
+        assert type(reference) is type(ours), where
+
+
+def test_the_bound_decides_bright_symbols_and_guesses_dark_ones(small: Scene) -> None:
+    errors = {}
+    for light in (1.0, 1e-4):
+        scene = replace(small, picture="sky", light_e_per_s=small.light_e_per_s * light, start_slot=10.0)
+        oracle = simulate_frame(scene, 2, oracle=True).oracle
+        assert oracle is not None
+        decisions = [oracle.decide(column, 0) for column in range(20)]
+        wrong = sum(int((d != s)[seen].sum()) for d, s, seen in decisions)
+        errors[light] = wrong / sum(int(seen.sum()) for _, _, seen in decisions)
+    assert errors[1.0] == 0
+    assert errors[1e-4] == pytest.approx(127 / 128, abs=0.05)
+
+
+def symbol_error_rate(energy: np.ndarray, rng: np.random.Generator) -> float:
+    """Monte Carlo of maximum likelihood over the codebook, slots of given energies (n, 10) in white Gaussian noise."""
+    words = codebook(5).astype(float)
+    sent = rng.integers(0, len(words), len(energy))
+    matched = energy * words[sent] + np.sqrt(energy) * rng.standard_normal(energy.shape)
+    score = matched @ words.T - 0.5 * energy @ words.T
+    return float((np.argmax(score, axis=1) != sent).mean())
+
+
+def test_the_bound_meets_theory_at_moderate_light() -> None:
+    """With slots that do not overlap and noise that is not the light's own, errors are those of ten Gaussian slots."""
+    base = preset("xs10-still", "paper-34k6").scaled(0.02, 0.25)
+    sensor = replace(base.sensor, read_noise_e=40.0, row_noise_e=0.0, prnu=0.0, full_scale_e=4000.0)
+    scene = replace(base, sensor=sensor, picture="white", start_slot=20.0, exposure_s=0.02 / 34600, light_e_per_s=3.2e7)
+    rng = np.random.default_rng(1)
+    wrong = total = 0
+    expected = []
+    for seed in range(5):
+        oracle = simulate_frame(scene, seed, oracle=True).oracle
+        assert oracle is not None
+        for column in range(20):
+            decided, sent, seen = oracle.decide(column, 0)
+            wrong, total = wrong + int((decided != sent)[seen].sum()), total + int(seen.sum())
+            origin, _, shared = oracle.slot_statistics(column)
+            # Every payload symbol that the frame sees whole stands for itself, many times.
+            starts = np.arange(40, 260, 10) - origin
+            starts = starts[(starts >= 0) & (starts + 10 <= len(shared))]
+            energy = shared[starts[:, None] + np.arange(10), 0]
+            expected.append(symbol_error_rate(np.tile(energy, (20, 1)), rng))
+    rate, theory = wrong / total, float(np.mean(expected))
+    assert 0.1 < theory < 0.9
+    assert rate == pytest.approx(theory, abs=5 * np.sqrt(theory * (1 - theory) / total) + 0.01)
+
+
+def test_command_writes_capture_and_truth(tmp_path: Path) -> None:
+    out = tmp_path / "a.jpg"
+    result = run(str(out), *SMALL, "--start-slot", "20", "--payload", "hex:00ff", "--w", "4", "--roll", "180")
+    assert result.exit_code == 0, result.output
+    assert result.stdout == ""
+    truth = json.loads((tmp_path / "a.truth.json").read_text())
+    assert truth["capture"] == "a.jpg"
+    assert truth["w"] == [4] * 20
+    assert truth["orientation"] == 3
+    assert truth["payload"]["0"][0].startswith("00ff00ff")
+    first = out.read_bytes()
+    run(str(out), *SMALL, "--start-slot", "20", "--payload", "hex:00ff", "--w", "4", "--roll", "180")
+    assert out.read_bytes() == first
+
+
+@pytest.mark.parametrize("name", ["a.dng", "a.png", "a.tiff"])
+def test_command_writes_other_stills(tmp_path: Path, name: str) -> None:
+    import cv2
+    import rawpy
+
+    out = tmp_path / name
+    result = run(str(out), *SMALL)
+    assert result.exit_code == 0, result.output
+    if name.endswith("dng"):
+        with rawpy.imread(str(out)) as file:
+            assert file.raw_image_visible.shape == (499, 749)
+    else:
+        assert cv2.imread(str(out)).shape == (499, 749, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "bits"), [("a.mp4", "h264", 8), ("a.mkv", "hevc-10", 10), ("a.avi", "mjpeg", 8)]
+)
+def test_command_writes_clips_through_real_encoders(tmp_path: Path, name: str, codec: str, bits: int) -> None:
+    import av
+
+    out = tmp_path / name
+    args = ["--preset", "video-1080p", "--frames", "3", "--scale", "0.2", "--format", codec, "--waveforms"]
+    result = run(str(out), *args, str(tmp_path / "lab"))
+    assert result.exit_code == 0, result.output
+    with av.open(str(out)) as container:
+        frames = list(container.decode(video=0))
+    assert len(frames) == 3
+    assert (frames[0].width, frames[0].height) == (384, 216)
+    assert frames[0].format.components[0].bits == bits
+    truth = json.loads(out.with_suffix("").with_suffix(".truth.json").read_text())
+    assert [frame["frame"] for frame in truth["frames"]] == [0, 1, 2]
+    assert (tmp_path / "lab" / "slots.npy").is_file()
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["a.xyz"], "no format goes with this suffix"),
+        (["missing/a.jpg"], "no such folder"),
+        (["a.jpg", "--w", "12"], "1..9"),
+        (["a.jpg", "--w", "five"], "no weight"),
+        (["a.jpg", "--payload", "hex:0g"], "no hex"),
+        (["a.jpg", "--payload", "none.bin"], "cannot be read"),
+        (["a.jpg", "--exposure", "1/0"], "no time"),
+        (["a.jpg", "--exposure", "-1"], "exposure_s must be positive"),
+        (["a.jpg", "--corners", "1,2,3"], "takes 8 numbers"),
+        (["a.jpg", "--screen", "nope"], "no profile"),
+        (["a.jpg", "--picture", "nope.png"], "no such picture"),
+        (["a.dng", "--preset", "video-1080p"], "no.* has none|has none"),
+    ],
+)
+def test_mistakes_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], message: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = run(*args)
+    assert isinstance(result.exception, ReceiverError)
+    assert result.exception.hint
+    assert re.search(message, str(result.exception))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_scenes_refuse_nonsense(small: Scene) -> None:
+    with pytest.raises(UsageError, match=r"exposure_s must be positive \(got 0\)"):
+        replace(small, exposure_s=0)
+    with pytest.raises(UsageError, match="no preset 'x'"):
+        preset("x")
+
+
+def test_sample_frames_are_what_their_readme_makes(tmp_path: Path) -> None:
+    import shlex
+
+    import rawpy
+
+    from rxcli.resources import data_dir
+
+    samples = data_dir("sample_frames")
+    commands = (samples / "README.md").read_text().replace("\\\n", " ").splitlines()
+    line = next(line for line in commands if line.startswith("vlc-rx simulate") and ".dng" in line)
+    args = shlex.split(line)[2:]
+    profile = args.index("--camera-profile") + 1
+    name, toml = args[0], args[profile]
+    args[0], args[profile] = str(tmp_path / name), str(tmp_path / toml)
+    result = run(*args)
+    assert result.exit_code == 0, result.output
+    with rawpy.imread(str(samples / name)) as kept, rawpy.imread(str(tmp_path / name)) as made:
+        # Another processor may round an exponential otherwise, and with it a few pixels.
+        assert (kept.raw_image_visible == made.raw_image_visible).mean() > 0.99
+    truth = name.replace(".dng", ".truth.json")
+    kept_truth, made_truth = (json.loads((folder / truth).read_text()) for folder in (samples, tmp_path))
+    assert made_truth["payload"] == kept_truth["payload"]
+    assert made_truth["frames"][0]["bursts"] == kept_truth["frames"][0]["bursts"]
+    assert (tmp_path / toml).read_text() == (samples / toml).read_text()
+
+
+def test_camera_profile_fits_the_capture(tmp_path: Path) -> None:
+    profile = tmp_path / "camera.toml"
+    result = run(str(tmp_path / "a.jpg"), *SMALL, "--preset", "phone-corrected", "--camera-profile", str(profile))
+    assert result.exit_code == 0, result.output
+    camera = load_profile(str(profile), CameraProfile)
+    truth = json.loads((tmp_path / "a.truth.json").read_text())["camera"]
+    assert camera.matches("Example", "Phone 12MP")
+    mode = camera.mode_for(truth["width"], truth["height"])
+    assert mode is not None
+    assert mode.line_delay_s == truth["line_delay_s"]
+    assert camera.lens is not None
+    assert camera.lens.distortion_already_corrected
+    assert [list(row) for row in camera.lens.camera_matrix] == truth["camera_matrix"]

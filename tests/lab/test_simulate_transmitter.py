@@ -1,0 +1,152 @@
+"""The transmitter against closed forms and the air interface's own numbers."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rxcli.errors import UsageError
+from rxcli.lab.simulate.pictures import load_picture, picture_names
+from rxcli.lab.simulate.transmitter import (
+    Link,
+    backlight_average,
+    choose_weights,
+    dimming_levels,
+    drive_screen,
+    export_waveforms,
+    light_spread,
+)
+from rxcli.profiles import ScreenProfile, load_profile
+
+
+@pytest.fixture(scope="module")
+def screen() -> ScreenProfile:
+    return load_profile("paper-34k6", ScreenProfile)
+
+
+def link_of(screen: ScreenProfile, w: int = 5, message: bytes | None = None) -> Link:
+    return Link(screen, np.full(screen.columns, w), 1, message)
+
+
+@pytest.mark.parametrize(("sigma", "n"), [(0.45, 20), (0.5, 100), (0.45, 8)])
+def test_light_of_a_segment_is_one_pitch_of_light(sigma: float, n: int) -> None:
+    places = np.linspace(-0.5, 1.5, 40001)
+    energy = light_spread(places, n, sigma).sum(axis=0) * (places[1] - places[0]) * n
+    np.testing.assert_allclose(energy, 1.0, rtol=1e-6)
+
+
+def test_neighbours_give_fifteen_percent_in_the_middle_and_half_at_the_edge() -> None:
+    spread = light_spread(np.array([10.5 / 20, 11 / 20]), 20, 0.45)
+    share = 1 - spread[:, 10] / spread.sum(axis=1)
+    # Closed form: 2 g(1) / (1 + 2 g(1)) with g(1) = exp(-1 / (2 * 0.45^2)).
+    g = np.exp(-0.5 / 0.45**2)
+    assert share[0] == pytest.approx(2 * g / (1 + 2 * g), rel=1e-3)
+    assert share[0] == pytest.approx(0.15, abs=0.01)
+    assert share[1] == pytest.approx(0.5, abs=0.01)
+
+
+def test_sharp_segments_light_only_themselves() -> None:
+    np.testing.assert_array_equal(light_spread((np.arange(5) + 0.5) / 5, 5, 0), np.eye(5))
+
+
+def test_dimming_takes_the_brightest_subpixel_of_each_segment() -> None:
+    picture = np.zeros((8, 20, 3))
+    picture[3, 7, 2] = 0.6
+    picture[3, 8, 0] = 0.2
+    levels = dimming_levels(picture, 4, 10)
+    assert levels[1, 3] == 0.6
+    assert levels[1, 4] == 0.2
+    assert levels.sum() == pytest.approx(0.8)
+
+
+def test_compensated_picture_times_backlight_is_the_picture(screen: ScreenProfile) -> None:
+    picture = np.full((screen.height_px, screen.width_px, 3), 128, np.uint8)
+    picture[:, ::2] = 90
+    drive = drive_screen(screen, picture, 5)
+    shown = drive.transmittance * backlight_average(drive.levels, screen, *picture.shape[:2])[..., None]
+    wanted = (picture / 255) ** 2.2
+    inner = (slice(100, -100), slice(80, -80))
+    # The brightest pixels find a little less than the average light between segments, and cannot do more than open.
+    np.testing.assert_allclose(shown[inner][:, 1::2], wanted[inner][:, 1::2], rtol=0.08)
+    np.testing.assert_allclose(shown[inner][:, ::2], wanted[inner][:, ::2], rtol=0.02)
+
+
+def test_light_while_lit_makes_up_for_the_dark_slots(screen: ScreenProfile) -> None:
+    drive = drive_screen(screen, np.full((768, 1366, 3), 255, np.uint8), (2,) * 10 + (8,) * 10)
+    np.testing.assert_allclose(drive.lit_light * drive.weights / 10, drive.levels)
+
+
+def test_weights_follow_the_dimming_and_are_checked() -> None:
+    levels = np.array([[0.04, 0.3, 1.0], [0.0, 0.72, 0.5]])
+    assert choose_weights("dimming", levels).tolist() == [1, 7, 9]
+    assert choose_weights(4, levels).tolist() == [4, 4, 4]
+    with pytest.raises(UsageError, match=r"one for each of 3 columns \(got 2\)"):
+        choose_weights((4, 5), levels)
+    with pytest.raises(UsageError, match=r"1\.\.9"):
+        choose_weights(10, levels)
+
+
+def test_slots_are_laid_out_as_the_air_interface_says(screen: ScreenProfile) -> None:
+    # All payload bits 0, then all 1: codewords 0 and 127 of weight 5, written out in the air interface.
+    for message, word in ((b"\x00", "0000011111"), (b"\xff", "1000010111")):
+        slots = link_of(screen, message=message).slots(0, 260)[3]
+        assert "".join(map(str, slots)) == "0011100011" + "1111100000" + word * 24
+
+
+def test_a_burst_is_three_equal_packets_and_bursts_follow_without_gap(screen: ScreenProfile) -> None:
+    link = link_of(screen)
+    slots = link.slots(0, 2 * link.burst_slots)
+    first, second, third, fourth = (slots[:, i * 260 : (i + 1) * 260] for i in range(4))
+    np.testing.assert_array_equal(first, second)
+    np.testing.assert_array_equal(first, third)
+    assert (first != fourth).any(axis=1).all()
+    assert (slots.reshape(20, -1, 10).sum(axis=2) == 5).all()
+
+
+def test_any_window_of_slots_is_the_same_stream(screen: ScreenProfile) -> None:
+    link = link_of(screen)
+    stream = link.slots(-30, 2000)
+    assert not stream[:, :30].any()
+    for first, stop in ((-30, -5), (-3, 4), (779, 781), (700, 1700)):
+        np.testing.assert_array_equal(link.slots(first, stop), stream[:, first + 30 : stop + 30])
+
+
+def test_message_is_sent_burst_by_burst_and_column_by_column(screen: ScreenProfile) -> None:
+    message = bytes(range(256)) * 2
+    link = link_of(screen, message=message)
+    sent = np.concatenate([*link.payload(0), *link.payload(1)])
+    wanted = np.resize(np.unpackbits(np.frombuffer(message, np.uint8)), sent.size)
+    np.testing.assert_array_equal(sent, wanted)
+
+
+def test_waveforms_for_a_real_backlight(screen: ScreenProfile, tmp_path: Path) -> None:
+    import cv2
+
+    drive = drive_screen(screen, load_picture("bars", 1366, 768), 5)
+    link = link_of(screen)
+    files = export_waveforms(drive, link, 1, tmp_path / "lab")
+    assert all(path.is_file() for path in files)
+    slots = np.load(tmp_path / "lab" / "slots.npy")
+    np.testing.assert_array_equal(slots.T, link.slots(0, link.burst_slots))
+    with (tmp_path / "lab" / "slots.csv").open() as file:
+        rows = list(csv.reader(file))
+    assert rows[0][19] == "column_19"
+    np.testing.assert_array_equal(np.array(rows[1:], int), slots)
+    picture = cv2.imread(str(tmp_path / "lab" / "picture.png"))[..., ::-1]
+    np.testing.assert_array_equal(picture, drive.grey)
+
+
+@pytest.mark.parametrize("name", picture_names())
+def test_every_picture_fills_the_screen(name: str) -> None:
+    picture = load_picture(name, 136, 77)
+    assert picture.shape == (77, 136, 3)
+    assert picture.dtype == np.uint8
+    assert (picture.max() > 0) == (name != "black")
+
+
+def test_a_missing_picture_is_told_with_the_known_names() -> None:
+    with pytest.raises(UsageError, match=r"no-such\.png: no such picture.*astronaut"):
+        load_picture("no-such.png", 16, 16)

@@ -1,0 +1,324 @@
+"""Blind estimation against cameras that are known, and the reasons where nothing can be estimated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from rxcli.ingest import open_source
+from rxcli.lab.simulate.capture import prepare
+from rxcli.lab.simulate.isp import Isp
+from rxcli.lab.simulate.optics import Lens as SimulatedLens
+from rxcli.lab.simulate.optics import Pose
+from rxcli.lab.simulate.scenes import preset
+from rxcli.lab.simulate.sensor import Sensor
+from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile, shipped_profiles
+from rxcli.protocol import encode_packet, payload_bits
+from rxcli.receiver import camera as blind
+from rxcli.receiver import sampling
+from rxcli.receiver.camera.bend import BEND_PRECISION
+from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.receiver.screen import geometry
+from rxcli.types import Clock, FloatArray, Frame, Lens, RowProfiles
+
+SCREENS = tuple(shipped_profiles(ScreenProfile))
+LENGTHS = sorted({screen.packet_slots for screen in SCREENS})
+
+
+def phone(
+    screen: str, rows_per_slot: float, height: int, *, corrected: bool, upside_down: bool, k1: float, seed: int
+) -> tuple[Frame, FloatArray, dict[str, Any]]:
+    """A simulated phone's picture, its screen's corners in it, and the truth; upside down: turned by 180 degrees."""
+    profile = load_profile(screen, ScreenProfile)
+    width = height * 4 // 3
+    line_delay = 1 / (rows_per_slot * profile.slot_rate_hz)
+    scene = replace(
+        preset("phone-plain", profile),
+        sensor=Sensor(width, height, line_delay, "bayer", full_scale_e=260.0, black_level=64, white_level=1023),
+        lens=SimulatedLens(0.8, (k1, -0.5 * k1, 0.0003, -0.0002, 0.0)),
+        pose=Pose(fill=0.92, roll_deg=0.6, yaw_deg=2.0, pitch_deg=-1.5),
+        isp=Isp(tone="bt709", gain=2.0, sharpen=0.4, denoise_px=0.3, correct_distortion=corrected),
+        exposure_s=0.9 / profile.slot_rate_hz,
+        light_e_per_s=1.4e6 * profile.slot_rate_hz / 20000,
+        picture="coffee",
+    )
+    capture = prepare(scene, seed).frame(0)
+    truth = capture.truth
+    corners = np.array(truth["corners_sensor_px"])
+    if corrected:
+        camera = truth["camera"]
+        lens = Lens(np.array(camera["camera_matrix"]), np.array(camera["dist_coeffs"]), corrected=True)
+        corners = geometry.undistort(corners, lens)
+    pixels = capture.pixels
+    if upside_down:
+        pixels, corners = np.ascontiguousarray(pixels[::-1, ::-1]), np.array([width - 1, height - 1]) - corners
+    return Frame(pixels, "phone"), corners, truth
+
+
+def strips_of(frame: Frame, corners: FloatArray, n_columns: int = 20) -> blind.Strips:
+    """Strips of a frame as the pipeline makes them."""
+    column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
+    n_strips = sampling.strips_per_column(column_px)
+    outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height)
+    profiles = sampling.sample_rows(frame, outlines, "srgb")
+    return blind.strips_of(profiles, (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2, frame.width, frame.height)
+
+
+@pytest.mark.parametrize(
+    ("screen", "rows_per_slot", "height", "corrected", "upside_down", "k1"),
+    [
+        ("paper-17k3", 3.7, 960, False, False, -0.02),
+        ("paper-34k6", 2.6, 1080, True, False, 0.09),
+        ("paper-17k3", 3.4, 960, True, True, -0.06),
+        ("paper-8k65", 7.3, 960, False, True, 0.0),
+    ],
+)
+def test_unknown_phones_are_estimated(
+    screen: str, rows_per_slot: float, height: int, corrected: bool, upside_down: bool, k1: float
+) -> None:
+    frame, corners, truth = phone(
+        screen, rows_per_slot, height, corrected=corrected, upside_down=upside_down, k1=k1, seed=height
+    )
+    estimate = blind.estimate_camera(strips_of(frame, corners), SCREENS).estimate
+    assert estimate is not None
+    assert estimate.packet_slots == 20 + 10 * truth["payload_symbols"]
+    assert estimate.reversed == upside_down
+    error = estimate.rows_per_slot / rows_per_slot - 1
+    assert abs(error) < 5e-4
+    assert abs(error) < 5 * estimate.rows_per_slot_sd / rows_per_slot
+    assert estimate.exposure_slots == pytest.approx(0.9, abs=0.25)
+    assert estimate.corrected == corrected
+    if corrected:
+        assert _bend_error_slots(estimate, corners, truth, upside_down) < 0.05
+
+
+def _bend_error_slots(
+    estimate: blind.BlindEstimate, corners: FloatArray, truth: dict[str, Any], upside_down: bool
+) -> float:
+    """Standard deviation over the screen of the error of the row-time map, start and period aside, in slots."""
+    camera = truth["camera"]
+    width, height = camera["width"], camera["height"]
+    lens = blind.lens_of(estimate, width, height)
+    assert lens is not None
+    true = Lens(np.array(camera["camera_matrix"]), np.array(camera["dist_coeffs"]), corrected=True)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    points = np.stack(np.meshgrid(*(np.linspace(a, b, 15) for a, b in zip(low, high, strict=True))), axis=-1)
+    turned = np.array([width - 1, height - 1]) - points if upside_down else points
+    sensor = geometry.distort(turned, true)[..., 1]
+    if upside_down:
+        sensor = height - 1 - sensor
+    error = (geometry.distort(points, lens)[..., 1] - sensor).ravel()
+    line = np.stack([points[..., 1].ravel(), np.ones(error.size)], axis=1)
+    left = error - line @ np.linalg.lstsq(line, error, rcond=None)[0]
+    return float(left.std() / estimate.rows_per_slot)
+
+
+def test_bend_terms_are_the_lens_model_at_any_focal_length() -> None:
+    rng = np.random.default_rng(0)
+    width, height, focal = 800, 600, 530.0
+    points = rng.uniform([0, 0], [width, height], (50, 2))
+    coefficients = np.array([0.11, -0.08, 4e-4, -7e-4])
+    matrix = np.array([[focal, 0, 399.5], [0, focal, 299.5], [0, 0, 1]])
+    moved = geometry.distort(points, Lens(matrix, np.append(coefficients, 0.0), True))[:, 1] - points[:, 1]
+    scaled = coefficients * (width / focal) ** np.array([2, 4, 1, 1])
+    terms = blind.bend_terms(points[:, 0], points[:, 1], width, height)
+    np.testing.assert_allclose(scaled @ terms, moved, rtol=1e-9, atol=1e-9)
+
+
+def test_lenses_are_expected_to_bend_back() -> None:
+    def surprise(*coefficients: float) -> float:
+        bend = np.array(coefficients)
+        return float(bend @ BEND_PRECISION @ bend)
+
+    for k1 in (-0.2, 0.2):
+        assert surprise(k1, -k1, 0, 0) == pytest.approx((k1 / 0.3) ** 2)
+        assert surprise(k1, -k1, 0, 0) < surprise(k1, 0, 0, 0) < surprise(k1, k1, 0, 0)
+    np.testing.assert_allclose(BEND_PRECISION, BEND_PRECISION.T)
+    assert np.linalg.eigvalsh(BEND_PRECISION).min() > 0
+
+
+def test_structure_evidence_knows_packets_from_other_bits() -> None:
+    rng = np.random.default_rng(1)
+    bits = [rng.integers(0, 2, payload_bits(w, 11), dtype=np.uint8) for w in (3, 5, 7, 8)]
+    packets = np.stack([np.tile(encode_packet(b, w), 3) for b, w in zip(bits, (3, 5, 7, 8), strict=True)])
+    slots = packets[:, 37:300] + rng.normal(0, 0.15, (4, 263))
+    right = blind.structure_evidence(slots, 37, 130)
+    assert right > 100
+    wrong = [(slots, 41, 130), (slots, 37, 260), (1 - slots[:, ::-1], 0, 130), (rng.normal(size=(4, 263)), 37, 130)]
+    assert max(blind.structure_evidence(*case) for case in wrong) < 0.8 * right
+    assert blind.structure_evidence(rng.normal(size=(4, 263)), 37, 130) < blind.MIN_EVIDENCE
+
+
+def test_an_estimate_can_be_kept_as_a_profile() -> None:
+    estimate = blind.BlindEstimate(
+        rows_per_slot=5.0,
+        rows_per_slot_sd=0.001,
+        packet_slots=130,
+        reversed=False,
+        exposure_slots=0.8,
+        exposure_slots_sd=0.02,
+        bend=np.array([0.1, -0.2, 3e-4, -1e-4]),
+        bend_sd=np.full(4, 1e-3),
+        corrected=True,
+        evidence=400.0,
+        explained=0.9,
+    )
+    estimated = blind.summary(estimate, 17300.0)
+    assert estimated["line_delay_s"] == pytest.approx((1 / (5 * 17300), 0.001 / 5 / (5 * 17300)))
+    profile = blind.camera_profile(estimated, "mine", "Maker", "Phone X", 4032, 3024)
+    again = parse_profile(dump_profile(profile), CameraProfile, "mine")
+    assert again == profile
+    assert again.matches("maker", "phone x")
+    mode = again.mode_for(4032, 3024)
+    assert mode is not None
+    assert mode.exposure_s == pytest.approx(0.8 / 17300)
+    assert again.lens is not None
+    lens, kept = blind.lens_of(estimate, 4032, 3024), geometry.lens_for(again.lens, 4032, 3024)
+    points = np.array([[100.0, 200.0], [3900.0, 2800.0]])
+    assert lens is not None
+    np.testing.assert_allclose(geometry.distort(points, kept), geometry.distort(points, lens))
+
+
+def _flat_strips(light: FloatArray) -> blind.Strips:
+    n_rows = light.shape[1]
+    return blind.Strips(
+        light=light.astype(np.float32),
+        inside=np.ones(light.shape, np.float32),
+        x=np.broadcast_to(np.linspace(10, 790, light.shape[0])[:, None], light.shape),
+        rows=np.arange(n_rows, dtype=np.float64),
+        n_columns=20,
+        noise=blind.Noise(0.002**2, 0.0),
+        width=800,
+        height=n_rows,
+    )
+
+
+@pytest.mark.parametrize(
+    ("sides", "mosaic", "correction"),
+    [
+        (None, False, "unknown"),
+        (None, True, "no"),
+        ((0.2, 0.1), False, "unknown"),
+        ((0.014, 0.01), False, "likely"),
+        ((0.02, 0.01), False, "unknown"),
+        ((0.014, 0.01), True, "no"),
+        ((-0.2, 0.01), False, "no"),
+        ((0.2, 0.05), False, "no"),
+    ],
+)
+def test_sides_and_mosaics_say_whether_a_picture_was_corrected(
+    sides: tuple[float, float] | None, mosaic: bool, correction: str
+) -> None:
+    strips = replace(_flat_strips(np.ones((20, 40))), sides=sides, mosaic=mosaic)
+    assert strips.correction == correction
+    assert strips.bow == (sides if sides and abs(sides[0]) > 0.1 and sides[1] < 0.06 else None)
+
+
+def _striped(rng: np.random.Generator, n_rows: int) -> FloatArray:
+    slots = rng.integers(0, 2, (20, n_rows // 4 + 1)).astype(np.float64)
+    return np.repeat(np.repeat(slots, 4, axis=1)[:, :n_rows], 4, axis=0) * 0.3
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [("dark", "dark"), ("still", "no stripes"), ("part", "only a part"), ("random", "no packet header")],
+)
+def test_pictures_that_cannot_work_are_named(kind: str, words: str) -> None:
+    rng = np.random.default_rng(3)
+    n_rows = 800
+    light = rng.normal(0.3 if kind != "dark" else 0.0, 0.002, (80, n_rows))
+    if kind == "part":
+        light[:, :300] = _striped(rng, 300) + rng.normal(0, 0.002, (80, 300))
+    if kind == "random":
+        light = _striped(rng, n_rows) + rng.normal(0, 0.002, light.shape)
+    found = blind.estimate_camera(_flat_strips(light), SCREENS)
+    assert found.estimate is None
+    assert words in found.reason
+
+
+def test_no_screens_is_a_mistake_of_the_caller() -> None:
+    with pytest.raises(ValueError, match="screens"):
+        blind.estimate_camera(_flat_strips(np.zeros((80, 200))), ())
+
+
+@pytest.mark.parametrize("columns", [20, 100])
+def test_columns_are_counted_by_their_width(columns: int) -> None:
+    rng = np.random.default_rng(columns)
+    screens = [load_profile(name, ScreenProfile) for name in ("paper-34k6", "wide-100")]
+    bits = rng.integers(0, 2, (columns, payload_bits(5, 24)), dtype=np.uint8)
+    slots = np.concatenate([np.stack([encode_packet(b, 5) for b in bits])] * 2, axis=1).astype(np.float64)
+    place = (np.arange(160) + 0.5) / 160 * columns
+    spread = screens[columns == 100].light_spread
+    light = np.exp(-((place[:, None] - np.arange(columns) - 0.5) ** 2) / (2 * spread**2)) @ slots
+    light = np.repeat(light * rng.uniform(0.02, 0.3, (160, 1)), 3, axis=1) + rng.normal(0, 0.01, (160, 3 * 520))
+    profiles = RowProfiles(
+        light=light.reshape(20, 8, -1).astype(np.float32),
+        inside=np.ones((20, 8, light.shape[1]), bool),
+        rows=np.arange(light.shape[1]),
+        sensor_row=None,
+        count=np.full((20, 8), 30.0, np.float32),
+        noise_floor=1e-4,
+        noise_slope=0.0,
+    )
+    clock = Clock(3.0, 1.0, 260, -0.5, 520, 0, np.zeros(2, np.int64), np.zeros(20), 5.0)
+    assert blind.likely_columns(profiles, clock, screens).columns == columns
+
+
+def test_rows_against_the_readout_are_turned_and_back() -> None:
+    rng = np.random.default_rng(5)
+    profiles = RowProfiles(
+        light=rng.random((2, 3, 7)).astype(np.float32),
+        inside=rng.random((2, 3, 7)) > 0.5,
+        rows=np.arange(4, 11),
+        sensor_row=np.arange(4, 11) + rng.random((2, 3, 7)),
+        count=np.ones((2, 3), np.float32),
+        noise_floor=1e-4,
+        noise_slope=0.0,
+    )
+    turned = blind.in_time_order(profiles, 20)
+    assert turned.rows.tolist() == list(range(9, 16))
+    assert turned.sensor_row is not None
+    np.testing.assert_array_equal(turned.light[..., 0], profiles.light[..., -1])
+    again = blind.in_time_order(turned, 20)
+    np.testing.assert_array_equal(again.rows, profiles.rows)
+    np.testing.assert_allclose(again.sensor_row, profiles.sensor_row)
+
+
+CAPTURES = [
+    ("phone_coffee_8k65", "paper-8k65", 20, 18),
+    ("phone_astronaut_17k3", "paper-17k3", 20, 15),
+    ("phone_motorcycle_17k3_near", "paper-17k3", 20, 19),
+]
+
+
+@pytest.mark.parametrize(("name", "screen", "sent", "floor"), CAPTURES)
+@pytest.mark.parametrize("scale", [1.0, 0.6])
+def test_captures_of_unknown_cameras_decode(
+    shared_captures: Path, name: str, screen: str, sent: int, floor: int, scale: float
+) -> None:
+    """As stored, and as a messenger's copy: no metadata, 60 % of the size."""
+    import json
+
+    truth = json.loads((shared_captures / f"{name}.truth.json").read_text())
+    frame = next(iter(open_source(str(shared_captures / truth["capture"]))))
+    camera = truth["camera"]
+    lens = Lens(np.array(camera["camera_matrix"]), np.array(camera["dist_coeffs"]), corrected=True)
+    corners = geometry.undistort(np.array(truth["corners_sensor_px"]), lens)
+    if scale != 1.0:
+        small = cv2.resize(frame.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        frame, corners = Frame(small, name), (corners + 0.5) * scale - 0.5
+    result = next(receive([frame], ReceiverOptions(screens=SCREENS, corners=corners, cae="never")))
+    assert result.screen_profile == screen
+    assert result.line_delay_s == pytest.approx(camera["line_delay_s"] / scale, rel=1.5e-3)
+    right = sum(
+        packet.payload in {payload[column.column] for payload in truth["payload"].values()}
+        for column in result.columns
+        for packet in column.packets
+    )
+    assert right >= floor - (3 if scale != 1.0 else 0)
+    assert sent == len(result.columns)

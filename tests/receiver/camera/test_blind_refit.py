@@ -1,0 +1,145 @@
+"""The camera once more from decoded slots, and the choice between several estimates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rxcli.protocol import encode_packet, payload_bits
+from rxcli.receiver import camera as blind
+from rxcli.types import Clock, FloatArray
+
+WIDTH, ROWS, COLUMNS, LENGTH = 1600, 1200, 20, 130
+ROWS_PER_SLOT, EXPOSURE, START = 4.2, 1.7, -7.3
+BEND = np.array([-0.22, 0.1, 4e-4, -3e-4])
+
+
+def _strips(rng: np.random.Generator, bend: FloatArray, reverse: bool) -> tuple[blind.Strips, FloatArray]:
+    """Strips of a textured picture whose sensor rows are bent, and the slots (C, N) that they show."""
+    bits = [rng.integers(0, 2, payload_bits(w, 11), dtype=np.uint8) for w in rng.integers(3, 8, COLUMNS)]
+    lit = np.stack([np.tile(encode_packet(b, _weight(b)), 3)[:300] for b in bits]).astype(np.float64)
+    n = 4 * COLUMNS
+    x = np.broadcast_to(((np.arange(n) + 0.5) * WIDTH / n)[:, None], (n, ROWS))
+    rows = np.arange(ROWS, dtype=np.float64)
+    across, down = (x - (WIDTH - 1) / 2) / WIDTH, (rows - (ROWS - 1) / 2) / WIDTH
+    square = across**2 + down**2
+    k1, k2, p1, p2 = bend
+    moved = WIDTH * (down * (k1 * square + k2 * square**2) + p1 * (square + 2 * down**2) + 2 * p2 * across * down)
+    time = (rows + moved - START) / ROWS_PER_SLOT
+    light = np.zeros((n, ROWS))
+    for offset in (np.arange(40) + 0.5) / 40 - 0.5:
+        slot = np.clip(np.floor(time + offset * EXPOSURE).astype(int), 0, lit.shape[1] - 1)
+        light += lit[np.arange(n)[:, None] // 4, slot] / 40
+    picture = 0.2 * np.exp(np.cumsum(rng.normal(0, 0.01, (n, ROWS)), axis=1))
+    light = picture * light + rng.normal(0, 0.003, light.shape)
+    strips = blind.Strips(
+        light=light.astype(np.float32),
+        inside=np.ones(light.shape, np.float32),
+        x=x,
+        rows=rows,
+        n_columns=COLUMNS,
+        noise=blind.Noise(0.003**2, 0.0),
+        width=WIDTH,
+        height=ROWS,
+    )
+    return (blind.in_readout_order(strips) if reverse else strips), lit
+
+
+def _weight(bits: np.ndarray) -> int:
+    return next(w for w in (3, 4, 5, 6, 7) if payload_bits(w, 11) == bits.size)
+
+
+def _estimate(bend: FloatArray, reverse: bool) -> blind.BlindEstimate:
+    """A first estimate: a period that is off by a thousandth, half of the bend, an exposure too short."""
+    turned = bend * np.array([1.0, 1.0, -1.0, 1.0]) if reverse else bend
+    return blind.BlindEstimate(
+        rows_per_slot=1.001 * ROWS_PER_SLOT,
+        rows_per_slot_sd=0.001,
+        packet_slots=LENGTH,
+        reversed=reverse,
+        exposure_slots=1.3,
+        exposure_slots_sd=0.05,
+        bend=0.9 * turned,
+        bend_sd=np.full(4, 1e-3),
+        corrected=bool(bend.any()),
+        evidence=300.0,
+        explained=0.5,
+    )
+
+
+def _clock(estimate: blind.BlindEstimate) -> Clock:
+    return Clock(
+        rows_per_slot=estimate.rows_per_slot,
+        exposure_slots=estimate.exposure_slots,
+        packet_slots=LENGTH,
+        row0=START - 0.6,
+        n_slots=300,
+        first_slot=0,
+        burst=np.zeros(3, np.int64),
+        delay_slots=np.zeros(COLUMNS),
+        lock=5.0,
+    )
+
+
+@pytest.mark.parametrize(("bend", "reverse"), [(np.zeros(4), False), (BEND, False), (BEND, True)])
+def test_decoded_slots_correct_a_first_estimate(bend: FloatArray, reverse: bool) -> None:
+    strips, lit = _strips(np.random.default_rng(11), bend, reverse)
+    estimate = _estimate(bend, reverse)
+    found, moved_slots = blind.refit(strips, estimate, _clock(estimate), lit.astype(np.float32))
+    assert found.rows_per_slot == pytest.approx(ROWS_PER_SLOT, rel=2e-4)
+    assert abs(found.rows_per_slot - ROWS_PER_SLOT) < 4 * found.rows_per_slot_sd
+    assert found.exposure_slots == pytest.approx(EXPOSURE, rel=0.06)
+    assert found.corrected == bool(bend.any())
+    assert 0.1 < moved_slots < 2
+    if bend.any():
+        turned = bend * np.array([1.0, 1.0, -1.0, 1.0]) if reverse else bend
+        assert found.bend[0] == pytest.approx(turned[0], abs=0.01)
+
+
+def test_a_bend_that_is_none_is_taken_out() -> None:
+    strips, lit = _strips(np.random.default_rng(12), np.zeros(4), False)
+    wrong = replace(_estimate(np.zeros(4), False), bend=np.array([0.01, 0.02, 0.0, 0.0]), corrected=True)
+    found, _ = blind.refit(strips, wrong, _clock(wrong), lit.astype(np.float32))
+    assert not found.corrected
+    assert not found.bend.any()
+    assert found.rows_per_slot == pytest.approx(ROWS_PER_SLOT, rel=2e-4)
+
+
+def test_slots_that_explain_nothing_change_nothing() -> None:
+    strips, lit = _strips(np.random.default_rng(13), np.zeros(4), False)
+    estimate = _estimate(np.zeros(4), False)
+    found, moved_slots = blind.refit(strips, estimate, _clock(estimate), np.full_like(lit, 0.5, np.float32))
+    assert found is estimate
+    assert moved_slots == 0.0
+
+
+@pytest.mark.parametrize(("tone", "power", "exponent"), [("srgb", 1.0, 2.2), ("srgb", 2.2, 1.0), ("linear", 1.0, 1.0)])
+def test_light_that_bends_over_the_slots_tells_the_tone_curve(tone: str, power: float, exponent: float) -> None:
+    strips, lit = _strips(np.random.default_rng(15), np.zeros(4), False)
+    estimate = _estimate(np.zeros(4), False)
+    bent = replace(strips, light=np.maximum(strips.light, 0) ** np.float32(power), tone=tone)
+    found, _ = blind.refit(bent, estimate, _clock(estimate), lit.astype(np.float32))
+    assert found.tone is not None
+    assert found.tone[0] == pytest.approx(exponent, rel=0.2)
+    assert abs(found.tone[0] - exponent) < 2 * found.tone[1]
+    assert blind.is_linear(found.tone) == (exponent < 1.5)
+    assert blind.summary(found, 17300.0)["tone_exponent"] == found.tone
+
+
+def test_values_that_are_known_to_be_light_tell_no_tone_curve() -> None:
+    strips, lit = _strips(np.random.default_rng(15), np.zeros(4), False)
+    estimate = _estimate(np.zeros(4), False)
+    found, _ = blind.refit(strips, estimate, _clock(estimate), lit.astype(np.float32))
+    assert found.tone is None
+    assert "tone_exponent" not in blind.summary(found, 17300.0)
+
+
+def test_the_file_tells_the_least_exposure() -> None:
+    strips, lit = _strips(np.random.default_rng(14), np.zeros(4), False)
+    told = replace(_estimate(np.zeros(4), False), least_exposure_slots=2.0)
+    found, _ = blind.refit(strips, told, _clock(told), lit.astype(np.float32))
+    assert found.exposure_slots == 2.0
+    assert found.exposure_slots_sd == 0.0
+    assert "exposure_s" not in blind.summary(found, 17300.0)

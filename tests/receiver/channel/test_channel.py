@@ -1,0 +1,388 @@
+"""The light model against numeric integration and links whose every slot is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from row_profiles import Link, Shot, random_link, row_profiles, sigma_of, slot_odds
+
+from rxcli.protocol import slot_patterns
+from rxcli.receiver import channel, sync
+from rxcli.receiver.channel.words import _innovations
+from rxcli.types import Clock, SlotSamples
+
+FloatArray = NDArray[np.float64]
+Q = 4
+
+
+def true_clock(shot: Shot, packet_slots: int, n_columns: int) -> Clock:
+    """The clock that the shot was made with, its grid starting at the first row."""
+    before = int(np.floor(shot.start_slot))
+    n_slots = int(np.ceil(shot.n_rows / shot.rows_per_slot)) + 1
+    first_slot = before % packet_slots
+    n_copies = -(-(first_slot + n_slots) // packet_slots)
+    burst = (before // packet_slots + np.arange(n_copies)) // 3
+    return Clock(
+        rows_per_slot=shot.rows_per_slot,
+        exposure_slots=shot.exposure_slots,
+        packet_slots=packet_slots,
+        row0=(before - shot.start_slot) * shot.rows_per_slot,
+        n_slots=n_slots,
+        first_slot=first_slot,
+        burst=burst - burst[0],
+        delay_slots=np.zeros(n_columns),
+        lock=10.0,
+    )
+
+
+def true_slots(link: Link, shot: Shot, n_slots: int) -> NDArray[np.float32]:
+    before = int(np.floor(shot.start_slot))
+    return link.slots()[:, before : before + n_slots].astype(np.float32)
+
+
+def model_for(shot: Shot, sigma: float, floor: float) -> channel.LightModel:
+    memory = channel.memory_for(shot.exposure_slots)
+    return channel.LightModel(
+        floor=floor,
+        sigma=sigma,
+        shot=0.0,
+        spread=np.tile([shot.crosstalk, 1.0, shot.crosstalk], (shot.n_strips, 1)),
+        taps=channel.exposure_taps(shot.exposure_slots, 1 / Q, memory, Q),
+    )
+
+
+def scene(shot: Shot, seed: int, w: list[int] | None = None) -> tuple[Link, Clock, SlotSamples, channel.LightModel]:
+    rng = np.random.default_rng(seed)
+    link = random_link(rng, w or [5, 3, 7, 4, 6, 5], 5)
+    profiles = row_profiles(link, shot, rng)
+    now = true_clock(shot, link.packet_slots, len(link.w))
+    samples = sync.sample_slots(profiles, now, Q)
+    sigma = sigma_of(profiles) / np.sqrt(max(shot.rows_per_slot / Q, 1.0))
+    return link, now, samples, model_for(shot, sigma, shot.ambient)
+
+
+def numeric_taps(exposure: float, blur: float, memory: int, q: int) -> FloatArray:
+    """Slot n covers 0..1; sample k's instants lie around -memory/2 + (k + 1/2)/q; both boxes by brute force."""
+    instants = (np.arange(500) + 0.5) / 500 - 0.5
+    out = np.zeros((q, memory + 1))
+    for k in range(q):
+        t = -memory / 2 + (k + 0.5) / q + blur * instants[:, None] + exposure * instants[None, :]
+        slot = np.floor(t).astype(int) + memory
+        inside = (slot >= 0) & (slot <= memory)
+        out[k] = np.bincount(slot[inside], minlength=memory + 1) / t.size
+    return out
+
+
+@pytest.mark.parametrize("blur", [0.01, 0.25, 0.6])
+@pytest.mark.parametrize(("exposure", "memory"), [(0.05, 1), (0.5, 1), (1.08, 1), (1.08, 3), (2.2, 3), (4.0, 5)])
+def test_exposure_taps_against_numeric_integration(exposure: float, memory: int, blur: float) -> None:
+    taps = channel.exposure_taps(exposure, blur, memory, Q)
+    np.testing.assert_allclose(taps, numeric_taps(exposure, blur, memory, Q), atol=4e-3)
+
+
+@pytest.mark.parametrize(("exposure", "memory"), [(0.01, 1), (0.7, 1), (2.6, 3), (4.7, 5)])
+@pytest.mark.parametrize("q", [1, 2, 4, 7])
+def test_exposure_taps_keep_the_energy(exposure: float, memory: int, q: int) -> None:
+    """As long as exposure and blur fit the memory, each sample's weights add up to one, and so do each slot's."""
+    taps = channel.exposure_taps(exposure, 0.25, memory, q)
+    assert (taps >= 0).all()
+    np.testing.assert_allclose(taps.sum(axis=1), 1.0, atol=1e-9)
+    np.testing.assert_allclose(taps, taps[::-1, ::-1], atol=1e-9)
+    assert taps.sum() == pytest.approx(q)
+
+
+@pytest.mark.parametrize("exposure", [1e-6, 0.2, 1.0, 1.08, 1.3, 2.0, 2.6, 3.0, 4.0])
+def test_memory_covers_the_exposure(exposure: float) -> None:
+    memory = channel.memory_for(exposure)
+    assert memory in {1, 3, 5}
+    taps = channel.exposure_taps(exposure, 1 / Q, memory, Q)
+    assert taps.sum(axis=1).min() > 0.83
+    assert channel.memory_for(exposure) <= channel.memory_for(exposure + 1.0)
+
+
+def test_crosstalk_of_the_specification() -> None:
+    """With equal drive about 15 % of the light at a column's middle comes from its neighbours, half at its edge."""
+    shares = channel.spread_matrix(101, 0.45)
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0)
+    assert shares[50, 0] + shares[50, 2] == pytest.approx(0.15, abs=0.01)
+    assert shares[0, 0] == pytest.approx(0.5, abs=0.02)
+    assert shares[-1, 2] == pytest.approx(0.5, abs=0.02)
+    np.testing.assert_allclose(shares, shares[::-1, ::-1], atol=1e-12)
+
+
+def test_no_spread_is_no_crosstalk() -> None:
+    np.testing.assert_allclose(channel.spread_matrix(5, 0.0), np.tile([0.0, 1.0, 0.0], (5, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("ambient", [0.0, 0.03, 0.2])
+@pytest.mark.parametrize("exposure", [0.3, 1.08])
+def test_floor_is_the_room_light(ambient: float, exposure: float) -> None:
+    shot = Shot(ambient=ambient, exposure_slots=exposure, texture=0.3, sigma=0.003)
+    _, now, samples, _ = scene(shot, seed=1)
+    assert channel.estimate_floor(samples, now) == pytest.approx(ambient, abs=0.002)
+
+
+def test_sigma_is_the_noise_of_a_dark_sample() -> None:
+    """Dark parts of a picture: a tenth of the light is left."""
+    for sigma in (0.0005, 0.002):
+        shot = Shot(rows_per_slot=16.0, n_rows=3000, level=2e-4, sigma=sigma)
+        _, _, samples, model = scene(shot, seed=2)
+        found = channel.estimate_sigma(samples, shot.ambient, 1e-6)
+        assert found == pytest.approx(model.sigma, rel=0.2)
+        assert channel.estimate_sigma(samples, shot.ambient, 1.0) == 1.0
+
+
+CLEAN = {
+    "plain": Shot(sigma=0.002),
+    "textured": Shot(texture=0.3, sigma=0.002),
+    "short": Shot(exposure_slots=0.3, texture=0.2),
+    "two rows a slot": Shot(rows_per_slot=2.4, n_rows=400, texture=0.1),
+    "crosstalk": Shot(crosstalk=0.1, texture=0.2),
+}
+
+
+@pytest.mark.parametrize("thorough", [True, False])
+@pytest.mark.parametrize("kind", CLEAN)
+def test_clean_slots_have_the_right_sign(kind: str, thorough: bool) -> None:
+    shot = replace(CLEAN[kind], start_slot=12.3)
+    right = []
+    for seed in range(6):
+        link, now, samples, model = scene(shot, seed)
+        lit = true_slots(link, shot, now.n_slots)
+        idea = np.abs(lit - np.float32(0.1))
+        found = channel.slot_likelihoods(samples, now, model, idea, np.arange(6), thorough=thorough)
+        llr = slot_odds(found.metrics, model.memory)
+        inner = slice(3, now.n_slots - 3)
+        right.append(((llr > 0) == (lit > 0.5))[:, inner].ravel())
+    assert np.concatenate(right).mean() > (0.999 if shot.crosstalk == 0 else 0.995)
+
+
+def test_likelihoods_start_from_nothing_but_contrast() -> None:
+    shot = Shot(texture=0.3, sigma=0.005, start_slot=12.3)
+    link, now, samples, model = scene(shot, seed=3)
+    contrast = sync.contrast(samples.light, samples.valid, Q, model.sigma)
+    first = slot_odds(channel.first_metrics(*contrast, model.taps), model.memory)
+    lit = true_slots(link, shot, now.n_slots)
+    idea = (1 / (1 + np.exp(-first))).astype(np.float32)
+    llr = slot_odds(channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics, model.memory)
+    inner = slice(3, now.n_slots - 3)
+    wrong_first = ((first > 0) != (lit > 0.5))[:, inner].mean()
+    wrong_then = ((llr > 0) != (lit > 0.5))[:, inner].mean()
+    assert wrong_first < 0.1
+    assert wrong_then < 0.01
+
+
+@pytest.mark.parametrize("late", [-0.2, -0.05, 0.0, 0.05, 0.2])
+def test_timing_tells_how_late_the_clock_is(late: float) -> None:
+    found = []
+    for seed in range(5):
+        shot = Shot(texture=0.2, sigma=0.005, start_slot=12.3)
+        rng = np.random.default_rng(seed)
+        link = random_link(rng, [5, 3, 7, 4, 6, 5], 5)
+        profiles = row_profiles(link, shot, rng)
+        now = true_clock(shot, 70, 6)
+        model = model_for(shot, 0.005, shot.ambient)
+        lit = true_slots(link, shot, now.n_slots)
+        off = replace(now, row0=now.row0 + late * now.rows_per_slot)
+        samples = sync.sample_slots(profiles, off, Q)
+        timing = channel.slot_likelihoods(samples, off, model, lit, np.arange(6)).timing
+        numerator, denominator = timing.sum(axis=0)
+        found.append(numerator / denominator)
+        moved = sync.corrected(off, timing)
+        assert abs(moved.row0 - now.row0) <= abs(off.row0 - now.row0) + 0.02 * now.rows_per_slot
+    if late == 0.0:
+        assert abs(np.mean(found)) < 0.01
+    else:
+        assert 0.3 < np.mean(found) / late < 1.3
+
+
+@pytest.mark.parametrize("factor", [0.3, 3.0])
+def test_brightness_does_not_matter(factor: float) -> None:
+    shot = Shot(texture=0.3, sigma=0.004, ambient=0.02, start_slot=12.3)
+    link, now, samples, model = scene(shot, seed=4)
+    lit = true_slots(link, shot, now.n_slots)
+    idea = np.abs(lit - np.float32(0.1))
+    brighter = replace(samples, light=samples.light * np.float32(factor))
+    scaled = replace(model, floor=model.floor * factor, sigma=model.sigma * factor)
+    one = slot_odds(channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics, 1)
+    other = slot_odds(channel.slot_likelihoods(brighter, now, scaled, idea, np.arange(6)).metrics, 1)
+    np.testing.assert_allclose(other, one, rtol=0.05, atol=0.3)
+
+
+def test_columns_asked_for_are_those_of_the_whole() -> None:
+    shot = Shot(texture=0.3, sigma=0.004, crosstalk=0.1)
+    link, now, samples, model = scene(shot, seed=5)
+    lit = true_slots(link, shot, now.n_slots)
+    whole = channel.slot_likelihoods(samples, now, model, lit, np.arange(6))
+    two = SlotSamples(samples.light[[1, 4]], samples.valid[[1, 4]], samples.samples_per_slot)
+    some = channel.slot_likelihoods(two, now, model, lit, np.array([1, 4]))
+    np.testing.assert_allclose(some.metrics, whole.metrics[[1, 4]], rtol=1e-5, atol=1e-4)
+    assert whole.metrics.shape == (6, now.n_slots + model.memory, 2 << model.memory)
+    assert whole.snr.shape == (6, now.n_slots)
+
+
+def test_more_noise_is_less_signal_to_noise() -> None:
+    ratios = []
+    for sigma in (0.001, 0.01, 0.1):
+        shot = Shot(sigma=sigma, texture=0.05)
+        link, now, samples, model = scene(shot, seed=6)
+        lit = true_slots(link, shot, now.n_slots)
+        ratios.append(float(np.median(channel.slot_likelihoods(samples, now, model, lit, np.arange(6)).snr)))
+    assert ratios[0] > ratios[1] > 4 * ratios[2] > 0
+
+
+def hostile(kind: str, samples: SlotSamples) -> SlotSamples:
+    light = np.zeros_like(samples.light)
+    valid = samples.valid
+    if kind == "constant":
+        light[:] = 0.4
+    elif kind == "saturated":
+        light[:] = 1.0
+    elif kind == "one lit sample":
+        light[2, 1, 200] = 1.0
+    elif kind == "zero rows":
+        light = samples.light.copy()
+        light[..., 100:300] = 0.0
+    elif kind == "nothing seen":
+        valid = np.zeros_like(valid)
+    elif kind == "huge":
+        light = samples.light * np.float32(1e6)
+    elif kind == "tiny":
+        light = samples.light * np.float32(1e-9)
+    return SlotSamples(light, valid, samples.samples_per_slot)
+
+
+@pytest.mark.parametrize("idea", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("thorough", [True, False])
+@pytest.mark.parametrize(
+    "kind", ["zeros", "constant", "saturated", "one lit sample", "zero rows", "nothing seen", "huge", "tiny"]
+)
+def test_hostile_light_gives_finite_likelihoods(kind: str, thorough: bool, idea: float) -> None:
+    _, now, samples, _ = scene(Shot(), seed=7)
+    samples = hostile(kind, samples)
+    floor = channel.estimate_floor(samples, now)
+    sigma = channel.estimate_sigma(samples, floor, 1e-5)
+    model = model_for(Shot(), sigma, floor)
+    lit = np.full((6, now.n_slots), idea, np.float32)
+    contrast = sync.contrast(samples.light, samples.valid, Q, model.sigma)
+    first = channel.first_metrics(*contrast, model.taps)
+    found = channel.slot_likelihoods(samples, now, model, lit, np.arange(6), thorough=thorough)
+    for values in (first, found.metrics, found.snr, found.timing):
+        assert np.isfinite(values).all()
+    if kind == "nothing seen":
+        assert (found.metrics == 0).all()
+        assert (found.snr == 0).all()
+
+
+def test_metrics_of_independent_slots() -> None:
+    llr = np.random.default_rng(0).normal(0, 3, (2, 30)).astype(np.float32)
+    for memory in (1, 3):
+        metrics = channel.metrics_of(llr, memory)
+        assert metrics.shape == (2, 30 + memory, 2 << memory)
+        newest = slot_patterns(memory)[:, -1] == 1
+        np.testing.assert_allclose((metrics[..., newest] - metrics[..., ~newest])[:, :30].max(axis=2), llr, rtol=1e-5)
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_metrics_of_copies_are_added(memory: int) -> None:
+    """Four copies of seventy slots, the first from its slot 33 on; the last is another burst."""
+    now = Clock(5.0, 1.0, 70, 0.0, 180, 33, np.array([0, 0, 0, 1]), np.zeros(2), 9.0)
+    rng = np.random.default_rng(0)
+    metrics = rng.normal(0, 1, (2, 180 + memory, 2 << memory))
+    found = channel.by_burst(metrics, now, memory)
+    assert found.shape == (2, 2, 70 + memory, 2 << memory)
+    at = 50  # seen in copies 0, 1 and 2, on grid slots 17, 87 and 157
+    np.testing.assert_allclose(found[0, :, at], metrics[:, 17] + metrics[:, 87] + metrics[:, 157])
+    early = 20  # not seen in copy 0
+    np.testing.assert_allclose(found[0, :, early], metrics[:, 57] + metrics[:, 127])
+    # The header after a copy tells of the copy's last slots: its first metrics are added at the end.
+    np.testing.assert_allclose(found[0, :, 70], metrics[:, 37] + metrics[:, 107] + metrics[:, 177])
+    assert (found[:, :, :memory] == 0).all()
+
+
+@pytest.mark.parametrize(("deviation", "length"), [(0.1, 0.7), (0.5, 3.0)])
+def test_innovations_are_those_of_a_gaussian_process(deviation: float, length: float) -> None:
+    rng = np.random.default_rng(0)
+    n = 12
+    gain, noise = rng.uniform(0.1, 1, n), rng.uniform(0.01, 0.2, n)
+    apart = np.abs(np.arange(n)[:, None] - np.arange(n)) / 2
+    covariance = deviation**2 * np.exp(-apart / length) * gain[:, None] * gain + np.diag(noise)
+    residual = rng.multivariate_normal(np.zeros(n), covariance)
+    density = -(residual @ np.linalg.solve(covariance, residual) + np.linalg.slogdet(covariance)[1]) / 2
+    by_time = (values.astype(np.float32)[:, None, None] for values in (residual, gain, noise))
+    (found,) = _innovations(*by_time, ((deviation, length),))
+    assert found[0, 0] == pytest.approx(density, rel=1e-4, abs=1e-3)
+
+
+def words_in_doubt(
+    lit: FloatArray, now: Clock, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Every symbol that is seen whole, with its word and three that have a lit slot elsewhere; the word anywhere."""
+    places, words = [], []
+    for start in range(-now.first_slot % 10, now.n_slots - 9, 10):
+        copy, slot = divmod(start + now.first_slot, now.packet_slots)
+        if slot < 20:
+            continue
+        for column in range(len(lit)):
+            sent = (lit[column, start : start + 10] > 0.5).astype(np.uint8)
+            others = []
+            for _ in range(3):
+                other = sent.copy()
+                other[rng.choice(np.flatnonzero(sent))] = 0
+                other[rng.choice(np.flatnonzero(sent == 0))] = 1
+                others.append(other)
+            places.append((now.burst[copy], column, (slot - 20) // 10))
+            words.append(rng.permutation(np.stack([sent, *others])))
+    first = np.unique(np.array(places), axis=0, return_index=True)[1]
+    return np.array(places)[first], np.stack(words)[first]
+
+
+def right_words(shot: Shot, seed: int) -> list[bool]:
+    """Of every symbol, whether the corrections like the word that was sent best."""
+    link, now, samples, model = scene(shot, seed)
+    lit = true_slots(link, shot, now.n_slots)
+    places, words = words_in_doubt(lit, now, np.random.default_rng(seed))
+    every = np.ones(words.shape[:2], bool)
+    found = channel.word_corrections(samples, now, model, lit, np.arange(6), places, words, every)
+    right = []
+    for (burst, column, symbol), choice in zip(places, words, strict=True):
+        copies = np.flatnonzero(now.burst == burst) * now.packet_slots + 20 + 10 * symbol - now.first_slot
+        starts = [at for at in copies if 0 <= at <= now.n_slots - 10]
+        score = sum(choice @ found[column, at : at + 10] for at in starts)
+        right.append(bool((choice[score.argmax()] == lit[column, starts[0] : starts[0] + 10]).all()))
+    return right
+
+
+@pytest.mark.parametrize("exposure", [0.6, 1.08, 2.0])
+def test_the_light_tells_words_apart(exposure: float) -> None:
+    """In noise in which a word is often mistaken for one of three others by chance alone."""
+    calm = Shot(texture=0.3, sigma=0.05, start_slot=12.3, exposure_slots=exposure)
+    assert np.mean(right_words(calm, 8) + right_words(calm, 9)) > 0.95
+    # Nothing but noise: one of four is right by chance.
+    dark = replace(calm, level=1e-4)
+    assert np.mean(right_words(dark, 8) + right_words(dark, 9)) < 0.6
+
+
+def test_words_are_weighed_alike_at_any_brightness_and_cut_by_the_grid() -> None:
+    shot = Shot(texture=0.3, sigma=0.02, ambient=0.02, start_slot=12.3)
+    link, now, samples, model = scene(shot, seed=9)
+    lit = true_slots(link, shot, now.n_slots)
+    every = np.argwhere(np.ones((int(now.burst.max()) + 1, 6, 5)))
+    words = np.tile(np.array([[1] * 5 + [0] * 5, [1] * 4 + [0] * 5 + [1]], np.uint8), (len(every), 1, 1))
+    likely = np.ones(words.shape[:2], bool)
+    one = channel.word_corrections(samples, now, model, lit, np.arange(6), every, words, likely)
+    brighter = replace(samples, light=samples.light * np.float32(3))
+    scaled = replace(model, floor=model.floor * 3, sigma=model.sigma * 3)
+    other = channel.word_corrections(brighter, now, scaled, lit, np.arange(6), every, words, likely)
+    assert one.shape == lit.shape
+    assert np.isfinite(one).all()
+    np.testing.assert_allclose(other, one, atol=0.05)
+    # Only the two slots in which the words differ are corrected, and nothing where one word is likely.
+    assert {int(slot) for slot in (np.flatnonzero(np.abs(one).max(axis=0)) + now.first_slot) % 10} == {4, 9}
+    likely[:, 1] = False
+    assert not channel.word_corrections(samples, now, model, lit, np.arange(6), every, words, likely).any()
+    nothing = channel.word_corrections(samples, now, model, lit, np.arange(6), every[:0], words[:0], likely[:0])
+    assert not nothing.any()

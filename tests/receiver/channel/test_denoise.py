@@ -1,0 +1,451 @@
+"""The auto-encoder's input contract, the model folder, inference, and the gate in the receiver."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rxcli.errors import ProfileError
+from rxcli.lab.benchmark.trial import Trial, simulate_trial
+from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
+from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
+from rxcli.receiver import still as reception
+from rxcli.receiver.channel import denoise, metrics_of
+from rxcli.receiver.channel.denoise import COLUMN_FEATURES, STRIP_FEATURES, Scene, load_denoiser, network_inputs
+from rxcli.receiver.locate import Stages, find_camera, find_corners, find_lock
+from rxcli.resources import data_dir
+from rxcli.results.truth import Score
+from rxcli.types import Clock, FrameResult, SlotSamples
+
+N_COLUMNS, N_STRIPS, Q = 3, 5, 4
+N_SYMBOLS, W = 5, 5
+PACKET = 20 + 10 * N_SYMBOLS
+EXPOSURE = 1.2
+
+
+def sent(rng: np.random.Generator) -> np.ndarray:
+    """(C, 2 packets) slots of two copies."""
+    bits = rng.integers(0, 2, (N_COLUMNS, N_SYMBOLS * bits_per_symbol(W)), dtype=np.uint8)
+    return np.stack([np.tile(encode_packet(b, W), 2) for b in bits])
+
+
+def through_exposure(slots: np.ndarray, exposure: float) -> np.ndarray:
+    """(C, N * Q) by brute force: 64 instants of every sample's exposure, half lit beyond the ends."""
+    n = slots.shape[1]
+    centres = (np.arange(n * Q) + 0.5) / Q
+    instants = centres[:, None] + ((np.arange(64) + 0.5) / 64 - 0.5) * exposure
+    index = np.floor(instants).astype(int)
+    values = slots[:, np.clip(index, 0, n - 1)].astype(float)
+    return np.where((index < 0) | (index >= n), 0.5, values).mean(axis=2)
+
+
+def scene_of(slots: np.ndarray, rng: np.random.Generator, *, noise: float = 0.005, rows: float = 0.0) -> Scene:
+    """Columns in front of a slowly changing picture, rightly believed; every row with an offset of its own."""
+    shape = through_exposure(slots, EXPOSURE)
+    place = (np.arange(N_STRIPS) + 0.5) / N_STRIPS - 0.5
+    spread = np.exp(-((place[:, None] - np.arange(-1, 2)) ** 2) / (2 * 0.45**2))
+    around = np.pad(shape, ((1, 1), (0, 0)))
+    light = sum(spread[None, :, k, None] * around[k : k + len(slots), None] for k in range(3))
+    picture = 0.3 + 0.1 * np.sin(np.arange(shape.shape[1]) / 90 + place[:, None] * 5)
+    light = 0.01 + light * picture + noise * rng.standard_normal(light.shape)
+    light += rows * rng.standard_normal(light.shape[-1])
+    clock = Clock(5.0, EXPOSURE, PACKET, 0.0, slots.shape[1], 0, np.zeros(2, np.int64), np.zeros(len(slots)), 9.0)
+    return Scene(
+        samples=SlotSamples(light.astype(np.float32), np.ones(light.shape, np.float32), Q),
+        clock=clock,
+        lit=slots.astype(np.float32),
+        metrics=metrics_of(9.0 * (2.0 * slots - 1), 1),
+        w=np.full(len(slots), W),
+        floor=0.01,
+        sigma=noise,
+        shot=1e-6,
+        spread=spread,
+    )
+
+
+@pytest.fixture
+def scene() -> Scene:
+    rng = np.random.default_rng(3)
+    return scene_of(sent(rng), rng)
+
+
+def widths(names: tuple[str, ...]) -> list[int]:
+    return [int(found.group(1)) if (found := re.search(r"\[(\d+)\]", name)) else 1 for name in names]
+
+
+def feature(strips: np.ndarray, name: str) -> np.ndarray:
+    """(B, S, k, N) the features of one name."""
+    number = STRIP_FEATURES.index(name)
+    start = sum(widths(STRIP_FEATURES)[:number])
+    return strips[:, :, start : start + widths(STRIP_FEATURES)[number]]
+
+
+def column_feature(columns: np.ndarray, name: str) -> np.ndarray:
+    """(B, N) a feature of columns that is one number a slot."""
+    return columns[:, sum(widths(COLUMN_FEATURES)[: COLUMN_FEATURES.index(name)])]
+
+
+def test_the_contract_names_every_feature(scene: Scene) -> None:
+    strips, columns = network_inputs(scene, np.array([0, 2]))
+    n_named = [sum(widths(names)) for names in (STRIP_FEATURES, COLUMN_FEATURES)]
+    assert strips.shape == (2, N_STRIPS, n_named[0], 2 * PACKET)
+    assert columns.shape == (2, n_named[1], 2 * PACKET)
+    assert strips.dtype == columns.dtype == np.float32
+    assert np.isfinite(strips).all()
+
+
+def test_headers_are_known_and_no_other_slot(scene: Scene) -> None:
+    _, columns = network_inputs(scene, np.array([1]))
+    np.testing.assert_array_equal(columns[0, 0, :10], 2 * np.array(HEADER) - 1)
+    np.testing.assert_array_equal(columns[0, 0, PACKET : PACKET + 10], 2 * np.array(HEADER) - 1)
+    assert not columns[0, 0, 10:PACKET].any()
+    np.testing.assert_array_equal(columns[0, 1:11].argmax(axis=0), np.arange(2 * PACKET) % 10)
+
+
+def test_neighbours_light_is_slots_through_the_exposure(scene: Scene) -> None:
+    strips, _ = network_inputs(scene, np.array([0, 1]))
+    shape = through_exposure(scene.lit, EXPOSURE).reshape(N_COLUMNS, -1, Q)
+    expected = scene.spread[:, 0, None, None] * shape[0] + scene.spread[:, 2, None, None] * shape[2]
+    np.testing.assert_allclose(np.moveaxis(feature(strips, "neighbours[4]")[1], 1, 2), expected, atol=0.02)
+    alone = scene.spread[:, 2, None, None] * shape[1]
+    np.testing.assert_allclose(np.moveaxis(feature(strips, "neighbours[4]")[0], 1, 2), alone, atol=0.02)
+
+
+def test_shares_count_up_to_a_factor(scene: Scene) -> None:
+    shares = replace(scene, spread=scene.spread / scene.spread.sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(
+        network_inputs(shares, np.array([1]))[0], network_inputs(scene, np.array([1]))[0], atol=1e-5
+    )
+    alone = replace(scene, spread=np.array([[0.0, 1.0, 0.0]] * N_STRIPS))
+    assert feature(network_inputs(alone, np.array([1]))[0], "neighbours[4]").max() < 1e-6
+
+
+def test_delayed_neighbours_move(scene: Scene) -> None:
+    delayed = replace(scene, clock=replace(scene.clock, delay_slots=np.array([1.0, 0.0, 1.0])))
+    on_time = feature(network_inputs(scene, np.array([1]))[0], "neighbours[4]")
+    late = feature(network_inputs(delayed, np.array([1]))[0], "neighbours[4]")
+    np.testing.assert_allclose(late[..., 1:], on_time[..., :-1], atol=1e-5)
+
+
+def test_own_light_is_the_columns_slots_through_the_exposure(scene: Scene) -> None:
+    strips, _ = network_inputs(scene, np.array([1]))
+    shape = through_exposure(scene.lit, EXPOSURE)[1].reshape(-1, Q)
+    expected = scene.spread[:, 1, None, None] * shape
+    np.testing.assert_allclose(np.moveaxis(feature(strips, "own[4]")[0], 1, 2), expected, atol=0.02)
+
+
+def test_right_beliefs_leave_noise_alone(scene: Scene) -> None:
+    strips, _ = network_inputs(scene, np.arange(N_COLUMNS))
+    inner = feature(strips, "residual[4]")[..., 5:-5]
+    assert abs(inner.mean()) < 0.1
+    assert 0.5 < inner.std() < 1.2
+
+
+@pytest.mark.parametrize("sent_state", [0, 1])
+def test_a_wrong_belief_stands_out(scene: Scene, sent_state: int) -> None:
+    """Light where the slot is believed dark, and the reverse."""
+    slot = 20 + int(np.flatnonzero(scene.lit[1, 20:] == sent_state)[5])
+    lit = scene.lit.copy()
+    lit[1, slot] = 1 - sent_state
+    residual = feature(network_inputs(replace(scene, lit=lit), np.array([1]))[0], "residual[4]")[0].mean(axis=(0, 1))
+    assert np.abs(residual).argmax() == slot
+    assert np.sign(residual[slot]) == 2 * sent_state - 1
+
+
+def test_what_all_columns_show_at_one_instant_is_taken_off() -> None:
+    """Most of the rows' own light goes, and hardly anything of what the columns send."""
+    rng = np.random.default_rng(8)
+    slots = np.concatenate([sent(rng) for _ in range(4)])
+    rows = 0.008
+    scene = scene_of(slots, rng, rows=rows)
+    taken = scene.samples.light - denoise.without_row_light(scene).samples.light
+    own = np.random.default_rng(8)
+    _ = [sent(own) for _ in range(4)]
+    own.standard_normal(scene.samples.light.shape)
+    true = rows * own.standard_normal(scene.samples.light.shape[-1])
+    inner = slice(20, -20)
+    left = (true - taken)[..., inner]
+    assert left.std() < 0.6 * true[inner].std()
+    calm = scene_of(slots, rng)
+    spoiled = calm.samples.light - denoise.without_row_light(calm).samples.light
+    assert spoiled[..., inner].std() < 0.3 * rows
+
+
+def test_one_column_alone_has_no_row_light_to_tell(scene: Scene) -> None:
+    alone = scene_of(scene.lit[:1], np.random.default_rng(1))
+    np.testing.assert_array_equal(denoise.without_row_light(alone).samples.light, alone.samples.light)
+
+
+def test_slots_that_are_independent_keep_their_ratio() -> None:
+    llr = np.random.default_rng(1).normal(0, 3, (2, 50)).astype(np.float32)
+    for memory in (1, 3):
+        found = denoise._slot_llr(metrics_of(llr, memory), np.full(llr.shape, 0.5, np.float32))
+        np.testing.assert_allclose(found, llr, atol=1e-4)
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_ratios_of_slots_by_brute_force(memory: int) -> None:
+    """With all others known, a slot's ratio is a difference of sums of metrics."""
+    rng = np.random.default_rng(memory)
+    n = 12
+    metrics, slots = rng.normal(0, 2, (1, n + memory, 2 << memory)), rng.integers(0, 2, n)
+
+    def total(states: np.ndarray) -> float:
+        padded = np.pad(states, memory)
+        index = [int("".join(map(str, padded[i : i + memory + 1])), 2) for i in range(n + memory)]
+        return float(metrics[0, np.arange(n + memory), index].sum())
+
+    lit = np.where(slots == 1, 1 - 1e-5, 1e-5)[None].astype(np.float32)
+    found = denoise._slot_llr(metrics, lit)[0]
+    for slot in range(memory, n - memory):
+        lit_there, dark_there = (np.where(np.arange(n) == slot, state, slots) for state in (1, 0))
+        assert found[slot] == pytest.approx(total(lit_there) - total(dark_there), abs=1e-2)
+
+
+def test_only_the_own_belief_and_the_neighbours_are_looked_at(scene: Scene) -> None:
+    lit = scene.lit.copy()
+    lit[0] = 1 - lit[0]
+    far, near = (np.array([column]) for column in (2, 1))
+    name = "neighbours[4]"
+    before, after = (network_inputs(s, far)[0] for s in (scene, replace(scene, lit=lit)))
+    np.testing.assert_array_equal(feature(after, name), feature(before, name))
+    before, after = (network_inputs(s, near)[0] for s in (scene, replace(scene, lit=lit)))
+    assert np.abs(feature(after, name) - feature(before, name)).max() > 0.1
+
+
+def test_brightness_does_not_matter(scene: Scene) -> None:
+    """Twice the light with twice the noise is the same scene."""
+    twice = replace(
+        scene,
+        samples=replace(scene.samples, light=2 * scene.samples.light),
+        floor=2 * scene.floor,
+        sigma=2 * scene.sigma,
+        shot=2 * scene.shot,
+    )
+    columns = np.arange(N_COLUMNS)
+    np.testing.assert_allclose(network_inputs(twice, columns)[0], network_inputs(scene, columns)[0], atol=1e-4)
+
+
+SHIPPED = sorted(path.parent.name for path in data_dir("models").glob("*/model.toml"))
+
+
+def test_a_model_is_shipped() -> None:
+    assert denoise.DEFAULT_MODEL in SHIPPED
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_are_small_and_explained(name: str) -> None:
+    folder = data_dir("models") / name
+    denoiser = load_denoiser(name)
+    assert denoiser.card.name == name
+    assert (folder / denoiser.card.file).stat().st_size <= 2_000_000
+    assert denoiser.card.recipe["steps"] > 0
+    assert (folder / "README.md").is_file()
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_do_not_spoil_what_is_right(name: str) -> None:
+    rng = np.random.default_rng(3)
+    scene = scene_of(sent(rng), rng, noise=0.02)
+    corrections = load_denoiser(name).slot_corrections(scene, np.arange(N_COLUMNS))
+    assert corrections.shape == scene.lit.shape
+    corrected = 9.0 * (2 * scene.lit - 1) + corrections
+    assert ((corrected > 0) == (scene.lit > 0.5)).mean() > 0.99
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_contradict_wrong_beliefs(name: str) -> None:
+    """Where the light model is wrongly sure of a slot, the correction points the other way."""
+    rng = np.random.default_rng(4)
+    scene = scene_of(sent(rng), rng, noise=0.03)
+    wrong = rng.random(scene.lit.shape) < 0.04
+    wrong[:, np.arange(2 * PACKET) % PACKET < 20] = False
+    lit = np.where(wrong, 1 - scene.lit, scene.lit).astype(np.float32)
+    doubted = replace(scene, lit=lit, metrics=metrics_of(2.0 * (2 * lit - 1), 1))
+    towards = load_denoiser(name).slot_corrections(doubted, np.arange(N_COLUMNS)) * (2 * scene.lit - 1)
+    assert (towards[wrong] > 0).mean() > 0.8
+    assert towards[wrong].mean() > towards[~wrong].mean() + 0.5
+
+
+def test_slots_that_are_not_seen_and_preambles_are_left_alone(scene: Scene) -> None:
+    valid = scene.samples.valid.copy()
+    valid[..., : 26 * Q] = 0
+    hidden = replace(scene, samples=replace(scene.samples, valid=valid))
+    corrections = load_denoiser().slot_corrections(hidden, np.array([1]))
+    assert not corrections[:, :26].any()
+    assert not corrections[:, PACKET : PACKET + 20].any()
+    assert corrections[:, 26:PACKET].all()
+
+
+def test_columns_and_the_order_of_strips_do_not_touch_each_other(scene: Scene) -> None:
+    denoiser = load_denoiser()
+    together = denoiser.slot_corrections(scene, np.array([0, 1, 2]))
+    alone = denoiser.slot_corrections(scene, np.array([2]))
+    np.testing.assert_allclose(together[2], alone[0], atol=1e-3)
+    order = np.array([3, 0, 4, 1, 2])
+    samples = SlotSamples(scene.samples.light[:, order], scene.samples.valid[:, order], Q)
+    mixed = denoiser.slot_corrections(replace(scene, samples=samples, spread=scene.spread[order]), np.array([0, 1, 2]))
+    np.testing.assert_allclose(mixed, together, atol=1e-2)
+
+
+def test_the_session_is_made_when_first_needed_and_once(scene: Scene) -> None:
+    denoiser = load_denoiser()
+    assert "_session" not in vars(denoiser)
+    denoiser.slot_corrections(scene, np.array([0]))
+    session = vars(denoiser)["_session"]
+    denoiser.slot_corrections(scene, np.array([1]))
+    assert vars(denoiser)["_session"] is session
+    copy = pickle.loads(pickle.dumps(denoiser))
+    assert "_session" not in vars(copy)
+    np.testing.assert_array_equal(
+        copy.slot_corrections(scene, np.array([1])), denoiser.slot_corrections(scene, np.array([1]))
+    )
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    """A copy of the shipped model that may be damaged."""
+    return Path(shutil.copytree(data_dir("models") / denoise.DEFAULT_MODEL, tmp_path / "model"))
+
+
+def edit(model: Path, old: str, new: str) -> None:
+    text = (model / "model.toml").read_text()
+    assert old in text
+    (model / "model.toml").write_text(text.replace(old, new))
+
+
+def replace_weights(model: Path, data: bytes) -> None:
+    """Put other bytes in place of the weights, with their own checksum."""
+    before = load_denoiser(str(model)).card.sha256
+    (model / "model.onnx").write_bytes(data)
+    edit(model, before, hashlib.sha256(data).hexdigest())
+
+
+def test_a_missing_model_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ProfileError, match=r"nowhere.*no model can be read there.*vlc-rx train"):
+        load_denoiser(str(tmp_path / "nowhere"))
+
+
+def test_missing_weights_are_named(model: Path) -> None:
+    (model / "model.onnx").unlink()
+    with pytest.raises(ProfileError, match=r"model\.onnx: cannot be read"):
+        load_denoiser(str(model))
+
+
+def test_cut_weights_do_not_match_their_checksum(model: Path) -> None:
+    weights = model / "model.onnx"
+    weights.write_bytes(weights.read_bytes()[:-100])
+    with pytest.raises(ProfileError, match=r"does not match the checksum"):
+        load_denoiser(str(model))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('kind = "denoiser"', 'kind = "camera"'),
+        ("format = 1", "format = 2"),
+        ("format = 1", "format = 1\ncolour = 3"),
+        ("samples_per_slot = 4", "samples_per_slot = 8"),
+        ('"shot"', '"phase of the moon"'),
+        ("[contract]", "[contract"),
+    ],
+)
+def test_cards_are_strict(model: Path, old: str, new: str) -> None:
+    edit(model, old, new)
+    with pytest.raises(ProfileError, match=r"model\.toml"):
+        load_denoiser(str(model))
+
+
+def test_what_is_no_network_is_refused_when_it_is_needed(model: Path, scene: Scene) -> None:
+    replace_weights(model, b"not a network")
+    with pytest.raises(ProfileError, match="ONNX Runtime refuses it"):
+        load_denoiser(str(model)).slot_corrections(scene, np.array([0]))
+
+
+def test_a_foreign_network_is_refused(model: Path, scene: Scene) -> None:
+    onnx = pytest.importorskip("onnx", reason="onnx (extra train) makes the foreign network")
+    tensor = onnx.helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, [1, 3, None, None])
+    out = onnx.helper.make_tensor_value_info("label", onnx.TensorProto.FLOAT, [1, 3, None, None])
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Relu", ["image"], ["label"])], "foreign", [tensor], [out])
+    made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
+    replace_weights(model, made.SerializeToString())
+    with pytest.raises(ProfileError, match=r"its tensors .*image.* are not those of its contract"):
+        load_denoiser(str(model)).slot_corrections(scene, np.array([0]))
+
+
+@pytest.fixture(scope="module")
+def trials() -> dict[str, Trial]:
+    """A clean frame, and one whose long exposure leaves the receiver in doubt."""
+    clean, *_, long_exposure = SCENE_CLASSES
+    return {
+        "clean": simulate_trial(validation_scene(clean, "paper-17k3", 0), 1),
+        "hard": simulate_trial(validation_scene(long_exposure, "paper-17k3", 3), 1),
+    }
+
+
+def packets(result: FrameResult) -> list[str]:
+    return [packet.payload for column in result.columns for packet in column.packets]
+
+
+def received(trial: Trial, mode: str) -> tuple[FrameResult, Score]:
+    return trial.receive(trial.options(cae=mode))
+
+
+def test_a_clean_frame_goes_without(trials: dict[str, Trial]) -> None:
+    result, score = received(trials["clean"], "auto")
+    assert score.bit_errors == 0
+    assert result.denoiser is None
+    assert not any(column.denoised for column in result.columns)
+
+
+def test_always_runs_on_every_column_and_harms_none(trials: dict[str, Trial]) -> None:
+    result, score = received(trials["clean"], "always")
+    assert score.bit_errors == 0
+    assert result.denoiser is not None
+    assert result.denoiser["columns"] == 20
+    assert result.denoiser["kept"] == sum(column.denoised for column in result.columns)
+
+
+def test_doubtful_columns_get_a_second_opinion(trials: dict[str, Trial]) -> None:
+    never, without = received(trials["hard"], "never")
+    auto, with_it = received(trials["hard"], "auto")
+    assert never.denoiser is None
+    assert auto.denoiser is not None
+    assert 0 < auto.denoiser["columns"] <= 20
+    assert with_it.error_free >= without.error_free
+
+
+def test_the_receiver_goes_on_without_a_broken_model(trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch) -> None:
+    never, _ = received(trials["hard"], "never")
+
+    def broken() -> denoise.Denoiser:
+        raise ProfileError("models/strips/model.onnx: does not match its checksum", "install the package again")
+
+    monkeypatch.setattr(reception, "_denoiser", broken)
+    auto, _ = received(trials["hard"], "auto")
+    assert packets(auto) == packets(never)
+    assert auto.denoiser is not None
+    assert "does not match its checksum; install the package again" in auto.denoiser["message"]
+
+
+def test_columns_beyond_repair_are_not_asked(trials: dict[str, Trial]) -> None:
+    options = trials["hard"].options()
+    corners = find_corners(trials["hard"].frame, options)
+    camera, options = find_camera(trials["hard"].frame, corners, options, Stages())
+    lock = find_lock(trials["hard"].frame, corners, camera, options, Stages())
+    seen = reception.decode(lock, options.skip)
+    better, kept, report = reception.second_opinion(lock, seen, options)
+    assert report is not None
+    assert report["kept"] == len(kept) > 0
+    columns = sorted(kept)
+    doubt = [-part.posteriors.log_prob[:, columns].sum(axis=(0, 2)) for part in (seen, better)]
+    assert (doubt[1] < doubt[0]).all()
+    guessed = replace(seen.posteriors, log_prob=np.full_like(seen.posteriors.log_prob, -2.0))
+    assert reception.second_opinion(lock, replace(seen, posteriors=guessed), options)[2] is None

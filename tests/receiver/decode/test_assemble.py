@@ -1,0 +1,311 @@
+"""Results from posteriors made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.protocol import bits_per_symbol, bits_to_hex, indices_to_bits
+from rxcli.receiver.decode import assemble
+from rxcli.types import BurstPosteriors, Clock, ColumnResult, PacketResult, SlotSamples
+
+N_SYMBOLS, PACKET, Q = 3, 50, 4
+
+
+def clock_of(n_slots: int, first_slot: int, burst: list[int], n_columns: int = 2) -> Clock:
+    return Clock(
+        rows_per_slot=5.0,
+        exposure_slots=1.2,
+        packet_slots=PACKET,
+        row0=17.0,
+        n_slots=n_slots,
+        first_slot=first_slot,
+        burst=np.array(burst),
+        delay_slots=np.array([0.0, 1.5, 0.0, 0.0][:n_columns]),
+        lock=5.0,
+    )
+
+
+def samples_of(n_slots: int, n_columns: int = 2) -> SlotSamples:
+    shape = (n_columns, 2, n_slots * Q)
+    return SlotSamples(np.ones(shape, np.float32), np.ones(shape, np.float32), Q)
+
+
+def posteriors_of(
+    w: list[int], index: NDArray[np.int64], probability: float = 0.9999, w_probability: float = 0.9999
+) -> BurstPosteriors:
+    """Posteriors of (B, C, N) indices, each right with `probability`, its bits as sure as that."""
+    n_bursts, n_columns, n_symbols = index.shape
+    w_log_prob = np.full((n_columns, 9), np.log((1 - w_probability) / 8))
+    w_log_prob[np.arange(n_columns), np.array(w) - 1] = np.log(w_probability)
+    bit_llr = np.full((n_bursts, n_columns, n_symbols, 7), np.nan)
+    for column, weight in enumerate(w):
+        k = bits_per_symbol(weight)
+        bits = indices_to_bits(index[:, column].ravel(), weight).reshape(n_bursts, n_symbols, k)
+        bit_llr[:, column, :, :k] = (2.0 * bits - 1) * np.log(probability / (1 - probability))
+    return BurstPosteriors(
+        w=np.array(w),
+        w_log_prob=w_log_prob,
+        lit=np.zeros((n_bursts, n_columns, PACKET), np.float32),
+        index=index,
+        log_prob=np.full(index.shape, np.log(probability)),
+        bit_llr=bit_llr,
+        header_llr=np.full((n_bursts, n_columns), 20.0),
+    )
+
+
+def indices(w: list[int], n_bursts: int = 1) -> NDArray[np.int64]:
+    rng = np.random.default_rng(0)
+    columns = [rng.integers(0, 1 << bits_per_symbol(weight), (n_bursts, N_SYMBOLS)) for weight in w]
+    return np.stack(columns, axis=1)
+
+
+def snr(n_slots: int, value: float = 100.0, n_columns: int = 2) -> NDArray[np.float32]:
+    return np.full((n_columns, n_slots), value, np.float32)
+
+
+def results_of(
+    now: Clock,
+    posteriors: BurstPosteriors,
+    snr: NDArray[np.float32],
+    samples: SlotSamples,
+    min_confidence: float = 0.0,
+    support: float | NDArray[np.float32] = 10.0,
+) -> tuple[ColumnResult, ...]:
+    """Results where every slot of the grid has the same support unless told otherwise."""
+    told = np.broadcast_to(np.asarray(support, np.float32), snr.shape)
+    headerless = assemble.without_header(posteriors)
+    return assemble.column_results(now, posteriors, snr, samples, told, headerless, min_confidence)
+
+
+def test_a_sure_packet() -> None:
+    w = [5, 8]
+    index = indices(w)
+    columns = results_of(clock_of(120, 30, [0, 0, 0]), posteriors_of(w, index), snr(120), samples_of(120), 0)
+    assert [c.status for c in columns] == ["ok", "ok"]
+    assert [c.column for c in columns] == [0, 1]
+    assert [c.w for c in columns] == w
+    assert [c.snr_db for c in columns] == pytest.approx([20.0, 20.0])
+    assert [c.delay_slots for c in columns] == [0.0, 1.5]
+    assert [c.message for c in columns] == [None, None]
+    for column, result in enumerate(columns):
+        (packet,) = result.packets
+        assert packet.payload_bits == N_SYMBOLS * bits_per_symbol(w[column])
+        assert packet.payload == bits_to_hex(indices_to_bits(index[0, column], w[column]))
+        assert packet.copies == pytest.approx(120 / 50)
+        assert 0.99 < packet.confidence < 1
+        assert packet.ber_hat == pytest.approx(1e-4, rel=0.01)
+        assert packet.bit_errors is None
+
+
+def test_first_row_is_where_the_exposure_of_the_header_starts() -> None:
+    """Grid slot 0 is slot 30 of its packet; row0 has it in the middle of its exposure of 1.2 slots of 5 rows."""
+    columns = results_of(
+        clock_of(120, 30, [0, 0, 0]), posteriors_of([5, 5], indices([5, 5])), snr(120), samples_of(120), 0
+    )
+    rows = [c.packets[0].first_row for c in columns]
+    assert rows == pytest.approx([17 + (0.6 - 30) * 5, 17 + (0.6 - 30 + 1.5) * 5])
+
+
+def test_one_entry_a_burst_in_time_order() -> None:
+    index = indices([5, 5], n_bursts=2)
+    now = clock_of(180, 0, [0, 0, 1, 1])
+    columns = results_of(now, posteriors_of([5, 5], index), snr(180), samples_of(180), 0)
+    for column, result in enumerate(columns):
+        payloads = [bits_to_hex(indices_to_bits(index[burst, column], 5)) for burst in range(2)]
+        assert [packet.payload for packet in result.packets] == payloads
+        assert [packet.copies for packet in result.packets] == pytest.approx([2.0, 1.6])
+        assert result.packets[1].first_row - result.packets[0].first_row == pytest.approx(100 * 5)
+
+
+def test_a_payload_slot_that_was_never_seen_is_no_packet() -> None:
+    """37 slots of the second burst are seen: some of its payload is not."""
+    now = clock_of(137, 0, [0, 0, 1])
+    index = indices([5, 5], n_bursts=2)
+    columns = results_of(now, posteriors_of([5, 5], index), snr(137), samples_of(137), 0)
+    assert [len(c.packets) for c in columns] == [1, 1]
+
+
+def test_a_cut_copy_completes_another() -> None:
+    """The end of one copy and the beginning of the next hold every slot once: 60 slots from slot 25 on."""
+    columns = results_of(clock_of(60, 25, [0, 0]), posteriors_of([5, 5], indices([5, 5])), snr(60), samples_of(60), 0)
+    assert [c.packets[0].copies for c in columns] == pytest.approx([1.2, 1.2])
+
+
+def test_slots_off_the_screen_are_not_seen() -> None:
+    now, samples = clock_of(60, 0, [0, 0]), samples_of(60)
+    valid = samples.valid.copy()
+    valid[0, :, 30 * Q : 32 * Q] = 0
+    valid[1, 0, 30 * Q : 32 * Q] = 0
+    samples = replace(samples, valid=valid)
+    columns = results_of(now, posteriors_of([5, 5], indices([5, 5])), snr(60), samples, 0)
+    assert [len(c.packets) for c in columns] == [0, 1]
+    assert assemble.slots_seen(samples, now)[0, 0, 28:34].tolist() == [1, 1, 0, 0, 1, 1]
+    assert assemble.slots_seen(samples, now)[0, 1, :12].tolist() == [2] * 10 + [1] * 2
+
+
+@pytest.mark.parametrize(("min_confidence", "n_packets"), [(0.0, 1), (0.6, 1), (0.99, 0), (1.0, 0)])
+def test_packets_below_the_confidence_asked_for(min_confidence: float, n_packets: int) -> None:
+    posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.9)
+    columns = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), min_confidence)
+    assert [len(c.packets) for c in columns] == [n_packets] * 2
+
+
+@pytest.mark.parametrize(
+    ("probability", "status"), [(0.99, "ok"), (0.9, "ok"), (0.7, None), (0.93, "ok"), (0.55, "no_packet")]
+)
+def test_status_follows_the_confidence(probability: float, status: str | None) -> None:
+    """Below a half: weak, or nothing where too many bits are uncertain."""
+    posteriors = posteriors_of([5, 5], indices([5, 5]), probability=probability)
+    (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+    assert first.status == status or (status is None and first.status in {"weak", "no_packet"})
+    for packet in first.packets:
+        assert packet.ber_hat <= 0.2
+
+
+def test_a_packet_of_low_confidence_is_weak() -> None:
+    posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.95)
+    posteriors = replace(posteriors, log_prob=np.full((1, 2, N_SYMBOLS), np.log(0.1)))
+    (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+    assert first.status == "weak"
+    assert 0 < first.packets[0].confidence < 0.5
+
+
+def test_confidence_grows_with_the_log_probability_and_stays_below_one() -> None:
+    confidences = []
+    for log_prob in (-800.0, -10.0, -1.0, -0.1, -1e-3, -1e-12, 0.0):
+        posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.999)
+        posteriors = replace(posteriors, log_prob=np.full((1, 2, N_SYMBOLS), log_prob / N_SYMBOLS))
+        (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+        confidences.append(first.packets[0].confidence)
+    assert confidences == sorted(confidences)
+    assert confidences[0] >= 0
+    assert confidences[-1] < 1
+
+
+def test_slots_that_speak_against_a_packet_make_it_less_sure() -> None:
+    """Slots of its own payload only: the header, dimming symbol and other bursts have no say."""
+    now = clock_of(180, 0, [0, 0, 1, 1])
+    posteriors = posteriors_of([5, 5], indices([5, 5], n_bursts=2))
+
+    def confidences(slots: list[int]) -> list[float]:
+        support = np.full((2, 180), 10.0, np.float32)
+        support[0, slots] = -9.0
+        (first, _) = results_of(now, posteriors, snr(180), samples_of(180), support=support)
+        return [packet.confidence for packet in first.packets]
+
+    sure = confidences([])
+    assert confidences([3, 12, 53, 104]) == sure
+    one, two = confidences([25]), confidences([25, 77])
+    assert two[0] < one[0] < sure[0]
+    assert two[1] == one[1] == sure[1]
+
+
+def test_the_more_strips_a_column_has_the_less_its_posterior_counts() -> None:
+    """Strips err together: each adds to the posterior what it says alone."""
+    w, support = [5], np.full((1, 1, PACKET), 10.0, np.float32)
+    sure = posteriors_of(w, indices(w), 0.999)
+    found = [
+        float(assemble.confidence(assemble.evidence(sure, support, np.zeros(1, bool), n_strips)).squeeze())
+        for n_strips in (1, 2, 4, 7)
+    ]
+    assert 1 > found[0] > found[1] > found[2] > found[3] > 0.9
+
+
+def test_a_header_that_is_contradicted_stands_for_no_packet() -> None:
+    posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.9999)
+    posteriors = replace(posteriors, header_llr=np.array([[-20.0, 40.0]]))
+    first, second = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
+    assert not first.packets
+    assert first.w is None
+    assert first.status == "no_packet"
+    assert first.message is not None
+    assert "header" in first.message
+    assert second.packets
+
+
+def test_nothing_decoded_says_why() -> None:
+    unsure = posteriors_of([5, 5], indices([5, 5]), probability=0.5001)
+    now, samples = clock_of(120, 0, [0, 0, 0]), samples_of(120)
+    light = np.stack([snr(120)[0], snr(120, 0.01)[0]])
+    bright, dark = results_of(now, unsure, light, samples, 0)
+    assert (bright.status, dark.status) == ("no_packet", "dark")
+    assert bright.message is not None
+    assert "20.0 dB" in bright.message
+    assert dark.message is not None
+    assert "too little light" in dark.message
+    short = clock_of(30, 0, [0])
+    (few, _) = results_of(short, unsure, snr(30), samples_of(30), 0)
+    assert few.message is not None
+    assert "of 50 slots 20 are missing" in few.message
+    for column in (bright, dark, few):
+        assert "\n" not in (column.message or "")
+        assert "; " in (column.message or "")
+
+
+def test_a_column_never_seen_is_dark() -> None:
+    (first, _) = results_of(
+        clock_of(120, 0, [0, 0, 0]),
+        posteriors_of([5, 5], indices([5, 5]), probability=0.5001),
+        snr(120, 0.0),
+        samples_of(120),
+        0,
+    )
+    assert (first.status, first.snr_db, first.packets) == ("dark", None, ())
+
+
+@pytest.mark.parametrize(("w_probability", "known"), [(0.999, True), (0.6, False)])
+def test_an_unsure_weight_is_not_reported_alone(w_probability: float, known: bool) -> None:
+    unsure = posteriors_of([6, 5], indices([6, 5]), probability=0.5001, w_probability=w_probability)
+    (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), unsure, snr(120), samples_of(120), 0)
+    assert first.w == (6 if known else None)
+
+
+PACKET_RESULT = PacketResult(0.0, 1.0, 21, "000000", 0.99, 0.001)
+
+
+def column(status: str, with_packet: bool) -> ColumnResult:
+    return ColumnResult(0, status, packets=(PACKET_RESULT,) if with_packet else ())  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("columns", "expected"),
+    [
+        ([column("ok", True), column("weak", True)], "ok"),
+        ([column("ok", True), column("dark", False)], "ok"),
+        ([column("ok", True), column("no_packet", False)], "partial"),
+        ([column("no_packet", False), column("dark", False)], "no_signal"),
+        ([column("dark", False)], "no_signal"),
+        ([], "no_signal"),
+    ],
+)
+def test_frame_status(columns: list[ColumnResult], expected: str) -> None:
+    assert assemble.frame_status(tuple(columns)) == expected
+
+
+@pytest.mark.parametrize(
+    ("same", "quieter", "expected"),
+    [
+        ((1, 2), 2, [2]),
+        ((1, 2), 1, [1]),
+        ((1, 3), 3, []),
+        ((0, 1, 2, 3), 2, []),
+        ((), 2, []),
+    ],
+    ids=["of the left", "of the right", "not beside", "all send the same", "all differ"],
+)
+def test_a_column_that_shows_its_neighbour_has_no_packet(
+    same: tuple[int, ...], quieter: int, expected: list[int]
+) -> None:
+    now = clock_of(2 * PACKET, 0, [0, 0], n_columns=4)
+    w = [4, 4, 4, 4]
+    index = np.arange(4 * N_SYMBOLS).reshape(1, 4, N_SYMBOLS)
+    index[:, list(same)] = 50
+    snr = np.full((4, now.n_slots), 100.0, np.float32)
+    snr[quieter] = 30.0
+    results = results_of(now, posteriors_of(w, index), snr, samples_of(now.n_slots, 4), 0.0)
+    assert [c.column for c in results if not c.packets] == expected
+    assert all("the column beside it" in (results[column].message or "") for column in expected)

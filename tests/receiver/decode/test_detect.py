@@ -1,0 +1,371 @@
+"""The detector against enumeration of all symbol sequences, closed forms and its own calibration."""
+
+from __future__ import annotations
+
+from itertools import product
+from math import erf, log, pi, sqrt
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.protocol import (
+    HEADER,
+    WEIGHTS,
+    bits_per_symbol,
+    codebook,
+    dimming_symbol,
+    indices_to_bits,
+    slot_patterns,
+)
+from rxcli.receiver.channel import metrics_of
+from rxcli.receiver.decode.detect import (
+    detect,
+    detect_with_words,
+    first_guess,
+    plausible_weights,
+    slot_support,
+    weight_evidence,
+)
+
+FloatArray = NDArray[np.float64]
+#: One sample a slot, of that slot alone; memory 1.
+WHITE = np.array([[0.0, 1.0]])
+
+
+def log_sum(values: FloatArray) -> float:
+    top = values.max()
+    return float(top + np.log(np.exp(values - top).sum()))
+
+
+def only(w: int, n_columns: int = 1) -> NDArray[np.bool_]:
+    return np.tile(np.array(WEIGHTS) == w, (n_columns, 1))
+
+
+def sequences(w: int, n_symbols: int) -> NDArray[np.int64]:
+    return np.array(list(product(range(1 << bits_per_symbol(w)), repeat=n_symbols)))
+
+
+def packet_and_next(indices: NDArray[np.int64], w: int, memory: int) -> NDArray[np.int64]:
+    """Slots of packets (n, N indices) and of the header's start after them."""
+    n = indices.shape[0]
+    known = np.tile(np.concatenate([HEADER, dimming_symbol(w)]), (n, 1))
+    payload = codebook(w)[indices].reshape(n, -1)
+    return np.concatenate([known, payload, np.tile(HEADER[:memory], (n, 1))], axis=1).astype(np.int64)
+
+
+def path_metrics(metrics: FloatArray, indices: NDArray[np.int64], w: int) -> FloatArray:
+    """Log-likelihood of every sequence of `indices` (n, N), slot by slot; metrics (L, patterns)."""
+    memory = metrics.shape[1].bit_length() - 2
+    slots = packet_and_next(indices, w, memory)
+    total = np.zeros(len(indices))
+    for i in range(memory, slots.shape[1]):
+        pattern = sum(slots[:, i - back] << back for back in range(memory + 1))
+        total += metrics[i, pattern]
+    return total
+
+
+def box_exposure(exposure_slots: float, memory: int, n_samples: int = 4) -> FloatArray:
+    """(n_samples, memory + 1) share of each slot in samples spread over one slot, in the middle of the pattern."""
+    start = np.arange(-memory, 1.0)
+    centre = -memory / 2 + (np.arange(n_samples)[:, None] + 0.5) / n_samples
+    end = np.minimum(centre + exposure_slots / 2, start + 1)
+    return np.maximum(end - np.maximum(centre - exposure_slots / 2, start), 0) / exposure_slots
+
+
+def gaussian_metrics(observed: FloatArray, taps: FloatArray, sigma: float) -> FloatArray:
+    """Metrics (..., L, patterns) of observations (..., L, Q) of slots through `taps` (Q, memory + 1), oldest first."""
+    levels = slot_patterns(taps.shape[1] - 1) @ taps.T
+    return -((observed[..., None, :] - levels) ** 2).sum(axis=-1) / (2 * sigma**2)
+
+
+def observe(indices: NDArray[np.int64], w: int, taps: FloatArray, sigma: float, rng: np.random.Generator) -> FloatArray:
+    """Observations (1, n, L, Q) of packets (n, N indices) through `taps` (Q, memory + 1) and white noise."""
+    memory = taps.shape[1] - 1
+    slots = packet_and_next(indices, w, memory)
+    before = rng.integers(0, 2, (slots.shape[0], memory))
+    windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([before, slots], axis=1), memory + 1, axis=1)
+    clean = windows @ taps.T
+    return (clean + rng.normal(0, sigma, clean.shape))[None]
+
+
+def sent_through(
+    indices: NDArray[np.int64], w: int, taps: FloatArray, sigma: float, rng: np.random.Generator
+) -> FloatArray:
+    """Metrics (1, n, L, patterns) of packets through a channel that the receiver knows."""
+    return gaussian_metrics(observe(indices, w, taps, sigma, rng), taps, sigma)
+
+
+@pytest.mark.parametrize(
+    ("w", "n_symbols", "memory"),
+    [(1, 3, 1), (9, 3, 1), (2, 2, 1), (8, 2, 3), (1, 3, 3), (2, 2, 3), (9, 2, 5), (5, 1, 3)],
+)
+def test_agrees_with_enumeration_of_all_sequences(w: int, n_symbols: int, memory: int) -> None:
+    rng = np.random.default_rng([w, n_symbols, memory])
+    metrics = rng.normal(0, 1.5, (1, 4, 20 + 10 * n_symbols + memory, 2 << memory))
+    found = detect(metrics, only(w, 4))
+    evidence = weight_evidence(metrics, only(w, 4))
+    every = sequences(w, n_symbols)
+    k = bits_per_symbol(w)
+    bits = indices_to_bits(every.ravel(), w).reshape(len(every), n_symbols, k)
+    for column in range(4):
+        paths = path_metrics(metrics[0, column], every, w)
+        total = log_sum(paths)
+        assert evidence[column, w - 1] == pytest.approx(total - n_symbols * k * log(2), abs=2e-3)
+        share = np.exp(paths - total)
+        for symbol in range(n_symbols):
+            posterior = np.bincount(every[:, symbol], share, 1 << k)
+            assert found.index[0, column, symbol] == posterior.argmax()
+            assert found.log_prob[0, column, symbol] == pytest.approx(np.log(posterior.max()), abs=1e-3)
+            lit = posterior @ codebook(w)
+            at = 20 + 10 * symbol
+            np.testing.assert_allclose(found.lit[0, column, at : at + 10], lit, atol=1e-4)
+            ones = share @ bits[:, symbol]
+            llr = np.log(ones / (1 - ones))
+            np.testing.assert_allclose(found.bit_llr[0, column, symbol, :k], llr, rtol=1e-3, atol=1e-3)
+            assert np.isnan(found.bit_llr[0, column, symbol, k:]).all()
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_weight_probabilities_agree_with_enumeration(memory: int) -> None:
+    rng = np.random.default_rng(memory)
+    metrics = rng.normal(0, 0.4, (2, 3, 30 + memory, 2 << memory))
+    found = detect(metrics)
+    for column in range(3):
+        evidence = np.array(
+            [
+                sum(log_sum(path_metrics(burst[column], sequences(w, 1), w)) for burst in metrics)
+                - 2 * bits_per_symbol(w) * log(2)
+                for w in WEIGHTS
+            ]
+        )
+        np.testing.assert_allclose(found.w_log_prob[column], evidence - log_sum(evidence), atol=2e-3)
+        assert found.w[column] == evidence.argmax() + 1
+
+
+def test_what_is_known_of_a_packet_is_lit_as_sent() -> None:
+    metrics = np.random.default_rng(0).normal(0, 1, (1, 9, 41, 4))
+    for w in WEIGHTS:
+        lit = detect(metrics, only(w, 9)).lit[0, :, :20]
+        assert (lit == np.concatenate([HEADER, dimming_symbol(w)])).all()
+
+
+@pytest.mark.parametrize(("w", "sigma"), [(1, 0.45), (9, 0.45), (1, 0.6)])
+def test_symbol_error_rate_of_one_pulse_follows_theory(w: int, sigma: float) -> None:
+    """Weights 1 and 9 are orthogonal signals: P(right) = E[Phi(x + 1/sigma)^7], as eight of the ten words are sent."""
+    rng = np.random.default_rng([w, int(100 * sigma)])
+    tx = rng.integers(0, 8, (500, 20))
+    rx = detect(sent_through(tx, w, WHITE, sigma, rng), only(w, 500)).index[0]
+    x = np.linspace(-8, 12, 20001)
+    below = np.array([0.5 * (1 + erf(v / sqrt(2))) for v in x])
+    right = np.trapezoid(np.exp(-((x - 1 / sigma) ** 2) / 2) / sqrt(2 * pi) * below**7, x)
+    n, errors = tx.size, int((rx != tx).sum())
+    assert abs(errors - n * (1 - right)) < 4 * sqrt(n * right * (1 - right))
+
+
+@pytest.mark.parametrize("w", [3, 5, 8])
+def test_decisions_in_white_noise_are_those_of_a_correlator(w: int) -> None:
+    rng = np.random.default_rng(w)
+    tx = rng.integers(0, 1 << bits_per_symbol(w), (200, 12))
+    metrics = sent_through(tx, w, WHITE, 0.5, rng)
+    llr = metrics[0, :, 20:-1, 1] - metrics[0, :, 20:-1, 0]
+    correlation = llr.reshape(200, 12, 10) @ codebook(w).T
+    expected = correlation.argmax(axis=2)
+    assert 0.02 < (expected != tx).mean() < 0.6
+    assert (detect(metrics, only(w, 200)).index[0] == expected).all()
+
+
+def test_interference_that_is_known_costs_little() -> None:
+    """Half a slot of the one before: a receiver that ignores it errs often, the trellis hardly more than without."""
+    rng = np.random.default_rng(7)
+    tx = rng.integers(0, 128, (300, 10))
+    taps, sigma = np.array([[0.5, 0.5]]), 0.12
+    observed = observe(tx, 5, taps, sigma, rng)
+    metrics, ignoring = gaussian_metrics(observed, taps, sigma), gaussian_metrics(observed, WHITE, sigma)
+    errors = (detect(metrics, only(5, 300)).index[0] != tx).mean()
+    blind_errors = (detect(ignoring, only(5, 300)).index[0] != tx).mean()
+    assert errors < 0.03
+    assert blind_errors > 5 * errors
+
+
+@pytest.mark.parametrize(
+    ("taps", "sigma"),
+    [(WHITE, 0.4), (np.array([[0.35, 0.65]]), 0.3), (box_exposure(1.08, 1), 0.7), (box_exposure(2.2, 3), 0.5)],
+)
+def test_posteriors_are_calibrated(taps: FloatArray, sigma: float) -> None:
+    rng = np.random.default_rng(taps.size)
+    probability, right, bit_probability, bit_right = [], [], [], []
+    for w in (1, 4, 5, 8):
+        tx = rng.integers(0, 1 << bits_per_symbol(w), (150, 11))
+        found = detect(sent_through(tx, w, taps, sigma, rng), only(w, 150))
+        probability.append(np.exp(found.log_prob[0]).ravel())
+        right.append((found.index[0] == tx).ravel())
+        llr = found.bit_llr[0, :, :, : bits_per_symbol(w)].ravel()
+        bit_probability.append(1 / (1 + np.exp(-np.abs(llr))))
+        bit_right.append((llr > 0) == indices_to_bits(tx.ravel(), w).astype(bool))
+    for p, ok in ((probability, right), (bit_probability, bit_right)):
+        claimed, true = np.concatenate(p), np.concatenate(ok)
+        assert claimed.min() < 0.7 < 0.99 < claimed.max()
+        for low, high in ((0.0, 0.5), (0.5, 0.7), (0.7, 0.9), (0.9, 0.99), (0.99, 1.01)):
+            inside = (claimed >= low) & (claimed < high)
+            spread = sqrt(max(float((claimed * (1 - claimed))[inside].sum()), 1.0))
+            assert abs(float(true[inside].sum() - claimed[inside].sum())) < 4.5 * spread
+
+
+@pytest.mark.parametrize(("exposure_slots", "memory"), [(0.4, 1), (1.08, 1), (2.0, 3), (4.0, 5)])
+@pytest.mark.parametrize("w", WEIGHTS)
+def test_the_true_weight_is_never_dropped(w: int, exposure_slots: float, memory: int) -> None:
+    rng = np.random.default_rng([w, memory])
+    tx = rng.integers(0, 1 << bits_per_symbol(w), (100, 5))
+    for sigma in (0.05, 0.3):
+        kept = plausible_weights(sent_through(tx, w, box_exposure(exposure_slots, memory), sigma, rng), 20.0)
+        assert kept[:, w - 1].all()
+
+
+@pytest.mark.parametrize("w", WEIGHTS)
+def test_the_weight_is_found(w: int) -> None:
+    rng = np.random.default_rng(w)
+    tx = rng.integers(0, 1 << bits_per_symbol(w), (100, 5))
+    assert (detect(sent_through(tx, w, box_exposure(1.08, 1), 0.3, rng)).w == w).all()
+
+
+def test_hopeless_weights_are_dropped_and_a_wide_margin_keeps_all() -> None:
+    rng = np.random.default_rng(0)
+    metrics = sent_through(rng.integers(0, 128, (20, 11)), 5, WHITE, 0.1, rng)
+    assert plausible_weights(metrics, 20.0).sum() == 20
+    assert plausible_weights(metrics, 1e9).all()
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_the_first_guess_is_exact_where_slots_are_independent(memory: int) -> None:
+    rng = np.random.default_rng(memory)
+    w = np.array([3, 5, 8])
+    tx = np.stack([packet_and_next(rng.integers(0, 1 << bits_per_symbol(i), (1, 4)), i, 0)[0] for i in w])
+    llr = (4 * (2 * tx - 1) + rng.normal(0, 3, (2, *tx.shape))).astype(np.float32)
+    metrics = np.stack([metrics_of(burst, memory) for burst in llr])
+    guess = first_guess(metrics)
+    found = detect(metrics, np.array(WEIGHTS) == w[:, None])
+    np.testing.assert_allclose(guess, found.lit, atol=1e-4)
+    assert 0.01 < np.abs(guess[..., 20:] - tx[:, 20:]).mean() < 0.2
+
+
+@pytest.mark.parametrize(("exposure_slots", "memory"), [(0.4, 1), (1.08, 1), (1.3, 1)])
+@pytest.mark.parametrize("w", WEIGHTS)
+def test_the_first_guess_of_clean_slots_is_what_was_sent(w: int, exposure_slots: float, memory: int) -> None:
+    rng = np.random.default_rng([w, memory])
+    tx = rng.integers(0, 1 << bits_per_symbol(w), (40, 5))
+    guess = first_guess(sent_through(tx, w, box_exposure(exposure_slots, memory), 0.02, rng))
+    sent = packet_and_next(tx, w, 0)
+    assert guess.shape == (1, *sent.shape)
+    assert np.abs(guess[0] - sent).max() < 0.05
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_constants_added_to_all_patterns_of_a_slot_change_nothing(memory: int) -> None:
+    rng = np.random.default_rng(memory)
+    metrics = rng.normal(0, 1, (2, 5, 40 + memory, 2 << memory))
+    shifted = metrics + rng.normal(0, 300, metrics.shape[:3])[..., None]
+    one, other = detect(metrics), detect(shifted)
+    assert (one.w == other.w).all()
+    assert (one.index == other.index).all()
+    np.testing.assert_allclose(one.w_log_prob, other.w_log_prob, atol=5e-3)
+    np.testing.assert_allclose(one.bit_llr, other.bit_llr, rtol=2e-3, atol=5e-3)
+    assert (plausible_weights(metrics, 5.0) == plausible_weights(shifted, 5.0)).all()
+
+
+def test_columns_and_bursts_do_not_touch_one_another() -> None:
+    metrics = np.random.default_rng(3).normal(0, 1, (3, 4, 41, 4))
+    whole = detect(metrics)
+    alone = detect(metrics[:, 2:3])
+    assert alone.w[0] == whole.w[2]
+    assert (alone.index[:, 0] == whole.index[:, 2]).all()
+    one_burst = detect(metrics[1:2], only(4, 4))
+    assert (one_burst.index[0] == detect(metrics, only(4, 4)).index[1]).all()
+
+
+def extreme(kind: str, shape: tuple[int, ...]) -> FloatArray:
+    rng = np.random.default_rng(0)
+    if kind == "mixed":
+        return rng.choice([-1e6, 0.0, 1e6], shape)
+    if kind == "one huge":
+        metrics = np.zeros(shape)
+        metrics[:, :, 25, 1] = 1e6
+        return metrics
+    return np.full(shape, {"equal": 0.0, "huge": 1e6, "never": -1e6}[kind])
+
+
+@pytest.mark.parametrize("kind", ["equal", "huge", "never", "mixed", "one huge"])
+@pytest.mark.parametrize("memory", [1, 3, 5])
+def test_extreme_metrics_give_finite_posteriors(kind: str, memory: int) -> None:
+    metrics = extreme(kind, (2, 3, 40 + memory, 2 << memory))
+    for candidates in (None, plausible_weights(metrics, 20.0)):
+        found = detect(metrics, candidates)
+        assert np.isfinite(found.lit).all()
+        assert np.isfinite(found.log_prob).all()
+        assert (found.log_prob <= 0).all()
+        assert not np.isnan(found.w_log_prob).any()
+        for column, w in enumerate(found.w):
+            k = bits_per_symbol(int(w))
+            assert np.isfinite(found.bit_llr[:, column, :, :k]).all()
+            assert (found.index[:, column] < 1 << k).all()
+
+
+def test_nothing_seen_is_nothing_known() -> None:
+    found = detect(np.zeros((1, 1, 71, 4)), only(5))
+    np.testing.assert_allclose(found.bit_llr, 0, atol=1e-5)
+    np.testing.assert_allclose(np.exp(found.log_prob), 1 / 128, rtol=1e-4)
+    np.testing.assert_allclose(np.exp(detect(np.zeros((1, 1, 71, 4))).w_log_prob), 1 / 9, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "shape", [(1, 31, 4), (1, 1, 31, 3), (1, 1, 31, 2), (1, 1, 31, 256), (1, 1, 36, 4), (1, 1, 15, 4)]
+)
+def test_shapes_that_do_not_fit(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="metrics must"):
+        detect(np.zeros(shape))
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_doubtful_words_are_those_of_the_posterior(memory: int) -> None:
+    metrics = np.random.default_rng(memory).normal(0, 1.5, (2, 3, 60 + memory, 2 << memory))
+    w = np.array([5, 1, 5])
+    candidates = np.zeros((3, 9), bool)
+    candidates[np.arange(3), w - 1] = True
+    found, doubtful = detect_with_words(metrics, candidates, -0.3, 4)
+    places, words, log_prob = doubtful.places, doubtful.words, doubtful.log_prob
+    np.testing.assert_array_equal(found.index, detect(metrics, candidates).index)
+    at = tuple(places.T)
+    assert {tuple(place) for place in places} == {tuple(place) for place in np.argwhere(found.log_prob < -0.3)}
+    assert 0 < len(places) < found.log_prob.size
+    np.testing.assert_allclose(log_prob[:, 0], found.log_prob[at], atol=1e-4)
+    best = [codebook(int(w[column]))[found.index[burst, column, symbol]] for burst, column, symbol in places]
+    np.testing.assert_array_equal(words[:, 0], best)
+    assert (np.diff(log_prob, axis=1) <= 0).all()
+    assert (words.sum(axis=2) == w[places[:, 1], None]).all()
+
+
+@pytest.mark.parametrize("memory", [1, 3])
+def test_support_is_what_turning_a_single_slot_costs(memory: int) -> None:
+    rng = np.random.default_rng(5)
+    decided = rng.random((2, 3, 12)) < 0.5
+    metrics = rng.normal(size=(2, 3, 12 + memory, 1 << (memory + 1)))
+
+    def total(slots: NDArray[np.bool_]) -> float:
+        padded = np.pad(slots.astype(np.int64), (memory, memory))
+        patterns = [sum(padded[n + memory - back] << back for back in range(memory + 1)) for n in range(12 + memory)]
+        return float(metrics[1, 2, np.arange(12 + memory), patterns].sum())
+
+    support = slot_support(metrics, decided)
+    assert support.shape == decided.shape
+    for slot in range(12):
+        turned = decided[1, 2].copy()
+        turned[slot] = not turned[slot]
+        assert support[1, 2, slot] == pytest.approx(total(decided[1, 2]) - total(turned), abs=1e-5)
+
+
+def test_no_word_is_doubtful_where_all_are_sure() -> None:
+    metrics = np.zeros((1, 2, 41, 4))
+    metrics[..., 1::2] = 30.0 * np.tile(codebook(5)[3], 5)[:41, None][:, :1]
+    metrics[..., ::2] = -metrics[..., 1::2]
+    _, doubtful = detect_with_words(metrics, only(5, 2), -10.0, 4)
+    assert [len(part) for part in (doubtful.places, doubtful.words, doubtful.log_prob)] == [0, 0, 0]

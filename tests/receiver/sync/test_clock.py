@@ -1,0 +1,293 @@
+"""Clock, bursts and delays of links whose every slot is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_of
+
+from rxcli.protocol import encode_packet
+from rxcli.receiver import channel, sync
+from rxcli.receiver.decode import detect
+from rxcli.types import BurstPosteriors, Clock, RowProfiles, SlotSamples
+
+FloatArray = NDArray[np.float64]
+Q = 4
+
+
+def found_clock(profiles: RowProfiles, shot: Shot, packet_slots: int) -> Clock:
+    found = sync.find_clock(profiles, shot.rows_per_slot, shot.exposure_slots, packet_slots, sigma_of(profiles))
+    assert found is not None
+    return found
+
+
+def start_error(found: Clock, shot: Shot) -> float:
+    """Lateness of the headers in slots, modulo a packet; the truth is that slot 0 of the link starts a packet."""
+    header_row = found.row0 - found.first_slot * found.rows_per_slot
+    slot = shot.start_slot + (header_row - shot.first_row) / shot.rows_per_slot
+    half = found.packet_slots / 2
+    return float((slot + half) % found.packet_slots - half)
+
+
+def received(
+    profiles: RowProfiles, shot: Shot, now: Clock, rounds: int = 2
+) -> tuple[Clock, BurstPosteriors, SlotSamples]:
+    """Light model and detection in turn, the clock corrected after each."""
+    samples = sync.sample_slots(profiles, now, Q)
+    memory = channel.memory_for(shot.exposure_slots)
+    floor = channel.estimate_floor(samples, now)
+    model = channel.LightModel(
+        floor=floor,
+        sigma=channel.estimate_sigma(samples, floor, 1e-4),
+        shot=0.0,
+        spread=np.tile([shot.crosstalk, 1.0, shot.crosstalk], (shot.n_strips, 1)),
+        taps=channel.exposure_taps(shot.exposure_slots, 1 / Q, memory, Q),
+    )
+    contrast = sync.contrast(samples.light, samples.valid, Q, model.sigma)
+    metrics = channel.first_metrics(*contrast, model.taps)
+    now = sync.assign_bursts(now, detect.slot_llr(metrics), REPEATS)
+    for _ in range(rounds):
+        posteriors = detect.detect(channel.by_burst(metrics, now, memory))
+        lit = channel.lit_on_grid(posteriors, now)
+        found = channel.slot_likelihoods(samples, now, model, lit, np.arange(lit.shape[0]))
+        metrics = found.metrics
+        now = sync.corrected(sync.assign_bursts(now, detect.slot_llr(metrics), REPEATS), found.timing)
+        samples = sync.sample_slots(profiles, now, Q)
+    posteriors = detect.detect(channel.by_burst(metrics, now, memory))
+    return now, posteriors, samples
+
+
+def right_packets(posteriors: BurstPosteriors, link: Link, first_burst: int) -> NDArray[np.bool_]:
+    """(B, C) whether the packets of bursts `first_burst` on were detected without a wrong slot."""
+    return np.array(
+        [
+            [
+                (posteriors.lit[b, c].round() == encode_packet(bits, link.w[c])).all()
+                for c, bits in enumerate(link.bits[first_burst + b])
+            ]
+            for b in range(posteriors.lit.shape[0])
+        ]
+    )
+
+
+SHOTS = {
+    "plain": Shot(),
+    "textured": Shot(texture=0.4, sigma=0.01),
+    "long exposure": Shot(exposure_slots=2.2, sigma=0.005),
+    "short exposure": Shot(exposure_slots=0.3),
+    "few rows": Shot(rows_per_slot=2.3, n_rows=330, sigma=0.01),
+    "many rows": Shot(rows_per_slot=21.7, n_rows=3000, sigma=0.02),
+    "crosstalk": Shot(crosstalk=0.1, texture=0.2, sigma=0.005),
+}
+
+
+@pytest.mark.parametrize("kind", SHOTS)
+def test_start_is_found(kind: str) -> None:
+    """Within 0.05 slot once the light model has had its say, and every packet in the frame is right."""
+    rng = np.random.default_rng(1)
+    link = random_link(rng, [5, 3, 7, 5, 4, 5, 6, 2, 5, 8], 5, n_bursts=2)
+    shot = replace(SHOTS[kind], start_slot=12.37, first_row=31)
+    profiles = row_profiles(link, shot, rng)
+    first = found_clock(profiles, shot, link.packet_slots)
+    assert abs(start_error(first, shot)) < 0.3
+    now, posteriors, _ = received(profiles, shot, first)
+    assert abs(start_error(now, shot)) < 0.05
+    assert first.lock > 1.6
+    assert (posteriors.w == link.w).all()
+    assert right_packets(posteriors, link, 0)[0].all()
+
+
+@pytest.mark.parametrize("phase", range(6))
+def test_copies_are_given_to_their_bursts(phase: int) -> None:
+    """Frames of 3.4 packets that begin with the 1st, 2nd, 3rd copy of a burst, at its start or within."""
+    rng = np.random.default_rng(phase)
+    link = random_link(rng, [5] * 8, 5)
+    start = 70 * (phase % 3) + (35.0 if phase >= 3 else 2.0)
+    shot = Shot(start_slot=start, n_rows=int(3.4 * 70 * 5), texture=0.2, sigma=0.005)
+    profiles = row_profiles(link, shot, rng)
+    now, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 70))
+    first_copy = int((start + now.first_slot * 0) // 70)
+    grid_copy = round((shot.start_slot + (now.row0 / 5.0)) // 70)
+    true_burst = (grid_copy + np.arange(now.n_copies)) // REPEATS
+    assert grid_copy in {first_copy, first_copy - 1}
+    assert (now.burst == true_burst - true_burst[0]).all()
+    shown = np.bincount(now.burst, minlength=2) >= 2
+    assert right_packets(posteriors, link, int(true_burst[0]))[np.flatnonzero(shown)].all()
+
+
+def test_grid_covers_the_rows() -> None:
+    rng = np.random.default_rng(3)
+    link = random_link(rng, [5] * 6, 5)
+    shot = Shot(start_slot=33.0)
+    now = found_clock(row_profiles(link, shot, rng), shot, 70)
+    assert now.row0 <= 0
+    assert now.row0 + now.n_slots * now.rows_per_slot >= shot.n_rows - 1
+    assert now.n_slots <= shot.n_rows / shot.rows_per_slot + 2
+    assert 0 <= now.first_slot < now.packet_slots
+    assert now.n_copies * now.packet_slots >= now.first_slot + now.n_slots
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("reach", [0.5, 2.0])
+def test_delays_of_up_to_two_slots_are_found(seed: int, reach: float) -> None:
+    rng = np.random.default_rng([seed, 77])
+    link = random_link(rng, [5] * 20, 5, n_bursts=2)
+    delays = rng.uniform(-reach, reach, 20)
+    shot = Shot(start_slot=9.6 + seed, n_rows=800, texture=0.2, sigma=0.005)
+    profiles = row_profiles(link, shot, rng, delays)
+    now, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 70), rounds=4)
+    off = now.delay_slots + start_error(now, shot) - delays
+    assert np.abs(off).max() < 0.1
+    assert right_packets(posteriors, link, 0)[0].mean() >= 0.95
+
+
+@pytest.mark.parametrize("ppm", [-100.0, 100.0])
+def test_a_slot_rate_error_is_tolerated(ppm: float) -> None:
+    """The longest packets, three copies: 0.08 slot from end to end."""
+    rng = np.random.default_rng(8)
+    link = random_link(rng, [5] * 6, 24, n_bursts=2)
+    shot = Shot(start_slot=3.0, n_rows=5 * 3 * 260, texture=0.2, sigma=0.01)
+    profiles = row_profiles(link, replace(shot, rows_per_slot=5.0 * (1 + 1e-6 * ppm)), rng)
+    now, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 260))
+    assert abs(start_error(now, shot)) < 0.1
+    assert right_packets(posteriors, link, 0)[0].all()
+
+
+def test_noise_and_still_light_do_not_lock_like_a_link() -> None:
+    locks = {}
+    for level in (0.0, 0.5):
+        found = []
+        for seed in range(25):
+            rng = np.random.default_rng([seed, 5])
+            shot = Shot(start_slot=20.0, level=level, sigma=0.01, texture=0.2)
+            profiles = row_profiles(random_link(rng, [5] * 20, 5), shot, rng)
+            now = sync.find_clock(profiles, 5.0, 1.0, 70, 0.01)
+            found.append(now.lock if now else 0.0)
+        locks[level] = np.array(found)
+    assert np.median(locks[0.0]) < 1.6
+    assert locks[0.5].min() > np.quantile(locks[0.0], 0.9)
+    assert np.median(locks[0.5]) > 3.5
+
+
+@pytest.mark.parametrize("start", [0.3, 41.0, 66.0])
+def test_one_packet_and_a_little_is_enough(start: float) -> None:
+    rng = np.random.default_rng(4)
+    link = random_link(rng, [5] * 12, 5)
+    shot = Shot(start_slot=start, n_rows=int(5 * 70 * 1.2), texture=0.1, sigma=0.005)
+    profiles = row_profiles(link, shot, rng)
+    now, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 70))
+    assert abs(start_error(now, shot)) < (0.15 if start == 0.3 else 0.05)  # at 0.3 the first header is cut
+    n_bursts = posteriors.lit.shape[0]
+    sent = replace(link, bits=[link.bits[0]] * n_bursts)  # a sliver of the copy before may count as a burst
+    assert right_packets(posteriors, sent, 0).any(axis=0).mean() > 0.9
+
+
+def test_columns_that_show_nothing_do_not_hide_the_clock_of_those_that_do() -> None:
+    """Noise seems to be spread in time; the clock of columns that are not is told too."""
+    twice = 0
+    for seed in range(12):
+        rng = np.random.default_rng([seed, 6])
+        shot = Shot(start_slot=33.0, texture=0.1, sigma=0.005)
+        profiles = row_profiles(random_link(rng, [5] * 20, 5), shot, rng)
+        light = profiles.light.copy()
+        light[5:] = rng.normal(0.01, 0.005, light[5:].shape)
+        found = sync.find_clocks(replace(profiles, light=light), 5.0, 1.0, 70, 0.005)
+        assert min(abs(start_error(one, shot)) for one in found) < 0.2
+        twice += len(found) == 2
+    assert twice >= 3
+
+
+def test_bursts_in_every_way_likeliest_first() -> None:
+    rng = np.random.default_rng(4)
+    shot = Shot(n_rows=5 * 70 * 4)
+    now = found_clock(row_profiles(random_link(rng, [5] * 3, 5), shot, rng), shot, 70)
+    now = replace(now, first_slot=0, n_slots=350, burst=np.zeros(5, np.int64))
+    sent = rng.choice([-4.0, 4.0], (2, 3, 70)).astype(np.float32)
+    llr = np.concatenate([sent[0], sent[0], sent[1], sent[1], sent[1]], axis=1)
+    possible = sync.possible_bursts(now, llr, REPEATS)
+    assert possible[0][0].burst.tolist() == [0, 0, 1, 1, 1]
+    assert sorted(one.burst.tolist() for one, _ in possible) == [[0, 0, 0, 1, 1], [0, 0, 1, 1, 1], [0, 1, 1, 1, 2]]
+    scores = [score for _, score in possible]
+    assert scores == sorted(scores, reverse=True)
+    assert scores[0] - scores[1] > 100
+    assert sync.assign_bursts(now, llr, REPEATS).burst.tolist() == [0, 0, 1, 1, 1]
+    alone = replace(now, n_slots=70, burst=np.zeros(1, np.int64))
+    assert len(sync.possible_bursts(alone, llr[:, :70], REPEATS)) == 1
+
+
+@pytest.mark.parametrize("n_rows", [1, 5, 30])
+def test_too_few_rows_for_a_header(n_rows: int) -> None:
+    rng = np.random.default_rng(4)
+    shot = Shot(n_rows=n_rows)
+    profiles = row_profiles(random_link(rng, [5] * 3, 5), shot, rng)
+    assert sync.find_clock(profiles, 5.0, 1.0, 70, 0.01) is None
+
+
+@pytest.mark.parametrize("kind", ["zeros", "constant", "one lit row", "nothing inside"])
+def test_light_without_a_link(kind: str) -> None:
+    rng = np.random.default_rng(4)
+    profiles = row_profiles(random_link(rng, [5] * 3, 5), Shot(), rng)
+    light = np.full_like(profiles.light, 0.0 if kind == "zeros" else 0.5)
+    if kind == "one lit row":
+        light[..., 300] = 1.0
+    inside = np.zeros_like(profiles.inside) if kind == "nothing inside" else profiles.inside
+    found = sync.find_clock(replace(profiles, light=light, inside=inside), 5.0, 1.0, 70, 1e-3)
+    assert found is None or (np.isfinite([found.row0, found.lock]).all() and np.isfinite(found.delay_slots).all())
+
+
+def test_resample_integrates_exactly() -> None:
+    """Row r covers r - 0.5 .. r + 0.5; a sample is the mean of what it covers."""
+    rng = np.random.default_rng(0)
+    profiles = row_profiles(random_link(rng, [5] * 2, 5), Shot(n_rows=50, n_strips=3, first_row=100), rng)
+    step, row0 = 2.37, 101.3
+    light, valid = sync.resample(profiles, row0, step, 19)
+    fine = np.arange(100_000) / 2000  # positions from the top of row 100
+    row = fine.astype(int)
+    for i in range(19):
+        low, high = row0 - 99.5 + i * step, row0 - 99.5 + (i + 1) * step
+        if high <= 50:
+            covered = (fine >= low) & (fine < high)
+            expected = profiles.light[:, :, row[covered]].mean(axis=2)
+            np.testing.assert_allclose(light[:, :, i], expected, atol=2e-3)
+            assert (valid[:, :, i] == 1).all()
+    beyond, invalid = sync.resample(profiles, 140.0, step, 10)
+    assert (beyond[:, :, -1] == 0).all()
+    assert (invalid[:, :, -1] == 0).all()
+
+
+def test_resample_follows_the_sensor_rows() -> None:
+    """Strips whose picture rows lie elsewhere on the sensor give the same samples as rows in place."""
+    rng = np.random.default_rng(0)
+    profiles = row_profiles(random_link(rng, [5] * 2, 5), Shot(n_rows=300), rng)
+    moved = np.broadcast_to(np.arange(300.0), profiles.light.shape) + np.array([0.0, 17.0])[:, None, None]
+    bent = replace(profiles, sensor_row=moved.copy())
+    straight, _ = sync.resample(profiles, 20.0, 1.25, 100)
+    followed, _ = sync.resample(bent, 20.0, 1.25, 100)
+    np.testing.assert_allclose(followed[0], straight[0], atol=1e-6)
+    later, _ = sync.resample(bent, 37.0, 1.25, 100)
+    np.testing.assert_allclose(later[1], straight[1], atol=1e-6)
+
+
+def test_copies_and_back() -> None:
+    now = Clock(5.0, 1.0, 70, 0.0, n_slots=180, first_slot=33, burst=np.zeros(4, int), delay_slots=np.zeros(2), lock=9)
+    slots = np.random.default_rng(0).random((2, 180)).astype(np.float32)
+    copies = sync.to_copies(slots, now)
+    assert copies.shape == (2, 4, 70)
+    assert (copies[:, 0, :33] == 0).all()
+    assert (copies[:, 0, 33] == slots[:, 0]).all()
+    assert (copies[:, 1, 0] == slots[:, 37]).all()
+    assert (sync.from_copies(copies, now) == slots).all()
+
+
+@pytest.mark.parametrize(("n_strips", "n_pooled"), [(2, 1), (3, 3), (4, 2), (6, 3), (8, 2)])
+def test_pooled_strips_keep_the_light(n_strips: int, n_pooled: int) -> None:
+    rng = np.random.default_rng(0)
+    profiles = row_profiles(random_link(rng, [5] * 2, 5), Shot(n_rows=60, n_strips=n_strips), rng)
+    pooled = sync.pooled_strips(sync.halved_strips(profiles))
+    together = n_strips // n_pooled
+    assert pooled.light.shape == (2, n_pooled, 60)
+    np.testing.assert_allclose(pooled.light[:, -1], profiles.light[:, -together:].mean(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(pooled.count, together)

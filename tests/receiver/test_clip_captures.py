@@ -1,0 +1,62 @@
+"""Floors on the reference clips beside the checkout: pictures that the project's own simulator did not make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rxcli.ingest import open_source
+from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile
+from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.results.truth import Scorer, Truth, load_truth, truth_path
+from rxcli.types import PacketResult
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Error-free packets that a clip must give."""
+
+    name: str
+    expected: int
+    error_free: int
+
+
+#: Of the 4K clip's starved frames, slots given, 464 to 473 packets come out: docs/video.md.
+FLOORS = (Floor("video1080_chelsea_17k3", 720, 718), Floor("video4k_rocket_34k6", 520, 450))
+
+
+def camera_of(truth: Truth) -> CameraProfile:
+    camera = truth.camera
+    assert camera is not None
+    size = {"width": camera["width"], "height": camera["height"]}
+    mode = {"name": "video", **size, "line_delay_s": camera["line_delay_s"], "exposure_s": camera["exposure_s"]}
+    lens = {key: camera[key] for key in ("camera_matrix", "dist_coeffs", "distortion_already_corrected")}
+    raw = {"format": 1, "kind": "camera", "name": camera["name"], "modes": [mode], "lens": {**size, **lens}}
+    return check_profile(raw, CameraProfile, "truth")
+
+
+@pytest.mark.parametrize("floor", FLOORS, ids=lambda floor: floor.name)
+def test_floor(shared_captures: Path, floor: Floor, capsys: pytest.CaptureFixture[str]) -> None:
+    path = shared_captures / f"{floor.name}.mp4"
+    truth = load_truth(truth_path(path))
+    screen = load_profile(str(truth.screen), ScreenProfile)
+    options = ReceiverOptions(screens=(screen,), cameras=(camera_of(truth),), force_camera=True)
+    scorer = Scorer(truth)
+    results = [scorer.add(result) for result in receive(open_source(path), options)]
+    score = scorer.score()
+    with capsys.disabled():
+        print(f"\n{floor.name}: {score.error_free} of {score.expected} error-free, {score.false} false", end=" ")
+    assert score.expected == floor.expected
+    assert score.error_free >= floor.error_free
+    assert score.false == 0
+    assert score.wrong_w == 0
+    sure = [p for r in results for c in r.columns for p in c.packets if p.confidence >= 0.99]
+    assert sure
+    assert np.mean([right(packet) for packet in sure]) >= 0.99
+
+
+def right(packet: PacketResult) -> bool:
+    return packet.bit_errors == 0

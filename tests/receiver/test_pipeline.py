@@ -1,0 +1,457 @@
+"""Frames in, packets or reasons out: small simulated scenes from clean to hopeless, and what no receiver can read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.lab.benchmark.trial import simulate_trial
+from rxcli.lab.simulate.capture import Capture, simulate_frame
+from rxcli.lab.simulate.scenes import Scene, preset
+from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
+from rxcli.receiver import sampling, sync
+from rxcli.receiver import still as reception
+from rxcli.receiver.channel import denoise
+from rxcli.receiver.decode import detect
+from rxcli.receiver.locate import Lock, Stages, find_camera, find_corners, find_lock
+from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.results.truth import Score, Scorer, Truth
+from rxcli.types import Frame, FrameResult, Metadata, Mosaic, PacketResult
+
+FloatArray = NDArray[np.float64]
+
+
+def small_scene(screen: str, camera: str = "xs10-still", picture: str = "sky", electrons: float = 30.0) -> Scene:
+    """A part of the width, rows enough for a packet and more, and `electrons` times the light, all else alike."""
+    scene = replace(preset(camera, screen), picture=picture, start_slot=40.0)
+    scene = scene.scaled(0.25, 0.7) if camera.startswith("phone") else scene.scaled(0.1, 0.5)
+    return replace(
+        scene,
+        light_e_per_s=scene.light_e_per_s * electrons,
+        room=replace(scene.room, light_e_per_s=scene.room.light_e_per_s * electrons),
+        sensor=replace(scene.sensor, full_scale_e=scene.sensor.full_scale_e * electrons),
+    )
+
+
+@cache
+def capture(screen: str, camera: str, picture: str, electrons: float, seed: int) -> Capture:
+    return simulate_frame(small_scene(screen, camera, picture, electrons), seed)
+
+
+def clean(seed: int = 1) -> Capture:
+    return capture("paper-34k6", "xs10-still", "sky", 30.0, seed)
+
+
+def camera_of(taken: Capture) -> CameraProfile:
+    camera = taken.truth["camera"]
+    size = {"width": camera["width"], "height": camera["height"]}
+    mode = {"name": "still", **size, "line_delay_s": camera["line_delay_s"], "exposure_s": camera["exposure_s"]}
+    lens = {key: camera[key] for key in ("camera_matrix", "dist_coeffs", "distortion_already_corrected")}
+    raw = {"format": 1, "kind": "camera", "name": "truth", "tone": taken.truth["tone_curve"], "modes": [mode]}
+    return check_profile(raw | {"lens": {**size, **lens}}, CameraProfile, "truth")
+
+
+def corners_of(taken: Capture) -> FloatArray:
+    """The corners on the delivered picture."""
+    import cv2
+
+    camera, corners = taken.truth["camera"], np.array(taken.truth["corners_sensor_px"])
+    if not camera["distortion_already_corrected"]:
+        return corners
+    matrix, coeffs = np.array(camera["camera_matrix"]), np.array(camera["dist_coeffs"])
+    return np.asarray(cv2.undistortPoints(corners[:, None], matrix, coeffs, P=matrix)[:, 0], np.float64)
+
+
+def options_for(taken: Capture, **changes: object) -> ReceiverOptions:
+    screens = (load_profile(taken.truth["screen"], ScreenProfile),)
+    options = ReceiverOptions(screens=screens, cameras=(camera_of(taken),), force_camera=True)
+    return replace(options, **{"corners": corners_of(taken), **changes})  # type: ignore[arg-type]
+
+
+def frame_of(taken: Capture, pixels: NDArray[np.uint8] | None = None, orientation: int = 1) -> Frame:
+    metadata = Metadata(exposure_s=taken.truth["camera"]["exposure_s"], orientation=orientation)
+    shown = taken.pixels if pixels is None else pixels
+    return Frame(shown, "memory", metadata=metadata)
+
+
+def received(frame: Frame, options: ReceiverOptions) -> FrameResult:
+    (result,) = receive([frame], options)
+    return result
+
+
+def score_of(result: FrameResult, taken: Capture) -> Score:
+    scorer = Scorer(msgspec.convert(taken.truth, Truth, strict=False))
+    scorer.add(result)
+    return scorer.score()
+
+
+@pytest.mark.parametrize(
+    ("screen", "camera"),
+    [("paper-34k6", "xs10-still"), ("paper-17k3", "xs10-still"), ("paper-8k65", "phone-plain")],
+)
+def test_a_clean_frame_gives_every_packet(screen: str, camera: str) -> None:
+    taken = capture(screen, camera, "sky", 30.0, 1)
+    result = received(frame_of(taken), options_for(taken))
+    score = score_of(result, taken)
+    assert score.expected >= 20
+    assert (score.error_free, score.false, score.wrong_w) == (score.expected, 0, 0)
+    assert result.status == "ok"
+    assert result.message is None
+    assert result.screen_profile == screen
+    assert [c.column for c in result.columns] == list(range(20))
+    packets = [p for c in result.columns for p in c.packets]
+    assert min(p.confidence for p in packets) > 0.9
+    assert all(c.snr_db is not None and c.snr_db > 5 for c in result.columns)
+
+
+def test_the_screen_is_found_in_a_frame_of_true_proportions() -> None:
+    scene = replace(preset("xs10-still", "paper-8k65"), picture="sky", start_slot=20.0).scaled(0.25, keep_readout=True)
+    taken = simulate_frame(replace(scene, light_e_per_s=2 * scene.light_e_per_s), 1)
+    result = received(frame_of(taken), options_for(taken, corners=None))
+    score = score_of(result, taken)
+    assert score.expected >= 20
+    assert score.error_free == score.expected
+    assert result.corners is not None
+    off = np.linalg.norm(result.corners - corners_of(taken), axis=1)
+    assert off.max() < 0.003 * np.ptp(result.corners[:, 0])
+
+
+def test_stripes_bent_by_a_correction_in_the_camera() -> None:
+    taken = capture("paper-17k3", "phone-corrected", "sky", 20.0, 2)
+    score = score_of(received(frame_of(taken), options_for(taken)), taken)
+    assert score.expected >= 20
+    assert score.error_free == score.expected
+    assert score.false == 0
+
+
+def test_raw_mosaic() -> None:
+    scene = replace(small_scene("paper-34k6"), output="raw")
+    taken = simulate_frame(scene, 4)
+    sensor = scene.sensor
+    pattern = np.array([list(row) for row in ("GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB", "RBGBRG")])
+    kinds = np.select([pattern == "R", pattern == "G"], [0, 1], 2).astype(np.uint8)
+    level = float(sensor.black_level)
+    mosaic = Mosaic(kinds, (1 / 0.55, 1.0, 1 / 0.65), (level, level, level), float(sensor.white_level))
+    frame = Frame(taken.raw, "memory", mosaic=mosaic)
+    score = score_of(received(frame, options_for(taken)), taken)
+    assert score.error_free >= 0.9 * score.expected
+    assert (score.false, score.wrong_w) == (0, 0)
+
+
+def test_the_right_screen_among_all_is_told() -> None:
+    taken = clean()
+    result = received(frame_of(taken), options_for(taken, screens=tuple(shipped_profiles(ScreenProfile))))
+    assert result.screen_profile == "paper-34k6"
+    assert score_of(result, taken).error_free == 20
+
+
+@pytest.mark.parametrize("n_strips", [2, 3, 4, 8])
+def test_columns_in_doubt_are_read_pixel_by_pixel(n_strips: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling, "strips_per_column", lambda _: n_strips)
+    taken = clean()
+    frame, options = frame_of(taken), options_for(taken)
+    corners = find_corners(frame, options)
+    camera, options = find_camera(frame, corners, options, Stages())
+    quick = find_lock(frame, corners, camera, options, Stages(), quick=True)
+    exact = find_lock(frame, corners, camera, options, Stages())
+    assert not np.array_equal(quick.profiles.light, exact.profiles.light)
+    asked = np.array([0, 4, 5, 6, 19])
+    light = quick.in_depth(asked).profiles.light
+    np.testing.assert_allclose(light[asked], exact.profiles.light[asked], atol=1e-3)
+    others = np.setdiff1d(np.arange(20), asked)
+    assert quick.reading.in_pairs == (n_strips >= 4)
+    np.testing.assert_array_equal(light[others], quick.profiles.light[others].repeat(1 + (n_strips >= 4), axis=1))
+    assert quick.in_depth(asked[:0]) is quick
+    assert exact.in_depth(asked) is exact
+
+
+def test_upside_down() -> None:
+    """Turned by half a turn on the sensor: time runs on, the columns run from right to left."""
+    taken = clean()
+    options = options_for(taken)
+    assert options.corners is not None
+    turned = frame_of(taken, np.ascontiguousarray(taken.pixels[:, ::-1]), orientation=2)
+    mirrored = options.corners * [-1, 1] + [taken.pixels.shape[1] - 1, 0]
+    lens = options.cameras[0].lens
+    assert lens is not None
+    plain = msgspec.structs.replace(options.cameras[0], lens=None)
+    score = score_of(received(turned, replace(options, corners=mirrored, cameras=(plain,))), taken)
+    assert score.error_free >= 18
+    assert score.false == 0
+
+
+def scored_packets(result: FrameResult, taken: Capture) -> list[PacketResult]:
+    """All packets with their wrong bits."""
+    scorer = Scorer(msgspec.convert(taken.truth, Truth, strict=False))
+    return [p for c in scorer.add(result).columns for p in c.packets]
+
+
+@pytest.mark.parametrize(
+    ("electrons", "at_least", "at_most"), [(30.0, 16, 20), (1.0, 5, 20), (0.2, 0, 20), (0.02, 0, 0)]
+)
+def test_from_clean_to_hopeless_nothing_false(electrons: float, at_least: int, at_most: int) -> None:
+    taken = capture("paper-34k6", "xs10-still", "coffee", electrons, 3)
+    result = received(frame_of(taken), options_for(taken))
+    score = score_of(result, taken)
+    assert at_least <= score.error_free <= at_most
+    assert score.false == 0
+    sure = [p for p in scored_packets(result, taken) if p.confidence > 0.9]
+    assert sum(p.bit_errors != 0 for p in sure) <= max(1, 0.15 * len(sure))
+
+
+def test_overexposure_gives_nothing_that_is_believed() -> None:
+    """Thirty times too much light: nearly all slots are clipped."""
+    scene = small_scene("paper-34k6")
+    taken = simulate_frame(replace(scene, sensor=replace(scene.sensor, full_scale_e=130.0)), 1)
+    packets = scored_packets(received(frame_of(taken), options_for(taken)), taken)
+    wrong = [p.confidence for p in packets if p.bit_errors != 0]
+    assert max(wrong, default=0) < 0.9
+    assert sum(confidence >= 0.5 for confidence in wrong) <= 1
+
+
+@pytest.mark.parametrize(("budget", "least", "most"), [(1, 1, 1), (10**9, 10, 20)])
+def test_the_network_is_shown_what_its_time_allows(
+    monkeypatch: pytest.MonkeyPatch, budget: int, least: int, most: int
+) -> None:
+    """Columns beyond that still have their words weighed: they are asked, but not shown."""
+    shown: list[int] = []
+    denoiser = denoise.load_denoiser()
+
+    class Recording:
+        name = denoiser.name
+
+        def slot_corrections(self, scene: denoise.Scene, columns: NDArray[np.int64]) -> NDArray[np.float32]:
+            shown.append(columns.size)
+            return denoiser.slot_corrections(scene, columns)
+
+    monkeypatch.setattr(reception, "_denoiser", Recording)
+    monkeypatch.setattr(reception, "_MOST_SHOWN", budget)
+    scene = small_scene("paper-34k6")
+    taken = simulate_frame(replace(scene, sensor=replace(scene.sensor, full_scale_e=130.0)), 1)
+    report = received(frame_of(taken), options_for(taken)).denoiser
+    assert report is not None
+    assert report["columns"] >= 10
+    assert len(shown) == 1
+    assert least <= shown[0] <= most
+
+
+def test_weights_that_differ_by_column() -> None:
+    w = tuple(1 + column % 9 for column in range(20))
+    scene = replace(small_scene("paper-34k6"), w=w)
+    taken = simulate_frame(scene, 6)
+    result = received(frame_of(taken), options_for(taken))
+    assert [c.w for c in result.columns] == list(w)
+    assert score_of(result, taken).error_free >= 18
+
+
+@pytest.mark.parametrize("reach", [0.5, 2.0])
+def test_columns_with_delays(reach: float) -> None:
+    scene = replace(small_scene("paper-34k6"), column_delay_slots=reach, slot_rate_error_ppm=100.0)
+    taken = simulate_frame(scene, 7)
+    result = received(frame_of(taken), options_for(taken))
+    score = score_of(result, taken)
+    assert score.error_free >= 0.9 * score.expected
+    assert not [p for p in scored_packets(result, taken) if p.bit_errors and p.confidence >= 0.5]
+    found = np.array([c.delay_slots for c in result.columns])
+    off = found - np.array(taken.truth["column_delay_slots"])
+    assert np.quantile(np.abs(off - np.median(off)), 0.8) < 0.2
+
+
+def test_portrait_is_refused_with_a_reason() -> None:
+    taken = clean()
+    for orientation in (5, 6, 7, 8):
+        result = received(frame_of(taken, orientation=orientation), options_for(taken))
+        assert result.status == "no_signal"
+        assert result.columns == ()
+        assert result.message is not None
+        assert "portrait" in result.message
+        assert "landscape" in result.message
+
+
+def test_a_screen_too_small_says_how_much_it_needs() -> None:
+    """One packet at 8.65 kHz lasts 8.09 ms: 34 % of the 24.1 ms of a whole readout."""
+    taken = clean()
+    lens_free = msgspec.structs.replace(camera_of(taken), lens=None)
+    height, width = 1040, taken.pixels.shape[1]
+    line_delay = 24.098e-3 / height
+    mode = msgspec.structs.replace(lens_free.modes[0], height=height, line_delay_s=line_delay)
+    camera = msgspec.structs.replace(lens_free, modes=(mode,))
+    pixels = np.full((height, width), 20, np.uint8)
+    top, bottom = 300, 300 + round(0.251 * height)
+    pixels[top:bottom, 100:500] = np.random.default_rng(0).choice([30, 160], bottom - top)[:, None]
+    corners = np.array([[100.0, top], [499, top], [499, bottom], [100, bottom]])
+    options = ReceiverOptions(
+        screens=(load_profile("paper-8k65", ScreenProfile),), cameras=(camera,), force_camera=True, corners=corners
+    )
+    result = received(frame_of(taken, pixels), options)
+    assert result.status == "no_signal"
+    assert result.message is not None
+    assert "the screen fills 25 % of the height: one packet at 8.65 kHz needs 34 % with this camera" in result.message
+
+
+def without_signal(kind: str, taken: Capture) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(0)
+    shape = taken.pixels.shape
+    if kind == "noise":
+        return rng.integers(0, 256, shape, dtype=np.uint8)
+    if kind == "still screen":
+        pixels = np.full(shape, 12.0)
+        pixels[200:1900, 20:600] = 120 + 40 * np.sin(np.arange(580) / 30.0)
+        return np.clip(pixels + rng.normal(0, 2, shape), 0, 255).astype(np.uint8)
+    if kind == "lamp at 100 Hz":
+        rows = 90 + 40 * np.cos(2 * np.pi * 100 * 5.79e-6 * np.arange(shape[0]))
+        return np.clip(rows[:, None] + rng.normal(0, 3, shape), 0, 255).astype(np.uint8)
+    if kind == "random stripes":
+        rows = np.repeat(rng.choice([30.0, 160.0], shape[0] // 5 + 1), 5)[: shape[0]]
+        return np.clip(rows[:, None] + rng.normal(0, 2, shape), 0, 255).astype(np.uint8)
+    return np.full(shape, {"black": 0, "saturated": 255, "grey": 128}[kind], np.uint8)
+
+
+NOTHING = ["black", "saturated", "grey", "noise", "still screen", "lamp at 100 Hz", "random stripes"]
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["corners given", "corners searched"])
+@pytest.mark.parametrize("kind", NOTHING)
+def test_no_packet_where_none_was_sent(kind: str, given: bool) -> None:
+    taken = clean()
+    options = options_for(taken) if given else options_for(taken, corners=None)
+    result = received(frame_of(taken, without_signal(kind, taken)), options)
+    assert not [p for c in result.columns for p in c.packets]
+    assert result.status == ("no_signal" if given else result.status)
+    assert result.status in {"no_screen", "no_signal"}
+    assert result.message
+    assert "\n" not in result.message
+
+
+def test_a_picture_without_a_screen_is_stopped_at_once_unless_told_not_to() -> None:
+    taken = clean()
+    grey = frame_of(taken, without_signal("grey", taken))
+    options = options_for(taken, corners=None)
+    stopped = received(grey, options)
+    assert stopped.status == "no_screen"
+    assert stopped.skipped == {"no_screen": 1}
+    assert "clock" not in stopped.timing_ms
+    tried = received(grey, replace(options, skip=options.skip - {"no_screen"}))
+    assert tried.status == "no_signal"
+    assert "no_screen" not in tried.skipped
+    assert "clock" in tried.timing_ms
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["corners given", "corners searched"])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 600), (600, 1), (3, 7)])
+def test_tiny_pictures(shape: tuple[int, int], given: bool) -> None:
+    taken = clean()
+    mode = msgspec.structs.replace(camera_of(taken).modes[0], width=shape[1], height=shape[0])
+    camera = msgspec.structs.replace(camera_of(taken), modes=(mode,), lens=None)
+    right, bottom = shape[1] - 0.5, shape[0] - 0.5
+    corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
+    options = options_for(taken, cameras=(camera,), corners=corners if given else None)
+    result = received(frame_of(taken, np.full(shape, 99, np.uint8)), options)
+    assert result.status in {"no_screen", "no_signal"}
+    assert result.message
+
+
+def test_a_camera_without_this_size_is_named() -> None:
+    taken = clean()
+    result = received(frame_of(taken, taken.pixels[:1000]), options_for(taken))
+    assert result.status == "no_signal"
+    assert result.message is not None
+    assert "truth" in result.message
+    assert f"{taken.pixels.shape[1]} x 1000" in result.message
+
+
+def without_times(result: FrameResult) -> FrameResult:
+    return replace(result, timing_ms={}, corners=None)
+
+
+def test_the_same_frame_gives_the_same_result() -> None:
+    taken = capture("paper-34k6", "xs10-still", "coffee", 1.0, 3)
+    results = [received(frame_of(taken), options_for(taken)) for _ in range(2)]
+    assert without_times(results[0]) == without_times(results[1])
+
+
+def test_frames_received_side_by_side_give_the_same_results() -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    frames = [clean(), clean(2)]
+    alone = [without_times(received(frame_of(taken), options_for(taken))) for taken in frames]
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(lambda taken: without_times(received(frame_of(taken), options_for(taken))), frames))
+    assert alone == together
+
+
+def test_min_confidence_leaves_out_what_is_less_sure() -> None:
+    taken = capture("paper-34k6", "xs10-still", "coffee", 1.0, 3)
+    everything = received(frame_of(taken), options_for(taken))
+    sure = received(frame_of(taken), options_for(taken, min_confidence=0.9))
+    expected = [p for c in everything.columns for p in c.packets if p.confidence >= 0.9]
+    assert [p for c in sure.columns for p in c.packets] == expected
+
+
+def test_stages_are_timed() -> None:
+    taken = clean()
+    timing = received(frame_of(taken), options_for(taken)).timing_ms
+    assert {"geometry", "sampling", "clock", "detect", "total"} <= timing.keys()
+    assert timing["total"] >= max(value for name, value in timing.items() if name != "total")
+
+
+def test_rows_that_developing_mixes_are_told_from_the_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 1.7 rows a slot demosaicing blurs a slot more than an exposure of 0.4 slots does."""
+    base = preset("phone-plain", "paper-17k3")
+    scene = base.scaled(700 / base.sensor.width, 1.7 / base.rows_per_slot, keep_readout=True)
+    exposure_s = 0.4 / scene.screen.slot_rate_hz
+    light = scene.light_e_per_s * scene.exposure_s / exposure_s
+    scene = replace(scene, exposure_s=exposure_s, light_e_per_s=light, picture="coffee", n_frames=1)
+    trials = [simulate_trial(scene, seed) for seed in range(3)]
+    mixed = [trial.receive(trial.options(cae="never"))[1] for trial in trials]
+    monkeypatch.setattr(reception, "_MIXED_ROWS", (0.0,))
+    nominal = [trial.receive(trial.options(cae="never"))[1] for trial in trials]
+    assert sum(score.expected for score in mixed) == 60
+    assert sum(score.error_free for score in mixed) >= 45
+    assert sum(score.false for score in mixed) == 0
+    assert sum(score.error_free for score in nominal) <= sum(score.error_free for score in mixed) / 2
+
+
+def lock_of(taken: Capture) -> tuple[Lock, ReceiverOptions]:
+    frame, options = frame_of(taken), options_for(taken)
+    corners = find_corners(frame, options)
+    camera, options = find_camera(frame, corners, options, Stages())
+    return find_lock(frame, corners, camera, options, Stages()), options
+
+
+def test_of_two_clocks_the_one_with_packets_is_received() -> None:
+    lock, options = lock_of(clean())
+    wrong = replace(lock.clock, row0=lock.clock.row0 - 7 * lock.clock.rows_per_slot)
+    for either in (replace(lock, rival=wrong), replace(lock, clock=wrong, rival=lock.clock)):
+        seen = reception.decode_likeliest(either, options.skip)
+        assert abs(seen.clock.row0 - lock.clock.row0) < 0.5 * lock.clock.rows_per_slot
+
+
+def test_copies_of_two_packets_taken_for_one_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = replace(small_scene("paper-17k3", "phone-plain"), start_slot=300.0)
+    lock, options = lock_of(simulate_frame(scene, 1))
+    right = reception.decode_likeliest(lock, options.skip)
+    assert right.clock.burst.max() > 0
+    repeats = lock.screen.repeats
+    for now, _ in sync.possible_bursts(right.clock, detect.slot_llr(right.metrics), repeats)[1:]:
+        burst = now.burst
+        monkeypatch.setattr(sync, "assign_bursts", lambda now, *_, burst=burst: replace(now, burst=burst))
+        assert np.array_equal(reception.decode(lock, options.skip).clock.burst, burst)
+        again = reception.decode_likeliest(lock, options.skip)
+        assert again.clock.burst.tolist() == right.clock.burst.tolist()
+        np.testing.assert_array_equal(again.posteriors.index, right.posteriors.index)
+
+
+def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:
+    lock, options = lock_of(clean())
+    seen = reception.decode(lock, options.skip)
+    assert not reception.headerless(seen).any()
+    unseen = replace(seen.posteriors, header_llr=np.full_like(seen.posteriors.header_llr, -30.0))
+    assert not reception.headerless(replace(seen, posteriors=unseen)).any()
+    moved = replace(seen, posteriors=unseen, metrics=np.roll(seen.metrics, 3, axis=1))
+    assert reception.headerless(moved).all()

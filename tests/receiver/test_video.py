@@ -1,0 +1,493 @@
+"""Clips: time through the frames, bursts over several frames, what is reused and what makes it start again."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.errors import InputError
+from rxcli.lab.simulate.capture import Take, prepare
+from rxcli.lab.simulate.scenes import preset
+from rxcli.options import SKIPS, ReceiverOptions
+from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
+from rxcli.receiver.channel.known_picture import KnownPicture, exposed
+from rxcli.receiver.decode.detect import detect
+from rxcli.receiver.pipeline import receive
+from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime
+from rxcli.results.truth import Score, Scorer, Truth
+from rxcli.types import Clock, Float32Array, Frame, FrameResult
+
+N_FRAMES = 14
+BURST_SLOTS = 210
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A simulated clip, its truth and the options to receive it."""
+
+    frames: tuple[Frame, ...]
+    truth: Truth
+    options: ReceiverOptions
+
+
+def camera_of(take: Take) -> CameraProfile:
+    scene, told = take.scene, take.truth("clip")["camera"]
+    width, height = scene.sensor.width, scene.sensor.height
+    mode = ReadoutMode(
+        name="video",
+        width=width,
+        height=height,
+        line_delay_s=scene.sensor.line_delay_s,
+        exposure_s=scene.exposure_s,
+    )
+    rows = [tuple(float(v) for v in row) for row in told["camera_matrix"]]
+    lens = LensModel(
+        width=width,
+        height=height,
+        camera_matrix=(rows[0], rows[1], rows[2]),  # type: ignore[arg-type]
+        dist_coeffs=tuple(told["dist_coeffs"]),
+    )
+    return CameraProfile(format=1, kind="camera", name="sim", tone="bt709", modes=(mode,), lens=lens)
+
+
+def simulate(
+    seed: int,
+    n_frames: int,
+    picture: str | NDArray[np.uint8] = "coffee",
+    height: float = 0.94,
+    repeats: int = 3,
+    frame_rate_hz: float = 60000 / 1001,
+) -> Clip:
+    """Nearly the whole height is screen: a frame shows 1.5 packets, so that bursts fall into two or three frames."""
+    scene = preset("video-1080p", "paper-8k65").scaled(0.32, 0.5, keep_readout=True)
+    left, right, n_rows = 20.0, scene.sensor.width - 22.0, scene.sensor.height
+    top, bottom = n_rows * (1 - height) / 2, n_rows * (1 + height) / 2
+    corners = ((left, top), (right, top + 3), (right - 2, bottom), (left + 3, bottom - 2))
+    scene = replace(
+        scene,
+        screen=msgspec.structs.replace(scene.screen, repeats=repeats),
+        n_frames=n_frames,
+        frame_rate_hz=frame_rate_hz,
+        picture=picture,
+        pose=replace(scene.pose, corners=corners),
+        shake_px=0.0,
+    )
+    take = prepare(scene, seed)
+    frames = tuple(
+        Frame(np.asarray(take.frame(k).pixels), "clip", k, round(k / scene.frame_rate_hz, 3)) for k in range(n_frames)
+    )
+    truth = msgspec.json.decode(msgspec.json.encode(take.truth("clip")), type=Truth)
+    corners_px = np.array(take.truth("clip")["corners_sensor_px"])
+    options = ReceiverOptions(
+        screens=(scene.screen,), cameras=(camera_of(take),), force_camera=True, corners=corners_px, cae="never"
+    )
+    return Clip(frames, truth, options)
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    return simulate(3, N_FRAMES)
+
+
+def scored(results: list[FrameResult], truth: Truth) -> tuple[list[FrameResult], Score]:
+    scorer = Scorer(truth)
+    return [scorer.add(result) for result in results], scorer.score()
+
+
+def bursts_in(results: list[FrameResult]) -> list[tuple[int | None, int]]:
+    return [(p.burst, c.column) for r in results for c in r.columns for p in c.packets]
+
+
+@pytest.fixture(scope="module")
+def results(clip: Clip) -> list[FrameResult]:
+    return list(receive(clip.frames, clip.options))
+
+
+def test_every_frame_has_a_result_in_order(results: list[FrameResult]) -> None:
+    assert [result.frame for result in results] == list(range(N_FRAMES))
+
+
+def test_packets_are_right_and_none_is_false(clip: Clip, results: list[FrameResult]) -> None:
+    _, score = scored(results, clip.truth)
+    assert score.false == 0
+    assert score.error_free >= 0.9 * score.expected
+
+
+def test_a_packet_stands_once_in_the_last_frame_that_shows_it(clip: Clip, results: list[FrameResult]) -> None:
+    found = bursts_in(results)
+    assert len(found) == len(set(found))
+    for result in results:
+        for column in result.columns:
+            for packet in column.packets:
+                assert packet.frames is not None
+                assert packet.frames[-1] == result.frame
+    combined = [p for r in results for c in r.columns for p in c.packets if p.frames and len(p.frames) > 1]
+    assert len(combined) >= 20
+
+
+def test_the_counter_counts_bursts_as_they_were_sent(clip: Clip, results: list[FrameResult]) -> None:
+    shown = {f.frame: [b.burst for b in f.bursts] for f in clip.truth.frames}
+    first = shown[0][0]
+    for result in results:
+        numbers = {p.burst for c in result.columns for p in c.packets}
+        assert numbers <= {burst - first for burst in shown[result.frame]}
+
+
+def test_tracking_is_counted_and_can_be_switched_off(clip: Clip, results: list[FrameResult]) -> None:
+    assert sum(result.skipped.get("tracking", 0) for result in results) >= N_FRAMES - 2
+    few = clip.frames[:4]
+    plain = list(receive(few, replace(clip.options, skip=frozenset(SKIPS) - {"tracking", "certain_columns"})))
+    assert all("tracking" not in result.skipped for result in plain)
+    assert scored(plain, clip.truth)[1].error_free >= 20
+
+
+def test_an_occluded_frame_costs_its_own_packets_only(clip: Clip) -> None:
+    dark = replace(clip.frames[7], pixels=np.full_like(clip.frames[7].pixels, 20))
+    got = list(receive((*clip.frames[:7], dark, *clip.frames[8:]), clip.options))
+    assert got[7].status in ("no_signal", "no_screen")
+    assert got[7].message
+    marked, score = scored(got, clip.truth)
+    assert score.false <= 1
+    after = [p for r in marked[8:] for c in r.columns for p in c.packets]
+    assert len(after) >= 60
+    first = clip.truth.frames[0].bursts[0].burst
+    sent = {b.burst - first for f in clip.truth.frames[8:] for b in f.bursts}
+    assert {p.burst for p in after} <= sent
+
+
+def test_what_came_before_a_break_comes_out(clip: Clip) -> None:
+    def breaking() -> Iterator[Frame]:
+        yield from clip.frames[:5]
+        raise InputError("clip: the clip breaks off", "copy it again")
+
+    got: list[FrameResult] = []
+    with pytest.raises(InputError, match="breaks off"):
+        got.extend(receive(breaking(), clip.options))
+    assert [result.frame for result in got] == [0, 1, 2, 3, 4]
+    assert scored(got, clip.truth)[1].error_free >= 20
+
+
+def test_the_source_is_closed_when_reception_is_left(clip: Clip) -> None:
+    closed = []
+
+    def source() -> Iterator[Frame]:
+        try:
+            yield from clip.frames
+        finally:
+            closed.append(True)
+
+    reception = receive(source(), clip.options)
+    next(reception)
+    reception.close()  # type: ignore[attr-defined]
+    assert closed == [True]
+
+
+def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More would spin beside the decoder's; what is done between the frames keeps its own."""
+    blas = pytest.importorskip("threadpoolctl").ThreadpoolController()
+    inside: list[list[int]] = []
+
+    def threads() -> list[int]:
+        return [library["num_threads"] for library in blas.info() if library["user_api"] == "blas"]
+
+    def take(_clip: object, _frame: Frame) -> list[object]:
+        inside.append(threads())
+        return [None]
+
+    monkeypatch.setattr("rxcli.receiver.clip.receiver._Clip.take", take)
+    with blas.limit(limits=2, user_api="blas"):
+        if max(threads(), default=0) < 2:
+            pytest.skip("this numpy's BLAS has one thread")
+        between = [threads() for _ in receive(clip.frames[:3], clip.options)]
+    assert inside == [[1] * len(threads())] * 3
+    assert all(max(counts) == 2 for counts in between)
+
+
+def test_a_single_frame_is_a_photograph(clip: Clip) -> None:
+    (result,) = receive(clip.frames[:1], clip.options)
+    packets = [p for c in result.columns for p in c.packets]
+    assert all(p.burst is None and p.frames is None for p in packets)
+
+
+def test_another_scene_is_searched_anew(clip: Clip) -> None:
+    other = simulate(8, 8, "chelsea")
+    moved = tuple(replace(frame, index=6 + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames))
+    got = list(receive((*clip.frames[:6], *moved), clip.options))
+    late = [replace(result, frame=result.frame - 6) for result in got[6:]]
+    _, score = scored(late, other.truth)
+    assert score.error_free >= 0.7 * score.expected
+    numbers = [p.burst for r in got for c in r.columns[:1] for p in c.packets if p.burst is not None]
+    assert numbers == sorted(numbers)
+
+
+def test_another_scene_while_frames_are_held_back(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frames held back are looked at again by their own picture, and leave that of the new scene alone."""
+    monkeypatch.setattr("rxcli.receiver.clip.receiver._MUCH_DOUBT", -1.0)
+    other = simulate(8, 8, "chelsea")
+    moved = tuple(replace(frame, index=6 + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames))
+    got = list(receive((*clip.frames[:6], *moved), clip.options))
+    _, score = scored([replace(result, frame=result.frame - 6) for result in got[6:]], other.truth)
+    assert score.error_free >= 0.9 * score.expected
+
+
+def test_frames_before_and_after_an_occlusion_are_looked_at_again(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[list[int]] = []
+
+    def measure_again(_scene: object, views: list[Any], *_: object) -> None:
+        measured.append([view.bursts.frame for view in views])
+
+    monkeypatch.setattr("rxcli.receiver.clip.scene.Scene.measure_again", measure_again)
+    monkeypatch.setattr("rxcli.receiver.clip.receiver._TOO_MUCH_DOUBT", 1.0)
+    dark = replace(clip.frames[3], pixels=np.full_like(clip.frames[3].pixels, 2))
+    got = list(receive((*clip.frames[:3], dark, *clip.frames[4:]), clip.options))
+    assert [result.frame for result in got] == [frame.index for frame in clip.frames]
+    assert got[3].status in ("no_signal", "no_screen")
+    assert measured[:2] == [[0, 1, 2], [4, 5, 6, 7, 8, 9]]
+
+
+def test_a_look_that_would_not_mend_much_is_left_out(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[int] = []
+
+    def measure_again(_scene: object, views: list[Any], *_: object) -> None:
+        measured.append(len(views))
+
+    monkeypatch.setattr("rxcli.receiver.clip.scene.Scene.measure_again", measure_again)
+    monkeypatch.setattr("rxcli.receiver.clip.bursts.BurstReader.doubts", lambda *_: (3, 10))
+    assert len(list(receive(clip.frames, clip.options))) == len(clip.frames)
+    assert measured == [len(clip.frames)]
+
+
+def test_parts_of_packets_are_put_together() -> None:
+    """No frame shows a whole packet: what two frames show of one burst makes it."""
+    few = simulate(5, 16, height=0.51, repeats=4, frame_rate_hz=53.7)
+    assert few.truth.expected_bursts == frozenset()
+    got = list(receive(few.frames, few.options))
+    combined = [p for r in got for c in r.columns for p in c.packets if p.frames and len(p.frames) > 1]
+    assert len(combined) >= 60
+    _, score = scored(got, few.truth)
+    assert score.extra_error_free >= 0.85 * len(combined)
+    assert score.false <= 1
+
+
+def test_frames_with_nothing_new_are_passed_over_on_request() -> None:
+    long = simulate(2, 16, repeats=14)
+    every = list(receive(long.frames, long.options))
+    thinned = list(receive(long.frames, replace(long.options, stop_when_certain=True)))
+    passed = [result for result in thinned if result.skipped.get("certain_frames")]
+    assert passed
+    assert all(result.status == "ok" and not result.columns for result in passed)
+    assert not any("certain_frames" in result.skipped for result in every)
+    assert {b for b, _ in bursts_in(thinned)} == {b for b, _ in bursts_in(every)}
+
+
+def clock_at(slot: float, rows_per_slot: float = 5.0, packet: int = 70) -> Clock:
+    """A clock whose sensor row 0 is `slot`."""
+    whole = int(np.floor(slot))
+    return Clock(
+        rows_per_slot=rows_per_slot,
+        exposure_slots=1.0,
+        packet_slots=packet,
+        row0=-(slot - whole) * rows_per_slot,
+        n_slots=100,
+        first_slot=whole % packet,
+        burst=np.zeros(3, np.int64),
+        delay_slots=np.zeros(20),
+        lock=5.0,
+    )
+
+
+@pytest.mark.parametrize("digits", [3, 6])
+def test_link_time_counts_copies_over_rounded_times(digits: int) -> None:
+    rate, frame_s, start = 8650.0 * (1 + 80e-6), 1001 / 60000, 33.3
+    time = LinkTime(70, 8650.0)
+    for number in range(400):
+        if number % 50 == 17:
+            continue  # a frame that the camera dropped
+        slot = start + number * frame_s * rate
+        copy = time.take(number - number // 50, round(number * frame_s, digits), clock_at(slot))
+        assert copy == int(slot // 70)
+
+
+def test_link_time_tells_another_time() -> None:
+    time = LinkTime(70, 8650.0)
+    for number in range(5):
+        assert time.take(number, number / 60, clock_at(10 + number * 8650 / 60)) is not None
+    assert time.take(5, 5 / 60, clock_at(10 + 20 + 5 * 8650 / 60)) is None
+
+
+def test_burst_phase_from_parts_of_copies_over_frames() -> None:
+    rng = np.random.default_rng(1)
+    repeats, packet, columns = 3, 70, 10
+    sent = {burst: rng.integers(0, 2, (columns, packet)) for burst in range(40)}
+    phase = BurstPhase(repeats)
+    for frame in range(30):
+        start = 2.22 * frame
+        first = int(start)
+        llr = np.zeros((2, columns, packet))
+        for number in (0, 1):
+            place = first + number + np.arange(packet) / packet
+            seen = (place >= start) & (place < start + 0.8)
+            slots = 2.0 * sent[(first + number + 1) // repeats] - 1
+            llr[number] = seen * (2.5 * slots + rng.normal(0, 1.5, slots.shape))
+        phase.take(first, llr)
+    assert phase.settled
+    copies = np.arange(60)
+    assert (phase.burst_of(copies) == (copies + 1) // repeats).all()
+
+
+def test_known_picture_gives_back_the_columns_light() -> None:
+    """Light made by the equation itself, in another way: a loop over strips and columns."""
+    rng = np.random.default_rng(5)
+    columns, strips, rows, floor = 6, 4, 200, 0.01
+    picture = rng.uniform(0.02, 0.5, (columns, strips, rows)).astype(np.float32)
+    spread = rng.uniform(0.1, 1.0, (strips, 3))
+    inside = np.ones(picture.shape, bool)
+    known = KnownPicture(inside, spread, floor, 1e-7, 1e-6)
+
+    def frame() -> tuple[np.ndarray, np.ndarray]:
+        slots = exposed(rng.integers(0, 2, (columns, 42)).astype(np.float32), np.arange(rows)[None] / 5 + 0.5, 1.08)
+        light = np.full(picture.shape, floor)
+        for column in range(columns):
+            for strip in range(strips):
+                for k in (-1, 0, 1):
+                    if 0 <= column + k < columns:
+                        light[column, strip] += picture[column, strip] * spread[strip, k + 1] * slots[column + k]
+        return light.astype(np.float32), slots
+
+    for _ in range(25):
+        light, slots = frame()
+        known.learn(light, slots, np.ones_like(slots))
+    light, slots = frame()
+    seen = known.solve(light)
+    assert np.abs(seen.value - slots).max() < 0.1
+    assert (seen.precision > 0).all()
+
+
+def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, rows: int = 400) -> tuple[Any, ...]:
+    """A picture known from many frames, 5 rows a slot; and what makes a frame of it: light and exposed slots."""
+    picture = rng.uniform(0.1, 0.5, (columns, strips, rows)).astype(np.float32)
+    spread = np.tile([0.0, 1.0, 0.0], (strips, 1))
+    known = KnownPicture(np.ones(picture.shape, bool), spread, 0.0, 1e-6, 0.0)
+
+    def frame() -> tuple[Float32Array, Float32Array]:
+        bits = rng.integers(0, 2, (columns, rows // 5 + 2)).astype(np.float32)
+        slots = exposed(bits, np.arange(rows)[None] / 5 + 0.5, 1.0)
+        return (picture * slots[:, None]).astype(np.float32), slots
+
+    for _ in range(20):
+        light, slots = frame()
+        known.learn(light, slots, np.ones_like(slots))
+    return known, frame
+
+
+def test_strips_that_show_something_else_are_trusted_less() -> None:
+    rng = np.random.default_rng(8)
+    known, frame = known_picture(rng)
+    light, slots = frame()
+    light[:, 0] += rng.normal(0, 0.2, light[:, 0].shape).astype(np.float32)
+    plain = np.abs(known.solve(light).value - slots).mean()
+    again = np.abs(known.solve_again(light, slots, 5.0).value - slots).mean()
+    assert again < 0.5 * plain
+
+
+def test_a_decision_does_not_bear_itself_out() -> None:
+    """One slot that shows the opposite of what was decided must still show it."""
+    known, frame = known_picture(np.random.default_rng(9))
+    light, slots = frame()
+    wrong = slots.copy()
+    wrong[2, 200:205] = 1 - wrong[2, 200:205]
+    seen = known.solve_again(light, wrong, 5.0).value[2, 201:204]
+    assert np.abs(seen - slots[2, 201:204]).max() < 0.1
+
+
+def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
+    known, frame = known_picture(np.random.default_rng(10))
+    other = copy.deepcopy(known)
+    light, slots = frame()
+    trust = np.full_like(slots, 0.7)
+    known.learn(light, slots, trust, keep=1.0)
+    with_it, _ = known.picture()
+    without, _ = known.without(light, slots, trust).picture()
+    alone, _ = other.picture()
+    assert without == pytest.approx(alone, abs=1e-4)
+    assert known.picture()[0] == pytest.approx(with_it)
+
+
+def test_columns_not_yet_tried_are_unknown() -> None:
+    """Dark columns may be left out at first; the others are kept as they were found."""
+    rng = np.random.default_rng(2)
+    columns, packet, memory = 4, 70, 1
+    bursts = Bursts()
+    clock = replace(clock_at(0.0), burst=np.zeros(2, np.int64))
+    shown = np.ones((2, columns, packet), np.int64)
+    metrics = rng.normal(0, 2, (1, columns, packet + memory, 4))
+    bursts.add(FrameBursts(0, 0, clock, metrics[0], shown), np.array([7]), metrics)
+    tried = np.array([0, 2])
+    found = detect(metrics[:, tried])
+    bursts.note(7, tried, found, np.ones(2, bool))
+    known = bursts.known(7)
+    assert known is not None
+    assert (known.index[:, tried] == found.index).all()
+    assert (known.lit[:, [1, 3]] == 0.5).all()
+    (closed,) = bursts.close(np.array([7]))
+    assert closed.metrics == pytest.approx(metrics[0])
+    assert not closed.tracked
+
+
+def test_few_frames_are_not_sure_of_what_they_taught_themselves() -> None:
+    """A picture learned from the frames that it is then used on bears out every wrong decision."""
+    short = simulate(3, 2)
+    marked, score = scored(list(receive(short.frames, short.options)), short.truth)
+    packets = [p for r in marked for c in r.columns for p in c.packets]
+    sure = [p for p in packets if p.confidence >= 0.9]
+    assert score.error_free >= 10
+    assert score.false <= 1
+    assert sum(p.bit_errors != 0 for p in sure) <= 0.15 * len(sure)
+
+
+def test_dark_columns_are_left_out_and_counted() -> None:
+    """Nine columns of twenty under black: not tried, the others as they are without the shortcut."""
+    picture = np.full((90, 160, 3), 200, np.uint8)
+    picture[:, 88:] = 0
+    half = simulate(6, 12, picture)
+    results = [
+        list(receive(half.frames, replace(half.options, skip=skip)))
+        for skip in (frozenset(SKIPS), frozenset(SKIPS) - {"dark_columns"})
+    ]
+    counts = [sum(r.skipped.get("dark_columns", 0) for r in got) for got in results]
+    assert counts[0] >= 20
+    assert counts[1] == 0
+    marked, scores = zip(*(scored(got, half.truth) for got in results), strict=True)
+    assert scores[0].error_free == scores[1].error_free >= 90
+    assert scores[0].false <= scores[1].false
+    packets = [p for r in marked[0] for c in r.columns for p in c.packets]
+    assert all(p.bit_errors == 0 for p in packets if p.confidence >= 0.9)
+    assert all(not c.packets for r in marked[0][6:] for c in r.columns[12:])
+
+
+def test_the_screen_may_come_nearer(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many strips its columns would have now, the picture is known by those of the first frame."""
+    start = clip.options.corners
+    assert start is not None
+    looks = itertools.count(1)
+
+    def nearer(_pixels: object, stored: object, **_levels: object) -> SimpleNamespace:
+        return SimpleNamespace(corners=start + np.array([[-1, 0], [1, 0], [1, 0], [-1, 0]]) * 4.0 * next(looks))
+
+    numbers = itertools.count(2)
+    monkeypatch.setattr("rxcli.receiver.clip.scene._LOOK_EVERY", 3)
+    monkeypatch.setattr("rxcli.receiver.screen.find.track_screen", nearer)
+    monkeypatch.setattr("rxcli.receiver.clip.receiver.find_corners", lambda *_: start)
+    monkeypatch.setattr("rxcli.receiver.clip.scene.sampling.strips_per_column", lambda _px: next(numbers))
+    got = list(receive(clip.frames[:8], replace(clip.options, corners=None)))
+    assert [result.frame for result in got] == list(range(8))
+    assert next(looks) == 3  # every third after the first

@@ -1,0 +1,83 @@
+"""Taps: what `--dump-dir` writes of photographs and of the frames of clips."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rxcli.errors import UsageError
+from rxcli.lab.benchmark.folder import scene
+from rxcli.lab.benchmark.trial import Trial, frame_of, simulate_trial
+from rxcli.lab.simulate.capture import prepare
+from rxcli.protocol import hex_to_bits, indices_to_bits
+from rxcli.receiver.pipeline import receive
+from rxcli.results.dump import dump_stages
+from rxcli.types import FrameResult
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[FrameResult]]:
+    """The taps and results of a short clip that was not compressed."""
+    folder = tmp_path_factory.mktemp("taps")
+    take = prepare(replace(scene("clip", "sky"), n_frames=5), 1)
+    trials = [Trial(take.frame(number, threads=1), number) for number in range(5)]
+    frames = [replace(frame_of(t.capture, n), source="a clip.mp4", time_s=n / 30) for n, t in enumerate(trials)]
+    return folder, list(receive(frames, trials[0].options(dump_dir=folder)))
+
+
+def taps_of(folder: Path, frame: int) -> dict[str, np.ndarray]:
+    with np.load(folder / f"a_clip.mp4-{frame:06d}.npz") as file:
+        return dict(file)
+
+
+def test_every_frame_of_a_clip_has_its_taps(clip: tuple[Path, list[FrameResult]]) -> None:
+    folder, results = clip
+    assert len(list(folder.iterdir())) == len(results) == 5
+    for result in results:
+        taps = taps_of(folder, result.frame)
+        np.testing.assert_array_equal(taps["geometry.corners"], result.corners)
+        n_columns, _, n_rows = taps["sampling.light"].shape
+        assert taps["sampling.inside"].shape == taps["sampling.light"].shape
+        assert taps["sampling.rows"].shape == (n_rows,)
+        assert taps["channel.metrics"].shape[0] == n_columns == len(result.columns)
+        assert taps["clock.burst"].max() + 1 == taps["bursts.number"].size
+
+
+def test_bursts_are_written_with_the_frame_that_reports_them(clip: tuple[Path, list[FrameResult]]) -> None:
+    folder, results = clip
+    n_packets = 0
+    for result in results:
+        taps = taps_of(folder, result.frame)
+        for column in result.columns:
+            for packet in column.packets:
+                index = taps[f"detect.{packet.burst}.index"][0, column.column]
+                bits = indices_to_bits(index, int(column.w or 0))
+                assert packet.burst in taps["bursts.ended"]
+                np.testing.assert_array_equal(bits, hex_to_bits(packet.payload, packet.payload_bits))
+                n_packets += 1
+    assert n_packets >= 20
+
+
+def test_a_photograph_has_the_taps_of_all_stages(tmp_path: Path) -> None:
+    trial = simulate_trial(replace(scene("still", "sky"), start_slot=12.0), 1)
+    trial.receive(trial.options(dump_dir=tmp_path))
+    with np.load(tmp_path / "simulated-000000.npz") as taps:
+        stages = {name.split(".")[0] for name in taps.files}
+        assert stages == {"geometry", "sampling", "clock", "samples", "channel", "detect"}
+        assert taps["sampling.light"].shape[:2] == taps["sampling.count"].shape
+
+
+def test_what_is_unknown_is_left_out(tmp_path: Path) -> None:
+    path = dump_stages(tmp_path / "new", "x", 7, {"a": None, "b.c": [1, 2]})
+    assert path.name == "x-000007.npz"
+    with np.load(path) as taps:
+        assert taps.files == ["b.c"]
+
+
+def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="name another folder with --dump-dir"):
+        dump_stages(tmp_path / "file", "x", 0, {})

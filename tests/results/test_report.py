@@ -1,0 +1,248 @@
+"""JSON lines, tables, summaries and JUnit files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rxcli.errors import ExitCode, InputError, UsageError
+from rxcli.results.report import format_frame, format_table, from_record, printable, shorten, to_json_line, to_record
+from rxcli.results.summary import Limits, SourceSummary, exit_code, format_summary, total, write_junit, write_summary
+from rxcli.results.truth import Score
+from rxcli.types import ColumnResult, FrameResult, PacketResult
+
+PACKET = PacketResult(412.6, 2.76, 168, "d076558cfe9de2d3cbb042f32dc440df474e5a5d9c", 0.998, 1.23e-5)
+OK = FrameResult(
+    "a.jpg",
+    0,
+    0.0,
+    "ok",
+    screen_profile="paper-34k6",
+    corners=np.array([[1.0, 2.0], [3.004, 4.0], [5.0, 6.0], [7.0, 8.0]]),
+    camera_profile="xs10",
+    line_delay_s=5.79e-06,
+    exposure_s=3.125e-05,
+    columns=(
+        ColumnResult(0, "ok", w=5, snr_db=21.3, delay_slots=0.0, packets=(PACKET, replace(PACKET, first_row=1912.0))),
+        ColumnResult(1, "dark", message="too little light; expose longer"),
+        ColumnResult(2, "dark", message="too little light; expose longer"),
+    ),
+    timing_ms={"ingest": 118.0, "total": 150.2},
+)
+LOST = FrameResult("b.jpg", 0, 0.0, "no_screen", message="no screen found; give --corners")
+BAD = FrameResult("c.jpg", 0, 0.0, "unreadable", message="c.jpg: the file is empty; copy it again")
+
+
+def test_the_documented_shape_in_the_documented_order() -> None:
+    line = to_json_line(OK)
+    assert line.startswith(
+        '{"source": "a.jpg", "frame": 0, "time_s": 0.0, "status": "ok", '
+        '"screen": {"profile": "paper-34k6", "corners": [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]]}, '
+        '"camera": {"profile": "xs10", "line_delay_s": 5.79e-06, "exposure_s": 3.125e-05}, '
+        '"columns": [{"column": 0, "status": "ok", "w": 5, "snr_db": 21.3, "denoised": false, "delay_slots": 0.0, '
+        '"packets": [{"first_row": 412.6, "copies": 2.76, "payload_bits": 168, '
+        '"payload": "d076558cfe9de2d3cbb042f32dc440df474e5a5d9c", "confidence": 0.998, "bit_errors": null, '
+    )
+    assert line.endswith('"timing_ms": {"ingest": 118.0, "total": 150.2}}')
+    assert "\n" not in line
+
+
+def test_unknown_values_are_null_and_failures_carry_a_message() -> None:
+    record = json.loads(to_json_line(LOST))
+    assert record["screen"] == {"profile": None, "corners": None}
+    assert record["camera"] == {"profile": None, "line_delay_s": None, "exposure_s": None}
+    assert record["message"] == LOST.message
+    assert "message" not in to_record(OK)
+    assert "message" in to_record(OK)["columns"][1]
+    assert to_record(OK)["columns"][1]["snr_db"] is None
+
+
+def test_clips_have_burst_and_frames() -> None:
+    packet = replace(PACKET, burst=7, frames=(3, 4))
+    [found] = to_record(replace(OK, columns=(replace(OK.columns[0], packets=(packet,)),)))["columns"][0]["packets"]
+    assert (found["burst"], found["frames"]) == (7, [3, 4])
+
+
+wild = st.floats(allow_nan=True, allow_infinity=True) | st.none()
+
+
+@given(wild, wild, st.floats(), st.floats(), st.text(), st.lists(st.floats(), min_size=8, max_size=8))
+def test_no_value_makes_a_line_that_is_not_json(
+    snr: float, delay: float, confidence: float, row: float, name: str, corners: list[float]
+) -> None:
+    packet = PacketResult(row, confidence, 3, "a0", confidence, row, bit_errors=2)
+    column = ColumnResult(0, "ok", w=5, snr_db=snr, delay_slots=delay, packets=(packet,), message=name)
+    result = replace(
+        OK,
+        source=name,
+        columns=(column,),
+        corners=np.array(corners).reshape(4, 2),
+        estimated={"line_delay_s": (row, confidence)},
+        denoiser={"snr": np.float64(row), "columns": np.arange(3), name: (confidence, None, True)},
+        timing_ms={"total": row},
+    )
+
+    def refuse(token: str) -> float:
+        raise AssertionError(token)
+
+    line = to_json_line(result)
+    record = json.loads(line, parse_constant=refuse)
+    assert to_json_line(from_record(record)) == line
+    assert "\n" not in format_frame(result).splitlines()[0]
+
+
+def test_a_line_reads_back_as_the_result() -> None:
+    back = from_record(json.loads(to_json_line(OK)))
+    assert back.columns == OK.columns
+    assert back.corners == pytest.approx(np.round(OK.corners, 2))
+    assert replace(back, corners=None) == replace(OK, corners=None)
+
+
+@pytest.mark.parametrize("record", [{}, [], None, {"source": 3}, to_record(OK) | {"columns": 3}])
+def test_what_is_no_result_is_refused(record: Any) -> None:
+    with pytest.raises(UsageError, match="not a result line"):
+        from_record(record)
+
+
+def test_file_names_that_are_no_utf8_survive() -> None:
+    name = b"caf\xe9.jpg".decode(errors="surrogateescape")
+    line = to_json_line(replace(OK, source=name))
+    line.encode("ascii")
+    assert from_record(json.loads(line)).source == name
+    assert printable(name) == "caf�.jpg"
+    format_frame(replace(OK, source=name)).encode("utf-8")
+
+
+def test_the_table_shows_what_a_person_looks_for() -> None:
+    text = format_frame(OK)
+    heading, header, first, second, dark = text.splitlines()
+    assert heading == "a.jpg | ok | screen paper-34k6 | camera xs10 | 2 packets in 1 of 3 columns | 150 ms"
+    assert header.split() == ["col", "status", "w", "snr", "dB", "confidence", "copies", "errors", "payload"]
+    assert first.split() == ["0", "ok", "5", "21.3", "0.9980", "2.76", "-", "d076558cfe9de2d3cbb…5d9c"]
+    assert second.split() == ["0.9980", "2.76", "-", "d076558cfe9de2d3cbb…5d9c"]
+    assert first.index("d076") == second.index("d076") == header.index("payload")
+    assert dark.split(maxsplit=2) == ["1-2", "dark", "too little light; expose longer"]
+
+
+def test_the_table_never_rounds_confidence_up_to_certainty() -> None:
+    packet = replace(PACKET, confidence=0.99999)
+    assert " 0.9999 " in format_frame(replace(OK, columns=(replace(OK.columns[0], packets=(packet,)),)))
+
+
+def test_a_failure_is_told_once() -> None:
+    assert format_frame(BAD) == "c.jpg | unreadable\n  the file is empty; copy it again"
+
+
+def test_short_payloads_are_shown_whole() -> None:
+    assert shorten("0123456789abcdef01234567") == "0123456789abcdef01234567"
+    assert len(shorten("0" * 42)) == 24
+
+
+def test_tables_line_up() -> None:
+    lines = format_table(["name", "n", ""], [["a", "10", "x"], ["long", "2", ""]]).splitlines()
+    assert lines == ["name   n", "a     10  x", "long   2"]
+
+
+def summary(*results: FrameResult, score: Score | None = None) -> SourceSummary:
+    found = SourceSummary(results[0].source, score=score)
+    for result in results:
+        found.add(result)
+    return found
+
+
+SCORE = Score(expected=4, bits=400, error_free=3, bit_errors=8)
+
+
+@pytest.mark.parametrize(
+    ("summaries", "limits", "code"),
+    [
+        ([summary(OK)], Limits(), ExitCode.OK),
+        ([summary(OK), summary(LOST)], Limits(), ExitCode.NOT_RECEIVED),
+        ([summary(OK), summary(BAD), summary(LOST)], Limits(), ExitCode.UNREADABLE),
+        ([summary(OK, BAD)], Limits(), ExitCode.UNREADABLE),
+        ([summary(OK)], Limits(min_packets=2), ExitCode.OK),
+        ([summary(OK)], Limits(min_packets=3), ExitCode.NOT_RECEIVED),
+        ([summary(OK, score=SCORE)], Limits(max_ber=0.02), ExitCode.OK),
+        ([summary(OK, score=SCORE)], Limits(max_ber=0.0199), ExitCode.NOT_RECEIVED),
+        ([summary(OK)], Limits(max_ber=1.0), ExitCode.NOT_RECEIVED),
+        ([], Limits(), ExitCode.OK),
+    ],
+)
+def test_exit_codes(summaries: list[SourceSummary], limits: Limits, code: ExitCode) -> None:
+    assert exit_code(summaries, limits) is code
+
+
+def test_the_total_adds_up() -> None:
+    whole = total([summary(OK, score=SCORE), summary(LOST), summary(OK, score=SCORE)])
+    assert (whole.n_frames, whole.n_packets, whole.confidence) == (3, 4, pytest.approx(0.998))
+    assert whole.score is not None
+    assert (whole.score.expected, whole.score.ber) == (8, pytest.approx(0.02))
+
+
+def test_the_summary_names_reasons_and_scores() -> None:
+    header, first, second, last = format_summary([summary(OK, score=SCORE), summary(BAD)], Limits()).splitlines()
+    assert header.split() == [
+        "source",
+        "frames",
+        "packets",
+        "confidence",
+        "expected",
+        "error-free",
+        "lost",
+        "false",
+        "ber",
+    ]
+    assert first.split()[:9] == ["a.jpg", "1", "2", "0.998", "4", "3", "0", "0", "0.02"]
+    assert second.endswith("the file is empty; copy it again")
+    assert last.endswith("1 of 2 failed")
+    assert "expected" not in format_summary([summary(OK)], Limits())
+
+
+def test_summary_files(tmp_path: Path) -> None:
+    summaries = [summary(OK, score=SCORE), summary(BAD)]
+    write_summary(tmp_path / "s.csv", summaries, Limits())
+    with (tmp_path / "s.csv").open(newline="") as file:
+        first, second = csv.DictReader(file)
+    assert (first["source"], first["packets"], first["ber"], first["exit_code"]) == ("a.jpg", "2", "0.02", "0")
+    assert (second["ber"], second["exit_code"]) == ("", "3")
+    with pytest.raises(UsageError, match=r"must end in .csv or .parquet \(got"):
+        write_summary(tmp_path / "s.xls", summaries, Limits())
+    with pytest.raises(InputError, match="cannot be written"):
+        write_summary(tmp_path / "none" / "s.csv", summaries, Limits())
+
+
+def test_parquet_summaries(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed (extra parquet)")
+    write_summary(tmp_path / "s.parquet", [summary(BAD), summary(OK, score=SCORE)], Limits())
+    first, second = parquet.read_table(tmp_path / "s.parquet").to_pylist()
+    assert (first["expected"], first["exit_code"]) == (None, 3)
+    assert (second["expected"], second["ber"]) == (4, 0.02)
+
+
+def test_junit(tmp_path: Path) -> None:
+    odd = replace(LOST, source="odd\x00\x1f<&>.jpg")
+    write_junit(tmp_path / "j.xml", [summary(OK), summary(BAD), summary(odd)], Limits())
+    [suite] = ElementTree.parse(tmp_path / "j.xml").getroot()
+    assert (suite.get("tests"), suite.get("errors"), suite.get("failures")) == ("3", "1", "1")
+    passed, error, failure = suite
+    assert len(passed) == 0
+    assert float(str(passed.get("time"))) == pytest.approx(0.150)
+    assert "the file is empty" in str(error.find("error").get("message"))
+    assert "no screen found" in str(failure.find("failure").get("message"))
+    assert str(failure.get("name")).endswith("<&>.jpg")
+
+
+def test_confidence_without_a_number_is_unknown() -> None:
+    packet = replace(PACKET, confidence=math.nan)
+    found = summary(replace(OK, columns=(replace(OK.columns[0], packets=(packet,)),)))
+    assert found.row(Limits())["confidence"] is None

@@ -1,0 +1,216 @@
+"""Scoring against the truth: the definitions, by hand-made packets."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rxcli.errors import InputError
+from rxcli.protocol import bits_to_hex
+from rxcli.results.truth import Score, Scorer, Truth, find_truth, load_truth, wrong_bits
+from rxcli.types import ColumnResult, FrameResult, PacketResult
+
+N_BITS = 40
+#: Five symbols of seven bits would be 35; the scorer goes by `payload_bits` alone. 70 slots a packet: 71.4 are needed.
+RAW: dict[str, Any] = {
+    "columns": 2,
+    "payload_symbols": 5,
+    "w": [5, 4],
+    "payload_bits": [N_BITS, N_BITS],
+    "frames": [
+        {"frame": 0, "bursts": [{"burst": 0, "visible_slots": 71.5}, {"burst": 1, "visible_slots": 71.3}]},
+        {"frame": 1, "bursts": [{"burst": 1, "visible_slots": 60.0}, {"burst": 2, "visible_slots": 100.0}]},
+    ],
+    "payload": {
+        "0": ["0000000000", "ffffffffff"],
+        "1": ["aaaaaaaaaa", "5555555555"],
+        "2": ["0f0f0f0f0f", "f0f0f0f0f0"],
+    },
+    "a key of the simulator": {"tone": "srgb"},
+}
+
+
+def truth(**changes: Any) -> Truth:
+    return msgspec.convert(json.loads(json.dumps(RAW | changes)), Truth, strict=False)
+
+
+def frame(index: int, payloads: Sequence[tuple[int, str]], w: tuple[int, int] = (5, 4)) -> FrameResult:
+    columns = tuple(
+        ColumnResult(
+            column,
+            "ok",
+            w=w[column],
+            packets=tuple(
+                PacketResult(0.0, 1.0, 4 * len(text), text, confidence=0.9, ber_hat=0.0)
+                for where, text in payloads
+                if where == column
+            ),
+        )
+        for column in (0, 1)
+    )
+    return FrameResult("a", index, 0.0, "ok", columns=columns)
+
+
+def flip(text: str, n: int) -> str:
+    """`text` with its first `n` bits inverted."""
+    return f"{int(text, 16) ^ ((1 << n) - 1) << (4 * len(text) - n):0{len(text)}x}"
+
+
+def score(*frames: FrameResult) -> Score:
+    scorer = Scorer(truth())
+    for one in frames:
+        scorer.add(one)
+    return scorer.score()
+
+
+def test_only_bursts_of_more_than_a_packet_length_and_two_percent_are_expected() -> None:
+    assert truth().expected_bursts == {0, 2}
+
+
+def test_everything_received() -> None:
+    found = score(
+        frame(0, [(0, "0000000000"), (1, "ffffffffff")]),
+        frame(1, [(0, "0f0f0f0f0f"), (1, "f0f0f0f0f0")]),
+    )
+    assert found == Score(expected=4, bits=4 * N_BITS, error_free=4)
+    assert found.ber == 0.0
+
+
+def test_nothing_received_is_half_the_bits_wrong() -> None:
+    found = score(frame(0, []), frame(1, []))
+    assert (found.lost, found.error_free, found.ber) == (4, 0, 0.5)
+
+
+def test_bit_errors_are_filled_in_and_counted() -> None:
+    scorer = Scorer(truth())
+    filled = scorer.add(frame(0, [(0, flip("0000000000", 3)), (1, "ffffffffff")]))
+    assert [packet.bit_errors for column in filled.columns for packet in column.packets] == [3, 0]
+    scorer.add(frame(1, [(0, "0f0f0f0f0f"), (1, "f0f0f0f0f0")]))
+    found = scorer.score()
+    assert (found.error_free, found.bit_errors, found.lost, found.false) == (3, 3, 0, 0)
+    assert found.ber == pytest.approx(3 / 160)
+
+
+@pytest.mark.parametrize(("n_wrong", "n_lost"), [(10, 0), (11, 1)])
+def test_a_quarter_of_wrong_bits_is_the_limit(n_wrong: int, n_lost: int) -> None:
+    found = score(
+        frame(0, [(0, flip("0000000000", n_wrong)), (1, "ffffffffff")]),
+        frame(1, [(0, "0f0f0f0f0f"), (1, "f0f0f0f0f0")]),
+    )
+    assert (found.lost, found.false) == (n_lost, n_lost)
+    assert found.ber == pytest.approx((N_BITS / 2 if n_lost else n_wrong) / 160)
+
+
+def test_a_burst_of_the_frame_before_is_no_false_packet_but_one_of_the_next_is() -> None:
+    assert score(frame(1, [(0, "0000000000")])).false == 0
+    assert score(frame(0, [(0, "0f0f0f0f0f")])).false == 1
+    assert score(frame(2, [(0, "0f0f0f0f0f")])).false == 0
+    assert score(frame(3, [(0, "0f0f0f0f0f")])).false == 1
+
+
+def test_a_packet_of_another_column_is_false() -> None:
+    assert score(frame(0, [(0, "ffffffffff")])).false == 1
+
+
+def test_a_packet_reported_twice_counts_once_by_its_better_copy() -> None:
+    found = score(frame(0, [(0, flip("0000000000", 2))]), frame(1, [(0, "0000000000")]))
+    assert (found.error_free, found.bit_errors, found.lost) == (1, 0, 3)
+
+
+def test_a_packet_that_no_frame_shows_whole_is_extra() -> None:
+    found = score(frame(1, [(0, "aaaaaaaaaa"), (1, flip("5555555555", 1))]))
+    assert (found.extra, found.extra_error_free, found.false, found.lost) == (2, 1, 0, 4)
+
+
+def test_wrong_w_is_counted_and_bits_that_lack_are_wrong() -> None:
+    found = score(frame(0, [(0, "00000000")], w=(4, 4)))
+    assert (found.wrong_w, found.bit_errors, found.error_free) == (1, 8, 0)
+
+
+def test_a_column_that_the_screen_does_not_have_is_false() -> None:
+    scorer = Scorer(truth(columns=1, w=[5], payload_bits=[40], payload={b: [p[0]] for b, p in RAW["payload"].items()}))
+    filled = scorer.add(frame(0, [(0, "0000000000"), (1, "ffffffffff")]))
+    assert scorer.score().false == 1
+    assert filled.columns[1].packets[0].bit_errors is None
+
+
+def test_scores_add_up() -> None:
+    one = score(frame(0, [(0, flip("0000000000", 3))]), frame(1, []))
+    assert (one + one).expected == 8
+    assert (one + one).ber == one.ber
+    assert Score().ber is None
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=90), st.data())
+def test_wrong_bits_agrees_with_counting_them(bits: list[bool], data: st.DataObject) -> None:
+    received = np.array(bits, np.uint8)
+    sent = np.array(data.draw(st.lists(st.booleans(), min_size=len(bits), max_size=len(bits))), np.uint8)
+    errors = wrong_bits(bits_to_hex(received), received.size, bits_to_hex(sent), sent.size)
+    assert errors == int(np.sum(received != sent))
+    assert wrong_bits(bits_to_hex(received), received.size, "", 0) == received.size
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"w": [5]}, "w must have one entry per column, 2"),
+        ({"w": [5, 10]}, "w must be in 1..9 .got 10"),
+        ({"payload_bits": [40, 40, 40]}, "payload_bits must have one entry per column"),
+        ({"payload": {"0": RAW["payload"]["0"], "1": RAW["payload"]["1"]}}, "burst 2 is missing"),
+        ({"payload": RAW["payload"] | {"1": ["aa"]}}, "payload of burst 1 must have one entry per column"),
+        ({"payload": RAW["payload"] | {"1": ["aa", "bb"]}}, "burst 1, column 0, must be hex of at least 40 bits"),
+        ({"payload": RAW["payload"] | {"1": ["zzzzzzzzzz", "bb"]}}, "must be hex"),
+        ({"columns": "two"}, "cannot be read as truth .*columns"),
+        ({"frames": None}, "cannot be read as truth .*frames"),
+    ],
+)
+def test_a_wrong_truth_file_is_named_with_the_reason(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    path = tmp_path / "a.truth.json"
+    path.write_text(json.dumps(RAW | changes))
+    with pytest.raises(InputError, match=message) as caught:
+        load_truth(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", b"null"])
+def test_a_truth_file_that_is_none(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.truth.json"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read as truth"):
+        load_truth(path)
+
+
+def test_truth_beside_a_capture(tmp_path: Path) -> None:
+    assert find_truth(tmp_path / "a.b.jpg") is None
+    (tmp_path / "a.b.truth.json").write_text(json.dumps(RAW))
+    path = find_truth(tmp_path / "a.b.jpg")
+    assert path is not None
+    assert load_truth(path).payload[2][1] == "f0f0f0f0f0"
+    with pytest.raises(InputError, match="No such file"):
+        load_truth(tmp_path / "none.truth.json")
+
+
+#: Packets expected of the still pictures, as their README counts them.
+EXPECTED = {
+    "xs10_sky_34k6": 20,
+    "xs10_china_17k3": 40,
+    "xs10_flower_34k6": 20,
+    "phone_coffee_8k65": 20,
+    "phone_astronaut_17k3": 20,
+    "phone_motorcycle_17k3_near": 20,
+    "xs10_coffee_wide100": 100,
+}
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_reference_captures_expect_what_their_table_says(shared_captures: Path, name: str) -> None:
+    known = load_truth(shared_captures / f"{name}.truth.json")
+    assert Scorer(known).score().expected == EXPECTED[name]

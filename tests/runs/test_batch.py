@@ -1,0 +1,205 @@
+"""Batches: which files, in which order, by whom, and what a kill leaves behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from fake_receiver import fake_decoder
+
+from rxcli.errors import InputError, UsageError
+from rxcli.results.report import from_record, to_json_line
+from rxcli.runs.batch import Journal, Source, collect_sources, decode_here, decode_in_processes, recover, unreadable
+from rxcli.types import FrameResult
+
+SUFFIXES = frozenset({".jpg", ".mp4"})
+
+
+def write_order(folder: Path, name: str, **order: object) -> Source:
+    path = folder / name
+    path.write_text(json.dumps(order))
+    return Source(str(path), str(path))
+
+
+def lines(decoded: object) -> list[str]:
+    return [to_json_line(result) for _, results in decoded for result in results]
+
+
+def test_folders_are_walked_in_order_and_unknown_suffixes_are_passed_over(tmp_path: Path) -> None:
+    for name in ("b.jpg", "a.MP4", "notes.txt", "sub/c.jpg", ".hidden.jpg", ".git/d.jpg", "a.truth.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = [os.path.relpath(source.name, tmp_path) for source in collect_sources([str(tmp_path)], SUFFIXES)]
+    assert found == ["a.MP4", "b.jpg", "sub/c.jpg"]
+
+
+def test_a_file_named_explicitly_is_taken_whatever_its_suffix_and_only_once(tmp_path: Path) -> None:
+    odd, plain = tmp_path / "odd.txt", tmp_path / "a.jpg"
+    odd.touch()
+    plain.touch()
+    sources = collect_sources([str(odd), str(plain), str(tmp_path), str(tmp_path / "missing")], SUFFIXES)
+    assert [source.name for source in sources] == [str(odd), str(plain), str(tmp_path / "missing")]
+
+
+def test_a_folder_without_pictures_is_a_reason_not_silence(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    [source] = collect_sources([str(tmp_path)], SUFFIXES)
+    [result] = fake_decoder().results(source)
+    assert result.status == "unreadable"
+    assert result.message is not None
+    assert str(tmp_path) in result.message
+    assert "no picture" in result.message
+
+
+def test_a_clip_that_breaks_off_gives_everything_before_the_break(tmp_path: Path) -> None:
+    results = list(fake_decoder().results(write_order(tmp_path, "a.mp4", frames=5, fail_at=3)))
+    assert [result.status for result in results] == ["ok", "ok", "ok", "unreadable"]
+    assert results[-1].frame == 3
+    assert "breaks off in frame 3" in str(results[-1].message)
+
+
+def test_a_bug_costs_one_source_and_says_what_to_do(tmp_path: Path) -> None:
+    sources = [write_order(tmp_path, "a.jpg", bug_at=0), write_order(tmp_path, "b.jpg")]
+    results = [result for _, found in decode_here(sources, fake_decoder()) for result in found]
+    assert [result.status for result in results] == ["unreadable", "ok"]
+    assert "internal error (ZeroDivisionError: a bug); run again with --verbose" in str(results[0].message)
+
+
+def test_an_empty_clip_is_unreadable(tmp_path: Path) -> None:
+    [result] = fake_decoder().results(write_order(tmp_path, "a.mp4", frames=0))
+    assert result.status == "unreadable"
+
+
+def test_wrong_options_end_the_run(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="make no sense"):
+        list(fake_decoder("wrong").results(write_order(tmp_path, "a.jpg")))
+
+
+def mixed(folder: Path) -> list[Source]:
+    sources = [write_order(folder, f"{i:02}.jpg", sleep_s=0.02 * (i % 3)) for i in range(9)]
+    sources.insert(2, write_order(folder, "clip.mp4", frames=6, sleep_s=0.02))
+    sources.insert(4, write_order(folder, "cut.mp4", frames=4, fail_at=2))
+    sources.append(Source(str(folder / "missing"), str(folder / "missing")))
+    return sources
+
+
+def test_worker_processes_give_what_one_gives_in_the_same_order(tmp_path: Path) -> None:
+    sources = mixed(tmp_path)
+    alone = lines(decode_here(sources, fake_decoder()))
+    assert len(alone) == 9 + 6 + 3 + 1
+    assert lines(decode_in_processes(sources, fake_decoder(), 3)) == alone
+
+
+def test_a_worker_that_dies_costs_the_source_in_its_hands_only(tmp_path: Path) -> None:
+    sources = mixed(tmp_path)
+    deadly = write_order(tmp_path, "deadly.mp4", frames=3, kill_at=1)
+    sources.insert(3, deadly)
+    results = [result for _, found in decode_in_processes(sources, fake_decoder(), 2) for result in found]
+    [last] = [result for result in results if result.source == deadly.name and result.status == "unreadable"]
+    assert "was ended by SIGKILL" in str(last.message)
+    others = [to_json_line(result) for result in results if result.source != deadly.name]
+    assert others == lines(decode_here([source for source in sources if source != deadly], fake_decoder()))
+
+
+def test_wrong_options_end_a_run_of_worker_processes_too(tmp_path: Path) -> None:
+    sources = mixed(tmp_path)
+    with pytest.raises(UsageError, match="make no sense"):
+        lines(decode_in_processes(sources, fake_decoder("wrong"), 2))
+
+
+def results_of(names: str) -> list[FrameResult]:
+    """One frame per letter, numbered within the source that the letter names."""
+    counts: dict[str, int] = {}
+    found = []
+    for name in names:
+        found.append(replace(unreadable(Source(name, name), counts.get(name, 0), "why"), status="ok"))
+        counts[name] = counts.get(name, 0) + 1
+    return found
+
+
+@pytest.mark.parametrize("cut", range(0, 60, 7))
+def test_recover_drops_a_half_line_and_the_source_it_belongs_to(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "out.jsonl"
+    journal = Journal(path)
+    for result in results_of("aabccc"):
+        journal.write(result)
+    journal.close()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) - cut])
+    assert [(name, len(found)) for name, found in recover(path)] == [("a", 2), ("b", 1)]
+    assert path.read_bytes() == b"".join(line for line in whole.splitlines(True)[:3])
+
+
+def test_recover_of_a_file_that_is_not_there_starts_afresh(tmp_path: Path) -> None:
+    assert list(recover(tmp_path / "none.jsonl")) == []
+
+
+@pytest.mark.parametrize("text", ["hello\nworld\n", "hello", "{}\n", '[1, 2]\n{"source": 3}\n', "null\n"])
+def test_recover_leaves_a_foreign_file_alone(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "letter.txt"
+    path.write_text(text)
+    with pytest.raises(UsageError, match="line 1"):
+        list(recover(path))
+    assert path.read_text() == text
+
+
+def test_a_journal_that_cannot_be_written_says_so(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be written"):
+        Journal(tmp_path / "no such folder" / "out.jsonl")
+    full = Journal(Path("/dev/full"))
+    with pytest.raises(InputError, match="No space left"):
+        full.write(results_of("a")[0])
+    full.close()
+
+
+RUN = """
+import sys
+from pathlib import Path
+from fake_receiver import fake_decoder
+from rxcli.runs.batch import Journal, collect_sources, decode_here, recover
+folder, out = sys.argv[1], Path(sys.argv[2])
+done = {name for name, _ in recover(out)}
+journal = Journal(out, resume=True)
+sources = collect_sources([folder], frozenset({".jpg", ".mp4"}))
+for source, results in decode_here([s for s in sources if s.name not in done], fake_decoder()):
+    for result in results:
+        journal.write(result)
+"""
+
+
+def start_run(folder: Path, out: Path) -> subprocess.Popen[bytes]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    return subprocess.Popen([sys.executable, "-c", RUN, str(folder), str(out)], env=environment)
+
+
+def test_a_run_killed_again_and_again_ends_with_the_same_lines(tmp_path: Path) -> None:
+    folder, out = tmp_path / "in", tmp_path / "out.jsonl"
+    folder.mkdir()
+    sources = [write_order(folder, f"{i:02}.jpg", sleep_s=0.03) for i in range(20)]
+    sources.append(write_order(folder, "clip.mp4", frames=8, sleep_s=0.03))
+    undisturbed = lines(decode_here(sources, fake_decoder()))
+    generator = random.Random(5)
+    n_killed = 0
+    while n_killed < 5:
+        run = start_run(folder, out)
+        before = out.stat().st_size if out.exists() else -1
+        while (out.stat().st_size if out.exists() else -1) <= before and run.poll() is None:
+            time.sleep(0.005)
+        time.sleep(generator.uniform(0, 0.08))
+        run.send_signal(signal.SIGKILL)
+        n_killed += run.wait() == -signal.SIGKILL
+        if run.returncode == 0:
+            break
+        text = out.read_text()
+        assert all(from_record(json.loads(line)) for line in text.splitlines())
+    assert n_killed >= 3
+    assert start_run(folder, out).wait() == 0
+    assert out.read_text().splitlines() == undisturbed

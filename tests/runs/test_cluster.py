@@ -1,0 +1,94 @@
+"""A real Dask scheduler with two worker processes on the loopback interface."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from fake_receiver import fake_decoder
+
+from rxcli.errors import UsageError
+from rxcli.results.report import to_json_line
+from rxcli.runs.batch import Source, decode_here
+from rxcli.runs.cluster import decode_on_cluster
+
+pytest.importorskip("distributed", reason="dask.distributed is not installed (extra cluster)")
+
+QUIET = {
+    "DASK_DISTRIBUTED__SCHEDULER__DASHBOARD__ENABLED": "False",
+    "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "5s",
+}
+
+
+@contextmanager
+def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """`python -m distributed...`, killed at the end."""
+    environment = {**os.environ, **QUIET, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, "-W", "ignore", "-m", *arguments]
+    started = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    try:
+        yield started
+    finally:
+        started.kill()
+        started.wait()
+        assert started.stderr is not None
+        started.stderr.close()
+
+
+def wait_for(started: subprocess.Popen[str], pattern: str) -> re.Match[str]:
+    assert started.stderr is not None
+    for line in started.stderr:
+        found = re.search(pattern, line)
+        if found:
+            return found
+    raise AssertionError(f"ended without saying {pattern!r}")
+
+
+@contextmanager
+def worker(address: str, folder: Path, name: str) -> Iterator[subprocess.Popen[str]]:
+    options = ("--no-nanny", "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder), "--name", name)
+    with process("distributed.cli.dask_worker", address, *options) as started:
+        wait_for(started, "Registered to")
+        yield started
+
+
+def write_orders(folder: Path) -> list[Source]:
+    orders = {f"{i:02}.jpg": {"sleep_s": 0.05} for i in range(30)}
+    orders["clip.mp4"] = {"frames": 5, "sleep_s": 0.05}
+    orders["cut.mp4"] = {"frames": 5, "fail_at": 2}
+    for name, order in orders.items():
+        (folder / name).write_text(json.dumps(order))
+    return [Source(str(folder / name), str(folder / name)) for name in orders]
+
+
+def test_a_run_is_complete_and_in_order_though_a_worker_is_killed(tmp_path: Path) -> None:
+    sources = write_orders(tmp_path)
+    alone = [to_json_line(result) for _, results in decode_here(sources, fake_decoder()) for result in results]
+    scheduler_options = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+    with process("distributed.cli.dask_scheduler", *scheduler_options) as scheduler:
+        address = wait_for(scheduler, r"Scheduler at:\s*(tcp://[0-9.:]+)").group(1)
+        with worker(address, tmp_path, "first") as first, worker(address, tmp_path, "second") as second:
+            lines = []
+            for number, (_, results) in enumerate(decode_on_cluster(sources, fake_decoder(), address)):
+                lines += [to_json_line(result) for result in results]
+                if number == 5:
+                    first.send_signal(signal.SIGKILL)
+            assert first.wait() == -signal.SIGKILL
+            assert second.poll() is None
+    assert lines == alone
+
+
+def test_a_scheduler_that_is_not_there(tmp_path: Path) -> None:
+    sources = write_orders(tmp_path)
+    with pytest.raises(UsageError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:1'"):
+        next(decode_on_cluster(sources, fake_decoder(), "tcp://127.0.0.1:1", connect_s=0.5))
+    with pytest.raises(UsageError, match="no Dask scheduler answers at 'nonsense://x'"):
+        next(decode_on_cluster(sources, fake_decoder(), "nonsense://x", connect_s=0.5))
