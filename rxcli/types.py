@@ -150,7 +150,7 @@ class Clock:
     #: (C,) float64: delay of each column, slots.
     delay_slots: FloatArray
     #: Height of the header peak over the strongest one elsewhere.
-    lock: float
+    header_peak_ratio: float
 
     @property
     def n_copies(self) -> int:
@@ -215,7 +215,7 @@ class PacketResult:
     #: Frames of the clip in which the burst was seen; None for stills.
     frames: tuple[int, ...] | None = None
     #: What the confidence was made of, see `rxcli.receiver.decode.assemble`; for fits, not for reports.
-    evidence: tuple[float, ...] = ()
+    confidence_features: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -78,7 +78,7 @@ class Camera:
     #: What was estimated: name -> (value, standard deviation).
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
     #: The estimate and the strips it is of, for `refitted_camera`; None for a camera from a profile.
-    guess: tuple[blind.BlindEstimate, blind.Strips] | None = None
+    blind_estimate: tuple[blind.BlindEstimate, blind.Strips] | None = None
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -92,36 +92,36 @@ class Camera:
 
     def without_tone(self) -> Camera:
         """The camera, its tone curve not told."""
-        told = {name: found for name, found in self.estimated.items() if name != "tone_exponent"}
-        return replace(self, estimated=told)
+        denoised = {name: found for name, found in self.estimated.items() if name != "tone_exponent"}
+        return replace(self, estimated=denoised)
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class ColumnSampler:
     """What was read of the columns of a screen."""
 
     profiles: RowProfiles
     #: Whether strips were read in pairs, as a quick look takes them.
-    in_pairs: bool = False
+    is_binned: bool = False
     #: Reads all strips of some columns pixel by pixel, given the noise model, where the profiles are of a quick look;
     #: None where they are not.
     read: Callable[[slice, tuple[float, float]], RowProfiles] | None = None
 
     @property
-    def n_quick_strips(self) -> int:
-        """Strips of a column that a quick look takes: see `sync.halved_strips`."""
+    def n_binned_strips(self) -> int:
+        """Strips of a column that a quick look takes: see `sync.binned_strips`."""
         n_strips: int = self.profiles.light.shape[1]
-        return n_strips if self.in_pairs or n_strips % 2 else n_strips // 2
+        return n_strips if self.is_binned or n_strips % 2 else n_strips // 2
 
-    def halved(self) -> RowProfiles:
+    def binned(self) -> RowProfiles:
         """Strips pooled in pairs."""
-        return self.profiles if self.in_pairs else sync.halved_strips(self.profiles)
+        return self.profiles if self.is_binned else sync.binned_strips(self.profiles)
 
-    def in_depth(self, columns: NDArray[np.int64]) -> Reading:
+    def in_depth(self, columns: NDArray[np.int64]) -> ColumnSampler:
         """The same with some columns read pixel by pixel, strip by strip."""
         if self.read is None or not columns.size:
             return self
-        every = sync.doubled_strips(self.profiles) if self.in_pairs else self.profiles
+        every = sync.unbinned_strips(self.profiles) if self.is_binned else self.profiles
         names = [name for name in ("light", "inside", "count", "sensor_row") if getattr(every, name) is not None]
         arrays = {name: getattr(every, name).copy() for name in names}
         for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
@@ -129,15 +129,15 @@ class Reading:
             read = self.read(part, (every.noise_floor, every.noise_slope))
             for name, array in arrays.items():
                 array[part] = getattr(read, name)
-        return Reading(replace(every, **arrays), read=self.read)
+        return ColumnSampler(replace(every, **arrays), read=self.read)
 
 
 @dataclass(frozen=True, slots=True)
-class Lock:
+class Acquisition:
     """A screen whose clock was found."""
 
     screen: ScreenProfile
-    reading: Reading
+    sampler: ColumnSampler
     clock: Clock
     #: Another that it may be: of columns which are not spread in time, where they seem to be.
     rival: Clock | None = None
@@ -146,16 +146,16 @@ class Lock:
 
     @property
     def profiles(self) -> RowProfiles:
-        return self.reading.profiles
+        return self.sampler.profiles
 
-    def in_pairs(self) -> Lock:
+    def is_binned(self) -> Acquisition:
         """The lock with strips pooled in pairs."""
-        return replace(self, reading=Reading(self.reading.halved(), in_pairs=True))
+        return replace(self, sampler=ColumnSampler(self.sampler.binned(), is_binned=True))
 
-    def in_depth(self, columns: NDArray[np.int64]) -> Lock:
+    def in_depth(self, columns: NDArray[np.int64]) -> Acquisition:
         """The lock with some columns read pixel by pixel, strip by strip."""
-        reading = self.reading.in_depth(columns)
-        return self if reading is self.reading else replace(self, reading=reading)
+        sampler = self.sampler.in_depth(columns)
+        return self if sampler is self.sampler else replace(self, sampler=sampler)
 
 
 def _camera_of(frame: Frame, options: ReceiverOptions) -> Camera | None:
@@ -212,13 +212,13 @@ def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, st
         return Cameras((known, options))
     n_columns = min(screen.columns for screen in options.screens)
     with stages("sampling"):
-        strips = _unbent_strips(frame, corners, n_columns, _sides_of(frame, corners))
+        strips = _straightened_strips(frame, corners, n_columns, _sides_of(frame, corners))
     with stages("blind"):
-        contradicted = strips.bow is not None and blind.stripes_are_bent(strips)
+        contradicted = strips.side_curvature is not None and blind.stripes_are_curved(strips)
     if contradicted:
         # Lenses that are left in a picture do not bend stripes: what looked like its sides are others.
         with stages("sampling"):
-            strips = _unbent_strips(frame, corners, n_columns, None)
+            strips = _straightened_strips(frame, corners, n_columns, None)
     with stages("blind"):
         found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
     first = _with_screens(found.estimate, strips, options) if found.estimate else None
@@ -238,17 +238,17 @@ def _with_screens(
 
 
 def _sides_of(frame: Frame, corners: FloatArray) -> tuple[float, float] | None:
-    """The distortion that the screen's sides show, see `find_screen.measure_bow`."""
-    from rxcli.receiver.screen.find import measure_bow
+    """The distortion that the screen's sides show, see `find_screen.measure_side_curvature`."""
+    from rxcli.receiver.screen.find import measure_side_curvature
 
-    return measure_bow(frame.pixels, corners, **levels_of(frame))
+    return measure_side_curvature(frame.pixels, corners, **levels_of(frame))
 
 
-def _unbent_strips(
+def _straightened_strips(
     frame: Frame, corners: FloatArray, n_columns: int, sides: tuple[float, float] | None, tone: str = _DEFAULT_TONE
 ) -> blind.Strips:
     """Strips of a picture whose camera is not known, along sides that show some distortion."""
-    lens = blind.bowing_lens(blind.bow_of(sides), frame.width, frame.height)
+    lens = blind.curving_lens(blind.side_curvature_of(sides), frame.width, frame.height)
     outlines = _outlines(frame, corners, lens, n_columns)
     centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
     profiles = sampling.sample_rows(frame, outlines, tone)
@@ -266,37 +266,41 @@ def _estimated_camera(estimate: blind.BlindEstimate, strips: blind.Strips, rate:
         tone=strips.tone or _DEFAULT_TONE,
         reversed=estimate.reversed,
         estimated=blind.summary(estimate, rate),
-        guess=(estimate, strips),
+        blind_estimate=(estimate, strips),
     )
 
 
 def refitted_camera(
-    frame: Frame, corners: FloatArray, camera: Camera, lock: Lock, now: Clock, lit: Float32Array
+    frame: Frame, corners: FloatArray, camera: Camera, acquisition: Acquisition, clock: Clock, lit: Float32Array
 ) -> tuple[Camera, float]:
     """An estimated camera from slots (C, N) that were decoded on a clock; and how far that moves the clock, slots."""
-    if camera.guess is None:
+    if camera.blind_estimate is None:
         return camera, 0.0
-    estimate, strips = camera.guess
-    if strips.n_columns != lock.screen.columns:
-        strips = _unbent_strips(frame, corners, lock.screen.columns, strips.sides, camera.tone)
-    found, moved_slots = blind.refit(strips, estimate, now, lit)
-    return _estimated_camera(found, strips, lock.screen.slot_rate_hz), moved_slots
+    estimate, strips = camera.blind_estimate
+    if strips.n_columns != acquisition.screen.columns:
+        strips = _straightened_strips(frame, corners, acquisition.screen.columns, strips.sides, camera.tone)
+    found, moved_slots = blind.refit(strips, estimate, clock, lit)
+    return _estimated_camera(found, strips, acquisition.screen.slot_rate_hz), moved_slots
 
 
 def linear_camera(
-    frame: Frame, corners: FloatArray, camera: Camera, lock: Lock, now: Clock, lit: Float32Array
+    frame: Frame, corners: FloatArray, camera: Camera, acquisition: Acquisition, clock: Clock, lit: Float32Array
 ) -> Camera:
     """An estimated camera refitted to values taken as they are, where light bends over the slots as if they were light.
 
     The same camera where it does not; without an exponent where that is not borne out by the values as they are.
     """
-    if camera.guess is None or camera.tone != _DEFAULT_TONE or not blind.is_linear(camera.guess[0].tone):
+    if (
+        camera.blind_estimate is None
+        or camera.tone != _DEFAULT_TONE
+        or not blind.is_linear(camera.blind_estimate[0].tone)
+    ):
         return camera
-    estimate, strips = camera.guess
-    as_stored = _unbent_strips(frame, corners, lock.screen.columns, strips.sides, "linear")
-    found, _ = blind.refit(as_stored, estimate, now, lit)
+    estimate, strips = camera.blind_estimate
+    as_stored = _straightened_strips(frame, corners, acquisition.screen.columns, strips.sides, "linear")
+    found, _ = blind.refit(as_stored, estimate, clock, lit)
     if blind.is_linear(found.tone):
-        return _estimated_camera(found, as_stored, lock.screen.slot_rate_hz)
+        return _estimated_camera(found, as_stored, acquisition.screen.slot_rate_hz)
     return camera.without_tone()
 
 
@@ -306,7 +310,7 @@ def _exposure_of(frame: Frame, mode: ReadoutMode) -> float:
 
 
 def levels_of(frame: Frame) -> dict[str, Any]:
-    """What pixel values mean, by the names of the arguments of `find_screen` and `measure_bow`."""
+    """What pixel values mean, by the names of the arguments of `find_screen` and `measure_side_curvature`."""
     levels = frame.mosaic
     if levels is None:
         return {"black": frame.black, "white": frame.white}
@@ -336,55 +340,57 @@ def find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray:
     return geometry.viewer_order(corners, orientation)
 
 
-def find_lock(
+def acquire(
     frame: Frame, corners: FloatArray, camera: Camera, options: ReceiverOptions, stages: Stages, *, quick: bool = False
-) -> Lock:
+) -> Acquisition:
     """The screen profile that fits best, with the row profiles of its columns.
 
     Screens that differ in nothing but their columns share a clock: which of them it is, is asked last. With `quick`,
-    columns are read pixel by pixel when they are asked for, see `Lock.in_depth`.
+    columns are read pixel by pixel when they are asked for, see `Acquisition.in_depth`.
     """
     n_columns = min(screen.columns for screen in options.screens)
     with stages("sampling"):
-        reading = _read_columns(frame, corners, camera, n_columns, quick=quick)
+        sampler = _read_columns(frame, corners, camera, n_columns, quick=quick)
     with stages("clock"):
-        pooled = sync.pooled_strips(reading.halved())
+        pooled = sync.pooled_strips(sampler.binned())
         rates = {(s.slot_rate_hz, s.packet_slots): s for s in options.screens}
         clocks = {rate: found for rate, screen in rates.items() if (found := _clocks_of(screen, pooled, camera))}
-        clocks = {rate: found for rate, found in clocks.items() if found[0].lock >= _MIN_LOCK}
+        clocks = {rate: found for rate, found in clocks.items() if found[0].header_peak_ratio >= _MIN_LOCK}
         if not clocks:
             raise Failure("no_signal", _why_no_signal(frame, corners, camera, options))
         rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(pooled, clocks[r][0]))
     alike = [screen for screen in options.screens if (screen.slot_rate_hz, screen.packet_slots) == rate]
-    locks = [_locked(alike[0], reading, clocks[rate])] if alike[0].columns == n_columns else []
-    for screen in alike[len(locks) :]:
+    acquisitions = [_acquired(alike[0], sampler, clocks[rate])] if alike[0].columns == n_columns else []
+    for screen in alike[len(acquisitions) :]:
         with stages("sampling"):
             finer = _read_columns(frame, corners, camera, screen.columns, quick=quick)
         with stages("clock"):
-            found = _clocks_of(screen, sync.pooled_strips(finer.halved()), camera)
+            found = _clocks_of(screen, sync.pooled_strips(finer.binned()), camera)
         if found:
-            locks.append(_locked(screen, finer, found))
-    if not locks:
+            acquisitions.append(_acquired(screen, finer, found))
+    if not acquisitions:
         raise Failure("no_signal", _why_no_signal(frame, corners, camera, options))
-    return locks[0] if len(locks) == 1 else _with_likely_columns(locks)
+    return acquisitions[0] if len(acquisitions) == 1 else _with_likely_columns(acquisitions)
 
 
-def _locked(screen: ScreenProfile, reading: Reading, clocks: tuple[Clock, ...]) -> Lock:
-    return Lock(screen, reading, clocks[0], rival=clocks[1] if len(clocks) > 1 else None)
+def _acquired(screen: ScreenProfile, sampler: ColumnSampler, clocks: tuple[Clock, ...]) -> Acquisition:
+    return Acquisition(screen, sampler, clocks[0], rival=clocks[1] if len(clocks) > 1 else None)
 
 
-def _structure(profiles: RowProfiles, now: Clock) -> float:
+def _structure(profiles: RowProfiles, clock: Clock) -> float:
     """How much the strips, each on its own, look like packets on this clock."""
-    samples = sync.sample_slots(profiles, now, 1)
-    slots = samples.light.reshape(-1, now.n_slots).astype(np.float64)
-    return blind.structure_evidence(slots, now.first_slot, now.packet_slots)
+    samples = sync.sample_slots(profiles, clock, 1)
+    slots = samples.light.reshape(-1, clock.n_slots).astype(np.float64)
+    return blind.structure_llr(slots, clock.first_slot, clock.packet_slots)
 
 
-def _with_likely_columns(locks: list[Lock]) -> Lock:
+def _with_likely_columns(acquisitions: list[Acquisition]) -> Acquisition:
     """Among screens of one clock, the one whose columns are as wide as seen."""
-    finest = max(locks, key=lambda lock: lock.profiles.light.shape[0] * lock.profiles.light.shape[1])
-    likely = blind.likely_columns(finest.profiles, finest.clock, [lock.screen for lock in locks])
-    return next(lock for lock in locks if lock.screen is likely)
+    finest = max(
+        acquisitions, key=lambda acquisition: acquisition.profiles.light.shape[0] * acquisition.profiles.light.shape[1]
+    )
+    likely = blind.likely_columns(finest.profiles, finest.clock, [acquisition.screen for acquisition in acquisitions])
+    return next(acquisition for acquisition in acquisitions if acquisition.screen is likely)
 
 
 def _n_strips(corners: FloatArray, n_columns: int) -> int:
@@ -401,11 +407,11 @@ def sample_columns(frame: Frame, corners: FloatArray, camera: Camera, n_columns:
     return _read_columns(frame, corners, camera, n_columns, quick=False).profiles
 
 
-def _read_columns(frame: Frame, corners: FloatArray, camera: Camera, n_columns: int, *, quick: bool) -> Reading:
+def _read_columns(frame: Frame, corners: FloatArray, camera: Camera, n_columns: int, *, quick: bool) -> ColumnSampler:
     """All columns; after a quick look, with what reads some of them pixel by pixel."""
     quick = quick and sampling.is_coded(frame)
     n_strips = _n_strips(corners, n_columns)
-    in_pairs = quick and n_strips >= _MANY_STRIPS and n_strips % 2 == 0
+    is_binned = quick and n_strips >= _MANY_STRIPS and n_strips % 2 == 0
 
     def read(
         columns: slice, noise: tuple[float, float] | None, n_strips: int = n_strips, quick: bool = False
@@ -416,8 +422,8 @@ def _read_columns(frame: Frame, corners: FloatArray, camera: Camera, n_columns: 
         profiles = sampling.sample_rows(frame, outlines, camera.tone, quick=quick, noise=noise)
         return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
 
-    profiles = read(slice(0, n_columns), None, n_strips // 2 if in_pairs else n_strips, quick)
-    return Reading(profiles, in_pairs, read if quick else None)
+    profiles = read(slice(0, n_columns), None, n_strips // 2 if is_binned else n_strips, quick)
+    return ColumnSampler(profiles, is_binned, read if quick else None)
 
 
 def _clocks_of(screen: ScreenProfile, profiles: RowProfiles, camera: Camera) -> tuple[Clock, ...]:

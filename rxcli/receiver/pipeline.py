@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.locate import Failure, Stages, find_camera, find_corners, find_lock, too_small
-from rxcli.receiver.still import decode, decode_likeliest, doubtful_columns, headerless, second_opinion, support
+from rxcli.receiver.locate import Failure, Stages, acquire, find_camera, find_corners, too_small
+from rxcli.receiver.still import apply_autoencoder, decode, decode_likeliest, doubtful_columns, headerless, slot_margin
 from rxcli.receiver.unknown_camera import likely_camera, with_refitted_camera, without_estimate
 from rxcli.results.dump import dump_frame
 from rxcli.types import Frame, FrameResult
@@ -53,17 +53,17 @@ def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
     yield from frames
 
 
-def denoiser_case(frame: Frame, options: ReceiverOptions) -> tuple[denoise.Scene, NDArray[np.int64]] | None:
+def denoiser_case(frame: Frame, options: ReceiverOptions) -> tuple[denoise.DenoiserInput, NDArray[np.int64]] | None:
     """For training: what the auto-encoder is shown of a frame, and which columns it is asked; None without any."""
     try:
         corners = find_corners(frame, options)
         camera, options = find_camera(frame, corners, options, Stages())
-        lock = find_lock(frame, corners, camera, options, Stages(), quick=True)
+        acquisition = acquire(frame, corners, camera, options, Stages(), quick=True)
     except Failure:
         return None
-    seen = decode(lock, options.skip)
-    columns = doubtful_columns(seen)
-    return (seen.scene, columns) if seen.scene is not None and columns.size else None
+    reception = decode(acquisition, options.skip)
+    columns = doubtful_columns(reception)
+    return (reception.scene, columns) if reception.scene is not None and columns.size else None
 
 
 def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
@@ -75,39 +75,48 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
         result = replace(result, corners=corners)
         camera, options = likely_camera(frame, corners, options, stages)
         result = replace(result, **camera.facts)
-        lock = find_lock(frame, corners, camera, options, stages, quick=True)
-        result = replace(result, screen_profile=lock.screen.name)
+        acquisition = acquire(frame, corners, camera, options, stages, quick=True)
+        result = replace(result, screen_profile=acquisition.screen.name)
         with stages("detect"):
-            seen = decode_likeliest(lock, options.skip)
-        if camera.guess is not None:
-            camera, lock, seen = with_refitted_camera(frame, corners, camera, lock, seen, options, stages)
+            reception = decode_likeliest(acquisition, options.skip)
+        if camera.blind_estimate is not None:
+            camera, acquisition, reception = with_refitted_camera(
+                frame, corners, camera, acquisition, reception, options, stages
+            )
             result = replace(result, **camera.facts)
         with stages("detect"):
-            no_header = headerless(seen)
+            no_header = headerless(reception)
         with stages("denoise"):
-            seen, denoised, report = second_opinion(lock, seen, options)
+            reception, denoised, report = apply_autoencoder(acquisition, reception, options)
         if options.dump_dir is not None:
             dump_frame(
-                options.dump_dir, frame, corners, lock.profiles, seen.clock, seen.samples, seen.metrics, seen.posteriors
+                options.dump_dir,
+                frame,
+                corners,
+                acquisition.profiles,
+                reception.clock,
+                reception.samples,
+                reception.metrics,
+                reception.posteriors,
             )
         columns = assemble.column_results(
-            seen.clock,
-            seen.posteriors,
-            seen.snr,
-            seen.samples,
-            support(seen),
+            reception.clock,
+            reception.posteriors,
+            reception.snr,
+            reception.samples,
+            slot_margin(reception),
             no_header,
             options.min_confidence,
             denoised,
         )
         if camera.reversed:
             columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
-        result = replace(result, denoiser=report, skipped=seen.skipped)
+        result = replace(result, denoiser=report, skipped=reception.skipped)
         result = replace(result, columns=columns, status=assemble.frame_status(columns))
         if result.status == "no_signal":
-            too_few_rows = too_small(frame, corners, camera, lock.screen)
+            too_few_rows = too_small(frame, corners, camera, acquisition.screen)
             result = replace(result, message=too_few_rows or assemble.why_no_packet(columns))
-            result = without_estimate(result, camera, seen)
+            result = without_estimate(result, camera, reception)
     except Failure as failure:
         skipped = {"no_screen": 1} if failure.status == "no_screen" else {}
         estimated = failure.estimated or result.estimated

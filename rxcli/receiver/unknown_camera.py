@@ -9,8 +9,17 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import camera as blind
 from rxcli.receiver import channel
-from rxcli.receiver.locate import Camera, Failure, Lock, Stages, find_cameras, find_lock, linear_camera, refitted_camera
-from rxcli.receiver.still import Reception, decode_likeliest, packet_evidence, quick_look
+from rxcli.receiver.locate import (
+    Acquisition,
+    Camera,
+    Failure,
+    Stages,
+    acquire,
+    find_cameras,
+    linear_camera,
+    refitted_camera,
+)
+from rxcli.receiver.still import Reception, decode_likeliest, initial_pass, packet_llr
 from rxcli.types import FloatArray, Frame, FrameResult
 
 #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
@@ -44,7 +53,7 @@ def likely_camera(
         return found.first
     best, most = found.first if found.sure else None, -np.inf
     for camera in ([found.first] if found.first else []) + list(found.rivals):
-        packets, symbols = _look(frame, corners, *camera, stages)
+        packets, symbols = _quick_evidence(frame, corners, *camera, stages)
         if packets > _PACKETS_AT_LEAST and packets + symbols > most:
             best, most = camera, packets + symbols
     if best is None:
@@ -52,72 +61,72 @@ def likely_camera(
     return best
 
 
-def _look(
+def _quick_evidence(
     frame: Frame, corners: FloatArray, camera: Camera, options: ReceiverOptions, stages: Stages
 ) -> tuple[float, float]:
     """What a quick look says of a camera: evidence of headers and packets, and how sure the symbols are, nats."""
     try:
-        lock = find_lock(frame, corners, camera, options, stages, quick=True)
+        acquisition = acquire(frame, corners, camera, options, stages, quick=True)
     except Failure:
         return -np.inf, 0.0
     with stages("detect"):
-        seen = quick_look(lock)
-        packets = float(seen.posteriors.header_llr.sum()) + packet_evidence(seen)
-    return packets, _SAY_OF_SYMBOLS * float(seen.posteriors.log_prob.mean())
+        reception = initial_pass(acquisition)
+        packets = float(reception.posteriors.header_llr.sum()) + packet_llr(reception)
+    return packets, _SAY_OF_SYMBOLS * float(reception.posteriors.log_prob.mean())
 
 
 def with_refitted_camera(
     frame: Frame,
     corners: FloatArray,
     camera: Camera,
-    lock: Lock,
-    seen: Reception,
+    acquisition: Acquisition,
+    reception: Reception,
     options: ReceiverOptions,
     stages: Stages,
-) -> tuple[Camera, Lock, Reception]:
+) -> tuple[Camera, Acquisition, Reception]:
     """The camera that the slots tell, and what is received with it, until that moves the clock no more.
 
     Where packets show less then, what was received before stays. Values that seem to be light are received as such.
     """
     for _ in range(_MOST_REFITS):
         with stages("blind"):
-            lit = channel.lit_on_grid(seen.posteriors, seen.clock)
-            camera, moved_slots = refitted_camera(frame, corners, camera, lock, seen.clock, lit)
+            lit = channel.lit_on_grid(reception.posteriors, reception.clock)
+            camera, moved_slots = refitted_camera(frame, corners, camera, acquisition, reception.clock, lit)
         if moved_slots < _MATTERS_SLOTS:
             break
-        found = _received(frame, corners, camera, seen, options, stages)
+        found = _received(frame, corners, camera, reception, options, stages)
         if found is None:
             break
-        lock, seen = found
+        acquisition, reception = found
     with stages("blind"):
-        lit = channel.lit_on_grid(seen.posteriors, seen.clock)
-        linear = linear_camera(frame, corners, camera, lock, seen.clock, lit)
+        lit = channel.lit_on_grid(reception.posteriors, reception.clock)
+        linear = linear_camera(frame, corners, camera, acquisition, reception.clock, lit)
     if linear.tone == camera.tone:
-        return linear, lock, seen
-    found = _received(frame, corners, linear, seen, options, stages)
+        return linear, acquisition, reception
+    found = _received(frame, corners, linear, reception, options, stages)
     if found is None:
-        return camera.without_tone(), lock, seen
+        return camera.without_tone(), acquisition, reception
     return with_refitted_camera(frame, corners, linear, *found, options, stages)
 
 
 def _received(
     frame: Frame, corners: FloatArray, camera: Camera, before: Reception, options: ReceiverOptions, stages: Stages
-) -> tuple[Lock, Reception] | None:
+) -> tuple[Acquisition, Reception] | None:
     """What is received with a camera; None where packets show less than in what was received before."""
     try:
-        lock = find_lock(frame, corners, camera, options, stages, quick=True)
+        acquisition = acquire(frame, corners, camera, options, stages, quick=True)
     except Failure:
         return None
     with stages("detect"):
-        seen = decode_likeliest(lock, options.skip)
-    return (lock, seen) if packet_evidence(seen) >= _KEPT_EVIDENCE * packet_evidence(before) else None
+        reception = decode_likeliest(acquisition, options.skip)
+    return (acquisition, reception) if packet_llr(reception) >= _KEPT_EVIDENCE * packet_llr(before) else None
 
 
-def without_estimate(result: FrameResult, camera: Camera, seen: Reception) -> FrameResult:
+def without_estimate(result: FrameResult, camera: Camera, reception: Reception) -> FrameResult:
     """A result without packets, the camera's estimate taken out where neither packets nor edges bear it out."""
-    if camera.guess is None or packet_evidence(seen) >= _PACKETS_IF_NONE_RECEIVED:
+    if camera.blind_estimate is None or packet_llr(reception) >= _PACKETS_IF_NONE_RECEIVED:
         return result
-    estimate, strips = camera.guess
+    estimate, strips = camera.blind_estimate
     if blind.by_edges(strips, [estimate]):
         return result
     return replace(result, line_delay_s=None, exposure_s=None, estimated={}, message=_NO_HEADERS)

@@ -176,11 +176,11 @@ def profile_figure(
     """Root of the mean light of each column on every sensor row, over the decided slots: lit ones are shaded."""
     figure = new_figure(16, 1.1 * len(columns) + 0.6)
     many = figure.subplots(len(columns), 1, sharex=True, squeeze=False)[:, 0]
-    rows_seen: list[float] = []
+    rows_observed: list[float] = []
     for axes, column in zip(many, columns, strict=True):
         rows, light = column_light(profiles, column.column)
         axes.plot(rows, np.sqrt(np.maximum(light, 0)), linewidth=0.5, color="black")  # the root shows dark parts too
-        rows_seen += [float(rows[0]), float(rows[-1])] if rows.size else []
+        rows_observed += [float(rows[0]), float(rows[-1])] if rows.size else []
         if result.line_delay_s:
             rows_per_slot = 1 / (screen.slot_rate_hz * result.line_delay_s)
             # A packet starts on the row whose exposure starts with it; a slot shows most where exposures are half over.
@@ -190,8 +190,8 @@ def profile_figure(
         axes.set_ylabel(f"{column.column}", rotation=0, ha="right")
         axes.set_yticks([])
         axes.set_title(f"{column.status}, w {column.w}", loc="right", fontsize=7, pad=1)
-    if rows_seen:
-        many[-1].set_xlim(min(rows_seen), max(rows_seen))
+    if rows_observed:
+        many[-1].set_xlim(min(rows_observed), max(rows_observed))
     many[-1].set_xlabel("sensor row")
     return figure
 

@@ -14,7 +14,7 @@ from rxcli.cli.common import receiver_options
 from rxcli.cli.main import run
 from rxcli.ingest import open_source
 from rxcli.receiver.pipeline import receive
-from rxcli.results import plots as pictures
+from rxcli.results import plots
 from rxcli.results.plots import column_light, decided_slots
 
 SAMPLE = Path(__file__).parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
@@ -103,15 +103,15 @@ def test_slots_of_an_unknown_camera_are_shaded_along_bent_stripes(
     import cv2
 
     seen: list[tuple[Any, ...]] = []
-    figure, drawn = pictures.new_figure(1, 1), pictures.profile_figure
-    monkeypatch.setattr(pictures, "profile_figure", lambda *arguments: seen.append(arguments) or figure)
+    figure, drawn = plots.new_figure(1, 1), plots.profile_figure
+    monkeypatch.setattr(plots, "profile_figure", lambda *arguments: seen.append(arguments) or figure)
     stored = cv2.imread(str(SAMPLE), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(tmp_path / "phone.png"), stored[::-1, ::-1] if turned else stored)
     assert run(["inspect", str(tmp_path / "phone.png"), "--screen", "paper-17k3"]) == 0
     [(profiles, result, columns, screen)] = seen
     assert result.camera_profile is None
     shaded: list[tuple[float, NDArray[np.uint8]]] = []
-    monkeypatch.setattr(pictures, "_shade", lambda axes, start, rows_per_slot, slots: shaded.append((start, slots)))
+    monkeypatch.setattr(plots, "_shade", lambda axes, start, rows_per_slot, slots: shaded.append((start, slots)))
     rows_per_slot = 1 / (screen.slot_rate_hz * result.line_delay_s)
     agreement = []
     for column in columns:

@@ -65,20 +65,20 @@ def test_samples_tell_what_was_sent(samples: list[fit.Sample]) -> None:
 def test_words_are_scored_as_the_detector_would() -> None:
     """By brute force: the metrics of every slot that a word, or its end, is part of."""
     rng = np.random.default_rng(5)
-    w, memory, n_symbols = 4, 3, 2
+    w, isi_memory, n_symbols = 4, 3, 2
     bits = rng.integers(0, 2, n_symbols * bits_per_symbol(w), dtype=np.uint8)
     sent = encode_packet(bits, w)
-    metrics = rng.normal(0, 3, (sent.size + memory, 2 << memory))
+    metrics = rng.normal(0, 3, (sent.size + isi_memory, 2 << isi_memory))
     scores = dataset._word_scores(metrics, sent, w)
     assert scores.shape == (n_symbols, 128)
     assert not np.isfinite(scores[:, len(codebook(w)) :]).any()
     for symbol in range(n_symbols):
         totals = []
         for word in codebook(w):
-            tried = np.concatenate([sent, HEADER[:memory]]).astype(int)
+            tried = np.concatenate([sent, HEADER[:isi_memory]]).astype(int)
             tried[20 + 10 * symbol : 30 + 10 * symbol] = word
-            index = [int("".join(map(str, tried[i - memory : i + 1])), 2) for i in range(memory, tried.size)]
-            totals.append(metrics[np.arange(memory, tried.size), index].sum())
+            index = [int("".join(map(str, tried[i - isi_memory : i + 1])), 2) for i in range(isi_memory, tried.size)]
+            totals.append(metrics[np.arange(isi_memory, tried.size), index].sum())
         wanted = np.maximum(np.array(totals) - max(totals), -60)
         np.testing.assert_allclose(scores[symbol, : len(wanted)], wanted, atol=0.05)
 
@@ -101,7 +101,7 @@ def test_corrections_of_all_copies_count(samples: list[fit.Sample]) -> None:
         def forward(self, strips: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
             return torch.from_numpy(corrections)
 
-    corrections = np.zeros(sample.seen.shape, np.float32)
+    corrections = np.zeros(sample.reception.shape, np.float32)
     grid = np.arange(corrections.shape[1]) + int(sample.first_slot)
     length = int(sample.packet_slots)
     for row, w in enumerate(sample.w):

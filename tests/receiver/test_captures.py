@@ -123,8 +123,8 @@ def test_floor(corpus: Corpus, floor: Floor, say: Callable[[str], None]) -> None
     say(f"{floor.name}: {received.error_free} error-free, {above:+d} to the floor, bound {floor.bound}")
     assert received.error_free >= floor.error_free
     assert received.false == 0
-    told = {c.column: c.w for c in received.result.columns if c.w is not None}
-    assert told == {column: received.truth["w"][column] for column in told}
+    denoised = {c.column: c.w for c in received.result.columns if c.w is not None}
+    assert denoised == {column: received.truth["w"][column] for column in denoised}
     assert received.result.status in {"ok", "partial"}
 
 

@@ -20,7 +20,7 @@ from rxcli.lab.simulate.sensor import Sensor
 from rxcli.profiles import ScreenProfile, load_profile, parse_profile, shipped_profiles
 from rxcli.receiver import camera as blind
 from rxcli.receiver import unknown_camera
-from rxcli.receiver.locate import Camera, Cameras, Failure, Lock, Stages, find_cameras, find_lock
+from rxcli.receiver.locate import Acquisition, Camera, Cameras, Failure, Stages, acquire, find_cameras
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.still import decode
 from rxcli.types import FloatArray, Frame, FrameResult
@@ -83,7 +83,7 @@ def test_an_estimate_without_a_lock_is_none_where_it_has_rivals(
 
     frame, _ = _frame(tmp_path)
     right, wrong = _camera(ROWS_PER_SLOT), _camera(1.13 * ROWS_PER_SLOT)
-    monkeypatch.setattr(unknown_camera, "find_lock", no_lock)
+    monkeypatch.setattr(unknown_camera, "acquire", no_lock)
     assert _chosen(frame, Cameras(right), monkeypatch) is right[0]
     with pytest.raises(Failure, match="no packet header"):
         _chosen(frame, Cameras(right, (wrong,)), monkeypatch)
@@ -92,7 +92,7 @@ def test_an_estimate_without_a_lock_is_none_where_it_has_rivals(
 def test_packets_are_seen_on_their_own_clock_alone(tmp_path: Path) -> None:
     frame, _ = _frame(tmp_path)
     clocks = (ROWS_PER_SLOT, 1.004 * ROWS_PER_SLOT)
-    right, wrong = (unknown_camera._look(frame, CORNERS, *_camera(rows), Stages()) for rows in clocks)
+    right, wrong = (unknown_camera._quick_evidence(frame, CORNERS, *_camera(rows), Stages()) for rows in clocks)
     assert right[0] > 100
     assert sum(wrong) < 0.8 * sum(right)
 
@@ -118,18 +118,18 @@ def test_an_estimate_that_neither_packets_nor_edges_bear_out_is_taken_back(
     found = find_cameras(frame, CORNERS, OPTIONS, Stages()).first
     assert found is not None
     right = found[0]
-    assert right.guess is not None
-    estimate, strips = right.guess
-    wrong = replace(right, guess=(replace(estimate, rows_per_slot=1.03 * ROWS_PER_SLOT), strips))
-    lock = find_lock(frame, CORNERS, right, found[1], Stages(), quick=True)
-    seen = decode(lock, OPTIONS.skip)
+    assert right.blind_estimate is not None
+    estimate, strips = right.blind_estimate
+    wrong = replace(right, blind_estimate=(replace(estimate, rows_per_slot=1.03 * ROWS_PER_SLOT), strips))
+    acquisition = acquire(frame, CORNERS, right, found[1], Stages(), quick=True)
+    reception = decode(acquisition, OPTIONS.skip)
     result = FrameResult("small", 0, None, "no_signal", message="none", **right.facts)
 
     def after(camera: Camera, packets: float) -> FrameResult:
-        monkeypatch.setattr(unknown_camera, "packet_evidence", lambda _: packets)
-        return unknown_camera.without_estimate(result, camera, seen)
+        monkeypatch.setattr(unknown_camera, "packet_llr", lambda _: packets)
+        return unknown_camera.without_estimate(result, camera, reception)
 
-    assert after(wrong, 100.0) == after(right, 0.0) == after(replace(wrong, guess=None), 0.0) == result
+    assert after(wrong, 100.0) == after(right, 0.0) == after(replace(wrong, blind_estimate=None), 0.0) == result
     doubted = after(wrong, 0.0)
     assert not doubted.estimated
     assert doubted.line_delay_s is None
@@ -160,11 +160,11 @@ def test_a_picture_whose_values_follow_light_is_read_as_one(tone: Tone, monkeypa
     options = ReceiverOptions(screens=tuple(shipped_profiles(ScreenProfile)), corners=trial.corners, cae="never")
     read: list[str] = []
 
-    def noting_the_tone(frame: Frame, corners: FloatArray, camera: Camera, *rest: Any, **more: Any) -> Lock:
+    def noting_the_tone(frame: Frame, corners: FloatArray, camera: Camera, *rest: Any, **more: Any) -> Acquisition:
         read.append(camera.tone)
-        return find_lock(frame, corners, camera, *rest, **more)
+        return acquire(frame, corners, camera, *rest, **more)
 
-    monkeypatch.setattr(unknown_camera, "find_lock", noting_the_tone)
+    monkeypatch.setattr(unknown_camera, "acquire", noting_the_tone)
     result = next(receive([frame], options))
     exponent, sd = result.estimated["tone_exponent"]
     assert abs(exponent - (1.0 if tone == "linear" else 2.2)) < 2 * sd

@@ -40,7 +40,7 @@ class Clip:
 
 
 def camera_of(take: Take) -> CameraProfile:
-    scene, told = take.scene, take.truth("clip")["camera"]
+    scene, denoised = take.scene, take.truth("clip")["camera"]
     width, height = scene.sensor.width, scene.sensor.height
     mode = ReadoutMode(
         name="video",
@@ -49,12 +49,12 @@ def camera_of(take: Take) -> CameraProfile:
         line_delay_s=scene.sensor.line_delay_s,
         exposure_s=scene.exposure_s,
     )
-    rows = [tuple(float(v) for v in row) for row in told["camera_matrix"]]
+    rows = [tuple(float(v) for v in row) for row in denoised["camera_matrix"]]
     lens = LensModel(
         width=width,
         height=height,
         camera_matrix=(rows[0], rows[1], rows[2]),  # type: ignore[arg-type]
-        dist_coeffs=tuple(told["dist_coeffs"]),
+        dist_coeffs=tuple(denoised["dist_coeffs"]),
     )
     return CameraProfile(format=1, kind="camera", name="sim", tone="bt709", modes=(mode,), lens=lens)
 
@@ -301,7 +301,7 @@ def clock_at(slot: float, rows_per_slot: float = 5.0, packet: int = 70) -> Clock
         first_slot=whole % packet,
         burst=np.zeros(3, np.int64),
         delay_slots=np.zeros(20),
-        lock=5.0,
+        header_peak_ratio=5.0,
     )
 
 
@@ -335,9 +335,9 @@ def test_burst_phase_from_parts_of_copies_over_frames() -> None:
         llr = np.zeros((2, columns, packet))
         for number in (0, 1):
             place = first + number + np.arange(packet) / packet
-            seen = (place >= start) & (place < start + 0.8)
+            reception = (place >= start) & (place < start + 0.8)
             slots = 2.0 * sent[(first + number + 1) // repeats] - 1
-            llr[number] = seen * (2.5 * slots + rng.normal(0, 1.5, slots.shape))
+            llr[number] = reception * (2.5 * slots + rng.normal(0, 1.5, slots.shape))
         phase.take(first, llr)
     assert phase.settled
     copies = np.arange(60)
@@ -347,36 +347,36 @@ def test_burst_phase_from_parts_of_copies_over_frames() -> None:
 def test_known_picture_gives_back_the_columns_light() -> None:
     """Light made by the equation itself, in another way: a loop over strips and columns."""
     rng = np.random.default_rng(5)
-    columns, strips, rows, floor = 6, 4, 200, 0.01
+    columns, strips, rows, black_level = 6, 4, 200, 0.01
     picture = rng.uniform(0.02, 0.5, (columns, strips, rows)).astype(np.float32)
-    spread = rng.uniform(0.1, 1.0, (strips, 3))
+    crosstalk = rng.uniform(0.1, 1.0, (strips, 3))
     inside = np.ones(picture.shape, bool)
-    known = KnownPicture(inside, spread, floor, 1e-7, 1e-6)
+    known = KnownPicture(inside, crosstalk, black_level, 1e-7, 1e-6)
 
     def frame() -> tuple[np.ndarray, np.ndarray]:
         slots = exposed(rng.integers(0, 2, (columns, 42)).astype(np.float32), np.arange(rows)[None] / 5 + 0.5, 1.08)
-        light = np.full(picture.shape, floor)
+        light = np.full(picture.shape, black_level)
         for column in range(columns):
             for strip in range(strips):
                 for k in (-1, 0, 1):
                     if 0 <= column + k < columns:
-                        light[column, strip] += picture[column, strip] * spread[strip, k + 1] * slots[column + k]
+                        light[column, strip] += picture[column, strip] * crosstalk[strip, k + 1] * slots[column + k]
         return light.astype(np.float32), slots
 
     for _ in range(25):
         light, slots = frame()
         known.learn(light, slots, np.ones_like(slots))
     light, slots = frame()
-    seen = known.solve(light)
-    assert np.abs(seen.value - slots).max() < 0.1
-    assert (seen.precision > 0).all()
+    reception = known.solve(light)
+    assert np.abs(reception.value - slots).max() < 0.1
+    assert (reception.precision > 0).all()
 
 
 def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, rows: int = 400) -> tuple[Any, ...]:
     """A picture known from many frames, 5 rows a slot; and what makes a frame of it: light and exposed slots."""
     picture = rng.uniform(0.1, 0.5, (columns, strips, rows)).astype(np.float32)
-    spread = np.tile([0.0, 1.0, 0.0], (strips, 1))
-    known = KnownPicture(np.ones(picture.shape, bool), spread, 0.0, 1e-6, 0.0)
+    crosstalk = np.tile([0.0, 1.0, 0.0], (strips, 1))
+    known = KnownPicture(np.ones(picture.shape, bool), crosstalk, 0.0, 1e-6, 0.0)
 
     def frame() -> tuple[Float32Array, Float32Array]:
         bits = rng.integers(0, 2, (columns, rows // 5 + 2)).astype(np.float32)
@@ -405,8 +405,8 @@ def test_a_decision_does_not_bear_itself_out() -> None:
     light, slots = frame()
     wrong = slots.copy()
     wrong[2, 200:205] = 1 - wrong[2, 200:205]
-    seen = known.solve_again(light, wrong, 5.0).value[2, 201:204]
-    assert np.abs(seen - slots[2, 201:204]).max() < 0.1
+    reception = known.solve_again(light, wrong, 5.0).value[2, 201:204]
+    assert np.abs(reception - slots[2, 201:204]).max() < 0.1
 
 
 def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
@@ -425,11 +425,11 @@ def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
 def test_columns_not_yet_tried_are_unknown() -> None:
     """Dark columns may be left out at first; the others are kept as they were found."""
     rng = np.random.default_rng(2)
-    columns, packet, memory = 4, 70, 1
+    columns, packet, isi_memory = 4, 70, 1
     bursts = Bursts()
     clock = replace(clock_at(0.0), burst=np.zeros(2, np.int64))
     shown = np.ones((2, columns, packet), np.int64)
-    metrics = rng.normal(0, 2, (1, columns, packet + memory, 4))
+    metrics = rng.normal(0, 2, (1, columns, packet + isi_memory, 4))
     bursts.add(FrameBursts(0, 0, clock, metrics[0], shown), np.array([7]), metrics)
     tried = np.array([0, 2])
     found = detect(metrics[:, tried])
@@ -478,10 +478,10 @@ def test_the_screen_may_come_nearer(clip: Clip, monkeypatch: pytest.MonkeyPatch)
     """However many strips its columns would have now, the picture is known by those of the first frame."""
     start = clip.options.corners
     assert start is not None
-    looks = itertools.count(1)
+    passes = itertools.count(1)
 
     def nearer(_pixels: object, stored: object, **_levels: object) -> SimpleNamespace:
-        return SimpleNamespace(corners=start + np.array([[-1, 0], [1, 0], [1, 0], [-1, 0]]) * 4.0 * next(looks))
+        return SimpleNamespace(corners=start + np.array([[-1, 0], [1, 0], [1, 0], [-1, 0]]) * 4.0 * next(passes))
 
     numbers = itertools.count(2)
     monkeypatch.setattr("rxcli.receiver.clip.scene._LOOK_EVERY", 3)
@@ -490,4 +490,4 @@ def test_the_screen_may_come_nearer(clip: Clip, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("rxcli.receiver.clip.scene.sampling.strips_per_column", lambda _px: next(numbers))
     got = list(receive(clip.frames[:8], replace(clip.options, corners=None)))
     assert [result.frame for result in got] == list(range(8))
-    assert next(looks) == 3  # every third after the first
+    assert next(passes) == 3  # every third after the first

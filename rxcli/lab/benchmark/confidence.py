@@ -145,7 +145,7 @@ def reported_packets(result: FrameResult, sent_w: Sequence[int]) -> list[Record]
             "tx_w": sent_w[column.column],
             "snr_db": column.snr_db,
             "denoised": column.denoised,
-            "evidence": packet.evidence,
+            "evidence": packet.confidence_features,
         }
         for column in result.columns
         for packet in column.packets

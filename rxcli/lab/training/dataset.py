@@ -22,7 +22,7 @@ from rxcli.lab.training.fit import MOST_WORDS, UNKNOWN, Sample
 from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_scene
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 from rxcli.receiver.channel import by_burst
-from rxcli.receiver.channel.denoise import Scene, network_inputs, payload_seen
+from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
 from rxcli.receiver.pipeline import denoiser_case
 from rxcli.types import Clock, FloatArray
 
@@ -112,7 +112,7 @@ def _simulated(simulated: SimulatedScene, seed: int) -> list[Sample]:
 
 
 def sample_of(
-    scene: Scene, columns: NDArray[np.int64], slots: NDArray[np.uint8], weights: NDArray[np.integer]
+    scene: DenoiserInput, columns: NDArray[np.int64], slots: NDArray[np.uint8], weights: NDArray[np.integer]
 ) -> list[Sample]:
     """What is to be learned from some columns of a scene; nothing where the receiver mixed up the bursts.
 
@@ -123,11 +123,11 @@ def sample_of(
         weights: (C,) what was sent.
     """
     clock = scene.clock
-    memory = scene.metrics.shape[1] - clock.n_slots
+    isi_memory = scene.metrics.shape[1] - clock.n_slots
     lit, dark = (_by_packet(part, clock) for part in (slots[columns], 1 - slots[columns]))
     if (lit * dark).any():
         return []
-    bursts = by_burst(scene.metrics[columns], clock, memory)
+    bursts = by_burst(scene.metrics[columns], clock, isi_memory)
     scores, words = [], []
     for burst in range(bursts.shape[0]):
         for row, w in enumerate(weights[columns]):
@@ -141,7 +141,7 @@ def sample_of(
         Sample(
             strips=strips.astype(np.float16),
             columns=features.astype(np.float16),
-            seen=payload_seen(scene)[columns].astype(np.float16),
+            reception=payload_observed(scene)[columns].astype(np.float16),
             first_slot=np.array(clock.first_slot),
             packet_slots=np.array(clock.packet_slots),
             burst=clock.burst,
@@ -178,17 +178,17 @@ def _word_scores(metrics: FloatArray, sent: NDArray[np.uint8], w: int) -> NDArra
         sent: (packet,) the slots that were sent.
         w: weight.
     """
-    memory = metrics.shape[0] - sent.size
+    isi_memory = metrics.shape[0] - sent.size
     words = codebook(w)
-    around = np.concatenate([sent, np.array(HEADER[:memory], np.uint8)])
+    around = np.concatenate([sent, np.array(HEADER[:isi_memory], np.uint8)])
     out = np.full((len(_payload(sent)), MOST_WORDS), -np.inf)
     for symbol in range(len(out)):
         at = PREAMBLE_SLOTS + symbol * SLOTS_PER_SYMBOL
-        slots = np.repeat(around[None, at - memory : at + SLOTS_PER_SYMBOL + memory], len(words), axis=0)
-        slots[:, memory : memory + SLOTS_PER_SYMBOL] = words
-        windows = np.lib.stride_tricks.sliding_window_view(slots.astype(np.int64), memory + 1, axis=1)
-        pattern = windows @ (1 << np.arange(memory, -1, -1))
-        place = np.arange(at, at + SLOTS_PER_SYMBOL + memory)
+        slots = np.repeat(around[None, at - isi_memory : at + SLOTS_PER_SYMBOL + isi_memory], len(words), axis=0)
+        slots[:, isi_memory : isi_memory + SLOTS_PER_SYMBOL] = words
+        windows = np.lib.stride_tricks.sliding_window_view(slots.astype(np.int64), isi_memory + 1, axis=1)
+        pattern = windows @ (1 << np.arange(isi_memory, -1, -1))
+        place = np.arange(at, at + SLOTS_PER_SYMBOL + isi_memory)
         score = metrics[place, pattern].sum(axis=1)
         out[symbol, : len(words)] = np.maximum(score - score.max(), _LEAST_SCORE)
     return out.astype(np.float16)

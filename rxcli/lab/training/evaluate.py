@@ -17,8 +17,8 @@ from tqdm import tqdm
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
 from rxcli.protocol import indices_to_bits
-from rxcli.receiver.locate import Failure, Stages, find_camera, find_corners, find_lock
-from rxcli.receiver.still import decode, second_opinion
+from rxcli.receiver.locate import Failure, Stages, acquire, find_camera, find_corners
+from rxcli.receiver.still import apply_autoencoder, decode
 from rxcli.results.truth import EXPECTED_LENGTHS, Score
 
 _SCREENS = ("paper-34k6", "paper-17k3")
@@ -77,13 +77,13 @@ def _cpu_ms(trial: Trial) -> float:
     try:
         corners = find_corners(trial.frame, options)
         camera, options = find_camera(trial.frame, corners, options, Stages())
-        lock = find_lock(trial.frame, corners, camera, options, Stages())
+        acquisition = acquire(trial.frame, corners, camera, options, Stages())
     except Failure:
         return 0.0
-    seen, spent = decode(lock, options.skip), []
+    reception, spent = decode(acquisition, options.skip), []
     for _ in range(2):
         start = time.process_time()
-        second_opinion(lock, replace(seen), options)
+        apply_autoencoder(acquisition, replace(reception), options)
         spent.append(1e3 * (time.process_time() - start))
     return min(spent)
 

@@ -38,7 +38,7 @@ class Sample:
     #: (B, G, N) float16.
     columns: NDArray[np.float16]
     #: (B, N) 1 where a slot of the payload can be seen.
-    seen: NDArray[np.float16]
+    reception: NDArray[np.float16]
     #: (): place of the first slot in its packet, and slots of a packet.
     first_slot: NDArray[np.int64]
     packet_slots: NDArray[np.int64]
@@ -75,10 +75,10 @@ def loss_of(network: StripNetwork, sample: Sample, columns: NDArray[np.int64]) -
 
     The copies of a burst are added before its words are compared, as the receiver does.
     """
-    strips, features, seen = (
-        torch.from_numpy(part[columns].astype(np.float32)) for part in (sample.strips, sample.columns, sample.seen)
+    strips, features, reception = (
+        torch.from_numpy(part[columns].astype(np.float32)) for part in (sample.strips, sample.columns, sample.reception)
     )
-    bursts = _by_burst(network(strips, features) * seen, sample)
+    bursts = _by_burst(network(strips, features) * reception, sample)
     payload = bursts[..., PREAMBLE_SLOTS:].reshape(*bursts.shape[:2], -1, SLOTS_PER_SYMBOL)
     books = torch.stack([_codebook(int(w)) for w in sample.w[columns]])
     scores = torch.from_numpy(sample.scores[:, columns].astype(np.float32)) + payload @ books

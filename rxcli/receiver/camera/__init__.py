@@ -1,7 +1,7 @@
 """What a picture says of the camera that took it: rows per slot, direction of readout, exposure, bend of the stripes.
 
 Six steps on the row profiles, none of which needs to know the camera. Before them the screen's sides are looked at
-(`find_screen.measure_bow`): bowed ones mean that the lens's distortion is still in the picture, whose stripes are then
+(`screen.side_curvature`): bowed ones mean that the lens's distortion is still in the picture, whose stripes are then
 straight, and straight ones that the camera took it out (`Strips.correction`).
 
 1. **Bend.** Neighbouring strips show the same slots, so the lag between them, over all of the picture, is the slope of
@@ -26,16 +26,16 @@ straight, and straight ones that the camera took it out (`Strips.correction`).
 """
 
 from rxcli.receiver.camera.advice import stripe_likeness, why_not
-from rxcli.receiver.camera.bend import bend_terms, estimate_bend, straightened
-from rxcli.receiver.camera.camera import bowing_lens, camera_profile, in_time_order, lens_of, summary, summary_of_rows
+from rxcli.receiver.camera.camera import camera_profile, curving_lens, in_time_order, lens_of, summary, summary_of_rows
 from rxcli.receiver.camera.columns import likely_columns
+from rxcli.receiver.camera.curvature import curvature_terms, estimate_curvature, straightened
 from rxcli.receiver.camera.edges import by_edges
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis
 from rxcli.receiver.camera.refit import refit
 from rxcli.receiver.camera.scan import find_clocks
-from rxcli.receiver.camera.search import MIN_EVIDENCE, BlindSearch, estimate_camera, stripes_are_bent
-from rxcli.receiver.camera.strips import Noise, Strips, bow_of, in_readout_order, strips_of
-from rxcli.receiver.camera.structure import structure_evidence
+from rxcli.receiver.camera.search import MIN_EVIDENCE, BlindSearch, estimate_camera, stripes_are_curved
+from rxcli.receiver.camera.strips import Noise, Strips, in_readout_order, side_curvature_of, strips_of
+from rxcli.receiver.camera.structure import structure_llr
 from rxcli.receiver.camera.timing import refine
 from rxcli.receiver.camera.tone import is_linear
 
@@ -46,13 +46,12 @@ __all__ = [
     "Hypothesis",
     "Noise",
     "Strips",
-    "bend_terms",
-    "bow_of",
-    "bowing_lens",
     "by_edges",
     "camera_profile",
-    "estimate_bend",
+    "curvature_terms",
+    "curving_lens",
     "estimate_camera",
+    "estimate_curvature",
     "find_clocks",
     "in_readout_order",
     "in_time_order",
@@ -61,11 +60,12 @@ __all__ = [
     "likely_columns",
     "refine",
     "refit",
+    "side_curvature_of",
     "straightened",
     "stripe_likeness",
-    "stripes_are_bent",
+    "stripes_are_curved",
     "strips_of",
-    "structure_evidence",
+    "structure_llr",
     "summary",
     "summary_of_rows",
     "why_not",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rxcli.receiver.camera.bend import BEND_LEVEL_ROWS, strip_distances
+from rxcli.receiver.camera.curvature import BEND_LEVEL_ROWS, strip_distances
 from rxcli.receiver.camera.scan import HALF_WIDTH, MIN_ROWS_PER_SLOT, autocorrelation, half_width
 from rxcli.receiver.camera.strips import Strips, levelled
 from rxcli.types import BoolArray, Float32Array, FloatArray

@@ -15,15 +15,17 @@ from rxcli.types import FloatArray, Lens, RowProfiles
 def lens_of(estimate: BlindEstimate, width: int, height: int) -> Lens | None:
     """The lens model of a picture; None where neither sides nor stripes were seen to be bent."""
     if estimate.corrected:
-        return Lens(_one_width(width, height), np.append(estimate.bend, 0.0), corrected=True)
-    return bowing_lens(estimate.bow, width, height)
+        return Lens(_one_width(width, height), np.append(estimate.curvature, 0.0), corrected=True)
+    return curving_lens(estimate.side_curvature, width, height)
 
 
-def bowing_lens(bow: tuple[float, float] | None, width: int, height: int) -> Lens | None:
+def curving_lens(side_curvature: tuple[float, float] | None, width: int, height: int) -> Lens | None:
     """The lens that bows the sides of the screen; None where they are not bowed."""
-    if bow is None:
+    if side_curvature is None:
         return None
-    return Lens(_one_width(width, height), np.array([bow[0], -bow[0], 0.0, 0.0, 0.0]), corrected=False)
+    return Lens(
+        _one_width(width, height), np.array([side_curvature[0], -side_curvature[0], 0.0, 0.0, 0.0]), corrected=False
+    )
 
 
 def _one_width(width: int, height: int) -> FloatArray:
@@ -67,10 +69,12 @@ def summary_of_rows(estimate: BlindEstimate) -> dict[str, tuple[float, float]]:
     out = {"rows_per_slot": (estimate.rows_per_slot, estimate.rows_per_slot_sd)}
     if estimate.corrected:
         names = ("k1", "k2", "p1", "p2")
-        out |= {n: (float(v), float(sd)) for n, v, sd in zip(names, estimate.bend, estimate.bend_sd, strict=True)}
+        out |= {
+            n: (float(v), float(sd)) for n, v, sd in zip(names, estimate.curvature, estimate.curvature_sd, strict=True)
+        }
         out["distortion_corrected"] = (1.0, 0.0)
-    elif estimate.bow:
-        k1, sd = estimate.bow
+    elif estimate.side_curvature:
+        k1, sd = estimate.side_curvature
         out |= {"k1": (k1, sd), "k2": (-k1, sd), "distortion_corrected": (0.0, 0.0)}
     return out
 

@@ -26,10 +26,10 @@ def likely_columns(profiles: RowProfiles, clock: Clock, screens: Sequence[Screen
     number = np.arange(clock.n_slots)
     payload = number[(number + clock.first_slot) % clock.packet_slots >= PREAMBLE_SLOTS]
     borders = clock.row0 + clock.rows_per_slot * np.stack([payload, payload + 1], axis=1).ravel()
-    slots, seen = _strip_slots(profiles, borders)
+    slots, observed = _strip_slots(profiles, borders)
     n_strips = slots.shape[0]
     reach = max(2, min(n_strips - 1, round(1.5 * n_strips / min(screen.columns for screen in screens))))
-    measured = np.array([_mean_likeness(slots, seen, distance) for distance in range(1, reach)])
+    measured = np.array([_mean_likeness(slots, observed, distance) for distance in range(1, reach)])
     misfit = []
     for screen in screens:
         # Codewords are not quite random, so that strips far apart are a little alike too: a constant.
@@ -58,14 +58,14 @@ def _strip_slots(profiles: RowProfiles, borders: FloatArray) -> tuple[FloatArray
         at = below + (np.take_along_axis(total, low + 1, 1) - below) * (place - low)
         return np.asarray((at[:, 1::2] - at[:, ::2]) / np.maximum(place[:, 1::2] - place[:, ::2], 1e-6))
 
-    seen = integral(inside.astype(np.float64)) > 0.99
-    means = (integral(light) * seen).astype(np.float32)
-    level, _ = levelled(means, seen.astype(np.float32), EXTREMES_SLOTS, Noise(1e-8, 0.0))
-    return level.astype(np.float64), seen
+    observed = integral(inside.astype(np.float64)) > 0.99
+    means = (integral(light) * observed).astype(np.float32)
+    level, _ = levelled(means, observed.astype(np.float32), EXTREMES_SLOTS, Noise(1e-8, 0.0))
+    return level.astype(np.float64), observed
 
 
-def _mean_likeness(slots: FloatArray, seen: BoolArray, distance: int) -> float:
-    both = seen[:-distance] & seen[distance:]
+def _mean_likeness(slots: FloatArray, observed: BoolArray, distance: int) -> float:
+    both = observed[:-distance] & observed[distance:]
     return float((slots[:-distance] * slots[distance:] * both).sum() / max(int(both.sum()), 1))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rxcli.receiver.camera.bend import bend_terms
+from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.estimates import BlindEstimate
 from rxcli.receiver.camera.strips import EXTREMES_SLOTS, Strips, levelled
 from rxcli.receiver.camera.waves import local_mean
@@ -23,7 +23,7 @@ def edge_power(columns: Float32Array) -> Float32Array:
     return square - local_mean(square, LOCAL_ROWS)
 
 
-def line_evidence(strips: Strips, rows_per_slot: float, bend: FloatArray) -> float:
+def line_evidence(strips: Strips, rows_per_slot: float, curvature: FloatArray) -> float:
     """Nats by which edges keep to a grid of some period on stripes of some bend, over chance.
 
     Args:
@@ -34,7 +34,7 @@ def line_evidence(strips: Strips, rows_per_slot: float, bend: FloatArray) -> flo
     level, weight = levelled(strips.light, strips.inside, round(EXTREMES_SLOTS * rows_per_slot), strips.noise)
     shape = (strips.n_columns, -1, strips.rows.size)
     power = edge_power((level * weight).reshape(shape).sum(axis=1))
-    rows = strips.rows + np.tensordot(bend, bend_terms(strips.x, strips.rows, strips.width, strips.height), 1)
+    rows = strips.rows + np.tensordot(curvature, curvature_terms(strips.x, strips.rows, strips.width, strips.height), 1)
     middle = rows.reshape(shape).mean(axis=1)
     turned = power * np.exp(1j * np.pi / rows_per_slot * (middle[:, 1:] + middle[:, :-1]))
     return float(np.abs(turned.sum()) ** 2 / max(float((power * power).sum()), 1e-30))
@@ -47,8 +47,8 @@ def by_edges(strips: Strips, estimates: list[BlindEstimate]) -> BlindEstimate | 
     """
     best, most = None, _BEYOND_DOUBT
     for estimate in estimates:
-        bend = estimate.bend * estimate.corrected
-        nats, double = (line_evidence(strips, n * estimate.rows_per_slot, bend) for n in (1, 2))
+        curvature = estimate.curvature * estimate.corrected
+        nats, double = (line_evidence(strips, n * estimate.rows_per_slot, curvature) for n in (1, 2))
         if nats > most and double < _BEYOND_DOUBT:
             best, most = estimate, nats
     return best

@@ -22,7 +22,7 @@ class Hypothesis:
     #: True where the picture's rows run against the readout.
     reversed: bool
     #: Log-likelihood ratio of header and weights over chance; of the scan while it was not tried.
-    evidence: float
+    log_evidence: float
     #: How much headers and repeats stood out in the scan.
     salience: float = 0.0
 
@@ -42,18 +42,18 @@ class BlindEstimate:
     exposure_slots: float
     exposure_slots_sd: float
     #: (4,) k1 k2 p1 p2 for a focal length of one picture width, of a picture that was corrected in the camera.
-    bend: FloatArray
-    bend_sd: FloatArray
+    curvature: FloatArray
+    curvature_sd: FloatArray
     #: True where the stripes are bent beyond doubt.
     corrected: bool
     #: Log-likelihood ratio of header and weights over chance.
-    evidence: float
+    log_evidence: float
     #: Share of the local variance of the light that the slots explain.
     explained: float
     #: Exposure that the file tells, 0 where it does not.
     least_exposure_slots: float = 0.0
     #: k1 of the lens that bows the screen's sides, and its standard deviation; None where none was seen to.
-    bow: tuple[float, float] | None = None
+    side_curvature: tuple[float, float] | None = None
     #: Exponent that makes light of the picture's values, and its standard deviation; None while it was not measured.
     tone: tuple[float, float] | None = None
 
@@ -69,6 +69,8 @@ def distinct(found: Iterable[_T], same: Callable[[_T, _T], bool], most: int) -> 
     return chosen
 
 
-def on_one_bend(same: Callable[[Hypothesis, Hypothesis], bool]) -> Callable[[BentHypothesis, BentHypothesis], bool]:
+def on_one_curvature(
+    same: Callable[[Hypothesis, Hypothesis], bool],
+) -> Callable[[BentHypothesis, BentHypothesis], bool]:
     """The comparison of hypotheses as one of hypotheses with the bends they were found with, which must be one."""
     return lambda one, other: same(one[0], other[0]) and one[1] is other[1]

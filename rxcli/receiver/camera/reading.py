@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, dimming_symbol
-from rxcli.receiver.camera.bend import reversed_bend
-from rxcli.receiver.camera.estimates import BentHypothesis, Hypothesis, distinct, on_one_bend
+from rxcli.receiver.camera.curvature import reversed_curvature
+from rxcli.receiver.camera.estimates import BentHypothesis, Hypothesis, distinct, on_one_curvature
 from rxcli.receiver.camera.scan import same_slots
 from rxcli.receiver.camera.strips import Strips, in_readout_order
 from rxcli.receiver.camera.timing import slot_time, thinned, time_terms
@@ -47,38 +47,40 @@ def read(strips: Strips, found: Sequence[BentHypothesis], packet_lengths: Sequen
         any kind.
     """
     outstanding = sorted(found, key=lambda pair: -pair[0].salience)
-    read_once = _read_all(strips, distinct(outstanding, on_one_bend(same_slots), _READ), packet_lengths)
-    best = distinct(sorted(read_once, key=_by_evidence), on_one_bend(same_slots), _READ_AROUND)
+    read_once = _read_all(strips, distinct(outstanding, on_one_curvature(same_slots), _READ), packet_lengths)
+    best = distinct(sorted(read_once, key=_by_evidence), on_one_curvature(same_slots), _READ_AROUND)
     n_rows = float(strips.rows[-1] - strips.rows[0])
     near = [
-        (replace(clock, rows_per_slot=clock.rows_per_slot * (1 + off * clock.rows_per_slot / n_rows)), bend)
-        for clock, bend in best
+        (replace(clock, rows_per_slot=clock.rows_per_slot * (1 + off * clock.rows_per_slot / n_rows)), curvature)
+        for clock, curvature in best
         for off in _OFF_SLOTS
     ]
     return sorted(read_once + _read_all(strips, near, packet_lengths), key=_by_evidence)
 
 
 def _by_evidence(pair: BentHypothesis) -> float:
-    return -pair[0].evidence
+    return -pair[0].log_evidence
 
 
 def _read_all(strips: Strips, clocks: Sequence[BentHypothesis], packet_lengths: Sequence[int]) -> list[BentHypothesis]:
-    return [(one, bend) for clock, bend in clocks for one in _read(strips, clock, bend, packet_lengths)]
+    return [(one, curvature) for clock, curvature in clocks for one in _read(strips, clock, curvature, packet_lengths)]
 
 
-def _read(strips: Strips, clock: Hypothesis, bend: FloatArray, packet_lengths: Sequence[int]) -> list[Hypothesis]:
-    ordered, bend = (in_readout_order(strips), reversed_bend(bend)) if clock.reversed else (strips, bend)
+def _read(strips: Strips, clock: Hypothesis, curvature: FloatArray, packet_lengths: Sequence[int]) -> list[Hypothesis]:
+    ordered, curvature = (
+        (in_readout_order(strips), reversed_curvature(curvature)) if clock.reversed else (strips, curvature)
+    )
     ordered = thinned(ordered, clock.rows_per_slot)
     first_row = ordered.rows[0] - 0.5 * (ordered.rows[1] - ordered.rows[0])
     start = clock.start_row % clock.rows_per_slot - 2 * clock.rows_per_slot
-    values = np.concatenate([[first_row + start, clock.rows_per_slot], bend])
+    values = np.concatenate([[first_row + start, clock.rows_per_slot], curvature])
     time = slot_time(ordered, time_terms(ordered), values)
     log_odds = free_log_odds(column_waves(ordered, time, clock.rows_per_slot), _EXPOSURE)
     out = []
-    for packet_slots, evidence in zip(packet_lengths, start_evidence(log_odds, packet_lengths), strict=True):
-        at = int(evidence.argmax())
+    for packet_slots, log_evidence in zip(packet_lengths, start_evidence(log_odds, packet_lengths), strict=True):
+        at = int(log_evidence.argmax())
         start_row = start + at * clock.rows_per_slot
-        out.append(replace(clock, packet_slots=packet_slots, start_row=start_row, evidence=float(evidence[at])))
+        out.append(replace(clock, packet_slots=packet_slots, start_row=start_row, log_evidence=float(log_evidence[at])))
     return out
 
 

@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.receiver.camera.bend import reversed_bend
+from rxcli.receiver.camera.curvature import reversed_curvature
 from rxcli.receiver.camera.estimates import BlindEstimate
 from rxcli.receiver.camera.rows import fit_rows
 from rxcli.receiver.camera.strips import Correction, Strips, in_readout_order
 from rxcli.receiver.camera.timing import (
     FLAT,
     UNDERSTATED,
-    bend_chi_square,
+    curvature_chi_square,
     gauss_newton,
     slot_time,
     thinned,
@@ -69,13 +69,13 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
         lit: (C, N) probability that each slot of the clock's grid is lit; C columns of the strips.
     """
     ordered = thinned(in_readout_order(strips) if estimate.reversed else strips, estimate.rows_per_slot)
-    bend = reversed_bend(estimate.bend) if estimate.reversed else estimate.bend
-    first = np.concatenate([[clock.row0, clock.rows_per_slot], bend if estimate.corrected else np.zeros(4)])
+    curvature = reversed_curvature(estimate.curvature) if estimate.reversed else estimate.curvature
+    first = np.concatenate([[clock.row0, clock.rows_per_slot], curvature if estimate.corrected else np.zeros(4)])
     shutter = estimate.least_exposure_slots
-    may_bend = strips.correction != "no"
-    fit = _fit(ordered, first, lit, clock.exposure_slots, 6 if may_bend else 2, shutter)
-    corrected = bend_chi_square(fit.values, fit.covariance) > _BENT_CHI_SQUARE[strips.correction]
-    if may_bend and not corrected:
+    may_curve = strips.correction != "no"
+    fit = _fit(ordered, first, lit, clock.exposure_slots, 6 if may_curve else 2, shutter)
+    corrected = curvature_chi_square(fit.values, fit.covariance) > _BENT_CHI_SQUARE[strips.correction]
+    if may_curve and not corrected:
         before = fit.explained_first
         fit = replace(_fit(ordered, first * FLAT, lit, fit.exposure_slots, 2, shutter), explained_first=before)
     if fit.explained < max(_NOT_LESS * fit.explained_first, _LEAST_EXPLAINED):
@@ -89,8 +89,8 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
         rows_per_slot_sd=float(sd[1]),
         exposure_slots=max(fit.exposure_slots, estimate.least_exposure_slots),
         exposure_slots_sd=fit.exposure_sd if fit.exposure_slots > estimate.least_exposure_slots else 0.0,
-        bend=reversed_bend(fit.values[2:]) if estimate.reversed else fit.values[2:],
-        bend_sd=sd[2:],
+        curvature=reversed_curvature(fit.values[2:]) if estimate.reversed else fit.values[2:],
+        curvature_sd=sd[2:],
         corrected=corrected,
         explained=fit.explained,
         tone=tone_exponent(ordered, fit.wave, fit.window),
@@ -117,8 +117,10 @@ def _fit(
             exposure, exposure_sd = exposure_of_known(column_waves(strips, time, values[1]), lit, exposure)
             window = round(_LOCAL_SLOTS * values[1] / pitch)
             rows = fit_rows(strips, time, values, slots, exposure, window, shutter_slots)
-        seen = rows.seen(strips, time, values, slots)
-        change, covariance, explained = gauss_newton(strips, terms, values, time, seen, n_free, _LOCAL_SLOTS, _ORDER)
+        observed = rows.observed(strips, time, values, slots)
+        change, covariance, explained = gauss_newton(
+            strips, terms, values, time, observed, n_free, _LOCAL_SLOTS, _ORDER
+        )
         explained_first = explained_first or explained
         values = values + change
-    return _Fit(values, covariance, exposure, exposure_sd, explained_first, explained, seen[0], window)
+    return _Fit(values, covariance, exposure, exposure_sd, explained_first, explained, observed[0], window)

@@ -37,7 +37,7 @@ class RowModel:
     #: (3,) weights of a sensor row, of its neighbours, and of those next to them; their sum is 1.
     kernel: FloatArray
 
-    def seen(
+    def observed(
         self, strips: Strips, time: Float32Array, values: FloatArray, lit: Float32Array
     ) -> tuple[Float32Array, Float32Array]:
         """(M, R) light 0..1 of every strip's rows, and its change per slot of time.
@@ -96,13 +96,13 @@ def _parts(
     n = int(np.ceil(place.max())) + 2 + reach - first
     sensor_time = (first + np.arange(n + join - 1) - start) / rows_per_slot
     columns = np.arange(lit.shape[0])
-    seen = seen_through(lit, np.broadcast_to(sensor_time, (columns.size, sensor_time.size)), columns, shutter_slots)
+    observed = seen_through(lit, np.broadcast_to(sensor_time, (columns.size, sensor_time.size)), columns, shutter_slots)
     shares = column_shares(strips).astype(np.float32)
     place -= first
     low: IntArray = place.astype(np.int64)
     fraction = (place - low).astype(np.float32)
     low += (np.arange(low.shape[0]) * n)[:, None]
-    light, slope = (_mixed(shares @ _joined(table, join), low, fraction) for table in seen)
+    light, slope = (_mixed(shares @ _joined(table, join), low, fraction) for table in observed)
     return light, slope
 
 

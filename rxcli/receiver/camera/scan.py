@@ -12,7 +12,7 @@ from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.edges import edge_power
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis, distinct
 from rxcli.receiver.camera.strips import SAMPLES, Noise, Strips, levelled
-from rxcli.receiver.camera.structure import structure_evidence
+from rxcli.receiver.camera.structure import structure_llr
 from rxcli.types import Float32Array, FloatArray
 
 #: Rows per slot that are considered.
@@ -195,11 +195,11 @@ def find_clocks(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesi
     """
     octaves = _octaves(strips)
     found = [(h, o) for o in octaves for h in _scan_octave(o, strips.rows.size, packet_lengths)]
-    found.sort(key=lambda pair: -pair[0].evidence)
+    found.sort(key=lambda pair: -pair[0].log_evidence)
     places = range(len(found))
     chosen = distinct(places, lambda n, m: alike(found[n][0], found[m][0]), _TRIALS)
     chosen += distinct(places, lambda n, m: same_slots(found[n][0], found[m][0]), _TRIALS)
-    return sorted((_try(*found[n]) for n in dict.fromkeys(chosen)), key=lambda hypothesis: -hypothesis.evidence)
+    return sorted((_try(*found[n]) for n in dict.fromkeys(chosen)), key=lambda hypothesis: -hypothesis.log_evidence)
 
 
 def alike(one: Hypothesis, other: Hypothesis) -> bool:
@@ -228,8 +228,8 @@ def _scan_octave(octave: _Octave, n_rows: int, packet_lengths: Sequence[int]) ->
             repeats = _repeats_near(octave, rows_per_slot, packet_slots)
             for number, (score, sample) in enumerate(zip(*_comb(near, packet_slots), strict=True)):
                 start = (float(sample) / SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
-                evidence = float(score / spread) ** 2 + repeats**2 + line
-                out.append(Hypothesis(rows_per_slot, packet_slots, start, number == 1, evidence))
+                log_evidence = float(score / spread) ** 2 + repeats**2 + line
+                out.append(Hypothesis(rows_per_slot, packet_slots, start, number == 1, log_evidence))
         rows_per_slot *= 1 + _SCAN_STEP / min(n_rows / rows_per_slot, _SCAN_SLOTS)
     return out
 
@@ -257,8 +257,8 @@ def _try(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
     first = start - before * rows_per_slot
     borders = np.arange(first, columns.shape[1], rows_per_slot)
     total = np.concatenate([np.zeros((columns.shape[0], 1)), np.cumsum(columns, axis=1)], axis=1)
-    evidence = structure_evidence(_slot_means(total, borders), -before % fine.packet_slots, fine.packet_slots)
-    return replace(fine, start_row=start * octave.rows, evidence=evidence, salience=hypothesis.evidence)
+    log_evidence = structure_llr(_slot_means(total, borders), -before % fine.packet_slots, fine.packet_slots)
+    return replace(fine, start_row=start * octave.rows, log_evidence=log_evidence, salience=hypothesis.log_evidence)
 
 
 def _slot_means(total: FloatArray, borders: FloatArray) -> FloatArray:

@@ -9,9 +9,9 @@ import numpy as np
 
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.camera.advice import why_not
-from rxcli.receiver.camera.bend import estimate_bend, straightened
+from rxcli.receiver.camera.curvature import estimate_curvature, straightened
 from rxcli.receiver.camera.edges import by_edges
-from rxcli.receiver.camera.estimates import BentHypothesis, BlindEstimate, distinct, on_one_bend
+from rxcli.receiver.camera.estimates import BentHypothesis, BlindEstimate, distinct, on_one_curvature
 from rxcli.receiver.camera.reading import read
 from rxcli.receiver.camera.scan import alike, find_clocks, same_slots
 from rxcli.receiver.camera.strips import Strips
@@ -58,7 +58,7 @@ class BlindSearch:
     @property
     def sure(self) -> bool:
         """Whether the estimate is beyond doubt but for the length of its packets; rivals are of other lengths then."""
-        return self.estimate is not None and self.estimate.evidence > _BEYOND_DOUBT
+        return self.estimate is not None and self.estimate.log_evidence > _BEYOND_DOUBT
 
 
 def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None) -> BlindSearch:
@@ -75,38 +75,40 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     if not screens:
         raise ValueError("screens must name at least one screen (got none)")
     rates = {screen.packet_slots: screen.slot_rate_hz for screen in reversed(screens)}
-    bend, gain = (np.zeros(4), 0.0) if strips.correction == "no" else estimate_bend(strips)
-    bends = [bend] if gain > _BEND_GAINS[1] else [np.zeros(4), bend] if gain > _BEND_GAINS[0] else [np.zeros(4)]
-    found = [(clock, b) for b in bends for clock in find_clocks(straightened(strips, b), sorted(rates))]
-    found.sort(key=lambda pair: -pair[0].evidence)
-    if found and found[0][0].evidence < _READ_FIRST:
+    curvature, gain = (np.zeros(4), 0.0) if strips.correction == "no" else estimate_curvature(strips)
+    curves = (
+        [curvature] if gain > _BEND_GAINS[1] else [np.zeros(4), curvature] if gain > _BEND_GAINS[0] else [np.zeros(4)]
+    )
+    found = [(clock, b) for b in curves for clock in find_clocks(straightened(strips, b), sorted(rates))]
+    found.sort(key=lambda pair: -pair[0].log_evidence)
+    if found and found[0][0].log_evidence < _READ_FIRST:
         found = read(strips, found, sorted(rates))
     estimates: list[BlindEstimate] = []
     for clock, b in _worth_refining(found):
-        plain = any(estimate.evidence > _PLAIN_EVIDENCE for estimate in estimates)
-        if plain and clock.evidence < _RIVAL * found[0][0].evidence and not same_slots(clock, found[0][0]):
+        plain = any(estimate.log_evidence > _PLAIN_EVIDENCE for estimate in estimates)
+        if plain and clock.log_evidence < _RIVAL * found[0][0].log_evidence and not same_slots(clock, found[0][0]):
             continue
         exposure = (exposure_s or 0.0) * rates[clock.packet_slots]
         estimates.append(refine(strips, clock, b, exposure, sure=gain > _BEND_GAINS[1]))
     rows_per_slot = estimates[0].rows_per_slot if estimates else 1.0
     estimates.sort(key=lambda estimate: -_plausibility(estimate, strips, rows_per_slot))
     best = estimates[0] if estimates else None
-    if best is None or best.evidence < MIN_EVIDENCE or best.explained < _LEAST_EXPLAINED:
-        return BlindSearch(None, why_not(strips), _worth_a_look(estimates), by_edges(strips, estimates))
-    rivals = _worth_a_look(estimates[1:])
-    if best.evidence > _BEYOND_DOUBT:
+    if best is None or best.log_evidence < MIN_EVIDENCE or best.explained < _LEAST_EXPLAINED:
+        return BlindSearch(None, why_not(strips), _worth_reading(estimates), by_edges(strips, estimates))
+    rivals = _worth_reading(estimates[1:])
+    if best.log_evidence > _BEYOND_DOUBT:
         least = _plausibility(best, strips, rows_per_slot) - _ANOTHER_LENGTH
         of_other_length = (one for one in rivals if same_slots(one, best) and one.packet_slots != best.packet_slots)
         rivals = tuple(one for one in of_other_length if _plausibility(one, strips, rows_per_slot) > least)
     return BlindSearch(best, rivals=rivals)
 
 
-def stripes_are_bent(strips: Strips) -> bool:
+def stripes_are_curved(strips: Strips) -> bool:
     """Whether neighbouring strips alone say beyond doubt that stripes are bent, whatever the screen's sides show."""
-    return estimate_bend(strips)[1] > _BEND_GAINS[1]
+    return estimate_curvature(strips)[1] > _BEND_GAINS[1]
 
 
-def _worth_a_look(estimates: list[BlindEstimate]) -> tuple[BlindEstimate, ...]:
+def _worth_reading(estimates: list[BlindEstimate]) -> tuple[BlindEstimate, ...]:
     """Estimates whose slots explain light."""
     return tuple(estimate for estimate in estimates if estimate.explained >= _LEAST_EXPLAINED)
 
@@ -118,16 +120,16 @@ def _worth_refining(found: list[BentHypothesis]) -> list[BentHypothesis]:
     """
     if not found:
         return []
-    best = found[0][0].evidence
-    close = [pair for pair in found[: 4 * _REFINED] if pair[0].evidence >= _CLOSE_EVIDENCE * best]
-    chosen = distinct(close, on_one_bend(alike), _REFINED) or found[:1]
+    best = found[0][0].log_evidence
+    close = [pair for pair in found[: 4 * _REFINED] if pair[0].log_evidence >= _CLOSE_EVIDENCE * best]
+    chosen = distinct(close, on_one_curvature(alike), _REFINED) or found[:1]
     # With the same slots a packet may have any length: they differ in where other headers would be.
     for pair in close:
         if same_slots(pair[0], found[0][0]) and all(pair[0].packet_slots != one.packet_slots for one, _ in chosen):
             chosen.append(pair)
     if best < _WEAK_EVIDENCE:
         outstanding = sorted(found, key=lambda pair: -pair[0].salience)
-        chosen = distinct([*chosen, *outstanding], on_one_bend(alike), _REFINED_IF_WEAK)
+        chosen = distinct([*chosen, *outstanding], on_one_curvature(alike), _REFINED_IF_WEAK)
     return chosen
 
 
@@ -138,4 +140,4 @@ def _plausibility(estimate: BlindEstimate, strips: Strips, rows_per_slot: float)
     """
     slots = strips.n_columns * strips.rows.size / rows_per_slot
     light = -0.5 * slots / ALIKE * float(np.log(max(1 - estimate.explained, 1e-3)))
-    return estimate.evidence + light - _LONGER_PACKET * float(np.log2(estimate.packet_slots))
+    return estimate.log_evidence + light - _LONGER_PACKET * float(np.log2(estimate.packet_slots))

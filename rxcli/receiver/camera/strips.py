@@ -66,20 +66,20 @@ class Strips:
     tone: str | None = None
 
     @property
-    def bow(self) -> tuple[float, float] | None:
+    def side_curvature(self) -> tuple[float, float] | None:
         """k1 and its standard deviation where the sides are bowed without doubt."""
-        return bow_of(self.sides)
+        return side_curvature_of(self.sides)
 
     @property
     def correction(self) -> Correction:
         """Whether the camera took the distortion out of the picture, which straightens sides and bends stripes."""
-        if self.mosaic or self.bow:
+        if self.mosaic or self.side_curvature:
             return "no"
         straight = self.sides and abs(self.sides[0]) < _STRAIGHT * self.sides[1] and self.sides[1] < _TELLING
         return "likely" if straight else "unknown"
 
 
-def bow_of(sides: tuple[float, float] | None) -> tuple[float, float] | None:
+def side_curvature_of(sides: tuple[float, float] | None) -> tuple[float, float] | None:
     """k1 that sides show and its standard deviation, None where they may be straight."""
     return sides if sides and abs(sides[0]) > _BOWED * sides[1] else None
 

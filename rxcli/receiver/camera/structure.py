@@ -13,7 +13,7 @@ from rxcli.types import BoolArray, Float32Array, FloatArray
 _MOST_FOR_REPEATS = 40.0
 
 
-def structure_evidence(slots: FloatArray | Float32Array, first_slot: int, packet_slots: int) -> float:
+def structure_llr(slots: FloatArray | Float32Array, first_slot: int, packet_slots: int) -> float:
     """Log-likelihood ratio of slots being packets, over slots lit at random.
 
     Headers must read 0011100011, and every other symbol of a column must have the same number of lit slots; a column
@@ -74,8 +74,10 @@ def _weight_evidence(count: NDArray[np.int64], share: FloatArray) -> FloatArray:
     p = np.clip(share, 0.1, 0.9)[:, None]
     ways = np.array([1, 10, 45, 120, 210, 252, 210, 120, 45, 10, 1])
     chance = ways * p**weights * (1 - p) ** (SLOTS_PER_SYMBOL - weights)
-    seen = (count[..., None] == weights).sum(axis=1)
-    return np.asarray(seen @ np.log(likely) - (seen * np.log(chance)).sum(axis=1, keepdims=True) - np.log(len(WEIGHTS)))
+    observed = (count[..., None] == weights).sum(axis=1)
+    return np.asarray(
+        observed @ np.log(likely) - (observed * np.log(chance)).sum(axis=1, keepdims=True) - np.log(len(WEIGHTS))
+    )
 
 
 def _dimming_evidence(lit: BoolArray, position: NDArray[np.int64]) -> FloatArray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.receiver.camera.bend import BEND_PRECISION, BEND_SCALE, bend_terms, reversed_bend
+from rxcli.receiver.camera.curvature import BEND_PRECISION, BEND_SCALE, curvature_terms, reversed_curvature
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis
 from rxcli.receiver.camera.strips import Correction, Strips, in_readout_order
 from rxcli.receiver.camera.structure import repeat_evidence
@@ -23,7 +23,7 @@ from rxcli.receiver.camera.waves import (
     first_slots,
     local_mean,
     local_moments,
-    packet_evidence,
+    packet_llr,
     residual_of,
     seen_through,
 )
@@ -80,14 +80,14 @@ class _Timing:
     exposure_slots: float
     exposure_sd: float
     #: Log-likelihood ratio of header and weights over chance.
-    evidence: float
+    log_evidence: float
     #: Share of the strips' local variance that the slots explain.
     explained: float
     slots: Slots
 
 
 def refine(
-    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, least_exposure_slots: float = 0.0, sure: bool = False
+    strips: Strips, hypothesis: Hypothesis, curvature: FloatArray, least_exposure_slots: float = 0.0, sure: bool = False
 ) -> BlindEstimate:
     """The clock, the bend and the exposure that fit all light of the picture best.
 
@@ -98,9 +98,11 @@ def refine(
         least_exposure_slots: exposure that the file tells, 0 where it does not; optics and demosaicing add to it.
         sure: whether the stripes are bent without doubt.
     """
-    ordered, bend = (in_readout_order(strips), reversed_bend(bend)) if hypothesis.reversed else (strips, bend)
+    ordered, curvature = (
+        (in_readout_order(strips), reversed_curvature(curvature)) if hypothesis.reversed else (strips, curvature)
+    )
     ordered = thinned(ordered, hypothesis.rows_per_slot)
-    timing, corrected = _fit_timing(ordered, hypothesis, bend, least_exposure_slots, sure)
+    timing, corrected = _fit_timing(ordered, hypothesis, curvature, least_exposure_slots, sure)
     found, sd = timing.values[2:], UNDERSTATED * np.sqrt(np.diag(timing.covariance))
     return BlindEstimate(
         rows_per_slot=float(timing.values[1]),
@@ -109,13 +111,13 @@ def refine(
         reversed=hypothesis.reversed,
         exposure_slots=timing.exposure_slots,
         exposure_slots_sd=timing.exposure_sd,
-        bend=reversed_bend(found) if hypothesis.reversed else found,
-        bend_sd=sd[2:],
+        curvature=reversed_curvature(found) if hypothesis.reversed else found,
+        curvature_sd=sd[2:],
         corrected=corrected,
-        evidence=timing.evidence,
+        log_evidence=timing.log_evidence,
         explained=timing.explained,
         least_exposure_slots=least_exposure_slots,
-        bow=strips.bow,
+        side_curvature=strips.side_curvature,
     )
 
 
@@ -141,18 +143,20 @@ def thinned(strips: Strips, rows_per_slot: float) -> Strips:
 
 
 def _fit_timing(
-    strips: Strips, hypothesis: Hypothesis, bend: FloatArray, least_exposure_slots: float, sure: bool
+    strips: Strips, hypothesis: Hypothesis, curvature: FloatArray, least_exposure_slots: float, sure: bool
 ) -> tuple[_Timing, bool]:
     """The row-time map, with a bend only where it is beyond doubt: one that is free for nothing blurs the period."""
     first_row = strips.rows[0] - 0.5 * (strips.rows[1] - strips.rows[0])
     before = int(hypothesis.start_row // hypothesis.rows_per_slot) + 2
     start = first_row + hypothesis.start_row - before * hypothesis.rows_per_slot
     grid = Grid(-before % hypothesis.packet_slots, hypothesis.packet_slots)
-    values = np.concatenate([[start, hypothesis.rows_per_slot], bend])
+    values = np.concatenate([[start, hypothesis.rows_per_slot], curvature])
     first = _descend(strips, grid, values, least_exposure_slots, n_free=2 if strips.correction == "no" else 6)
-    if sure or bend_chi_square(first.values, first.covariance) > _BENT_CHI_SQUARE[strips.correction]:
+    if sure or curvature_chi_square(first.values, first.covariance) > _BENT_CHI_SQUARE[strips.correction]:
         return first, True
-    values = np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not bend.any() else first.values * FLAT
+    values = (
+        np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not curvature.any() else first.values * FLAT
+    )
     flat = _descend(strips, grid, values, first.exposure_slots, n_free=2, slots=first.slots)
     return replace(flat, exposure_sd=first.exposure_sd), False
 
@@ -187,23 +191,23 @@ def _descend(
             exposure, exposure_sd = (exposure, exposure_sd) if exposure > exposure_slots else (exposure_slots, 0.0)
         slots = decide(waves, exposure, grid, slots)
         free = n_free if step >= _RIGID_STEPS or values[2:].any() else 2
-        seen = seen_by_strips(strips, time, slots.lit, exposure)
-        change, covariance, explained = gauss_newton(strips, terms, values, time, seen, free)
+        observed = seen_by_strips(strips, time, slots.lit, exposure)
+        change, covariance, explained = gauss_newton(strips, terms, values, time, observed, free)
         values = values + change
         moved = float(np.abs(slot_time(strips, terms, values)[:, ::BLOCK_ROWS] - time[:, ::BLOCK_ROWS]).max())
         if moved < _CONVERGED and step >= _AGAIN_STEP:
             break
     position = (np.arange(slots.lit.shape[1]) + grid.first_slot) % grid.packet_slots
-    evidence = packet_evidence(waves, exposure, grid, slots)
-    evidence += repeat_evidence(slots.lit > 0.5, position, grid.packet_slots)
-    return _Timing(values, covariance, exposure, exposure_sd, evidence, explained, slots)
+    log_evidence = packet_llr(waves, exposure, grid, slots)
+    log_evidence += repeat_evidence(slots.lit > 0.5, position, grid.packet_slots)
+    return _Timing(values, covariance, exposure, exposure_sd, log_evidence, explained, slots)
 
 
 def time_terms(strips: Strips) -> FloatArray:
     """(4, M, blocks + 1) bend terms at the borders of blocks of rows."""
     n = strips.rows.size
     nodes = np.minimum(np.arange(-(-n // BLOCK_ROWS) + 1) * BLOCK_ROWS, n - 1)
-    return bend_terms(strips.x[:, nodes], strips.rows[nodes], strips.width, strips.height)
+    return curvature_terms(strips.x[:, nodes], strips.rows[nodes], strips.width, strips.height)
 
 
 def slot_time(strips: Strips, terms: FloatArray, values: FloatArray) -> Float32Array:
@@ -232,7 +236,7 @@ def gauss_newton(
     terms: FloatArray,
     values: FloatArray,
     time: Float32Array,
-    seen: tuple[Float32Array, Float32Array],
+    observed: tuple[Float32Array, Float32Array],
     n_free: int,
     local_slots: float = LOCAL_SLOTS,
     order: int = 0,
@@ -249,7 +253,7 @@ def gauss_newton(
         local_slots: slots over which the picture may be taken as constant.
         order: rows by which what is left of a row is foretold; the picture's texture is alike in neighbouring rows.
     """
-    wave, slope = seen
+    wave, slope = observed
     pitch = float(strips.rows[1] - strips.rows[0])
     window = round(local_slots * values[1] / pitch)
     inside = strips.inside
@@ -338,7 +342,7 @@ def _solve(
     return step, covariance
 
 
-def bend_chi_square(values: FloatArray, covariance: FloatArray) -> float:
+def curvature_chi_square(values: FloatArray, covariance: FloatArray) -> float:
     """Chi-square of a bend against none, from a row-time map (6,) and its covariance."""
-    bend = values[2:]
-    return float(bend @ np.linalg.solve(covariance[2:, 2:] + 1e-8 * np.diag(BEND_SCALE**2), bend))
+    curvature = values[2:]
+    return float(curvature @ np.linalg.solve(covariance[2:, 2:] + 1e-8 * np.diag(BEND_SCALE**2), curvature))

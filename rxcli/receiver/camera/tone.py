@@ -55,9 +55,9 @@ def tone_exponent(strips: Strips, wave: Float32Array, window: int) -> tuple[floa
     information = by_column(arc * arc) - on_line * by_column(arc * line)
     if information.sum() <= 0:
         return None
-    bend = pull.sum() / information.sum()
-    sd = np.hypot(np.linalg.norm(pull - bend * information) / information.sum(), _BEND_SD)
-    half = max(0.5 + bend / 4, _LEAST_HALF)
+    curvature = pull.sum() / information.sum()
+    sd = np.hypot(np.linalg.norm(pull - curvature * information) / information.sum(), _BEND_SD)
+    half = max(0.5 + curvature / 4, _LEAST_HALF)
     power = -np.log2(half)
     exponent = _EXPONENTS[strips.tone] / power
     return float(exponent), float(exponent * sd / (4 * np.log(2) * half * power))

@@ -59,8 +59,8 @@ def lit_probability(
     patterns = np.arange(n_patterns)
     joint = ahead[..., patterns >> 1] * back[..., turned[patterns & (states - 1)]] * weight.transpose(1, 0, 2)
     total = joint.sum(axis=2)
-    evidence = np.log(scales[:, :n_columns].astype(np.float64)).sum(axis=0) + top.sum(axis=(1, 2), dtype=np.float64)
-    return np.asarray(((joint @ middle) / np.maximum(total, 1e-30)).T, np.float32), evidence
+    log_evidence = np.log(scales[:, :n_columns].astype(np.float64)).sum(axis=0) + top.sum(axis=(1, 2), dtype=np.float64)
+    return np.asarray(((joint @ middle) / np.maximum(total, 1e-30)).T, np.float32), log_evidence
 
 
 def _walk(weight: Float32Array) -> tuple[Float32Array, Float32Array]:

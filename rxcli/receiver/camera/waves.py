@@ -115,9 +115,9 @@ def first_slots(waves: Waves, exposure_slots: float, grid: Grid) -> Slots:
     lit, _ = lit_probability(_pattern_metric(many, gain, offset, power, pattern), known)
     gain, offset, residual = _levels(many, lit, exposure_slots)
     power = _power(many, residual)
-    lit, evidence = lit_probability(_pattern_metric(many, gain, offset, power, pattern), known)
-    evidence = evidence - 0.5 * _TEMPER * _trust(many).sum(axis=1) * np.log(power[:, 0])
-    best = _shared_weights(evidence.reshape(len(WEIGHTS), n_columns))
+    lit, log_evidence = lit_probability(_pattern_metric(many, gain, offset, power, pattern), known)
+    log_evidence = log_evidence - 0.5 * _TEMPER * _trust(many).sum(axis=1) * np.log(power[:, 0])
+    best = _shared_weights(log_evidence.reshape(len(WEIGHTS), n_columns))
     return Slots(lit.reshape(len(WEIGHTS), n_columns, n)[best, np.arange(n_columns)], np.array(WEIGHTS)[best])
 
 
@@ -142,11 +142,11 @@ def _log_odds(share: FloatArray) -> FloatArray:
     return np.asarray(np.log(share / (1 - share)))
 
 
-def _shared_weights(evidence: FloatArray) -> NDArray[np.int64]:
+def _shared_weights(log_evidence: FloatArray) -> NDArray[np.int64]:
     """(C,) most probable weight of each column, where weights that many columns have are more probable."""
-    prior = np.full((evidence.shape[0], 1), 1 / evidence.shape[0])
+    prior = np.full((log_evidence.shape[0], 1), 1 / log_evidence.shape[0])
     for _ in range(_SHARING_ROUNDS):
-        posterior = np.exp(evidence - evidence.max(axis=0)) * prior
+        posterior = np.exp(log_evidence - log_evidence.max(axis=0)) * prior
         posterior /= posterior.sum(axis=0)
         prior = posterior.mean(axis=1, keepdims=True) + 0.01
     return np.asarray(posterior.argmax(axis=0))
@@ -178,7 +178,7 @@ def fitted(lit: Float32Array, n: int) -> Float32Array:
     return lit[:, :n] if more <= 0 else np.pad(lit, ((0, 0), (0, more)), constant_values=0.5)
 
 
-def packet_evidence(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots) -> float:
+def packet_llr(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots) -> float:
     """Log-likelihood ratio of headers and dimming symbols being where they must, over slots of any kind, nats."""
     n = slots.lit.shape[1]
     gain, offset, residual = _levels(waves, slots.lit, exposure_slots)
@@ -346,12 +346,12 @@ def _least(tried: FloatArray, errors: FloatArray, waves: Waves) -> tuple[float, 
     """Where the logarithm of the misfit is least, by a parabola, and the standard deviation."""
     best = int(errors.argmin())
     inner = int(np.clip(best, 1, tried.size - 2))
-    bend, slope, _ = np.polyfit(tried[inner - 1 : inner + 2], errors[inner - 1 : inner + 2], 2)
-    if bend <= 0:
+    curvature, slope, _ = np.polyfit(tried[inner - 1 : inner + 2], errors[inner - 1 : inner + 2], 2)
+    if curvature <= 0:
         return float(tried[best]), 0.3
-    exposure = float(np.clip(-slope / (2 * bend), tried[inner - 1], tried[inner + 1]))
+    exposure = float(np.clip(-slope / (2 * curvature), tried[inner - 1], tried[inner + 1]))
     independent = waves.value.size / SAMPLES
-    return exposure, float(np.clip(np.sqrt(1 / (bend * independent)), 0.02, 0.5))
+    return exposure, float(np.clip(np.sqrt(1 / (curvature * independent)), 0.02, 0.5))
 
 
 def _misfit(waves: Waves, exposure_slots: float, lit: Float32Array) -> float:

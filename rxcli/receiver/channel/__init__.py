@@ -27,11 +27,11 @@ its innovations.
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
 from rxcli.receiver.channel.model import (
     LightModel,
-    estimate_floor,
+    crosstalk_matrix,
+    estimate_black_level,
     estimate_sigma,
     exposure_taps,
-    memory_for,
-    spread_matrix,
+    isi_memory_for,
 )
 from rxcli.receiver.channel.patterns import by_burst, first_metrics, lit_on_grid, metrics_of, on_grid
 from rxcli.receiver.channel.words import word_corrections
@@ -40,15 +40,15 @@ __all__ = [
     "LightModel",
     "SlotLikelihoods",
     "by_burst",
-    "estimate_floor",
+    "crosstalk_matrix",
+    "estimate_black_level",
     "estimate_sigma",
     "exposure_taps",
     "first_metrics",
+    "isi_memory_for",
     "lit_on_grid",
-    "memory_for",
     "metrics_of",
     "on_grid",
     "slot_likelihoods",
-    "spread_matrix",
     "word_corrections",
 ]

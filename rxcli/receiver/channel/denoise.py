@@ -61,7 +61,7 @@ _MAX_MODEL_BYTES = 2_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class DenoiserInput:
     """What a frame's columns look like to the network; C columns of S strips, N slots of Q samples."""
 
     samples: SlotSamples
@@ -73,13 +73,13 @@ class Scene:
     #: (C,) most likely weight.
     w: NDArray[np.int64]
     #: Light of a dark slot.
-    floor: float
+    black_level: float
     #: Standard deviation of a sample of no light.
     sigma: float
     #: Variance of a sample per unit of light.
-    shot: float
+    shot_gain: float
     #: (S, 3) shares of columns -1, 0, +1 in the light of each strip, up to a factor.
-    spread: FloatArray
+    crosstalk: FloatArray
 
 
 class Denoiser(Protocol):
@@ -89,38 +89,38 @@ class Denoiser(Protocol):
     def name(self) -> str:
         """Name for reports."""
 
-    def slot_corrections(self, scene: Scene, columns: NDArray[np.int64]) -> Float32Array:
+    def slot_corrections(self, scene: DenoiserInput, columns: NDArray[np.int64]) -> Float32Array:
         """(len(columns), N) what to add to ln p(light | lit) - ln p(light | dark) of every slot of `columns`.
 
-        The scene is one `without_row_light`.
+        The scene is one `remove_row_noise`.
         """
 
 
-def without_row_light(scene: Scene) -> Scene:
+def remove_row_noise(scene: DenoiserInput) -> DenoiserInput:
     """The scene without the light that a sensor row shows everywhere.
 
     For every column it is what the other columns leave unexplained at the same instant.
     """
     some = slice(None, None, _ROW_STRIPS)
     thin = replace(scene.samples, light=scene.samples.light[:, some], valid=scene.samples.valid[:, some])
-    seen = _explain(replace(scene, samples=thin, spread=scene.spread[some]), np.arange(len(scene.lit)))
-    rows = _row_light(np.clip(seen.residual, -_ROW_SIGMAS, _ROW_SIGMAS), seen.scale)[:, None]
+    observed = _explain(replace(scene, samples=thin, crosstalk=scene.crosstalk[some]), np.arange(len(scene.lit)))
+    rows = _row_light(np.clip(observed.residual, -_ROW_SIGMAS, _ROW_SIGMAS), observed.scale)[:, None]
     samples = replace(scene.samples, light=scene.samples.light - rows * scene.samples.valid)
     return replace(scene, samples=samples)
 
 
-def network_inputs(scene: Scene, columns: NDArray[np.int64]) -> tuple[Float32Array, Float32Array]:
+def network_inputs(scene: DenoiserInput, columns: NDArray[np.int64]) -> tuple[Float32Array, Float32Array]:
     """The input contract.
 
     Args:
-        scene: the frame, `without_row_light`.
+        scene: the frame, `remove_row_noise`.
         columns: columns to look at, B of them.
 
     Returns:
         (B, S, 26, N) features of the strips, and (B, 16, N) of the columns; float32.
     """
-    seen = _explain(scene, columns)
-    return _strip_features(scene, seen, columns), _column_features(scene, seen, columns)
+    observed = _explain(scene, columns)
+    return _strip_features(scene, observed, columns), _column_features(scene, observed, columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,16 +139,16 @@ class _Explained:
     residual: Float32Array
 
 
-def _explain(scene: Scene, columns: NDArray[np.int64]) -> _Explained:
+def _explain(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Explained:
     valid, q = scene.samples.valid[columns], scene.samples.samples_per_slot
-    light = (scene.samples.light[columns] - np.float32(scene.floor)) * valid
-    share = _against_middle(scene.spread)[None, :, 1, None].astype(np.float32)
+    light = (scene.samples.light[columns] - np.float32(scene.black_level)) * valid
+    share = _against_middle(scene.crosstalk)[None, :, 1, None].astype(np.float32)
     own = share * _exposures(scene, columns, np.zeros(columns.size))[:, None]
     others = _from_neighbours(scene, columns)
     expected = own + others
     picture, variance = _predict_picture(light, expected, valid, scene.sigma, q)
     believed = picture * expected
-    noise = variance * expected * expected + np.float32(scene.shot) * believed + np.float32(scene.sigma**2)
+    noise = variance * expected * expected + np.float32(scene.shot_gain) * believed + np.float32(scene.sigma**2)
     scale = valid / np.sqrt(noise)
     return _Explained(light, others, own, scale, picture * share * scale, (light - believed) * scale)
 
@@ -181,24 +181,24 @@ def _predict_picture(
     # Every other sample tells the error well enough.
     some = (slice(None), slice(None), slice(None, None, 2))
     light, weighted, around = light[some], weighted[some], _ERROR_SLOTS * q // 2
-    floor = np.float32(sigma * sigma) * _box(valid[some], around)
+    black_level = np.float32(sigma * sigma) * _box(valid[some], around)
     picture = variance = None
     for scale in _PICTURE_SCALES:
         reach = int(_HOLE_SLOTS * q) + 2 * int(scale * q)
         numerator, denominator = (_box(part, reach) - hole for part, hole in sums)
-        guess = np.maximum(numerator, 0) / (denominator + np.float32(1e-4))
-        predicted = guess[some] * weighted
-        error = _box(np.square(light - predicted), around) - floor
+        initial = np.maximum(numerator, 0) / (denominator + np.float32(1e-4))
+        predicted = initial[some] * weighted
+        error = _box(np.square(light - predicted), around) - black_level
         texture = np.clip(error / (_box(np.square(predicted), around) + np.float32(1e-9)), *_TEXTURE_BOUNDS)
-        spread = guess * guess * np.repeat(texture, 2, axis=2) + np.float32(sigma * sigma) / (
+        crosstalk = initial * initial * np.repeat(texture, 2, axis=2) + np.float32(sigma * sigma) / (
             denominator + np.float32(1e-6)
         )
         if picture is None or variance is None:
-            picture, variance = guess, spread
+            picture, variance = initial, crosstalk
             continue
         # Arithmetic picks several times quicker than a masked copy.
-        picture += (spread < variance) * (guess - picture)
-        np.minimum(variance, spread, out=variance)
+        picture += (crosstalk < variance) * (initial - picture)
+        np.minimum(variance, crosstalk, out=variance)
     assert picture is not None
     assert variance is not None
     return picture, variance
@@ -213,18 +213,18 @@ def _box(values: Float32Array, half: int) -> Float32Array:
     return np.asarray(summed, np.float32).reshape(values.shape)
 
 
-def _strip_features(scene: Scene, seen: _Explained, columns: NDArray[np.int64]) -> Float32Array:
+def _strip_features(scene: DenoiserInput, observed: _Explained, columns: NDArray[np.int64]) -> Float32Array:
     """(B, S, 26, N)"""
     q, sigma = scene.samples.samples_per_slot, np.float32(max(scene.sigma, 1e-7))
-    valid, light = scene.samples.valid[columns], seen.light
+    valid, light = scene.samples.valid[columns], observed.light
     level = _local_level(light, valid, q)
     base = np.float32(0.02) * level + 2 * sigma
     by_sample = (
         np.log((np.maximum(light, 0) + base) / (level + base)),
-        seen.others,
-        seen.own,
-        np.clip(seen.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS),
-        _tamed(seen.contrast),
+        observed.others,
+        observed.own,
+        np.clip(observed.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS),
+        _tamed(observed.contrast),
     )
     shape = (*light.shape[:2], -1, q)
     out = np.empty((*light.shape[:2], N_STRIP_FEATURES, light.shape[-1] // q), np.float32)
@@ -232,8 +232,8 @@ def _strip_features(scene: Scene, seen: _Explained, columns: NDArray[np.int64]) 
         out[:, :, number * q : (number + 1) * q] = np.moveaxis(values.reshape(shape), -1, 2)
     by_slot = (
         valid.reshape(shape).mean(axis=-1),
-        *_noise_features(level.reshape(shape)[..., 0], sigma, np.float32(scene.shot)),
-        _against_middle(scene.spread)[None, :, 1, None],
+        *_noise_features(level.reshape(shape)[..., 0], sigma, np.float32(scene.shot_gain)),
+        _against_middle(scene.crosstalk)[None, :, 1, None],
         np.float32(scene.clock.exposure_slots),
         _known_slots(scene.clock),
     )
@@ -242,12 +242,12 @@ def _strip_features(scene: Scene, seen: _Explained, columns: NDArray[np.int64]) 
     return out
 
 
-def _column_features(scene: Scene, seen: _Explained, columns: NDArray[np.int64]) -> Float32Array:
+def _column_features(scene: DenoiserInput, observed: _Explained, columns: NDArray[np.int64]) -> Float32Array:
     """(B, 16, N)"""
     q, clock = scene.samples.samples_per_slot, scene.clock
     lit = np.clip(scene.lit[columns], 1e-5, 1 - 1e-5)
     llr = _slot_llr(scene.metrics[columns], lit)
-    contrast = _tamed(seen.contrast)
+    contrast = _tamed(observed.contrast)
     place = (np.arange(clock.n_slots) + clock.first_slot) % SLOTS_PER_SYMBOL
     by_slot = (
         _known_slots(clock),
@@ -255,7 +255,9 @@ def _column_features(scene: Scene, seen: _Explained, columns: NDArray[np.int64])
         np.clip(llr / 4, -3, 3),
         np.clip((np.log(lit / (1 - lit)) - llr) / 4, -3, 3),
         scene.w[columns, None] / SLOTS_PER_SYMBOL,
-        np.clip(_pooled(_bounded(np.clip(seen.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS)) * contrast, q), -4, 4),
+        np.clip(
+            _pooled(_bounded(np.clip(observed.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS)) * contrast, q), -4, 4
+        ),
         np.log1p(_pooled(contrast * contrast, q)),
     )
     shape = (columns.size, clock.n_slots)
@@ -283,15 +285,17 @@ def _slot_llr(metrics: FloatArray, lit: Float32Array) -> Float32Array:
         metrics: (B, N + memory, patterns).
         lit: (B, N) probability that each slot is lit, neither 0 nor 1.
     """
-    memory, n_slots = metrics.shape[1] - lit.shape[1], lit.shape[1]
-    patterns = slot_patterns(memory).astype(np.float64)
-    padded = np.pad(lit.astype(np.float64), ((0, 0), (memory, memory)), constant_values=0.5)
-    odds = np.lib.stride_tricks.sliding_window_view(np.log(padded) - np.log1p(-padded), memory + 1, axis=1)
+    isi_memory, n_slots = metrics.shape[1] - lit.shape[1], lit.shape[1]
+    patterns = slot_patterns(isi_memory).astype(np.float64)
+    padded = np.pad(lit.astype(np.float64), ((0, 0), (isi_memory, isi_memory)), constant_values=0.5)
+    odds = np.lib.stride_tricks.sliding_window_view(np.log(padded) - np.log1p(-padded), isi_memory + 1, axis=1)
     joint = metrics + odds @ patterns.T
     joint = np.exp(joint - joint.max(axis=2, keepdims=True))
     # (B, N + memory, memory + 1): posterior odds of each slot of a pattern, against its prior ones.
     gained = np.log(joint @ patterns + _TINY) - np.log(joint @ (1 - patterns) + _TINY) - odds
-    return np.asarray(sum(gained[:, age : age + n_slots, memory - age] for age in range(memory + 1)), np.float32)
+    return np.asarray(
+        sum(gained[:, age : age + n_slots, isi_memory - age] for age in range(isi_memory + 1)), np.float32
+    )
 
 
 def _local_level(light: Float32Array, valid: Float32Array, q: int) -> Float32Array:
@@ -307,10 +311,10 @@ def _local_level(light: Float32Array, valid: Float32Array, q: int) -> Float32Arr
     return np.asarray(mean.reshape(light.shape), np.float32)
 
 
-def _noise_features(level: Float32Array, sigma: np.float32, shot: np.float32) -> tuple[Float32Array, Float32Array]:
+def _noise_features(level: Float32Array, sigma: np.float32, shot_gain: np.float32) -> tuple[Float32Array, Float32Array]:
     """Noise of a dark and of an average sample against the level, decades."""
     whole = level + sigma
-    return np.log10(sigma / whole), np.log10(np.sqrt(sigma * sigma + shot * level) / whole)
+    return np.log10(sigma / whole), np.log10(np.sqrt(sigma * sigma + shot_gain * level) / whole)
 
 
 def _known_slots(clock: Clock) -> Float32Array:
@@ -320,18 +324,18 @@ def _known_slots(clock: Clock) -> Float32Array:
     return np.where(position < len(HEADER), header[np.minimum(position, len(HEADER) - 1)], 0).astype(np.float32)
 
 
-def _from_neighbours(scene: Scene, columns: NDArray[np.int64]) -> Float32Array:
+def _from_neighbours(scene: DenoiserInput, columns: NDArray[np.int64]) -> Float32Array:
     """(B, S, N * Q) light that the adjacent columns should shed into each strip, per unit of picture."""
-    delay, spread = scene.clock.delay_slots, _against_middle(scene.spread).astype(np.float32)
+    delay, crosstalk = scene.clock.delay_slots, _against_middle(scene.crosstalk).astype(np.float32)
     out = np.zeros((columns.size, *scene.samples.light.shape[1:]), np.float32)
-    for side, share in ((-1, spread[:, 0]), (1, spread[:, 2])):
+    for side, share in ((-1, crosstalk[:, 0]), (1, crosstalk[:, 2])):
         there = (columns + side >= 0) & (columns + side < delay.size)
         own, other = columns[there], columns[there] + side
         out[there] += share[:, None] * _exposures(scene, other, delay[own] - delay[other])[:, None]
     return out
 
 
-def _exposures(scene: Scene, columns: NDArray[np.int64], ahead: FloatArray) -> Float32Array:
+def _exposures(scene: DenoiserInput, columns: NDArray[np.int64], ahead: FloatArray) -> Float32Array:
     """(B, N * Q) mean of the believed slots of columns over every sample's exposure, read `ahead` slots later."""
     n = scene.samples.light.shape[-1]
     centres = (np.arange(n) + 0.5) / scene.samples.samples_per_slot
@@ -340,17 +344,17 @@ def _exposures(scene: Scene, columns: NDArray[np.int64], ahead: FloatArray) -> F
     return np.asarray(rows, np.float32).reshape(columns.size, n)
 
 
-def _against_middle(spread: FloatArray) -> FloatArray:
+def _against_middle(crosstalk: FloatArray) -> FloatArray:
     """(S, 3) light of columns -1, 0, +1 in each strip against the column's own light in its middle.
 
     A Gaussian's shares tell where in the column the strip lies: their logarithms bend by 1 / sigma**2 and rise by the
     strip's place over sigma**2.
     """
-    log = np.log(np.maximum(spread, 1e-12))
+    log = np.log(np.maximum(crosstalk, 1e-12))
     bend = np.maximum(2 * log[:, 1] - log[:, 0] - log[:, 2], 1e-6)
     rise = (log[:, 2] - log[:, 0]) / 2
     own = np.exp(-np.square(rise) / (2 * bend))
-    return np.asarray(spread / spread[:, 1:2] * own[:, None])
+    return np.asarray(crosstalk / crosstalk[:, 1:2] * own[:, None])
 
 
 def _exposed(lit: Float32Array, centres: FloatArray, exposure_slots: float) -> FloatArray:
@@ -365,7 +369,7 @@ def _exposed(lit: Float32Array, centres: FloatArray, exposure_slots: float) -> F
     )
 
 
-def payload_seen(scene: Scene) -> Float32Array:
+def payload_observed(scene: DenoiserInput) -> Float32Array:
     """(C, N) 1 where any part of a payload slot can be seen, else 0.
 
     Only payloads have been learned from: header and dimming symbol are left to the light model.
@@ -463,10 +467,10 @@ class OnnxDenoiser:
         """Name and version, for reports."""
         return f"{self.card.name}-{self.card.version}"
 
-    def slot_corrections(self, scene: Scene, columns: NDArray[np.int64]) -> Float32Array:
+    def slot_corrections(self, scene: DenoiserInput, columns: NDArray[np.int64]) -> Float32Array:
         """(len(columns), N) what to add to ln p(light | lit) - ln p(light | dark) of every slot of `columns`.
 
-        The scene is one `without_row_light`.
+        The scene is one `remove_row_noise`.
 
         Raises:
             ProfileError: the file is not the network that its card tells of.
@@ -475,7 +479,7 @@ class OnnxDenoiser:
         contract = self.card.contract
         fed = {contract.strips: strips, contract.columns: features}
         correction = np.asarray(self._session.run([contract.correction], fed)[0], np.float32)
-        return correction * payload_seen(scene)[columns]
+        return correction * payload_observed(scene)[columns]
 
     @cached_property
     def _session(self) -> Any:

@@ -82,7 +82,7 @@ def slot_likelihoods(
     slope[:, 1:-1] = (shape[:, 2:] - shape[:, :-2]) * np.float32(samples.samples_per_slot / 2)
     others = from_neighbours(shape, model, clock, columns)
     others_slope = from_neighbours(slope, model, clock, columns)
-    own = model.spread[None, :, 1, None].astype(np.float32)
+    own = model.crosstalk[None, :, 1, None].astype(np.float32)
 
     def of_part(part: NDArray[np.int64]) -> SlotLikelihoods:
         these = columns[part]
@@ -108,7 +108,7 @@ def slot_likelihoods(
 def _likelihoods(
     light: Float32Array, valid: Float32Array, expected: _Expected, model: LightModel, thorough: bool
 ) -> SlotLikelihoods:
-    light = (light - np.float32(model.floor)) * valid
+    light = (light - np.float32(model.black_level)) * valid
     predictions = predict_picture(light, expected.whole, valid, model.sigma, model.taps.shape[0], thorough)
     metrics = _pattern_metrics(light, valid, predictions, expected, model)
     timing = _timing(light, valid, predictions[0], expected, model)
@@ -118,7 +118,7 @@ def _likelihoods(
 def _slot_snr(valid: Float32Array, prediction: Prediction, own: Float32Array, model: LightModel) -> Float32Array:
     """(C, N) squared contrast over variance of a slot, as far as strips and samples are independent."""
     contrast = prediction.picture * own
-    noise = np.float32(model.sigma**2) + np.float32(model.shot) * contrast + prediction.variance * own * own
+    noise = np.float32(model.sigma**2) + np.float32(model.shot_gain) * contrast + prediction.variance * own * own
     q = model.taps.shape[0]
     ratio = (contrast * contrast / noise * valid).sum(axis=1) * np.float32(_TEMPER / q)
     return by_slot(ratio, q)
@@ -130,24 +130,26 @@ def _timing(
     """(C, 2) numerator and denominator of each column's lateness: one Gauss-Newton step, samples weighted robustly."""
     whole = prediction.picture * expected.whole
     change = prediction.picture * expected.slope
-    spread = np.float32(model.sigma**2) + np.float32(model.shot) * whole + prediction.variance * expected.whole**2
+    crosstalk = (
+        np.float32(model.sigma**2) + np.float32(model.shot_gain) * whole + prediction.variance * expected.whole**2
+    )
     residual = light - whole
-    weight = valid / (spread + residual * residual / np.float32(_DEGREES))
+    weight = valid / (crosstalk + residual * residual / np.float32(_DEGREES))
     numerator = (weight * residual * change).sum(axis=(1, 2), dtype=np.float64)
     return np.stack([numerator, (weight * change * change).sum(axis=(1, 2), dtype=np.float64)], axis=1)
 
 
 def shape_on_grid(lit: Float32Array, model: LightModel) -> Float32Array:
     """(C, N * Q) mean of the exposure over the expected slots; unknown slots beyond the grid are half lit."""
-    memory, q = model.memory, model.taps.shape[0]
-    padded = np.full((lit.shape[0], lit.shape[1] + 2 * memory), 0.5, np.float32)
-    padded[:, memory : memory + lit.shape[1]] = lit
-    n_metrics = lit.shape[1] + memory
+    isi_memory, q = model.isi_memory, model.taps.shape[0]
+    padded = np.full((lit.shape[0], lit.shape[1] + 2 * isi_memory), 0.5, np.float32)
+    padded[:, isi_memory : isi_memory + lit.shape[1]] = lit
+    n_metrics = lit.shape[1] + isi_memory
     repeated = np.repeat(padded, q, axis=1)
     shape = np.zeros((lit.shape[0], n_metrics * q), np.float32)
     for place, weights in enumerate(model.taps.T.astype(np.float32)):
         shape += repeated[:, place * q :][:, : n_metrics * q] * np.tile(weights, n_metrics)
-    skip = memory * q // 2
+    skip = isi_memory * q // 2
     return np.ascontiguousarray(shape[:, skip : skip + lit.shape[1] * q])
 
 
@@ -159,8 +161,8 @@ def from_neighbours(shape: Float32Array, model: LightModel, clock: Clock, column
         ahead = np.diff(clock.delay_slots) * model.taps.shape[0]
         left[1:] = _shifted(left[1:], ahead)
         right[:-1] = _shifted(right[:-1], -ahead)
-    spread = model.spread.astype(np.float32)
-    return left[columns, None] * spread[None, :, 0, None] + right[columns, None] * spread[None, :, 2, None]
+    crosstalk = model.crosstalk.astype(np.float32)
+    return left[columns, None] * crosstalk[None, :, 0, None] + right[columns, None] * crosstalk[None, :, 2, None]
 
 
 def _shifted(rows: Float32Array, by: FloatArray) -> Float32Array:
@@ -200,7 +202,7 @@ def _density(
     With four degrees of freedom, variance v and residual r it is v^2 / (v + r^2 / 4)^2.5: a root, and no logarithm.
     """
     variance = prediction.variance * whole
-    variance += np.float32(model.shot) * prediction.picture
+    variance += np.float32(model.shot_gain) * prediction.picture
     variance *= whole
     variance += np.float32(model.sigma**2)
     wide = light - prediction.picture * whole

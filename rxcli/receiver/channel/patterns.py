@@ -39,22 +39,22 @@ def by_pattern(taps: FloatArray, n: int, of_levels: Callable[[Float32Array], Flo
         n: samples.
         of_levels: from the (n,) levels between dark and lit that a pattern has in every sample, to (C, n).
     """
-    q, memory = taps.shape[0], taps.shape[1] - 1
-    lead = memory * q // 2
+    q, isi_memory = taps.shape[0], taps.shape[1] - 1
+    lead = isi_memory * q // 2
     sums = []
-    for levels in slot_patterns(memory) @ taps.T:
+    for levels in slot_patterns(isi_memory) @ taps.T:
         # Sample i belongs to metric (i + lead) // q.
         values = of_levels(np.tile(np.roll(levels, -(lead % q)).astype(np.float32), -(-n // q))[:n])
-        padded = np.zeros((values.shape[0], n + memory * q), np.float32)
+        padded = np.zeros((values.shape[0], n + isi_memory * q), np.float32)
         padded[:, lead : lead + n] = values
         sums.append(by_slot(padded, q))
     return np.stack(sums, axis=2).astype(np.float64)
 
 
-def metrics_of(llr: Float32Array, memory: int) -> FloatArray:
+def metrics_of(llr: Float32Array, isi_memory: int) -> FloatArray:
     """Metrics (C, N + memory, patterns) of slots (C, N) that are independent, given their log-likelihood ratios."""
-    padded = np.pad(llr, ((0, 0), (0, memory)))
-    return np.asarray(padded[..., None] / 2 * (2.0 * slot_patterns(memory)[:, -1] - 1))
+    padded = np.pad(llr, ((0, 0), (0, isi_memory)))
+    return np.asarray(padded[..., None] / 2 * (2.0 * slot_patterns(isi_memory)[:, -1] - 1))
 
 
 def lit_on_grid(posteriors: BurstPosteriors, clock: Clock) -> Float32Array:
@@ -69,7 +69,7 @@ def on_grid(lit: Float32Array, clock: Clock) -> Float32Array:
     return flat[:, clock.first_slot : clock.first_slot + clock.n_slots]
 
 
-def by_burst(metrics: FloatArray, clock: Clock, memory: int) -> FloatArray:
+def by_burst(metrics: FloatArray, clock: Clock, isi_memory: int) -> FloatArray:
     """Metrics of the grid (C, N + memory, patterns) added over the copies of each burst.
 
     Returns:
@@ -77,11 +77,11 @@ def by_burst(metrics: FloatArray, clock: Clock, memory: int) -> FloatArray:
     """
     n_columns, _, n_patterns = metrics.shape
     length = clock.packet_slots
-    padded = np.zeros((n_columns, clock.n_copies * length + memory, n_patterns))
+    padded = np.zeros((n_columns, clock.n_copies * length + isi_memory, n_patterns))
     end = min(clock.first_slot + metrics.shape[1], padded.shape[1])
     padded[:, clock.first_slot : end] = metrics[:, : end - clock.first_slot]
-    out = np.zeros((int(clock.burst.max()) + 1, n_columns, length + memory, n_patterns))
+    out = np.zeros((int(clock.burst.max()) + 1, n_columns, length + isi_memory, n_patterns))
     for copy, burst in enumerate(clock.burst):
-        out[burst] += padded[:, copy * length : (copy + 1) * length + memory]
-    out[:, :, :memory] = 0
+        out[burst] += padded[:, copy * length : (copy + 1) * length + isi_memory]
+    out[:, :, :isi_memory] = 0
     return out

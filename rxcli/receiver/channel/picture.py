@@ -66,23 +66,23 @@ def predict_picture(
         sums = zip(
             sides(box_sums(numerator, half), half, hole), sides(box_sums(denominator, half), half, hole), strict=True
         )
-        for side, (light_seen, seen) in enumerate(sums):
-            guess = np.maximum(light_seen, 0, out=light_seen)
-            guess /= seen + np.float32(1e-4)
+        for side, (light_observed, observed) in enumerate(sums):
+            initial = np.maximum(light_observed, 0, out=light_observed)
+            initial /= observed + np.float32(1e-4)
             # Which scale is best is asked once a slot, in its middle.
-            variance = np.square(guess[..., samples_per_slot // 2 :: samples_per_slot]) * texture.of(guess)
+            variance = np.square(initial[..., samples_per_slot // 2 :: samples_per_slot]) * texture.of(initial)
             variance += np.float32(sigma * sigma) / (
-                seen[..., samples_per_slot // 2 :: samples_per_slot] + np.float32(1e-6)
+                observed[..., samples_per_slot // 2 :: samples_per_slot] + np.float32(1e-6)
             )
             if len(pictures) <= side:
-                pictures.append(guess)
+                pictures.append(initial)
                 variances.append(variance)
                 continue
             # Arithmetic picks several times quicker than a masked copy.
             better = (variance < variances[side]).astype(np.float32)
-            guess -= pictures[side]
-            guess *= np.repeat(better, samples_per_slot, axis=-1)
-            pictures[side] += guess
+            initial -= pictures[side]
+            initial *= np.repeat(better, samples_per_slot, axis=-1)
+            pictures[side] += initial
             np.minimum(variances[side], variance, out=variances[side])
     return [
         Prediction(picture, np.repeat(variance, samples_per_slot, axis=-1))

@@ -37,7 +37,7 @@ class _Halves:
     #: Light of the adjacent columns per unit of picture.
     others: Float32Array
     #: Whether both samples are seen.
-    seen: NDArray[np.bool_]
+    observed: NDArray[np.bool_]
 
 
 def word_corrections(
@@ -72,9 +72,9 @@ def word_corrections(
     halves = _halves(samples, clock, model, lit, columns)
     item, word = np.nonzero(likely[symbol])
     levels = _word_levels(lit[columns[places[symbol[item], 1]]], start[item], words[symbol[item], word], model)
-    seen = _process_likelihood(halves, places[symbol[item], 1], start[item], levels, model)
+    observed = _process_likelihood(halves, places[symbol[item], 1], start[item], levels, model)
     score = np.zeros(likely.shape)
-    np.add.at(score, (symbol[item], word), seen)
+    np.add.at(score, (symbol[item], word), observed)
     slots = _as_slots(_WORD_TEMPER * score, words, likely)
     _share_among_copies(out, slots, symbol, places[symbol, 1], start)
     return out
@@ -110,8 +110,8 @@ def _halves(
 ) -> _Halves:
     shape, q = shape_on_grid(lit, model), samples.samples_per_slot
     others = from_neighbours(shape, model, clock, columns)
-    light: Float32Array = (samples.light - np.float32(model.floor)) * samples.valid
-    own = model.spread[None, :, 1, None].astype(np.float32) * shape[columns, None]
+    light: Float32Array = (samples.light - np.float32(model.black_level)) * samples.valid
+    own = model.crosstalk[None, :, 1, None].astype(np.float32) * shape[columns, None]
     weight = (others + own) * samples.valid
     light_around, seen_around = (box_sums(part * weight, _MEAN_SLOTS * q) for part in (light, weight))
     mean = np.maximum(light_around, np.float32(0)) / np.maximum(seen_around, np.float32(1e-3))
@@ -134,15 +134,15 @@ def _word_levels(
         words: (R, 10).
         model: the light model.
     """
-    lead = _AROUND_SLOTS + model.memory
+    lead = _AROUND_SLOTS + model.isi_memory
     at = start[:, None] + np.arange(-lead, SLOTS_PER_SYMBOL + lead)
     slots = np.take_along_axis(lit, np.clip(at, 0, lit.shape[1] - 1), axis=1)
     slots[(at < 0) | (at >= lit.shape[1])] = 0.5
     slots[:, lead : lead + SLOTS_PER_SYMBOL] = words
-    windows = np.lib.stride_tricks.sliding_window_view(slots, model.memory + 1, axis=1)
+    windows = np.lib.stride_tricks.sliding_window_view(slots, model.isi_memory + 1, axis=1)
     levels = (windows @ model.taps.T.astype(np.float32)).reshape(start.size, -1)
     q = model.taps.shape[0]
-    skip = model.memory * q // 2
+    skip = model.isi_memory * q // 2
     return _paired(np.asarray(levels[:, skip : skip + (SLOTS_PER_SYMBOL + 2 * _AROUND_SLOTS) * q], np.float32))
 
 
@@ -154,12 +154,12 @@ def _process_likelihood(
     at = 2 * (start[:, None] - _AROUND_SLOTS) + np.arange(width)
     index = (column[None, :, None], np.arange(halves.light.shape[1])[None, None], np.clip(at, 0, n - 1).T[:, :, None])
     # From here on time comes first: (W, R, S).
-    mean, seen = halves.mean[index], halves.seen[index] & ((at >= 0) & (at < n)).T[:, :, None]
-    own = model.spread[None, None, :, 1].astype(np.float32)
+    mean, observed = halves.mean[index], halves.observed[index] & ((at >= 0) & (at < n)).T[:, :, None]
+    own = model.crosstalk[None, None, :, 1].astype(np.float32)
     gain = (halves.others[index] + own * levels.T[:, :, None]) * mean
-    noise = np.float32(_PAIR_NOISE) * (np.float32(model.sigma**2) + np.float32(model.shot) * gain)
-    residual = np.where(seen, halves.light[index] - gain, np.float32(0))
-    gain = np.where(seen, gain, np.float32(0))
+    noise = np.float32(_PAIR_NOISE) * (np.float32(model.sigma**2) + np.float32(model.shot_gain) * gain)
+    residual = np.where(observed, halves.light[index] - gain, np.float32(0))
+    gain = np.where(observed, gain, np.float32(0))
     kinds = _innovations(residual, gain, noise, _PICTURE_KINDS)
     return np.asarray(np.logaddexp.reduce(kinds, axis=0).sum(axis=1), np.float64)
 
@@ -181,18 +181,18 @@ def _innovations(
     variance, total = state + power, state.copy()
     for light, slope, error in zip(residual, gain, noise, strict=True):
         shared = slope * variance
-        spread = shared * slope
-        spread += error
+        crosstalk = shared * slope
+        crosstalk += error
         innovation = light - slope * state
-        step = innovation / spread
+        step = innovation / crosstalk
         innovation *= step
         total += innovation
-        total += np.log(spread)
-        np.divide(shared, spread, out=spread)
+        total += np.log(crosstalk)
+        np.divide(shared, crosstalk, out=crosstalk)
         step *= shared
         state += step
         state *= keep
-        shared *= spread
+        shared *= crosstalk
         variance -= shared
         variance -= power
         variance *= keep * keep

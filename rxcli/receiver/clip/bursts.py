@@ -46,10 +46,10 @@ class BurstReader:
 
     def add(self, view: View, numbers: IntArray) -> None:
         """Add a frame to its bursts (B,); they are detected when somebody asks what they say."""
-        metrics = channel.by_burst(view.bursts.metrics, view.bursts.clock, view.memory)
+        metrics = channel.by_burst(view.bursts.metrics, view.bursts.clock, view.isi_memory)
         self.open.add(view.bursts, numbers, metrics)
 
-    def freshen(self, *frames: Waiting) -> None:
+    def detect_stale(self, *frames: Waiting) -> None:
         """Detect the bursts of frames that were added to since they were looked at."""
         asked: list[tuple[Waiting, IntArray]] = []
         stale: set[int] = set()
@@ -116,25 +116,25 @@ class BurstReader:
         """(C, N) probability that each slot of a frame is lit, by all that is known of its bursts."""
         assert waiting.view is not None
         assert waiting.numbers is not None
-        self.freshen(waiting)
-        now = waiting.view.bursts.clock
-        lit = np.full((waiting.numbers.size, self.open.n_columns, now.packet_slots), 0.5, np.float32)
+        self.detect_stale(waiting)
+        clock = waiting.view.bursts.clock
+        lit = np.full((waiting.numbers.size, self.open.n_columns, clock.packet_slots), 0.5, np.float32)
         for place, number in enumerate(waiting.numbers):
             if self.open.is_open(int(number)):
                 lit[place] = self.open.lit(waiting.numbers[place : place + 1])[0]
-        return sync.from_copies(lit[now.burst].transpose(1, 0, 2), now)
+        return sync.from_copies(lit[clock.burst].transpose(1, 0, 2), clock)
 
     def doubts(self, waiting: Waiting) -> tuple[int, int]:
         """Packets of a frame in columns that are well lit and of which all was seen: those in doubt, and all."""
         assert waiting.view is not None
         assert waiting.numbers is not None
-        self.freshen(waiting)
+        self.detect_stale(waiting)
         lit = np.median(waiting.view.snr, axis=1) >= _WELL_LIT_SNR
         doubtful = total = 0
         for number in waiting.numbers:
             known = self.open.known(int(number)) if self.open.is_open(int(number)) else None
             if known is not None:
-                whole = assemble.complete(self.open.seen(np.array([number])))[0] & lit
+                whole = assemble.complete(self.open.n_observed(np.array([number])))[0] & lit
                 doubtful += int((known.log_prob[0].sum(axis=1) < _DOUBTFUL)[whole].sum())
                 total += int(whole.sum())
         return doubtful, total
@@ -157,6 +157,6 @@ def _settled_weights(before: NDArray[np.bool_], metrics: FloatArray, wanted: NDA
         weights[unknown] = detect.plausible_weights(metrics[bursts][:, unknown], HOPELESS_WEIGHT)
     several = columns[weights[columns].sum(axis=1) > 1]
     if several.size:
-        evidence = detect.weight_evidence(metrics[bursts][:, several], weights[several])
-        weights[several] = np.arange(len(WEIGHTS)) == evidence.argmax(axis=1)[:, None]
+        confidence_features = detect.weight_log_evidence(metrics[bursts][:, several], weights[several])
+        weights[several] = np.arange(len(WEIGHTS)) == confidence_features.argmax(axis=1)[:, None]
     return weights

@@ -14,12 +14,21 @@ from rxcli.options import ReceiverOptions
 from rxcli.receiver import channel, sync
 from rxcli.receiver.clip import results
 from rxcli.receiver.clip.bursts import BurstReader
-from rxcli.receiver.clip.scene import Scene
+from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.start import Start, agree, lock_at, shows_little
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble, detect
-from rxcli.receiver.locate import Camera, Failure, Lock, Stages, find_camera, find_corners, find_lock, sample_columns
-from rxcli.receiver.still import Reception, decode, doubtful_columns, quick_look, second_opinion
+from rxcli.receiver.locate import (
+    Acquisition,
+    Camera,
+    Failure,
+    Stages,
+    acquire,
+    find_camera,
+    find_corners,
+    sample_columns,
+)
+from rxcli.receiver.still import Reception, apply_autoencoder, decode, doubtful_columns, initial_pass
 from rxcli.receiver.sync import tracking
 from rxcli.results.dump import dump_stages
 from rxcli.types import FloatArray, Frame, FrameResult, IntArray
@@ -95,8 +104,8 @@ class _Clip:
         #: Number of a frame that is yet to be received, and its corners.
         self._found: tuple[int, FloatArray] | None = None
         #: None where nothing is known, or frames cannot be tracked; and the one before the last search.
-        self._scene: Scene | None = None
-        self._scene_before: Scene | None = None
+        self._scene: TrackedScreen | None = None
+        self._scene_before: TrackedScreen | None = None
         self._hold_first()
 
     def _hold_first(self) -> None:
@@ -153,7 +162,7 @@ class _Clip:
             waiting.result = replace(
                 waiting.result,
                 **view.camera.facts,
-                screen_profile=view.lock.screen.name,
+                screen_profile=view.acquisition.screen.name,
                 corners=self._corners,
             )
             done = self._enter(waiting, frame, stages)
@@ -171,7 +180,7 @@ class _Clip:
         if link is None or scene is None or scene.last is None or not link.phase.settled or self._n_held:
             return False
         last, (top, bottom) = scene.last, scene.rows[[0, -1]]
-        slot, rows_per_slot = link.time.foretell(frame.index, frame.time_s), last.lock.clock.rows_per_slot
+        slot, rows_per_slot = link.time.predict(frame.index, frame.time_s), last.acquisition.clock.rows_per_slot
         if slot is None:
             return False
         ends = (slot + np.array([top, bottom]) / rows_per_slot) // link.time.packet_slots
@@ -187,7 +196,7 @@ class _Clip:
     def _finish(self) -> list[FrameResult]:
         if self._n_held:
             self._settle()
-            self._look_again(at_last=True)
+            self._refine_columns(at_last=True)
         done = self._settle()
         done += [self._report(waiting, None) for waiting in self._waiting]
         self._waiting.clear()
@@ -216,22 +225,34 @@ class _Clip:
             self._camera = find_camera(frame, corners, self._options, stages)
             self._taken_with = _taken_with(frame)
         camera, options = self._camera
-        lock = self._foretold(frame, corners, camera, stages) or find_lock(frame, corners, camera, options, stages)
-        can_track = self._can_track(frame, camera, lock)
-        seen, denoised, report = self._decoded(lock, can_track and self._n_held == _HELD, stages)
-        if assemble.all_dark(seen.snr):
+        acquisition = self._predicted(frame, corners, camera, stages) or acquire(
+            frame, corners, camera, options, stages
+        )
+        can_track = self._can_track(frame, camera, acquisition)
+        reception, denoised, report = self._decoded(acquisition, can_track and self._n_held == _HELD, stages)
+        if assemble.all_dark(reception.snr):
             raise Failure("no_signal", "no light of the screen's columns is seen; something may be in front of it")
-        view = View(camera, lock, _bursts_of(frame, seen), seen.model.memory, frame.height, seen.snr, denoised)
+        view = View(
+            camera,
+            acquisition,
+            _bursts_of(frame, reception),
+            reception.model.isi_memory,
+            frame.height,
+            reception.snr,
+            denoised,
+        )
         if can_track:
             with stages("sampling"):
-                scene = Scene.of_frame(frame, corners, camera, lock, seen.model.floor, self._scene_before)
+                scene = TrackedScreen.of_frame(
+                    frame, corners, camera, acquisition, reception.model.black_level, self._scene_before
+                )
                 view.light, view.map = scene.strips(frame), scene.map
-            scene.take(view, lambda: channel.lit_on_grid(seen.posteriors, seen.clock))
+            scene.take(view, lambda: channel.lit_on_grid(reception.posteriors, reception.clock))
             self._scene = scene
         return view, replace(result, denoiser=report)
 
     def _decoded(
-        self, lock: Lock, again: bool, stages: Stages
+        self, acquisition: Acquisition, again: bool, stages: Stages
     ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
         """What is received at a lock, columns that the auto-encoder changed, and its report.
 
@@ -239,15 +260,15 @@ class _Clip:
         """
         if again and self._options.cae != "always":
             with stages("detect"):
-                seen = quick_look(lock)
-                if doubtful_columns(seen).size <= _QUICK_DOUBT * seen.snr.shape[0]:
-                    return seen, frozenset(), None
+                reception = initial_pass(acquisition)
+                if doubtful_columns(reception).size <= _QUICK_DOUBT * reception.snr.shape[0]:
+                    return reception, frozenset(), None
         with stages("detect"):
-            seen = decode(lock, self._options.skip)
+            reception = decode(acquisition, self._options.skip)
         with stages("denoise"):
-            return second_opinion(lock, seen, self._options)
+            return apply_autoencoder(acquisition, reception, self._options)
 
-    def _foretold(self, frame: Frame, corners: FloatArray, camera: Camera, stages: Stages) -> Lock | None:
+    def _predicted(self, frame: Frame, corners: FloatArray, camera: Camera, stages: Stages) -> Acquisition | None:
         """The lock by the clock that the first frames agreed on, where a frame cannot find its own."""
         if self._start is None:
             return None
@@ -255,12 +276,12 @@ class _Clip:
             profiles = sample_columns(frame, corners, camera, self._start.screen.columns)
         return lock_at(self._start, frame, profiles, camera)
 
-    def _can_track(self, frame: Frame, camera: Camera, lock: Lock) -> bool:
+    def _can_track(self, frame: Frame, camera: Camera, acquisition: Acquisition) -> bool:
         """Whether a row of the picture is one instant, in the order of time."""
         return (
             "tracking" in self._options.skip
             and frame.mosaic is None
-            and lock.profiles.sensor_row is None
+            and acquisition.profiles.sensor_row is None
             and not camera.reversed
         )
 
@@ -300,11 +321,11 @@ class _Clip:
             if self._link.phase.settled or n_unsettled > _MAX_WAITING:
                 self._settle_bursts()
                 if self._n_held and len(self._waiting) >= self._n_held:
-                    self._look_again(at_last=False)
+                    self._refine_columns(at_last=False)
         return done + self._ready()
 
     def _begin_link(self, view: View, frame: Frame) -> None:
-        screen = view.lock.screen
+        screen = view.acquisition.screen
         offset = self._next_number
         if self._link is not None and offset:
             offset += int((frame.time_s - self._link.last_time_s) / (screen.packet_s * screen.repeats))
@@ -315,9 +336,9 @@ class _Clip:
     def _compare(self, view: View) -> None:
         """What the frame says of the phase of the bursts."""
         assert self._link is not None
-        now = view.bursts.clock
+        clock = view.bursts.clock
         llr = detect.slot_llr(view.bursts.metrics)
-        copies = sync.to_copies(llr, now).transpose(1, 0, 2) * (view.bursts.shown > 0)
+        copies = sync.to_copies(llr, clock).transpose(1, 0, 2) * (view.bursts.shown > 0)
         self._link.phase.take(view.bursts.first_copy, np.asarray(copies, np.float64))
 
     def _settle(self) -> list[FrameResult]:
@@ -335,7 +356,7 @@ class _Clip:
         """Add a frame to its bursts, and learn from it; they are detected when somebody asks what they say."""
         numbers, view = self._add(waiting), waiting.view
         if "certain_columns" not in self._options.skip or self._options.stop_when_certain:
-            self._bursts.freshen(waiting)
+            self._bursts.detect_stale(waiting)
         tracked = view is not None and view.flat is not None and self._bursts.open.is_open(int(numbers[-1]))
         if self._scene is not None and view is not None and tracked:
             self._scene.take(view, lambda: self._bursts.lit(waiting))
@@ -345,10 +366,10 @@ class _Clip:
         view, link = waiting.view, self._link
         assert view is not None
         assert link is not None
-        now = view.bursts.clock
-        bursts = link.phase.burst_of(view.bursts.first_copy + np.arange(now.n_copies))
+        clock = view.bursts.clock
+        bursts = link.phase.burst_of(view.bursts.first_copy + np.arange(clock.n_copies))
         numbers = np.unique(bursts)
-        view.bursts = replace(view.bursts, clock=replace(now, burst=bursts - numbers[0]))
+        view.bursts = replace(view.bursts, clock=replace(clock, burst=bursts - numbers[0]))
         waiting.numbers = numbers + link.offset
         self._next_number = max(self._next_number, int(waiting.numbers[-1]) + 1)
         self._bursts.add(view, waiting.numbers)
@@ -356,13 +377,13 @@ class _Clip:
 
     # -- a second look at the first frames ---------------------------------------------------------------------------
 
-    def _look_again(self, at_last: bool) -> None:
+    def _refine_columns(self, at_last: bool) -> None:
         """The first frames once more: by then it is known better what is on the screen.
 
         Where that leaves doubt, more frames are waited for, unless it is `at_last`.
         """
         held = [
-            w for w in self._waiting if w.view is not None and w.numbers is not None and self._can_look_again(w.view)
+            w for w in self._waiting if w.view is not None and w.numbers is not None and self._can_receive_again(w.view)
         ]
         may_wait = self._n_held < _HELD_LONG and not at_last
         if len(held) > 1 and not (may_wait and self._doubt(held) > _TOO_MUCH_DOUBT):
@@ -375,13 +396,13 @@ class _Clip:
         doubtful, whole = np.sum([self._bursts.doubts(waiting) for waiting in held], axis=0) if held else (0, 0)
         return float(doubtful / max(whole, 1))
 
-    def _can_look_again(self, view: View) -> bool:
+    def _can_receive_again(self, view: View) -> bool:
         return self._scene is not None and self._scene.can_measure_again(view)
 
     def _measure_again(self, held: list[Waiting]) -> None:
         """Learn the picture anew from all frames held, and measure those in doubt by what the others say of it."""
         assert self._scene is not None
-        self._bursts.freshen(*held)
+        self._bursts.detect_stale(*held)
         known = [self._bursts.lit(waiting) for waiting in held]
         doubtful = [self._bursts.doubts(waiting)[0] > 0 for waiting in held]
         self._scene.measure_again([w.view for w in held if w.view is not None], known, doubtful)
@@ -420,7 +441,7 @@ class _Clip:
         view, bursts = waiting.view, self._bursts
         if view is None or waiting.numbers is None:
             return waiting.result
-        bursts.freshen(waiting)
+        bursts.detect_stale(waiting)
         going_on = waiting.numbers[:0]
         if following is not None and following.numbers is not None:
             going_on = np.intersect1d(waiting.numbers, following.numbers)
@@ -438,7 +459,7 @@ def _taken_with(frame: Frame) -> tuple[object, ...]:
     return frame.width, frame.height, frame.pixels.dtype.str, frame.black, frame.white, frame.metadata
 
 
-def _bursts_of(frame: Frame, seen: Reception) -> tracking.FrameBursts:
-    by_copy = replace(seen.clock, burst=np.arange(seen.clock.n_copies))
-    shown = np.minimum(assemble.slots_seen(seen.samples, by_copy), 1)
-    return tracking.FrameBursts(frame.index, 0, seen.clock, seen.metrics, shown)
+def _bursts_of(frame: Frame, reception: Reception) -> tracking.FrameBursts:
+    by_copy = replace(reception.clock, burst=np.arange(reception.clock.n_copies))
+    shown = np.minimum(assemble.slots_observed(reception.samples, by_copy), 1)
+    return tracking.FrameBursts(frame.index, 0, reception.clock, reception.metrics, shown)

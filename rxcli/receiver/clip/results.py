@@ -17,15 +17,15 @@ from rxcli.types import ColumnResult, Float32Array, FloatArray, IntArray
 
 def bursts_of(closed: Sequence[ClosedBurst], first: int, view: View) -> list[assemble.BurstInClip]:
     """Bursts that end in the frame of a view, for `assemble`; `first` is the number of the frame's first burst."""
-    n_strips = view.lock.reading.n_quick_strips
+    n_strips = view.acquisition.sampler.n_binned_strips
     return [
         assemble.BurstInClip(
             number=burst.number,
             index=int(burst.number - first),
             posteriors=burst.posteriors,
-            seen=burst.seen,
+            n_observed=burst.n_observed,
             frames=burst.frames,
-            evidence=_evidence(burst, n_strips),
+            confidence_features=_confidence_features(burst, n_strips),
             against=_against(burst),
         )
         for burst in closed
@@ -57,18 +57,20 @@ def taps(waiting: Waiting, view: View, ended: Sequence[assemble.BurstInClip]) ->
         rows = view.map.first_row + np.arange(view.light.shape[2])
         found |= {"sampling.light": view.light, "sampling.inside": view.map.inside, "sampling.rows": rows}
     else:
-        found["sampling"] = view.lock.profiles
+        found["sampling"] = view.acquisition.profiles
     numbers: IntArray = np.array([burst.number for burst in ended], np.int64)
     found |= {"channel.metrics": view.bursts.metrics, "bursts.shown": view.bursts.shown}
     found |= {"bursts.number": waiting.numbers, "bursts.ended": numbers}
     return found | {f"detect.{burst.number}": burst.posteriors for burst in ended}
 
 
-def _evidence(burst: ClosedBurst, n_strips: int) -> FloatArray:
+def _confidence_features(burst: ClosedBurst, n_strips: int) -> FloatArray:
     """(C, 8) what the confidence of packets is made of, all copies and frames together."""
-    support = detect.slot_support(burst.metrics[None], burst.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
-    evidence = assemble.evidence(burst.posteriors, support, np.zeros(support.shape[1], bool), n_strips)
-    return np.asarray(evidence[0])
+    slot_margin = detect.slot_margin(burst.metrics[None], burst.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
+    confidence_features = assemble.confidence_features(
+        burst.posteriors, slot_margin, np.zeros(slot_margin.shape[1], bool), n_strips
+    )
+    return np.asarray(confidence_features[0])
 
 
 def _against(burst: ClosedBurst) -> Float32Array | None:

@@ -16,10 +16,10 @@ from rxcli.profiles import ScreenProfile
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver import sync
 from rxcli.receiver.locate import (
+    Acquisition,
     Camera,
+    ColumnSampler,
     Failure,
-    Lock,
-    Reading,
     Stages,
     find_camera,
     find_corners,
@@ -65,9 +65,9 @@ def agree(frames: Sequence[Frame], options: ReceiverOptions) -> Start | None:
         return None
     best: tuple[float, Start] | None = None
     for n_columns in sorted({screen.columns for screen in options.screens}):
-        seen = [sample_columns(frame, corners, camera, n_columns) for frame in frames]
+        profiles_of = [sample_columns(frame, corners, camera, n_columns) for frame in frames]
         for screen in (s for s in options.screens if s.columns == n_columns):
-            lead, slot, period = _phase(frames, seen, screen, camera)
+            lead, slot, period = _phase(frames, profiles_of, screen, camera)
             if lead > _MIN_LEAD and (best is None or lead > best[0]):
                 time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
                 time.begin(frames[0].index, frames[0].time_s, slot, period)
@@ -75,7 +75,7 @@ def agree(frames: Sequence[Frame], options: ReceiverOptions) -> Start | None:
     return best[1] if best else None
 
 
-def lock_at(start: Start, frame: Frame, profiles: RowProfiles, camera: Camera) -> Lock | None:
+def lock_at(start: Start, frame: Frame, profiles: RowProfiles, camera: Camera) -> Acquisition | None:
     """The lock that the clip's clock foretells for a frame; None where nothing of the screen is in the picture."""
     screen = start.screen
     rows = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
@@ -91,20 +91,20 @@ def lock_at(start: Start, frame: Frame, profiles: RowProfiles, camera: Camera) -
         first_slot=0,
         burst=np.zeros(0, np.int64),
         delay_slots=np.zeros(screen.columns),
-        lock=1.0,
+        header_peak_ratio=1.0,
     )
     n_slots = int(np.ceil((rows[-1] - rows[0] + 1) / rows_per_slot)) + 1
     top = float(profiles.rows[rows[0]]) - 0.5
-    now = start.time.clock_at(frame.index, frame.time_s, template, n_slots, top)
-    return None if now is None else Lock(screen, Reading(profiles), now)
+    clock = start.time.clock_at(frame.index, frame.time_s, template, n_slots, top)
+    return None if clock is None else Acquisition(screen, ColumnSampler(profiles), clock)
 
 
 def _phase(
-    frames: Sequence[Frame], seen: Sequence[RowProfiles], screen: ScreenProfile, camera: Camera
+    frames: Sequence[Frame], profiles_of: Sequence[RowProfiles], screen: ScreenProfile, camera: Camera
 ) -> tuple[float, float, float]:
     """Lead of the best place of the headers; slot of row 0 of the first frame; slots from frame to frame."""
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
-    responses = [_response(profiles, rows_per_slot) for profiles in seen]
+    responses = [_response(profiles, rows_per_slot) for profiles in profiles_of]
     times = np.array([frame.time_s for frame in frames])
     numbers = np.array([frame.index for frame in frames])
     slope = float(np.polyfit(numbers - numbers[0], times - times[0], 1)[0])

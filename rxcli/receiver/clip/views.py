@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from rxcli.receiver.channel.known_picture import ColumnLight
-from rxcli.receiver.locate import Camera, Lock
-from rxcli.receiver.sampling import tracked as strips
+from rxcli.receiver.locate import Acquisition, Camera
+from rxcli.receiver.sampling import tracked
 from rxcli.receiver.sync.tracking import FrameBursts
 from rxcli.types import Float32Array, FrameResult, IntArray
 
@@ -16,9 +16,9 @@ class View:
     """A frame with a lock."""
 
     camera: Camera
-    lock: Lock
+    acquisition: Acquisition
     bursts: FrameBursts
-    memory: int
+    isi_memory: int
     height: int
     #: (C, N) squared contrast over variance of every slot.
     snr: Float32Array
@@ -27,7 +27,7 @@ class View:
     #: (C, S, R) light of the strips as tracking samples them; None where that cannot be done.
     light: Float32Array | None = None
     #: Where the strips were then.
-    map: strips.StripMap | None = None
+    map: tracked.StripMap | None = None
     #: The columns' own light; None where the frame was received like a photograph.
     flat: ColumnLight | None = None
 

@@ -62,7 +62,7 @@ def column_results(
     posteriors: BurstPosteriors,
     snr: Float32Array,
     samples: SlotSamples,
-    support: Float32Array,
+    slot_margin: Float32Array,
     headerless: BoolArray,
     min_confidence: float,
     denoised: frozenset[int] = frozenset(),
@@ -74,16 +74,16 @@ def column_results(
         posteriors: of B bursts and C columns.
         snr: (C, N) squared contrast over variance of every slot of the grid.
         samples: the samples, for what was visible.
-        support: (C, N) what the light says for every slot as decided, see `detect.slot_support`.
+        support: (C, N) what the light says for every slot as decided, see `detect.slot_margin`.
         headerless: (C,) columns that show no packets, whatever was decided of their slots, see `without_header`.
         min_confidence: packets below it are left out.
         denoised: columns in which corrections of the auto-encoder were kept.
     """
-    seen = slots_seen(samples, clock)
-    whole = complete(seen)
-    told = np.isin(np.arange(len(snr)), list(denoised))
-    by_burst = slot_support_by_burst(support, clock)
-    doubts = _doubts(posteriors, evidence(posteriors, by_burst, told, samples.light.shape[1]))
+    n_observed = slots_observed(samples, clock)
+    whole = complete(n_observed)
+    was_denoised = np.isin(np.arange(len(snr)), list(denoised))
+    by_burst = slot_margin_by_burst(slot_margin, clock)
+    doubts = _doubts(posteriors, confidence_features(posteriors, by_burst, was_denoised, samples.light.shape[1]))
     snr_db = _snr_db_of_columns(snr)
     echoes: BoolArray = np.any(_echoes(posteriors, snr_db) & whole, axis=0)
     reported = whole & doubts.reported(min_confidence)
@@ -94,11 +94,11 @@ def column_results(
             clock,
             posteriors,
             db,
-            seen[:, column],
+            n_observed[:, column],
             reported[:, column],
             doubts,
             against[column],
-            bool(told[column]),
+            bool(was_denoised[column]),
         )
         for column, db in enumerate(snr_db)
     )
@@ -114,10 +114,10 @@ class BurstInClip:
     #: Of this burst alone.
     posteriors: BurstPosteriors
     #: (C, packet) how often each slot was seen, over all frames.
-    seen: IntArray
+    n_observed: IntArray
     frames: tuple[int, ...]
-    #: (C, 8) see `evidence`.
-    evidence: FloatArray
+    #: (C, 8) see `confidence_features`.
+    confidence_features: FloatArray
     #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
     #: received like photographs.
     against: Float32Array | None = None
@@ -138,15 +138,15 @@ def clip_results(
     snr_db = _snr_db_of_columns(snr)
     doubts = [_clip_doubts(burst) for burst in bursts]
     reported = [
-        complete(burst.seen[None])[0] & ~_echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]
+        complete(burst.n_observed[None])[0] & ~_echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]
         for burst, doubt in zip(bursts, doubts, strict=True)
     ]
     own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
     out = []
     for column in range(snr.shape[0]):
         packets = tuple(
-            _packet(0, column, now, burst.posteriors, burst.seen[column], doubt, burst.number, burst.frames)
-            for burst, now, doubt, shown in zip(bursts, own, doubts, reported, strict=True)
+            _packet(0, column, clock, burst.posteriors, burst.n_observed[column], doubt, burst.number, burst.frames)
+            for burst, clock, doubt, shown in zip(bursts, own, doubts, reported, strict=True)
             if shown[column]
         )
         out.append(_clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], packets))
@@ -166,7 +166,7 @@ def _clip_column(
         status = "ok"
     message = None
     if not packets:
-        message = _why_none_here(status, snr_db, [burst.seen[column] for burst in bursts])
+        message = _why_none_here(status, snr_db, [burst.n_observed[column] for burst in bursts])
     return ColumnResult(
         column=column,
         status=status,
@@ -193,10 +193,10 @@ def _weight_of_best(column: int, packets: Sequence[PacketResult], bursts: Sequen
     return next(int(burst.posteriors.w[column]) for burst in bursts if burst.number == number)
 
 
-def _why_none_here(status: ColumnStatus, snr_db: float | None, seen: list[IntArray]) -> str:
-    if status == "ok" or not seen:
+def _why_none_here(status: ColumnStatus, snr_db: float | None, n_observed: list[IntArray]) -> str:
+    if status == "ok" or not n_observed:
         return "its burst goes on in the next frame and is reported there"
-    return _cut_off(np.stack(seen)) or _why_none(status, snr_db)
+    return _cut_off(np.stack(n_observed)) or _why_none(status, snr_db)
 
 
 def _snr_db(snr: Float32Array) -> float | None:
@@ -229,7 +229,7 @@ def frame_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
     return "ok" if all(column.packets for column in lit) else "partial"
 
 
-def slots_seen(samples: SlotSamples, clock: Clock) -> IntArray:
+def slots_observed(samples: SlotSamples, clock: Clock) -> IntArray:
     """How often the middle of each slot of each burst's packet is on the screen and in the picture, (B, C, packet)."""
     q = samples.samples_per_slot
     shown = samples.valid[..., q // 2 :: q].max(axis=1) > 0
@@ -239,13 +239,13 @@ def slots_seen(samples: SlotSamples, clock: Clock) -> IntArray:
     return np.stack([by_copy[:, clock.burst == burst].sum(axis=1) for burst in range(int(clock.burst.max()) + 1)])
 
 
-def complete(seen: IntArray) -> BoolArray:
+def complete(n_observed: IntArray) -> BoolArray:
     """(B, C) whether every payload slot was seen, so that the packet can be reported.
 
     Args:
-        seen: (B, C, packet) from `slots_seen`.
+        seen: (B, C, packet) from `slots_observed`.
     """
-    return np.asarray((seen[:, :, PREAMBLE_SLOTS:] > 0).all(axis=2))
+    return np.asarray((n_observed[:, :, PREAMBLE_SLOTS:] > 0).all(axis=2))
 
 
 def _column_result(
@@ -253,14 +253,14 @@ def _column_result(
     clock: Clock,
     posteriors: BurstPosteriors,
     snr_db: float | None,
-    seen: IntArray,
+    n_observed: IntArray,
     reported: BoolArray,
     doubts: _Doubts,
     against: str | None,
     denoised: bool,
 ) -> ColumnResult:
     bursts = () if against else np.flatnonzero(reported)
-    packets = tuple(_packet(int(burst), column, clock, posteriors, seen[burst], doubts) for burst in bursts)
+    packets = tuple(_packet(int(burst), column, clock, posteriors, n_observed[burst], doubts) for burst in bursts)
     sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
     return ColumnResult(
@@ -271,7 +271,7 @@ def _column_result(
         denoised=denoised,
         delay_slots=float(clock.delay_slots[column]),
         packets=packets,
-        message=None if packets else _cut_off(seen) or against or _why_none(status, snr_db),
+        message=None if packets else _cut_off(n_observed) or against or _why_none(status, snr_db),
     )
 
 
@@ -305,14 +305,14 @@ def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> C
     return "dark" if snr_db is None or snr_db < _DARK_SNR_DB else "no_packet"
 
 
-def _cut_off(seen: IntArray) -> str | None:
-    """How much is missing of the packet that is nearest to whole; None where one is. `seen` is (B, packet)."""
-    missing = int((seen[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
+def _cut_off(n_observed: IntArray) -> str | None:
+    """How much is missing of the packet that is nearest to whole; None where one is. `n_observed` is (B, packet)."""
+    missing = int((n_observed[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
     if not missing:
         return None
     return (
-        f"no packet is in view as a whole: of {seen.shape[1]} slots {missing} are missing; move closer so that the "
-        "screen fills more of the height, or take another picture"
+        f"no packet is in view as a whole: of {n_observed.shape[1]} slots {missing} are missing; move closer so that "
+        "the screen fills more of the height, or take another picture"
     )
 
 
@@ -329,17 +329,17 @@ class _Doubts:
     #: (B, C) probability that they are error-free, and expected share of wrong bits.
     confidence: FloatArray
     ber_hat: FloatArray
-    #: (B, C, 8) see `evidence`.
-    evidence: FloatArray
+    #: (B, C, 8) see `confidence_features`.
+    confidence_features: FloatArray
 
     def reported(self, min_confidence: float) -> BoolArray:
         """(B, C) packets that are sure enough to be reported."""
         return np.asarray((self.ber_hat <= MAX_BER_HAT) & (self.confidence >= min_confidence))
 
 
-def _doubts(posteriors: BurstPosteriors, evidence: FloatArray) -> _Doubts:
+def _doubts(posteriors: BurstPosteriors, confidence_features: FloatArray) -> _Doubts:
     unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of few bits are filled up with NaN
-    return _Doubts(confidence(evidence), np.nanmean(unsure, axis=(2, 3)), evidence)
+    return _Doubts(confidence(confidence_features), np.nanmean(unsure, axis=(2, 3)), confidence_features)
 
 
 def _clip_doubts(burst: BurstInClip) -> _Doubts:
@@ -348,7 +348,7 @@ def _clip_doubts(burst: BurstInClip) -> _Doubts:
     Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
     What slots say against the codeword that was decided shows it.
     """
-    doubts = _doubts(burst.posteriors, burst.evidence[None])
+    doubts = _doubts(burst.posteriors, burst.confidence_features[None])
     if burst.against is None:
         return doubts
     offset, slope, slope_against = _CLIP_CALIBRATION
@@ -365,27 +365,29 @@ def _packet(
     column: int,
     clock: Clock,
     posteriors: BurstPosteriors,
-    seen: IntArray,
+    n_observed: IntArray,
     doubts: _Doubts,
     number: int | None = None,
     frames: tuple[int, ...] | None = None,
 ) -> PacketResult:
-    """The packet of one burst; `seen` is (packet,)."""
+    """The packet of one burst; `n_observed` is (packet,)."""
     bits = indices_to_bits(posteriors.index[burst, column], int(posteriors.w[column]))
     return PacketResult(
         first_row=_header_row(int(np.flatnonzero(clock.burst == burst)[0]), column, clock),
-        copies=float(seen.sum() / clock.packet_slots),
+        copies=float(n_observed.sum() / clock.packet_slots),
         payload_bits=int(bits.size),
         payload=bits_to_hex(bits),
         confidence=float(doubts.confidence[burst, column]),
         ber_hat=float(doubts.ber_hat[burst, column]),
         burst=number,
         frames=frames,
-        evidence=tuple(doubts.evidence[burst, column].tolist()),
+        confidence_features=tuple(doubts.confidence_features[burst, column].tolist()),
     )
 
 
-def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolArray, n_strips: int) -> FloatArray:
+def confidence_features(
+    posteriors: BurstPosteriors, slot_margin: Float32Array, denoised: BoolArray, n_strips: int
+) -> FloatArray:
     """What the confidence of packets is made of, (B, C, 8), in the order of `_CALIBRATION`.
 
     The light model's likelihoods are tempered, since strips and samples err together; still they are too sure where
@@ -396,31 +398,31 @@ def evidence(posteriors: BurstPosteriors, support: Float32Array, denoised: BoolA
     Args:
         posteriors: of B bursts and C columns.
         support: (B, C, n) what the light says for payload slots of the packets as decided, nats; 0 where nothing is
-            seen; see `slot_support_by_burst`.
+            seen; see `slot_margin_by_burst`.
         denoised: (C,) whether corrections of the auto-encoder were kept.
         n_strips: strips of a column in a quick look.
     """
     log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), _MOST_ODDS)
-    against = np.log(_AGAINST_AT_LEAST - np.minimum(support, 0).sum(axis=2))
-    heard = np.maximum((support != 0).sum(axis=2), 1)
-    average = np.log(np.clip(support.sum(axis=2) / heard, 1, _MOST_AVERAGE))
+    against = np.log(_AGAINST_AT_LEAST - np.minimum(slot_margin, 0).sum(axis=2))
+    n_heard_slots = np.maximum((slot_margin != 0).sum(axis=2), 1)
+    average = np.log(np.clip(slot_margin.sum(axis=2) / n_heard_slots, 1, _MOST_AVERAGE))
     strips = np.log(n_strips)
     terms = (1.0, log_odds, denoised, against, average, average * log_odds, strips, strips * log_odds)
     return np.stack([np.broadcast_to(term, log_odds.shape) for term in terms], axis=2).astype(np.float64)
 
 
-def confidence(evidence: FloatArray) -> FloatArray:
+def confidence(confidence_features: FloatArray) -> FloatArray:
     """Probability (...) that packets are error-free, from their evidence (..., 8)."""
-    return _probability(evidence @ np.array(_CALIBRATION))
+    return _probability(confidence_features @ np.array(_CALIBRATION))
 
 
-def slot_support_by_burst(support: Float32Array, clock: Clock) -> Float32Array:
+def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Array:
     """(B, C, N) the support (C, N) of the payload slots of each burst, 0 for the other slots of the grid."""
     slot = np.arange(clock.first_slot, clock.first_slot + clock.n_slots)
     payload = slot % clock.packet_slots >= PREAMBLE_SLOTS
     bursts = np.arange(int(clock.burst.max()) + 1)
     payload_of = payload & (clock.burst[slot // clock.packet_slots] == bursts[:, None])
-    return np.asarray(payload_of[:, None] * support)
+    return np.asarray(payload_of[:, None] * slot_margin)
 
 
 def _log_odds(log_prob: FloatArray) -> FloatArray:

@@ -1,10 +1,10 @@
 """Maximum-likelihood detection of MPPM symbols under inter-symbol interference, soft.
 
-The channel hands over one log-likelihood for every slot and every pattern of the slot and its `memory` predecessors.
-Copies of a packet are added. A trellis over symbols, whose state is the last `memory` slots of the previous symbol and
-whose branches are the codewords, then gives the posterior of every symbol (forward-backward; Bahl et al., IEEE Trans.
-Inf. Theory 20(2), 1974). Header and dimming symbol are known once `w` is, so both ends of the trellis are fixed, and
-the sum over all paths is the evidence for `w`.
+The channel hands over one log-likelihood for every slot and every pattern of the slot and its `isi_memory`
+predecessors. Copies of a packet are added. A trellis over symbols, whose state is the last `isi_memory` slots of the
+previous symbol and whose branches are the codewords, then gives the posterior of every symbol (forward-backward;
+Bahl et al., IEEE Trans. Inf. Theory 20(2), 1974). Header and dimming symbol are
+known once `w` is, so both ends of the trellis are fixed, and the sum over all paths is the evidence for `w`.
 """
 
 from __future__ import annotations
@@ -43,23 +43,23 @@ class _Branches:
     into: NDArray[np.float32]
 
 
-def _pattern_index(slots: NDArray[np.integer], memory: int) -> NDArray[np.int64]:
-    """Index of the pattern at every slot that has `memory` predecessors; (..., n) to (..., n - memory)."""
-    windows = np.lib.stride_tricks.sliding_window_view(slots.astype(np.int64), memory + 1, axis=-1)
-    return windows @ (1 << np.arange(memory, -1, -1))
+def _pattern_index(slots: NDArray[np.integer], isi_memory: int) -> NDArray[np.int64]:
+    """Index of the pattern at every slot that has `isi_memory` predecessors; (..., n) to (..., n - memory)."""
+    windows = np.lib.stride_tricks.sliding_window_view(slots.astype(np.int64), isi_memory + 1, axis=-1)
+    return windows @ (1 << np.arange(isi_memory, -1, -1))
 
 
 @lru_cache(maxsize=64)
-def _branches(w: int, memory: int) -> _Branches:
+def _branches(w: int, isi_memory: int) -> _Branches:
     words = codebook(w)
-    n_states, n_words = 1 << memory, len(words)
-    states = (np.arange(n_states)[:, None] >> np.arange(memory - 1, -1, -1)) & 1
+    n_states, n_words = 1 << isi_memory, len(words)
+    states = (np.arange(n_states)[:, None] >> np.arange(isi_memory - 1, -1, -1)) & 1
     slots = np.concatenate(
         [np.repeat(states[:, None], n_words, axis=1), np.repeat(words[None], n_states, axis=0)], axis=2
     )
-    index = _pattern_index(slots, memory)
-    features = (index[..., None] == np.arange(1 << (memory + 1))).reshape(n_states * n_words, -1)
-    end = words[:, SLOTS_PER_SYMBOL - memory :] @ (1 << np.arange(memory - 1, -1, -1))
+    index = _pattern_index(slots, isi_memory)
+    features = (index[..., None] == np.arange(1 << (isi_memory + 1))).reshape(n_states * n_words, -1)
+    end = words[:, SLOTS_PER_SYMBOL - isi_memory :] @ (1 << np.arange(isi_memory - 1, -1, -1))
     into = (end[:, None] == np.arange(n_states)).astype(np.float32)
     return _Branches(words, np.ascontiguousarray(features.T, np.float32), into)
 
@@ -81,19 +81,19 @@ def _over_few(combine: np.ufunc, values: FloatArray) -> FloatArray:
 class _Packets:
     """Posterior of n packets of one weight."""
 
-    evidence: FloatArray  # (n,)
+    confidence_features: FloatArray  # (n,)
     word: FloatArray  # (n, N, words) probability
 
 
-def _forward_backward(metrics: FloatArray, w: int, memory: int) -> _Packets:
+def _forward_backward(metrics: FloatArray, w: int, isi_memory: int) -> _Packets:
     """Posterior of n packets of weight `w` from their metrics (n, packet + memory, patterns)."""
-    branches = _branches(w, memory)
+    branches = _branches(w, isi_memory)
     n, length, _ = metrics.shape
-    n_symbols = (length - memory - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL
-    n_states, n_words = 1 << memory, len(branches.words)
+    n_symbols = (length - isi_memory - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL
+    n_states, n_words = 1 << isi_memory, len(branches.words)
     preamble = np.concatenate([np.array(HEADER, np.int64), dimming_symbol(w)])
-    known = metrics[:, np.arange(memory, PREAMBLE_SLOTS), _pattern_index(preamble, memory)].sum(axis=1)
-    payload = metrics[:, PREAMBLE_SLOTS : length - memory].reshape(n * n_symbols, -1)
+    known = metrics[:, np.arange(isi_memory, PREAMBLE_SLOTS), _pattern_index(preamble, isi_memory)].sum(axis=1)
+    payload = metrics[:, PREAMBLE_SLOTS : length - isi_memory].reshape(n * n_symbols, -1)
     # Only differences matter; what is left fits float32 with room to spare.
     offset = payload.max(axis=1)
     payload = (payload - offset[:, None]).astype(np.float32)
@@ -103,16 +103,16 @@ def _forward_backward(metrics: FloatArray, w: int, memory: int) -> _Packets:
     likelihood = np.exp(branch, out=branch)
     step = np.log(np.maximum(likelihood @ branches.into, _TINY)) + top
     start = np.full((n, n_states), _NEVER)
-    start[:, _pattern_index(preamble[PREAMBLE_SLOTS - memory :], memory - 1)[0]] = 0.0
-    before, after = _recursions(step, start, _tail(metrics[:, length - memory :], memory))
+    start[:, _pattern_index(preamble[PREAMBLE_SLOTS - isi_memory :], isi_memory - 1)[0]] = 0.0
+    before, after = _recursions(step, start, _tail(metrics[:, length - isi_memory :], isi_memory))
     joint = _scaled(before + top[..., 0])[:, :, None, :] @ likelihood
     joint = joint[:, :, 0] * (_scaled(after) @ branches.into.T)
     total = joint.sum(axis=2, keepdims=True)
     last = _log_sum(before[:, -1, :, None] + step[:, -1], axis=1) + after[:, -1]
     offset = SLOTS_PER_SYMBOL * offset.reshape(n, n_symbols).sum(axis=1)
-    evidence = known + offset + _log_sum(last, axis=1) - n_symbols * np.log(n_words)
+    confidence_features = known + offset + _log_sum(last, axis=1) - n_symbols * np.log(n_words)
     uniform = np.full_like(joint, 1 / n_words)
-    return _Packets(evidence, np.divide(joint, total, out=uniform, where=total > 0))
+    return _Packets(confidence_features, np.divide(joint, total, out=uniform, where=total > 0))
 
 
 def _recursions(step: FloatArray, start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -133,18 +133,18 @@ def _scaled(log_values: FloatArray) -> NDArray[np.float32]:
     return np.asarray(np.exp(log_values - log_values.max(axis=-1, keepdims=True)), np.float32)
 
 
-def _tail(metrics: FloatArray, memory: int) -> FloatArray:
+def _tail(metrics: FloatArray, isi_memory: int) -> FloatArray:
     """(n, states) log-likelihood of the next header's first slots after each state; they tell of the last symbol."""
-    states = (np.arange(1 << memory)[:, None] >> np.arange(memory - 1, -1, -1)) & 1
-    header = np.broadcast_to(np.array(HEADER[:memory], np.int64), (len(states), memory))
-    index = _pattern_index(np.concatenate([states, header], axis=1), memory)
-    return np.asarray(metrics[:, np.arange(memory), index].sum(axis=2))
+    states = (np.arange(1 << isi_memory)[:, None] >> np.arange(isi_memory - 1, -1, -1)) & 1
+    header = np.broadcast_to(np.array(HEADER[:isi_memory], np.int64), (len(states), isi_memory))
+    index = _pattern_index(np.concatenate([states, header], axis=1), isi_memory)
+    return np.asarray(metrics[:, np.arange(isi_memory), index].sum(axis=2))
 
 
 def slot_llr(metrics: FloatArray) -> Float32Array:
     """Log-likelihood ratio of every slot being lit, each slot on its own, its neighbours lit or not alike.
 
-    A slot shows in its own metric and in the `memory` metrics after it; what each says of it is added.
+    A slot shows in its own metric and in the `isi_memory` metrics after it; what each says of it is added.
 
     Args:
         metrics: (..., N + memory, patterns).
@@ -152,11 +152,11 @@ def slot_llr(metrics: FloatArray) -> Float32Array:
     Returns:
         (..., N) float32.
     """
-    memory = _memory_of(metrics)
-    n_slots = metrics.shape[-2] - memory
+    isi_memory = _isi_memory_of(metrics)
+    n_slots = metrics.shape[-2] - isi_memory
     total = np.zeros((*metrics.shape[:-2], n_slots))
     likelihood = np.exp(metrics - _over_few(np.maximum, metrics)[..., None])
-    for age in range(memory + 1):
+    for age in range(isi_memory + 1):
         # Bit `age` of the pattern's number is the slot `age` slots ago.
         split = likelihood[..., age : age + n_slots, :].reshape(*total.shape, -1, 2, 1 << age)
         dark, lit = (_over_few(np.add, split[..., state, :].reshape(*total.shape, -1)) for state in (0, 1))
@@ -164,7 +164,7 @@ def slot_llr(metrics: FloatArray) -> Float32Array:
     return total.astype(np.float32)
 
 
-def slot_support(metrics: FloatArray, decided: NDArray[np.bool_]) -> Float32Array:
+def slot_margin(metrics: FloatArray, decided: NDArray[np.bool_]) -> Float32Array:
     """What the light says for every slot as decided against the other way, all other slots as decided, nats.
 
     It is what a single slot has to say; a packet may be sure as a whole and yet have slots that say much against it.
@@ -176,14 +176,16 @@ def slot_support(metrics: FloatArray, decided: NDArray[np.bool_]) -> Float32Arra
     Returns:
         (..., N) float32, 0 where nothing is seen.
     """
-    memory, n_slots = _memory_of(metrics), decided.shape[-1]
+    isi_memory, n_slots = _isi_memory_of(metrics), decided.shape[-1]
     around = [(0, 0)] * (decided.ndim - 1)
-    pattern = _pattern_index(np.pad(decided, [*around, (memory, memory)]).astype(np.uint8), memory)
-    support = np.zeros(decided.shape)
-    for age in range(memory + 1):
-        seen, shown = metrics[..., age : age + n_slots, :], pattern[..., age : age + n_slots, None]
-        support += (np.take_along_axis(seen, shown, -1) - np.take_along_axis(seen, shown ^ (1 << age), -1))[..., 0]
-    return support.astype(np.float32)
+    pattern = _pattern_index(np.pad(decided, [*around, (isi_memory, isi_memory)]).astype(np.uint8), isi_memory)
+    slot_margin = np.zeros(decided.shape)
+    for age in range(isi_memory + 1):
+        n_observed, shown = metrics[..., age : age + n_slots, :], pattern[..., age : age + n_slots, None]
+        slot_margin += (
+            np.take_along_axis(n_observed, shown, -1) - np.take_along_axis(n_observed, shown ^ (1 << age), -1)
+        )[..., 0]
+    return slot_margin.astype(np.float32)
 
 
 def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
@@ -198,13 +200,13 @@ def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
     """
     score = _weight_scores(_symbols_llr(metrics))
     # The metrics that a slot shares with its neighbours were counted for each of them.
-    lead = margin * (_memory_of(metrics) + 1) / 2
+    lead = margin * (_isi_memory_of(metrics) + 1) / 2
     return np.asarray(score >= score.max(axis=1, keepdims=True) - lead)
 
 
 def _symbols_llr(metrics: FloatArray) -> Float32Array:
     """(B, C, symbols, 10) log-likelihood ratios of the slots of packets, header first."""
-    llr = slot_llr(metrics)[:, :, : metrics.shape[2] - _memory_of(metrics)]
+    llr = slot_llr(metrics)[:, :, : metrics.shape[2] - _isi_memory_of(metrics)]
     return llr.reshape(*llr.shape[:2], -1, SLOTS_PER_SYMBOL)
 
 
@@ -221,7 +223,7 @@ def _weight_scores(symbols: Float32Array) -> FloatArray:
     return np.asarray(score + np.cumsum(symbols[:, :, 1], axis=2)[..., : len(WEIGHTS)].sum(axis=0))
 
 
-def first_guess(metrics: FloatArray) -> Float32Array:
+def first_decision_of(metrics: FloatArray) -> Float32Array:
     """Probability of every slot of B bursts being lit, (B, C, packet), every symbol by itself.
 
     What slots share with their neighbours is told by `slot_llr` alone, so that no trellis is needed; as a start for the
@@ -243,7 +245,7 @@ def first_guess(metrics: FloatArray) -> Float32Array:
     return lit.reshape(*lit.shape[:2], -1)
 
 
-def weight_evidence(metrics: FloatArray, candidates: NDArray[np.bool_]) -> FloatArray:
+def weight_log_evidence(metrics: FloatArray, candidates: NDArray[np.bool_]) -> FloatArray:
     """Log evidence of every weight, (C, 9); -inf where it is not among the `candidates`.
 
     Args:
@@ -251,17 +253,19 @@ def weight_evidence(metrics: FloatArray, candidates: NDArray[np.bool_]) -> Float
         candidates: (C, 9) which weights to try for each column.
     """
     n_bursts, n_columns = metrics.shape[:2]
-    memory = _memory_of(metrics)
+    isi_memory = _isi_memory_of(metrics)
     out = np.full((n_columns, len(WEIGHTS)), -np.inf)
     for w in WEIGHTS:
         columns = np.flatnonzero(candidates[:, w - 1])
         if columns.size:
             chosen = metrics[:, columns].reshape(n_bursts * columns.size, *metrics.shape[2:])
-            out[columns, w - 1] = _forward_backward(chosen, w, memory).evidence.reshape(n_bursts, -1).sum(axis=0)
+            out[columns, w - 1] = (
+                _forward_backward(chosen, w, isi_memory).confidence_features.reshape(n_bursts, -1).sum(axis=0)
+            )
     return out
 
 
-def free_evidence(metrics: FloatArray, share: FloatArray) -> FloatArray:
+def free_log_evidence(metrics: FloatArray, share: FloatArray) -> FloatArray:
     """(C,) log evidence of slots that are no packets: each is lit on its own.
 
     Args:
@@ -279,7 +283,7 @@ def free_evidence(metrics: FloatArray, share: FloatArray) -> FloatArray:
     return np.asarray(np.logaddexp.reduce(state, axis=1))
 
 
-def _memory_of(metrics: FloatArray) -> int:
+def _isi_memory_of(metrics: FloatArray) -> int:
     return int(metrics.shape[-1]).bit_length() - 2
 
 
@@ -289,7 +293,7 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
     Args:
         metrics: (B, C, packet + memory, 2**(memory+1)) natural log-likelihoods, copies added: entry i, j is the
             log-likelihood of what was seen at slot i given pattern j of `protocol.slot_patterns`. The first
-            `memory` slots are not used; the last `memory` entries are the first slots of the header that follows.
+            `isi_memory` slots are not used; the last ones, as many, are the first slots of the header that follows.
         candidates: (C, 9) weights to consider, all by default.
 
     Returns:
@@ -309,7 +313,7 @@ def _check(metrics: FloatArray) -> None:
         raise ValueError(
             f"metrics must be (bursts, columns, slots, 2**(memory+1)) with memory 1..{MAX_MEMORY} (got {metrics.shape})"
         )
-    n_payload = metrics.shape[2] - _memory_of(metrics) - PREAMBLE_SLOTS
+    n_payload = metrics.shape[2] - _isi_memory_of(metrics) - PREAMBLE_SLOTS
     if n_payload <= 0 or n_payload % SLOTS_PER_SYMBOL:
         raise ValueError(f"metrics must hold whole packets and memory slots after them (got {metrics.shape})")
 
@@ -343,11 +347,11 @@ def detect_with_words(
     _check(metrics)
     found: list[DoubtfulWords] = []
 
-    def heed(w: int, columns: NDArray[np.int64], word: FloatArray) -> None:
+    def on_posteriors(w: int, columns: NDArray[np.int64], word: FloatArray) -> None:
         by_burst = word.reshape(len(metrics), columns.size, *word.shape[1:])
         found.append(_in_doubt(by_burst, w, columns, certain, most))
 
-    posteriors = _posteriors(metrics, _weights(metrics, candidates), heed)
+    posteriors = _posteriors(metrics, _weights(metrics, candidates), on_posteriors)
     return posteriors, DoubtfulWords(
         np.concatenate([f.places for f in found]),
         np.concatenate([f.words for f in found]),
@@ -369,29 +373,29 @@ def _weights(metrics: FloatArray, candidates: NDArray[np.bool_]) -> FloatArray:
     log_prob = np.where(candidates, 0.0, -np.inf)
     open_columns = np.flatnonzero(candidates.sum(axis=1) > 1)
     if open_columns.size:
-        log_prob[open_columns] = weight_evidence(metrics[:, open_columns], candidates[open_columns])
+        log_prob[open_columns] = weight_log_evidence(metrics[:, open_columns], candidates[open_columns])
     return np.asarray(log_prob - _log_sum(log_prob, 1)[:, None])
 
 
 def _posteriors(
     metrics: FloatArray,
     w_log_prob: FloatArray,
-    heed: Callable[[int, NDArray[np.int64], FloatArray], None] | None = None,
+    on_posteriors: Callable[[int, NDArray[np.int64], FloatArray], None] | None = None,
 ) -> BurstPosteriors:
-    """Posteriors given the weights; `heed` is told weight, columns and probability of each word, (B * C, N, words)."""
+    """Posteriors given the weights; `on_posteriors` gets weight, columns, (B * C, N, words) probabilities."""
     n_bursts, n_columns, length, _ = metrics.shape
-    memory = _memory_of(metrics)
-    n_symbols = (length - memory - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL
+    isi_memory = _isi_memory_of(metrics)
+    n_symbols = (length - isi_memory - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL
     weights = w_log_prob.argmax(axis=1) + 1
-    lit = np.empty((n_bursts, n_columns, length - memory), np.float32)
+    lit = np.empty((n_bursts, n_columns, length - isi_memory), np.float32)
     index = np.empty((n_bursts, n_columns, n_symbols), np.int64)
     log_prob = np.empty((n_bursts, n_columns, n_symbols))
     bit_llr = np.full((n_bursts, n_columns, n_symbols, 7), np.nan)
     for w, columns in _batches(weights, n_bursts):
         chosen = metrics[:, columns].reshape(n_bursts * columns.size, *metrics.shape[2:])
-        posterior = _forward_backward(chosen, w, memory).word
-        if heed is not None:
-            heed(w, columns, posterior)
+        posterior = _forward_backward(chosen, w, isi_memory).word
+        if on_posteriors is not None:
+            on_posteriors(w, columns, posterior)
         words = codebook(w)
         preamble = np.concatenate([np.array(HEADER), dimming_symbol(w)])
         lit[:, columns, :PREAMBLE_SLOTS] = preamble
@@ -414,9 +418,9 @@ def _batches(weights: NDArray[np.int64], n_bursts: int) -> Iterator[tuple[int, N
 
 def _header_llr(metrics: FloatArray) -> FloatArray:
     """(B, C) log-likelihood of the header's slots as they must be, over slots that are anything with equal chance."""
-    memory = _memory_of(metrics)
-    header = metrics[:, :, memory : len(HEADER)]
-    known = header[:, :, np.arange(len(HEADER) - memory), _pattern_index(np.array(HEADER), memory)]
+    isi_memory = _isi_memory_of(metrics)
+    header = metrics[:, :, isi_memory : len(HEADER)]
+    known = header[:, :, np.arange(len(HEADER) - isi_memory), _pattern_index(np.array(HEADER), isi_memory)]
     anything = _log_sum(header, axis=3) - np.log(metrics.shape[-1])
     return np.asarray((known - anything).sum(axis=2))
 

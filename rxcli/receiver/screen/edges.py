@@ -73,7 +73,7 @@ class Steps:
 
 
 def refine(
-    picture: Picture, guess: list[Side], pose: FloatArray, rectangle: Rectangle
+    picture: Picture, initial: list[Side], pose: FloatArray, rectangle: Rectangle
 ) -> tuple[FloatArray, list[float]]:
     """Corners (4, 2) from pixels at full resolution, and the share of each side that supports them.
 
@@ -83,24 +83,24 @@ def refine(
         pose: (8,) the pose that fits them.
         rectangle: picture and screen.
     """
-    corners = corners_of(guess, picture.width, picture.height)
+    corners = corners_of(initial, picture.width, picture.height)
     size = width_of(corners)
-    steps = [steps_of(picture, guess, side, size) for side in range(4)]
-    depths = [INWARD[side] * (s.place - guess[side].at(s.t)) for side, s in enumerate(steps)]
+    steps = [steps_of(picture, initial, side, size) for side in range(4)]
+    depths = [INWARD[side] * (s.place - initial[side].at(s.t)) for side, s in enumerate(steps)]
     expected = rectangle.project(pose)
     supporters = [_supporters(steps[side], depths[side], side, 1.6 * steps[side].sd, _SKEW, 2.0) for side in range(4)]
     # A slot's end can look like an edge: a side that shows on a part of its length follows from the others at first.
     sure = [
-        mask if mask.sum() > _SURE * mask.size or not guess[side].support else np.zeros_like(mask)
+        mask if mask.sum() > _SURE * mask.size or not initial[side].support else np.zeros_like(mask)
         for side, mask in enumerate(supporters)
     ]
-    places = [_places(steps[side], sure[side], guess[side], size) for side in range(4)]
+    places = [_places(steps[side], sure[side], initial[side], size) for side in range(4)]
     pose = fit_pose(places, expected, _CORNER_SD * size, pose, rectangle, 4)
     depths = _depths(steps, pose, rectangle)
     for side, tolerance in enumerate(1.2 * s.sd for s in steps):
         nearer = _supporters(steps[side], depths[side], side, tolerance, _SMALL_SKEW, 1.2)
         supporters[side] = nearer if nearer.any() else sure[side]
-    places = [_places(steps[side], supporters[side], guess[side], size) for side in range(4)]
+    places = [_places(steps[side], supporters[side], initial[side], size) for side in range(4)]
     pose = fit_pose(places, expected, _CORNER_SD * size, pose, rectangle, 3)
     depths = _depths(steps, pose, rectangle)
     own = [_deviation(steps[side], supporters[side], depths[side], side, _POSE_SD * size) for side in range(4)]
@@ -135,14 +135,14 @@ def _supporters(steps: Steps, depth: FloatArray, side: int, tolerance: float, sk
     return on_it if enough and np.ptp(steps.t[on_it]) >= _SPAN * np.ptp(steps.t) else none
 
 
-def _places(steps: Steps, supporters: BoolArray, guess: Side, size: float) -> Places | None:
+def _places(steps: Steps, supporters: BoolArray, initial: Side, size: float) -> Places | None:
     """What a side contributes to the pose; its guess where it does not show at full resolution."""
     if supporters.any():
         return Places(steps.t[supporters], steps.place[supporters], steps.sd)
-    if not guess.support:
+    if not initial.support:
         return None
-    t = guess.middle + guess.half * np.linspace(-0.8, 0.8, 5)
-    return Places(t, guess.at(t), _GUESS_SD * size)
+    t = initial.middle + initial.half * np.linspace(-0.8, 0.8, 5)
+    return Places(t, initial.at(t), _GUESS_SD * size)
 
 
 def _deviation(
@@ -177,7 +177,7 @@ def _meet(pose: FloatArray, own: list[tuple[FloatArray, float, float]], rectangl
     return np.asarray(corners, np.float64)
 
 
-def steps_of(picture: Picture, guess: list[Side], side: int, size: float) -> Steps:
+def steps_of(picture: Picture, initial: list[Side], side: int, size: float) -> Steps:
     """The steps of light across one side.
 
     Args:
@@ -189,7 +189,7 @@ def steps_of(picture: Picture, guess: list[Side], side: int, size: float) -> Ste
     half = max(_LEAST_HALF_STEP, int(_HALF_STEP * size), picture.period)
     out, inward = max(int(_OUT * size), 3 * half), max(int(_IN * size), 6 * half)
     read = _across if across(side) else _upright
-    t, centre, light, threshold, inside = read(picture, guess, side, size, out, inward, half)
+    t, centre, light, threshold, inside = read(picture, initial, side, size, out, inward, half)
     sd = max(_LEAST_TOLERANCE, _TOLERANCE * size, _PERIODS * picture.period)
     if not t.size:
         return Steps(t, t, t > 0, t, sd)
@@ -215,23 +215,23 @@ def _blurred(light: Float32Array, period: int) -> Float32Array:
 _Read = tuple[FloatArray, FloatArray, Float32Array, FloatArray, BoolArray]
 
 
-def _ends(guess: list[Side], side: int, size: float, limit: int) -> tuple[float, float]:
+def _ends(initial: list[Side], side: int, size: float, limit: int) -> tuple[float, float]:
     """From where to where a side goes, a little inside its neighbours and inside the picture."""
-    before, after = (guess[LEFT], guess[RIGHT]) if across(side) else (guess[TOP], guess[BOTTOM])
-    middle = guess[side].at(limit / 2)
+    before, after = (initial[LEFT], initial[RIGHT]) if across(side) else (initial[TOP], initial[BOTTOM])
+    middle = initial[side].at(limit / 2)
     return max(before.at(middle) + 0.004 * size, 0.0), min(after.at(middle) - 0.004 * size, limit - 1.0)
 
 
-def _across(picture: Picture, guess: list[Side], side: int, size: float, out: int, inward: int, half: int) -> _Read:
+def _across(picture: Picture, initial: list[Side], side: int, size: float, out: int, inward: int, half: int) -> _Read:
     """Top and bottom: light of strips of some pixels, from outside to inside."""
     strip = picture.period * max(1, round(_STRIP_PX / picture.period))
-    first, last = _ends(guess, side, size, picture.width)
+    first, last = _ends(initial, side, size, picture.width)
     n = min(_STRIPS, int((last - first) / strip))
     if n < _SUPPORTERS:
         return _nothing(out + inward)
     left = np.round(np.linspace(first, last - strip, n)).astype(np.int64)
     t: FloatArray = left.astype(np.float64) + (strip - 1) / 2
-    centre = np.round(guess[side].at(t)).astype(np.int64)
+    centre = np.round(initial[side].at(t)).astype(np.int64)
     top = centre - (out if INWARD[side] > 0 else inward - 1)
     block = _cut(picture.pixels, top, left, (out + inward, strip), 1)
     mean = np.full(strip, 1 / strip, np.float32)
@@ -242,9 +242,9 @@ def _across(picture: Picture, guess: list[Side], side: int, size: float, out: in
     return t, centre.astype(np.float64), light, threshold, inside
 
 
-def _upright(picture: Picture, guess: list[Side], side: int, size: float, out: int, inward: int, half: int) -> _Read:
+def _upright(picture: Picture, initial: list[Side], side: int, size: float, out: int, inward: int, half: int) -> _Read:
     """Left and right: the share of the inside's changes that pixels show, from outside to inside, in bands of rows."""
-    first, last = _ends(guess, side, size, picture.height)
+    first, last = _ends(initial, side, size, picture.height)
     step = picture.period * max(1, round((last - first) / _ROWS / picture.period))
     lag = max(1, round(LAG * row_step(picture) / step))
     n = int((last - first) / step - lag) // _BAND_ROWS
@@ -252,7 +252,7 @@ def _upright(picture: Picture, guess: list[Side], side: int, size: float, out: i
         return _nothing(out + inward)
     top = int(first) + step * _BAND_ROWS * np.arange(n)
     t: FloatArray = top.astype(np.float64) + step * (_BAND_ROWS + lag - 1) / 2
-    centre = np.round(guess[side].at(t)).astype(np.int64)
+    centre = np.round(initial[side].at(t)).astype(np.int64)
     left = centre - (out if INWARD[side] > 0 else inward - 1)
     light = picture.linear(_cut(picture.pixels, top, left, (_BAND_ROWS + lag, out + inward), step))
     change = light[:, lag:] - light[:, :-lag]

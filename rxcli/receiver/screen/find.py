@@ -13,7 +13,7 @@ edges. Four steps, each on less of the picture:
 4. Along the four lines pixels are read at full resolution (`edges`), and a flat screen of known aspect before one lens
    is fitted to all sides together (`pose`).
 
-Where the camera is unknown, `bow` asks afterwards what lens bows the sides between the corners.
+Where the camera is unknown, `side_curvature` asks afterwards what lens bows the sides between the corners.
 
 A side that shows nothing (black, or outside the picture) is put where a flat screen of known aspect must have it.
 """
@@ -24,16 +24,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.receiver.screen.bow import measure_bow
 from rxcli.receiver.screen.edges import refine
 from rxcli.receiver.screen.onsets import Reach, fit_side
 from rxcli.receiver.screen.picture import Picture, Pixels, Plane, reduce
 from rxcli.receiver.screen.pose import Places, Rectangle, fit_pose, misfit, pose_of
+from rxcli.receiver.screen.side_curvature import measure_side_curvature
 from rxcli.receiver.screen.sides import INWARD, SIDE_NAMES, Side, corners_of, extent, from_top_left, straight
 from rxcli.receiver.screen.stripes import Stripes, coarse_sides, find_stripes
 from rxcli.types import FloatArray
 
-__all__ = ["ScreenSearch", "find_screen", "measure_bow", "track_screen"]
+__all__ = ["ScreenSearch", "find_screen", "measure_side_curvature", "track_screen"]
 
 #: Least share of a side's segments that must agree on a line.
 _MIN_SUPPORT = 0.06
@@ -84,12 +84,12 @@ def find_screen(
     picture = Picture(pixels, black, white, mosaic_period)
     plane = reduce(picture)
     stripes = find_stripes(plane)
-    guess = coarse_sides(plane, stripes)
-    if guess is None:
+    initial = coarse_sides(plane, stripes)
+    if initial is None:
         return ScreenSearch(None, 0.0, "no area with the stripes of a modulated backlight was found in the picture")
-    size = extent(guess, plane.height)
+    size = extent(initial, plane.height)
     out = max(0.025 * size, 1.5 * plane.cell_rows * plane.fy)
-    return _search(picture, plane, stripes, guess, Reach(out, max(0.09 * size, 3 * out), size), aspect)
+    return _search(picture, plane, stripes, initial, Reach(out, max(0.09 * size, 3 * out), size), aspect)
 
 
 def track_screen(
@@ -119,9 +119,9 @@ def track_screen(
     picture = Picture(pixels, black, white, mosaic_period)
     plane = reduce(picture)
     stripes = find_stripes(plane)
-    guess = [straight(previous, side) for side in range(4)]
+    initial = [straight(previous, side) for side in range(4)]
     size = float(np.linalg.norm(previous[1] - previous[0]))
-    return _search(picture, plane, stripes, guess, Reach(reach * size, 3 * reach * size, size), aspect)
+    return _search(picture, plane, stripes, initial, Reach(reach * size, 3 * reach * size, size), aspect)
 
 
 def _unusable(pixels: Pixels, black: float, white: float) -> str:
@@ -138,15 +138,15 @@ def _unusable(pixels: Pixels, black: float, white: float) -> str:
 
 
 def _search(
-    picture: Picture, plane: Plane, stripes: Stripes, guess: list[Side], reach: Reach, aspect: float
+    picture: Picture, plane: Plane, stripes: Stripes, initial: list[Side], reach: Reach, aspect: float
 ) -> ScreenSearch:
     """Fit the four sides near a guess, infer those that do not show, refine them, and judge the result."""
     if not 0.02 * plane.width < reach.size < 4 * plane.width:
         return ScreenSearch(None, 0.0, _NO_SHAPE)
-    sides = [fit_side(picture, plane, stripes, guess, side, reach) for side in range(4)]
+    sides = [fit_side(picture, plane, stripes, initial, side, reach) for side in range(4)]
     sides = [side if side.support >= _MIN_SUPPORT else replace(side, support=0.0) for side in sides]
     rectangle = Rectangle(plane.width, plane.height, aspect)
-    expected = corners_of(guess, plane.width, plane.height)
+    expected = corners_of(initial, plane.width, plane.height)
     missing = [number for number, side in enumerate(sides) if not side.support]
     if len(missing) > 1:
         names = " and ".join(SIDE_NAMES[side] for side in missing)

@@ -43,7 +43,7 @@ class _Onsets:
     t: FloatArray
     place: FloatArray
     #: (K,) energy was found; it begins inside the picture.
-    seen: BoolArray
+    observed: BoolArray
     usable: BoolArray
     #: (K,) energy is there from the window's first place on, and the picture goes on beyond it.
     earlier: BoolArray
@@ -69,23 +69,23 @@ class _Window:
         return self.origin + self.step * (self.index[:, 0] + self.sign * depth)
 
 
-def between(guess: list[Side], side: int, t: FloatArray, margin: float) -> BoolArray:
+def between(initial: list[Side], side: int, t: FloatArray, margin: float) -> BoolArray:
     """(K,) places along a side that lie between the neighbouring sides, by a margin."""
-    before, after = (guess[LEFT], guess[RIGHT]) if across(side) else (guess[TOP], guess[BOTTOM])
-    middle = guess[side].at(float(t.mean()))
+    before, after = (initial[LEFT], initial[RIGHT]) if across(side) else (initial[TOP], initial[BOTTOM])
+    middle = initial[side].at(float(t.mean()))
     return np.asarray((t > before.at(middle) + margin) & (t < after.at(middle) - margin), np.bool_)
 
 
-def fit_side(picture: Picture, plane: Plane, stripes: Stripes, guess: list[Side], side: int, reach: Reach) -> Side:
+def fit_side(picture: Picture, plane: Plane, stripes: Stripes, initial: list[Side], side: int, reach: Reach) -> Side:
     """One side near its guess; support 0 where nothing shows."""
     for _ in range(_MOVES_OUT):
         if across(side):
-            onsets = _strip_onsets(plane, stripes, guess, side, reach)
+            onsets = _strip_onsets(plane, stripes, initial, side, reach)
         else:
-            onsets = _band_onsets(picture, plane, guess, side, reach)
+            onsets = _band_onsets(picture, plane, initial, side, reach)
         if not onsets.t.size or onsets.earlier.mean() < 0.1:
             break
-        guess = [old.moved(-0.8 * reach.out * INWARD[side]) if i == side else old for i, old in enumerate(guess)]
+        initial = [old.moved(-0.8 * reach.out * INWARD[side]) if i == side else old for i, old in enumerate(initial)]
     sign = INWARD[side]
     tolerance = max(1.5 * onsets.step, (0.0012 if across(side) else 0.002) * reach.size)
     # Where the picture ends before the screen does, a line must pass well outside.
@@ -93,13 +93,13 @@ def fit_side(picture: Picture, plane: Plane, stripes: Stripes, guess: list[Side]
     weight: FloatArray = onsets.usable.astype(np.float64)
     if across(side):
         weight = row_trust(onsets.place, onsets.usable, onsets.step)
-    slope = sign * guess[side].slope
+    slope = sign * initial[side].slope
     line = outermost_line(
-        onsets.t, depth, weight, onsets.seen, tolerance, slope=slope, spread=MAX_SKEW, outside_cost=OUTSIDE_COST
+        onsets.t, depth, weight, onsets.observed, tolerance, slope=slope, spread=MAX_SKEW, outside_cost=OUTSIDE_COST
     )
-    cut = onsets.seen & ~onsets.usable
+    cut = onsets.observed & ~onsets.usable
     if line is None or line.support < cut.mean():
-        return Side(guess[side].coefficients, guess[side].middle, guess[side].half, 0.0)
+        return Side(initial[side].coefficients, initial[side].middle, initial[side].half, 0.0)
     return _bend(onsets, np.array([line.slope, line.start]), depth, weight, tolerance, sign, across(side))
 
 
@@ -142,17 +142,17 @@ def _bend(
 
 
 def _window(
-    guess: list[Side], side: int, t: FloatArray, origin: float, step: float, reach: Reach, margin: float
+    initial: list[Side], side: int, t: FloatArray, origin: float, step: float, reach: Reach, margin: float
 ) -> tuple[_Window, BoolArray]:
     """The window of a side and the (K,) segments of `t` that lie between the neighbouring sides."""
-    inside = between(guess, side, t, margin)
-    centre = np.round((guess[side].at(t[inside]) - origin) / step).astype(np.int64)
+    inside = between(initial, side, t, margin)
+    centre = np.round((initial[side].at(t[inside]) - origin) / step).astype(np.int64)
     outer = max(int(reach.out / step), 2)
     index = centre[:, None] + INWARD[side] * np.arange(-outer, max(int(reach.inward / step), 8))
     return _Window(t[inside], index, outer, origin, step, INWARD[side]), inside
 
 
-def _strip_onsets(plane: Plane, stripes: Stripes, guess: list[Side], side: int, reach: Reach) -> _Onsets:
+def _strip_onsets(plane: Plane, stripes: Stripes, initial: list[Side], side: int, reach: Reach) -> _Onsets:
     """Top and bottom: the first change of every strip, which is the screen's edge where its column is lit."""
     import cv2
 
@@ -163,7 +163,7 @@ def _strip_onsets(plane: Plane, stripes: Stripes, guess: list[Side], side: int, 
     t = (strips.astype(np.float64) + (1 + plane.apart) / 2) * plane.fx - 0.5
     # A change spans the lag; from outside, the lit row comes last at the top and first at the bottom.
     origin = plane.fy * ((LAG - 0.5) if side == TOP else 0.5)
-    window, inside = _window(guess, side, t, origin, plane.fy, reach, 0.004 * reach.size)
+    window, inside = _window(initial, side, t, origin, plane.fy, reach, 0.004 * reach.size)
     if not window.t.size:
         return _no_onsets(plane.fy)
     first, last = _span(window.index, rows)
@@ -174,9 +174,9 @@ def _strip_onsets(plane: Plane, stripes: Stripes, guess: list[Side], side: int, 
     active = energy > level[:, None]
     depth = _half_way(energy, active.argmax(axis=1))
     place = window.place(depth.astype(np.float64))
-    seen = active.any(axis=1) & agreeing(place, 2.5 * plane.fy)
-    usable = seen & (depth > valid.argmax(axis=1) + 1)
-    return _Onsets(window.t, place, seen, usable, seen & ~usable & valid[:, 0], plane.fy)
+    observed = active.any(axis=1) & agreeing(place, 2.5 * plane.fy)
+    usable = observed & (depth > valid.argmax(axis=1) + 1)
+    return _Onsets(window.t, place, observed, usable, observed & ~usable & valid[:, 0], plane.fy)
 
 
 def _plateau(energy: FloatArray, outer: int) -> FloatArray:
@@ -202,7 +202,7 @@ def agreeing(place: FloatArray, tolerance: float) -> BoolArray:
     return np.asarray(np.sum(close, axis=0) >= 2, np.bool_)
 
 
-def _band_onsets(picture: Picture, plane: Plane, guess: list[Side], side: int, reach: Reach) -> _Onsets:
+def _band_onsets(picture: Picture, plane: Plane, initial: list[Side], side: int, reach: Reach) -> _Onsets:
     """Left and right: where the energy of bands of rows begins and stays."""
     fx = fine_step(picture)
     n_rows, steps = plane.light.shape[0] - LAG, apart(fx)
@@ -211,7 +211,7 @@ def _band_onsets(picture: Picture, plane: Plane, guess: list[Side], side: int, r
     y = (np.arange(rows * n_bands) + (LAG - 1) / 2) * float(plane.fy)
     # A product needs light on both its columns: the outermost one says where light begins.
     origin = -0.5 if side == LEFT else fx * (steps + 1) - 0.5
-    window, _ = _window(guess, side, y, origin, fx, reach, -np.inf)
+    window, _ = _window(initial, side, y, origin, fx, reach, -np.inf)
     n_columns = picture.width // fx - steps
     if window.index.max() < 0 or window.index.min() >= n_columns:
         return _no_onsets(fx)
@@ -225,7 +225,7 @@ def _band_onsets(picture: Picture, plane: Plane, guess: list[Side], side: int, r
     t = y.reshape(n_bands, rows).mean(axis=1)
     index = window.index.reshape(n_bands, rows, -1).mean(axis=1)
     bands = _Window(t, index, window.outer, origin, fx, window.sign)
-    return _lasting_steps(energy, spread / rows, spread > 0, bands, between(guess, side, t, 0.004 * reach.size))
+    return _lasting_steps(energy, spread / rows, spread > 0, bands, between(initial, side, t, 0.004 * reach.size))
 
 
 def _lasting_steps(
@@ -242,14 +242,14 @@ def _lasting_steps(
     k, start = np.arange(len(energy)), rising.argmax(axis=1)
     level = ahead[k, start + box]
     active = (energy > level[:, None] / 2) & (np.arange(n) >= start[:, None]) & (level > 0)[:, None]
-    seen = rising.any(axis=1) & active.any(axis=1)
+    observed = rising.any(axis=1) & active.any(axis=1)
     depth = active.argmax(axis=1)
-    scale = np.where(seen, level, 1.0)
+    scale = np.where(observed, level, 1.0)
     covered = np.clip(energy[k, depth] / scale, 0, 1) + np.clip(energy[k, np.maximum(depth - 1, 0)] / scale, 0, 1)
     place = window.place(depth + 1 - covered)
-    usable = seen & (depth > valid.argmax(axis=1) + 1)
-    earlier = seen & ~usable & valid[:, 0]
-    return _Onsets(window.t[inside], place[inside], seen[inside], usable[inside], earlier[inside], window.step)
+    usable = observed & (depth > valid.argmax(axis=1) + 1)
+    earlier = observed & ~usable & valid[:, 0]
+    return _Onsets(window.t[inside], place[inside], observed[inside], usable[inside], earlier[inside], window.step)
 
 
 def _row_noise(outside: FloatArray, limit: FloatArray) -> FloatArray:

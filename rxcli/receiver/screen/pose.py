@@ -98,10 +98,10 @@ def misfit(places: list[Places | None], pose: FloatArray, rectangle: Rectangle) 
     """Sum of squares of what a pose leaves of the places and of what is usual, in standard deviations."""
     total = float((_prior(pose)[0] ** 2).sum())
     corners = rectangle.project(pose)
-    for side, seen in enumerate(places):
-        if seen is not None:
-            left = seen.place - rectangle.side_at(corners, pose[_DISTORTION], side, seen.t)
-            total += float((left**2).mean()) * min(seen.t.size, INDEPENDENT) / seen.sd**2
+    for side, observed in enumerate(places):
+        if observed is not None:
+            left = observed.place - rectangle.side_at(corners, pose[_DISTORTION], side, observed.t)
+            total += float((left**2).mean()) * min(observed.t.size, INDEPENDENT) / observed.sd**2
     return total
 
 

@@ -118,7 +118,7 @@ def outermost_line(
     t: FloatArray,
     depth: FloatArray,
     weight: FloatArray,
-    seen: BoolArray,
+    observed: BoolArray,
     tolerance: float,
     *,
     slope: float,
@@ -152,8 +152,8 @@ def outermost_line(
     if not i.size:
         return None
     starts = depth[i] - slopes * t[i]
-    beyond = (depth[seen] - starts[:, None] - slopes[:, None] * t[seen]) / tolerance
-    support = np.maximum(1 - beyond**2, 0) @ weight[seen]
+    beyond = (depth[observed] - starts[:, None] - slopes[:, None] * t[observed]) / tolerance
+    support = np.maximum(1 - beyond**2, 0) @ weight[observed]
     against = np.clip(-beyond - 1, 0, 1).sum(axis=1)
     best = int((support - outside_cost * against).argmax())
     return Line(float(starts[best]), float(slopes[best]), float(support[best] / t.size))

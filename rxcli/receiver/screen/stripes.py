@@ -143,10 +143,17 @@ def coarse_sides(plane: Plane, stripes: Stripes) -> list[Side] | None:
 
 
 def _cell_line(
-    t: FloatArray, depth: FloatArray, seen: BoolArray, step: float, slope: float, spread: float
+    t: FloatArray, depth: FloatArray, observed: BoolArray, step: float, slope: float, spread: float
 ) -> Line | None:
     return outermost_line(
-        t, depth, seen.astype(np.float64), seen, 1.2 * step, slope=slope, spread=spread, outside_cost=OUTSIDE_COST
+        t,
+        depth,
+        observed.astype(np.float64),
+        observed,
+        1.2 * step,
+        slope=slope,
+        spread=spread,
+        outside_cost=OUTSIDE_COST,
     )
 
 

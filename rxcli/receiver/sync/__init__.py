@@ -2,34 +2,34 @@
 
 from rxcli.receiver.sync.clock import (
     assign_bursts,
+    binned_strips,
     contrast,
     corrected,
-    doubled_strips,
     find_clock,
     find_clocks,
     from_copies,
-    halved_strips,
     header_response,
     pooled_strips,
     possible_bursts,
     resample,
     sample_slots,
     to_copies,
+    unbinned_strips,
 )
 
 __all__ = [
     "assign_bursts",
+    "binned_strips",
     "contrast",
     "corrected",
-    "doubled_strips",
     "find_clock",
     "find_clocks",
     "from_copies",
-    "halved_strips",
     "header_response",
     "pooled_strips",
     "possible_bursts",
     "resample",
     "sample_slots",
     "to_copies",
+    "unbinned_strips",
 ]

@@ -45,10 +45,10 @@ _MAX_CORRECTION = 0.25
 
 def pooled_strips(profiles: RowProfiles) -> RowProfiles:
     """Profiles of a few strips a column, to search the clock: pooled in pairs where there are four or more."""
-    return halved_strips(profiles) if profiles.light.shape[1] >= _MANY_STRIPS else profiles
+    return binned_strips(profiles) if profiles.light.shape[1] >= _MANY_STRIPS else profiles
 
 
-def halved_strips(profiles: RowProfiles) -> RowProfiles:
+def binned_strips(profiles: RowProfiles) -> RowProfiles:
     """Profiles with strips pooled in pairs, for a quick look; the same profiles where their number is odd."""
     rows, light = profiles.sensor_row, _bounded(profiles.light)
     if light.shape[1] % 2:
@@ -62,7 +62,7 @@ def halved_strips(profiles: RowProfiles) -> RowProfiles:
     )
 
 
-def doubled_strips(profiles: RowProfiles) -> RowProfiles:
+def unbinned_strips(profiles: RowProfiles) -> RowProfiles:
     """Profiles with every strip taken for two of half the pixels; copies."""
     rows = profiles.sensor_row
     return replace(
@@ -223,17 +223,19 @@ def find_clocks(
     light, valid = resample(profiles, top, step, n)
     pooled, weight = contrast(light, valid, _SEARCH_SAMPLES, sigma / np.sqrt(max(step, 1.0)))
     response = header_response(pooled, weight, _SEARCH_SAMPLES)
-    start, lock = _comb(response, packet_slots * _SEARCH_SAMPLES)
+    start, header_peak_ratio = _comb(response, packet_slots * _SEARCH_SAMPLES)
     if not np.isfinite(start):
         return ()
     delays = _delays(pooled, weight, start, packet_slots)
     starts = [(start, delays)]
     many_delays = np.count_nonzero(delays) > delays.size * _MANY
-    if lock < _SURE_LOCK or many_delays:
-        spread_start, spread_lock, spread_delays = _spread_comb(pooled, weight, packet_slots * _SEARCH_SAMPLES)
-        if spread_lock > lock or many_delays:
-            starts = [(spread_start, spread_delays), (start, np.zeros_like(delays))]
-            lock = max(lock, spread_lock)
+    if header_peak_ratio < _SURE_LOCK or many_delays:
+        staggered_start, staggered_ratio, staggered_delays = _staggered_comb(
+            pooled, weight, packet_slots * _SEARCH_SAMPLES
+        )
+        if staggered_ratio > header_peak_ratio or many_delays:
+            starts = [(staggered_start, staggered_delays), (start, np.zeros_like(delays))]
+            header_peak_ratio = max(header_peak_ratio, staggered_ratio)
 
     def clock_from(start: float, delays: FloatArray) -> Clock:
         row0 = top + start * step
@@ -250,7 +252,7 @@ def find_clocks(
             first_slot=first_slot,
             burst=np.zeros(n_copies, np.int64),
             delay_slots=delays,
-            lock=lock,
+            header_peak_ratio=header_peak_ratio,
         )
 
     return tuple(clock_from(*found) for found in starts)
@@ -258,10 +260,10 @@ def find_clocks(
 
 def _row_span(profiles: RowProfiles) -> tuple[float, float]:
     """First and last sensor row that any strip shows, as borders."""
-    seen = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
-    if seen.size == 0:
+    observed = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
+    if observed.size == 0:
         return 0.0, 0.0
-    first, last = int(seen[0]), int(seen[-1])
+    first, last = int(observed[0]), int(observed[-1])
     if profiles.sensor_row is None:
         return float(profiles.rows[first]) - 0.5, float(profiles.rows[last]) + 0.5
     rows = profiles.sensor_row[:, :, first : last + 1]
@@ -278,8 +280,8 @@ def _comb(response: FloatArray, period: int) -> tuple[float, float]:
     if score[best] <= 0:
         return float("nan"), 0.0
     left, middle, right = score[best - 1], score[best], score[(best + 1) % period]
-    bend = left - 2 * middle + right
-    offset = 0.5 * (left - right) / bend if bend < 0 else 0.0
+    curvature = left - 2 * middle + right
+    offset = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
     rival = float(score[_away(period, best)].max(initial=0.0))
     return best + float(np.clip(offset, -0.5, 0.5)), float(middle / max(rival, 1e-12))
 
@@ -290,7 +292,7 @@ def _away(period: int, best: int, further: int = 0) -> BoolArray:
     return np.asarray(distance > SLOTS_PER_SYMBOL * _SEARCH_SAMPLES // 4 + further)
 
 
-def _spread_comb(pooled: Float32Array, weight: Float32Array, period: int) -> tuple[float, float, FloatArray]:
+def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> tuple[float, float, FloatArray]:
     """Start, lead and delays of columns whose headers lie too far apart to be seen in their mean.
 
     Each column's own header correlation is folded; the start is where most columns have a peak within reach.
@@ -311,13 +313,13 @@ def _spread_comb(pooled: Float32Array, weight: Float32Array, period: int) -> tup
     near = np.lib.stride_tricks.sliding_window_view(wrapped, 2 * reach + 1, axis=1)[:, wide - reach :][:, :period]
     score = np.maximum(near.max(axis=2), 0).sum(axis=0)
     start = int(score.argmax())
-    lock = score[start] / max(float(score[_away(period, start, 2 * reach)].max(initial=0.0)), 1e-12)
+    header_peak_ratio = score[start] / max(float(score[_away(period, start, 2 * reach)].max(initial=0.0)), 1e-12)
     around = wrapped[:, start : start + 2 * wide + 1]
     best = around.argmax(axis=1)
     delays = best + _parabola(around, best) - wide
     sure = around[np.arange(n_columns), best] > 0
     middle = float(np.median(delays[sure])) if sure.any() else 0.0
-    return (start + middle) % period, float(lock), np.where(sure, delays - middle, 0.0) / _SEARCH_SAMPLES
+    return (start + middle) % period, float(header_peak_ratio), np.where(sure, delays - middle, 0.0) / _SEARCH_SAMPLES
 
 
 def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slots: int) -> FloatArray:
@@ -328,8 +330,8 @@ def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slo
     n = pooled.shape[1]
     starts = np.arange(round(start), n, packet_slots * _SEARCH_SAMPLES)
     index = starts[:, None, None] + np.arange(-reach, reach + 1)[:, None] + np.arange(template.size)
-    seen = (index >= 0) & (index < n)
-    signal = (pooled * share)[:, np.clip(index, 0, n - 1)] * seen
+    observed = (index >= 0) & (index < n)
+    signal = (pooled * share)[:, np.clip(index, 0, n - 1)] * observed
     score = (signal * template).sum(axis=(1, 3))
     best = score.argmax(axis=1)
     fine = (best + _parabola(score, best) - reach - (start - round(start))) / _SEARCH_SAMPLES
@@ -344,8 +346,10 @@ def _parabola(score: FloatArray, best: NDArray[np.int64]) -> FloatArray:
     rows = np.arange(best.size)
     inner = np.clip(best, 1, score.shape[1] - 2)
     left, middle, right = (score[rows, inner + k] for k in (-1, 0, 1))
-    bend = left - 2 * middle + right
-    return np.clip(np.divide(0.5 * (left - right), bend, out=np.zeros_like(bend), where=bend < 0), -0.5, 0.5)
+    curvature = left - 2 * middle + right
+    return np.clip(
+        np.divide(0.5 * (left - right), curvature, out=np.zeros_like(curvature), where=curvature < 0), -0.5, 0.5
+    )
 
 
 def corrected(clock: Clock, timing: FloatArray) -> Clock:
@@ -441,13 +445,15 @@ def copy_likeness(llr: Float32Array, clock: Clock) -> FloatArray:
         clock: the clock.
     """
     copies = to_copies(np.clip(llr, -_SURE_LLR, _SURE_LLR), clock)
-    seen = copies != 0
-    seen[..., :SLOTS_PER_SYMBOL] = False
+    observed = copies != 0
+    observed[..., :SLOTS_PER_SYMBOL] = False
     lit = 1 / (1 + np.exp(-copies))
-    share = np.clip((lit * seen).sum(axis=(1, 2)) / np.maximum(seen.sum(axis=(1, 2)), 1), 0.1, 0.9)[:, None, None]
+    share = np.clip((lit * observed).sum(axis=(1, 2)) / np.maximum(observed.sum(axis=(1, 2)), 1), 0.1, 0.9)[
+        :, None, None
+    ]
     first, second = lit[:, :-1], lit[:, 1:]
     alike = first * second / share + (1 - first) * (1 - second) / (1 - share)
-    both = seen[:, :-1] & seen[:, 1:]
+    both = observed[:, :-1] & observed[:, 1:]
     return np.asarray((np.log(alike) * both).sum(axis=(0, 2)), np.float64)
 
 

@@ -60,7 +60,7 @@ class LinkTime:
         """How far a clock may be from the foretold one: at first by the times, which may be rounded to milliseconds."""
         return _MAX_JUMP_SLOTS if self._period is not None else self.packet_slots / 4
 
-    def foretell(self, frame: int, time_s: float) -> float | None:
+    def predict(self, frame: int, time_s: float) -> float | None:
         """Slot of sensor row 0 in a frame, from the locks before; None before the first."""
         if self._last is None:
             return None
@@ -72,13 +72,13 @@ class LinkTime:
     def take(self, frame: int, time_s: float, clock: Clock) -> int | None:
         """Enter a locked clock; returns the number of its copy 0, None where it is not of the time told so far."""
         inside = clock.first_slot - clock.row0 / clock.rows_per_slot
-        foretold = self.foretell(frame, time_s)
-        if foretold is None:
+        predicted = self.predict(frame, time_s)
+        if predicted is None:
             first_copy, slot = 0, inside
         else:
-            first_copy = round((foretold - inside) / self.packet_slots)
+            first_copy = round((predicted - inside) / self.packet_slots)
             slot = inside + first_copy * self.packet_slots
-            if self._period is not None and abs(slot - foretold) > _MAX_JUMP_SLOTS:
+            if self._period is not None and abs(slot - predicted) > _MAX_JUMP_SLOTS:
                 return None
             self._measure(frame, time_s, slot)
         self._last = (frame, time_s, slot)
@@ -94,10 +94,10 @@ class LinkTime:
             n_slots: slots of the grid.
             top_row: sensor row above which nothing is seen.
         """
-        foretold = self.foretell(frame, time_s)
-        if foretold is None:
+        predicted = self.predict(frame, time_s)
+        if predicted is None:
             return None
-        slot = foretold + top_row / like.rows_per_slot
+        slot = predicted + top_row / like.rows_per_slot
         first_slot = int(np.floor(slot)) % self.packet_slots
         return replace(
             like,
@@ -198,7 +198,7 @@ class FrameBursts:
 @dataclass(slots=True)
 class _Burst:
     metrics: FloatArray
-    seen: IntArray
+    n_observed: IntArray
     frames: list[int]
     #: (C,) columns that need no further look.
     certain: BoolArray
@@ -218,7 +218,7 @@ class ClosedBurst:
     #: Of this burst alone.
     posteriors: BurstPosteriors
     #: (C, packet) how often each slot was seen.
-    seen: IntArray
+    n_observed: IntArray
     frames: tuple[int, ...]
     #: (C, packet + memory, patterns) of all frames together.
     metrics: FloatArray
@@ -252,15 +252,15 @@ class Bursts:
         for burst, number in enumerate(numbers):
             if number <= self._closed:
                 continue
-            seen = view.shown[view.clock.burst == burst].sum(axis=0)
+            n_observed = view.shown[view.clock.burst == burst].sum(axis=0)
             have = self._open.get(int(number))
             if have is None:
                 self._open[int(number)] = _Burst(
-                    metrics[burst].copy(), seen, [view.frame], np.zeros(seen.shape[0], bool), view.tracked
+                    metrics[burst].copy(), n_observed, [view.frame], np.zeros(n_observed.shape[0], bool), view.tracked
                 )
                 continue
             have.metrics += metrics[burst]
-            have.seen = have.seen + seen
+            have.n_observed = have.n_observed + n_observed
             have.frames.append(view.frame)
             have.tracked |= view.tracked
             have.stale = True
@@ -282,14 +282,14 @@ class Bursts:
         """(B, C, packet + memory, patterns) of open bursts, all frames added."""
         return np.stack([self._open[int(n)].metrics for n in numbers])
 
-    def seen(self, numbers: IntArray) -> IntArray:
+    def n_observed(self, numbers: IntArray) -> IntArray:
         """(B, C, packet) how often each slot was seen."""
-        return np.stack([self._open[int(n)].seen for n in numbers])
+        return np.stack([self._open[int(n)].n_observed for n in numbers])
 
     @property
     def n_columns(self) -> int:
         """Columns of the open bursts; 0 where none is open."""
-        return next((entry.seen.shape[0] for entry in self._open.values()), 0)
+        return next((entry.n_observed.shape[0] for entry in self._open.values()), 0)
 
     def certain(self, numbers: IntArray) -> BoolArray:
         """(B, C) columns that are certain."""
@@ -298,13 +298,13 @@ class Bursts:
     def lit(self, numbers: IntArray) -> Float32Array:
         """(B, C, packet) probability that each slot is lit."""
         entries = [self._open[int(n)] for n in numbers]
-        half = np.full(entries[0].seen.shape, 0.5, np.float32)
+        half = np.full(entries[0].n_observed.shape, 0.5, np.float32)
         return np.stack([half if e.posteriors is None else e.posteriors.lit[0] for e in entries])
 
     def note(self, number: int, columns: IntArray, posteriors: BurstPosteriors, certain: BoolArray) -> None:
         """Keep what was detected of some columns of an open burst; `certain` is (columns,)."""
         entry = self._open[number]
-        entry.posteriors = _merged(entry.posteriors, posteriors, columns, entry.seen.shape[0])
+        entry.posteriors = _merged(entry.posteriors, posteriors, columns, entry.n_observed.shape[0])
         entry.certain[columns] = certain
 
     def known(self, number: int) -> BurstPosteriors | None:
@@ -319,7 +319,7 @@ class Bursts:
         self._certain |= {number: entry.certain for number, entry in entries if entry is not None}
         self._certain = {n: c for n, c in self._certain.items() if n > self._closed - _REMEMBERED}
         return [
-            ClosedBurst(number, entry.posteriors, entry.seen, tuple(entry.frames), entry.metrics, entry.tracked)
+            ClosedBurst(number, entry.posteriors, entry.n_observed, tuple(entry.frames), entry.metrics, entry.tracked)
             for number, entry in entries
             if entry is not None and entry.posteriors is not None
         ]

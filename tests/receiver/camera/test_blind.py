@@ -21,7 +21,7 @@ from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_prof
 from rxcli.protocol import encode_packet, payload_bits
 from rxcli.receiver import camera as blind
 from rxcli.receiver import sampling
-from rxcli.receiver.camera.bend import BEND_PRECISION
+from rxcli.receiver.camera.curvature import BEND_PRECISION
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.screen import geometry
 from rxcli.types import Clock, FloatArray, Frame, Lens, RowProfiles
@@ -126,14 +126,14 @@ def test_bend_terms_are_the_lens_model_at_any_focal_length() -> None:
     matrix = np.array([[focal, 0, 399.5], [0, focal, 299.5], [0, 0, 1]])
     moved = geometry.distort(points, Lens(matrix, np.append(coefficients, 0.0), True))[:, 1] - points[:, 1]
     scaled = coefficients * (width / focal) ** np.array([2, 4, 1, 1])
-    terms = blind.bend_terms(points[:, 0], points[:, 1], width, height)
+    terms = blind.curvature_terms(points[:, 0], points[:, 1], width, height)
     np.testing.assert_allclose(scaled @ terms, moved, rtol=1e-9, atol=1e-9)
 
 
 def test_lenses_are_expected_to_bend_back() -> None:
     def surprise(*coefficients: float) -> float:
-        bend = np.array(coefficients)
-        return float(bend @ BEND_PRECISION @ bend)
+        curvature = np.array(coefficients)
+        return float(curvature @ BEND_PRECISION @ curvature)
 
     for k1 in (-0.2, 0.2):
         assert surprise(k1, -k1, 0, 0) == pytest.approx((k1 / 0.3) ** 2)
@@ -147,11 +147,11 @@ def test_structure_evidence_knows_packets_from_other_bits() -> None:
     bits = [rng.integers(0, 2, payload_bits(w, 11), dtype=np.uint8) for w in (3, 5, 7, 8)]
     packets = np.stack([np.tile(encode_packet(b, w), 3) for b, w in zip(bits, (3, 5, 7, 8), strict=True)])
     slots = packets[:, 37:300] + rng.normal(0, 0.15, (4, 263))
-    right = blind.structure_evidence(slots, 37, 130)
+    right = blind.structure_llr(slots, 37, 130)
     assert right > 100
     wrong = [(slots, 41, 130), (slots, 37, 260), (1 - slots[:, ::-1], 0, 130), (rng.normal(size=(4, 263)), 37, 130)]
-    assert max(blind.structure_evidence(*case) for case in wrong) < 0.8 * right
-    assert blind.structure_evidence(rng.normal(size=(4, 263)), 37, 130) < blind.MIN_EVIDENCE
+    assert max(blind.structure_llr(*case) for case in wrong) < 0.8 * right
+    assert blind.structure_llr(rng.normal(size=(4, 263)), 37, 130) < blind.MIN_EVIDENCE
 
 
 def test_an_estimate_can_be_kept_as_a_profile() -> None:
@@ -162,10 +162,10 @@ def test_an_estimate_can_be_kept_as_a_profile() -> None:
         reversed=False,
         exposure_slots=0.8,
         exposure_slots_sd=0.02,
-        bend=np.array([0.1, -0.2, 3e-4, -1e-4]),
-        bend_sd=np.full(4, 1e-3),
+        curvature=np.array([0.1, -0.2, 3e-4, -1e-4]),
+        curvature_sd=np.full(4, 1e-3),
         corrected=True,
-        evidence=400.0,
+        log_evidence=400.0,
         explained=0.9,
     )
     estimated = blind.summary(estimate, 17300.0)
@@ -216,7 +216,7 @@ def test_sides_and_mosaics_say_whether_a_picture_was_corrected(
 ) -> None:
     strips = replace(_flat_strips(np.ones((20, 40))), sides=sides, mosaic=mosaic)
     assert strips.correction == correction
-    assert strips.bow == (sides if sides and abs(sides[0]) > 0.1 and sides[1] < 0.06 else None)
+    assert strips.side_curvature == (sides if sides and abs(sides[0]) > 0.1 and sides[1] < 0.06 else None)
 
 
 def _striped(rng: np.random.Generator, n_rows: int) -> FloatArray:

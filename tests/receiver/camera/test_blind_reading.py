@@ -12,7 +12,7 @@ from rxcli.receiver import camera as blind
 from rxcli.receiver.camera.reading import read, start_evidence
 from rxcli.receiver.camera.strips import SAMPLES
 from rxcli.receiver.camera.waves import WORD_SHARES, Waves, free_log_odds
-from rxcli.receiver.decode.detect import free_evidence
+from rxcli.receiver.decode.detect import free_log_evidence
 from rxcli.types import Float32Array, FloatArray
 
 LENGTHS = [70, 130, 260]
@@ -56,11 +56,11 @@ def test_packets_start_where_they_were_sent(n_symbols: int, first: int) -> None:
     rng = np.random.default_rng(first)
     sent = _sent(rng, [3, 4, 5, 5, 6, 7], n_symbols, first, 340)
     log_odds = 2.0 * (2 * sent - 1) + rng.normal(0, 2.0, sent.shape)
-    evidence = dict(zip(LENGTHS, start_evidence(log_odds, LENGTHS), strict=True))
+    log_evidence = dict(zip(LENGTHS, start_evidence(log_odds, LENGTHS), strict=True))
     right = PREAMBLE_SLOTS + 10 * n_symbols
-    assert max(evidence, key=lambda length: float(evidence[length].max())) == right
-    assert int(evidence[right].argmax()) == -first % right
-    assert evidence[right].max() > 60
+    assert max(log_evidence, key=lambda length: float(log_evidence[length].max())) == right
+    assert int(log_evidence[right].argmax()) == -first % right
+    assert log_evidence[right].max() > 60
     noise = rng.normal(0, 2.0, sent.shape)
     assert max(one.max() for one in start_evidence(noise, LENGTHS)) < 20
 
@@ -104,20 +104,20 @@ def test_a_hypothesis_is_read_whatever_length_and_start_it_came_with() -> None:
     noise = blind.Noise(0.0064, 0.0)
     picture = blind.Strips(light, np.ones_like(light), x, rows, sent.shape[0], noise, 1000, n_rows)
     # Another length, another start, and a wrong period that stood out more.
-    near = blind.Hypothesis(4.03, 70, 41.0, reversed=False, evidence=-10.0, salience=50.0)
-    off = blind.Hypothesis(5.3, 130, 12.0, reversed=False, evidence=-5.0, salience=90.0)
+    near = blind.Hypothesis(4.03, 70, 41.0, reversed=False, log_evidence=-10.0, salience=50.0)
+    off = blind.Hypothesis(5.3, 130, 12.0, reversed=False, log_evidence=-5.0, salience=90.0)
     found = read(picture, [(off, np.zeros(4)), (near, np.zeros(4))], LENGTHS)
-    best, bend = found[0]
-    assert not bend.any()
+    best, curvature = found[0]
+    assert not curvature.any()
     assert best.packet_slots == 130
     # The clock came 1.5 slots off by the end of the picture; those around it are read too.
     assert best.rows_per_slot == pytest.approx(4, abs=0.012)
     assert best.start_row % (130 * best.rows_per_slot) == pytest.approx((130 - 37) * 4, abs=4)
-    as_it_came = max(one.evidence for one, _ in found if one.rows_per_slot == near.rows_per_slot)
-    wrong = max(one.evidence for one, _ in found if one.rows_per_slot > 5)
-    assert best.evidence > 1.5 * as_it_came > 0
-    assert best.evidence > 2 * wrong
-    assert found == sorted(found, key=lambda pair: -pair[0].evidence)
+    as_it_came = max(one.log_evidence for one, _ in found if one.rows_per_slot == near.rows_per_slot)
+    wrong = max(one.log_evidence for one, _ in found if one.rows_per_slot > 5)
+    assert best.log_evidence > 1.5 * as_it_came > 0
+    assert best.log_evidence > 2 * wrong
+    assert found == sorted(found, key=lambda pair: -pair[0].log_evidence)
 
 
 @pytest.mark.parametrize("memory", [1, 2, 3])
@@ -132,4 +132,4 @@ def test_free_evidence_is_that_of_all_sequences(memory: int) -> None:
         # The slots before the first one are any.
         prior = np.prod(np.where(lit, share[:, None], 1 - share[:, None]), axis=1) / 2**memory
         total += prior * np.exp(metrics[:, np.arange(n), pattern].sum(axis=1))
-    np.testing.assert_allclose(free_evidence(metrics, share), np.log(total), rtol=1e-9)
+    np.testing.assert_allclose(free_log_evidence(metrics, share), np.log(total), rtol=1e-9)

@@ -16,7 +16,7 @@ ROWS_PER_SLOT, EXPOSURE, START = 4.2, 1.7, -7.3
 BEND = np.array([-0.22, 0.1, 4e-4, -3e-4])
 
 
-def _strips(rng: np.random.Generator, bend: FloatArray, reverse: bool) -> tuple[blind.Strips, FloatArray]:
+def _strips(rng: np.random.Generator, curvature: FloatArray, reverse: bool) -> tuple[blind.Strips, FloatArray]:
     """Strips of a textured picture whose sensor rows are bent, and the slots (C, N) that they show."""
     bits = [rng.integers(0, 2, payload_bits(w, 11), dtype=np.uint8) for w in rng.integers(3, 8, COLUMNS)]
     lit = np.stack([np.tile(encode_packet(b, _weight(b)), 3)[:300] for b in bits]).astype(np.float64)
@@ -25,7 +25,7 @@ def _strips(rng: np.random.Generator, bend: FloatArray, reverse: bool) -> tuple[
     rows = np.arange(ROWS, dtype=np.float64)
     across, down = (x - (WIDTH - 1) / 2) / WIDTH, (rows - (ROWS - 1) / 2) / WIDTH
     square = across**2 + down**2
-    k1, k2, p1, p2 = bend
+    k1, k2, p1, p2 = curvature
     moved = WIDTH * (down * (k1 * square + k2 * square**2) + p1 * (square + 2 * down**2) + 2 * p2 * across * down)
     time = (rows + moved - START) / ROWS_PER_SLOT
     light = np.zeros((n, ROWS))
@@ -51,9 +51,9 @@ def _weight(bits: np.ndarray) -> int:
     return next(w for w in (3, 4, 5, 6, 7) if payload_bits(w, 11) == bits.size)
 
 
-def _estimate(bend: FloatArray, reverse: bool) -> blind.BlindEstimate:
+def _estimate(curvature: FloatArray, reverse: bool) -> blind.BlindEstimate:
     """A first estimate: a period that is off by a thousandth, half of the bend, an exposure too short."""
-    turned = bend * np.array([1.0, 1.0, -1.0, 1.0]) if reverse else bend
+    turned = curvature * np.array([1.0, 1.0, -1.0, 1.0]) if reverse else curvature
     return blind.BlindEstimate(
         rows_per_slot=1.001 * ROWS_PER_SLOT,
         rows_per_slot_sd=0.001,
@@ -61,10 +61,10 @@ def _estimate(bend: FloatArray, reverse: bool) -> blind.BlindEstimate:
         reversed=reverse,
         exposure_slots=1.3,
         exposure_slots_sd=0.05,
-        bend=0.9 * turned,
-        bend_sd=np.full(4, 1e-3),
-        corrected=bool(bend.any()),
-        evidence=300.0,
+        curvature=0.9 * turned,
+        curvature_sd=np.full(4, 1e-3),
+        corrected=bool(curvature.any()),
+        log_evidence=300.0,
         explained=0.5,
     )
 
@@ -79,31 +79,31 @@ def _clock(estimate: blind.BlindEstimate) -> Clock:
         first_slot=0,
         burst=np.zeros(3, np.int64),
         delay_slots=np.zeros(COLUMNS),
-        lock=5.0,
+        header_peak_ratio=5.0,
     )
 
 
-@pytest.mark.parametrize(("bend", "reverse"), [(np.zeros(4), False), (BEND, False), (BEND, True)])
-def test_decoded_slots_correct_a_first_estimate(bend: FloatArray, reverse: bool) -> None:
-    strips, lit = _strips(np.random.default_rng(11), bend, reverse)
-    estimate = _estimate(bend, reverse)
+@pytest.mark.parametrize(("curvature", "reverse"), [(np.zeros(4), False), (BEND, False), (BEND, True)])
+def test_decoded_slots_correct_a_first_estimate(curvature: FloatArray, reverse: bool) -> None:
+    strips, lit = _strips(np.random.default_rng(11), curvature, reverse)
+    estimate = _estimate(curvature, reverse)
     found, moved_slots = blind.refit(strips, estimate, _clock(estimate), lit.astype(np.float32))
     assert found.rows_per_slot == pytest.approx(ROWS_PER_SLOT, rel=2e-4)
     assert abs(found.rows_per_slot - ROWS_PER_SLOT) < 4 * found.rows_per_slot_sd
     assert found.exposure_slots == pytest.approx(EXPOSURE, rel=0.06)
-    assert found.corrected == bool(bend.any())
+    assert found.corrected == bool(curvature.any())
     assert 0.1 < moved_slots < 2
-    if bend.any():
-        turned = bend * np.array([1.0, 1.0, -1.0, 1.0]) if reverse else bend
-        assert found.bend[0] == pytest.approx(turned[0], abs=0.01)
+    if curvature.any():
+        turned = curvature * np.array([1.0, 1.0, -1.0, 1.0]) if reverse else curvature
+        assert found.curvature[0] == pytest.approx(turned[0], abs=0.01)
 
 
 def test_a_bend_that_is_none_is_taken_out() -> None:
     strips, lit = _strips(np.random.default_rng(12), np.zeros(4), False)
-    wrong = replace(_estimate(np.zeros(4), False), bend=np.array([0.01, 0.02, 0.0, 0.0]), corrected=True)
+    wrong = replace(_estimate(np.zeros(4), False), curvature=np.array([0.01, 0.02, 0.0, 0.0]), corrected=True)
     found, _ = blind.refit(strips, wrong, _clock(wrong), lit.astype(np.float32))
     assert not found.corrected
-    assert not found.bend.any()
+    assert not found.curvature.any()
     assert found.rows_per_slot == pytest.approx(ROWS_PER_SLOT, rel=2e-4)
 
 

@@ -25,13 +25,13 @@ def _sensor_rows(slots: Float32Array, rows: FloatArray) -> FloatArray:
     return np.asarray(slots[:, np.floor(time).astype(int)].mean(axis=1))
 
 
-def _picture(rng: np.random.Generator, bend: FloatArray) -> tuple[blind.Strips, Float32Array]:
+def _picture(rng: np.random.Generator, curvature: FloatArray) -> tuple[blind.Strips, Float32Array]:
     """Strips of a picture that mixes sensor rows and then takes its rows from between them; and the slots (C, N)."""
     slots = rng.integers(0, 2, (COLUMNS, 420)).astype(np.float32)
     lit = np.repeat(slots, 4, axis=0)
     x = np.broadcast_to(((np.arange(4 * COLUMNS) + 0.5) * WIDTH / (4 * COLUMNS))[:, None], (4 * COLUMNS, ROWS))
     rows = np.arange(ROWS, dtype=np.float64)
-    place = rows + np.tensordot(bend, blind.bend_terms(x, rows, WIDTH, ROWS), 1)
+    place = rows + np.tensordot(curvature, blind.curvature_terms(x, rows, WIDTH, ROWS), 1)
     first = int(np.floor(place.min())) - 3
     sensor = _sensor_rows(lit, np.arange(first, int(place.max()) + 5, dtype=np.float64))
     mixed = sum(weight / 2 * (np.roll(sensor, k, 1) + np.roll(sensor, -k, 1)) for k, weight in enumerate(KERNEL))
@@ -43,17 +43,17 @@ def _picture(rng: np.random.Generator, bend: FloatArray) -> tuple[blind.Strips, 
     return blind.Strips(light.astype(np.float32), ones, x, rows, COLUMNS, noise, WIDTH, ROWS), slots
 
 
-@pytest.mark.parametrize("bend", [np.zeros(4), BEND])
-def test_the_mix_of_rows_is_found(bend: FloatArray, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("curvature", [np.zeros(4), BEND])
+def test_the_mix_of_rows_is_found(curvature: FloatArray, monkeypatch: pytest.MonkeyPatch) -> None:
     # Every column on its own: the spread of light has no part in this.
     monkeypatch.setattr("rxcli.receiver.camera.rows.column_shares", lambda _: np.repeat(np.eye(COLUMNS), 4, axis=0))
-    strips, slots = _picture(np.random.default_rng(5), bend)
-    values = np.concatenate([[START, ROWS_PER_SLOT], bend])
+    strips, slots = _picture(np.random.default_rng(5), curvature)
+    values = np.concatenate([[START, ROWS_PER_SLOT], curvature])
     time = slot_time(strips, time_terms(strips), values)
     found = fit_rows(strips, time, values, slots, 1.2 * SHUTTER, 60)
     assert found.shutter_slots == pytest.approx(SHUTTER, rel=0.2)
     np.testing.assert_allclose(found.kernel, KERNEL, atol=0.08)
-    light, slope = RowModel(SHUTTER, KERNEL).seen(strips, time, values, slots)
+    light, slope = RowModel(SHUTTER, KERNEL).observed(strips, time, values, slots)
     residual = strips.light - 0.2 * light
     assert residual.std() < 0.1 * strips.light.std()
     assert np.abs(slope).max() <= np.abs(KERNEL).sum() / SHUTTER + 1e-4
@@ -75,15 +75,15 @@ def test_an_estimate_that_edges_do_not_keep_to_is_none() -> None:
         reversed=False,
         exposure_slots=SHUTTER,
         exposure_slots_sd=0.05,
-        bend=BEND,
-        bend_sd=np.full(4, 1e-3),
+        curvature=BEND,
+        curvature_sd=np.full(4, 1e-3),
         corrected=True,
-        evidence=-5.0,
+        log_evidence=-5.0,
         explained=0.1,
     )
     wrong = replace(right, rows_per_slot=1.02 * ROWS_PER_SLOT)
     harmonic = replace(right, rows_per_slot=ROWS_PER_SLOT / 2)
     assert by_edges(strips, [wrong, right]) is right
     assert by_edges(strips, [wrong, harmonic]) is None
-    bend = {"k1", "k2", "p1", "p2", "distortion_corrected"}
-    assert set(blind.summary_of_rows(right)) == {"rows_per_slot", *bend}
+    curvature = {"k1", "k2", "p1", "p2", "distortion_corrected"}
+    assert set(blind.summary_of_rows(right)) == {"rows_per_slot", *curvature}

@@ -18,7 +18,7 @@ from rxcli.receiver.camera.waves import (
     decide,
     estimate_exposure,
     first_slots,
-    packet_evidence,
+    packet_llr,
 )
 
 
@@ -36,10 +36,10 @@ def test_probabilities_are_those_of_all_sequences(n_bits: int) -> None:
         lit += weight[:, None] * middle
         total += weight
         count += prior
-    found, evidence = lit_probability(metric, log_odds)
+    found, log_evidence = lit_probability(metric, log_odds)
     np.testing.assert_allclose(found, lit / total[:, None], atol=1e-6)
     # The slots beyond the ends are any.
-    np.testing.assert_allclose(evidence, np.log(total / count), rtol=1e-5)
+    np.testing.assert_allclose(log_evidence, np.log(total / count), rtol=1e-5)
 
 
 def test_patterns_see_the_share_of_every_slot() -> None:
@@ -79,10 +79,10 @@ def test_slots_and_weights_are_found_at_unknown_levels(exposure: float) -> None:
 
 def test_evidence_knows_where_headers_are() -> None:
     waves, _, grid = _scene(np.random.default_rng(6), 1.0, [3, 4, 5, 6, 7])
-    right = packet_evidence(waves, 1.0, grid, first_slots(waves, 1.0, grid))
+    right = packet_llr(waves, 1.0, grid, first_slots(waves, 1.0, grid))
     wrong = Grid((grid.first_slot + 37) % 130, 130)
     assert right > 60
-    assert packet_evidence(waves, 1.0, wrong, first_slots(waves, 1.0, wrong)) < 0.2 * right
+    assert packet_llr(waves, 1.0, wrong, first_slots(waves, 1.0, wrong)) < 0.2 * right
 
 
 @pytest.mark.parametrize("exposure", [0.6, 1.3, 2.0])

@@ -18,76 +18,78 @@ FloatArray = NDArray[np.float64]
 Q = 4
 
 
-def true_clock(shot: Shot, packet_slots: int, n_columns: int) -> Clock:
+def true_clock(shot_gain: Shot, packet_slots: int, n_columns: int) -> Clock:
     """The clock that the shot was made with, its grid starting at the first row."""
-    before = int(np.floor(shot.start_slot))
-    n_slots = int(np.ceil(shot.n_rows / shot.rows_per_slot)) + 1
+    before = int(np.floor(shot_gain.start_slot))
+    n_slots = int(np.ceil(shot_gain.n_rows / shot_gain.rows_per_slot)) + 1
     first_slot = before % packet_slots
     n_copies = -(-(first_slot + n_slots) // packet_slots)
     burst = (before // packet_slots + np.arange(n_copies)) // 3
     return Clock(
-        rows_per_slot=shot.rows_per_slot,
-        exposure_slots=shot.exposure_slots,
+        rows_per_slot=shot_gain.rows_per_slot,
+        exposure_slots=shot_gain.exposure_slots,
         packet_slots=packet_slots,
-        row0=(before - shot.start_slot) * shot.rows_per_slot,
+        row0=(before - shot_gain.start_slot) * shot_gain.rows_per_slot,
         n_slots=n_slots,
         first_slot=first_slot,
         burst=burst - burst[0],
         delay_slots=np.zeros(n_columns),
-        lock=10.0,
+        header_peak_ratio=10.0,
     )
 
 
-def true_slots(link: Link, shot: Shot, n_slots: int) -> NDArray[np.float32]:
-    before = int(np.floor(shot.start_slot))
+def true_slots(link: Link, shot_gain: Shot, n_slots: int) -> NDArray[np.float32]:
+    before = int(np.floor(shot_gain.start_slot))
     return link.slots()[:, before : before + n_slots].astype(np.float32)
 
 
-def model_for(shot: Shot, sigma: float, floor: float) -> channel.LightModel:
-    memory = channel.memory_for(shot.exposure_slots)
+def model_for(shot_gain: Shot, sigma: float, black_level: float) -> channel.LightModel:
+    isi_memory = channel.isi_memory_for(shot_gain.exposure_slots)
     return channel.LightModel(
-        floor=floor,
+        black_level=black_level,
         sigma=sigma,
-        shot=0.0,
-        spread=np.tile([shot.crosstalk, 1.0, shot.crosstalk], (shot.n_strips, 1)),
-        taps=channel.exposure_taps(shot.exposure_slots, 1 / Q, memory, Q),
+        shot_gain=0.0,
+        crosstalk=np.tile([shot_gain.crosstalk, 1.0, shot_gain.crosstalk], (shot_gain.n_strips, 1)),
+        taps=channel.exposure_taps(shot_gain.exposure_slots, 1 / Q, isi_memory, Q),
     )
 
 
-def scene(shot: Shot, seed: int, w: list[int] | None = None) -> tuple[Link, Clock, SlotSamples, channel.LightModel]:
+def scene(
+    shot_gain: Shot, seed: int, w: list[int] | None = None
+) -> tuple[Link, Clock, SlotSamples, channel.LightModel]:
     rng = np.random.default_rng(seed)
     link = random_link(rng, w or [5, 3, 7, 4, 6, 5], 5)
-    profiles = row_profiles(link, shot, rng)
-    now = true_clock(shot, link.packet_slots, len(link.w))
+    profiles = row_profiles(link, shot_gain, rng)
+    now = true_clock(shot_gain, link.packet_slots, len(link.w))
     samples = sync.sample_slots(profiles, now, Q)
-    sigma = sigma_of(profiles) / np.sqrt(max(shot.rows_per_slot / Q, 1.0))
-    return link, now, samples, model_for(shot, sigma, shot.ambient)
+    sigma = sigma_of(profiles) / np.sqrt(max(shot_gain.rows_per_slot / Q, 1.0))
+    return link, now, samples, model_for(shot_gain, sigma, shot_gain.ambient)
 
 
-def numeric_taps(exposure: float, blur: float, memory: int, q: int) -> FloatArray:
+def numeric_taps(exposure: float, blur: float, isi_memory: int, q: int) -> FloatArray:
     """Slot n covers 0..1; sample k's instants lie around -memory/2 + (k + 1/2)/q; both boxes by brute force."""
     instants = (np.arange(500) + 0.5) / 500 - 0.5
-    out = np.zeros((q, memory + 1))
+    out = np.zeros((q, isi_memory + 1))
     for k in range(q):
-        t = -memory / 2 + (k + 0.5) / q + blur * instants[:, None] + exposure * instants[None, :]
-        slot = np.floor(t).astype(int) + memory
-        inside = (slot >= 0) & (slot <= memory)
-        out[k] = np.bincount(slot[inside], minlength=memory + 1) / t.size
+        t = -isi_memory / 2 + (k + 0.5) / q + blur * instants[:, None] + exposure * instants[None, :]
+        slot = np.floor(t).astype(int) + isi_memory
+        inside = (slot >= 0) & (slot <= isi_memory)
+        out[k] = np.bincount(slot[inside], minlength=isi_memory + 1) / t.size
     return out
 
 
 @pytest.mark.parametrize("blur", [0.01, 0.25, 0.6])
-@pytest.mark.parametrize(("exposure", "memory"), [(0.05, 1), (0.5, 1), (1.08, 1), (1.08, 3), (2.2, 3), (4.0, 5)])
-def test_exposure_taps_against_numeric_integration(exposure: float, memory: int, blur: float) -> None:
-    taps = channel.exposure_taps(exposure, blur, memory, Q)
-    np.testing.assert_allclose(taps, numeric_taps(exposure, blur, memory, Q), atol=4e-3)
+@pytest.mark.parametrize(("exposure", "isi_memory"), [(0.05, 1), (0.5, 1), (1.08, 1), (1.08, 3), (2.2, 3), (4.0, 5)])
+def test_exposure_taps_against_numeric_integration(exposure: float, isi_memory: int, blur: float) -> None:
+    taps = channel.exposure_taps(exposure, blur, isi_memory, Q)
+    np.testing.assert_allclose(taps, numeric_taps(exposure, blur, isi_memory, Q), atol=4e-3)
 
 
-@pytest.mark.parametrize(("exposure", "memory"), [(0.01, 1), (0.7, 1), (2.6, 3), (4.7, 5)])
+@pytest.mark.parametrize(("exposure", "isi_memory"), [(0.01, 1), (0.7, 1), (2.6, 3), (4.7, 5)])
 @pytest.mark.parametrize("q", [1, 2, 4, 7])
-def test_exposure_taps_keep_the_energy(exposure: float, memory: int, q: int) -> None:
+def test_exposure_taps_keep_the_energy(exposure: float, isi_memory: int, q: int) -> None:
     """As long as exposure and blur fit the memory, each sample's weights add up to one, and so do each slot's."""
-    taps = channel.exposure_taps(exposure, 0.25, memory, q)
+    taps = channel.exposure_taps(exposure, 0.25, isi_memory, q)
     assert (taps >= 0).all()
     np.testing.assert_allclose(taps.sum(axis=1), 1.0, atol=1e-9)
     np.testing.assert_allclose(taps, taps[::-1, ::-1], atol=1e-9)
@@ -96,16 +98,16 @@ def test_exposure_taps_keep_the_energy(exposure: float, memory: int, q: int) -> 
 
 @pytest.mark.parametrize("exposure", [1e-6, 0.2, 1.0, 1.08, 1.3, 2.0, 2.6, 3.0, 4.0])
 def test_memory_covers_the_exposure(exposure: float) -> None:
-    memory = channel.memory_for(exposure)
-    assert memory in {1, 3, 5}
-    taps = channel.exposure_taps(exposure, 1 / Q, memory, Q)
+    isi_memory = channel.isi_memory_for(exposure)
+    assert isi_memory in {1, 3, 5}
+    taps = channel.exposure_taps(exposure, 1 / Q, isi_memory, Q)
     assert taps.sum(axis=1).min() > 0.83
-    assert channel.memory_for(exposure) <= channel.memory_for(exposure + 1.0)
+    assert channel.isi_memory_for(exposure) <= channel.isi_memory_for(exposure + 1.0)
 
 
 def test_crosstalk_of_the_specification() -> None:
     """With equal drive about 15 % of the light at a column's middle comes from its neighbours, half at its edge."""
-    shares = channel.spread_matrix(101, 0.45)
+    shares = channel.crosstalk_matrix(101, 0.45)
     np.testing.assert_allclose(shares.sum(axis=1), 1.0)
     assert shares[50, 0] + shares[50, 2] == pytest.approx(0.15, abs=0.01)
     assert shares[0, 0] == pytest.approx(0.5, abs=0.02)
@@ -114,25 +116,25 @@ def test_crosstalk_of_the_specification() -> None:
 
 
 def test_no_spread_is_no_crosstalk() -> None:
-    np.testing.assert_allclose(channel.spread_matrix(5, 0.0), np.tile([0.0, 1.0, 0.0], (5, 1)), atol=1e-12)
+    np.testing.assert_allclose(channel.crosstalk_matrix(5, 0.0), np.tile([0.0, 1.0, 0.0], (5, 1)), atol=1e-12)
 
 
 @pytest.mark.parametrize("ambient", [0.0, 0.03, 0.2])
 @pytest.mark.parametrize("exposure", [0.3, 1.08])
 def test_floor_is_the_room_light(ambient: float, exposure: float) -> None:
-    shot = Shot(ambient=ambient, exposure_slots=exposure, texture=0.3, sigma=0.003)
-    _, now, samples, _ = scene(shot, seed=1)
-    assert channel.estimate_floor(samples, now) == pytest.approx(ambient, abs=0.002)
+    shot_gain = Shot(ambient=ambient, exposure_slots=exposure, texture=0.3, sigma=0.003)
+    _, now, samples, _ = scene(shot_gain, seed=1)
+    assert channel.estimate_black_level(samples, now) == pytest.approx(ambient, abs=0.002)
 
 
 def test_sigma_is_the_noise_of_a_dark_sample() -> None:
     """Dark parts of a picture: a tenth of the light is left."""
     for sigma in (0.0005, 0.002):
-        shot = Shot(rows_per_slot=16.0, n_rows=3000, level=2e-4, sigma=sigma)
-        _, _, samples, model = scene(shot, seed=2)
-        found = channel.estimate_sigma(samples, shot.ambient, 1e-6)
+        shot_gain = Shot(rows_per_slot=16.0, n_rows=3000, level=2e-4, sigma=sigma)
+        _, _, samples, model = scene(shot_gain, seed=2)
+        found = channel.estimate_sigma(samples, shot_gain.ambient, 1e-6)
         assert found == pytest.approx(model.sigma, rel=0.2)
-        assert channel.estimate_sigma(samples, shot.ambient, 1.0) == 1.0
+        assert channel.estimate_sigma(samples, shot_gain.ambient, 1.0) == 1.0
 
 
 CLEAN = {
@@ -147,27 +149,27 @@ CLEAN = {
 @pytest.mark.parametrize("thorough", [True, False])
 @pytest.mark.parametrize("kind", CLEAN)
 def test_clean_slots_have_the_right_sign(kind: str, thorough: bool) -> None:
-    shot = replace(CLEAN[kind], start_slot=12.3)
+    shot_gain = replace(CLEAN[kind], start_slot=12.3)
     right = []
     for seed in range(6):
-        link, now, samples, model = scene(shot, seed)
-        lit = true_slots(link, shot, now.n_slots)
+        link, now, samples, model = scene(shot_gain, seed)
+        lit = true_slots(link, shot_gain, now.n_slots)
         idea = np.abs(lit - np.float32(0.1))
         found = channel.slot_likelihoods(samples, now, model, idea, np.arange(6), thorough=thorough)
-        llr = slot_odds(found.metrics, model.memory)
+        llr = slot_odds(found.metrics, model.isi_memory)
         inner = slice(3, now.n_slots - 3)
         right.append(((llr > 0) == (lit > 0.5))[:, inner].ravel())
-    assert np.concatenate(right).mean() > (0.999 if shot.crosstalk == 0 else 0.995)
+    assert np.concatenate(right).mean() > (0.999 if shot_gain.crosstalk == 0 else 0.995)
 
 
 def test_likelihoods_start_from_nothing_but_contrast() -> None:
-    shot = Shot(texture=0.3, sigma=0.005, start_slot=12.3)
-    link, now, samples, model = scene(shot, seed=3)
+    shot_gain = Shot(texture=0.3, sigma=0.005, start_slot=12.3)
+    link, now, samples, model = scene(shot_gain, seed=3)
     contrast = sync.contrast(samples.light, samples.valid, Q, model.sigma)
-    first = slot_odds(channel.first_metrics(*contrast, model.taps), model.memory)
-    lit = true_slots(link, shot, now.n_slots)
+    first = slot_odds(channel.first_metrics(*contrast, model.taps), model.isi_memory)
+    lit = true_slots(link, shot_gain, now.n_slots)
     idea = (1 / (1 + np.exp(-first))).astype(np.float32)
-    llr = slot_odds(channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics, model.memory)
+    llr = slot_odds(channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics, model.isi_memory)
     inner = slice(3, now.n_slots - 3)
     wrong_first = ((first > 0) != (lit > 0.5))[:, inner].mean()
     wrong_then = ((llr > 0) != (lit > 0.5))[:, inner].mean()
@@ -179,13 +181,13 @@ def test_likelihoods_start_from_nothing_but_contrast() -> None:
 def test_timing_tells_how_late_the_clock_is(late: float) -> None:
     found = []
     for seed in range(5):
-        shot = Shot(texture=0.2, sigma=0.005, start_slot=12.3)
+        shot_gain = Shot(texture=0.2, sigma=0.005, start_slot=12.3)
         rng = np.random.default_rng(seed)
         link = random_link(rng, [5, 3, 7, 4, 6, 5], 5)
-        profiles = row_profiles(link, shot, rng)
-        now = true_clock(shot, 70, 6)
-        model = model_for(shot, 0.005, shot.ambient)
-        lit = true_slots(link, shot, now.n_slots)
+        profiles = row_profiles(link, shot_gain, rng)
+        now = true_clock(shot_gain, 70, 6)
+        model = model_for(shot_gain, 0.005, shot_gain.ambient)
+        lit = true_slots(link, shot_gain, now.n_slots)
         off = replace(now, row0=now.row0 + late * now.rows_per_slot)
         samples = sync.sample_slots(profiles, off, Q)
         timing = channel.slot_likelihoods(samples, off, model, lit, np.arange(6)).timing
@@ -201,35 +203,35 @@ def test_timing_tells_how_late_the_clock_is(late: float) -> None:
 
 @pytest.mark.parametrize("factor", [0.3, 3.0])
 def test_brightness_does_not_matter(factor: float) -> None:
-    shot = Shot(texture=0.3, sigma=0.004, ambient=0.02, start_slot=12.3)
-    link, now, samples, model = scene(shot, seed=4)
-    lit = true_slots(link, shot, now.n_slots)
+    shot_gain = Shot(texture=0.3, sigma=0.004, ambient=0.02, start_slot=12.3)
+    link, now, samples, model = scene(shot_gain, seed=4)
+    lit = true_slots(link, shot_gain, now.n_slots)
     idea = np.abs(lit - np.float32(0.1))
     brighter = replace(samples, light=samples.light * np.float32(factor))
-    scaled = replace(model, floor=model.floor * factor, sigma=model.sigma * factor)
+    scaled = replace(model, black_level=model.black_level * factor, sigma=model.sigma * factor)
     one = slot_odds(channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics, 1)
     other = slot_odds(channel.slot_likelihoods(brighter, now, scaled, idea, np.arange(6)).metrics, 1)
     np.testing.assert_allclose(other, one, rtol=0.05, atol=0.3)
 
 
 def test_columns_asked_for_are_those_of_the_whole() -> None:
-    shot = Shot(texture=0.3, sigma=0.004, crosstalk=0.1)
-    link, now, samples, model = scene(shot, seed=5)
-    lit = true_slots(link, shot, now.n_slots)
+    shot_gain = Shot(texture=0.3, sigma=0.004, crosstalk=0.1)
+    link, now, samples, model = scene(shot_gain, seed=5)
+    lit = true_slots(link, shot_gain, now.n_slots)
     whole = channel.slot_likelihoods(samples, now, model, lit, np.arange(6))
     two = SlotSamples(samples.light[[1, 4]], samples.valid[[1, 4]], samples.samples_per_slot)
     some = channel.slot_likelihoods(two, now, model, lit, np.array([1, 4]))
     np.testing.assert_allclose(some.metrics, whole.metrics[[1, 4]], rtol=1e-5, atol=1e-4)
-    assert whole.metrics.shape == (6, now.n_slots + model.memory, 2 << model.memory)
+    assert whole.metrics.shape == (6, now.n_slots + model.isi_memory, 2 << model.isi_memory)
     assert whole.snr.shape == (6, now.n_slots)
 
 
 def test_more_noise_is_less_signal_to_noise() -> None:
     ratios = []
     for sigma in (0.001, 0.01, 0.1):
-        shot = Shot(sigma=sigma, texture=0.05)
-        link, now, samples, model = scene(shot, seed=6)
-        lit = true_slots(link, shot, now.n_slots)
+        shot_gain = Shot(sigma=sigma, texture=0.05)
+        link, now, samples, model = scene(shot_gain, seed=6)
+        lit = true_slots(link, shot_gain, now.n_slots)
         ratios.append(float(np.median(channel.slot_likelihoods(samples, now, model, lit, np.arange(6)).snr)))
     assert ratios[0] > ratios[1] > 4 * ratios[2] > 0
 
@@ -263,9 +265,9 @@ def hostile(kind: str, samples: SlotSamples) -> SlotSamples:
 def test_hostile_light_gives_finite_likelihoods(kind: str, thorough: bool, idea: float) -> None:
     _, now, samples, _ = scene(Shot(), seed=7)
     samples = hostile(kind, samples)
-    floor = channel.estimate_floor(samples, now)
-    sigma = channel.estimate_sigma(samples, floor, 1e-5)
-    model = model_for(Shot(), sigma, floor)
+    black_level = channel.estimate_black_level(samples, now)
+    sigma = channel.estimate_sigma(samples, black_level, 1e-5)
+    model = model_for(Shot(), sigma, black_level)
     lit = np.full((6, now.n_slots), idea, np.float32)
     contrast = sync.contrast(samples.light, samples.valid, Q, model.sigma)
     first = channel.first_metrics(*contrast, model.taps)
@@ -279,28 +281,28 @@ def test_hostile_light_gives_finite_likelihoods(kind: str, thorough: bool, idea:
 
 def test_metrics_of_independent_slots() -> None:
     llr = np.random.default_rng(0).normal(0, 3, (2, 30)).astype(np.float32)
-    for memory in (1, 3):
-        metrics = channel.metrics_of(llr, memory)
-        assert metrics.shape == (2, 30 + memory, 2 << memory)
-        newest = slot_patterns(memory)[:, -1] == 1
+    for isi_memory in (1, 3):
+        metrics = channel.metrics_of(llr, isi_memory)
+        assert metrics.shape == (2, 30 + isi_memory, 2 << isi_memory)
+        newest = slot_patterns(isi_memory)[:, -1] == 1
         np.testing.assert_allclose((metrics[..., newest] - metrics[..., ~newest])[:, :30].max(axis=2), llr, rtol=1e-5)
 
 
-@pytest.mark.parametrize("memory", [1, 3])
-def test_metrics_of_copies_are_added(memory: int) -> None:
+@pytest.mark.parametrize("isi_memory", [1, 3])
+def test_metrics_of_copies_are_added(isi_memory: int) -> None:
     """Four copies of seventy slots, the first from its slot 33 on; the last is another burst."""
     now = Clock(5.0, 1.0, 70, 0.0, 180, 33, np.array([0, 0, 0, 1]), np.zeros(2), 9.0)
     rng = np.random.default_rng(0)
-    metrics = rng.normal(0, 1, (2, 180 + memory, 2 << memory))
-    found = channel.by_burst(metrics, now, memory)
-    assert found.shape == (2, 2, 70 + memory, 2 << memory)
+    metrics = rng.normal(0, 1, (2, 180 + isi_memory, 2 << isi_memory))
+    found = channel.by_burst(metrics, now, isi_memory)
+    assert found.shape == (2, 2, 70 + isi_memory, 2 << isi_memory)
     at = 50  # seen in copies 0, 1 and 2, on grid slots 17, 87 and 157
     np.testing.assert_allclose(found[0, :, at], metrics[:, 17] + metrics[:, 87] + metrics[:, 157])
     early = 20  # not seen in copy 0
     np.testing.assert_allclose(found[0, :, early], metrics[:, 57] + metrics[:, 127])
     # The header after a copy tells of the copy's last slots: its first metrics are added at the end.
     np.testing.assert_allclose(found[0, :, 70], metrics[:, 37] + metrics[:, 107] + metrics[:, 177])
-    assert (found[:, :, :memory] == 0).all()
+    assert (found[:, :, :isi_memory] == 0).all()
 
 
 @pytest.mark.parametrize(("deviation", "length"), [(0.1, 0.7), (0.5, 3.0)])
@@ -340,10 +342,10 @@ def words_in_doubt(
     return np.array(places)[first], np.stack(words)[first]
 
 
-def right_words(shot: Shot, seed: int) -> list[bool]:
+def right_words(shot_gain: Shot, seed: int) -> list[bool]:
     """Of every symbol, whether the corrections like the word that was sent best."""
-    link, now, samples, model = scene(shot, seed)
-    lit = true_slots(link, shot, now.n_slots)
+    link, now, samples, model = scene(shot_gain, seed)
+    lit = true_slots(link, shot_gain, now.n_slots)
     places, words = words_in_doubt(lit, now, np.random.default_rng(seed))
     every = np.ones(words.shape[:2], bool)
     found = channel.word_corrections(samples, now, model, lit, np.arange(6), places, words, every)
@@ -367,15 +369,15 @@ def test_the_light_tells_words_apart(exposure: float) -> None:
 
 
 def test_words_are_weighed_alike_at_any_brightness_and_cut_by_the_grid() -> None:
-    shot = Shot(texture=0.3, sigma=0.02, ambient=0.02, start_slot=12.3)
-    link, now, samples, model = scene(shot, seed=9)
-    lit = true_slots(link, shot, now.n_slots)
+    shot_gain = Shot(texture=0.3, sigma=0.02, ambient=0.02, start_slot=12.3)
+    link, now, samples, model = scene(shot_gain, seed=9)
+    lit = true_slots(link, shot_gain, now.n_slots)
     every = np.argwhere(np.ones((int(now.burst.max()) + 1, 6, 5)))
     words = np.tile(np.array([[1] * 5 + [0] * 5, [1] * 4 + [0] * 5 + [1]], np.uint8), (len(every), 1, 1))
     likely = np.ones(words.shape[:2], bool)
     one = channel.word_corrections(samples, now, model, lit, np.arange(6), every, words, likely)
     brighter = replace(samples, light=samples.light * np.float32(3))
-    scaled = replace(model, floor=model.floor * 3, sigma=model.sigma * 3)
+    scaled = replace(model, black_level=model.black_level * 3, sigma=model.sigma * 3)
     other = channel.word_corrections(brighter, now, scaled, lit, np.arange(6), every, words, likely)
     assert one.shape == lit.shape
     assert np.isfinite(one).all()

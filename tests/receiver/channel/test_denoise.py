@@ -16,10 +16,10 @@ from rxcli.errors import ProfileError
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
 from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
-from rxcli.receiver import still as reception
+from rxcli.receiver import still
 from rxcli.receiver.channel import denoise, metrics_of
-from rxcli.receiver.channel.denoise import COLUMN_FEATURES, STRIP_FEATURES, Scene, load_denoiser, network_inputs
-from rxcli.receiver.locate import Stages, find_camera, find_corners, find_lock
+from rxcli.receiver.channel.denoise import COLUMN_FEATURES, STRIP_FEATURES, DenoiserInput, load_denoiser, network_inputs
+from rxcli.receiver.locate import Stages, acquire, find_camera, find_corners
 from rxcli.resources import data_dir
 from rxcli.results.truth import Score
 from rxcli.types import Clock, FrameResult, SlotSamples
@@ -46,32 +46,32 @@ def through_exposure(slots: np.ndarray, exposure: float) -> np.ndarray:
     return np.where((index < 0) | (index >= n), 0.5, values).mean(axis=2)
 
 
-def scene_of(slots: np.ndarray, rng: np.random.Generator, *, noise: float = 0.005, rows: float = 0.0) -> Scene:
+def scene_of(slots: np.ndarray, rng: np.random.Generator, *, noise: float = 0.005, rows: float = 0.0) -> DenoiserInput:
     """Columns in front of a slowly changing picture, rightly believed; every row with an offset of its own."""
     shape = through_exposure(slots, EXPOSURE)
     place = (np.arange(N_STRIPS) + 0.5) / N_STRIPS - 0.5
-    spread = np.exp(-((place[:, None] - np.arange(-1, 2)) ** 2) / (2 * 0.45**2))
+    crosstalk = np.exp(-((place[:, None] - np.arange(-1, 2)) ** 2) / (2 * 0.45**2))
     around = np.pad(shape, ((1, 1), (0, 0)))
-    light = sum(spread[None, :, k, None] * around[k : k + len(slots), None] for k in range(3))
+    light = sum(crosstalk[None, :, k, None] * around[k : k + len(slots), None] for k in range(3))
     picture = 0.3 + 0.1 * np.sin(np.arange(shape.shape[1]) / 90 + place[:, None] * 5)
     light = 0.01 + light * picture + noise * rng.standard_normal(light.shape)
     light += rows * rng.standard_normal(light.shape[-1])
     clock = Clock(5.0, EXPOSURE, PACKET, 0.0, slots.shape[1], 0, np.zeros(2, np.int64), np.zeros(len(slots)), 9.0)
-    return Scene(
+    return DenoiserInput(
         samples=SlotSamples(light.astype(np.float32), np.ones(light.shape, np.float32), Q),
         clock=clock,
         lit=slots.astype(np.float32),
         metrics=metrics_of(9.0 * (2.0 * slots - 1), 1),
         w=np.full(len(slots), W),
-        floor=0.01,
+        black_level=0.01,
         sigma=noise,
-        shot=1e-6,
-        spread=spread,
+        shot_gain=1e-6,
+        crosstalk=crosstalk,
     )
 
 
 @pytest.fixture
-def scene() -> Scene:
+def scene() -> DenoiserInput:
     rng = np.random.default_rng(3)
     return scene_of(sent(rng), rng)
 
@@ -92,7 +92,7 @@ def column_feature(columns: np.ndarray, name: str) -> np.ndarray:
     return columns[:, sum(widths(COLUMN_FEATURES)[: COLUMN_FEATURES.index(name)])]
 
 
-def test_the_contract_names_every_feature(scene: Scene) -> None:
+def test_the_contract_names_every_feature(scene: DenoiserInput) -> None:
     strips, columns = network_inputs(scene, np.array([0, 2]))
     n_named = [sum(widths(names)) for names in (STRIP_FEATURES, COLUMN_FEATURES)]
     assert strips.shape == (2, N_STRIPS, n_named[0], 2 * PACKET)
@@ -101,7 +101,7 @@ def test_the_contract_names_every_feature(scene: Scene) -> None:
     assert np.isfinite(strips).all()
 
 
-def test_headers_are_known_and_no_other_slot(scene: Scene) -> None:
+def test_headers_are_known_and_no_other_slot(scene: DenoiserInput) -> None:
     _, columns = network_inputs(scene, np.array([1]))
     np.testing.assert_array_equal(columns[0, 0, :10], 2 * np.array(HEADER) - 1)
     np.testing.assert_array_equal(columns[0, 0, PACKET : PACKET + 10], 2 * np.array(HEADER) - 1)
@@ -109,39 +109,39 @@ def test_headers_are_known_and_no_other_slot(scene: Scene) -> None:
     np.testing.assert_array_equal(columns[0, 1:11].argmax(axis=0), np.arange(2 * PACKET) % 10)
 
 
-def test_neighbours_light_is_slots_through_the_exposure(scene: Scene) -> None:
+def test_neighbours_light_is_slots_through_the_exposure(scene: DenoiserInput) -> None:
     strips, _ = network_inputs(scene, np.array([0, 1]))
     shape = through_exposure(scene.lit, EXPOSURE).reshape(N_COLUMNS, -1, Q)
-    expected = scene.spread[:, 0, None, None] * shape[0] + scene.spread[:, 2, None, None] * shape[2]
+    expected = scene.crosstalk[:, 0, None, None] * shape[0] + scene.crosstalk[:, 2, None, None] * shape[2]
     np.testing.assert_allclose(np.moveaxis(feature(strips, "neighbours[4]")[1], 1, 2), expected, atol=0.02)
-    alone = scene.spread[:, 2, None, None] * shape[1]
+    alone = scene.crosstalk[:, 2, None, None] * shape[1]
     np.testing.assert_allclose(np.moveaxis(feature(strips, "neighbours[4]")[0], 1, 2), alone, atol=0.02)
 
 
-def test_shares_count_up_to_a_factor(scene: Scene) -> None:
-    shares = replace(scene, spread=scene.spread / scene.spread.sum(axis=1, keepdims=True))
+def test_shares_count_up_to_a_factor(scene: DenoiserInput) -> None:
+    shares = replace(scene, crosstalk=scene.crosstalk / scene.crosstalk.sum(axis=1, keepdims=True))
     np.testing.assert_allclose(
         network_inputs(shares, np.array([1]))[0], network_inputs(scene, np.array([1]))[0], atol=1e-5
     )
-    alone = replace(scene, spread=np.array([[0.0, 1.0, 0.0]] * N_STRIPS))
+    alone = replace(scene, crosstalk=np.array([[0.0, 1.0, 0.0]] * N_STRIPS))
     assert feature(network_inputs(alone, np.array([1]))[0], "neighbours[4]").max() < 1e-6
 
 
-def test_delayed_neighbours_move(scene: Scene) -> None:
+def test_delayed_neighbours_move(scene: DenoiserInput) -> None:
     delayed = replace(scene, clock=replace(scene.clock, delay_slots=np.array([1.0, 0.0, 1.0])))
     on_time = feature(network_inputs(scene, np.array([1]))[0], "neighbours[4]")
     late = feature(network_inputs(delayed, np.array([1]))[0], "neighbours[4]")
     np.testing.assert_allclose(late[..., 1:], on_time[..., :-1], atol=1e-5)
 
 
-def test_own_light_is_the_columns_slots_through_the_exposure(scene: Scene) -> None:
+def test_own_light_is_the_columns_slots_through_the_exposure(scene: DenoiserInput) -> None:
     strips, _ = network_inputs(scene, np.array([1]))
     shape = through_exposure(scene.lit, EXPOSURE)[1].reshape(-1, Q)
-    expected = scene.spread[:, 1, None, None] * shape
+    expected = scene.crosstalk[:, 1, None, None] * shape
     np.testing.assert_allclose(np.moveaxis(feature(strips, "own[4]")[0], 1, 2), expected, atol=0.02)
 
 
-def test_right_beliefs_leave_noise_alone(scene: Scene) -> None:
+def test_right_beliefs_leave_noise_alone(scene: DenoiserInput) -> None:
     strips, _ = network_inputs(scene, np.arange(N_COLUMNS))
     inner = feature(strips, "residual[4]")[..., 5:-5]
     assert abs(inner.mean()) < 0.1
@@ -149,7 +149,7 @@ def test_right_beliefs_leave_noise_alone(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("sent_state", [0, 1])
-def test_a_wrong_belief_stands_out(scene: Scene, sent_state: int) -> None:
+def test_a_wrong_belief_stands_out(scene: DenoiserInput, sent_state: int) -> None:
     """Light where the slot is believed dark, and the reverse."""
     slot = 20 + int(np.flatnonzero(scene.lit[1, 20:] == sent_state)[5])
     lit = scene.lit.copy()
@@ -165,7 +165,7 @@ def test_what_all_columns_show_at_one_instant_is_taken_off() -> None:
     slots = np.concatenate([sent(rng) for _ in range(4)])
     rows = 0.008
     scene = scene_of(slots, rng, rows=rows)
-    taken = scene.samples.light - denoise.without_row_light(scene).samples.light
+    taken = scene.samples.light - denoise.remove_row_noise(scene).samples.light
     own = np.random.default_rng(8)
     _ = [sent(own) for _ in range(4)]
     own.standard_normal(scene.samples.light.shape)
@@ -174,42 +174,42 @@ def test_what_all_columns_show_at_one_instant_is_taken_off() -> None:
     left = (true - taken)[..., inner]
     assert left.std() < 0.6 * true[inner].std()
     calm = scene_of(slots, rng)
-    spoiled = calm.samples.light - denoise.without_row_light(calm).samples.light
+    spoiled = calm.samples.light - denoise.remove_row_noise(calm).samples.light
     assert spoiled[..., inner].std() < 0.3 * rows
 
 
-def test_one_column_alone_has_no_row_light_to_tell(scene: Scene) -> None:
+def test_one_column_alone_has_no_row_light_to_tell(scene: DenoiserInput) -> None:
     alone = scene_of(scene.lit[:1], np.random.default_rng(1))
-    np.testing.assert_array_equal(denoise.without_row_light(alone).samples.light, alone.samples.light)
+    np.testing.assert_array_equal(denoise.remove_row_noise(alone).samples.light, alone.samples.light)
 
 
 def test_slots_that_are_independent_keep_their_ratio() -> None:
     llr = np.random.default_rng(1).normal(0, 3, (2, 50)).astype(np.float32)
-    for memory in (1, 3):
-        found = denoise._slot_llr(metrics_of(llr, memory), np.full(llr.shape, 0.5, np.float32))
+    for isi_memory in (1, 3):
+        found = denoise._slot_llr(metrics_of(llr, isi_memory), np.full(llr.shape, 0.5, np.float32))
         np.testing.assert_allclose(found, llr, atol=1e-4)
 
 
-@pytest.mark.parametrize("memory", [1, 3])
-def test_ratios_of_slots_by_brute_force(memory: int) -> None:
+@pytest.mark.parametrize("isi_memory", [1, 3])
+def test_ratios_of_slots_by_brute_force(isi_memory: int) -> None:
     """With all others known, a slot's ratio is a difference of sums of metrics."""
-    rng = np.random.default_rng(memory)
+    rng = np.random.default_rng(isi_memory)
     n = 12
-    metrics, slots = rng.normal(0, 2, (1, n + memory, 2 << memory)), rng.integers(0, 2, n)
+    metrics, slots = rng.normal(0, 2, (1, n + isi_memory, 2 << isi_memory)), rng.integers(0, 2, n)
 
     def total(states: np.ndarray) -> float:
-        padded = np.pad(states, memory)
-        index = [int("".join(map(str, padded[i : i + memory + 1])), 2) for i in range(n + memory)]
-        return float(metrics[0, np.arange(n + memory), index].sum())
+        padded = np.pad(states, isi_memory)
+        index = [int("".join(map(str, padded[i : i + isi_memory + 1])), 2) for i in range(n + isi_memory)]
+        return float(metrics[0, np.arange(n + isi_memory), index].sum())
 
     lit = np.where(slots == 1, 1 - 1e-5, 1e-5)[None].astype(np.float32)
     found = denoise._slot_llr(metrics, lit)[0]
-    for slot in range(memory, n - memory):
+    for slot in range(isi_memory, n - isi_memory):
         lit_there, dark_there = (np.where(np.arange(n) == slot, state, slots) for state in (1, 0))
         assert found[slot] == pytest.approx(total(lit_there) - total(dark_there), abs=1e-2)
 
 
-def test_only_the_own_belief_and_the_neighbours_are_looked_at(scene: Scene) -> None:
+def test_only_the_own_belief_and_the_neighbours_are_looked_at(scene: DenoiserInput) -> None:
     lit = scene.lit.copy()
     lit[0] = 1 - lit[0]
     far, near = (np.array([column]) for column in (2, 1))
@@ -220,14 +220,14 @@ def test_only_the_own_belief_and_the_neighbours_are_looked_at(scene: Scene) -> N
     assert np.abs(feature(after, name) - feature(before, name)).max() > 0.1
 
 
-def test_brightness_does_not_matter(scene: Scene) -> None:
+def test_brightness_does_not_matter(scene: DenoiserInput) -> None:
     """Twice the light with twice the noise is the same scene."""
     twice = replace(
         scene,
         samples=replace(scene.samples, light=2 * scene.samples.light),
-        floor=2 * scene.floor,
+        black_level=2 * scene.black_level,
         sigma=2 * scene.sigma,
-        shot=2 * scene.shot,
+        shot_gain=2 * scene.shot_gain,
     )
     columns = np.arange(N_COLUMNS)
     np.testing.assert_allclose(network_inputs(twice, columns)[0], network_inputs(scene, columns)[0], atol=1e-4)
@@ -274,7 +274,7 @@ def test_shipped_models_contradict_wrong_beliefs(name: str) -> None:
     assert towards[wrong].mean() > towards[~wrong].mean() + 0.5
 
 
-def test_slots_that_are_not_seen_and_preambles_are_left_alone(scene: Scene) -> None:
+def test_slots_that_are_not_seen_and_preambles_are_left_alone(scene: DenoiserInput) -> None:
     valid = scene.samples.valid.copy()
     valid[..., : 26 * Q] = 0
     hidden = replace(scene, samples=replace(scene.samples, valid=valid))
@@ -284,18 +284,20 @@ def test_slots_that_are_not_seen_and_preambles_are_left_alone(scene: Scene) -> N
     assert corrections[:, 26:PACKET].all()
 
 
-def test_columns_and_the_order_of_strips_do_not_touch_each_other(scene: Scene) -> None:
+def test_columns_and_the_order_of_strips_do_not_touch_each_other(scene: DenoiserInput) -> None:
     denoiser = load_denoiser()
     together = denoiser.slot_corrections(scene, np.array([0, 1, 2]))
     alone = denoiser.slot_corrections(scene, np.array([2]))
     np.testing.assert_allclose(together[2], alone[0], atol=1e-3)
     order = np.array([3, 0, 4, 1, 2])
     samples = SlotSamples(scene.samples.light[:, order], scene.samples.valid[:, order], Q)
-    mixed = denoiser.slot_corrections(replace(scene, samples=samples, spread=scene.spread[order]), np.array([0, 1, 2]))
+    mixed = denoiser.slot_corrections(
+        replace(scene, samples=samples, crosstalk=scene.crosstalk[order]), np.array([0, 1, 2])
+    )
     np.testing.assert_allclose(mixed, together, atol=1e-2)
 
 
-def test_the_session_is_made_when_first_needed_and_once(scene: Scene) -> None:
+def test_the_session_is_made_when_first_needed_and_once(scene: DenoiserInput) -> None:
     denoiser = load_denoiser()
     assert "_session" not in vars(denoiser)
     denoiser.slot_corrections(scene, np.array([0]))
@@ -363,13 +365,13 @@ def test_cards_are_strict(model: Path, old: str, new: str) -> None:
         load_denoiser(str(model))
 
 
-def test_what_is_no_network_is_refused_when_it_is_needed(model: Path, scene: Scene) -> None:
+def test_what_is_no_network_is_refused_when_it_is_needed(model: Path, scene: DenoiserInput) -> None:
     replace_weights(model, b"not a network")
     with pytest.raises(ProfileError, match="ONNX Runtime refuses it"):
         load_denoiser(str(model)).slot_corrections(scene, np.array([0]))
 
 
-def test_a_foreign_network_is_refused(model: Path, scene: Scene) -> None:
+def test_a_foreign_network_is_refused(model: Path, scene: DenoiserInput) -> None:
     onnx = pytest.importorskip("onnx", reason="onnx (extra train) makes the foreign network")
     tensor = onnx.helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, [1, 3, None, None])
     out = onnx.helper.make_tensor_value_info("label", onnx.TensorProto.FLOAT, [1, 3, None, None])
@@ -428,7 +430,7 @@ def test_the_receiver_goes_on_without_a_broken_model(trials: dict[str, Trial], m
     def broken() -> denoise.Denoiser:
         raise ProfileError("models/strips/model.onnx: does not match its checksum", "install the package again")
 
-    monkeypatch.setattr(reception, "_denoiser", broken)
+    monkeypatch.setattr(still, "_denoiser", broken)
     auto, _ = received(trials["hard"], "auto")
     assert packets(auto) == packets(never)
     assert auto.denoiser is not None
@@ -439,13 +441,13 @@ def test_columns_beyond_repair_are_not_asked(trials: dict[str, Trial]) -> None:
     options = trials["hard"].options()
     corners = find_corners(trials["hard"].frame, options)
     camera, options = find_camera(trials["hard"].frame, corners, options, Stages())
-    lock = find_lock(trials["hard"].frame, corners, camera, options, Stages())
-    seen = reception.decode(lock, options.skip)
-    better, kept, report = reception.second_opinion(lock, seen, options)
+    lock = acquire(trials["hard"].frame, corners, camera, options, Stages())
+    seen = still.decode(lock, options.skip)
+    better, kept, report = still.apply_autoencoder(lock, seen, options)
     assert report is not None
     assert report["kept"] == len(kept) > 0
     columns = sorted(kept)
     doubt = [-part.posteriors.log_prob[:, columns].sum(axis=(0, 2)) for part in (seen, better)]
     assert (doubt[1] < doubt[0]).all()
     guessed = replace(seen.posteriors, log_prob=np.full_like(seen.posteriors.log_prob, -2.0))
-    assert reception.second_opinion(lock, replace(seen, posteriors=guessed), options)[2] is None
+    assert still.apply_autoencoder(lock, replace(seen, posteriors=guessed), options)[2] is None

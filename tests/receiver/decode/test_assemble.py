@@ -25,7 +25,7 @@ def clock_of(n_slots: int, first_slot: int, burst: list[int], n_columns: int = 2
         first_slot=first_slot,
         burst=np.array(burst),
         delay_slots=np.array([0.0, 1.5, 0.0, 0.0][:n_columns]),
-        lock=5.0,
+        header_peak_ratio=5.0,
     )
 
 
@@ -68,17 +68,17 @@ def snr(n_slots: int, value: float = 100.0, n_columns: int = 2) -> NDArray[np.fl
 
 
 def results_of(
-    now: Clock,
+    clock: Clock,
     posteriors: BurstPosteriors,
     snr: NDArray[np.float32],
     samples: SlotSamples,
     min_confidence: float = 0.0,
-    support: float | NDArray[np.float32] = 10.0,
+    slot_margin: float | NDArray[np.float32] = 10.0,
 ) -> tuple[ColumnResult, ...]:
     """Results where every slot of the grid has the same support unless told otherwise."""
-    told = np.broadcast_to(np.asarray(support, np.float32), snr.shape)
+    was_denoised = np.broadcast_to(np.asarray(slot_margin, np.float32), snr.shape)
     headerless = assemble.without_header(posteriors)
-    return assemble.column_results(now, posteriors, snr, samples, told, headerless, min_confidence)
+    return assemble.column_results(clock, posteriors, snr, samples, was_denoised, headerless, min_confidence)
 
 
 def test_a_sure_packet() -> None:
@@ -112,8 +112,8 @@ def test_first_row_is_where_the_exposure_of_the_header_starts() -> None:
 
 def test_one_entry_a_burst_in_time_order() -> None:
     index = indices([5, 5], n_bursts=2)
-    now = clock_of(180, 0, [0, 0, 1, 1])
-    columns = results_of(now, posteriors_of([5, 5], index), snr(180), samples_of(180), 0)
+    clock = clock_of(180, 0, [0, 0, 1, 1])
+    columns = results_of(clock, posteriors_of([5, 5], index), snr(180), samples_of(180), 0)
     for column, result in enumerate(columns):
         payloads = [bits_to_hex(indices_to_bits(index[burst, column], 5)) for burst in range(2)]
         assert [packet.payload for packet in result.packets] == payloads
@@ -123,9 +123,9 @@ def test_one_entry_a_burst_in_time_order() -> None:
 
 def test_a_payload_slot_that_was_never_seen_is_no_packet() -> None:
     """37 slots of the second burst are seen: some of its payload is not."""
-    now = clock_of(137, 0, [0, 0, 1])
+    clock = clock_of(137, 0, [0, 0, 1])
     index = indices([5, 5], n_bursts=2)
-    columns = results_of(now, posteriors_of([5, 5], index), snr(137), samples_of(137), 0)
+    columns = results_of(clock, posteriors_of([5, 5], index), snr(137), samples_of(137), 0)
     assert [len(c.packets) for c in columns] == [1, 1]
 
 
@@ -136,15 +136,15 @@ def test_a_cut_copy_completes_another() -> None:
 
 
 def test_slots_off_the_screen_are_not_seen() -> None:
-    now, samples = clock_of(60, 0, [0, 0]), samples_of(60)
+    clock, samples = clock_of(60, 0, [0, 0]), samples_of(60)
     valid = samples.valid.copy()
     valid[0, :, 30 * Q : 32 * Q] = 0
     valid[1, 0, 30 * Q : 32 * Q] = 0
     samples = replace(samples, valid=valid)
-    columns = results_of(now, posteriors_of([5, 5], indices([5, 5])), snr(60), samples, 0)
+    columns = results_of(clock, posteriors_of([5, 5], indices([5, 5])), snr(60), samples, 0)
     assert [len(c.packets) for c in columns] == [0, 1]
-    assert assemble.slots_seen(samples, now)[0, 0, 28:34].tolist() == [1, 1, 0, 0, 1, 1]
-    assert assemble.slots_seen(samples, now)[0, 1, :12].tolist() == [2] * 10 + [1] * 2
+    assert assemble.slots_observed(samples, clock)[0, 0, 28:34].tolist() == [1, 1, 0, 0, 1, 1]
+    assert assemble.slots_observed(samples, clock)[0, 1, :12].tolist() == [2] * 10 + [1] * 2
 
 
 @pytest.mark.parametrize(("min_confidence", "n_packets"), [(0.0, 1), (0.6, 1), (0.99, 0), (1.0, 0)])
@@ -188,13 +188,13 @@ def test_confidence_grows_with_the_log_probability_and_stays_below_one() -> None
 
 def test_slots_that_speak_against_a_packet_make_it_less_sure() -> None:
     """Slots of its own payload only: the header, dimming symbol and other bursts have no say."""
-    now = clock_of(180, 0, [0, 0, 1, 1])
+    clock = clock_of(180, 0, [0, 0, 1, 1])
     posteriors = posteriors_of([5, 5], indices([5, 5], n_bursts=2))
 
     def confidences(slots: list[int]) -> list[float]:
-        support = np.full((2, 180), 10.0, np.float32)
-        support[0, slots] = -9.0
-        (first, _) = results_of(now, posteriors, snr(180), samples_of(180), support=support)
+        slot_margin = np.full((2, 180), 10.0, np.float32)
+        slot_margin[0, slots] = -9.0
+        (first, _) = results_of(clock, posteriors, snr(180), samples_of(180), slot_margin=slot_margin)
         return [packet.confidence for packet in first.packets]
 
     sure = confidences([])
@@ -206,10 +206,12 @@ def test_slots_that_speak_against_a_packet_make_it_less_sure() -> None:
 
 def test_the_more_strips_a_column_has_the_less_its_posterior_counts() -> None:
     """Strips err together: each adds to the posterior what it says alone."""
-    w, support = [5], np.full((1, 1, PACKET), 10.0, np.float32)
+    w, slot_margin = [5], np.full((1, 1, PACKET), 10.0, np.float32)
     sure = posteriors_of(w, indices(w), 0.999)
     found = [
-        float(assemble.confidence(assemble.evidence(sure, support, np.zeros(1, bool), n_strips)).squeeze())
+        float(
+            assemble.confidence(assemble.confidence_features(sure, slot_margin, np.zeros(1, bool), n_strips)).squeeze()
+        )
         for n_strips in (1, 2, 4, 7)
     ]
     assert 1 > found[0] > found[1] > found[2] > found[3] > 0.9
@@ -229,9 +231,9 @@ def test_a_header_that_is_contradicted_stands_for_no_packet() -> None:
 
 def test_nothing_decoded_says_why() -> None:
     unsure = posteriors_of([5, 5], indices([5, 5]), probability=0.5001)
-    now, samples = clock_of(120, 0, [0, 0, 0]), samples_of(120)
+    clock, samples = clock_of(120, 0, [0, 0, 0]), samples_of(120)
     light = np.stack([snr(120)[0], snr(120, 0.01)[0]])
-    bright, dark = results_of(now, unsure, light, samples, 0)
+    bright, dark = results_of(clock, unsure, light, samples, 0)
     assert (bright.status, dark.status) == ("no_packet", "dark")
     assert bright.message is not None
     assert "20.0 dB" in bright.message
@@ -300,12 +302,12 @@ def test_frame_status(columns: list[ColumnResult], expected: str) -> None:
 def test_a_column_that_shows_its_neighbour_has_no_packet(
     same: tuple[int, ...], quieter: int, expected: list[int]
 ) -> None:
-    now = clock_of(2 * PACKET, 0, [0, 0], n_columns=4)
+    clock = clock_of(2 * PACKET, 0, [0, 0], n_columns=4)
     w = [4, 4, 4, 4]
     index = np.arange(4 * N_SYMBOLS).reshape(1, 4, N_SYMBOLS)
     index[:, list(same)] = 50
-    snr = np.full((4, now.n_slots), 100.0, np.float32)
+    snr = np.full((4, clock.n_slots), 100.0, np.float32)
     snr[quieter] = 30.0
-    results = results_of(now, posteriors_of(w, index), snr, samples_of(now.n_slots, 4), 0.0)
+    results = results_of(clock, posteriors_of(w, index), snr, samples_of(clock.n_slots, 4), 0.0)
     assert [c.column for c in results if not c.packets] == expected
     assert all("the column beside it" in (results[column].message or "") for column in expected)

@@ -22,10 +22,10 @@ from rxcli.receiver.channel import metrics_of
 from rxcli.receiver.decode.detect import (
     detect,
     detect_with_words,
-    first_guess,
+    first_decision_of,
     plausible_weights,
-    slot_support,
-    weight_evidence,
+    slot_margin,
+    weight_log_evidence,
 )
 
 FloatArray = NDArray[np.float64]
@@ -46,29 +46,29 @@ def sequences(w: int, n_symbols: int) -> NDArray[np.int64]:
     return np.array(list(product(range(1 << bits_per_symbol(w)), repeat=n_symbols)))
 
 
-def packet_and_next(indices: NDArray[np.int64], w: int, memory: int) -> NDArray[np.int64]:
+def packet_and_next(indices: NDArray[np.int64], w: int, isi_memory: int) -> NDArray[np.int64]:
     """Slots of packets (n, N indices) and of the header's start after them."""
     n = indices.shape[0]
     known = np.tile(np.concatenate([HEADER, dimming_symbol(w)]), (n, 1))
     payload = codebook(w)[indices].reshape(n, -1)
-    return np.concatenate([known, payload, np.tile(HEADER[:memory], (n, 1))], axis=1).astype(np.int64)
+    return np.concatenate([known, payload, np.tile(HEADER[:isi_memory], (n, 1))], axis=1).astype(np.int64)
 
 
 def path_metrics(metrics: FloatArray, indices: NDArray[np.int64], w: int) -> FloatArray:
     """Log-likelihood of every sequence of `indices` (n, N), slot by slot; metrics (L, patterns)."""
-    memory = metrics.shape[1].bit_length() - 2
-    slots = packet_and_next(indices, w, memory)
+    isi_memory = metrics.shape[1].bit_length() - 2
+    slots = packet_and_next(indices, w, isi_memory)
     total = np.zeros(len(indices))
-    for i in range(memory, slots.shape[1]):
-        pattern = sum(slots[:, i - back] << back for back in range(memory + 1))
+    for i in range(isi_memory, slots.shape[1]):
+        pattern = sum(slots[:, i - back] << back for back in range(isi_memory + 1))
         total += metrics[i, pattern]
     return total
 
 
-def box_exposure(exposure_slots: float, memory: int, n_samples: int = 4) -> FloatArray:
+def box_exposure(exposure_slots: float, isi_memory: int, n_samples: int = 4) -> FloatArray:
     """(n_samples, memory + 1) share of each slot in samples spread over one slot, in the middle of the pattern."""
-    start = np.arange(-memory, 1.0)
-    centre = -memory / 2 + (np.arange(n_samples)[:, None] + 0.5) / n_samples
+    start = np.arange(-isi_memory, 1.0)
+    centre = -isi_memory / 2 + (np.arange(n_samples)[:, None] + 0.5) / n_samples
     end = np.minimum(centre + exposure_slots / 2, start + 1)
     return np.maximum(end - np.maximum(centre - exposure_slots / 2, start), 0) / exposure_slots
 
@@ -81,10 +81,10 @@ def gaussian_metrics(observed: FloatArray, taps: FloatArray, sigma: float) -> Fl
 
 def observe(indices: NDArray[np.int64], w: int, taps: FloatArray, sigma: float, rng: np.random.Generator) -> FloatArray:
     """Observations (1, n, L, Q) of packets (n, N indices) through `taps` (Q, memory + 1) and white noise."""
-    memory = taps.shape[1] - 1
-    slots = packet_and_next(indices, w, memory)
-    before = rng.integers(0, 2, (slots.shape[0], memory))
-    windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([before, slots], axis=1), memory + 1, axis=1)
+    isi_memory = taps.shape[1] - 1
+    slots = packet_and_next(indices, w, isi_memory)
+    before = rng.integers(0, 2, (slots.shape[0], isi_memory))
+    windows = np.lib.stride_tricks.sliding_window_view(np.concatenate([before, slots], axis=1), isi_memory + 1, axis=1)
     clean = windows @ taps.T
     return (clean + rng.normal(0, sigma, clean.shape))[None]
 
@@ -97,21 +97,21 @@ def sent_through(
 
 
 @pytest.mark.parametrize(
-    ("w", "n_symbols", "memory"),
+    ("w", "n_symbols", "isi_memory"),
     [(1, 3, 1), (9, 3, 1), (2, 2, 1), (8, 2, 3), (1, 3, 3), (2, 2, 3), (9, 2, 5), (5, 1, 3)],
 )
-def test_agrees_with_enumeration_of_all_sequences(w: int, n_symbols: int, memory: int) -> None:
-    rng = np.random.default_rng([w, n_symbols, memory])
-    metrics = rng.normal(0, 1.5, (1, 4, 20 + 10 * n_symbols + memory, 2 << memory))
+def test_agrees_with_enumeration_of_all_sequences(w: int, n_symbols: int, isi_memory: int) -> None:
+    rng = np.random.default_rng([w, n_symbols, isi_memory])
+    metrics = rng.normal(0, 1.5, (1, 4, 20 + 10 * n_symbols + isi_memory, 2 << isi_memory))
     found = detect(metrics, only(w, 4))
-    evidence = weight_evidence(metrics, only(w, 4))
+    confidence_features = weight_log_evidence(metrics, only(w, 4))
     every = sequences(w, n_symbols)
     k = bits_per_symbol(w)
     bits = indices_to_bits(every.ravel(), w).reshape(len(every), n_symbols, k)
     for column in range(4):
         paths = path_metrics(metrics[0, column], every, w)
         total = log_sum(paths)
-        assert evidence[column, w - 1] == pytest.approx(total - n_symbols * k * log(2), abs=2e-3)
+        assert confidence_features[column, w - 1] == pytest.approx(total - n_symbols * k * log(2), abs=2e-3)
         share = np.exp(paths - total)
         for symbol in range(n_symbols):
             posterior = np.bincount(every[:, symbol], share, 1 << k)
@@ -126,21 +126,23 @@ def test_agrees_with_enumeration_of_all_sequences(w: int, n_symbols: int, memory
             assert np.isnan(found.bit_llr[0, column, symbol, k:]).all()
 
 
-@pytest.mark.parametrize("memory", [1, 3])
-def test_weight_probabilities_agree_with_enumeration(memory: int) -> None:
-    rng = np.random.default_rng(memory)
-    metrics = rng.normal(0, 0.4, (2, 3, 30 + memory, 2 << memory))
+@pytest.mark.parametrize("isi_memory", [1, 3])
+def test_weight_probabilities_agree_with_enumeration(isi_memory: int) -> None:
+    rng = np.random.default_rng(isi_memory)
+    metrics = rng.normal(0, 0.4, (2, 3, 30 + isi_memory, 2 << isi_memory))
     found = detect(metrics)
     for column in range(3):
-        evidence = np.array(
+        confidence_features = np.array(
             [
                 sum(log_sum(path_metrics(burst[column], sequences(w, 1), w)) for burst in metrics)
                 - 2 * bits_per_symbol(w) * log(2)
                 for w in WEIGHTS
             ]
         )
-        np.testing.assert_allclose(found.w_log_prob[column], evidence - log_sum(evidence), atol=2e-3)
-        assert found.w[column] == evidence.argmax() + 1
+        np.testing.assert_allclose(
+            found.w_log_prob[column], confidence_features - log_sum(confidence_features), atol=2e-3
+        )
+        assert found.w[column] == confidence_features.argmax() + 1
 
 
 def test_what_is_known_of_a_packet_is_lit_as_sent() -> None:
@@ -208,17 +210,17 @@ def test_posteriors_are_calibrated(taps: FloatArray, sigma: float) -> None:
         assert claimed.min() < 0.7 < 0.99 < claimed.max()
         for low, high in ((0.0, 0.5), (0.5, 0.7), (0.7, 0.9), (0.9, 0.99), (0.99, 1.01)):
             inside = (claimed >= low) & (claimed < high)
-            spread = sqrt(max(float((claimed * (1 - claimed))[inside].sum()), 1.0))
-            assert abs(float(true[inside].sum() - claimed[inside].sum())) < 4.5 * spread
+            crosstalk = sqrt(max(float((claimed * (1 - claimed))[inside].sum()), 1.0))
+            assert abs(float(true[inside].sum() - claimed[inside].sum())) < 4.5 * crosstalk
 
 
-@pytest.mark.parametrize(("exposure_slots", "memory"), [(0.4, 1), (1.08, 1), (2.0, 3), (4.0, 5)])
+@pytest.mark.parametrize(("exposure_slots", "isi_memory"), [(0.4, 1), (1.08, 1), (2.0, 3), (4.0, 5)])
 @pytest.mark.parametrize("w", WEIGHTS)
-def test_the_true_weight_is_never_dropped(w: int, exposure_slots: float, memory: int) -> None:
-    rng = np.random.default_rng([w, memory])
+def test_the_true_weight_is_never_dropped(w: int, exposure_slots: float, isi_memory: int) -> None:
+    rng = np.random.default_rng([w, isi_memory])
     tx = rng.integers(0, 1 << bits_per_symbol(w), (100, 5))
     for sigma in (0.05, 0.3):
-        kept = plausible_weights(sent_through(tx, w, box_exposure(exposure_slots, memory), sigma, rng), 20.0)
+        kept = plausible_weights(sent_through(tx, w, box_exposure(exposure_slots, isi_memory), sigma, rng), 20.0)
         assert kept[:, w - 1].all()
 
 
@@ -236,34 +238,34 @@ def test_hopeless_weights_are_dropped_and_a_wide_margin_keeps_all() -> None:
     assert plausible_weights(metrics, 1e9).all()
 
 
-@pytest.mark.parametrize("memory", [1, 3])
-def test_the_first_guess_is_exact_where_slots_are_independent(memory: int) -> None:
-    rng = np.random.default_rng(memory)
+@pytest.mark.parametrize("isi_memory", [1, 3])
+def test_the_first_guess_is_exact_where_slots_are_independent(isi_memory: int) -> None:
+    rng = np.random.default_rng(isi_memory)
     w = np.array([3, 5, 8])
     tx = np.stack([packet_and_next(rng.integers(0, 1 << bits_per_symbol(i), (1, 4)), i, 0)[0] for i in w])
     llr = (4 * (2 * tx - 1) + rng.normal(0, 3, (2, *tx.shape))).astype(np.float32)
-    metrics = np.stack([metrics_of(burst, memory) for burst in llr])
-    guess = first_guess(metrics)
+    metrics = np.stack([metrics_of(burst, isi_memory) for burst in llr])
+    guess = first_decision_of(metrics)
     found = detect(metrics, np.array(WEIGHTS) == w[:, None])
     np.testing.assert_allclose(guess, found.lit, atol=1e-4)
     assert 0.01 < np.abs(guess[..., 20:] - tx[:, 20:]).mean() < 0.2
 
 
-@pytest.mark.parametrize(("exposure_slots", "memory"), [(0.4, 1), (1.08, 1), (1.3, 1)])
+@pytest.mark.parametrize(("exposure_slots", "isi_memory"), [(0.4, 1), (1.08, 1), (1.3, 1)])
 @pytest.mark.parametrize("w", WEIGHTS)
-def test_the_first_guess_of_clean_slots_is_what_was_sent(w: int, exposure_slots: float, memory: int) -> None:
-    rng = np.random.default_rng([w, memory])
+def test_the_first_guess_of_clean_slots_is_what_was_sent(w: int, exposure_slots: float, isi_memory: int) -> None:
+    rng = np.random.default_rng([w, isi_memory])
     tx = rng.integers(0, 1 << bits_per_symbol(w), (40, 5))
-    guess = first_guess(sent_through(tx, w, box_exposure(exposure_slots, memory), 0.02, rng))
+    guess = first_decision_of(sent_through(tx, w, box_exposure(exposure_slots, isi_memory), 0.02, rng))
     sent = packet_and_next(tx, w, 0)
     assert guess.shape == (1, *sent.shape)
     assert np.abs(guess[0] - sent).max() < 0.05
 
 
-@pytest.mark.parametrize("memory", [1, 3])
-def test_constants_added_to_all_patterns_of_a_slot_change_nothing(memory: int) -> None:
-    rng = np.random.default_rng(memory)
-    metrics = rng.normal(0, 1, (2, 5, 40 + memory, 2 << memory))
+@pytest.mark.parametrize("isi_memory", [1, 3])
+def test_constants_added_to_all_patterns_of_a_slot_change_nothing(isi_memory: int) -> None:
+    rng = np.random.default_rng(isi_memory)
+    metrics = rng.normal(0, 1, (2, 5, 40 + isi_memory, 2 << isi_memory))
     shifted = metrics + rng.normal(0, 300, metrics.shape[:3])[..., None]
     one, other = detect(metrics), detect(shifted)
     assert (one.w == other.w).all()
@@ -295,9 +297,9 @@ def extreme(kind: str, shape: tuple[int, ...]) -> FloatArray:
 
 
 @pytest.mark.parametrize("kind", ["equal", "huge", "never", "mixed", "one huge"])
-@pytest.mark.parametrize("memory", [1, 3, 5])
-def test_extreme_metrics_give_finite_posteriors(kind: str, memory: int) -> None:
-    metrics = extreme(kind, (2, 3, 40 + memory, 2 << memory))
+@pytest.mark.parametrize("isi_memory", [1, 3, 5])
+def test_extreme_metrics_give_finite_posteriors(kind: str, isi_memory: int) -> None:
+    metrics = extreme(kind, (2, 3, 40 + isi_memory, 2 << isi_memory))
     for candidates in (None, plausible_weights(metrics, 20.0)):
         found = detect(metrics, candidates)
         assert np.isfinite(found.lit).all()
@@ -325,9 +327,9 @@ def test_shapes_that_do_not_fit(shape: tuple[int, ...]) -> None:
         detect(np.zeros(shape))
 
 
-@pytest.mark.parametrize("memory", [1, 3])
-def test_doubtful_words_are_those_of_the_posterior(memory: int) -> None:
-    metrics = np.random.default_rng(memory).normal(0, 1.5, (2, 3, 60 + memory, 2 << memory))
+@pytest.mark.parametrize("isi_memory", [1, 3])
+def test_doubtful_words_are_those_of_the_posterior(isi_memory: int) -> None:
+    metrics = np.random.default_rng(isi_memory).normal(0, 1.5, (2, 3, 60 + isi_memory, 2 << isi_memory))
     w = np.array([5, 1, 5])
     candidates = np.zeros((3, 9), bool)
     candidates[np.arange(3), w - 1] = True
@@ -344,23 +346,25 @@ def test_doubtful_words_are_those_of_the_posterior(memory: int) -> None:
     assert (words.sum(axis=2) == w[places[:, 1], None]).all()
 
 
-@pytest.mark.parametrize("memory", [1, 3])
-def test_support_is_what_turning_a_single_slot_costs(memory: int) -> None:
+@pytest.mark.parametrize("isi_memory", [1, 3])
+def test_support_is_what_turning_a_single_slot_costs(isi_memory: int) -> None:
     rng = np.random.default_rng(5)
     decided = rng.random((2, 3, 12)) < 0.5
-    metrics = rng.normal(size=(2, 3, 12 + memory, 1 << (memory + 1)))
+    metrics = rng.normal(size=(2, 3, 12 + isi_memory, 1 << (isi_memory + 1)))
 
     def total(slots: NDArray[np.bool_]) -> float:
-        padded = np.pad(slots.astype(np.int64), (memory, memory))
-        patterns = [sum(padded[n + memory - back] << back for back in range(memory + 1)) for n in range(12 + memory)]
-        return float(metrics[1, 2, np.arange(12 + memory), patterns].sum())
+        padded = np.pad(slots.astype(np.int64), (isi_memory, isi_memory))
+        patterns = [
+            sum(padded[n + isi_memory - back] << back for back in range(isi_memory + 1)) for n in range(12 + isi_memory)
+        ]
+        return float(metrics[1, 2, np.arange(12 + isi_memory), patterns].sum())
 
-    support = slot_support(metrics, decided)
-    assert support.shape == decided.shape
+    margin = slot_margin(metrics, decided)
+    assert margin.shape == decided.shape
     for slot in range(12):
         turned = decided[1, 2].copy()
         turned[slot] = not turned[slot]
-        assert support[1, 2, slot] == pytest.approx(total(decided[1, 2]) - total(turned), abs=1e-5)
+        assert margin[1, 2, slot] == pytest.approx(total(decided[1, 2]) - total(turned), abs=1e-5)
 
 
 def test_no_word_is_doubtful_where_all_are_sure() -> None:

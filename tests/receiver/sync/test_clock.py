@@ -33,31 +33,31 @@ def start_error(found: Clock, shot: Shot) -> float:
 
 
 def received(
-    profiles: RowProfiles, shot: Shot, now: Clock, rounds: int = 2
+    profiles: RowProfiles, shot: Shot, clock_: Clock, rounds: int = 2
 ) -> tuple[Clock, BurstPosteriors, SlotSamples]:
     """Light model and detection in turn, the clock corrected after each."""
-    samples = sync.sample_slots(profiles, now, Q)
-    memory = channel.memory_for(shot.exposure_slots)
-    floor = channel.estimate_floor(samples, now)
+    samples = sync.sample_slots(profiles, clock_, Q)
+    memory = channel.isi_memory_for(shot.exposure_slots)
+    floor = channel.estimate_black_level(samples, clock_)
     model = channel.LightModel(
-        floor=floor,
+        black_level=floor,
         sigma=channel.estimate_sigma(samples, floor, 1e-4),
-        shot=0.0,
-        spread=np.tile([shot.crosstalk, 1.0, shot.crosstalk], (shot.n_strips, 1)),
+        shot_gain=0.0,
+        crosstalk=np.tile([shot.crosstalk, 1.0, shot.crosstalk], (shot.n_strips, 1)),
         taps=channel.exposure_taps(shot.exposure_slots, 1 / Q, memory, Q),
     )
     contrast = sync.contrast(samples.light, samples.valid, Q, model.sigma)
     metrics = channel.first_metrics(*contrast, model.taps)
-    now = sync.assign_bursts(now, detect.slot_llr(metrics), REPEATS)
+    clock_ = sync.assign_bursts(clock_, detect.slot_llr(metrics), REPEATS)
     for _ in range(rounds):
-        posteriors = detect.detect(channel.by_burst(metrics, now, memory))
-        lit = channel.lit_on_grid(posteriors, now)
-        found = channel.slot_likelihoods(samples, now, model, lit, np.arange(lit.shape[0]))
+        posteriors = detect.detect(channel.by_burst(metrics, clock_, memory))
+        lit = channel.lit_on_grid(posteriors, clock_)
+        found = channel.slot_likelihoods(samples, clock_, model, lit, np.arange(lit.shape[0]))
         metrics = found.metrics
-        now = sync.corrected(sync.assign_bursts(now, detect.slot_llr(metrics), REPEATS), found.timing)
-        samples = sync.sample_slots(profiles, now, Q)
-    posteriors = detect.detect(channel.by_burst(metrics, now, memory))
-    return now, posteriors, samples
+        clock_ = sync.corrected(sync.assign_bursts(clock_, detect.slot_llr(metrics), REPEATS), found.timing)
+        samples = sync.sample_slots(profiles, clock_, Q)
+    posteriors = detect.detect(channel.by_burst(metrics, clock_, memory))
+    return clock_, posteriors, samples
 
 
 def right_packets(posteriors: BurstPosteriors, link: Link, first_burst: int) -> NDArray[np.bool_]:
@@ -93,9 +93,9 @@ def test_start_is_found(kind: str) -> None:
     profiles = row_profiles(link, shot, rng)
     first = found_clock(profiles, shot, link.packet_slots)
     assert abs(start_error(first, shot)) < 0.3
-    now, posteriors, _ = received(profiles, shot, first)
-    assert abs(start_error(now, shot)) < 0.05
-    assert first.lock > 1.6
+    clock_, posteriors, _ = received(profiles, shot, first)
+    assert abs(start_error(clock_, shot)) < 0.05
+    assert first.header_peak_ratio > 1.6
     assert (posteriors.w == link.w).all()
     assert right_packets(posteriors, link, 0)[0].all()
 
@@ -108,13 +108,13 @@ def test_copies_are_given_to_their_bursts(phase: int) -> None:
     start = 70 * (phase % 3) + (35.0 if phase >= 3 else 2.0)
     shot = Shot(start_slot=start, n_rows=int(3.4 * 70 * 5), texture=0.2, sigma=0.005)
     profiles = row_profiles(link, shot, rng)
-    now, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 70))
-    first_copy = int((start + now.first_slot * 0) // 70)
-    grid_copy = round((shot.start_slot + (now.row0 / 5.0)) // 70)
-    true_burst = (grid_copy + np.arange(now.n_copies)) // REPEATS
+    clock_, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 70))
+    first_copy = int((start + clock_.first_slot * 0) // 70)
+    grid_copy = round((shot.start_slot + (clock_.row0 / 5.0)) // 70)
+    true_burst = (grid_copy + np.arange(clock_.n_copies)) // REPEATS
     assert grid_copy in {first_copy, first_copy - 1}
-    assert (now.burst == true_burst - true_burst[0]).all()
-    shown = np.bincount(now.burst, minlength=2) >= 2
+    assert (clock_.burst == true_burst - true_burst[0]).all()
+    shown = np.bincount(clock_.burst, minlength=2) >= 2
     assert right_packets(posteriors, link, int(true_burst[0]))[np.flatnonzero(shown)].all()
 
 
@@ -122,12 +122,12 @@ def test_grid_covers_the_rows() -> None:
     rng = np.random.default_rng(3)
     link = random_link(rng, [5] * 6, 5)
     shot = Shot(start_slot=33.0)
-    now = found_clock(row_profiles(link, shot, rng), shot, 70)
-    assert now.row0 <= 0
-    assert now.row0 + now.n_slots * now.rows_per_slot >= shot.n_rows - 1
-    assert now.n_slots <= shot.n_rows / shot.rows_per_slot + 2
-    assert 0 <= now.first_slot < now.packet_slots
-    assert now.n_copies * now.packet_slots >= now.first_slot + now.n_slots
+    clock_ = found_clock(row_profiles(link, shot, rng), shot, 70)
+    assert clock_.row0 <= 0
+    assert clock_.row0 + clock_.n_slots * clock_.rows_per_slot >= shot.n_rows - 1
+    assert clock_.n_slots <= shot.n_rows / shot.rows_per_slot + 2
+    assert 0 <= clock_.first_slot < clock_.packet_slots
+    assert clock_.n_copies * clock_.packet_slots >= clock_.first_slot + clock_.n_slots
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -138,8 +138,8 @@ def test_delays_of_up_to_two_slots_are_found(seed: int, reach: float) -> None:
     delays = rng.uniform(-reach, reach, 20)
     shot = Shot(start_slot=9.6 + seed, n_rows=800, texture=0.2, sigma=0.005)
     profiles = row_profiles(link, shot, rng, delays)
-    now, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 70), rounds=4)
-    off = now.delay_slots + start_error(now, shot) - delays
+    clock_, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 70), rounds=4)
+    off = clock_.delay_slots + start_error(clock_, shot) - delays
     assert np.abs(off).max() < 0.1
     assert right_packets(posteriors, link, 0)[0].mean() >= 0.95
 
@@ -151,25 +151,25 @@ def test_a_slot_rate_error_is_tolerated(ppm: float) -> None:
     link = random_link(rng, [5] * 6, 24, n_bursts=2)
     shot = Shot(start_slot=3.0, n_rows=5 * 3 * 260, texture=0.2, sigma=0.01)
     profiles = row_profiles(link, replace(shot, rows_per_slot=5.0 * (1 + 1e-6 * ppm)), rng)
-    now, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 260))
-    assert abs(start_error(now, shot)) < 0.1
+    clock_, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 260))
+    assert abs(start_error(clock_, shot)) < 0.1
     assert right_packets(posteriors, link, 0)[0].all()
 
 
 def test_noise_and_still_light_do_not_lock_like_a_link() -> None:
-    locks = {}
+    acquisitions = {}
     for level in (0.0, 0.5):
         found = []
         for seed in range(25):
             rng = np.random.default_rng([seed, 5])
             shot = Shot(start_slot=20.0, level=level, sigma=0.01, texture=0.2)
             profiles = row_profiles(random_link(rng, [5] * 20, 5), shot, rng)
-            now = sync.find_clock(profiles, 5.0, 1.0, 70, 0.01)
-            found.append(now.lock if now else 0.0)
-        locks[level] = np.array(found)
-    assert np.median(locks[0.0]) < 1.6
-    assert locks[0.5].min() > np.quantile(locks[0.0], 0.9)
-    assert np.median(locks[0.5]) > 3.5
+            clock_ = sync.find_clock(profiles, 5.0, 1.0, 70, 0.01)
+            found.append(clock_.header_peak_ratio if clock_ else 0.0)
+        acquisitions[level] = np.array(found)
+    assert np.median(acquisitions[0.0]) < 1.6
+    assert acquisitions[0.5].min() > np.quantile(acquisitions[0.0], 0.9)
+    assert np.median(acquisitions[0.5]) > 3.5
 
 
 @pytest.mark.parametrize("start", [0.3, 41.0, 66.0])
@@ -178,8 +178,8 @@ def test_one_packet_and_a_little_is_enough(start: float) -> None:
     link = random_link(rng, [5] * 12, 5)
     shot = Shot(start_slot=start, n_rows=int(5 * 70 * 1.2), texture=0.1, sigma=0.005)
     profiles = row_profiles(link, shot, rng)
-    now, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 70))
-    assert abs(start_error(now, shot)) < (0.15 if start == 0.3 else 0.05)  # at 0.3 the first header is cut
+    clock_, posteriors, _ = received(profiles, shot, found_clock(profiles, shot, 70))
+    assert abs(start_error(clock_, shot)) < (0.15 if start == 0.3 else 0.05)  # at 0.3 the first header is cut
     n_bursts = posteriors.lit.shape[0]
     sent = replace(link, bits=[link.bits[0]] * n_bursts)  # a sliver of the copy before may count as a burst
     assert right_packets(posteriors, sent, 0).any(axis=0).mean() > 0.9
@@ -203,18 +203,18 @@ def test_columns_that_show_nothing_do_not_hide_the_clock_of_those_that_do() -> N
 def test_bursts_in_every_way_likeliest_first() -> None:
     rng = np.random.default_rng(4)
     shot = Shot(n_rows=5 * 70 * 4)
-    now = found_clock(row_profiles(random_link(rng, [5] * 3, 5), shot, rng), shot, 70)
-    now = replace(now, first_slot=0, n_slots=350, burst=np.zeros(5, np.int64))
+    clock_ = found_clock(row_profiles(random_link(rng, [5] * 3, 5), shot, rng), shot, 70)
+    clock_ = replace(clock_, first_slot=0, n_slots=350, burst=np.zeros(5, np.int64))
     sent = rng.choice([-4.0, 4.0], (2, 3, 70)).astype(np.float32)
     llr = np.concatenate([sent[0], sent[0], sent[1], sent[1], sent[1]], axis=1)
-    possible = sync.possible_bursts(now, llr, REPEATS)
+    possible = sync.possible_bursts(clock_, llr, REPEATS)
     assert possible[0][0].burst.tolist() == [0, 0, 1, 1, 1]
     assert sorted(one.burst.tolist() for one, _ in possible) == [[0, 0, 0, 1, 1], [0, 0, 1, 1, 1], [0, 1, 1, 1, 2]]
     scores = [score for _, score in possible]
     assert scores == sorted(scores, reverse=True)
     assert scores[0] - scores[1] > 100
-    assert sync.assign_bursts(now, llr, REPEATS).burst.tolist() == [0, 0, 1, 1, 1]
-    alone = replace(now, n_slots=70, burst=np.zeros(1, np.int64))
+    assert sync.assign_bursts(clock_, llr, REPEATS).burst.tolist() == [0, 0, 1, 1, 1]
+    alone = replace(clock_, n_slots=70, burst=np.zeros(1, np.int64))
     assert len(sync.possible_bursts(alone, llr[:, :70], REPEATS)) == 1
 
 
@@ -235,7 +235,9 @@ def test_light_without_a_link(kind: str) -> None:
         light[..., 300] = 1.0
     inside = np.zeros_like(profiles.inside) if kind == "nothing inside" else profiles.inside
     found = sync.find_clock(replace(profiles, light=light, inside=inside), 5.0, 1.0, 70, 1e-3)
-    assert found is None or (np.isfinite([found.row0, found.lock]).all() and np.isfinite(found.delay_slots).all())
+    assert found is None or (
+        np.isfinite([found.row0, found.header_peak_ratio]).all() and np.isfinite(found.delay_slots).all()
+    )
 
 
 def test_resample_integrates_exactly() -> None:
@@ -272,21 +274,31 @@ def test_resample_follows_the_sensor_rows() -> None:
 
 
 def test_copies_and_back() -> None:
-    now = Clock(5.0, 1.0, 70, 0.0, n_slots=180, first_slot=33, burst=np.zeros(4, int), delay_slots=np.zeros(2), lock=9)
+    clock_ = Clock(
+        5.0,
+        1.0,
+        70,
+        0.0,
+        n_slots=180,
+        first_slot=33,
+        burst=np.zeros(4, int),
+        delay_slots=np.zeros(2),
+        header_peak_ratio=9,
+    )
     slots = np.random.default_rng(0).random((2, 180)).astype(np.float32)
-    copies = sync.to_copies(slots, now)
+    copies = sync.to_copies(slots, clock_)
     assert copies.shape == (2, 4, 70)
     assert (copies[:, 0, :33] == 0).all()
     assert (copies[:, 0, 33] == slots[:, 0]).all()
     assert (copies[:, 1, 0] == slots[:, 37]).all()
-    assert (sync.from_copies(copies, now) == slots).all()
+    assert (sync.from_copies(copies, clock_) == slots).all()
 
 
 @pytest.mark.parametrize(("n_strips", "n_pooled"), [(2, 1), (3, 3), (4, 2), (6, 3), (8, 2)])
 def test_pooled_strips_keep_the_light(n_strips: int, n_pooled: int) -> None:
     rng = np.random.default_rng(0)
     profiles = row_profiles(random_link(rng, [5] * 2, 5), Shot(n_rows=60, n_strips=n_strips), rng)
-    pooled = sync.pooled_strips(sync.halved_strips(profiles))
+    pooled = sync.pooled_strips(sync.binned_strips(profiles))
     together = n_strips // n_pooled
     assert pooled.light.shape == (2, n_pooled, 60)
     np.testing.assert_allclose(pooled.light[:, -1], profiles.light[:, -together:].mean(axis=1), rtol=1e-5)

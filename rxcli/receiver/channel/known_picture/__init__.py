@@ -13,14 +13,14 @@ from rxcli.receiver.channel.known_picture.exposure import exposed, row_positions
 from rxcli.receiver.channel.known_picture.header import dark_light, first_decision, header_contrast, header_dark
 from rxcli.receiver.channel.known_picture.metrics import pattern_metrics
 from rxcli.receiver.channel.known_picture.picture import MEMORY, ColumnLight, KnownPicture
-from rxcli.receiver.channel.known_picture.response import evened, exposures, fit_response
+from rxcli.receiver.channel.known_picture.response import equalized, exposures, fit_response
 
 __all__ = [
     "MEMORY",
     "ColumnLight",
     "KnownPicture",
     "dark_light",
-    "evened",
+    "equalized",
     "exposed",
     "exposures",
     "first_decision",

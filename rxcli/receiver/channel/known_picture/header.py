@@ -15,7 +15,7 @@ _DARK_SLOTS, _LEAST_DARK_ROWS = (5.0, 8.0), 12
 _LEAST_ROWS = 40
 
 
-def first_decision(seen: ColumnLight, positions: FloatArray, clock: Clock) -> Float32Array:
+def first_decision(observed: ColumnLight, positions: FloatArray, clock: Clock) -> Float32Array:
     """(C, N) probability that each slot is lit, from the rows around its middle alone.
 
     Args:
@@ -24,8 +24,8 @@ def first_decision(seen: ColumnLight, positions: FloatArray, clock: Clock) -> Fl
         clock: the clock.
     """
     middles = np.arange(clock.n_slots) + 0.5
-    total = np.zeros((seen.value.shape[0], seen.value.shape[1] + 1))
-    np.cumsum((seen.value - np.float32(0.5)) * seen.precision, axis=1, out=total[:, 1:])
+    total = np.zeros((observed.value.shape[0], observed.value.shape[1] + 1))
+    np.cumsum((observed.value - np.float32(0.5)) * observed.precision, axis=1, out=total[:, 1:])
     step = positions[:, -1:] - positions[:, :1]
     rows = (middles - positions[:, :1]) * ((positions.shape[1] - 1) / step) + 0.5
     reach = 0.35 * clock.rows_per_slot
@@ -33,7 +33,7 @@ def first_decision(seen: ColumnLight, positions: FloatArray, clock: Clock) -> Fl
     return np.asarray(0.5 + 0.5 * np.tanh(0.5 * llr), np.float32)
 
 
-def header_contrast(seen: ColumnLight, positions: FloatArray, clock: Clock) -> float:
+def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) -> float:
     """Contrast of the headers where the clock has them, 1 being full and 0 none; 1 where no header shows.
 
     Args:
@@ -45,7 +45,7 @@ def header_contrast(seen: ColumnLight, positions: FloatArray, clock: Clock) -> f
     rows = np.flatnonzero((place < SLOTS_PER_SYMBOL).any(axis=0))
     place = place[:, rows]
     sign = np.where(place < SLOTS_PER_SYMBOL, 2.0 * np.array(HEADER)[np.minimum(place, SLOTS_PER_SYMBOL - 1)] - 1, 0)
-    value, precision = (values.take(rows, axis=1) for values in (seen.value, seen.precision))
+    value, precision = (values.take(rows, axis=1) for values in (observed.value, observed.precision))
     weight = np.abs(sign) * np.minimum(precision, np.float32(PRIOR))
     if weight.sum() < PRIOR * _LEAST_ROWS:
         return 1.0
@@ -70,11 +70,11 @@ def dark_light(lights: list[Float32Array], dark: list[BoolArray], inside: BoolAr
         inside: (C, S, R) as for `KnownPicture`.
         usual: what is taken where too few rows tell.
     """
-    seen = [
+    observed = [
         np.where(np.broadcast_to(rows[:, None], light.shape) & inside, light, np.float32(np.nan))[..., rows.any(axis=0)]
         for light, rows in zip(lights, dark, strict=True)
     ]
-    together = np.concatenate(seen, axis=2)
+    together = np.concatenate(observed, axis=2)
     few = (~np.isnan(together)).sum(axis=2) < _LEAST_DARK_ROWS
     if together.shape[2] == 0:
         return np.full(together.shape[:2], usual, np.float32)

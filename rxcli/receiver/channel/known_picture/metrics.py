@@ -11,10 +11,10 @@ from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 
 def pattern_metrics(
-    seen: ColumnLight,
+    observed: ColumnLight,
     positions: FloatArray,
     clock: Clock,
-    memory: int,
+    isi_memory: int,
     response: Response,
     expected: Float32Array,
     lit: Float32Array,
@@ -30,9 +30,9 @@ def pattern_metrics(
         expected: (C, R) light that the slots give by it.
         lit: (C, N) present idea of the slots, for what reaches beyond the memory.
     """
-    value = seen.value - expected
+    value = observed.value - expected
     parts = [
-        _row_metrics(value[group], seen.precision[group], centre, clock, memory, response, lit[group])
+        _row_metrics(value[group], observed.precision[group], centre, clock, isi_memory, response, lit[group])
         for group, centre in zip(alike_columns(positions), positions, strict=True)
     ]
     return np.concatenate(parts).astype(np.float64)
@@ -43,22 +43,22 @@ def _row_metrics(
     precision: Float32Array,
     centre: FloatArray,
     clock: Clock,
-    memory: int,
+    isi_memory: int,
     response: Response,
     lit: Float32Array,
 ) -> Float32Array:
     """Metrics of columns whose rows lie at `centre` (R,); `value` is what the slots `lit` do not explain."""
-    metric = np.floor(centre + memory / 2).astype(np.intp)
-    borders = np.searchsorted(metric, np.arange(clock.n_slots + memory + 1))
+    metric = np.floor(centre + isi_memory / 2).astype(np.intp)
+    borders = np.searchsorted(metric, np.arange(clock.n_slots + isi_memory + 1))
     use = slice(borders[0], borders[-1])
-    slots = metric[use, None] + np.arange(-memory, 1)
+    slots = metric[use, None] + np.arange(-isi_memory, 1)
     share = shares_of_slots(centre[use], slots, clock.exposure_slots, response)
     value, precision = value[:, use].copy(), precision[:, use]
-    padded = np.pad(lit, ((0, 0), (memory, memory)), constant_values=np.float32(0.5))
-    for back in range(memory + 1):
-        value += share[:, back] * padded.take(slots[:, back] + memory, axis=1)
+    padded = np.pad(lit, ((0, 0), (isi_memory, isi_memory)), constant_values=np.float32(0.5))
+    for back in range(isi_memory + 1):
+        value += share[:, back] * padded.take(slots[:, back] + isi_memory, axis=1)
     value *= precision
-    sums, basis = _slot_sums(value, precision, share, borders - borders[0]), _pattern_basis(memory)
+    sums, basis = _slot_sums(value, precision, share, borders - borders[0]), _pattern_basis(isi_memory)
     metrics = sums.reshape(len(basis), -1).T @ basis
     return np.asarray(metrics.reshape(*sums.shape[1:], -1))
 
@@ -88,9 +88,9 @@ def _slot_sums(weighted: Float32Array, precision: Float32Array, share: Float32Ar
     return sums
 
 
-def _pattern_basis(memory: int) -> Float32Array:
+def _pattern_basis(isi_memory: int) -> Float32Array:
     """(terms, patterns) how `_slot_sums` make up the log-likelihood of every pattern."""
-    patterns = slot_patterns(memory).astype(np.float32)
-    first, second = np.triu_indices(memory + 1)
+    patterns = slot_patterns(isi_memory).astype(np.float32)
+    first, second = np.triu_indices(isi_memory + 1)
     power = patterns[:, first] * patterns[:, second] * np.where(first == second, np.float32(0.5), np.float32(1))
     return np.ascontiguousarray(np.concatenate([patterns, -power], axis=1).T)

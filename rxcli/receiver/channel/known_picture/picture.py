@@ -67,14 +67,19 @@ class KnownPicture:
     """
 
     def __init__(
-        self, inside: BoolArray, spread: FloatArray, floor: float | Float32Array, variance: float, shot: float
+        self,
+        inside: BoolArray,
+        crosstalk: FloatArray,
+        black_level: float | Float32Array,
+        variance: float,
+        shot_gain: float,
     ) -> None:
         self._inside = inside.astype(np.float32)
-        self._spread = spread.astype(np.float32)
-        self._floor = np.asarray(floor, np.float32)[..., None]
-        self._variance, self._shot = np.float32(variance), np.float32(shot)
+        self._crosstalk = crosstalk.astype(np.float32)
+        self._black_level = np.asarray(black_level, np.float32)[..., None]
+        self._variance, self._shot_gain = np.float32(variance), np.float32(shot_gain)
         self._light: Float32Array = np.zeros(inside.shape, np.float32)
-        self._seen: Float32Array = np.zeros(inside.shape, np.float32)
+        self._observed: Float32Array = np.zeros(inside.shape, np.float32)
         self._system: _System | None = None
         self._of_one: Float32Array | None = None
         self._picture = self._error = self._light
@@ -90,9 +95,9 @@ class KnownPicture:
             trust: (C, R) 0..1.
             keep: share of their weight that the frames before keep.
         """
-        lit, seen = self._lesson(light, slots, trust)
+        lit, observed = self._update_of(light, slots, trust)
         self._light = self._light * np.float32(keep) + lit
-        self._seen = self._seen * np.float32(keep) + seen
+        self._observed = self._observed * np.float32(keep) + observed
         self._system = None
 
     def without(self, light: Float32Array, slots: Float32Array, trust: Float32Array) -> KnownPicture:
@@ -105,20 +110,20 @@ class KnownPicture:
             slots: (C, R) likewise.
             trust: (C, R) likewise.
         """
-        lit, seen = self._lesson(light, slots, trust)
+        lit, observed = self._update_of(light, slots, trust)
         other = copy(self)
-        other._light, other._seen = self._light - lit, np.maximum(self._seen - seen, 0)
+        other._light, other._observed = self._light - lit, np.maximum(self._observed - observed, 0)
         other._system, other._excess = None, self._excess.copy()
         return other
 
-    def _lesson(
+    def _update_of(
         self, light: Float32Array, slots: Float32Array, trust: Float32Array
     ) -> tuple[Float32Array, Float32Array]:
         """Light and light expected of a picture of 1, each weighted with the latter."""
-        expected = self._spread @ _with_neighbours(slots)
-        doubt = self._spread @ (1 - _with_neighbours(trust, 1.0))
+        expected = self._crosstalk @ _with_neighbours(slots)
+        doubt = self._crosstalk @ (1 - _with_neighbours(trust, 1.0))
         weighted = expected * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * self._inside
-        return weighted * (light - self._floor), weighted * expected
+        return weighted * (light - self._black_level), weighted * expected
 
     def solve(self, light: Float32Array) -> ColumnLight:
         """The columns' own light in a frame.
@@ -145,8 +150,8 @@ class KnownPicture:
             rows_per_slot: rows per slot.
         """
         self._settled()
-        foreseen = self._picture * (self._spread @ _with_neighbours(expected))
-        error = light - self._floor - foreseen
+        predicted = self._picture * (self._crosstalk @ _with_neighbours(expected))
+        error = light - self._black_level - predicted
         error *= error
         error *= self._inside
         around = np.maximum(_around(error, rows_per_slot), 0)
@@ -160,16 +165,16 @@ class KnownPicture:
         return self._of_one
 
     def _solved(self, light: Float32Array, system: _System) -> ColumnLight:
-        seen = self._spread.T @ (system.gain * (light - self._floor))
-        right = seen[:, 1] + np.float32(PRIOR / 2)
-        right[1:] += seen[:-1, 2]
-        right[:-1] += seen[1:, 0]
+        observed = self._crosstalk.T @ (system.gain * (light - self._black_level))
+        right = observed[:, 1] + np.float32(PRIOR / 2)
+        right[1:] += observed[:-1, 2]
+        right[:-1] += observed[1:, 0]
         shrunk = _solve(system, right)
         precision = np.maximum(system.precision - np.float32(PRIOR), 0)
         value = shrunk + (shrunk - np.float32(0.5)) * (np.float32(PRIOR) / np.maximum(precision, np.float32(1e-3)))
         return ColumnLight(value, self._tempered(value, precision), shrunk)
 
-    def judge(self, seen: ColumnLight, expected: Float32Array, share: float) -> tuple[ColumnLight, float]:
+    def judge(self, observed: ColumnLight, expected: Float32Array, share: float) -> tuple[ColumnLight, float]:
         """Compare columns with what was decided; they are trusted accordingly, now and, in part, from now on.
 
         Args:
@@ -181,11 +186,11 @@ class KnownPicture:
             The light with its precision put right; and the median over the columns of the squared error over the
             variance foreseen.
         """
-        error = np.square(seen.value - expected) * seen.precision
-        ratio = error.sum(axis=1) / np.maximum((seen.precision > 0).sum(axis=1), 1) / np.float32(_TEMPER)
+        error = np.square(observed.value - expected) * observed.precision
+        ratio = error.sum(axis=1) / np.maximum((observed.precision > 0).sum(axis=1), 1) / np.float32(_TEMPER)
         now = np.clip(self._excess * ratio, 0.25, 100.0)
         self._excess += np.float32(share) * (now - self._excess)
-        better = ColumnLight(seen.value, seen.precision / np.maximum(ratio, 0.5)[:, None], seen.shrunk)
+        better = ColumnLight(observed.value, observed.precision / np.maximum(ratio, 0.5)[:, None], observed.shrunk)
         return better, float(np.median(ratio))
 
     def moved(self, row_of: FloatArray, inside: BoolArray) -> None:
@@ -215,8 +220,8 @@ class KnownPicture:
 
     def picture(self) -> tuple[Float32Array, Float32Array]:
         """The picture and its relative variance, (C, S, R) each."""
-        around = _box(self._light, _AROUND_ROWS) / (_box(self._seen, _AROUND_ROWS) + np.float32(1e-3))
-        total = self._seen + np.float32(_SMOOTH)
+        around = _box(self._light, _AROUND_ROWS) / (_box(self._observed, _AROUND_ROWS) + np.float32(1e-3))
+        total = self._observed + np.float32(_SMOOTH)
         picture = np.maximum(self._light + np.float32(_SMOOTH) * around, 0) / total
         unseen = np.float32(_SMOOTH * _AROUND_ERROR) / total
         return picture, unseen * unseen + np.float32(_LEAST_ERROR**2)
@@ -227,11 +232,11 @@ class KnownPicture:
             self._picture, self._error = self.picture()
         picture = self._picture
         half = np.float32(0.5) * picture
-        variance = self._variance + half * (self._shot + half * self._error)
+        variance = self._variance + half * (self._shot_gain + half * self._error)
         if measured is not None:
             variance += measured
         gain = picture * self._inside / variance
-        left, own, right = self._spread.T
+        left, own, right = self._crosstalk.T
         products = np.stack([own * own, left * left, right * right, own * right, left * own, left * right])
         power = products @ (gain * picture)
         middle = power[:, 0] + np.float32(PRIOR)

@@ -62,14 +62,14 @@ class Fit:
     late: float
 
 
-def fit_response(seen: ColumnLight, slots: Exposures) -> Fit:
+def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
     """The response of a frame by least squares over all columns.
 
     Args:
         seen: the columns' light.
         slots: what they should have seen.
     """
-    value, precision = (values.take(slots.rows, axis=1).ravel() for values in (seen.value, seen.precision))
+    value, precision = (values.take(slots.rows, axis=1).ravel() for values in (observed.value, observed.precision))
     parts = np.stack([slots.here, slots.beside, np.ones_like(slots.here), slots.slope]).reshape(4, -1)
     weighted = parts * precision
     weight = float(precision.sum()) + 1e-9
@@ -83,7 +83,7 @@ def fit_response(seen: ColumnLight, slots: Exposures) -> Fit:
     return Fit(response, float(np.clip(late / max(centre + 2 * side, 0.3), -_MAX_LATE, _MAX_LATE)))
 
 
-def evened(seen: ColumnLight, slots: Exposures) -> ColumnLight:
+def equalized(observed: ColumnLight, slots: Exposures) -> ColumnLight:
     """The light with its contrast put right: compression takes stripes away where they are faint, and only there.
 
     Rows are grouped by their precision; in each group the contrast that is left is measured against the slots.
@@ -93,14 +93,14 @@ def evened(seen: ColumnLight, slots: Exposures) -> ColumnLight:
         slots: what they should have seen.
     """
     half = np.float32(0.5)
-    level = np.log(np.maximum(seen.precision, np.float32(1e-3)))
+    level = np.log(np.maximum(observed.precision, np.float32(1e-3)))
     some = level.take(slots.rows, axis=1).ravel()
     shown = np.flatnonzero(some > np.log(2e-3))
     if shown.size < 10 * _GROUPS:
-        return seen
+        return observed
     size = shown.size // _GROUPS
     order = shown[np.argpartition(some[shown], size * np.arange(1, _GROUPS))][: size * _GROUPS]
-    value = np.clip(seen.value.take(slots.rows, axis=1).ravel()[order] - half, -1.2, 1.2)
+    value = np.clip(observed.value.take(slots.rows, axis=1).ravel()[order] - half, -1.2, 1.2)
     here, beside = slots.here.ravel()[order] - half, slots.beside.ravel()[order] - 1
     model = np.stack([here, beside, np.ones_like(here)]).reshape(3, _GROUPS, size).transpose(1, 0, 2)
     normal = model @ model.transpose(0, 2, 1) / size + np.float32(1e-3) * np.eye(3, dtype=np.float32)
@@ -108,7 +108,9 @@ def evened(seen: ColumnLight, slots: Exposures) -> ColumnLight:
     centre, side, offset = np.linalg.solve(normal, right)[..., 0].T
     gain, middle = np.clip(centre + 2 * side, *_GAIN), np.median(some[order].reshape(_GROUPS, size), axis=1)
     gains, offsets = _interpolated(level, middle, gain, offset)
-    return ColumnLight((seen.value - half - offsets) / gains + half, seen.precision * gains * gains, seen.shrunk)
+    return ColumnLight(
+        (observed.value - half - offsets) / gains + half, observed.precision * gains * gains, observed.shrunk
+    )
 
 
 def _interpolated(level: Float32Array, at: FloatArray, *values: FloatArray) -> list[Float32Array]:

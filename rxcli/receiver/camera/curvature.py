@@ -25,12 +25,12 @@ _BEND_DISTANCES = (0.5, 1.0, 2.0)
 _BEND_LAGS, _BEND_WINDOWS, BEND_LEVEL_ROWS = 24, 20, 100
 
 
-def reversed_bend(bend: FloatArray) -> FloatArray:
+def reversed_curvature(curvature: FloatArray) -> FloatArray:
     """The coefficients of the same bend with rows counted from the other end."""
-    return np.asarray(bend * np.array([1.0, 1.0, -1.0, 1.0]))
+    return np.asarray(curvature * np.array([1.0, 1.0, -1.0, 1.0]))
 
 
-def bend_terms(x: FloatArray, rows: FloatArray, width: int, height: int) -> FloatArray:
+def curvature_terms(x: FloatArray, rows: FloatArray, width: int, height: int) -> FloatArray:
     """Rows that a unit of k1, k2, p1, p2 moves the sensor row of a point, for a focal length of one width.
 
     Args:
@@ -47,7 +47,7 @@ def bend_terms(x: FloatArray, rows: FloatArray, width: int, height: int) -> Floa
     return width * np.stack([down * square, down * square**2, square + 2 * down**2, 2 * across * down])
 
 
-def estimate_bend(strips: Strips) -> tuple[FloatArray, float]:
+def estimate_curvature(strips: Strips) -> tuple[FloatArray, float]:
     """The bend whose sensor rows make neighbouring strips most alike.
 
     Returns:
@@ -83,7 +83,7 @@ def _lag_correlations(strips: Strips, distance: int) -> tuple[Float32Array, Floa
     borders = np.linspace(_BEND_LAGS, n_rows - _BEND_LAGS, _BEND_WINDOWS + 1).astype(int)
     middles = (borders[1:] + borders[:-1]) // 2
     rows, x = strips.rows[middles], strips.x[:, middles]
-    terms = bend_terms(x, rows, strips.width, strips.height)
+    terms = curvature_terms(x, rows, strips.width, strips.height)
     left, right = level[:-distance], level[distance:]
     inner = left[:, _BEND_LAGS : n_rows - _BEND_LAGS]
     out = np.empty((2 * _BEND_LAGS + 1, left.shape[0], _BEND_WINDOWS), np.float32)
@@ -104,14 +104,16 @@ def _at_lag(correlation: Float32Array, lag: FloatArray) -> tuple[FloatArray, Flo
     return value, linear + f * (2 * square + 3 * f * cubic), a - 2 * b + c
 
 
-def _likeness(bend: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float) -> float:
-    total = sum(float(_at_lag(c, np.tensordot(bend, terms, 1))[0].sum()) for c, terms in lags)
-    return weight * total - 0.5 * float(bend @ BEND_PRECISION @ bend)
+def _likeness(curvature: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float) -> float:
+    total = sum(float(_at_lag(c, np.tensordot(curvature, terms, 1))[0].sum()) for c, terms in lags)
+    return weight * total - 0.5 * float(curvature @ BEND_PRECISION @ curvature)
 
 
-def _climb(bend: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float, steps: int = 8) -> FloatArray:
+def _climb(
+    curvature: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float, steps: int = 8
+) -> FloatArray:
     """Newton's method on the likeness, with the prior of `BEND_PRECISION`; never downhill."""
-    best, score = bend, _likeness(bend, lags, weight)
+    best, score = curvature, _likeness(curvature, lags, weight)
     step = 1.0
     for _ in range(steps):
         gradient, hessian = -BEND_PRECISION @ best, BEND_PRECISION.copy()
@@ -129,11 +131,11 @@ def _climb(bend: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight
     return best
 
 
-def straightened(strips: Strips, bend: FloatArray) -> Strips:
+def straightened(strips: Strips, curvature: FloatArray) -> Strips:
     """The strips read along the bent stripes: every row of the result is one sensor row."""
-    if not bend.any():
+    if not curvature.any():
         return strips
-    moved = np.tensordot(bend, bend_terms(strips.x, strips.rows, strips.width, strips.height), 1)
+    moved = np.tensordot(curvature, curvature_terms(strips.x, strips.rows, strips.width, strips.height), 1)
     index = np.arange(strips.rows.size)
     # Row r shows sensor row r + moved(r); sensor row s is found at s - moved(s), to first order of a small slope.
     back = np.take_along_axis(moved, np.clip(np.rint(index - moved), 0, index[-1]).astype(np.int64), 1)

@@ -17,7 +17,7 @@ from rxcli.lab.simulate.sensor import Sensor
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile, shipped_profiles
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.find import measure_bow
+from rxcli.receiver.screen.find import measure_side_curvature
 from rxcli.types import FloatArray
 
 WIDTH, HEIGHT = 1280, 960
@@ -49,7 +49,7 @@ def take(k1: float, *, corrected: bool = False, picture: str = "coffee", seed: i
 
 
 def measured(trial: Trial) -> tuple[float, float]:
-    found = measure_bow(trial.frame.pixels, trial.corners, **BLACK_AND_WHITE)
+    found = measure_side_curvature(trial.frame.pixels, trial.corners, **BLACK_AND_WHITE)
     assert found is not None
     return found
 
@@ -71,16 +71,18 @@ def test_neither_a_turned_nor_a_mirrored_picture_changes_the_bow() -> None:
     trial = take(-0.15)
     pixels, corners = trial.frame.pixels, trial.corners
     last = np.array([WIDTH - 1, HEIGHT - 1])
-    turned = measure_bow(np.ascontiguousarray(pixels[::-1, ::-1]), last - corners, **BLACK_AND_WHITE)
-    mirrored = measure_bow(np.ascontiguousarray(pixels[:, ::-1]), corners * [-1, 1] + [WIDTH - 1, 0], **BLACK_AND_WHITE)
-    for found in (turned, mirrored, measure_bow(pixels, corners[[2, 3, 0, 1]], **BLACK_AND_WHITE)):
+    turned = measure_side_curvature(np.ascontiguousarray(pixels[::-1, ::-1]), last - corners, **BLACK_AND_WHITE)
+    mirrored = measure_side_curvature(
+        np.ascontiguousarray(pixels[:, ::-1]), corners * [-1, 1] + [WIDTH - 1, 0], **BLACK_AND_WHITE
+    )
+    for found in (turned, mirrored, measure_side_curvature(pixels, corners[[2, 3, 0, 1]], **BLACK_AND_WHITE)):
         assert found is not None
         assert found[0] == pytest.approx(-0.15, abs=3 * found[1])
 
 
 def test_a_mosaic_is_measured_too() -> None:
     trial = take(-0.15)
-    found = measure_bow(trial.capture.raw, trial.corners, black=64.0, white=1023.0, mosaic_period=2)
+    found = measure_side_curvature(trial.capture.raw, trial.corners, black=64.0, white=1023.0, mosaic_period=2)
     assert found is not None
     assert found[0] == pytest.approx(-0.15, abs=3 * found[1])
 
@@ -94,7 +96,7 @@ def test_a_mosaic_is_measured_too() -> None:
     ],
 )
 def test_where_no_sides_show_nothing_is_told(pixels: NDArray[Any], corners: list[list[int]]) -> None:
-    assert measure_bow(pixels, np.array(corners, float), **BLACK_AND_WHITE) is None
+    assert measure_side_curvature(pixels, np.array(corners, float), **BLACK_AND_WHITE) is None
 
 
 @pytest.mark.parametrize(
@@ -113,7 +115,7 @@ def test_where_no_sides_show_nothing_is_told(pixels: NDArray[Any], corners: list
 def test_corners_that_are_no_screens_tell_nothing(corners: list[list[int]]) -> None:
     rng = np.random.default_rng(1)
     stripes = np.repeat(rng.integers(0, 256, (HEIGHT, 1)), WIDTH, axis=1).astype(np.uint8)
-    assert measure_bow(stripes, np.array(corners, float), **BLACK_AND_WHITE) is None
+    assert measure_side_curvature(stripes, np.array(corners, float), **BLACK_AND_WHITE) is None
 
 
 def test_any_corners_on_any_pixels_end_well() -> None:
@@ -123,7 +125,9 @@ def test_any_corners_on_any_pixels_end_well() -> None:
         pixels = rng.integers(0, 256, (height, width if turn % 3 else 1)).astype(np.uint8)
         pixels = np.ascontiguousarray(np.broadcast_to(pixels, (height, width)))
         corners = rng.uniform(-1, 2, (4, 2)) if turn % 2 else np.array([[0.1, 0.1], [0.9, 0.1], [0.9, 0.9], [0.1, 0.9]])
-        found = measure_bow(pixels, (corners + rng.normal(0, 0.04, (4, 2))) * [width, height], **BLACK_AND_WHITE)
+        found = measure_side_curvature(
+            pixels, (corners + rng.normal(0, 0.04, (4, 2))) * [width, height], **BLACK_AND_WHITE
+        )
         assert found is None or (np.isfinite(found).all() and found[1] > 0)
 
 
@@ -132,7 +136,7 @@ def test_noise_has_no_sides() -> None:
     corners = np.array([[100.0, 100.0], [1100, 110], [1090, 700], [105, 690]])
     for _ in range(5):
         noise = rng.integers(0, 255, (HEIGHT, WIDTH)).astype(np.uint8)
-        found = measure_bow(noise, corners, **BLACK_AND_WHITE)
+        found = measure_side_curvature(noise, corners, **BLACK_AND_WHITE)
         assert found is None or abs(found[0]) < 3 * found[1]
 
 

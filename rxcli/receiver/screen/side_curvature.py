@@ -38,7 +38,7 @@ _STEP = 0.005
 _ALONG, _DEGREE = np.linspace(-0.02, 1.02, 33), 4
 
 
-def measure_bow(
+def measure_side_curvature(
     pixels: Pixels, corners: FloatArray, *, black: float, white: float, mosaic_period: int = 1
 ) -> tuple[float, float] | None:
     """The radial distortion that bows the sides of a screen.
@@ -60,7 +60,7 @@ def measure_bow(
         return None
     size = width_of(corners)
     support, k1, steps = max(
-        (_best_around(picture, corners, guess, size) for guess in _GUESSES), key=lambda one: one[0]
+        (_best_around(picture, corners, initial, size) for initial in _GUESSES), key=lambda one: one[0]
     )
     return _by_least_squares(picture, corners, k1, steps, size) if support >= _LEAST_SUPPORT else None
 
@@ -92,10 +92,10 @@ def _arcs(picture: Picture, corners: FloatArray, k1: float) -> list[Side]:
         square = (points**2).sum(axis=-1, keepdims=True)
         return np.asarray(1 + k1 * square * (1 - square))
 
-    seen = (corners - middle) / picture.width
-    ideal = seen
+    observed = (corners - middle) / picture.width
+    ideal = observed
     for _ in range(8):
-        ideal = seen / moved(ideal)
+        ideal = observed / moved(ideal)
     sides = []
     for side in range(4):
         straight = ideal[side] + _ALONG[:, None] * (ideal[(side + 1) % 4] - ideal[side])
@@ -106,20 +106,22 @@ def _arcs(picture: Picture, corners: FloatArray, k1: float) -> list[Side]:
     return sides
 
 
-def _best_around(picture: Picture, corners: FloatArray, guess: float, size: float) -> tuple[float, float, list[Steps]]:
+def _best_around(
+    picture: Picture, corners: FloatArray, initial: float, size: float
+) -> tuple[float, float, list[Steps]]:
     """The support of the best coefficient near a guess, that coefficient, and the steps found along the guess."""
-    arcs = _arcs(picture, corners, guess)
+    arcs = _arcs(picture, corners, initial)
     steps = [steps_of(picture, arcs, side, size) for side in range(4)]
-    supports = [(_support(steps, _arcs(picture, corners, k1)), k1) for k1 in (guess + _TRIED).tolist()]
+    supports = [(_support(steps, _arcs(picture, corners, k1)), k1) for k1 in (initial + _TRIED).tolist()]
     return *max(supports), steps
 
 
 def _support(steps: list[Steps], arcs: list[Side]) -> float:
     """Shares of the sides whose steps lie on arcs, added up."""
     total = 0.0
-    for seen, arc in zip(steps, arcs, strict=True):
-        off = (seen.place - arc.at(seen.t)) / (_TOLERANCES * seen.sd)
-        total += float((seen.weight * seen.found * np.maximum(1 - off**2, 0)).sum()) / max(seen.t.size, 1)
+    for observed, arc in zip(steps, arcs, strict=True):
+        off = (observed.place - arc.at(observed.t)) / (_TOLERANCES * observed.sd)
+        total += float((observed.weight * observed.found * np.maximum(1 - off**2, 0)).sum()) / max(observed.t.size, 1)
     return total
 
 
@@ -144,16 +146,16 @@ def _by_least_squares(
     return k1, _UNDERSTATED * (max(spread, 1.0) / total) ** 0.5
 
 
-def _said_by(seen: Steps, arc: Side, next_arc: Side, size: float) -> tuple[float, float] | None:
+def _said_by(observed: Steps, arc: Side, next_arc: Side, size: float) -> tuple[float, float] | None:
     """What one side says of the coefficient, its offset and turn aside: precision, and that times the change."""
-    left = seen.place - arc.at(seen.t)
-    on_it = seen.found & (np.abs(left) < _TOLERANCES * seen.sd)
+    left = observed.place - arc.at(observed.t)
+    on_it = observed.found & (np.abs(left) < _TOLERANCES * observed.sd)
     if on_it.sum() < max(_LEAST_PLACES, _LEAST_SHARE * on_it.size):
         return None
-    t, left = seen.t[on_it], left[on_it]
+    t, left = observed.t[on_it], left[on_it]
     bow = (next_arc.at(t) - arc.at(t)) / _STEP
     terms = np.stack([bow, np.ones_like(t), (t - arc.middle) / arc.half])
-    weight = seen.sd**-2 / max(t.size / INDEPENDENT, 1)
+    weight = observed.sd**-2 / max(t.size / INDEPENDENT, 1)
     normal, pull = weight * terms @ terms.T, weight * terms @ left
     shared = np.linalg.solve(normal[1:, 1:] + np.eye(2) / (_CORNER_SD * size) ** 2, normal[1:, 0])
     return float(normal[0, 0] - shared @ normal[1:, 0]), float(pull[0] - shared @ pull[1:])
