@@ -196,7 +196,7 @@ class _Clip:
     def _finish(self) -> list[FrameResult]:
         if self._n_held:
             self._settle()
-            self._refine_columns(at_last=True)
+            self._receive_first_again(at_last=True)
         done = self._settle()
         done += [self._report(waiting, None) for waiting in self._waiting]
         self._waiting.clear()
@@ -321,7 +321,7 @@ class _Clip:
             if self._link.phase.settled or n_unsettled > _MAX_WAITING:
                 self._settle_bursts()
                 if self._n_held and len(self._waiting) >= self._n_held:
-                    self._refine_columns(at_last=False)
+                    self._receive_first_again(at_last=False)
         return done + self._ready()
 
     def _begin_link(self, view: View, frame: Frame) -> None:
@@ -377,7 +377,7 @@ class _Clip:
 
     # -- a second look at the first frames ---------------------------------------------------------------------------
 
-    def _refine_columns(self, at_last: bool) -> None:
+    def _receive_first_again(self, at_last: bool) -> None:
         """The first frames once more: by then it is known better what is on the screen.
 
         Where that leaves doubt, more frames are waited for, unless it is `at_last`.

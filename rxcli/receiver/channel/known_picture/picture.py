@@ -204,7 +204,7 @@ class KnownPicture:
         place = np.clip(row_of, 0, n_before - 1.001)[:, None]
         left: IntArray = place.astype(np.int64)
         part = (place - left).astype(np.float32)
-        for name in ("_light", "_seen"):
+        for name in ("_light", "_observed"):
             values = getattr(self, name)
             before = np.take_along_axis(values, left, 2)
             after = np.take_along_axis(values, left + 1, 2)
