@@ -9,7 +9,9 @@ import numpy as np
 from rxcli.calibrate.shutter import ShutterCalibration, weighted_mean
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.locate import Failure, Stages, find_camera, find_corners
+from rxcli.receiver.cameras import find_camera
+from rxcli.receiver.context import Failure, Timer
+from rxcli.receiver.corners import find_corners
 from rxcli.types import Frame
 
 _NOTE = (
@@ -48,8 +50,9 @@ def calibrate_bent(frames: Sequence[Frame], screen: ScreenProfile) -> ShutterCal
 def _bent_line_delay(frame: Frame, screen: ScreenProfile) -> tuple[float, float] | None:
     """Line delay and its standard deviation; None where no screen is found or its stripes are not bent."""
     options = ReceiverOptions(screens=(screen,))
-    try:
-        camera, _ = find_camera(frame, find_corners(frame, options), options, Stages())
-    except Failure:
+    corners = find_corners(frame, options)
+    context = corners if isinstance(corners, Failure) else find_camera(frame, corners, options, Timer())
+    if isinstance(context, Failure):
         return None
-    return camera.estimated["line_delay_s"] if "k1" in camera.estimated else None
+    estimated = context.camera.estimated
+    return estimated["line_delay_s"] if "k1" in estimated else None

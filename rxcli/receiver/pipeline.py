@@ -1,7 +1,7 @@
 """The wiring of the receiver: `receive_frame` reads as the block diagram.
 
-`locate` finds corners, camera and clock, `still` turns light model and detection, `clip` carries
-over from frame to frame what is known.
+`corners` finds the screen, `cameras` and `unknown_camera` tell the camera, `acquisition` samples the columns and finds
+the clock, `still` turns light model and detection, `clip` carries over from frame to frame what is known.
 """
 
 from __future__ import annotations
@@ -10,20 +10,19 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import chain
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any
 
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
-from rxcli.receiver.channel import denoise
+from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.context import Failure, Timer
+from rxcli.receiver.corners import find_corners, too_small
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.locate import Failure, Stages, acquire, find_camera, find_corners, too_small
-from rxcli.receiver.still import apply_autoencoder, decode, decode_likeliest, doubtful_columns, headerless, slot_margin
-from rxcli.receiver.unknown_camera import likely_camera, with_refitted_camera, without_estimate
-from rxcli.results.dump import dump_frame
-from rxcli.types import Frame, FrameResult
+from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin
+from rxcli.receiver.unknown_camera import Received, likely_camera, with_refitted_camera, without_estimate
+from rxcli.results.dump import dump_stages
+from rxcli.types import FloatArray, Frame, FrameResult
 
-__all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "denoiser_case", "receive", "receive_frame"]
+__all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "failed", "receive", "receive_frame"]
 
 
 def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
@@ -53,72 +52,87 @@ def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
     yield from frames
 
 
-def denoiser_case(frame: Frame, options: ReceiverOptions) -> tuple[denoise.DenoiserInput, NDArray[np.int64]] | None:
-    """For training: what the auto-encoder is shown of a frame, and which columns it is asked; None without any."""
-    try:
-        corners = find_corners(frame, options)
-        camera, options = find_camera(frame, corners, options, Stages())
-        acquisition = acquire(frame, corners, camera, options, Stages(), quick=True)
-    except Failure:
-        return None
-    reception = decode(acquisition, options.skip)
-    columns = doubtful_columns(reception)
-    return (reception.scene, columns) if reception.scene is not None and columns.size else None
-
-
 def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
-    stages = Stages()
+    """Receive one frame as a photograph."""
+    timer = Timer()
+    return replace(_receive_still(frame, options, timer), timing_ms=timer.total())
+
+
+def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
-    try:
-        with stages("geometry"):
-            corners = find_corners(frame, options)
-        result = replace(result, corners=corners)
-        camera, options = likely_camera(frame, corners, options, stages)
-        result = replace(result, **camera.facts)
-        acquisition = acquire(frame, corners, camera, options, stages, quick=True)
-        result = replace(result, screen_profile=acquisition.screen.name)
-        with stages("detect"):
-            reception = decode_likeliest(acquisition, options.skip)
-        if camera.blind_estimate is not None:
-            camera, acquisition, reception = with_refitted_camera(
-                frame, corners, camera, acquisition, reception, options, stages
-            )
-            result = replace(result, **camera.facts)
-        with stages("detect"):
-            no_header = headerless(reception)
-        with stages("denoise"):
-            reception, denoised, report = apply_autoencoder(acquisition, reception, options)
-        if options.dump_dir is not None:
-            dump_frame(
-                options.dump_dir,
-                frame,
-                corners,
-                acquisition.profiles,
-                reception.clock,
-                reception.samples,
-                reception.metrics,
-                reception.posteriors,
-            )
-        columns = assemble.column_results(
-            reception.clock,
-            reception.posteriors,
-            reception.snr,
-            reception.samples,
-            slot_margin(reception),
-            no_header,
-            options.min_confidence,
-            denoised,
-        )
-        if camera.reversed:
-            columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
-        result = replace(result, denoiser=report, skipped=reception.skipped)
-        result = replace(result, columns=columns, status=assemble.frame_status(columns))
-        if result.status == "no_signal":
-            too_few_rows = too_small(frame, corners, camera, acquisition.screen)
-            result = replace(result, message=too_few_rows or assemble.why_no_packet(columns))
-            result = without_estimate(result, camera, reception)
-    except Failure as failure:
-        skipped = {"no_screen": 1} if failure.status == "no_screen" else {}
-        estimated = failure.estimated or result.estimated
-        result = replace(result, status=failure.status, message=failure.message, skipped=skipped, estimated=estimated)
-    return replace(result, timing_ms=stages.total())
+    # Screen: where the columns are.
+    with timer("geometry"):
+        corners = find_corners(frame, options)
+    if isinstance(corners, Failure):
+        return failed(result, corners)
+    result = replace(result, corners=corners)
+    # Camera: what a row is in time.
+    context = likely_camera(frame, corners, options, timer)
+    if isinstance(context, Failure):
+        return failed(result, context)
+    # Sampling: pixels to row profiles; sync: row profiles to a clock.
+    sampler = sample_columns(context, context.n_columns, quick=True)
+    acquisition = acquire(context, sampler)
+    if isinstance(acquisition, Failure):
+        return failed(replace(result, **context.camera.facts), acquisition)
+    # Channel and decode, in turn: slot metrics to symbols, and what they say of the picture.
+    with timer("detect"):
+        reception = decode_likeliest(acquisition, options.skip)
+    if context.camera.blind_estimate is not None:
+        received = with_refitted_camera(Received(context, acquisition, reception), options.skip)
+        context, acquisition, reception = received.context, received.acquisition, received.reception
+    with timer("detect"):
+        no_header = headerless(reception)
+    with timer("denoise"):
+        reception, denoised, report = apply_autoencoder(acquisition, reception, options)
+    if options.dump_dir is not None:
+        dump_stages(options.dump_dir, frame.source, frame.index, _taps(corners, acquisition, reception))
+    # Packets, with the probability that they are right.
+    columns = assemble.column_results(
+        reception.clock,
+        reception.posteriors,
+        reception.snr,
+        reception.samples,
+        slot_margin(reception),
+        no_header,
+        options.min_confidence,
+        denoised,
+    )
+    if context.camera.reversed:
+        columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
+    result = replace(
+        result,
+        **context.camera.facts,
+        screen_profile=acquisition.screen.name,
+        columns=columns,
+        status=assemble.frame_status(columns),
+        denoiser=report,
+        skipped=reception.skipped,
+    )
+    if result.status != "no_signal":
+        return result
+    message = too_small(context, acquisition.screen) or assemble.why_no_packet(columns)
+    return without_estimate(replace(result, message=message), context.camera, reception)
+
+
+def _taps(corners: FloatArray, acquisition: Acquisition, reception: Reception) -> dict[str, Any]:
+    """The arrays at the boundaries of the stages, by stage."""
+    return {
+        "geometry.corners": corners,
+        "sampling": acquisition.profiles,
+        "clock": reception.clock,
+        "samples": reception.samples,
+        "channel.metrics": reception.metrics,
+        "detect": reception.posteriors,
+    }
+
+
+def failed(result: FrameResult, failure: Failure) -> FrameResult:
+    """A result of which nothing more comes, with the reason."""
+    return replace(
+        result,
+        status=failure.status,
+        message=failure.message,
+        skipped={"no_screen": 1} if failure.status == "no_screen" else {},
+        estimated=failure.estimated or result.estimated,
+    )

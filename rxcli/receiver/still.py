@@ -13,9 +13,9 @@ from rxcli.errors import ReceiverError
 from rxcli.options import ReceiverOptions
 from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel, sync
+from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import assemble, detect
-from rxcli.receiver.locate import Acquisition, noise_of
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
@@ -127,7 +127,7 @@ def _first_pass(acquisition: Acquisition) -> Reception:
 
 def initial_pass(acquisition: Acquisition) -> Reception:
     """One pass over the strips pooled in pairs, from the first guess."""
-    acquisition = acquisition.is_binned()
+    acquisition = acquisition.binned()
     clock = acquisition.clock
     samples = sync.sample_slots(acquisition.profiles, clock, _COARSE)
     model = _light_model(acquisition, samples)
@@ -155,7 +155,7 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
 
     They tell on a slot of few rows: one of 1.5 rows that is exposed for 0.4 slots is seen as if for 1.2 and more.
     """
-    acquisition, clock = acquisition.is_binned(), acquisition.clock
+    acquisition, clock = acquisition.binned(), acquisition.clock
     widths = (np.hypot(clock.exposure_slots, mixed / clock.rows_per_slot) for mixed in _MIXED_ROWS)
     passes = [initial_pass(replace(acquisition, clock=replace(clock, exposure_slots=float(width)))) for width in widths]
     return max(passes, key=lambda reception: float(_evidence(reception.metrics, reception.clock).sum()))

@@ -11,40 +11,13 @@ from typing import Any
 import numpy as np
 
 from rxcli.errors import UsageError
-from rxcli.types import BurstPosteriors, Clock, FloatArray, Frame, RowProfiles, SlotSamples
-
-
-def dump_frame(
-    folder: Path,
-    frame: Frame,
-    corners: FloatArray,
-    profiles: RowProfiles,
-    clock: Clock,
-    samples: SlotSamples,
-    metrics: FloatArray,
-    posteriors: BurstPosteriors,
-) -> Path:
-    """Write the arrays of one frame to `folder`/SOURCE-FRAME.npz; keys are `stage.field`.
-
-    Stages and fields are those of `rxcli.types`; `geometry.corners` and `channel.metrics` stand beside them. Bit
-    log-likelihood ratios are ln p(1)/p(0).
-
-    Raises:
-        UsageError: the folder cannot be written.
-    """
-    stages = {
-        "geometry.corners": corners,
-        "sampling": profiles,
-        "clock": clock,
-        "samples": samples,
-        "channel.metrics": metrics,
-        "detect": posteriors,
-    }
-    return dump_stages(folder, frame.source, frame.index, stages)
 
 
 def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]) -> Path:
     """Write arrays, and dataclasses of arrays, to `folder`/SOURCE-FRAME.npz.
+
+    In frames' dumps stages and fields are those of `rxcli.types`; `geometry.corners` and `channel.metrics` stand beside
+    them. Bit log-likelihood ratios are ln p(1)/p(0).
 
     Args:
         folder: made where it does not exist.

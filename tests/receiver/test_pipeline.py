@@ -15,9 +15,12 @@ from rxcli.lab.simulate.capture import Capture, simulate_frame
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
 from rxcli.receiver import sampling, still, sync
+from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.channel import denoise
+from rxcli.receiver.context import FrameContext, Timer
+from rxcli.receiver.corners import find_corners
 from rxcli.receiver.decode import detect
-from rxcli.receiver.locate import Acquisition, Stages, acquire, find_camera, find_corners
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Frame, FrameResult, Metadata, Mosaic, PacketResult
@@ -154,10 +157,10 @@ def test_columns_in_doubt_are_read_pixel_by_pixel(n_strips: int, monkeypatch: py
     monkeypatch.setattr(sampling, "strips_per_column", lambda _: n_strips)
     taken = clean()
     frame, options = frame_of(taken), options_for(taken)
-    corners = find_corners(frame, options)
-    camera, options = find_camera(frame, corners, options, Stages())
-    quick = acquire(frame, corners, camera, options, Stages(), quick=True)
-    exact = acquire(frame, corners, camera, options, Stages())
+    context = context_of(frame, options)
+    quick, exact = (acquire(context, sample_columns(context, 20, quick=quick)) for quick in (True, False))
+    assert isinstance(quick, Acquisition)
+    assert isinstance(exact, Acquisition)
     assert not np.array_equal(quick.profiles.light, exact.profiles.light)
     asked = np.array([0, 4, 5, 6, 19])
     light = quick.in_depth(asked).profiles.light
@@ -416,15 +419,24 @@ def test_rows_that_developing_mixes_are_told_from_the_light(monkeypatch: pytest.
     assert sum(score.error_free for score in nominal) <= sum(score.error_free for score in mixed) / 1.5
 
 
-def lock_of(taken: Capture) -> tuple[Acquisition, ReceiverOptions]:
-    frame, options = frame_of(taken), options_for(taken)
+def context_of(frame: Frame, options: ReceiverOptions) -> FrameContext:
     corners = find_corners(frame, options)
-    camera, options = find_camera(frame, corners, options, Stages())
-    return acquire(frame, corners, camera, options, Stages()), options
+    assert isinstance(corners, np.ndarray)
+    context = find_camera(frame, corners, options, Timer())
+    assert isinstance(context, FrameContext)
+    return context
+
+
+def acquired(taken: Capture) -> tuple[Acquisition, ReceiverOptions]:
+    options = options_for(taken)
+    context = context_of(frame_of(taken), options)
+    acquisition = acquire(context, sample_columns(context, context.n_columns))
+    assert isinstance(acquisition, Acquisition)
+    return acquisition, options
 
 
 def test_of_two_clocks_the_one_with_packets_is_received() -> None:
-    acquisition, options = lock_of(clean())
+    acquisition, options = acquired(clean())
     wrong = replace(acquisition.clock, row0=acquisition.clock.row0 - 7 * acquisition.clock.rows_per_slot)
     for either in (replace(acquisition, rival=wrong), replace(acquisition, clock=wrong, rival=acquisition.clock)):
         reception = still.decode_likeliest(either, options.skip)
@@ -433,7 +445,7 @@ def test_of_two_clocks_the_one_with_packets_is_received() -> None:
 
 def test_copies_of_two_packets_taken_for_one_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = replace(small_scene("paper-17k3", "phone-plain"), start_slot=300.0)
-    acquisition, options = lock_of(simulate_frame(scene, 1))
+    acquisition, options = acquired(simulate_frame(scene, 1))
     right = still.decode_likeliest(acquisition, options.skip)
     assert right.clock.burst.max() > 0
     repeats = acquisition.screen.repeats
@@ -447,7 +459,7 @@ def test_copies_of_two_packets_taken_for_one_are_told_apart(monkeypatch: pytest.
 
 
 def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:
-    acquisition, options = lock_of(clean())
+    acquisition, options = acquired(clean())
     reception = still.decode(acquisition, options.skip)
     assert not still.headerless(reception).any()
     unseen = replace(reception.posteriors, header_llr=np.full_like(reception.posteriors.header_llr, -30.0))

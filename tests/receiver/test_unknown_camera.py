@@ -20,10 +20,12 @@ from rxcli.lab.simulate.sensor import Sensor
 from rxcli.profiles import ScreenProfile, load_profile, parse_profile, shipped_profiles
 from rxcli.receiver import camera as blind
 from rxcli.receiver import unknown_camera
-from rxcli.receiver.locate import Acquisition, Camera, Cameras, Failure, Stages, acquire, find_cameras
+from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.cameras import Cameras, find_cameras
+from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.still import decode
-from rxcli.types import FloatArray, Frame, FrameResult
+from rxcli.types import Frame, FrameResult
 
 CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
 OPTIONS = ReceiverOptions(screens=(parse_profile(SCREEN, ScreenProfile, "small"),), corners=CORNERS, cae="never")
@@ -34,21 +36,30 @@ def _frame(folder: Path) -> tuple[Frame, list[str]]:
     return next(iter(open_source(str(folder / "small.png")))), payloads
 
 
-def _camera(rows_per_slot: float) -> tuple[Camera, ReceiverOptions]:
-    return Camera(None, 1e-4 / rows_per_slot, 1e-5, None, "linear"), OPTIONS
+def _with_camera(frame: Frame, rows_per_slot: float) -> FrameContext:
+    camera = Camera(None, 1e-4 / rows_per_slot, 1e-5, None, "linear")
+    return FrameContext(frame, CORNERS, camera, OPTIONS.screens, Timer())
 
 
-def _chosen(frame: Frame, found: Cameras, monkeypatch: pytest.MonkeyPatch) -> Camera:
+def _chosen(frame: Frame, found: Cameras, monkeypatch: pytest.MonkeyPatch) -> FrameContext | Failure:
     monkeypatch.setattr(unknown_camera, "find_cameras", lambda *_: found)
-    return unknown_camera.likely_camera(frame, CORNERS, OPTIONS, Stages())[0]
+    return unknown_camera.likely_camera(frame, CORNERS, OPTIONS, Timer())
+
+
+def _why_none(frame: Frame, found: Cameras, monkeypatch: pytest.MonkeyPatch) -> str:
+    failure = _chosen(frame, found, monkeypatch)
+    assert isinstance(failure, Failure)
+    return failure.message
 
 
 def test_headers_decide_between_estimates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, _ = _frame(tmp_path)
-    right, wrong, other = (_camera(rows) for rows in (ROWS_PER_SLOT, 1.13 * ROWS_PER_SLOT, 0.7 * ROWS_PER_SLOT))
-    assert _chosen(frame, Cameras(wrong, (other, right)), monkeypatch) is right[0]
-    assert _chosen(frame, Cameras(right, (wrong, other)), monkeypatch) is right[0]
-    assert _chosen(frame, Cameras(None, (wrong, right), "nothing"), monkeypatch) is right[0]
+    right, wrong, other = (
+        _with_camera(frame, rows) for rows in (ROWS_PER_SLOT, 1.13 * ROWS_PER_SLOT, 0.7 * ROWS_PER_SLOT)
+    )
+    assert _chosen(frame, Cameras(wrong, (other, right)), monkeypatch) is right
+    assert _chosen(frame, Cameras(right, (wrong, other)), monkeypatch) is right
+    assert _chosen(frame, Cameras(None, (wrong, right), "nothing"), monkeypatch) is right
 
 
 @pytest.mark.parametrize(("seed", "number", "n_packets"), [(777, 71, 10), (2024, 25, 8)])
@@ -63,36 +74,31 @@ def test_packets_of_long_exposures_are_received(seed: int, number: int, n_packet
 
 def test_an_estimate_beyond_doubt_needs_no_packets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, _ = _frame(tmp_path)
-    first, other = _camera(1.13 * ROWS_PER_SLOT), _camera(0.7 * ROWS_PER_SLOT)
-    assert _chosen(frame, Cameras(first, (other,), sure=True), monkeypatch) is first[0]
-    with pytest.raises(Failure, match="no packet header"):
-        _chosen(frame, Cameras(first, (other,)), monkeypatch)
+    first, other = _with_camera(frame, 1.13 * ROWS_PER_SLOT), _with_camera(frame, 0.7 * ROWS_PER_SLOT)
+    assert _chosen(frame, Cameras(first, (other,), sure=True), monkeypatch) is first
+    assert "no packet header" in _why_none(frame, Cameras(first, (other,)), monkeypatch)
 
 
 def test_without_headers_nothing_is_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, _ = _frame(tmp_path)
-    with pytest.raises(Failure, match="too dark"):
-        _chosen(frame, Cameras(None, (_camera(1.13 * ROWS_PER_SLOT),), "too dark"), monkeypatch)
+    found = Cameras(None, (_with_camera(frame, 1.13 * ROWS_PER_SLOT),), "too dark")
+    assert _why_none(frame, found, monkeypatch) == "too dark"
 
 
 def test_an_estimate_without_a_lock_is_none_where_it_has_rivals(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_lock(*_: object, **__: object) -> None:
-        raise Failure("no_signal", "nothing there")
-
     frame, _ = _frame(tmp_path)
-    right, wrong = _camera(ROWS_PER_SLOT), _camera(1.13 * ROWS_PER_SLOT)
-    monkeypatch.setattr(unknown_camera, "acquire", no_lock)
-    assert _chosen(frame, Cameras(right), monkeypatch) is right[0]
-    with pytest.raises(Failure, match="no packet header"):
-        _chosen(frame, Cameras(right, (wrong,)), monkeypatch)
+    right, wrong = _with_camera(frame, ROWS_PER_SLOT), _with_camera(frame, 1.13 * ROWS_PER_SLOT)
+    monkeypatch.setattr(unknown_camera, "acquire", lambda *_: Failure("no_signal", "nothing there"))
+    assert _chosen(frame, Cameras(right), monkeypatch) is right
+    assert "no packet header" in _why_none(frame, Cameras(right, (wrong,)), monkeypatch)
 
 
 def test_packets_are_seen_on_their_own_clock_alone(tmp_path: Path) -> None:
     frame, _ = _frame(tmp_path)
     clocks = (ROWS_PER_SLOT, 1.004 * ROWS_PER_SLOT)
-    right, wrong = (unknown_camera._quick_evidence(frame, CORNERS, *_camera(rows), Stages()) for rows in clocks)
+    right, wrong = (unknown_camera._initial_evidence(_with_camera(frame, rows)) for rows in clocks)
     assert right[0] > 100
     assert sum(wrong) < 0.8 * sum(right)
 
@@ -115,13 +121,14 @@ def test_an_estimate_that_neither_packets_nor_edges_bear_out_is_taken_back(
 ) -> None:
     frame, _ = _frame(tmp_path)
 
-    found = find_cameras(frame, CORNERS, OPTIONS, Stages()).first
-    assert found is not None
-    right = found[0]
+    context = find_cameras(frame, CORNERS, OPTIONS, Timer()).first
+    assert context is not None
+    right = context.camera
     assert right.blind_estimate is not None
     estimate, strips = right.blind_estimate
     wrong = replace(right, blind_estimate=(replace(estimate, rows_per_slot=1.03 * ROWS_PER_SLOT), strips))
-    acquisition = acquire(frame, CORNERS, right, found[1], Stages(), quick=True)
+    acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
+    assert isinstance(acquisition, Acquisition)
     reception = decode(acquisition, OPTIONS.skip)
     result = FrameResult("small", 0, None, "no_signal", message="none", **right.facts)
 
@@ -160,9 +167,9 @@ def test_a_picture_whose_values_follow_light_is_read_as_one(tone: Tone, monkeypa
     options = ReceiverOptions(screens=tuple(shipped_profiles(ScreenProfile)), corners=trial.corners, cae="never")
     read: list[str] = []
 
-    def noting_the_tone(frame: Frame, corners: FloatArray, camera: Camera, *rest: Any, **more: Any) -> Acquisition:
-        read.append(camera.tone)
-        return acquire(frame, corners, camera, *rest, **more)
+    def noting_the_tone(context: FrameContext, *rest: Any) -> Acquisition | Failure:
+        read.append(context.camera.tone)
+        return acquire(context, *rest)
 
     monkeypatch.setattr(unknown_camera, "acquire", noting_the_tone)
     result = next(receive([frame], options))

@@ -245,7 +245,7 @@ def test_frames_before_and_after_an_occlusion_are_looked_at_again(clip: Clip, mo
     def measure_again(_scene: object, views: list[Any], *_: object) -> None:
         measured.append([view.bursts.frame for view in views])
 
-    monkeypatch.setattr("rxcli.receiver.clip.scene.Scene.measure_again", measure_again)
+    monkeypatch.setattr("rxcli.receiver.clip.scene.TrackedScreen.measure_again", measure_again)
     monkeypatch.setattr("rxcli.receiver.clip.receiver._TOO_MUCH_DOUBT", 1.0)
     dark = replace(clip.frames[3], pixels=np.full_like(clip.frames[3].pixels, 2))
     got = list(receive((*clip.frames[:3], dark, *clip.frames[4:]), clip.options))
@@ -260,7 +260,7 @@ def test_a_look_that_would_not_mend_much_is_left_out(clip: Clip, monkeypatch: py
     def measure_again(_scene: object, views: list[Any], *_: object) -> None:
         measured.append(len(views))
 
-    monkeypatch.setattr("rxcli.receiver.clip.scene.Scene.measure_again", measure_again)
+    monkeypatch.setattr("rxcli.receiver.clip.scene.TrackedScreen.measure_again", measure_again)
     monkeypatch.setattr("rxcli.receiver.clip.bursts.BurstReader.doubts", lambda *_: (3, 10))
     assert len(list(receive(clip.frames, clip.options))) == len(clip.frames)
     assert measured == [len(clip.frames)]

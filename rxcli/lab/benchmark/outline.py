@@ -16,7 +16,7 @@ from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset
-from rxcli.receiver.locate import levels_of
+from rxcli.receiver.corners import levels_of
 from rxcli.receiver.screen.find import find_screen
 from rxcli.types import FloatArray
 

@@ -15,15 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from rxcli.lab.benchmark.trial import simulate_trial
+from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.camera import Exposure
 from rxcli.lab.simulate.scenes import Scene as SimulatedScene
 from rxcli.lab.training.fit import MOST_WORDS, UNKNOWN, Sample
 from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_scene
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
+from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
-from rxcli.receiver.pipeline import denoiser_case
+from rxcli.receiver.context import Failure, Timer
+from rxcli.receiver.corners import find_corners
+from rxcli.receiver.still import decode, doubtful_columns
 from rxcli.types import Clock, FloatArray
 
 _SCREENS = ("paper-34k6", "paper-17k3")
@@ -97,13 +101,27 @@ def _read(path: Path) -> list[Sample] | None:
         return None
 
 
+def acquired(trial: Trial, *, quick: bool = True) -> Acquisition | None:
+    """Screen and clock of a trial's first frame; None where they are not found. For `quick` see `sample_columns`."""
+    options, timer = trial.options(), Timer()
+    corners = find_corners(trial.frame, options)
+    context = corners if isinstance(corners, Failure) else find_camera(trial.frame, corners, options, timer)
+    if isinstance(context, Failure):
+        return None
+    found = acquire(context, sample_columns(context, context.n_columns, quick=quick))
+    return None if isinstance(found, Failure) else found
+
+
 def _simulated(simulated: SimulatedScene, seed: int) -> list[Sample]:
     """One frame as a sample; none where the receiver finds no clock, a wrong one, or nothing doubtful."""
     trial = simulate_trial(simulated, seed)
-    case = denoiser_case(trial.frame, trial.options())
-    if case is None:
+    acquisition = acquired(trial)
+    if acquisition is None:
         return []
-    scene, columns = case
+    reception = decode(acquisition, trial.options().skip)
+    scene, columns = reception.scene, doubtful_columns(reception)
+    if scene is None or not columns.size:
+        return []
     slots = sent_slots(trial.capture.exposure, scene.clock)
     if not _headers_fit(slots, scene.clock):
         return []

@@ -15,9 +15,9 @@ import numpy as np
 from tqdm import tqdm
 
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
+from rxcli.lab.training.dataset import acquired
 from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
 from rxcli.protocol import indices_to_bits
-from rxcli.receiver.locate import Failure, Stages, acquire, find_camera, find_corners
 from rxcli.receiver.still import apply_autoencoder, decode
 from rxcli.results.truth import EXPECTED_LENGTHS, Score
 
@@ -73,12 +73,8 @@ def _evaluate_one(number: int, seed: int) -> Outcome:
 
 def _cpu_ms(trial: Trial) -> float:
     """CPU time of the second opinion, the smaller of two runs; 0 where no clock is found."""
-    options = trial.options()
-    try:
-        corners = find_corners(trial.frame, options)
-        camera, options = find_camera(trial.frame, corners, options, Stages())
-        acquisition = acquire(trial.frame, corners, camera, options, Stages())
-    except Failure:
+    options, acquisition = trial.options(), acquired(trial, quick=False)
+    if acquisition is None:
         return 0.0
     reception, spent = decode(acquisition, options.skip), []
     for _ in range(2):

@@ -12,22 +12,16 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import channel, sync
+from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.clip import results
 from rxcli.receiver.clip.bursts import BurstReader
 from rxcli.receiver.clip.scene import TrackedScreen
-from rxcli.receiver.clip.start import Start, agree, lock_at, shows_little
+from rxcli.receiver.clip.start import Start, acquisition_at, agree, shows_little
 from rxcli.receiver.clip.views import View, Waiting
+from rxcli.receiver.context import Failure, FrameContext, Timer
+from rxcli.receiver.corners import find_corners
 from rxcli.receiver.decode import assemble, detect
-from rxcli.receiver.locate import (
-    Acquisition,
-    Camera,
-    Failure,
-    Stages,
-    acquire,
-    find_camera,
-    find_corners,
-    sample_columns,
-)
 from rxcli.receiver.still import Reception, apply_autoencoder, decode, doubtful_columns, initial_pass
 from rxcli.receiver.sync import tracking
 from rxcli.results.dump import dump_stages
@@ -97,8 +91,8 @@ class _Clip:
         self._first: list[Frame] | None = [] if "tracking" in options.skip else None
         self._start: Start | None = None
         self._next_number = 0
-        #: The camera and the options with the screens that remain, and what they were found for.
-        self._camera: tuple[Camera, ReceiverOptions] | None = None
+        #: A frame with the camera and the screens that remain, and what they were found for.
+        self._context: FrameContext | None = None
         self._taken_with: tuple[object, ...] = ()
         self._corners: FloatArray | None = None
         #: Number of a frame that is yet to be received, and its corners.
@@ -131,9 +125,8 @@ class _Clip:
 
     def _shows_little(self, frame: Frame) -> bool:
         """Whether a frame shows so little that it should find its clock with others."""
-        try:
-            corners = find_corners(frame, self._options)
-        except Failure:
+        corners = find_corners(frame, self._options)
+        if isinstance(corners, Failure):
             return False
         self._found = frame.index, corners
         return shows_little(frame, corners, self._options)
@@ -145,33 +138,34 @@ class _Clip:
         return [result for frame in frames for result in self._take(frame)]
 
     def _take(self, frame: Frame) -> list[FrameResult]:
-        stages = Stages()
+        timer = Timer()
         waiting = Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok"))
         if self._options.stop_when_certain and self._shows_nothing_new(frame):
             waiting.result = replace(waiting.result, message="its bursts are certain from the frames before")
             waiting.skip("certain_frames", 1)
             self._waiting.append(waiting)
             return self._ready()
-        try:
-            view = self._known(frame, stages)
-            if view is not None:
-                waiting.skip("tracking", 1)
-            else:
-                view, waiting.result = self._search(frame, waiting.result, stages)
+        view: View | Failure | None = self._known(frame, timer)
+        if view is not None:
+            waiting.skip("tracking", 1)
+        else:
+            view, report = self._search(frame, timer)
+            waiting.result = replace(waiting.result, denoiser=report)
+        if isinstance(view, Failure):
+            self._scene = None
+            waiting.result = replace(waiting.result, status=view.status, message=view.message)
+            self._waiting.append(waiting)
+            done = self._finish_scene_before()
+        else:
             waiting.view = view
             waiting.result = replace(
                 waiting.result,
-                **view.camera.facts,
+                **view.context.camera.facts,
                 screen_profile=view.acquisition.screen.name,
                 corners=self._corners,
             )
-            done = self._enter(waiting, frame, stages)
-        except Failure as failure:
-            self._scene = None
-            waiting.result = replace(waiting.result, status=failure.status, message=failure.message)
-            self._waiting.append(waiting)
-            done = self._finish_scene_before()
-        waiting.result = replace(waiting.result, timing_ms=stages.total())
+            done = self._enter(waiting, frame, timer)
+        waiting.result = replace(waiting.result, timing_ms=timer.total())
         return done
 
     def _shows_nothing_new(self, frame: Frame) -> bool:
@@ -212,28 +206,22 @@ class _Clip:
 
     # -- a frame like a photograph ------------------------------------------------------------------------------
 
-    def _search(self, frame: Frame, result: FrameResult, stages: Stages) -> tuple[View, FrameResult]:
-        """Receive a frame like a photograph; only the camera is taken from the frames before."""
+    def _search(self, frame: Frame, timer: Timer) -> tuple[View | Failure, dict[str, Any] | None]:
+        """Receive a frame like a photograph, only the camera taken from before; and what the auto-encoder reports."""
         self._scene_before, self._scene = self._scene, None
-        with stages("geometry"):
-            found, self._found = self._found, None
-            corners = found[1] if found and found[0] == frame.index else find_corners(frame, self._options)
-            if self._scene_before is not None and self._scene_before.near(corners):
-                corners = self._scene_before.corners
-        self._corners = corners
-        if self._camera is None or self._taken_with != _taken_with(frame) or "tracking" not in self._options.skip:
-            self._camera = find_camera(frame, corners, self._options, stages)
-            self._taken_with = _taken_with(frame)
-        camera, options = self._camera
-        acquisition = self._predicted(frame, corners, camera, stages) or acquire(
-            frame, corners, camera, options, stages
-        )
-        can_track = self._can_track(frame, camera, acquisition)
-        reception, denoised, report = self._decoded(acquisition, can_track and self._n_held == _HELD, stages)
+        context = self._context_of(frame, timer)
+        if isinstance(context, Failure):
+            return context, None
+        acquisition = self._predicted(context) or acquire(context, sample_columns(context, context.n_columns))
+        if isinstance(acquisition, Failure):
+            return acquisition, None
+        can_track = self._can_track(context, acquisition)
+        reception, denoised, report = self._decoded(acquisition, can_track and self._n_held == _HELD, timer)
         if assemble.all_dark(reception.snr):
-            raise Failure("no_signal", "no light of the screen's columns is seen; something may be in front of it")
+            message = "no light of the screen's columns is seen; something may be in front of it"
+            return Failure("no_signal", message), None
         view = View(
-            camera,
+            context,
             acquisition,
             _bursts_of(frame, reception),
             reception.model.isi_memory,
@@ -242,64 +230,75 @@ class _Clip:
             denoised,
         )
         if can_track:
-            with stages("sampling"):
-                scene = TrackedScreen.of_frame(
-                    frame, corners, camera, acquisition, reception.model.black_level, self._scene_before
-                )
+            with timer("sampling"):
+                scene = TrackedScreen.of_frame(context, acquisition, reception.model.black_level, self._scene_before)
                 view.light, view.map = scene.strips(frame), scene.map
             scene.take(view, lambda: channel.lit_on_grid(reception.posteriors, reception.clock))
             self._scene = scene
-        return view, replace(result, denoiser=report)
+        return view, report
+
+    def _context_of(self, frame: Frame, timer: Timer) -> FrameContext | Failure:
+        """Where the screen is in a frame, and the camera, known from the frames before where nothing changed."""
+        with timer("geometry"):
+            found, self._found = self._found, None
+            corners = found[1] if found and found[0] == frame.index else find_corners(frame, self._options)
+        if isinstance(corners, Failure):
+            return corners
+        if self._scene_before is not None and self._scene_before.near(corners):
+            corners = self._scene_before.corners
+        self._corners = corners
+        if self._context is None or self._taken_with != _taken_with(frame) or "tracking" not in self._options.skip:
+            context = find_camera(frame, corners, self._options, timer)
+            if isinstance(context, Failure):
+                return context
+            self._context, self._taken_with = context, _taken_with(frame)
+        return replace(self._context, frame=frame, corners=corners, timer=timer)
 
     def _decoded(
-        self, acquisition: Acquisition, again: bool, stages: Stages
+        self, acquisition: Acquisition, again: bool, timer: Timer
     ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
         """What is received at a lock, columns that the auto-encoder changed, and its report.
 
         A quick look that leaves little doubt is enough of a frame that is looked at `again` when the picture is known.
         """
         if again and self._options.cae != "always":
-            with stages("detect"):
+            with timer("detect"):
                 reception = initial_pass(acquisition)
                 if doubtful_columns(reception).size <= _QUICK_DOUBT * reception.snr.shape[0]:
                     return reception, frozenset(), None
-        with stages("detect"):
+        with timer("detect"):
             reception = decode(acquisition, self._options.skip)
-        with stages("denoise"):
+        with timer("denoise"):
             return apply_autoencoder(acquisition, reception, self._options)
 
-    def _predicted(self, frame: Frame, corners: FloatArray, camera: Camera, stages: Stages) -> Acquisition | None:
-        """The lock by the clock that the first frames agreed on, where a frame cannot find its own."""
-        if self._start is None:
-            return None
-        with stages("sampling"):
-            profiles = sample_columns(frame, corners, camera, self._start.screen.columns)
-        return lock_at(self._start, frame, profiles, camera)
+    def _predicted(self, context: FrameContext) -> Acquisition | None:
+        """By the clock that the first frames agreed on, where a frame cannot find its own."""
+        return None if self._start is None else acquisition_at(self._start, context)
 
-    def _can_track(self, frame: Frame, camera: Camera, acquisition: Acquisition) -> bool:
+    def _can_track(self, context: FrameContext, acquisition: Acquisition) -> bool:
         """Whether a row of the picture is one instant, in the order of time."""
         return (
             "tracking" in self._options.skip
-            and frame.mosaic is None
+            and context.frame.mosaic is None
             and acquisition.profiles.sensor_row is None
-            and not camera.reversed
+            and not context.camera.reversed
         )
 
     # -- a frame whose place and picture are known ---------------------------------------------------------------
 
-    def _known(self, frame: Frame, stages: Stages) -> View | None:
+    def _known(self, frame: Frame, timer: Timer) -> View | None:
         """The view of a frame by what is known; None where that does not fit."""
         scene = self._scene
         if scene is None or self._link is None or self._taken_with != _taken_with(frame):
             return None
-        with stages("geometry"):
+        with timer("geometry"):
             if scene.follow(frame, may_move=self._options.corners is None):
                 self._corners = scene.corners
-        return scene.view(frame, self._link.time, self._n_held != _HELD_LONG, stages)
+        return scene.view(frame, self._link.time, self._n_held != _HELD_LONG, timer)
 
     # -- bursts ---------------------------------------------------------------------------------------------------
 
-    def _enter(self, waiting: Waiting, frame: Frame, stages: Stages) -> list[FrameResult]:
+    def _enter(self, waiting: Waiting, frame: Frame, timer: Timer) -> list[FrameResult]:
         view = waiting.view
         assert view is not None
         done: list[FrameResult] = []
@@ -314,7 +313,7 @@ class _Clip:
         self._link.last_time_s = frame.time_s
         view.bursts = replace(view.bursts, first_copy=first_copy)
         self._waiting.append(waiting)
-        with stages("detect"):
+        with timer("detect"):
             if not self._link.phase.settled:
                 self._compare(view)
             n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)

@@ -47,7 +47,7 @@ def columns_of(
     columns = assemble.clip_results(view.bursts.clock, ended, sure, view.snr, min_confidence)
     if view.denoised:
         columns = tuple(replace(c, denoised=c.column in view.denoised) for c in columns)
-    return tuple(assemble.in_stored_rows(c, view.height) for c in columns) if view.camera.reversed else columns
+    return tuple(assemble.in_stored_rows(c, view.height) for c in columns) if view.context.camera.reversed else columns
 
 
 def taps(waiting: Waiting, view: View, ended: Sequence[assemble.BurstInClip]) -> dict[str, Any]:

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.receiver import channel, sampling, sync
+from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel import known_picture
 from rxcli.receiver.clip.views import View
-from rxcli.receiver.locate import Acquisition, Camera, Stages
+from rxcli.receiver.context import Camera, FrameContext, Timer
 from rxcli.receiver.sampling import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.sync import tracking
@@ -74,18 +75,17 @@ class TrackedScreen:
     @classmethod
     def of_frame(
         cls,
-        frame: Frame,
-        corners: FloatArray,
-        camera: Camera,
+        context: FrameContext,
         acquisition: Acquisition,
         black_level: float,
         before: TrackedScreen | None,
     ) -> TrackedScreen:
         """A new picture; the strips stay those of the scene before, where the screen is still there."""
-        n_columns = acquisition.screen.columns
+        n_columns, corners = acquisition.screen.columns, context.corners
         if before is not None and corners is before.corners and before.map.inside.shape[0] == n_columns:
             return cls(corners, before.map, acquisition, black_level)
-        return cls(corners, _map(frame, corners, camera, acquisition), acquisition, black_level)
+        strip_map = _map(context.frame, corners, context.camera, acquisition)
+        return cls(corners, strip_map, acquisition, black_level)
 
     def _new_picture(self, black_level: float | Float32Array) -> known_picture.KnownPicture:
         acquisition, profiles = self._begun_with[0], self._begun_with[0].profiles
@@ -137,33 +137,33 @@ class TrackedScreen:
     def _move(self, frame: Frame, corners: FloatArray) -> None:
         assert self.last is not None
         rows, before, before_map = self.rows, self.corners, self.map
-        self.map = _map(frame, corners, self.last.camera, self.last.acquisition, before_map.inside.shape[1])
+        self.map = _map(frame, corners, self.last.context.camera, self.last.acquisition, before_map.inside.shape[1])
         self.corners = corners
         row_of = _row_before(self.rows, corners, before, self.last.acquisition.screen.columns)
         self._picture.moved(row_of - rows[0], self.map.inside)
 
     # -- a frame ------------------------------------------------------------------------------------------------
 
-    def view(self, frame: Frame, time: tracking.LinkTime, thorough: bool, stages: Stages) -> View | None:
+    def view(self, frame: Frame, time: tracking.LinkTime, thorough: bool, timer: Timer) -> View | None:
         """A frame by what is known; None where that does not fit.
 
         Args:
             frame: taken with the same camera as those before.
             time: the link's time.
             thorough: False where it is enough to measure a faded frame roughly, for it will be measured again.
-            stages: time is counted there.
+            timer: time is counted there.
         """
         last = self.last
         if last is None:
             return None
-        with stages("sampling"):
+        with timer("sampling"):
             light = self.strips(frame)
             flat = self._picture.solve(light)
-        with stages("clock"):
+        with timer("clock"):
             clock = self._clock(frame, flat, last.acquisition.clock, time)
             if clock is None:
                 return None
-        with stages("detect"):
+        with timer("detect"):
             refined = self._refined(self._picture, light, flat, clock, last.isi_memory, thorough)
             if refined is None:
                 return None
@@ -171,7 +171,7 @@ class TrackedScreen:
             shown = _shown(self.map.inside, positions, clock)
             snr = _snr(flat, clock)
         return View(
-            last.camera,
+            replace(last.context, frame=frame, corners=self.corners, timer=timer),
             replace(last.acquisition, clock=clock),
             tracking.FrameBursts(frame.index, 0, clock, metrics, shown, tracked=True),
             last.isi_memory,

@@ -7,7 +7,7 @@ at the same place in the packet's length, and nothing else does.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,17 +15,10 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver import sync
-from rxcli.receiver.locate import (
-    Acquisition,
-    Camera,
-    ColumnSampler,
-    Failure,
-    Stages,
-    find_camera,
-    find_corners,
-    noise_of,
-    sample_columns,
-)
+from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sample_columns
+from rxcli.receiver.cameras import find_camera
+from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
+from rxcli.receiver.corners import find_corners
 from rxcli.receiver.sync.tracking import LinkTime
 from rxcli.types import Clock, FloatArray, Frame, RowProfiles
 
@@ -48,26 +41,26 @@ class Start:
 
 def shows_little(frame: Frame, corners: FloatArray, options: ReceiverOptions) -> bool:
     """Whether a frame with the screen at the corners (4, 2) shows too few packets to find its clock alone."""
-    try:
-        camera, options = find_camera(frame, corners, options, Stages())
-    except Failure:
+    context = find_camera(frame, corners, options, Timer())
+    if isinstance(context, Failure):
         return False
     shown = min(float(corners[:, 1].max()), frame.height - 1.0) - max(float(corners[:, 1].min()), 0.0)
-    return shown * camera.line_delay_s < _FEW_PACKETS * min(screen.packet_s for screen in options.screens)
+    return shown * context.camera.line_delay_s < _FEW_PACKETS * min(screen.packet_s for screen in context.screens)
 
 
 def agree(frames: Sequence[Frame], options: ReceiverOptions) -> Start | None:
     """The clock that the headers of several frames agree on, None where they do not."""
-    try:
-        corners = find_corners(frames[0], options)
-        camera, options = find_camera(frames[0], corners, options, Stages())
-    except Failure:
+    corners = find_corners(frames[0], options)
+    if isinstance(corners, Failure):
+        return None
+    context = find_camera(frames[0], corners, options, Timer())
+    if isinstance(context, Failure):
         return None
     best: tuple[float, Start] | None = None
-    for n_columns in sorted({screen.columns for screen in options.screens}):
-        profiles_of = [sample_columns(frame, corners, camera, n_columns) for frame in frames]
-        for screen in (s for s in options.screens if s.columns == n_columns):
-            lead, slot, period = _phase(frames, profiles_of, screen, camera)
+    for n_columns in sorted({screen.columns for screen in context.screens}):
+        profiles_of = [sample_columns(replace(context, frame=frame), n_columns).profiles for frame in frames]
+        for screen in (s for s in context.screens if s.columns == n_columns):
+            lead, slot, period = _phase(frames, profiles_of, screen, context.camera)
             if lead > _MIN_LEAD and (best is None or lead > best[0]):
                 time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
                 time.begin(frames[0].index, frames[0].time_s, slot, period)
@@ -75,9 +68,10 @@ def agree(frames: Sequence[Frame], options: ReceiverOptions) -> Start | None:
     return best[1] if best else None
 
 
-def lock_at(start: Start, frame: Frame, profiles: RowProfiles, camera: Camera) -> Acquisition | None:
-    """The lock that the clip's clock foretells for a frame; None where nothing of the screen is in the picture."""
-    screen = start.screen
+def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:
+    """What the clip's clock predicts for a frame; None where nothing of the screen is in the picture."""
+    screen, frame, camera = start.screen, context.frame, context.camera
+    profiles = sample_columns(context, screen.columns).profiles
     rows = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
     if rows.size == 0:
         return None

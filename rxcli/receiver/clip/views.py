@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel.known_picture import ColumnLight
-from rxcli.receiver.locate import Acquisition, Camera
+from rxcli.receiver.context import FrameContext
 from rxcli.receiver.sampling import tracked
 from rxcli.receiver.sync.tracking import FrameBursts
 from rxcli.types import Float32Array, FrameResult, IntArray
@@ -15,7 +16,7 @@ from rxcli.types import Float32Array, FrameResult, IntArray
 class View:
     """A frame with a lock."""
 
-    camera: Camera
+    context: FrameContext
     acquisition: Acquisition
     bursts: FrameBursts
     isi_memory: int

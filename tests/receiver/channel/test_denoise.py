@@ -14,12 +14,12 @@ import pytest
 
 from rxcli.errors import ProfileError
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
+from rxcli.lab.training.dataset import acquired
 from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
 from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
 from rxcli.receiver import still
 from rxcli.receiver.channel import denoise, metrics_of
 from rxcli.receiver.channel.denoise import COLUMN_FEATURES, STRIP_FEATURES, DenoiserInput, load_denoiser, network_inputs
-from rxcli.receiver.locate import Stages, acquire, find_camera, find_corners
 from rxcli.resources import data_dir
 from rxcli.results.truth import Score
 from rxcli.types import Clock, FrameResult, SlotSamples
@@ -439,9 +439,8 @@ def test_the_receiver_goes_on_without_a_broken_model(trials: dict[str, Trial], m
 
 def test_columns_beyond_repair_are_not_asked(trials: dict[str, Trial]) -> None:
     options = trials["hard"].options()
-    corners = find_corners(trials["hard"].frame, options)
-    camera, options = find_camera(trials["hard"].frame, corners, options, Stages())
-    lock = acquire(trials["hard"].frame, corners, camera, options, Stages())
+    lock = acquired(trials["hard"], quick=False)
+    assert lock is not None
     seen = still.decode(lock, options.skip)
     better, kept, report = still.apply_autoencoder(lock, seen, options)
     assert report is not None

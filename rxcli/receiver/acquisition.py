@@ -1,0 +1,179 @@
+"""From a frame's context to a clock: columns sampled, screen profile and header found. Part of the wiring."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.profiles import ScreenProfile
+from rxcli.receiver import camera as blind
+from rxcli.receiver import sampling, sync
+from rxcli.receiver.context import Failure, FrameContext
+from rxcli.receiver.corners import too_small
+from rxcli.receiver.screen import geometry
+from rxcli.types import Clock, FloatArray, IntArray, RowProfiles
+
+#: A header peak less than this times the strongest rival is no clock.
+_MIN_PEAK_RATIO = 1.6
+#: Of so many strips a column an initial pass reads pairs; what tells screens by their columns needs some.
+_MANY_STRIPS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnSampler:
+    """Row profiles of a screen's columns, and what reads more of them."""
+
+    profiles: RowProfiles
+    #: Whether strips were read in pairs, as a quick look takes them.
+    is_binned: bool = False
+    #: Reads all strips of some columns pixel by pixel, given the noise model, where the profiles are of a quick look;
+    #: None where they are not.
+    read: Callable[[slice, tuple[float, float]], RowProfiles] | None = None
+
+    @property
+    def n_binned_strips(self) -> int:
+        """Strips of a column that a quick look takes: see `sync.binned_strips`."""
+        n_strips: int = self.profiles.light.shape[1]
+        return n_strips if self.is_binned or n_strips % 2 else n_strips // 2
+
+    def binned(self) -> RowProfiles:
+        """The profiles with strips pooled in pairs."""
+        return self.profiles if self.is_binned else sync.binned_strips(self.profiles)
+
+    def in_depth(self, columns: NDArray[np.int64]) -> ColumnSampler:
+        """The same with some columns read pixel by pixel, strip by strip."""
+        if self.read is None or not columns.size:
+            return self
+        every = sync.unbinned_strips(self.profiles) if self.is_binned else self.profiles
+        names = [name for name in ("light", "inside", "count", "sensor_row") if getattr(every, name) is not None]
+        arrays = {name: getattr(every, name).copy() for name in names}
+        for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
+            part = slice(int(run[0]), int(run[-1]) + 1)
+            read = self.read(part, (every.noise_floor, every.noise_slope))
+            for name, array in arrays.items():
+                array[part] = getattr(read, name)
+        return ColumnSampler(replace(every, **arrays), read=self.read)
+
+
+@dataclass(frozen=True, slots=True)
+class Acquisition:
+    """A screen whose clock was found."""
+
+    screen: ScreenProfile
+    sampler: ColumnSampler
+    clock: Clock
+    #: Another that it may be: of columns which are not spread in time, where they seem to be.
+    rival: Clock | None = None
+    #: (n_copies,) burst of every copy; None where the light is to tell.
+    burst: IntArray | None = None
+
+    @property
+    def profiles(self) -> RowProfiles:
+        return self.sampler.profiles
+
+    def binned(self) -> Acquisition:
+        """The same with strips pooled in pairs."""
+        return replace(self, sampler=ColumnSampler(self.sampler.binned(), is_binned=True))
+
+    def in_depth(self, columns: NDArray[np.int64]) -> Acquisition:
+        """The same with some columns read pixel by pixel, strip by strip."""
+        sampler = self.sampler.in_depth(columns)
+        return self if sampler is self.sampler else replace(self, sampler=sampler)
+
+
+def n_strips_of(corners: FloatArray, n_columns: int) -> int:
+    """Lateral strips of a column, by its width."""
+    return sampling.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
+
+
+def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False) -> ColumnSampler:
+    """Row profiles of a screen of `n_columns` columns, in the order of time.
+
+    With `quick`, columns of developed pictures are read pixel by pixel only when they are asked for, see
+    `ColumnSampler.in_depth`.
+    """
+    frame, camera = context.frame, context.camera
+    quick = quick and sampling.is_coded(frame)
+    n_strips = n_strips_of(context.corners, n_columns)
+    is_binned = quick and n_strips >= _MANY_STRIPS and n_strips % 2 == 0
+
+    def read(
+        columns: slice, noise: tuple[float, float] | None, n_strips: int = n_strips, quick: bool = False
+    ) -> RowProfiles:
+        outlines = geometry.column_outlines(
+            context.corners, n_columns, n_strips, frame.width, frame.height, camera.lens, columns
+        )
+        profiles = sampling.sample_rows(frame, outlines, camera.tone, quick=quick, noise=noise)
+        return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
+
+    with context.timer("sampling"):
+        profiles = read(slice(0, n_columns), None, n_strips // 2 if is_binned else n_strips, quick)
+    return ColumnSampler(profiles, is_binned, read if quick else None)
+
+
+def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Failure:
+    """The screen profile and the clock that fit best, from the columns of `context.n_columns`.
+
+    Screens that differ in nothing but their columns share a clock: which of them it is, is asked last.
+    """
+    n_columns = context.n_columns
+    with context.timer("clock"):
+        pooled = sync.pooled_strips(sampler.binned())
+        rates = {(s.slot_rate_hz, s.packet_slots): s for s in context.screens}
+        clocks = {rate: found for rate, screen in rates.items() if (found := _clocks_of(context, screen, pooled))}
+        clocks = {rate: found for rate, found in clocks.items() if found[0].header_peak_ratio >= _MIN_PEAK_RATIO}
+        if not clocks:
+            return Failure("no_signal", _why_no_signal(context))
+        rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(pooled, clocks[r][0]))
+    alike = [screen for screen in context.screens if (screen.slot_rate_hz, screen.packet_slots) == rate]
+    acquisitions = [_acquired(alike[0], sampler, clocks[rate])] if alike[0].columns == n_columns else []
+    for screen in alike[len(acquisitions) :]:
+        finer = sample_columns(context, screen.columns, quick=sampler.read is not None)
+        with context.timer("clock"):
+            found = _clocks_of(context, screen, sync.pooled_strips(finer.binned()))
+        if found:
+            acquisitions.append(_acquired(screen, finer, found))
+    if not acquisitions:
+        return Failure("no_signal", _why_no_signal(context))
+    return acquisitions[0] if len(acquisitions) == 1 else _with_likely_columns(acquisitions)
+
+
+def _acquired(screen: ScreenProfile, sampler: ColumnSampler, clocks: tuple[Clock, ...]) -> Acquisition:
+    return Acquisition(screen, sampler, clocks[0], rival=clocks[1] if len(clocks) > 1 else None)
+
+
+def _structure(profiles: RowProfiles, clock: Clock) -> float:
+    """How much the strips, each on its own, look like packets on this clock."""
+    samples = sync.sample_slots(profiles, clock, 1)
+    slots = samples.light.reshape(-1, clock.n_slots).astype(np.float64)
+    return blind.structure_llr(slots, clock.first_slot, clock.packet_slots)
+
+
+def _with_likely_columns(acquisitions: list[Acquisition]) -> Acquisition:
+    """Among screens of one clock, the one whose columns are as wide as seen."""
+    finest = max(
+        acquisitions, key=lambda acquisition: acquisition.profiles.light.shape[0] * acquisition.profiles.light.shape[1]
+    )
+    likely = blind.likely_columns(finest.profiles, finest.clock, [acquisition.screen for acquisition in acquisitions])
+    return next(acquisition for acquisition in acquisitions if acquisition.screen is likely)
+
+
+def _clocks_of(context: FrameContext, screen: ScreenProfile, profiles: RowProfiles) -> tuple[Clock, ...]:
+    rows_per_slot = 1 / (screen.slot_rate_hz * context.camera.line_delay_s)
+    exposure_slots = context.camera.exposure_s * screen.slot_rate_hz
+    return sync.find_clocks(profiles, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(profiles))
+
+
+def _why_no_signal(context: FrameContext) -> str:
+    shortest = min(context.screens, key=lambda screen: screen.packet_s)
+    return too_small(context, shortest) or (
+        "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
+    )
+
+
+def noise_of(profiles: RowProfiles) -> float:
+    """Standard deviation of a strip's row of no light."""
+    return float(np.sqrt(profiles.noise_floor / max(float(np.median(profiles.count)), 1.0)))

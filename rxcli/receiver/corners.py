@@ -1,0 +1,62 @@
+"""Where the screen's corners are in a frame, and what to say where they are not found. Part of the wiring."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rxcli.options import ReceiverOptions
+from rxcli.profiles import ScreenProfile
+from rxcli.receiver.context import Failure, FrameContext
+from rxcli.receiver.screen import geometry
+from rxcli.types import FloatArray, Frame
+
+#: Orientations in which the readout runs along the columns' width.
+_PORTRAIT = (5, 6, 7, 8)
+
+
+def find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray | Failure:
+    """(4, 2) corners of the screen, image pixels, top-left first, clockwise as a viewer sees it."""
+    orientation = frame.metadata.orientation
+    if orientation in _PORTRAIT:
+        return Failure(
+            "no_signal",
+            f"the picture was taken in portrait (EXIF orientation {orientation}): the sensor reads along the width of "
+            "the columns, so that they cannot be told apart; hold the camera in landscape",
+        )
+    if options.corners is not None:
+        return options.corners
+    from rxcli.receiver.screen.find import find_screen
+
+    found = find_screen(frame.pixels, **levels_of(frame))
+    corners = found.corners
+    if corners is None and "no_screen" in options.skip:
+        return Failure("no_screen", f"no screen found: {found.reason}; give its place with --corners")
+    if corners is None:
+        # Told not to give up: the picture may show nothing but a part of the screen.
+        right, bottom = frame.width - 1.0, frame.height - 1.0
+        corners = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
+    return geometry.viewer_order(corners, orientation)
+
+
+def levels_of(frame: Frame) -> dict[str, Any]:
+    """What pixel values mean, by the names of the arguments of `find_screen` and `measure_side_curvature`."""
+    levels = frame.mosaic
+    if levels is None:
+        return {"black": frame.black, "white": frame.white}
+    return {"black": float(np.mean(levels.black)), "white": levels.white, "mosaic_period": levels.pattern.shape[1]}
+
+
+def too_small(context: FrameContext, screen: ScreenProfile) -> str | None:
+    """Why no packet of `screen` fits the rows that show it, None where one does."""
+    frame, camera = context.frame, context.camera
+    fill = float(np.ptp(np.clip(context.corners[:, 1], 0, frame.height - 1))) / frame.height
+    needed = screen.packet_s / (camera.line_delay_s * frame.height)
+    if fill >= needed:
+        return None
+    advice = "move closer" if needed < 1 else "use a faster slot rate or shorter packets"
+    return (
+        f"the screen fills {np.floor(100 * fill):.0f} % of the height: one packet at {screen.slot_rate_hz / 1e3:g} kHz "
+        f"needs {np.ceil(100 * needed):.0f} % with this camera; {advice}"
+    )
