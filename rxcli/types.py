@@ -7,7 +7,7 @@ stored picture, which is never rotated. The time of a sensor row is the start of
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -187,6 +187,25 @@ class BurstPosteriors:
     bit_llr: FloatArray
     #: (B, C) float64: log-likelihood of the headers as they must be, over slots of any kind; 0 where none is seen.
     header_llr: FloatArray
+
+    def of_columns(self, columns: IntArray) -> BurstPosteriors:
+        """Those of some columns."""
+        return BurstPosteriors(*(getattr(self, f.name)[_columns_of(f.name, columns)] for f in fields(self)))
+
+    def with_columns(self, columns: IntArray, some: BurstPosteriors) -> BurstPosteriors:
+        """All columns, with `some` in the place of those named."""
+
+        def merged(name: str) -> Any:
+            out = getattr(self, name).copy()
+            out[_columns_of(name, columns)] = getattr(some, name)
+            return out
+
+        return BurstPosteriors(*(merged(f.name) for f in fields(self)))
+
+
+def _columns_of(name: str, columns: IntArray) -> Any:
+    """Index of some columns in a field of the posteriors; bursts come first in all but the weights."""
+    return columns if name.startswith("w") else (slice(None), columns)
 
 
 FrameStatus = Literal["ok", "partial", "no_screen", "no_signal", "unreadable"]

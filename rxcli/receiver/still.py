@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -194,7 +194,7 @@ def _refine_columns(
     likelihoods = channel.slot_likelihoods(samples, reception.clock, model, lit, columns)
     metrics, snr, timing = reception.metrics.copy(), reception.snr.copy(), np.zeros((lit.shape[0], 2))
     metrics[columns], snr[columns], timing[columns] = likelihoods.metrics, likelihoods.snr, likelihoods.timing
-    posteriors = _replaced(reception.posteriors, columns, _detect(metrics[columns], reception.clock))
+    posteriors = reception.posteriors.with_columns(columns, _detect(metrics[columns], reception.clock))
     return replace(reception, metrics=metrics, snr=snr, posteriors=posteriors), timing
 
 
@@ -218,31 +218,10 @@ def _view(
     return samples, model
 
 
-def _replaced(every: BurstPosteriors, columns: NDArray[np.int64], some: BurstPosteriors) -> BurstPosteriors:
-    """Posteriors of all columns, with those of some in their place."""
-
-    def merged(name: str) -> Any:
-        out = getattr(every, name).copy()
-        out[_in_columns(name, columns)] = getattr(some, name)
-        return out
-
-    return BurstPosteriors(*(merged(field.name) for field in fields(BurstPosteriors)))
-
-
-def of_columns(every: BurstPosteriors, columns: NDArray[np.int64]) -> BurstPosteriors:
-    """Posteriors of some columns."""
-    return BurstPosteriors(*(getattr(every, f.name)[_in_columns(f.name, columns)] for f in fields(BurstPosteriors)))
-
-
-def _in_columns(name: str, columns: NDArray[np.int64]) -> Any:
-    """Index of some columns in a field of the posteriors; bursts come first in all but the weights."""
-    return columns if name.startswith("w") else (slice(None), columns)
-
-
 def _dark(snr: Float32Array) -> NDArray[np.bool_]:
     """(C,) whether a column has too little light for the light model to make anything of it."""
-    reception, lit = ((snr > least).sum(axis=1) for least in (0.0, 10 ** (_DARK_SNR_DB / 10)))
-    return np.asarray((2 * lit < reception) | (reception == 0))
+    n_observed, n_lit = ((snr > least).sum(axis=1) for least in (0.0, 10 ** (_DARK_SNR_DB / 10)))
+    return np.asarray((2 * n_lit < n_observed) | (n_observed == 0))
 
 
 def _unsettled(
@@ -290,15 +269,15 @@ def apply_autoencoder(
     metrics = reception.metrics[columns] + channel.metrics_of(corrections, reception.model.isi_memory)
     metrics = _words_weighed(reception, reception.scene, columns, metrics)
     posteriors = _detect(metrics, reception.clock)
-    before, after = (p.log_prob.sum(axis=(0, 2)) for p in (of_columns(reception.posteriors, columns), posteriors))
+    before, after = (p.log_prob.sum(axis=(0, 2)) for p in (reception.posteriors.of_columns(columns), posteriors))
     better = np.flatnonzero(after > before)
     kept = columns[better]
     # The network is told where headers are; whether they show there, the light alone must say.
-    corrected = replace(of_columns(posteriors, better), header_llr=reception.posteriors.header_llr[:, kept])
+    corrected = replace(posteriors.of_columns(better), header_llr=reception.posteriors.header_llr[:, kept])
     of_all = reception.metrics.copy()
     of_all[kept] = metrics[better]
     report.update(model=denoiser.name, kept=kept.size)
-    reception = replace(reception, metrics=of_all, posteriors=_replaced(reception.posteriors, kept, corrected))
+    reception = replace(reception, metrics=of_all, posteriors=reception.posteriors.with_columns(kept, corrected))
     return reception, frozenset(kept.tolist()), report
 
 
@@ -323,7 +302,7 @@ def _words_weighed(
         scene.black_level, scene.sigma, scene.shot_gain, scene.crosstalk, _taps(clock, scene.samples.samples_per_slot)
     )
     samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
-    lit = channel.lit_on_grid(_replaced(reception.posteriors, columns, posteriors), clock)
+    lit = channel.lit_on_grid(reception.posteriors.with_columns(columns, posteriors), clock)
     likely = log_prob > log_prob[:, :1] - _WORD_MARGIN
     corrections = channel.word_corrections(samples, clock, model, lit, columns, places, words, likely)
     return metrics + channel.metrics_of(corrections, reception.model.isi_memory)
@@ -344,7 +323,7 @@ def remove_row_noise(acquisition: Acquisition, reception: Reception, columns: ND
         fresh = _from_nothing(reception.clock, light, model, scene.lit, there)
         better = _evidence(fresh.metrics, reception.clock) > _evidence(metrics[there], reception.clock)
         metrics[there[better]], snr[there[better]] = fresh.metrics[better], fresh.snr[better]
-    posteriors = _replaced(reception.posteriors, columns, _detect(metrics[columns], reception.clock))
+    posteriors = reception.posteriors.with_columns(columns, _detect(metrics[columns], reception.clock))
     cleaned = replace(reception, metrics=metrics, snr=snr, posteriors=posteriors)
     return replace(cleaned, scene=_scene_of(cleaned, scene.samples, model))
 

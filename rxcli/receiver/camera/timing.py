@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import local_mean
 from rxcli.receiver.camera.curvature import BEND_PRECISION, BEND_SCALE, curvature_terms, reversed_curvature
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis
 from rxcli.receiver.camera.strips import Correction, Strips, in_readout_order
@@ -21,7 +22,6 @@ from rxcli.receiver.camera.waves import (
     decide,
     estimate_exposure,
     first_slots,
-    local_mean,
     local_moments,
     packet_llr,
     residual_of,

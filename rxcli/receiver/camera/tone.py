@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from rxcli.numerics import local_mean
 from rxcli.receiver.camera.strips import Strips
-from rxcli.receiver.camera.waves import local_mean, local_moments, residual_of
+from rxcli.receiver.camera.waves import local_moments, residual_of
 from rxcli.types import Float32Array, FloatArray
 
 #: Exponent that makes light of values, as nearly as a power of them does, by the tone curve.

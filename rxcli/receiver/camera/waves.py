@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import local_mean
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook
 from rxcli.receiver.camera.strips import EXTREMES_SLOTS, SAMPLES, Strips, levelled
 from rxcli.receiver.camera.trellis import lit_probability, pattern_light
@@ -270,12 +271,6 @@ def _running(
     below: Float32Array = np.asarray(flat.take(index), np.float32)
     step: Float32Array = np.asarray(flat.take(index + 1), np.float32) - below
     return np.asarray(below + step * (place - low), np.float32), step
-
-
-def local_mean(values: Float32Array, window: int) -> Float32Array:
-    import cv2
-
-    return np.asarray(cv2.blur(values, (window | 1, 1)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from rxcli.errors import ProfileError
+from rxcli.numerics import box_sums
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, slot_patterns
 from rxcli.resources import data_dir
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
@@ -177,19 +178,19 @@ def _predict_picture(
     On each of several scales; the one that has predicted best thereabouts is taken.
     """
     weighted = expected * valid
-    sums = [(part, _box(part, int(_HOLE_SLOTS * q))) for part in (weighted * light, weighted * expected)]
+    sums = [(part, box_sums(part, int(_HOLE_SLOTS * q))) for part in (weighted * light, weighted * expected)]
     # Every other sample tells the error well enough.
     some = (slice(None), slice(None), slice(None, None, 2))
     light, weighted, around = light[some], weighted[some], _ERROR_SLOTS * q // 2
-    black_level = np.float32(sigma * sigma) * _box(valid[some], around)
+    black_level = np.float32(sigma * sigma) * box_sums(valid[some], around)
     picture = variance = None
     for scale in _PICTURE_SCALES:
         reach = int(_HOLE_SLOTS * q) + 2 * int(scale * q)
-        numerator, denominator = (_box(part, reach) - hole for part, hole in sums)
+        numerator, denominator = (box_sums(part, reach) - hole for part, hole in sums)
         initial = np.maximum(numerator, 0) / (denominator + np.float32(1e-4))
         predicted = initial[some] * weighted
-        error = _box(np.square(light - predicted), around) - black_level
-        texture = np.clip(error / (_box(np.square(predicted), around) + np.float32(1e-9)), *_TEXTURE_BOUNDS)
+        error = box_sums(np.square(light - predicted), around) - black_level
+        texture = np.clip(error / (box_sums(np.square(predicted), around) + np.float32(1e-9)), *_TEXTURE_BOUNDS)
         crosstalk = initial * initial * np.repeat(texture, 2, axis=2) + np.float32(sigma * sigma) / (
             denominator + np.float32(1e-6)
         )
@@ -202,15 +203,6 @@ def _predict_picture(
     assert picture is not None
     assert variance is not None
     return picture, variance
-
-
-def _box(values: Float32Array, half: int) -> Float32Array:
-    """Sum over the samples at most `half` away; last axis."""
-    import cv2
-
-    flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))
-    summed = cv2.boxFilter(flat, -1, (2 * half + 1, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(summed, np.float32).reshape(values.shape)
 
 
 def _strip_features(scene: DenoiserInput, observed: _Explained, columns: NDArray[np.int64]) -> Float32Array:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rxcli.numerics import box_sums
 from rxcli.types import Float32Array
 
 #: Scales, in slots, over which the picture is predicted: fine texture to plain sky.
@@ -25,15 +26,6 @@ class Prediction:
 
     picture: Float32Array
     variance: Float32Array
-
-
-def box_sums(values: Float32Array, half: int) -> Float32Array:
-    """Sum over the samples at most `half` away; last axis."""
-    import cv2
-
-    flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))
-    summed = cv2.boxFilter(flat, -1, (2 * half + 1, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(summed).reshape(values.shape)
 
 
 def predict_picture(

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import box_sums
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.likelihoods import from_neighbours, shape_on_grid
 from rxcli.receiver.channel.model import LightModel
-from rxcli.receiver.channel.picture import box_sums
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
 #: Kinds of picture, smooth to rough: relative standard deviation about the local mean, and slots after which it is

@@ -11,7 +11,7 @@ from rxcli.protocol import WEIGHTS
 from rxcli.receiver import channel, sync
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble, detect
-from rxcli.receiver.still import HOPELESS_WEIGHT, of_columns
+from rxcli.receiver.still import HOPELESS_WEIGHT
 from rxcli.receiver.sync.tracking import Bursts
 from rxcli.types import Float32Array, FloatArray, IntArray
 
@@ -107,7 +107,7 @@ class BurstReader:
         certain = posteriors.log_prob[0].min(axis=1) >= _CERTAIN
         for one in np.unique(number):
             mine = np.flatnonzero(number == one)
-            self.open.note(int(one), column[mine], of_columns(posteriors, mine), certain[mine])
+            self.open.note(int(one), column[mine], posteriors.of_columns(mine), certain[mine])
         # Weights of columns that were certain are the only ones tried next, until they are not certain any more.
         self._weights[column] = False
         self._weights[column[certain], posteriors.w[certain] - 1] = True

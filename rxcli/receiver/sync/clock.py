@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import log_alike
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
@@ -452,9 +453,8 @@ def copy_likeness(llr: Float32Array, clock: Clock) -> FloatArray:
         :, None, None
     ]
     first, second = lit[:, :-1], lit[:, 1:]
-    alike = first * second / share + (1 - first) * (1 - second) / (1 - share)
     both = observed[:, :-1] & observed[:, 1:]
-    return np.asarray((np.log(alike) * both).sum(axis=(0, 2)), np.float64)
+    return np.asarray((log_alike(first, second, share) * both).sum(axis=(0, 2)), np.float64)
 
 
 def to_copies(slots: Float32Array, clock: Clock) -> Float32Array:

@@ -9,11 +9,10 @@ clip, and with the phase of the bursts (`BurstPhase`) every burst too, those in 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rxcli.numerics import log_alike
 from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS, bits_per_symbol
 from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatArray, IntArray
 
@@ -175,8 +174,7 @@ def _alike(first: FloatArray, second: FloatArray) -> float:
     both = (first != 0) & (second != 0)
     p, q = 1 / (1 + np.exp(-first)), 1 / (1 + np.exp(-second))
     lit = np.clip((p * both).sum(axis=1) / np.maximum(both.sum(axis=1), 1), 0.1, 0.9)[:, None]
-    ratio = p * q / lit + (1 - p) * (1 - q) / (1 - lit)
-    return float((np.log(ratio) * both).sum())
+    return float((log_alike(p, q, lit) * both).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,18 +347,4 @@ def _merged(before: BurstPosteriors | None, new: BurstPosteriors, columns: IntAr
         return new
     if before is None:
         before = _nothing_known(new, n)
-
-    def put(old: NDArray[Any], part: NDArray[Any], axis: int) -> NDArray[Any]:
-        out = old.copy()
-        out[(slice(None),) * axis + (columns,)] = part
-        return out
-
-    return BurstPosteriors(
-        w=put(before.w, new.w, 0),
-        w_log_prob=put(before.w_log_prob, new.w_log_prob, 0),
-        lit=put(before.lit, new.lit, 1),
-        index=put(before.index, new.index, 1),
-        log_prob=put(before.log_prob, new.log_prob, 1),
-        bit_llr=put(before.bit_llr, new.bit_llr, 1),
-        header_llr=put(before.header_llr, new.header_llr, 1),
-    )
+    return before.with_columns(columns, new)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rxcli.numerics import box_sums
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Share of its weight that a frame keeps with every frame after it.
@@ -220,7 +221,7 @@ class KnownPicture:
 
     def picture(self) -> tuple[Float32Array, Float32Array]:
         """The picture and its relative variance, (C, S, R) each."""
-        around = _box(self._light, _AROUND_ROWS) / (_box(self._observed, _AROUND_ROWS) + np.float32(1e-3))
+        around = box_sums(self._light, _AROUND_ROWS) / (box_sums(self._observed, _AROUND_ROWS) + np.float32(1e-3))
         total = self._observed + np.float32(_SMOOTH)
         picture = np.maximum(self._light + np.float32(_SMOOTH) * around, 0) / total
         unseen = np.float32(_SMOOTH * _AROUND_ERROR) / total
@@ -257,16 +258,7 @@ def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
 def _around(values: Float32Array, rows_per_slot: float) -> Float32Array:
     """Sum over the slots around, a row's own left out; last axis."""
     near, far = (int(slots * rows_per_slot) for slots in (_OWN_SLOTS, _ERROR_SLOTS))
-    return _box(values, far) - _box(values, near)
-
-
-def _box(values: Float32Array, half: int) -> Float32Array:
-    """Sum over the rows at most `half` away; last axis."""
-    import cv2
-
-    flat = values.reshape(-1, values.shape[-1])
-    summed = cv2.boxFilter(flat, -1, (2 * half + 1, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(summed).reshape(values.shape)
+    return box_sums(values, far) - box_sums(values, near)
 
 
 def _factored(

@@ -1,0 +1,37 @@
+"""Maths that stages share; every stage may stand on it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.types import Float32Array
+
+
+def box_sums(values: Float32Array, half: int) -> Float32Array:
+    """Sum over the samples at most `half` away, nothing beyond the ends; last axis, same shape."""
+    import cv2
+
+    flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))
+    summed = cv2.boxFilter(flat, -1, (2 * half + 1, 1), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(summed, np.float32).reshape(values.shape)
+
+
+def local_mean(values: Float32Array, window: int) -> Float32Array:
+    """Mean over a window of (at least) `window` samples, mirrored at the ends; (n, samples), same shape."""
+    import cv2
+
+    return np.asarray(cv2.blur(values, (window | 1, 1)))
+
+
+def log_alike(
+    first: NDArray[np.floating], second: NDArray[np.floating], share: NDArray[np.floating]
+) -> NDArray[np.floating]:
+    """Log-likelihood ratio of two slots being the same one over their being two independent ones.
+
+    Args:
+        first: probability that the first is lit.
+        second: probability that the second is lit.
+        share: of lit slots among all, 0..1 exclusive.
+    """
+    return np.asarray(np.log(first * second / share + (1 - first) * (1 - second) / (1 - share)))
