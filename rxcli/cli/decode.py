@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-from rxcli.cli.common import receiver_arguments, receiver_options
-from rxcli.errors import ExitCode, InputError, UsageError
+from rxcli.cli.common import claim_outputs, force_argument, receiver_arguments, receiver_options
+from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
+    from rxcli.outputs import Output
     from rxcli.results.summary import SourceSummary
     from rxcli.results.truth import Scorer
     from rxcli.runs.batch import Decoded, Decoder, Source
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
 
 _FILE = click.Path(dir_okay=False, path_type=Path, allow_dash=False)
 _FOLDER = click.Path(file_okay=False, path_type=Path)
+#: The source that is read from stdin.
+STDIN = "-"
 
 
 @click.command()
@@ -47,6 +52,7 @@ _FOLDER = click.Path(file_okay=False, path_type=Path)
     "--stop-when-certain", is_flag=True, help="Pass over frames of a clip all of whose packets are certain already."
 )
 @click.option("--quiet", is_flag=True, help="No table, no summary, no progress.")
+@force_argument
 def decode(paths: tuple[str, ...], **options: Any) -> int:
     """Decode photos, RAW files and clips; PATH may be a folder, or - for one picture on stdin."""
     _check(paths, options)
@@ -66,13 +72,15 @@ def decode(paths: tuple[str, ...], **options: Any) -> int:
     from rxcli.runs.batch import standard_decoder
 
     configured = receiver_options(**receiver)
-    _make_folders(options)
     tap = None
     if options["save_undistorted"]:
         from rxcli.results.undistort import UndistortedWriter
 
-        tap = UndistortedWriter(options["save_undistorted"], configured.cameras, configured.force_camera)
-    with _stdin_as_file(paths) as sources:
+        folder = Path(options["save_undistorted"]).absolute()
+        tap = UndistortedWriter(folder, configured.cameras, configured.force_camera)
+    sources = _sources(paths)
+    _claim(options, sources)
+    with _stdin_as_file(sources) as sources:
         return _Run(standard_decoder(configured, tap), options).run(sources)
 
 
@@ -91,38 +99,72 @@ def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
         raise UsageError("stdin cannot be sent to a cluster", "name a file that its workers see")
     if options["summary"]:
         check_summary_path(options["summary"])
-    for name in ("summary", "junit", "save_camera"):
-        if options[name] is not None and not options[name].parent.is_dir():
-            option = name.replace("_", "-")
-            raise UsageError(f"--{option} {options[name]}: there is no such folder", "make it, or name another")
 
 
-def _make_folders(options: dict[str, Any]) -> None:
+def _claim(options: dict[str, Any], sources: list[Source]) -> None:
+    """Refuse outputs that would destroy something, and make the folders of the taps."""
+    from rxcli.outputs import claim_folder
+
+    truth = options["truth"]
+    truths = [_truth_of(source.name, truth) for source in sources]
+    inputs = [source.path for source in sources] + [str(path) for path in truths if path is not None]
+    claim_outputs(_outputs(options), inputs, (*options["screens"], *options["cameras"]), options["force"])
     for name in ("dump_dir", "save_undistorted"):
         if options[name] is not None:
-            try:
-                options[name].mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                option = name.replace("_", "-")
-                raise UsageError(f"--{option} {options[name]}: {error.strerror}", "name another folder") from None
+            claim_folder("--" + name.replace("_", "-"), options[name])
+
+
+def _outputs(options: dict[str, Any]) -> Iterator[Output]:
+    """Every file that the run will write."""
+    from rxcli import outputs
+
+    summary = options["summary"]
+    is_table = summary is not None and summary.suffix.casefold() == ".csv"
+    looks = {
+        "json": outputs.JOURNAL,
+        "junit": outputs.JUNIT,
+        "summary": outputs.CSV_SUMMARY if is_table else outputs.PARQUET_SUMMARY,
+        "save_camera": outputs.ESTIMATED_CAMERA,
+    }
+    paths = {**options, "json": None if options["json_path"] == "-" else options["json_path"]}
+    for name, ours in looks.items():
+        if paths[name] is not None:
+            yield outputs.Output("--" + name.replace("_", "-"), Path(paths[name]), ours)
+
+
+def _truth_of(name: str, truth: str | None) -> Path | None:
+    """The truth file of a source, None where it has none."""
+    from rxcli.results.truth import find_truth
+
+    return find_truth(name) if truth == "auto" else None if truth is None else Path(truth)
+
+
+def _sources(paths: tuple[str, ...]) -> list[Source]:
+    from rxcli.ingest import KNOWN_SUFFIXES
+    from rxcli.runs.batch import collect_sources
+
+    return collect_sources(paths, frozenset(KNOWN_SUFFIXES))
 
 
 @contextmanager
-def _stdin_as_file(paths: tuple[str, ...]) -> Iterator[list[Source]]:
-    """The sources that `paths` name, with what comes from stdin put into a file for as long as it is needed."""
+def _stdin_as_file(sources: list[Source]) -> Iterator[list[Source]]:
+    """The sources, with what comes from stdin put into a file for as long as it is needed."""
     from tempfile import NamedTemporaryFile
 
-    from rxcli.ingest import KNOWN_SUFFIXES
-    from rxcli.runs.batch import Source, collect_sources
-
-    with ExitStack() as stack:
-        sources = collect_sources([path for path in paths if path != "-"], frozenset(KNOWN_SUFFIXES))
-        if "-" in paths:
-            file = stack.enter_context(NamedTemporaryFile(prefix="vlc-rx-"))
-            file.write(sys.stdin.buffer.read())
-            file.flush()
-            sources.insert(min(paths.index("-"), len(sources)), Source("-", file.name))
+    if all(source.name != STDIN for source in sources):
         yield sources
+        return
+    if sys.stdin is None:
+        raise InputError("stdin is closed", "name a file instead of -")
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(NamedTemporaryFile(prefix="vlc-rx-"))
+            shutil.copyfileobj(sys.stdin.buffer, file)
+            file.flush()
+        except OSError as error:
+            reason = f"stdin: cannot be kept in a temporary file ({error.strerror or error})"
+            raise InputError(reason, "make room, or set TMPDIR to another folder") from None
+        yield [replace(source, path=file.name) if source.name == STDIN else source for source in sources]
 
 
 class _Run:
@@ -138,6 +180,8 @@ class _Run:
         self._to_stdout = options["json_path"] == "-"
         #: The frame with the most packets of those whose camera was estimated.
         self._estimated: FrameResult | None = None
+        #: Name of a source -> where it is opened.
+        self._paths: dict[str, str] = {}
 
     def run(self, sources: list[Source]) -> ExitCode:
         from rxcli.results.summary import exit_code
@@ -147,15 +191,17 @@ class _Run:
                 f"--truth {self._options['truth']} is the truth of one file ({len(sources)} were given)",
                 "give --truth auto, which takes the NAME.truth.json beside each file",
             )
+        self._paths = {source.name: source.path for source in sources}
         done = self._recover() if self._options["resume"] else set()
         try:
             with ExitStack() as stack:
                 write = self._writer(stack)
                 self._decode([source for source in sources if source.name not in done], write, len(sources))
-        finally:
-            self._summaries.sort(key=_order([source.name for source in sources]))
-            self._conclude()
-        return exit_code(self._summaries, self._limits)
+        except BaseException:
+            with suppress(OSError):
+                self._conclude(sources)  # what it cannot write is told; why the run ended says more
+            raise
+        return worst([*self._conclude(sources), exit_code(self._summaries, self._limits)])
 
     def _recover(self) -> set[str]:
         """Take the results of an earlier run into the summary; returns the names of its complete sources."""
@@ -238,32 +284,49 @@ class _Run:
 
     def _save_camera(self, path: Path) -> None:
         from rxcli.ingest import open_source
+        from rxcli.outputs import write_whole
         from rxcli.profiles import dump_profile
         from rxcli.receiver.camera import camera_profile
 
         if self._estimated is None:
             click.echo(f"vlc-rx: {path} was not written: no packet was received with an estimated camera", err=True)
             return
-        frame = next(iter(open_source(self._estimated.source)))
+        frame = next(iter(open_source(self._paths[self._estimated.source])))
         about = frame.metadata
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-") or "camera"
         profile = camera_profile(self._estimated.estimated, name, about.make, about.model, frame.width, frame.height)
-        try:
-            path.write_text(dump_profile(profile), encoding="utf-8")
-        except OSError as error:
-            raise UsageError(f"--save-camera {path}: {error.strerror}", "name another file") from None
+        write_whole(path, dump_profile(profile))
 
-    def _conclude(self) -> None:
-        from rxcli.results.summary import format_summary, write_junit, write_summary
+    def _conclude(self, sources: list[Source]) -> list[ExitCode]:
+        """Write what is written at the end, each whether or not the others can be; returns why some could not.
+
+        Raises:
+            OSError: stdout cannot be written, or its reader has gone; all files are written.
+        """
+        from rxcli.results.summary import write_junit, write_summary
+
+        self._summaries.sort(key=_order([source.name for source in sources]))
+        summaries, limits, codes = self._summaries, self._limits, []
+        steps: dict[str, Callable[[Path], None]] = {
+            "summary": lambda path: write_summary(path, summaries, limits),
+            "save_camera": self._save_camera,
+            "junit": lambda path: write_junit(path, summaries, limits),
+        }
+        for name, write in steps.items():
+            try:
+                if self._options[name]:
+                    write(self._options[name])
+            except ReceiverError as error:
+                click.echo(f"vlc-rx: {error}", err=True)
+                codes.append(error.exit_code)
+        self._print_summary()
+        return codes
+
+    def _print_summary(self) -> None:
+        from rxcli.results.summary import format_summary
 
         if self._summaries and not self._options["quiet"]:
             click.echo(format_summary(self._summaries, self._limits), err=self._to_stdout)
-        if self._options["summary"]:
-            write_summary(self._options["summary"], self._summaries, self._limits)
-        if self._options["save_camera"]:
-            self._save_camera(self._options["save_camera"])
-        if self._options["junit"]:
-            write_junit(self._options["junit"], self._summaries, self._limits)
 
 
 def _n_packets(result: FrameResult) -> int:

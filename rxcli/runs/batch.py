@@ -11,14 +11,14 @@ import json
 import logging
 import os
 import signal
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from rxcli.errors import InputError, ProfileError, ReceiverError, UsageError
+from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
 from rxcli.results.report import from_record, to_json_line
 from rxcli.types import Frame, FrameResult
 
@@ -59,23 +59,45 @@ class Source:
     path: str
     #: Why there is nothing to open, None where there is.
     problem: str | None = None
+    #: Where its taps go, below their folder: where it lies itself below what all sources of the run have in common.
+    subfolder: str = ""
 
 
 def collect_sources(paths: Iterable[str], suffixes: frozenset[str]) -> list[Source]:
     """The sources that `paths` name: files as they are, folders recursively and in order of name.
 
-    Each file is taken once. In folders, files of other suffixes and hidden ones are passed over.
+    Each file is taken once. In folders, files of other suffixes and hidden ones are passed over; "-" is stdin.
 
     Args:
         paths: files and folders.
         suffixes: lower-case suffixes, with the dot, of files to take from folders.
     """
     found = [source for path in paths for source in _sources_of(path, suffixes)]
-    return list({os.path.normpath(source.name): source for source in found}.values())
+    return _with_subfolders(list({os.path.normpath(source.name): source for source in found}.values()))
+
+
+def _with_subfolders(sources: list[Source]) -> list[Source]:
+    """The sources with a place of its own for the taps of each, whatever others are called."""
+    from rxcli.results.dump import plain_name
+
+    folders = [os.path.dirname(os.path.abspath(source.name)) for source in sources]
+    try:
+        common = os.path.commonpath(folders) if folders else ""
+    except ValueError:  # several drives
+        common = os.sep
+    count: Counter[tuple[str, str]] = Counter()
+    placed = []
+    for source, folder in zip(sources, folders, strict=True):
+        below = os.path.relpath(folder, common) if folder != common else ""
+        place = (below, plain_name(source.name).casefold())
+        count[place] += 1
+        own = below if count[place] == 1 else os.path.join(below, f"{count[place]}")
+        placed.append(replace(source, subfolder=own))
+    return placed
 
 
 def _sources_of(path: str, suffixes: frozenset[str]) -> Iterator[Source]:
-    if not os.path.isdir(path):
+    if path == "-" or not os.path.isdir(path):
         yield Source(path, path)
         return
     files = [name for name in _walk(path) if os.path.splitext(name)[1].casefold() in suffixes]
@@ -103,8 +125,8 @@ class Decoder:
     options: Any
     open_source: OpenSource
     receive: Receive
-    #: Sees every frame before it is received.
-    tap: Callable[[Frame], None] | None = None
+    #: Sees every frame before it is received, and the subfolder of its source.
+    tap: Callable[[Frame, str], None] | None = None
 
     def results(self, source: Source) -> Iterator[FrameResult]:
         """The results of all frames of `source`, at least one; an input that fails ends in an `unreadable` one.
@@ -112,16 +134,17 @@ class Decoder:
         Raises:
             UsageError: the options make no sense, whatever the source.
             ProfileError: likewise.
+            OutputError: taps cannot be written.
         """
-        failure = _Failure()
+        failure = _Failure(source)
         count = 0
         try:
             if source.problem:
                 raise InputError(source.problem)
-            for result in self.receive(failure.guard(self._frames(source)), self.options):
+            for result in self.receive(failure.guard(self._frames(source)), self._options_of(source)):
                 yield replace(result, source=source.name)
                 count += 1
-        except (UsageError, ProfileError):
+        except (UsageError, ProfileError, OutputError):
             raise
         except Exception as error:
             failure.note(error)
@@ -130,30 +153,42 @@ class Decoder:
 
     def _frames(self, source: Source) -> Iterator[Frame]:
         for frame in self.open_source(source.path):
+            frame = replace(frame, source=source.name)  # as the user named it, wherever it is opened
             if self.tap is not None:
-                self.tap(frame)
+                self.tap(frame, source.subfolder)
             yield frame
+
+    def _options_of(self, source: Source) -> Any:
+        """The options with a place of its own for the source's taps."""
+        folder = getattr(self.options, "dump_dir", None)
+        return self.options if folder is None else replace(self.options, dump_dir=folder / source.subfolder)
 
 
 class _Failure:
     """What went wrong with a source. The receiver behind a guarded iterator still gives what it had got till then."""
 
-    def __init__(self) -> None:
+    def __init__(self, source: Source) -> None:
+        self._source = source
         self.message: str | None = None
 
     def guard(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """The frames up to the failure, which is noted instead of raised."""
         try:
             yield from frames
-        except (UsageError, ProfileError):
+        except (UsageError, ProfileError, OutputError):
             raise
         except Exception as error:
             self.note(error)
 
     def note(self, error: Exception) -> None:
         """Keep the message of `error`; one that is no `ReceiverError` is a bug, whose traceback goes to the log."""
+        name = self._source.name
         if isinstance(error, ReceiverError):
-            self.message = str(error)
+            self.message = str(error).replace(self._source.path, name)
+            return
+        if isinstance(error, (OSError, MemoryError)):
+            reason = getattr(error, "strerror", None) or "more memory is needed than there is"
+            self.message = f"{name}: cannot be decoded ({reason}); try it by itself"
             return
         log.debug("unexpected error", exc_info=error)
         self.message = f"internal error ({type(error).__name__}: {error}); run again with --verbose and report it"
@@ -164,7 +199,7 @@ def unreadable(source: Source, frame: int, message: str) -> FrameResult:
     return FrameResult(source=source.name, frame=frame, time_s=0.0, status="unreadable", message=message)
 
 
-def standard_decoder(options: ReceiverOptions, tap: Callable[[Frame], None] | None = None) -> Decoder:
+def standard_decoder(options: ReceiverOptions, tap: Callable[[Frame, str], None] | None = None) -> Decoder:
     """The decoder that reads files and receives them."""
     from rxcli.ingest import open_source
     from rxcli.receiver.pipeline import receive
