@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 import click
 
@@ -21,10 +21,18 @@ if TYPE_CHECKING:
     from rxcli.results.summary import SourceSummary
     from rxcli.results.truth import Scorer
     from rxcli.runs.batch import Decoded, Decoder, Source
+    from rxcli.runs.journal import Head, Journal, Lines
     from rxcli.types import FrameResult
 
 _FILE = click.Path(dir_okay=False, path_type=Path, allow_dash=False)
 _FOLDER = click.Path(file_okay=False, path_type=Path)
+#: Options that change nothing of a source's results: where they go, who decodes, what is asked of them.
+_NO_MATTER = frozenset(
+    {
+        *("json_path", "junit", "summary", "save_camera", "dump_dir", "save_undistorted", "quiet", "force", "resume"),
+        *("workers", "cluster", "max_ber", "min_packets"),
+    }
+)
 #: The source that is read from stdin.
 STDIN = "-"
 
@@ -91,6 +99,8 @@ def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
     json_file = options["json_path"] not in (None, "-")
     if options["resume"] and not json_file:
         raise UsageError("--resume needs the file that --json wrote", "give --json FILE")
+    if options["resume"] and STDIN in paths:
+        raise UsageError("--resume cannot tell whether stdin is what it was", "name the file")
     if options["max_ber"] is not None and not options["truth"]:
         raise UsageError("--max-ber needs the truth", "give --truth FILE, or --truth auto")
     if options["cluster"] and options["workers"] > 1:
@@ -192,23 +202,24 @@ class _Run:
                 "give --truth auto, which takes the NAME.truth.json beside each file",
             )
         self._paths = {source.name: source.path for source in sources}
-        done = self._recover() if self._options["resume"] else set()
-        try:
-            with ExitStack() as stack:
-                write = self._writer(stack)
-                self._decode([source for source in sources if source.name not in done], write, len(sources))
-        except BaseException:
-            with suppress(OSError):
-                self._conclude(sources)  # what it cannot write is told; why the run ended says more
-            raise
+        with ExitStack() as stack:
+            journal = self._journal(stack)
+            done = self._recover() if self._options["resume"] else set()
+            writer = self._writer(journal, begun=bool(done))
+            try:
+                self._decode([source for source in sources if source.name not in done], writer, len(sources))
+            except BaseException:
+                with suppress(OSError):
+                    self._conclude(sources)  # what it cannot write is told; why the run ended says more
+                raise
         return worst([*self._conclude(sources), exit_code(self._summaries, self._limits)])
 
     def _recover(self) -> set[str]:
         """Take the results of an earlier run into the summary; returns the names of its complete sources."""
-        from rxcli.runs.batch import recover
+        from rxcli.runs.journal import recover
 
         done = set()
-        for name, results in recover(Path(self._options["json_path"])):
+        for name, results in recover(Path(self._options["json_path"]), self._head(), self._files()):
             summary, scorer = self._begin(name)
             for result in results:
                 summary.add(scorer.add(result) if scorer else result)
@@ -216,29 +227,50 @@ class _Run:
             done.add(name)
         return done
 
-    def _writer(self, stack: ExitStack) -> Any:
-        """The function that takes each result."""
-        if self._to_stdout:
-            return _print_json
-        if self._options["json_path"]:
-            from rxcli.runs.batch import Journal
+    def _journal(self, stack: ExitStack) -> Journal | None:
+        """The file of --json, locked."""
+        from rxcli.runs.journal import Journal
 
-            journal = Journal(Path(self._options["json_path"]), self._options["resume"])
-            stack.callback(journal.close)
-            return journal.write
-        return (lambda result: None) if self._options["quiet"] else _print_table
+        path = self._options["json_path"]
+        if path is None or self._to_stdout:
+            return None
+        journal = Journal(Path(path), self._options["resume"])
+        stack.callback(journal.close)
+        return journal
 
-    def _decode(self, sources: list[Source], write: Any, n_total: int) -> None:
+    def _files(self) -> dict[str, str]:
+        return {name: path for name, path in self._paths.items() if name != STDIN}
+
+    def _head(self) -> Head:
+        """What the results depend on: the version, the options, what the profiles hold."""
+        from rxcli import __version__
+        from rxcli.runs.journal import Head
+
+        options = {name: _plain(value) for name, value in self._options.items() if name not in _NO_MATTER}
+        configured = self._decoder.options
+        return Head(__version__, options | {"profiles": _digest((configured.screens, configured.cameras))})
+
+    def _writer(self, journal: Journal | None, begun: bool) -> _Writer:
+        """What takes each result."""
+        from rxcli.runs.journal import Lines
+
+        if journal is None and not self._to_stdout:
+            return _Nowhere() if self._options["quiet"] else _Table()
+        lines = Lines(self._head(), self._files(), begun)
+        return _JsonLines(lines, _print_line if journal is None else journal.append)
+
+    def _decode(self, sources: list[Source], writer: _Writer, n_total: int) -> None:
         with _progress(n_total, n_total - len(sources), self._options["quiet"]) as progress:
             for source, results in self._decoded(sources):
                 summary, scorer = self._begin(source.name)
+                writer.begin(source.name)
                 try:
-                    for result in results:
+                    for result, last in _with_last(results):
                         result = scorer.add(result) if scorer else result
                         summary.add(result)
                         self._keep_estimate(result)
                         with progress.paused():
-                            write(result)
+                            writer.write(result, last)
                 finally:
                     self._end(summary, scorer)
                 progress.finished(summary.n_frames)
@@ -338,17 +370,73 @@ def _order(names: list[str]) -> Any:
     return lambda summary: places.get(summary.source, len(places))
 
 
-def _print_json(result: FrameResult) -> None:
-    from rxcli.results.report import to_json_line
+def _with_last(results: Iterator[FrameResult]) -> Iterator[tuple[FrameResult, bool]]:
+    """Each result, and whether it is the last one; where they break off, none is."""
+    held: FrameResult | None = None
+    try:
+        for result in results:
+            if held is not None:
+                yield held, False
+            held = result
+    except (Exception, KeyboardInterrupt):
+        if held is not None:
+            yield held, False
+        raise
+    if held is not None:
+        yield held, True
 
-    sys.stdout.write(to_json_line(result) + "\n")
+
+def _plain(value: Any) -> Any:
+    """An option as JSON has it."""
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)
+
+
+def _digest(profiles: Any) -> str:
+    """A short mark that differs where profiles do."""
+    import hashlib
+
+    import msgspec
+
+    return hashlib.sha256(msgspec.json.encode(profiles)).hexdigest()[:16]
+
+
+class _Writer(Protocol):
+    """Takes the results of one source after the other."""
+
+    def begin(self, source: str) -> None: ...
+
+    def write(self, result: FrameResult, last: bool) -> None: ...
+
+
+class _Nowhere:
+    def begin(self, source: str) -> None: ...
+
+    def write(self, result: FrameResult, last: bool) -> None: ...
+
+
+class _Table(_Nowhere):
+    def write(self, result: FrameResult, last: bool) -> None:
+        from rxcli.results.report import format_frame
+
+        click.echo(format_frame(result) + "\n")
+
+
+class _JsonLines:
+    def __init__(self, lines: Lines, put: Callable[[str], None]) -> None:
+        self._lines, self._put = lines, put
+
+    def begin(self, source: str) -> None:
+        self._lines.begin(source)
+
+    def write(self, result: FrameResult, last: bool) -> None:
+        self._put(self._lines.line(result, last))
+
+
+def _print_line(line: str) -> None:
+    sys.stdout.write(line + "\n")
     sys.stdout.flush()
-
-
-def _print_table(result: FrameResult) -> None:
-    from rxcli.results.report import format_frame
-
-    click.echo(format_frame(result) + "\n")
 
 
 class _Progress:

@@ -1,25 +1,22 @@
-"""Many sources: which files there are, decoding them here or in worker processes, and results that survive a kill.
+"""Many sources: which files there are, and decoding them here or in worker processes.
 
-Results come source by source in the order of the input, whoever decodes them. The file of JSON lines is its own
-journal: every line is written whole, at once, and sources follow one another, so that after a kill at most the last
-source is incomplete; `recover` drops it and the run goes on from there.
+Results come source by source in the order of the input, whoever decodes them; `rxcli.runs.journal` keeps them.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import signal
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
-from rxcli.results.report import from_record, to_json_line
+from rxcli.runs.journal import Journal as Journal
+from rxcli.runs.journal import recover as recover
 from rxcli.types import Frame, FrameResult
 
 if TYPE_CHECKING:
@@ -38,8 +35,6 @@ Decoded = tuple["Source", Iterator[FrameResult]]
 
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
 _AHEAD = 32
-#: What every line of results starts with, so that half of one is told from a foreign file.
-_LINE_START = b'{"source": "'
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -405,90 +400,3 @@ def _one_thread_environment() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-class Journal:
-    """A file of JSON lines that holds whole lines only, whenever the process ends.
-
-    Args:
-        path: the file.
-        resume: keep what is there (after `recover`) and go on behind it.
-
-    Raises:
-        InputError: it cannot be written.
-    """
-
-    def __init__(self, path: Path, resume: bool = False) -> None:
-        self._path = path
-        try:
-            self._file: BinaryIO = path.open("ab" if resume else "wb", buffering=0)
-        except OSError as error:
-            raise self._unwritable(error) from None
-
-    def write(self, result: FrameResult) -> None:
-        """Append the line of `result`, in one call of the system.
-
-        Raises:
-            InputError: it cannot be written.
-        """
-        rest = memoryview(to_json_line(result).encode() + b"\n")
-        try:
-            while rest:
-                rest = rest[self._file.write(rest) :]
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            raise self._unwritable(error) from None
-
-    def _unwritable(self, error: OSError) -> InputError:
-        return InputError(f"{self._path}: cannot be written ({error.strerror})", "name a file that can be written")
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-def recover(path: Path) -> Iterator[tuple[str, list[FrameResult]]]:
-    """Give the complete sources of an earlier run's JSON lines, then cut off the last one, which may be incomplete.
-
-    Exhaust it before the file is written to.
-
-    Raises:
-        UsageError: the file is no output of `vlc-rx decode --json`; it is left as it is.
-        InputError: it cannot be read or cut.
-    """
-    try:
-        with path.open("rb+") as file:
-            start = yield from _complete_sources(file, path)
-            file.truncate(start)
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        raise InputError(f"{path}: cannot be resumed ({error.strerror})", "name another file") from None
-
-
-def _complete_sources(file: BinaryIO, path: Path) -> Generator[tuple[str, list[FrameResult]], None, int]:
-    """Give every source but the last one; returns where the last one starts."""
-    start = offset = 0
-    results: list[FrameResult] = []
-    for number, line in enumerate(file, start=1):
-        if not line.endswith(b"\n") and line[: len(_LINE_START)] == _LINE_START[: len(line)]:
-            break
-        result = _parse_line(line, f"{path} line {number}")
-        if results and result.source != results[0].source:
-            yield results[0].source, results
-            results, start = [], offset
-        results.append(result)
-        offset += len(line)
-    return start
-
-
-def _parse_line(line: bytes, place: str) -> FrameResult:
-    try:
-        record = json.loads(line)
-    except ValueError:
-        raise UsageError(f"{place}: not JSON", "name the file that --json wrote before") from None
-    try:
-        return from_record(record)
-    except UsageError as error:
-        raise UsageError(f"{place}: {error.message}", "name the file that --json wrote before") from None
