@@ -103,6 +103,8 @@ def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
         raise UsageError("--resume cannot tell whether stdin is what it was", "name the file")
     if options["max_ber"] is not None and not options["truth"]:
         raise UsageError("--max-ber needs the truth", "give --truth FILE, or --truth auto")
+    if options["cluster"] is not None and not options["cluster"].strip():
+        raise UsageError("--cluster needs the address of a Dask scheduler (got none)", "name it: tcp://host:8786")
     if options["cluster"] and options["workers"] > 1:
         raise UsageError("--workers and --cluster exclude each other", "give one of them")
     if options["cluster"] and "-" in paths:

@@ -33,6 +33,8 @@ Receive = Callable[[Iterable[Frame], Any], Iterator[FrameResult]]
 #: One source with its results, which are to be taken before the next source is asked for.
 Decoded = tuple["Source", Iterator[FrameResult]]
 
+#: What these signals mean is decided by the first process; they often come to all at once.
+_FIRST_DECIDES = (signal.SIGINT, signal.SIGTERM)
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
 _AHEAD = 32
 _THREAD_VARIABLES = (
@@ -266,7 +268,7 @@ class _Pool:
     def __exit__(self, *exception: object) -> None:
         for worker in self._workers:
             worker.connection.close()
-            worker.process.terminate()
+            worker.process.kill()  # it has nothing of its own, and passes over gentler signals
         for worker in self._workers:
             worker.process.join()
 
@@ -296,7 +298,7 @@ class _Pool:
     def _start(self) -> _Worker:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_work, args=(theirs, self._decoder, log_level()), daemon=True)
-        with _one_thread_environment():
+        with _one_thread_environment(), _signals_held():
             process.start()
         theirs.close()
         return _Worker(process, ours)
@@ -355,7 +357,9 @@ def _ending(exitcode: int | None) -> str:
 
 def _work(connection: Connection, decoder: Decoder, level: int) -> None:
     """A worker's life: take a source, send its results, until the other end is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides what an interrupt means
+    for number in _FIRST_DECIDES:
+        signal.signal(number, signal.SIG_IGN)
+    _hold_signals(signal.SIG_UNBLOCK)
     logging.basicConfig(level=level)
     use_one_thread()
     try:
@@ -385,6 +389,21 @@ def use_one_thread() -> None:
     import cv2
 
     cv2.setNumThreads(1)
+
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """While a worker starts, which inherits this, signals wait."""
+    _hold_signals(signal.SIG_BLOCK)
+    try:
+        yield
+    finally:
+        _hold_signals(signal.SIG_UNBLOCK)
+
+
+def _hold_signals(how: int) -> None:
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(how, _FIRST_DECIDES)
 
 
 @contextmanager
