@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
@@ -66,6 +67,7 @@ class _LazyGroup(click.Group):
         assert isinstance(command, click.Command)
         if _VERBOSE not in command.params:
             command.params.append(_VERBOSE)
+            _take_finite_numbers_only(command)
         return command
 
     def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
@@ -79,6 +81,26 @@ class _LazyGroup(click.Group):
         except BrokenPipeError:
             raise _PipeClosedError from None  # before click makes an exit code of its own of it
         return result
+
+
+def _take_finite_numbers_only(command: click.Command) -> None:
+    """Refuse nan and infinities for every option: no comparison with nan fails, so that it passes every bound."""
+    for parameter in command.params:
+        if isinstance(parameter.type, click.types.FloatParamType):
+            parameter.callback = _finite_then(parameter.callback)
+    if isinstance(command, click.Group):
+        for below in command.commands.values():
+            _take_finite_numbers_only(below)
+
+
+def _finite_then(callback: Callable[..., Any] | None) -> Callable[..., Any]:
+    def check(context: click.Context, parameter: click.Parameter, value: Any) -> Any:
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not math.isfinite(number):
+                raise click.BadParameter(f"{number} is no number", context, parameter)
+        return value if callback is None else callback(context, parameter, value)
+
+    return check
 
 
 @click.group(

@@ -155,7 +155,7 @@ def _kind_in(path: Path) -> str:
 
     try:
         kind = tomllib.loads(path.read_text(encoding="utf-8")).get("kind")
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+    except (OSError, ValueError, RecursionError):
         return ""
     if kind not in ("screen", "camera"):
         raise ProfileError(f"{path}: kind must be 'screen' or 'camera' (got {kind!r})", "correct the file")

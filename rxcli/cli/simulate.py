@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -246,7 +247,9 @@ def _seconds(text: str) -> float:
     try:
         value = float(numerator) / float(denominator or 1)
     except (ValueError, ZeroDivisionError):
-        raise UsageError(f"--exposure: {text!r} is no time", "give seconds, or a fraction such as 1/32000") from None
+        value = nan
+    if not 0 < value < 10:
+        raise UsageError(f"--exposure: {text!r} is no time", "give seconds, or a fraction such as 1/32000")
     return value
 
 
@@ -254,7 +257,9 @@ def _numbers(text: str, option: str, counts: tuple[int, ...]) -> tuple[float, ..
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise UsageError(f"{option}: {text!r} is no list of numbers", "separate numbers by commas") from None
+        values = (nan,)
+    if not all(map(isfinite, values)):
+        raise UsageError(f"{option}: {text!r} is no list of numbers", "separate numbers by commas")
     if len(values) not in counts:
         wanted = " or ".join(str(count) for count in counts)
         raise UsageError(f"{option} takes {wanted} numbers (got {len(values)})", "separate numbers by commas")

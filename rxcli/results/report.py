@@ -166,6 +166,8 @@ def _column_from(record: dict[str, Any]) -> ColumnResult:
 
 def _packet_from(record: dict[str, Any]) -> PacketResult:
     frames = record.get("frames")
+    if len(_text(record["payload"])) != 2 * -(-_count(record["payload_bits"]) // 8):
+        raise ValueError("payload and payload_bits disagree")
     return PacketResult(
         first_row=_number(record["first_row"]),
         copies=_number(record["copies"]),
