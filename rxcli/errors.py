@@ -17,15 +17,23 @@ class ExitCode(IntEnum):
     USAGE = 2
     UNREADABLE = 3
     INTERRUPTED = 130
+    TERMINATED = 143
 
 
 #: Where several codes hold, the first of these wins.
-_PRECEDENCE = (ExitCode.INTERRUPTED, ExitCode.USAGE, ExitCode.UNREADABLE, ExitCode.NOT_RECEIVED, ExitCode.OK)
+_PRECEDENCE = (
+    *(ExitCode.TERMINATED, ExitCode.INTERRUPTED),
+    *(ExitCode.USAGE, ExitCode.UNREADABLE, ExitCode.NOT_RECEIVED, ExitCode.OK),
+)
 
 
 def worst(codes: list[ExitCode]) -> ExitCode:
     """The exit code of a run in which each of `codes` occurred."""
     return next((code for code in _PRECEDENCE if code in codes), ExitCode.OK)
+
+
+class Terminated(BaseException):
+    """SIGTERM came: the run ends as by Ctrl-C, with what it has so far."""
 
 
 class ReceiverError(Exception):
@@ -51,6 +59,10 @@ class InputError(ReceiverError):
     """A file or device that cannot be read."""
 
     exit_code = ExitCode.UNREADABLE
+
+
+class OutputError(InputError):
+    """A file that cannot be written: the disk is full, for instance. It ends the run, whatever the source in hand."""
 
 
 class ProfileError(ReceiverError):

@@ -19,11 +19,14 @@ from msgspec import Meta
 
 from rxcli.errors import ProfileError
 from rxcli.protocol import packet_slots
-from rxcli.resources import data_dir
+from rxcli.resources import data_dir, read_limited
 
 PositiveInt = Annotated[int, Meta(gt=0, le=1_000_000)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
-Seconds = Annotated[float, Meta(gt=0, lt=1)]
+#: Times of rows and exposures; below a nanosecond nothing is read out.
+Seconds = Annotated[float, Meta(ge=1e-9, lt=1)]
+#: People write less.
+_MOST_BYTES = 1 << 18
 #: Names of the tone curves that `rxcli.receiver.sampling.rows.tone_to_light` can undo.
 ToneName = Literal["linear", "srgb", "bt709", "auto"]
 Triple = tuple[float, float, float]
@@ -36,11 +39,11 @@ class ScreenProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     kind: Literal["screen"]
     name: Name
     columns: Annotated[int, Meta(ge=1, le=1000)]
-    slot_rate_hz: Annotated[float, Meta(gt=0, le=1e6)]
+    slot_rate_hz: Annotated[float, Meta(ge=1, le=1e6)]
     payload_symbols: Annotated[int, Meta(ge=1, le=1000)]
     repeats: Annotated[int, Meta(ge=1, le=1000)] = 3
-    width_mm: Annotated[float, Meta(gt=0, le=1e5)] = 309.4
-    height_mm: Annotated[float, Meta(gt=0, le=1e5)] = 173.95
+    width_mm: Annotated[float, Meta(ge=1, le=1e5)] = 309.4
+    height_mm: Annotated[float, Meta(ge=1, le=1e5)] = 173.95
     width_px: PositiveInt = 1366
     height_px: PositiveInt = 768
     segment_rows: Annotated[int, Meta(ge=1, le=1000)] = 8
@@ -129,9 +132,10 @@ def parse_profile(text: str, kind: type[_Profile], source: str) -> _Profile:
     """
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # integers of thousands of digits, and brackets in brackets
+        reason = f"{error!s:.200}" if str(error) else type(error).__name__
         raise ProfileError(
-            f"{source}: not valid TOML ({error})", "correct the file, or name a shipped profile"
+            f"{source}: not valid TOML ({reason})", "correct the file, or name a shipped profile"
         ) from None
     return check_profile(raw, kind, source)
 
@@ -144,7 +148,7 @@ def check_profile(raw: dict[str, Any], kind: type[_Profile], source: str) -> _Pr
     """
     try:
         profile = msgspec.convert(raw, kind, strict=True)
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, OverflowError, RecursionError) as error:
         raise ProfileError(f"{source}: {_explain(str(error), raw)}", "correct the file") from None
     if isinstance(profile, CameraProfile):
         _check_lens(profile.lens, source)
@@ -177,7 +181,12 @@ def _explain(message: str, raw: dict[str, Any]) -> str:
             value = value[int(part)] if isinstance(value, list) else value[part]
         except (KeyError, IndexError, ValueError, TypeError):
             return f"{path}: {message[: found.start()]}"
-    return f"{path}: {message[: found.start()]} (got {value!r})"
+    return f"{path}: {message[: found.start()]} (got {_shown(value)})"
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
 
 
 def load_profile(name_or_path: str, kind: type[_Profile]) -> _Profile:
@@ -191,14 +200,15 @@ def load_profile(name_or_path: str, kind: type[_Profile]) -> _Profile:
     is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name_or_path) is not None
     path = by_name if is_name and by_name.is_file() else Path(name_or_path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_limited(path, _MOST_BYTES).decode("utf-8")
     except FileNotFoundError:
         known = ", ".join(sorted(p.stem for p in shipped.glob("*.toml")))
         raise ProfileError(
             f"no profile {name_or_path!r} among {_KINDS[kind]}", f"name a TOML file or one of: {known}"
         ) from None
     except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise ProfileError(f"{name_or_path}: cannot be read as a profile ({error})", "name a TOML file") from None
+        reason = getattr(error, "strerror", None) or error
+        raise ProfileError(f"{name_or_path}: cannot be read as a profile ({reason})", "name a TOML file") from None
     return parse_profile(text, kind, name_or_path)
 
 

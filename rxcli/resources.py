@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import stat
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parent
@@ -11,3 +13,18 @@ def data_dir(name: str) -> Path:
     """The folder `name` ("calibration", "models" or "sample_frames") of this installation."""
     installed = _PACKAGE / "_data" / name
     return installed if installed.is_dir() else _PACKAGE.parent / name
+
+
+def read_limited(path: Path, most_bytes: int) -> bytes:
+    """A whole file that people write; a pipe, which may never end, or a file that is absurdly long is none.
+
+    Raises:
+        OSError: it cannot be read, is no regular file, or longer than `most_bytes`.
+        ValueError: the path is none.
+    """
+    info = path.stat()
+    if not stat.S_ISREG(info.st_mode):
+        raise OSError(errno.EINVAL, "is no regular file")
+    if info.st_size > most_bytes:
+        raise OSError(errno.EFBIG, f"has {info.st_size} bytes, more than {most_bytes}")
+    return path.read_bytes()

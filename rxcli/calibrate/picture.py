@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rxcli.calibrate.lens import LensCalibration
-from rxcli.errors import InputError
+from rxcli.outputs import encode_png, write_whole
 
 #: Length of the residual that the picture draws over a tenth of its width.
 _SCALES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -19,15 +19,7 @@ def write_residuals(calibration: LensCalibration, path: Path) -> None:
     Raises:
         InputError: the picture cannot be written.
     """
-    import cv2
-
-    ok, data = cv2.imencode(".png", _draw(calibration))
-    try:
-        if not ok:
-            raise OSError("PNG encoding failed")
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})", "name another file") from None
+    write_whole(path, encode_png(_draw(calibration)))
 
 
 def _draw(calibration: LensCalibration) -> np.ndarray:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import msgspec
 
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import UsageError
+from rxcli.outputs import unwritable, write_whole
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode, dump_profile, load_profile
 from rxcli.types import Metadata
 
@@ -63,6 +64,6 @@ def write_profile(profile: CameraProfile, path: Path) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(dump_profile(profile), encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})", "name another file") from None
+        raise unwritable(path, error) from None
+    write_whole(path, dump_profile(profile))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import write_json
+from rxcli.cli.common import claim_outputs, force_argument, json_output, write_json
 from rxcli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ def calibrate() -> None:
 @_SAVE
 @_NAME
 @_JSON
+@force_argument
 def lens(
     paths: tuple[Path, ...],
     board_size: str,
@@ -58,6 +59,7 @@ def lens(
     save: Path | None,
     name: str | None,
     json_path: str | None,
+    force: bool,
 ) -> None:
     """Lens model from PATHS: pictures of a chessboard or ChArUco board, folders of them, or clips.
 
@@ -67,9 +69,10 @@ def lens(
     from rxcli.calibrate.saving import profile_to_extend, with_lens, write_profile
 
     board = _board(board_size, square_mm, dictionary, marker_ratio)
-    target = _target(save, name)
+    target, files = _target(save, name), _files(paths)
+    _claim(files, (), target, json_path, ("rms_px", "camera_matrix"), force, picture)
     reader = _BoardReader(every)
-    results, width, height = find_boards(reader.read(paths), board)
+    results, width, height = find_boards(reader.read(files), board)
     result = calibrate_lens([*reader.unreadable, *results], width, height)
     if picture is not None:
         from rxcli.calibrate.picture import write_residuals
@@ -88,6 +91,26 @@ def _board(size: str, square_mm: float, dictionary: str | None, marker_ratio: fl
     if not found:
         raise UsageError(f"--board {size!r} is not COLUMNSxROWS of inner corners", "write it as 9x6")
     return Board(int(found[1]), int(found[2]), square_mm, dictionary, marker_ratio)
+
+
+def _claim(
+    files: list[Path],
+    profiles: tuple[str | None, ...],
+    target: Path | None,
+    json_path: str | None,
+    json_keys: tuple[str, ...],
+    force: bool,
+    picture: Path | None = None,
+) -> None:
+    """Refuse outputs that would destroy something; the profile may be added to."""
+    from rxcli import outputs
+
+    found = [json_output(json_path, *json_keys)]
+    if target is not None:
+        found.append(outputs.Output("--save", target, outputs.CAMERA, makes_folder=True))
+    if picture is not None:
+        found.append(outputs.Output("--picture", picture, outputs.PICTURE))
+    claim_outputs(found, files, profiles, force)
 
 
 def _target(save: Path | None, name: str | None) -> Path | None:
@@ -109,12 +132,12 @@ class _BoardReader:
         self.unreadable: list[Rejected] = []
         self.metadata: Metadata | None = None
 
-    def read(self, paths: tuple[Path, ...]) -> Iterator[tuple[str, GrayImage]]:
+    def read(self, paths: list[Path]) -> Iterator[tuple[str, GrayImage]]:
         from rxcli.calibrate.frames import gray_of
         from rxcli.calibrate.lens import Rejected
         from rxcli.ingest import open_source
 
-        for path in _files(paths):
+        for path in paths:
             try:
                 for frame in islice(open_source(path), 0, None, self._every):
                     self.metadata = self.metadata or frame.metadata
@@ -186,6 +209,7 @@ def _lens_record(result: LensCalibration, target: Path | None) -> dict[str, Any]
 @_SAVE
 @_NAME
 @_JSON
+@force_argument
 def shutter(
     paths: tuple[Path, ...],
     frequencies: tuple[float, ...],
@@ -198,6 +222,7 @@ def shutter(
     save: Path | None,
     name: str | None,
     json_path: str | None,
+    force: bool,
 ) -> None:
     """Line delay and readout from PATHS: pictures or clips, of one readout mode, of blinking lamps.
 
@@ -208,8 +233,9 @@ def shutter(
     if bool(frequencies) == bool(screen):
         raise UsageError("either --frequency or --screen is needed", "say what the lamp blinks at, as --frequency 1000")
     _check_positive(frequencies, exposure_s)
-    target, window = _target(save, name), _window(region)
-    chosen = [frame for path in _files(paths) for frame in _some_frames(path, frames)]
+    target, window, files = _target(save, name), _window(region), _files(paths)
+    _claim(files, (screen,), target, json_path, ("readout_s", "line_delay_s"), force)
+    chosen = [frame for path in files for frame in _some_frames(path, frames)]
     result = _measure(chosen, frequencies, screen, axis, window, exposure_s)
     if target is not None:
         mode = _mode(result, mode_name)
@@ -375,6 +401,7 @@ def _shutter_record(result: ShutterCalibration, target: Path | None) -> dict[str
 @_SAVE
 @_NAME
 @_JSON
+@force_argument
 def lensfun(
     path: Path,
     make: str | None,
@@ -384,6 +411,7 @@ def lensfun(
     save: Path | None,
     name: str | None,
     json_path: str | None,
+    force: bool,
 ) -> None:
     """Lens model of the picture PATH from the lensfun database, by camera, lens and focal length (extra [lensfun])."""
     from dataclasses import replace
@@ -393,6 +421,7 @@ def lensfun(
     from rxcli.ingest import open_source
 
     target = _target(save, name)
+    _claim([path], (), target, json_path, ("camera", "lens", "camera_matrix"), force)
     frame = next(open_source(path))
     told = frame.metadata
     metadata = replace(

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
+    from rxcli.outputs import Output
     from rxcli.profiles import CameraProfile, ScreenProfile
     from rxcli.receiver.pipeline import ReceiverOptions
 
@@ -131,7 +132,7 @@ def receiver_options(
         cae=cae,  # type: ignore[arg-type]  # one of the choices
         min_confidence=min_confidence,
         skip=frozenset(SKIPS) - set(no_skip),
-        dump_dir=dump_dir,
+        dump_dir=dump_dir.absolute() if dump_dir else None,  # workers may stand in other folders
         stop_when_certain=stop_when_certain,
     )
 
@@ -165,6 +166,42 @@ def _checked(corners: Any) -> Any:
     return corners
 
 
+#: For every command that writes files which may be somebody's.
+force_argument = click.option(
+    "--force", is_flag=True, help="Replace files that are there already and were not written by the same option."
+)
+
+
+def claim_outputs(
+    outputs: Iterable[Output | None],
+    inputs: Iterable[str | Path] = (),
+    profiles: Iterable[str | Path | None] = (),
+    force: bool = False,
+) -> None:
+    """Refuse outputs that would destroy something, before anything is opened (see `rxcli.outputs.claim`).
+
+    Args:
+        outputs: all files that the command will write; None where an option was not given.
+        inputs: files that it reads.
+        profiles: names and files of profiles that it reads.
+        force: of `force_argument`.
+
+    Raises:
+        UsageError: one of them would.
+    """
+    from rxcli.outputs import claim
+
+    named = [path for path in profiles if path is not None and path != AUTO]
+    claim([output for output in outputs if output is not None], inputs, named, force)
+
+
+def json_output(path: str | None, *keys: str) -> Output | None:
+    """The file of a command's --json, None where there is none; earlier ones are told by the `keys` they hold."""
+    from rxcli.outputs import Output, json_with
+
+    return None if path in (None, "-") else Output("--json", Path(str(path)), json_with(*keys))
+
+
 def write_json(value: Any, path: str) -> None:
     """Write `value` as indented JSON to a file, or to stdout where `path` is "-".
 
@@ -175,10 +212,9 @@ def write_json(value: Any, path: str) -> None:
     if path == "-":
         click.echo(text)
         return
-    try:
-        Path(path).write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})", "name another file") from None
+    from rxcli.outputs import write_whole
+
+    write_whole(Path(path), text + "\n")
 
 
 def _finite(value: Any) -> Any:

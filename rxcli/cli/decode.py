@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 import click
 
-from rxcli.cli.common import receiver_arguments, receiver_options
-from rxcli.errors import ExitCode, InputError, UsageError
+from rxcli.cli.common import claim_outputs, force_argument, receiver_arguments, receiver_options
+from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
+    from rxcli.outputs import Output
     from rxcli.results.summary import SourceSummary
     from rxcli.results.truth import Scorer
     from rxcli.runs.batch import Decoded, Decoder, Source
+    from rxcli.runs.journal import Head, Journal, Lines
     from rxcli.types import FrameResult
 
 _FILE = click.Path(dir_okay=False, path_type=Path, allow_dash=False)
 _FOLDER = click.Path(file_okay=False, path_type=Path)
+#: Options that change nothing of a source's results: where they go, who decodes, what is asked of them.
+_NO_MATTER = frozenset(
+    {
+        *("json_path", "junit", "summary", "save_camera", "dump_dir", "save_undistorted", "quiet", "force", "resume"),
+        *("workers", "cluster", "max_ber", "min_packets"),
+    }
+)
+#: The source that is read from stdin.
+STDIN = "-"
 
 
 @click.command()
@@ -47,6 +60,7 @@ _FOLDER = click.Path(file_okay=False, path_type=Path)
     "--stop-when-certain", is_flag=True, help="Pass over frames of a clip all of whose packets are certain already."
 )
 @click.option("--quiet", is_flag=True, help="No table, no summary, no progress.")
+@force_argument
 def decode(paths: tuple[str, ...], **options: Any) -> int:
     """Decode photos, RAW files and clips; PATH may be a folder, or - for one picture on stdin."""
     _check(paths, options)
@@ -66,13 +80,15 @@ def decode(paths: tuple[str, ...], **options: Any) -> int:
     from rxcli.runs.batch import standard_decoder
 
     configured = receiver_options(**receiver)
-    _make_folders(options)
     tap = None
     if options["save_undistorted"]:
         from rxcli.results.undistort import UndistortedWriter
 
-        tap = UndistortedWriter(options["save_undistorted"], configured.cameras, configured.force_camera)
-    with _stdin_as_file(paths) as sources:
+        folder = Path(options["save_undistorted"]).absolute()
+        tap = UndistortedWriter(folder, configured.cameras, configured.force_camera)
+    sources = _sources(paths)
+    _claim(options, sources)
+    with _stdin_as_file(sources) as sources:
         return _Run(standard_decoder(configured, tap), options).run(sources)
 
 
@@ -83,46 +99,84 @@ def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
     json_file = options["json_path"] not in (None, "-")
     if options["resume"] and not json_file:
         raise UsageError("--resume needs the file that --json wrote", "give --json FILE")
+    if options["resume"] and STDIN in paths:
+        raise UsageError("--resume cannot tell whether stdin is what it was", "name the file")
     if options["max_ber"] is not None and not options["truth"]:
         raise UsageError("--max-ber needs the truth", "give --truth FILE, or --truth auto")
+    if options["cluster"] is not None and not options["cluster"].strip():
+        raise UsageError("--cluster needs the address of a Dask scheduler (got none)", "name it: tcp://host:8786")
     if options["cluster"] and options["workers"] > 1:
         raise UsageError("--workers and --cluster exclude each other", "give one of them")
     if options["cluster"] and "-" in paths:
         raise UsageError("stdin cannot be sent to a cluster", "name a file that its workers see")
     if options["summary"]:
         check_summary_path(options["summary"])
-    for name in ("summary", "junit", "save_camera"):
-        if options[name] is not None and not options[name].parent.is_dir():
-            option = name.replace("_", "-")
-            raise UsageError(f"--{option} {options[name]}: there is no such folder", "make it, or name another")
 
 
-def _make_folders(options: dict[str, Any]) -> None:
+def _claim(options: dict[str, Any], sources: list[Source]) -> None:
+    """Refuse outputs that would destroy something, and make the folders of the taps."""
+    from rxcli.outputs import claim_folder
+
+    truth = options["truth"]
+    truths = [_truth_of(source.name, truth) for source in sources]
+    inputs = [source.path for source in sources] + [str(path) for path in truths if path is not None]
+    claim_outputs(_outputs(options), inputs, (*options["screens"], *options["cameras"]), options["force"])
     for name in ("dump_dir", "save_undistorted"):
         if options[name] is not None:
-            try:
-                options[name].mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                option = name.replace("_", "-")
-                raise UsageError(f"--{option} {options[name]}: {error.strerror}", "name another folder") from None
+            claim_folder("--" + name.replace("_", "-"), options[name])
+
+
+def _outputs(options: dict[str, Any]) -> Iterator[Output]:
+    """Every file that the run will write."""
+    from rxcli import outputs
+
+    summary = options["summary"]
+    is_table = summary is not None and summary.suffix.casefold() == ".csv"
+    looks = {
+        "json": outputs.JOURNAL,
+        "junit": outputs.JUNIT,
+        "summary": outputs.CSV_SUMMARY if is_table else outputs.PARQUET_SUMMARY,
+        "save_camera": outputs.ESTIMATED_CAMERA,
+    }
+    paths = {**options, "json": None if options["json_path"] == "-" else options["json_path"]}
+    for name, ours in looks.items():
+        if paths[name] is not None:
+            yield outputs.Output("--" + name.replace("_", "-"), Path(paths[name]), ours)
+
+
+def _truth_of(name: str, truth: str | None) -> Path | None:
+    """The truth file of a source, None where it has none."""
+    from rxcli.results.truth import find_truth
+
+    return find_truth(name) if truth == "auto" else None if truth is None else Path(truth)
+
+
+def _sources(paths: tuple[str, ...]) -> list[Source]:
+    from rxcli.ingest import KNOWN_SUFFIXES
+    from rxcli.runs.batch import collect_sources
+
+    return collect_sources(paths, frozenset(KNOWN_SUFFIXES))
 
 
 @contextmanager
-def _stdin_as_file(paths: tuple[str, ...]) -> Iterator[list[Source]]:
-    """The sources that `paths` name, with what comes from stdin put into a file for as long as it is needed."""
+def _stdin_as_file(sources: list[Source]) -> Iterator[list[Source]]:
+    """The sources, with what comes from stdin put into a file for as long as it is needed."""
     from tempfile import NamedTemporaryFile
 
-    from rxcli.ingest import KNOWN_SUFFIXES
-    from rxcli.runs.batch import Source, collect_sources
-
-    with ExitStack() as stack:
-        sources = collect_sources([path for path in paths if path != "-"], frozenset(KNOWN_SUFFIXES))
-        if "-" in paths:
-            file = stack.enter_context(NamedTemporaryFile(prefix="vlc-rx-"))
-            file.write(sys.stdin.buffer.read())
-            file.flush()
-            sources.insert(min(paths.index("-"), len(sources)), Source("-", file.name))
+    if all(source.name != STDIN for source in sources):
         yield sources
+        return
+    if sys.stdin is None:
+        raise InputError("stdin is closed", "name a file instead of -")
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(NamedTemporaryFile(prefix="vlc-rx-"))
+            shutil.copyfileobj(sys.stdin.buffer, file)
+            file.flush()
+        except OSError as error:
+            reason = f"stdin: cannot be kept in a temporary file ({error.strerror or error})"
+            raise InputError(reason, "make room, or set TMPDIR to another folder") from None
+        yield [replace(source, path=file.name) if source.name == STDIN else source for source in sources]
 
 
 class _Run:
@@ -138,6 +192,8 @@ class _Run:
         self._to_stdout = options["json_path"] == "-"
         #: The frame with the most packets of those whose camera was estimated.
         self._estimated: FrameResult | None = None
+        #: Name of a source -> where it is opened.
+        self._paths: dict[str, str] = {}
 
     def run(self, sources: list[Source]) -> ExitCode:
         from rxcli.results.summary import exit_code
@@ -147,22 +203,25 @@ class _Run:
                 f"--truth {self._options['truth']} is the truth of one file ({len(sources)} were given)",
                 "give --truth auto, which takes the NAME.truth.json beside each file",
             )
-        done = self._recover() if self._options["resume"] else set()
-        try:
-            with ExitStack() as stack:
-                write = self._writer(stack)
-                self._decode([source for source in sources if source.name not in done], write, len(sources))
-        finally:
-            self._summaries.sort(key=_order([source.name for source in sources]))
-            self._conclude()
-        return exit_code(self._summaries, self._limits)
+        self._paths = {source.name: source.path for source in sources}
+        with ExitStack() as stack:
+            journal = self._journal(stack)
+            done = self._recover() if self._options["resume"] else set()
+            writer = self._writer(journal, begun=bool(done))
+            try:
+                self._decode([source for source in sources if source.name not in done], writer, len(sources))
+            except BaseException:
+                with suppress(OSError):
+                    self._conclude(sources)  # what it cannot write is told; why the run ended says more
+                raise
+        return worst([*self._conclude(sources), exit_code(self._summaries, self._limits)])
 
     def _recover(self) -> set[str]:
         """Take the results of an earlier run into the summary; returns the names of its complete sources."""
-        from rxcli.runs.batch import recover
+        from rxcli.runs.journal import recover
 
         done = set()
-        for name, results in recover(Path(self._options["json_path"])):
+        for name, results in recover(Path(self._options["json_path"]), self._head(), self._files()):
             summary, scorer = self._begin(name)
             for result in results:
                 summary.add(scorer.add(result) if scorer else result)
@@ -170,29 +229,50 @@ class _Run:
             done.add(name)
         return done
 
-    def _writer(self, stack: ExitStack) -> Any:
-        """The function that takes each result."""
-        if self._to_stdout:
-            return _print_json
-        if self._options["json_path"]:
-            from rxcli.runs.batch import Journal
+    def _journal(self, stack: ExitStack) -> Journal | None:
+        """The file of --json, locked."""
+        from rxcli.runs.journal import Journal
 
-            journal = Journal(Path(self._options["json_path"]), self._options["resume"])
-            stack.callback(journal.close)
-            return journal.write
-        return (lambda result: None) if self._options["quiet"] else _print_table
+        path = self._options["json_path"]
+        if path is None or self._to_stdout:
+            return None
+        journal = Journal(Path(path), self._options["resume"])
+        stack.callback(journal.close)
+        return journal
 
-    def _decode(self, sources: list[Source], write: Any, n_total: int) -> None:
+    def _files(self) -> dict[str, str]:
+        return {name: path for name, path in self._paths.items() if name != STDIN}
+
+    def _head(self) -> Head:
+        """What the results depend on: the version, the options, what the profiles hold."""
+        from rxcli import __version__
+        from rxcli.runs.journal import Head
+
+        options = {name: _plain(value) for name, value in self._options.items() if name not in _NO_MATTER}
+        configured = self._decoder.options
+        return Head(__version__, options | {"profiles": _digest((configured.screens, configured.cameras))})
+
+    def _writer(self, journal: Journal | None, begun: bool) -> _Writer:
+        """What takes each result."""
+        from rxcli.runs.journal import Lines
+
+        if journal is None and not self._to_stdout:
+            return _Nowhere() if self._options["quiet"] else _Table()
+        lines = Lines(self._head(), self._files(), begun)
+        return _JsonLines(lines, _print_line if journal is None else journal.append)
+
+    def _decode(self, sources: list[Source], writer: _Writer, n_total: int) -> None:
         with _progress(n_total, n_total - len(sources), self._options["quiet"]) as progress:
             for source, results in self._decoded(sources):
                 summary, scorer = self._begin(source.name)
+                writer.begin(source.name)
                 try:
-                    for result in results:
+                    for result, last in _with_last(results):
                         result = scorer.add(result) if scorer else result
                         summary.add(result)
                         self._keep_estimate(result)
                         with progress.paused():
-                            write(result)
+                            writer.write(result, last)
                 finally:
                     self._end(summary, scorer)
                 progress.finished(summary.n_frames)
@@ -238,32 +318,49 @@ class _Run:
 
     def _save_camera(self, path: Path) -> None:
         from rxcli.ingest import open_source
+        from rxcli.outputs import write_whole
         from rxcli.profiles import dump_profile
         from rxcli.receiver.camera import camera_profile
 
         if self._estimated is None:
             click.echo(f"vlc-rx: {path} was not written: no packet was received with an estimated camera", err=True)
             return
-        frame = next(iter(open_source(self._estimated.source)))
+        frame = next(iter(open_source(self._paths[self._estimated.source])))
         about = frame.metadata
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-") or "camera"
         profile = camera_profile(self._estimated.estimated, name, about.make, about.model, frame.width, frame.height)
-        try:
-            path.write_text(dump_profile(profile), encoding="utf-8")
-        except OSError as error:
-            raise UsageError(f"--save-camera {path}: {error.strerror}", "name another file") from None
+        write_whole(path, dump_profile(profile))
 
-    def _conclude(self) -> None:
-        from rxcli.results.summary import format_summary, write_junit, write_summary
+    def _conclude(self, sources: list[Source]) -> list[ExitCode]:
+        """Write what is written at the end, each whether or not the others can be; returns why some could not.
+
+        Raises:
+            OSError: stdout cannot be written, or its reader has gone; all files are written.
+        """
+        from rxcli.results.summary import write_junit, write_summary
+
+        self._summaries.sort(key=_order([source.name for source in sources]))
+        summaries, limits, codes = self._summaries, self._limits, []
+        steps: dict[str, Callable[[Path], None]] = {
+            "summary": lambda path: write_summary(path, summaries, limits),
+            "save_camera": self._save_camera,
+            "junit": lambda path: write_junit(path, summaries, limits),
+        }
+        for name, write in steps.items():
+            try:
+                if self._options[name]:
+                    write(self._options[name])
+            except ReceiverError as error:
+                click.echo(f"vlc-rx: {error}", err=True)
+                codes.append(error.exit_code)
+        self._print_summary()
+        return codes
+
+    def _print_summary(self) -> None:
+        from rxcli.results.summary import format_summary
 
         if self._summaries and not self._options["quiet"]:
             click.echo(format_summary(self._summaries, self._limits), err=self._to_stdout)
-        if self._options["summary"]:
-            write_summary(self._options["summary"], self._summaries, self._limits)
-        if self._options["save_camera"]:
-            self._save_camera(self._options["save_camera"])
-        if self._options["junit"]:
-            write_junit(self._options["junit"], self._summaries, self._limits)
 
 
 def _n_packets(result: FrameResult) -> int:
@@ -275,17 +372,73 @@ def _order(names: list[str]) -> Any:
     return lambda summary: places.get(summary.source, len(places))
 
 
-def _print_json(result: FrameResult) -> None:
-    from rxcli.results.report import to_json_line
+def _with_last(results: Iterator[FrameResult]) -> Iterator[tuple[FrameResult, bool]]:
+    """Each result, and whether it is the last one; where they break off, none is."""
+    held: FrameResult | None = None
+    try:
+        for result in results:
+            if held is not None:
+                yield held, False
+            held = result
+    except (Exception, KeyboardInterrupt):
+        if held is not None:
+            yield held, False
+        raise
+    if held is not None:
+        yield held, True
 
-    sys.stdout.write(to_json_line(result) + "\n")
+
+def _plain(value: Any) -> Any:
+    """An option as JSON has it."""
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)
+
+
+def _digest(profiles: Any) -> str:
+    """A short mark that differs where profiles do."""
+    import hashlib
+
+    import msgspec
+
+    return hashlib.sha256(msgspec.json.encode(profiles)).hexdigest()[:16]
+
+
+class _Writer(Protocol):
+    """Takes the results of one source after the other."""
+
+    def begin(self, source: str) -> None: ...
+
+    def write(self, result: FrameResult, last: bool) -> None: ...
+
+
+class _Nowhere:
+    def begin(self, source: str) -> None: ...
+
+    def write(self, result: FrameResult, last: bool) -> None: ...
+
+
+class _Table(_Nowhere):
+    def write(self, result: FrameResult, last: bool) -> None:
+        from rxcli.results.report import format_frame
+
+        click.echo(format_frame(result) + "\n")
+
+
+class _JsonLines:
+    def __init__(self, lines: Lines, put: Callable[[str], None]) -> None:
+        self._lines, self._put = lines, put
+
+    def begin(self, source: str) -> None:
+        self._lines.begin(source)
+
+    def write(self, result: FrameResult, last: bool) -> None:
+        self._put(self._lines.line(result, last))
+
+
+def _print_line(line: str) -> None:
+    sys.stdout.write(line + "\n")
     sys.stdout.flush()
-
-
-def _print_table(result: FrameResult) -> None:
-    from rxcli.results.report import format_frame
-
-    click.echo(format_frame(result) + "\n")
 
 
 class _Progress:

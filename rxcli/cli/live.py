@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-from rxcli.cli.common import receiver_arguments, receiver_options
+from rxcli.cli.common import claim_outputs, force_argument, receiver_arguments, receiver_options
 from rxcli.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -58,12 +58,14 @@ class _Exposure(click.ParamType[float]):
 @click.option("--json", "json_path", metavar="FILE|-", help="Write one JSON object a frame, instead of tables.")
 @click.option("--quiet", is_flag=True, help="No status line.")
 @receiver_arguments
+@force_argument
 def live(device: Path, **options: Any) -> int:
     """Receive from the V4L2 camera DEVICE, such as /dev/video0, until Ctrl-C."""
     if options["list_only"]:
         return _show_modes(device)
     names = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
     configured = receiver_options(**{name: options[name] for name in names})
+    _claim(device, options)
     from rxcli.ingest.v4l2 import LiveSource
     from rxcli.receiver.pipeline import receive
 
@@ -76,6 +78,15 @@ def live(device: Path, **options: Any) -> int:
             write(result)
             status.update(result)
     return ExitCode.OK if status.n_packets else ExitCode.NOT_RECEIVED
+
+
+def _claim(device: Path, options: dict[str, Any]) -> None:
+    """Refuse to write over what is no earlier output."""
+    from rxcli.outputs import JOURNAL, Output
+
+    if options["json_path"] not in (None, "-"):
+        output = Output("--json", Path(options["json_path"]), JOURNAL)
+        claim_outputs([output], (device,), (*options["screens"], *options["cameras"]), options["force"])
 
 
 def _settings(options: dict[str, Any]) -> Any:

@@ -6,10 +6,14 @@ same reason.
 
 from __future__ import annotations
 
+import io
 import logging
+import math
 import os
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -17,7 +21,7 @@ from typing import Any
 import click
 
 from rxcli import __version__
-from rxcli.errors import ExitCode, ReceiverError
+from rxcli.errors import ExitCode, OutputError, ReceiverError, Terminated
 
 _COMMANDS = {
     "decode": "Payloads of photos, RAW files, clips and folders.",
@@ -63,6 +67,7 @@ class _LazyGroup(click.Group):
         assert isinstance(command, click.Command)
         if _VERBOSE not in command.params:
             command.params.append(_VERBOSE)
+            _take_finite_numbers_only(command)
         return command
 
     def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
@@ -78,6 +83,26 @@ class _LazyGroup(click.Group):
         return result
 
 
+def _take_finite_numbers_only(command: click.Command) -> None:
+    """Refuse nan and infinities for every option: no comparison with nan fails, so that it passes every bound."""
+    for parameter in command.params:
+        if isinstance(parameter.type, click.types.FloatParamType):
+            parameter.callback = _finite_then(parameter.callback)
+    if isinstance(command, click.Group):
+        for below in command.commands.values():
+            _take_finite_numbers_only(below)
+
+
+def _finite_then(callback: Callable[..., Any] | None) -> Callable[..., Any]:
+    def check(context: click.Context, parameter: click.Parameter, value: Any) -> Any:
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not math.isfinite(number):
+                raise click.BadParameter(f"{number} is no number", context, parameter)
+        return value if callback is None else callback(context, parameter, value)
+
+    return check
+
+
 @click.group(
     name="vlc-rx",
     cls=_LazyGroup,
@@ -89,7 +114,8 @@ def cli() -> None:
     """Receive data that the mini-LED backlight of a display sends to rolling-shutter cameras.
 
     stdout carries data only; logs and progress go to stderr. Exit codes: 0 every input gave a packet, 1 some input gave
-    none, 2 bad usage or profile, 3 an input could not be read, 130 interrupted.
+    none, 2 bad usage or profile, 3 an input could not be read or an output could not be written, 130 interrupted, 143
+    terminated.
     """
 
 
@@ -97,7 +123,31 @@ def main() -> None:
     """Entry point of `vlc-rx`."""
     # Our matrices are small: threads inside their products spin more than they help, and numpy is not loaded yet.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _reserve_standard_streams()
+    signal.signal(signal.SIGTERM, _terminate)
     sys.exit(run(sys.argv[1:]))
+
+
+def _terminate(_number: int, _frame: object) -> None:
+    raise Terminated
+
+
+def _reserve_standard_streams() -> None:
+    """No file may get the number of a standard stream that is closed: libraries write to it. Ours then say so."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
+    if sys.stdout is None:
+        sys.stdout = _ClosedStream()
+
+
+class _ClosedStream(io.TextIOBase):
+    """stdout where there is none: silent until somebody has something to say."""
+
+    def write(self, _text: str) -> int:
+        raise OutputError("stdout is closed", "redirect it to a file, or use --quiet")
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -108,13 +158,22 @@ def run(arguments: Sequence[str]) -> int:
     except click.ClickException as error:
         return _say_usage(error)
     except (click.Abort, KeyboardInterrupt):
-        click.echo("vlc-rx: interrupted", err=True)
+        _say("interrupted")
         return ExitCode.INTERRUPTED
-    except _PipeClosedError:
-        return _leave_closed_pipe()
+    except Terminated:
+        _say("terminated")
+        return ExitCode.TERMINATED
+    except (_PipeClosedError, BrokenPipeError):
+        _leave_stdout()
+        return ExitCode.INTERRUPTED
     except ReceiverError as error:
-        click.echo(f"vlc-rx: {error}", err=True)
+        _say(str(error))
         return error.exit_code
+    except OSError as error:
+        return _say_system(error)
+    except MemoryError:
+        _say("more memory is needed than there is; decode fewer or smaller files at a time")
+        return ExitCode.UNREADABLE
     except Exception as error:
         return _say_internal(error)
     return int(code or ExitCode.OK)
@@ -135,7 +194,14 @@ class _StderrHandler(logging.Handler):
         self.setFormatter(logging.Formatter("vlc-rx: %(levelname)s: %(message)s"))
 
     def emit(self, record: logging.LogRecord) -> None:
-        click.echo(self.format(record), err=True)
+        with suppress(OSError):  # nobody hears that nobody hears
+            click.echo(self.format(record), err=True)
+
+
+def _say(message: str) -> None:
+    """One line on stderr, if it can be written."""
+    with suppress(OSError):
+        click.echo(f"vlc-rx: {message}", err=True)
 
 
 def _say_usage(error: click.ClickException) -> int:
@@ -143,24 +209,34 @@ def _say_usage(error: click.ClickException) -> int:
     context = getattr(error, "ctx", None)
     path = context.command_path if context is not None else "vlc-rx"
     message = error.format_message().rstrip(".").replace("\n", " ")
-    click.echo(f"vlc-rx: {message}; see `{path} --help`", err=True)
+    _say(f"{message}; see `{path} --help`")
     return ExitCode.USAGE
 
 
-def _leave_closed_pipe() -> int:
-    """The run was cut short by its reader: nothing to say, and nobody to say it to at exit."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return ExitCode.INTERRUPTED
+def _leave_stdout() -> None:
+    """What still waits to be written cannot be, and is not tried again at exit."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _say_system(error: OSError) -> int:
+    """The system refuses something: no space, no right, too many files."""
+    reason = error.strerror or str(error)
+    try:
+        sys.stdout.flush()
+    except (OSError, ReceiverError):
+        _say(f"stdout: cannot be written ({reason}); redirect it to where there is room")
+        _leave_stdout()
+    else:
+        _say(f"{error.filename or 'the system refuses'}: {reason}; make room or correct the permissions, and try again")
+    return ExitCode.UNREADABLE
 
 
 def _say_internal(error: Exception) -> int:
     log = logging.getLogger("rxcli")
     if log.isEnabledFor(logging.DEBUG):
         log.debug("internal error", exc_info=error)
-    click.echo(
-        f"vlc-rx: internal error ({type(error).__name__}: {error}); run again with --verbose and report what it says",
-        err=True,
-    )
+    _say(f"internal error ({type(error).__name__}: {error}); run again with --verbose and report what it says")
     return ExitCode.NOT_RECEIVED
 
 

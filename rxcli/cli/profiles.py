@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import write_json
+from rxcli.cli.common import claim_outputs, force_argument, json_output, write_json
 from rxcli.errors import ExitCode, InputError, ProfileError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
@@ -29,13 +29,15 @@ _CAMERAS = click.option(
 def profiles(context: click.Context) -> None:
     """Screen and camera profiles: list, show, validate, and which one a file would get."""
     if context.invoked_subcommand is None:
-        context.invoke(list_profiles, json_path=None)
+        context.invoke(list_profiles, json_path=None, force=False)
 
 
 @profiles.command("list")
 @_JSON
-def list_profiles(json_path: str | None) -> None:
+@force_argument
+def list_profiles(json_path: str | None, force: bool) -> None:
     """List the shipped profiles."""
+    claim_outputs([json_output(json_path, "screens", "cameras")], force=force)
     from rxcli.profiles import CameraProfile, ScreenProfile, shipped_profiles
 
     screens, cameras = shipped_profiles(ScreenProfile), shipped_profiles(CameraProfile)
@@ -55,8 +57,10 @@ def list_profiles(json_path: str | None) -> None:
 @profiles.command()
 @click.argument("name")
 @_JSON
-def show(name: str, json_path: str | None) -> None:
+@force_argument
+def show(name: str, json_path: str | None, force: bool) -> None:
     """Show the profile NAME, a shipped one or a TOML file."""
+    claim_outputs([json_output(json_path, "format", "kind", "name")], profiles=(name,), force=force)
     from rxcli.profiles import dump_profile
 
     profile = _load_any(name)
@@ -86,8 +90,10 @@ def validate(names: tuple[str, ...]) -> int:
 @click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
 @_CAMERAS
 @_JSON
-def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | None) -> int:
+@force_argument
+def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | None, force: bool) -> int:
     """Say which camera profile each file would get, and why."""
+    claim_outputs([json_output(json_path, "source", "camera", "reason")], paths, cameras, force)
     known = _choices(cameras)
     records, codes = [], [ExitCode.OK]
     for path in paths:
@@ -149,7 +155,7 @@ def _kind_in(path: Path) -> str:
 
     try:
         kind = tomllib.loads(path.read_text(encoding="utf-8")).get("kind")
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+    except (OSError, ValueError, RecursionError):
         return ""
     if kind not in ("screen", "camera"):
         raise ProfileError(f"{path}: kind must be 'screen' or 'camera' (got {kind!r})", "correct the file")

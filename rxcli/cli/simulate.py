@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from rxcli.cli.common import claim_outputs, force_argument
 from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -109,6 +111,7 @@ _SCENE_OPTIONS = (
     callback=lambda context, _parameter, wanted: _list(context, wanted),
     help="Print the names of pictures and exit.",
 )
+@force_argument
 def simulate(out: Path, **options: Any) -> None:
     """Simulate a capture of a mini-LED screen and write it to OUT, with OUT's name .truth.json beside it."""
     from rxcli.lab.simulate.capture import prepare
@@ -116,6 +119,7 @@ def simulate(out: Path, **options: Any) -> None:
     if not out.parent.is_dir():
         raise UsageError(f"{out.parent}: no such folder", "create it first")
     file_format = options["file_format"] or _format_of(out)
+    _claim(out, options)
     scene = _scene(options, file_format)
     take = prepare(scene, options["seed"])
     try:
@@ -125,6 +129,26 @@ def simulate(out: Path, **options: Any) -> None:
         where = error.filename or out
         raise UsageError(f"{where}: cannot be written ({error.strerror or error})", "choose another place") from None
     click.echo(f"{out} and {truth.name}: {_summary(take)}", err=True)
+
+
+def _claim(out: Path, options: dict[str, Any]) -> None:
+    """Refuse to write over what is no earlier capture of ours, which its truth beside it tells."""
+    from rxcli import outputs
+    from rxcli.lab.simulate.transmitter import WAVEFORM_FILES
+    from rxcli.lab.simulate.truth import truth_path
+
+    truth = truth_path(out)
+    ours = truth.is_file() and outputs.TRUTH.search(truth.read_bytes()) is not None
+    found = [outputs.Output("OUT", out, outputs.ANYTHING if ours else outputs.NEVER)]
+    found.append(outputs.Output("the truth of OUT", truth, outputs.TRUTH))
+    if options["camera_profile"] is not None:
+        found.append(outputs.Output("--camera-profile", options["camera_profile"], outputs.SIMULATED_CAMERA))
+    if options["waveforms"] is not None:
+        outputs.claim_folder("--waveforms", options["waveforms"])
+        for name in WAVEFORM_FILES:
+            look = outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS
+            found.append(outputs.Output("--waveforms", options["waveforms"] / name, look))
+    claim_outputs(found, (options["picture"], options["payload"]), (options["screen"],), options["force"])
 
 
 def _list(context: click.Context, wanted: bool) -> None:
@@ -223,7 +247,9 @@ def _seconds(text: str) -> float:
     try:
         value = float(numerator) / float(denominator or 1)
     except (ValueError, ZeroDivisionError):
-        raise UsageError(f"--exposure: {text!r} is no time", "give seconds, or a fraction such as 1/32000") from None
+        value = nan
+    if not 0 < value < 10:
+        raise UsageError(f"--exposure: {text!r} is no time", "give seconds, or a fraction such as 1/32000")
     return value
 
 
@@ -231,7 +257,9 @@ def _numbers(text: str, option: str, counts: tuple[int, ...]) -> tuple[float, ..
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise UsageError(f"{option}: {text!r} is no list of numbers", "separate numbers by commas") from None
+        values = (nan,)
+    if not all(map(isfinite, values)):
+        raise UsageError(f"{option}: {text!r} is no list of numbers", "separate numbers by commas")
     if len(values) not in counts:
         wanted = " or ".join(str(count) for count in counts)
         raise UsageError(f"{option} takes {wanted} numbers (got {len(values)})", "separate numbers by commas")
@@ -267,11 +295,13 @@ def _payload(text: str) -> bytes | None:
 def _write(take: Take, out: Path, file_format: str, bit_rate: int | None) -> Path:
     """Write the capture and its truth; returns the truth's path."""
     from rxcli.lab.simulate.truth import write_truth
+    from rxcli.outputs import replacing
 
-    if file_format in _CODECS:
-        _write_clip(take, out, file_format, bit_rate)
-    else:
-        _write_still(take, out, file_format)
+    with replacing(out) as hidden:
+        if file_format in _CODECS:
+            _write_clip(take, hidden, file_format, bit_rate)
+        else:
+            _write_still(take, hidden, file_format)
     return write_truth(take.truth(out.name), out)
 
 
@@ -279,11 +309,12 @@ def _write_extras(take: Take, options: dict[str, Any]) -> None:
     """Camera profile and waveforms, where they are asked for."""
     from rxcli.lab.simulate.transmitter import export_waveforms
     from rxcli.lab.simulate.truth import build_camera_profile
+    from rxcli.outputs import write_whole
     from rxcli.profiles import dump_profile
 
     last = take.exposure(take.scene.n_frames - 1)
     if options["camera_profile"] is not None:
-        options["camera_profile"].write_text(dump_profile(build_camera_profile(take.scene, last)), encoding="utf-8")
+        write_whole(options["camera_profile"], dump_profile(build_camera_profile(take.scene, last)))
     if options["waveforms"] is not None:
         n_bursts = 1 + int(last.row_start_slots[-1] // take.link.burst_slots)
         export_waveforms(take.drive, take.link, n_bursts, options["waveforms"])

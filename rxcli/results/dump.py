@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.errors import UsageError
+from rxcli.outputs import TAPS, check_replaceable, replacing, unwritable
 
 
 def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]) -> Path:
@@ -26,17 +26,23 @@ def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]
         stages: name -> array, or dataclass whose fields are written as `name.field`; None is left out.
 
     Raises:
-        UsageError: the folder cannot be written.
+        OutputError: the folder cannot be written, or holds a file of this name that is none of ours.
     """
     arrays: dict[str, Any] = {name: array for stage, value in stages.items() for name, array in _arrays(stage, value)}
-    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", Path(source).name) or "frame"
-    path = folder / f"{stem}-{frame:06d}.npz"
+    path = folder / f"{plain_name(source)}-{frame:06d}.npz"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        np.savez(path, **arrays)
     except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error})", "name another folder with --dump-dir") from None
+        raise unwritable(path, error) from None
+    check_replaceable(path, TAPS, "--dump-dir")
+    with replacing(path) as hidden:
+        np.savez(hidden, **arrays)
     return path
+
+
+def plain_name(source: str) -> str:
+    """The name of a source's file, as any file system takes it."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", Path(source).name) or "frame"
 
 
 def _arrays(name: str, value: Any) -> Iterator[tuple[str, Any]]:

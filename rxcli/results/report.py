@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
-from typing import Any
+from typing import Any, TypeVar, get_args
 
 from rxcli.errors import UsageError
-from rxcli.types import ColumnResult, FrameResult, PacketResult
+from rxcli.types import ColumnResult, ColumnStatus, FrameResult, FrameStatus, PacketResult
 
+_T = TypeVar("_T")
 #: Hex digits of a payload that a table shows.
 _SHOWN_DIGITS = 24
 
@@ -129,49 +130,87 @@ def from_record(record: dict[str, Any]) -> FrameResult:
     try:
         corners, camera = record["screen"]["corners"], record["camera"]
         return FrameResult(
-            source=str(record["source"]),
-            frame=int(record["frame"]),
+            source=_text(record["source"]),
+            frame=_count(record["frame"]),
             time_s=_number(record["time_s"]),
-            status=record["status"],
-            message=record.get("message"),
-            screen_profile=record["screen"]["profile"],
+            status=_one_of(record["status"], FrameStatus),
+            message=_unless_none(_text, record.get("message")),
+            screen_profile=_unless_none(_text, record["screen"]["profile"]),
             corners=None if corners is None else np.array(corners, dtype=np.float64).reshape(4, 2),
-            camera_profile=camera["profile"],
-            line_delay_s=camera["line_delay_s"],
-            exposure_s=camera["exposure_s"],
+            camera_profile=_unless_none(_text, camera["profile"]),
+            line_delay_s=_unless_none(_number, camera["line_delay_s"]),
+            exposure_s=_unless_none(_number, camera["exposure_s"]),
             estimated={name: (_number(v), _number(s)) for name, (v, s) in record.get("estimated", {}).items()},
             columns=tuple(_column_from(column) for column in record["columns"]),
             timing_ms={stage: _number(value) for stage, value in record["timing_ms"].items()},
-            skipped=record.get("skipped", {}),
-            denoiser=record.get("denoiser"),
+            skipped={name: _count(value) for name, value in record.get("skipped", {}).items()},
+            denoiser=_unless_none(dict, record.get("denoiser")),
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UsageError(f"not a result line of `vlc-rx decode --json` ({error!r})", "name another file") from None
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        shown = f"{error!r:.200}"
+        raise UsageError(f"not a result line of `vlc-rx decode --json` ({shown})", "name another file") from None
 
 
 def _column_from(record: dict[str, Any]) -> ColumnResult:
-    fields = {key: record[key] for key in ("column", "status", "w", "snr_db", "denoised", "delay_slots")}
-    packets = tuple(_packet_from(packet) for packet in record["packets"])
-    return ColumnResult(**fields, packets=packets, message=record.get("message"))
+    return ColumnResult(
+        column=_count(record["column"]),
+        status=_one_of(record["status"], ColumnStatus),
+        w=_unless_none(_count, record["w"]),
+        snr_db=_unless_none(_number, record["snr_db"]),
+        denoised=bool(record["denoised"]),
+        delay_slots=_unless_none(_number, record["delay_slots"]),
+        packets=tuple(_packet_from(packet) for packet in record["packets"]),
+        message=_unless_none(_text, record.get("message")),
+    )
 
 
 def _packet_from(record: dict[str, Any]) -> PacketResult:
     frames = record.get("frames")
+    if len(_text(record["payload"])) != 2 * -(-_count(record["payload_bits"]) // 8):
+        raise ValueError("payload and payload_bits disagree")
     return PacketResult(
         first_row=_number(record["first_row"]),
         copies=_number(record["copies"]),
-        payload_bits=int(record["payload_bits"]),
-        payload=str(record["payload"]),
+        payload_bits=_count(record["payload_bits"]),
+        payload=_hex(record["payload"]),
         confidence=_number(record["confidence"]),
         ber_hat=_number(record["ber_hat"]),
-        bit_errors=record["bit_errors"],
-        burst=record.get("burst"),
-        frames=None if frames is None else tuple(frames),
+        bit_errors=_unless_none(_count, record["bit_errors"]),
+        burst=_unless_none(_count, record.get("burst")),
+        frames=None if frames is None else tuple(_count(frame) for frame in frames),
     )
 
 
 def _number(value: float | None) -> float:
+    if not isinstance(value, (int, float, type(None))):
+        raise TypeError(f"{value!r:.60} is no number")
     return math.nan if value is None else float(value)
+
+
+def _count(value: Any) -> int:
+    if not isinstance(value, int) or abs(value) >= 1 << 63:
+        raise TypeError(f"{value!r:.60} is no count")
+    return value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r:.60} is no text")
+    return value
+
+
+def _hex(value: Any) -> str:
+    return bytes.fromhex(_text(value)).hex()
+
+
+def _one_of(value: Any, choices: Any) -> Any:
+    if value not in get_args(choices):
+        raise ValueError(f"{value!r:.60} is none of {', '.join(get_args(choices))}")
+    return value
+
+
+def _unless_none(convert: Callable[[Any], _T], value: Any) -> _T | None:
+    return None if value is None else convert(value)
 
 
 def printable(text: str) -> str:

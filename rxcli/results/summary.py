@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rxcli.errors import ExitCode, InputError, UsageError, worst
+from rxcli.errors import ExitCode, UsageError, worst
+from rxcli.outputs import replacing, write_whole
 from rxcli.results.report import format_table, printable
 from rxcli.results.truth import Score
 from rxcli.types import FrameResult
@@ -171,13 +172,11 @@ def write_summary(path: Path, summaries: Sequence[SourceSummary], limits: Limits
     """
     check_summary_path(path)
     rows = [summary.row(limits) for summary in summaries]
-    try:
+    with replacing(path) as hidden:
         if path.suffix.casefold() == ".csv":
-            _write_csv(path, rows)
+            _write_csv(hidden, rows)
         else:
-            _write_parquet(path, rows)
-    except OSError as error:
-        raise _unwritable(path, error) from None
+            _write_parquet(hidden, rows)
 
 
 def check_summary_path(path: Path) -> None:
@@ -198,15 +197,16 @@ def check_summary_path(path: Path) -> None:
             )
 
 
-def _unwritable(path: Path, error: OSError) -> InputError:
-    return InputError(f"{path}: cannot be written ({error.strerror})", "name a file in a folder that can be written")
-
-
 def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, _COLUMNS)
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: _cell(value) for name, value in row.items()} for row in rows)
+
+
+def _cell(value: Any) -> Any:
+    """`value` so that a spreadsheet takes it for text, not for a formula (OWASP, CSV injection)."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA_STARTS) else value
 
 
 def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -220,6 +220,8 @@ def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
 
 
 _COLUMNS = tuple(SourceSummary("").row(Limits()))
+#: What makes a spreadsheet compute a cell.
+_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 
 def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) -> None:
@@ -246,10 +248,7 @@ def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) 
     root = ElementTree.Element("testsuites")
     root.append(suite)
     ElementTree.indent(root)
-    try:
-        ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
-    except OSError as error:
-        raise _unwritable(path, error) from None
+    write_whole(path, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
 
 
 def _xml(text: str) -> str:

@@ -16,6 +16,7 @@ from msgspec import Meta
 
 from rxcli.errors import InputError
 from rxcli.protocol import WEIGHTS, packet_slots
+from rxcli.resources import read_limited
 from rxcli.types import ColumnResult, FrameResult, PacketResult
 
 TRUTH_SUFFIX = ".truth.json"
@@ -24,14 +25,17 @@ EXPECTED_LENGTHS = 1.02
 #: Above this share of wrong bits a packet is lost or false.
 MAX_WRONG_SHARE = 0.25
 
-Count = Annotated[int, Meta(ge=0)]
+#: Longer truths than those of hours of video are none.
+_MOST_BYTES = 1 << 28
+
+Count = Annotated[int, Meta(ge=0, lt=1 << 40)]
 
 
 class TruthBurst(msgspec.Struct, frozen=True):
     """How much of one burst one frame shows."""
 
     burst: Count
-    visible_slots: Annotated[float, Meta(ge=0)]
+    visible_slots: Annotated[float, Meta(ge=0, le=1e9)]
 
 
 class TruthFrame(msgspec.Struct, frozen=True):
@@ -44,12 +48,12 @@ class TruthFrame(msgspec.Struct, frozen=True):
 class Truth(msgspec.Struct, frozen=True, kw_only=True):
     """What was sent. Unlike profiles, truth files may hold further keys, which are passed over."""
 
-    columns: Annotated[int, Meta(ge=1)]
-    payload_symbols: Annotated[int, Meta(ge=1)]
+    columns: Annotated[int, Meta(ge=1, le=1000)]
+    payload_symbols: Annotated[int, Meta(ge=1, le=1000)]
     #: Lit slots per symbol, per column.
     w: tuple[int, ...]
     #: Payload bits of one packet, per column.
-    payload_bits: tuple[Count, ...]
+    payload_bits: tuple[Annotated[int, Meta(ge=0, le=7000)], ...]
     frames: tuple[TruthFrame, ...]
     #: Burst number -> one hex string per column, first bit most significant.
     payload: dict[int, tuple[str, ...]]
@@ -85,8 +89,8 @@ def load_truth(path: str | Path) -> Truth:
         InputError: it cannot be read, is no JSON, lacks a key, or contradicts itself.
     """
     try:
-        truth = msgspec.json.decode(Path(path).read_bytes(), type=Truth)
-    except (OSError, ValueError) as error:  # msgspec's own errors are ValueErrors
+        truth = msgspec.json.decode(read_limited(Path(path), _MOST_BYTES), type=Truth)
+    except (OSError, ValueError, RecursionError) as error:  # msgspec's own errors are ValueErrors
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: cannot be read as truth ({reason})", "name a NAME.truth.json file") from None
     problem = _contradiction(truth)
@@ -115,7 +119,9 @@ def _payload_problem(burst: int, row: tuple[str, ...], truth: Truth) -> str | No
         return f"payload of burst {burst} must have one entry per column, {truth.columns} (got {len(row)})"
     for column, (text, n_bits) in enumerate(zip(row, truth.payload_bits, strict=True)):
         if 4 * len(text) < n_bits or not _is_hex(text):
-            return f"payload of burst {burst}, column {column}, must be hex of at least {n_bits} bits (got {text!r})"
+            return (
+                f"payload of burst {burst}, column {column}, must be hex of at least {n_bits} bits (got {text!r:.60})"
+            )
     return None
 
 

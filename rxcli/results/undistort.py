@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError
+from rxcli.outputs import PICTURE, check_replaceable, encode_png, unwritable, write_whole
 from rxcli.profiles import CameraProfile, match_camera
 from rxcli.receiver.screen.geometry import lens_for
 from rxcli.types import Frame, Lens
@@ -67,11 +67,11 @@ class UndistortedWriter:
     #: Take the first camera whatever the file says of itself.
     force_camera: bool = False
 
-    def __call__(self, frame: Frame) -> None:
-        """Write `frame`; one whose lens is not known is passed over with a warning.
+    def __call__(self, frame: Frame, subfolder: str = "") -> None:
+        """Write `frame` into a subfolder; one whose lens is not known is passed over with a warning.
 
         Raises:
-            InputError: the file cannot be written.
+            OutputError: the file cannot be written, or is there and none of ours.
         """
         lens = self._lens(frame)
         if lens is None:
@@ -79,11 +79,13 @@ class UndistortedWriter:
                 "%s: no camera profile with a lens fits; not undistorted (name one with --camera)", frame.source
             )
             return
-        import cv2
-
-        path = self.folder / f"{Path(frame.source).name}.{frame.index:05d}.png"
-        if not cv2.imwrite(str(path), undistorted(frame, lens)):
-            raise InputError(f"{path}: cannot be written", "name another folder with --save-undistorted")
+        path = self.folder / subfolder / f"{Path(frame.source).name}.{frame.index:05d}.png"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise unwritable(path, error) from None
+        check_replaceable(path, PICTURE, "--save-undistorted")
+        write_whole(path, encode_png(undistorted(frame, lens)))
 
     def _lens(self, frame: Frame) -> Lens | None:
         meta = frame.metadata

@@ -1,25 +1,22 @@
-"""Many sources: which files there are, decoding them here or in worker processes, and results that survive a kill.
+"""Many sources: which files there are, and decoding them here or in worker processes.
 
-Results come source by source in the order of the input, whoever decodes them. The file of JSON lines is its own
-journal: every line is written whole, at once, and sources follow one another, so that after a kill at most the last
-source is incomplete; `recover` drops it and the run goes on from there.
+Results come source by source in the order of the input, whoever decodes them; `rxcli.runs.journal` keeps them.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import signal
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
-from rxcli.errors import InputError, ProfileError, ReceiverError, UsageError
-from rxcli.results.report import from_record, to_json_line
+from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
+from rxcli.runs.journal import Journal as Journal
+from rxcli.runs.journal import recover as recover
 from rxcli.types import Frame, FrameResult
 
 if TYPE_CHECKING:
@@ -36,10 +33,10 @@ Receive = Callable[[Iterable[Frame], Any], Iterator[FrameResult]]
 #: One source with its results, which are to be taken before the next source is asked for.
 Decoded = tuple["Source", Iterator[FrameResult]]
 
+#: What these signals mean is decided by the first process; they often come to all at once.
+_FIRST_DECIDES = (signal.SIGINT, signal.SIGTERM)
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
 _AHEAD = 32
-#: What every line of results starts with, so that half of one is told from a foreign file.
-_LINE_START = b'{"source": "'
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -59,23 +56,45 @@ class Source:
     path: str
     #: Why there is nothing to open, None where there is.
     problem: str | None = None
+    #: Where its taps go, below their folder: where it lies itself below what all sources of the run have in common.
+    subfolder: str = ""
 
 
 def collect_sources(paths: Iterable[str], suffixes: frozenset[str]) -> list[Source]:
     """The sources that `paths` name: files as they are, folders recursively and in order of name.
 
-    Each file is taken once. In folders, files of other suffixes and hidden ones are passed over.
+    Each file is taken once. In folders, files of other suffixes and hidden ones are passed over; "-" is stdin.
 
     Args:
         paths: files and folders.
         suffixes: lower-case suffixes, with the dot, of files to take from folders.
     """
     found = [source for path in paths for source in _sources_of(path, suffixes)]
-    return list({os.path.normpath(source.name): source for source in found}.values())
+    return _with_subfolders(list({os.path.normpath(source.name): source for source in found}.values()))
+
+
+def _with_subfolders(sources: list[Source]) -> list[Source]:
+    """The sources with a place of its own for the taps of each, whatever others are called."""
+    from rxcli.results.dump import plain_name
+
+    folders = [os.path.dirname(os.path.abspath(source.name)) for source in sources]
+    try:
+        common = os.path.commonpath(folders) if folders else ""
+    except ValueError:  # several drives
+        common = os.sep
+    count: Counter[tuple[str, str]] = Counter()
+    placed = []
+    for source, folder in zip(sources, folders, strict=True):
+        below = os.path.relpath(folder, common) if folder != common else ""
+        place = (below, plain_name(source.name).casefold())
+        count[place] += 1
+        own = below if count[place] == 1 else os.path.join(below, f"{count[place]}")
+        placed.append(replace(source, subfolder=own))
+    return placed
 
 
 def _sources_of(path: str, suffixes: frozenset[str]) -> Iterator[Source]:
-    if not os.path.isdir(path):
+    if path == "-" or not os.path.isdir(path):
         yield Source(path, path)
         return
     files = [name for name in _walk(path) if os.path.splitext(name)[1].casefold() in suffixes]
@@ -103,8 +122,8 @@ class Decoder:
     options: Any
     open_source: OpenSource
     receive: Receive
-    #: Sees every frame before it is received.
-    tap: Callable[[Frame], None] | None = None
+    #: Sees every frame before it is received, and the subfolder of its source.
+    tap: Callable[[Frame, str], None] | None = None
 
     def results(self, source: Source) -> Iterator[FrameResult]:
         """The results of all frames of `source`, at least one; an input that fails ends in an `unreadable` one.
@@ -112,16 +131,17 @@ class Decoder:
         Raises:
             UsageError: the options make no sense, whatever the source.
             ProfileError: likewise.
+            OutputError: taps cannot be written.
         """
-        failure = _Failure()
+        failure = _Failure(source)
         count = 0
         try:
             if source.problem:
                 raise InputError(source.problem)
-            for result in self.receive(failure.guard(self._frames(source)), self.options):
+            for result in self.receive(failure.guard(self._frames(source)), self._options_of(source)):
                 yield replace(result, source=source.name)
                 count += 1
-        except (UsageError, ProfileError):
+        except (UsageError, ProfileError, OutputError):
             raise
         except Exception as error:
             failure.note(error)
@@ -130,30 +150,42 @@ class Decoder:
 
     def _frames(self, source: Source) -> Iterator[Frame]:
         for frame in self.open_source(source.path):
+            frame = replace(frame, source=source.name)  # as the user named it, wherever it is opened
             if self.tap is not None:
-                self.tap(frame)
+                self.tap(frame, source.subfolder)
             yield frame
+
+    def _options_of(self, source: Source) -> Any:
+        """The options with a place of its own for the source's taps."""
+        folder = getattr(self.options, "dump_dir", None)
+        return self.options if folder is None else replace(self.options, dump_dir=folder / source.subfolder)
 
 
 class _Failure:
     """What went wrong with a source. The receiver behind a guarded iterator still gives what it had got till then."""
 
-    def __init__(self) -> None:
+    def __init__(self, source: Source) -> None:
+        self._source = source
         self.message: str | None = None
 
     def guard(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """The frames up to the failure, which is noted instead of raised."""
         try:
             yield from frames
-        except (UsageError, ProfileError):
+        except (UsageError, ProfileError, OutputError):
             raise
         except Exception as error:
             self.note(error)
 
     def note(self, error: Exception) -> None:
         """Keep the message of `error`; one that is no `ReceiverError` is a bug, whose traceback goes to the log."""
+        name = self._source.name
         if isinstance(error, ReceiverError):
-            self.message = str(error)
+            self.message = str(error).replace(self._source.path, name)
+            return
+        if isinstance(error, (OSError, MemoryError)):
+            reason = getattr(error, "strerror", None) or "more memory is needed than there is"
+            self.message = f"{name}: cannot be decoded ({reason}); try it by itself"
             return
         log.debug("unexpected error", exc_info=error)
         self.message = f"internal error ({type(error).__name__}: {error}); run again with --verbose and report it"
@@ -164,7 +196,7 @@ def unreadable(source: Source, frame: int, message: str) -> FrameResult:
     return FrameResult(source=source.name, frame=frame, time_s=0.0, status="unreadable", message=message)
 
 
-def standard_decoder(options: ReceiverOptions, tap: Callable[[Frame], None] | None = None) -> Decoder:
+def standard_decoder(options: ReceiverOptions, tap: Callable[[Frame, str], None] | None = None) -> Decoder:
     """The decoder that reads files and receives them."""
     from rxcli.ingest import open_source
     from rxcli.receiver.pipeline import receive
@@ -236,7 +268,7 @@ class _Pool:
     def __exit__(self, *exception: object) -> None:
         for worker in self._workers:
             worker.connection.close()
-            worker.process.terminate()
+            worker.process.kill()  # it has nothing of its own, and passes over gentler signals
         for worker in self._workers:
             worker.process.join()
 
@@ -266,7 +298,7 @@ class _Pool:
     def _start(self) -> _Worker:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_work, args=(theirs, self._decoder, log_level()), daemon=True)
-        with _one_thread_environment():
+        with _one_thread_environment(), _signals_held():
             process.start()
         theirs.close()
         return _Worker(process, ours)
@@ -325,7 +357,9 @@ def _ending(exitcode: int | None) -> str:
 
 def _work(connection: Connection, decoder: Decoder, level: int) -> None:
     """A worker's life: take a source, send its results, until the other end is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides what an interrupt means
+    for number in _FIRST_DECIDES:
+        signal.signal(number, signal.SIG_IGN)
+    _hold_signals(signal.SIG_UNBLOCK)
     logging.basicConfig(level=level)
     use_one_thread()
     try:
@@ -358,6 +392,21 @@ def use_one_thread() -> None:
 
 
 @contextmanager
+def _signals_held() -> Iterator[None]:
+    """While a worker starts, which inherits this, signals wait."""
+    _hold_signals(signal.SIG_BLOCK)
+    try:
+        yield
+    finally:
+        _hold_signals(signal.SIG_UNBLOCK)
+
+
+def _hold_signals(how: int) -> None:
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(how, _FIRST_DECIDES)
+
+
+@contextmanager
 def _one_thread_environment() -> Iterator[None]:
     """The environment in which a worker's libraries start no threads of their own."""
     before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
@@ -370,90 +419,3 @@ def _one_thread_environment() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
-
-
-class Journal:
-    """A file of JSON lines that holds whole lines only, whenever the process ends.
-
-    Args:
-        path: the file.
-        resume: keep what is there (after `recover`) and go on behind it.
-
-    Raises:
-        InputError: it cannot be written.
-    """
-
-    def __init__(self, path: Path, resume: bool = False) -> None:
-        self._path = path
-        try:
-            self._file: BinaryIO = path.open("ab" if resume else "wb", buffering=0)
-        except OSError as error:
-            raise self._unwritable(error) from None
-
-    def write(self, result: FrameResult) -> None:
-        """Append the line of `result`, in one call of the system.
-
-        Raises:
-            InputError: it cannot be written.
-        """
-        rest = memoryview(to_json_line(result).encode() + b"\n")
-        try:
-            while rest:
-                rest = rest[self._file.write(rest) :]
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            raise self._unwritable(error) from None
-
-    def _unwritable(self, error: OSError) -> InputError:
-        return InputError(f"{self._path}: cannot be written ({error.strerror})", "name a file that can be written")
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-def recover(path: Path) -> Iterator[tuple[str, list[FrameResult]]]:
-    """Give the complete sources of an earlier run's JSON lines, then cut off the last one, which may be incomplete.
-
-    Exhaust it before the file is written to.
-
-    Raises:
-        UsageError: the file is no output of `vlc-rx decode --json`; it is left as it is.
-        InputError: it cannot be read or cut.
-    """
-    try:
-        with path.open("rb+") as file:
-            start = yield from _complete_sources(file, path)
-            file.truncate(start)
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        raise InputError(f"{path}: cannot be resumed ({error.strerror})", "name another file") from None
-
-
-def _complete_sources(file: BinaryIO, path: Path) -> Generator[tuple[str, list[FrameResult]], None, int]:
-    """Give every source but the last one; returns where the last one starts."""
-    start = offset = 0
-    results: list[FrameResult] = []
-    for number, line in enumerate(file, start=1):
-        if not line.endswith(b"\n") and line[: len(_LINE_START)] == _LINE_START[: len(line)]:
-            break
-        result = _parse_line(line, f"{path} line {number}")
-        if results and result.source != results[0].source:
-            yield results[0].source, results
-            results, start = [], offset
-        results.append(result)
-        offset += len(line)
-    return start
-
-
-def _parse_line(line: bytes, place: str) -> FrameResult:
-    try:
-        record = json.loads(line)
-    except ValueError:
-        raise UsageError(f"{place}: not JSON", "name the file that --json wrote before") from None
-    try:
-        return from_record(record)
-    except UsageError as error:
-        raise UsageError(f"{place}: {error.message}", "name the file that --json wrote before") from None

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
+import warnings
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import InputError, ReceiverError, UsageError
 from rxcli.runs.batch import Decoded, Decoder, Source, unreadable
 from rxcli.types import FrameResult
 
@@ -23,6 +27,7 @@ log = logging.getLogger(__name__)
 _RETRIES = 3
 #: Tasks in the scheduler's hands at a time: enough for a large cluster, few enough that results do not pile up.
 _IN_FLIGHT = 1024
+_START_ONE = "start one with `dask scheduler` and name its address, such as tcp://host:8786"
 
 
 def decode_on_cluster(
@@ -39,8 +44,8 @@ def decode_on_cluster(
         connect_s: how long to wait for the scheduler, seconds.
 
     Raises:
-        UsageError: the extra is missing, or no scheduler answers.
-        InputError: the scheduler went away; what was taken till then is complete.
+        UsageError: the extra is missing, the address is none, or no scheduler answers there.
+        InputError: the scheduler went away, or its workers cannot decode; what was taken till then is complete.
     """
     with _connect(address, connect_s) as client:
         waiting = iter(sources)
@@ -56,16 +61,80 @@ def _connect(address: str, connect_s: float) -> Client:
         from distributed import Client
     except ImportError:
         raise UsageError("--cluster needs the package distributed", "pip install 'vlc-rx[cluster]'") from None
+    problem = _problem_at(address, connect_s)
+    if problem is not None:
+        raise UsageError(f"--cluster: no Dask scheduler answers at {address!r} ({problem})", _START_ONE)
     try:
-        client = Client(address, timeout=connect_s, set_as_default=False)
+        with _silent():
+            client = Client(address, timeout=connect_s, set_as_default=False)
     except (OSError, ValueError) as error:
         raise UsageError(
-            f"--cluster: no Dask scheduler answers at {address!r} ({type(error).__name__})",
-            "start one with `dask scheduler` and name its address, such as tcp://host:8786",
+            f"--cluster: no Dask scheduler answers at {address!r} ({type(error).__name__})", _START_ONE
         ) from None
     if not client.scheduler_info()["workers"]:
         log.warning("the scheduler at %s has no workers yet; waiting for some (`dask worker %s`)", address, address)
     return client
+
+
+def _problem_at(address: str, connect_s: float) -> str | None:
+    """Why no scheduler answers; None where one does. Dask itself would try again and again, and say so at length."""
+    outcome: list[str | None] = []
+    # A name that is looked up in vain, or a server that accepts and is silent, is left behind with its thread.
+    asker = Thread(target=lambda: outcome.append(_asked(address, connect_s)), daemon=True)
+    with _silent():
+        asker.start()
+        asker.join(1.5 * connect_s)
+    return outcome[0] if outcome else f"nothing within {connect_s:g} s"
+
+
+def _asked(address: str, connect_s: float) -> str | None:
+    from distributed.comm.addressing import get_address_host_port
+    from distributed.security import Security
+
+    try:
+        if not 0 < int(get_address_host_port(address, strict=True)[1] or 0) < 1 << 16:
+            return "that is no address with a port"
+        arguments = Security().get_connection_args("client")
+        kind = asyncio.run(asyncio.wait_for(_kind_at(address, arguments), connect_s))
+    except TimeoutError:
+        return f"nothing within {connect_s:g} s"
+    except Exception as error:  # Dask, its transports and TLS raise some ten unrelated types
+        return _first_line(error)
+    return None if kind == "Scheduler" else f"that is a {kind}"
+
+
+async def _kind_at(address: str, arguments: dict[str, Any]) -> str:
+    """What the Dask server at an address says that it is."""
+    from distributed.comm import connect
+
+    comm = await connect(address, **arguments)
+    try:
+        await comm.write({"op": "identity", "reply": True})
+        answer = await comm.read()
+    finally:
+        comm.abort()
+    return str(answer.get("type")) if isinstance(answer, dict) else "server of another kind"
+
+
+def _first_line(error: BaseException) -> str:
+    text = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {text[0]:.120}" if text else type(error).__name__
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Without the tracebacks that Dask logs of attempts that fail."""
+    loggers = [logging.getLogger(name) for name in ("distributed", "asyncio", "tornado")]
+    levels = [logger.level for logger in loggers]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL + 1)
+        try:
+            yield
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)
 
 
 def _submit(client: Client, decoder: Decoder, source: Source) -> Any:
@@ -90,6 +159,11 @@ def _await(source: Source, future: Any, address: str) -> list[FrameResult]:
         raise InputError(
             f"the scheduler at {address!r} went away ({type(error).__name__})", "start it again and use --resume"
         ) from None
+    except ReceiverError:
+        raise
+    except Exception as error:  # what a worker raises that cannot even load the task
+        reason = f"the workers of {address!r} cannot decode ({_first_line(error)})"
+        raise InputError(reason, "install the same vlc-rx there") from None
 
 
 def _cancelled() -> type[BaseException]:

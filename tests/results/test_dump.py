@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rxcli.errors import UsageError
+from rxcli.errors import OutputError
 from rxcli.lab.benchmark.folder import scene
 from rxcli.lab.benchmark.trial import Trial, frame_of, simulate_trial
 from rxcli.lab.simulate.capture import prepare
@@ -79,5 +79,5 @@ def test_what_is_unknown_is_left_out(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="name another folder with --dump-dir"):
+    with pytest.raises(OutputError, match="cannot be written"):
         dump_stages(tmp_path / "file", "x", 0, {})

@@ -194,6 +194,10 @@ class Link:
         return np.concatenate([dark, sent[:, max(first, 0) - origin : max(stop, 0) - origin]], axis=1)
 
 
+#: What `export_waveforms` writes.
+WAVEFORM_FILES = ("slots.npy", "slots.csv", "levels.csv", "lit_light.csv", "picture.png")
+
+
 def export_waveforms(drive: Drive, link: Link, n_bursts: int, folder: Path) -> list[Path]:
     """Write what a laboratory needs to drive a real backlight.
 
@@ -203,7 +207,7 @@ def export_waveforms(drive: Drive, link: Link, n_bursts: int, folder: Path) -> l
     Returns:
         The files written.
     """
-    import cv2
+    from rxcli.outputs import encode_png
 
     folder.mkdir(parents=True, exist_ok=True)
     slots = link.slots(0, n_bursts * link.burst_slots).T
@@ -212,5 +216,5 @@ def export_waveforms(drive: Drive, link: Link, n_bursts: int, folder: Path) -> l
     np.savetxt(folder / "slots.csv", slots, fmt="%d", delimiter=",", header=names, comments="")
     np.savetxt(folder / "levels.csv", drive.levels, fmt="%.6f", delimiter=",", header=names, comments="")
     np.savetxt(folder / "lit_light.csv", drive.lit_light, fmt="%.6f", delimiter=",", header=names, comments="")
-    (folder / "picture.png").write_bytes(cv2.imencode(".png", drive.grey[..., ::-1])[1].tobytes())
-    return [folder / name for name in ("slots.npy", "slots.csv", "levels.csv", "lit_light.csv", "picture.png")]
+    (folder / WAVEFORM_FILES[-1]).write_bytes(encode_png(np.ascontiguousarray(drive.grey[..., ::-1])))
+    return [folder / name for name in WAVEFORM_FILES]

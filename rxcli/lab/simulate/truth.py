@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[s
         "tone_curve": "linear" if scene.is_mosaic else scene.isp.tone,
         "slot_rate_error_ppm": scene.slot_rate_error_ppm,
         "column_delay_slots": first.delays.tolist(),
+        "written_by": "vlc-rx simulate",
     }
 
 
@@ -119,6 +121,11 @@ def _frame_truth(number: int, exposure: Exposure) -> dict[str, Any]:
 
 def write_truth(truth: dict[str, Any], path: Path) -> Path:
     """Write the truth beside the capture `path`, as `NAME.truth.json`; returns where."""
-    target = path.with_name(path.stem + ".truth.json")
-    target.write_text(json.dumps(truth, indent=1) + "\n", encoding="utf-8")
+    target = truth_path(path)
+    write_whole(target, json.dumps(truth, indent=1) + "\n")
     return target
+
+
+def truth_path(path: Path) -> Path:
+    """Where the truth of the capture `path` is written."""
+    return path.with_name(path.stem + ".truth.json")

@@ -1,0 +1,240 @@
+"""Files that a run writes: claimed together before anything is opened, written whole or not at all.
+
+`claim` refuses outputs that would destroy something: an input, a profile, another output, a folder, or a file that
+somebody else wrote. `replacing` and `write_whole` write to a hidden neighbour, which takes the name only when it is
+complete, so that a kill or a full disk leaves the old file. Journals, which grow line by line, are the exception
+(`rxcli.runs.journal`).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rxcli.errors import OutputError, UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+#: So much of a file's start and of its end tells whose it is.
+_LOOK_BYTES = 1 << 16
+#: Signature and IHDR of a PNG (ISO 15948, section 5).
+_PNG_HEADER_BYTES = 33
+
+# What files of ours look like.
+#: Nothing: whatever is there is somebody's.
+NEVER = re.compile(rb"(?!)")
+ANYTHING = re.compile(rb"")
+JOURNAL = re.compile(rb'\A\{"source": "[^\n]*?", "frame": \d+, "time_s": ')
+CSV_SUMMARY = re.compile(rb"\Asource,exit_code,frames,")
+PARQUET_SUMMARY = re.compile(rb"\APAR1.*frames_failed", re.DOTALL)
+JUNIT = re.compile(rb'<testsuite name="vlc-rx ')
+#: A profile that may be added to, and one that was only ever estimated.
+CAMERA = re.compile(rb'^kind = "camera"', re.MULTILINE)
+ESTIMATED_CAMERA = re.compile(rb'^description = "[^"\n]*estimated', re.MULTILINE)
+# Of `vlc-rx simulate`: truth, camera, what drives a screen.
+TRUTH = re.compile(rb'"written_by": "vlc-rx simulate"')
+SIMULATED_CAMERA = re.compile(rb'^description = "written by vlc-rx simulate"', re.MULTILINE)
+WAVEFORMS = re.compile(rb"\Acolumn_0|\A\x93NUMPY")
+#: Arrays of the stages (`rxcli.results.dump`).
+TAPS = re.compile(
+    rb"\APK\x03\x04.{26}(geometry|sampling|clock|samples|channel|detect|bursts)[a-z0-9._]*\.npy", re.DOTALL
+)
+#: Written by `encode_png`.
+PICTURE = re.compile(rb"\A\x89PNG.{29}....tEXtSoftware\0vlc-rx", re.DOTALL)
+
+
+def json_with(*keys: str) -> re.Pattern[bytes]:
+    """What JSON of ours with these keys, in this order, looks like."""
+    return re.compile(rb'\A[\[{].*"' + rb'":.*"'.join(re.escape(key.encode()) for key in keys) + rb'":', re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """One file that a run will write."""
+
+    #: The option that names it, as the user writes it.
+    option: str
+    path: Path
+    #: What an earlier output of the same sort looks like; such a file may be replaced.
+    ours: re.Pattern[bytes]
+    #: Whether its folder is made where there is none.
+    makes_folder: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.option} {self.path}"
+
+
+def claim(
+    outputs: Sequence[Output],
+    inputs: Iterable[str | Path] = (),
+    profiles: Iterable[str | Path] = (),
+    force: bool = False,
+) -> None:
+    """Refuse outputs that would destroy something; nothing is opened for writing.
+
+    Args:
+        outputs: all files that the run will write.
+        inputs: files that it reads; those that do not exist harm nothing.
+        profiles: profile files that it reads.
+        force: replace files that others wrote, though never an input or a profile of this run.
+
+    Raises:
+        UsageError: two outputs are one file; or an output is an input, a profile, a folder, in no folder, or a file
+            that does not look like an earlier output of the same sort.
+    """
+    taken: dict[object, str] = {}
+    for kind, paths in (("an input", inputs), ("a profile that is read", profiles)):
+        for path in paths:
+            identity = _identity(Path(path))
+            if identity is not None:
+                taken.setdefault(identity, kind)
+    for output in outputs:
+        identity = _place(output)
+        if _is_stream(output.path):
+            continue
+        if identity in taken:
+            reason = taken[identity]
+            raise UsageError(f"{output}: the same file is {reason}", "name another file")
+        taken[identity] = f"written by {output.option}"
+        if not force:
+            _check_ours(output)
+
+
+def claim_folder(option: str, folder: Path) -> None:
+    """Make a folder that a run writes into.
+
+    Raises:
+        UsageError: it is a file, or cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{option} {folder}: {_reason(error)}", "name another folder") from None
+
+
+def _identity(path: Path) -> object | None:
+    """What two names of one file have in common; None where there is no file."""
+    try:
+        info = path.stat()
+    except (OSError, ValueError):
+        return None
+    return (info.st_dev, info.st_ino)
+
+
+def _place(output: Output) -> object:
+    """The identity of an output, by its name where there is no such file yet."""
+    path = output.path
+    try:
+        if path.is_dir():
+            raise UsageError(f"{output}: is a folder", "name a file")
+        if not output.makes_folder and not path.resolve().parent.is_dir():
+            raise UsageError(f"{output}: there is no such folder", "make it, or name another")
+    except (OSError, ValueError, RuntimeError) as error:
+        raise UsageError(f"{output}: {_reason(error)}", "name another file") from None
+    return _identity(path) or path.resolve()
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether `path` is a device or a pipe, of which there is nothing to destroy."""
+    try:
+        return path.exists() and not path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _check_ours(output: Output) -> None:
+    try:
+        with output.path.open("rb") as file:
+            look = file.read(_LOOK_BYTES)
+            rest = file.seek(0, os.SEEK_END) - len(look)
+            file.seek(-min(rest, _LOOK_BYTES), os.SEEK_END)
+            look += file.read() if rest else b""
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise UsageError(f"{output}: cannot be looked at ({_reason(error)})", "name another file") from None
+    if look and not output.ours.search(look):
+        raise UsageError(
+            f"{output}: there is such a file, and it is no earlier output of this option",
+            "name another file, or replace it with --force",
+        )
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A path to write, with the suffix of `path`; what is there when the block ends well becomes `path`.
+
+    A device or a pipe is given as it is. A link is followed. Where the block fails, `path` is as it was.
+
+    Raises:
+        OutputError: the file cannot be written; any `OSError` of the block ends so.
+    """
+    target = path
+    try:
+        if _is_stream(path):
+            yield path
+            return
+        target = path.resolve()
+        hidden = target.with_name(f".{target.stem[:100]}.{os.getpid()}.part{target.suffix}")
+        try:
+            yield hidden
+            with suppress(FileNotFoundError):
+                hidden.chmod(stat.S_IMODE(target.stat().st_mode))
+            hidden.replace(target)
+        finally:
+            hidden.unlink(missing_ok=True)
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file as a whole or not at all.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    with replacing(path) as hidden:
+        hidden.write_bytes(data)
+
+
+def check_replaceable(path: Path, ours: re.Pattern[bytes], option: str) -> None:
+    """Refuse to replace a file that somebody else wrote, where a name is known only when it is written.
+
+    Raises:
+        OutputError: `path` is there, and does not look like `ours`.
+    """
+    try:
+        _check_ours(Output(option, path, ours))
+    except UsageError as error:
+        raise OutputError(error.message, "name another folder") from None
+
+
+def unwritable(path: Path, error: BaseException) -> OutputError:
+    """The error that says that `path` could not be written, and why."""
+    return OutputError(f"{path}: cannot be written ({_reason(error)})", "name a file in a folder that can be written")
+
+
+def _reason(error: BaseException) -> str:
+    return getattr(error, "strerror", None) or str(error)
+
+
+def encode_png(picture: NDArray[np.uint8]) -> bytes:
+    """A PNG of ours: `picture` is (height, width) grey or (height, width, 3) BGR; `PICTURE` knows it again."""
+    import cv2
+
+    data = cv2.imencode(".png", picture)[1].tobytes()
+    text = b"tEXtSoftware\0vlc-rx"
+    chunk = (len(text) - 4).to_bytes(4, "big") + text + zlib.crc32(text).to_bytes(4, "big")
+    return data[:_PNG_HEADER_BYTES] + chunk + data[_PNG_HEADER_BYTES:]
