@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import InputError
 
 if TYPE_CHECKING:
-    from rxcli.profiles import CameraProfile, ScreenProfile
-    from rxcli.receiver.pipeline import ReceiverOptions
+    from rxcli.options import ReceiverOptions
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 AUTO = "auto"
@@ -38,7 +37,7 @@ class _Point(click.ParamType[tuple[float, float]]):
 
 
 def _check_skip(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
-    from rxcli.receiver.pipeline import SKIPS
+    from rxcli.options import SKIPS
 
     for name in names:
         if name not in SKIPS:
@@ -100,69 +99,17 @@ def receiver_arguments(command: _F) -> _F:
 
 
 def receiver_options(
-    screens: tuple[str, ...] = (),
-    cameras: tuple[str, ...] = (),
-    corners: tuple[tuple[float, float], ...] | None = None,
-    cae: str = AUTO,
-    min_confidence: float = 0.0,
-    no_skip: tuple[str, ...] = (),
-    dump_dir: Path | None = None,
-    stop_when_certain: bool = False,
+    screens: tuple[str, ...] = (), cameras: tuple[str, ...] = (), corners: Any = None, **options: Any
 ) -> ReceiverOptions:
-    """The receiver's options from what the command line gave.
-
-    A single camera that is named, not `auto`, is taken whatever a file says of itself; of several, and of the shipped
-    ones, each file takes the one that matches.
+    """`rxcli.options.receiver_options` of what the command line gave: an option not given is `auto`.
 
     Raises:
         ProfileError: a profile is missing or malformed.
         UsageError: the corners are no convex quadrilateral.
     """
-    import numpy as np
+    from rxcli.options import receiver_options as options_of
 
-    from rxcli.receiver.pipeline import SKIPS, ReceiverOptions
-
-    named = [name for name in cameras if name != AUTO]
-    return ReceiverOptions(
-        screens=_screens(screens),
-        cameras=_cameras(cameras),
-        force_camera=len(named) == 1 == len(cameras),
-        corners=_checked(np.array(corners, dtype=np.float64)) if corners else None,
-        cae=cae,  # type: ignore[arg-type]  # one of the choices
-        min_confidence=min_confidence,
-        skip=frozenset(SKIPS) - set(no_skip),
-        dump_dir=dump_dir,
-        stop_when_certain=stop_when_certain,
-    )
-
-
-def _screens(names: tuple[str, ...]) -> tuple[ScreenProfile, ...]:
-    from rxcli.profiles import ScreenProfile, load_profile, shipped_profiles
-
-    named = [load_profile(name, ScreenProfile) for name in names if name != AUTO]
-    return tuple(named if names and AUTO not in names else [*named, *shipped_profiles(ScreenProfile)])
-
-
-def _cameras(names: tuple[str, ...]) -> tuple[CameraProfile, ...]:
-    from rxcli.profiles import CameraProfile, load_profile, shipped_profiles
-
-    named = [load_profile(name, CameraProfile) for name in names if name != AUTO]
-    return tuple(named if names and AUTO not in names else [*named, *shipped_profiles(CameraProfile)])
-
-
-def _checked(corners: Any) -> Any:
-    """The corners, where going round them always turns the same way, as it does round a screen seen by a camera."""
-    import numpy as np
-
-    edges = np.roll(corners, -1, axis=0) - corners
-    following = np.roll(edges, -1, axis=0)
-    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-    if not (np.all(turns > 0) or np.all(turns < 0)):
-        raise UsageError(
-            "--corners must go once round a convex outline: top-left, top-right, bottom-right, bottom-left",
-            "check their order and the numbers",
-        )
-    return corners
+    return options_of(screens or AUTO, cameras or AUTO, corners or None, **options)
 
 
 def write_json(value: Any, path: str) -> None:

@@ -17,7 +17,7 @@ from rxcli.lab.simulate.isp import Isp, Tone
 from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
-from rxcli.profiles import ScreenProfile, load_profile, parse_profile, shipped_profiles
+from rxcli.profiles import ScreenProfile, load_profile, parse_profile
 from rxcli.receiver import camera as blind
 from rxcli.receiver import unknown_camera
 from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
@@ -28,7 +28,9 @@ from rxcli.receiver.still import decode
 from rxcli.types import Frame, FrameResult
 
 CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
-OPTIONS = ReceiverOptions(screens=(parse_profile(SCREEN, ScreenProfile, "small"),), corners=CORNERS, cae="never")
+OPTIONS = ReceiverOptions(
+    screens=(parse_profile(SCREEN, ScreenProfile, "small"),), cameras=(), corners=CORNERS, cae="never"
+)
 
 
 def _frame(folder: Path) -> tuple[Frame, list[str]]:
@@ -164,7 +166,7 @@ def _small_phone(tone: Tone) -> tuple[Trial, Frame]:
 @pytest.mark.parametrize("tone", ["srgb", "linear"])
 def test_a_picture_whose_values_follow_light_is_read_as_one(tone: Tone, monkeypatch: pytest.MonkeyPatch) -> None:
     trial, frame = _small_phone(tone)
-    options = ReceiverOptions(screens=tuple(shipped_profiles(ScreenProfile)), corners=trial.corners, cae="never")
+    options = ReceiverOptions(cameras=(), corners=trial.corners, cae="never")
     read: list[str] = []
 
     def noting_the_tone(context: FrameContext, *rest: Any) -> Acquisition | Failure:

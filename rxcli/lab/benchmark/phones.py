@@ -89,7 +89,7 @@ def phone_record(task: Task) -> Record:
     scene, turned = phone_of(task["seed"], task["number"])
     trial = simulate_trial(scene, _FIRST_SEED + task["number"])
     frame, corners = _as_stored(trial, turned)
-    options = ReceiverOptions(screens=tuple(shipped_profiles(ScreenProfile)), corners=corners, cae=task["cae"])
+    options = ReceiverOptions(cameras=(), corners=corners, cae=task["cae"])
     result, _ = score_result(receive_frame(frame, options), trial.truth)
     about = {
         "screen": scene.screen.name,
