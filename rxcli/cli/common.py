@@ -19,6 +19,31 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 AUTO = "auto"
 
 
+def options(*rows: tuple[str, Any, Any, str]) -> Callable[[_F], _F]:
+    """Options of a command as a table of flags, type, default and help.
+
+    Flags are as click takes them, separated by spaces, a parameter's name of its own among them. A type of None makes a
+    switch, a list takes the option several times, and a default that is not None is shown.
+    """
+
+    def decorate(command: _F) -> _F:
+        for flags, kind, default, text in reversed(rows):
+            command = click.option(*flags.split(), **_option(kind, default), help=text)(command)
+        return command
+
+    return decorate
+
+
+def _option(kind: Any, default: Any) -> dict[str, Any]:
+    if kind is None:
+        return {"is_flag": True, "default": bool(default)} if default is not None else {"default": None}
+    if isinstance(kind, list):
+        return {"type": kind[0], "multiple": True}
+    if isinstance(kind, tuple):
+        return {"type": click.Choice(kind), "default": default, "show_default": default is not None}
+    return {"type": kind, "default": default, "show_default": default is not None}
+
+
 class _Point(click.ParamType[tuple[float, float]]):
     """`x,y` in pixels."""
 

@@ -11,7 +11,8 @@ import pytest
 from small_frames import BOTTOM, LEFT, RIGHT, ROWS_PER_SLOT, SCREEN, TOP, write_frame
 
 from rxcli.ingest import open_source
-from rxcli.lab.benchmark.phones import phone_record
+from rxcli.lab.benchmark import phones
+from rxcli.lab.benchmark.journal import SEEDS_A_RUN
 from rxcli.lab.benchmark.trial import Trial, score_result, simulate_trial
 from rxcli.lab.simulate.isp import Isp, Tone
 from rxcli.lab.simulate.optics import Lens, Pose
@@ -70,7 +71,7 @@ def test_packets_of_long_exposures_are_received(seed: int, number: int, n_packet
 
     Of the second, whose picture has much texture, wrong clocks fit as well until its slots are read.
     """
-    packets = phone_record({"seed": seed, "number": number, "cae": "never"})["packets"]
+    packets = phones.packets_of({"seed": SEEDS_A_RUN * seed + number, "cae": "never"})["packets"]
     assert sum(packet["bit_errors"] == 0 for packet in packets) >= n_packets
 
 
