@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
-from rxcli.profiles import CameraProfile, ScreenProfile
+import numpy as np
+
+from rxcli.errors import UsageError
+from rxcli.profiles import CameraProfile, ScreenProfile, load_profile, shipped_profiles
 from rxcli.types import FloatArray
 
 CaeMode = Literal["auto", "always", "never"]
 #: Names of the shortcuts that `ReceiverOptions.skip` may hold; every one is counted in the report.
 SKIPS = ("no_screen", "dark_columns", "certain_columns", "tracking")
+#: In place of a profile's name: all shipped ones, of which the picture decides.
+AUTO = "auto"
+_Profile = TypeVar("_Profile", ScreenProfile, CameraProfile)
 
 
 @dataclass(frozen=True, slots=True)
 class ReceiverOptions:
     """What the user asks of the receiver; picklable, so that worker processes can have it."""
 
-    #: Screens to try; the one whose clock fits best is taken.
-    screens: tuple[ScreenProfile, ...]
-    #: Cameras to choose from by make, model and size; empty: estimate everything blindly.
-    cameras: tuple[CameraProfile, ...] = ()
+    #: Screens to try, all shipped ones by default; the one whose clock fits best is taken.
+    screens: tuple[ScreenProfile, ...] = field(default_factory=lambda: tuple(shipped_profiles(ScreenProfile)))
+    #: Cameras to choose from by make, model and size, all shipped ones by default; empty: every camera is estimated.
+    cameras: tuple[CameraProfile, ...] = field(default_factory=lambda: tuple(shipped_profiles(CameraProfile)))
     #: Take `cameras[0]` whatever the file says of itself.
     force_camera: bool = False
     #: (4, 2) image pixels, top-left first, clockwise as a viewer sees the screen; None: find them.
@@ -35,3 +42,90 @@ class ReceiverOptions:
     stop_when_certain: bool = False
     #: Folder for the arrays of every stage boundary; None: none are written.
     dump_dir: Path | None = None
+
+
+def receiver_options(
+    screens: ScreenProfile | str | Sequence[ScreenProfile | str] = AUTO,
+    cameras: CameraProfile | str | Sequence[CameraProfile | str] = AUTO,
+    corners: Any = None,
+    *,
+    cae: CaeMode = "auto",
+    min_confidence: float = 0.0,
+    no_skip: Sequence[str] = (),
+    stop_when_certain: bool = False,
+    dump_dir: str | Path | None = None,
+) -> ReceiverOptions:
+    """The receiver's options from names, files or profiles.
+
+    A single camera that is named, not "auto", is taken whatever a file says of itself; of several, and of the shipped
+    ones, each file takes the one that matches its make, model and size.
+
+    Args:
+        screens: profile, name of a shipped one, TOML file, or several of these; "auto": all shipped ones.
+        cameras: likewise; an empty sequence: estimate every camera from its picture.
+        corners: (4, 2) stored pixels, top-left first, clockwise as a viewer sees the screen; None: find them.
+        cae: when the auto-encoder runs.
+        min_confidence: packets below it are not reported.
+        no_skip: shortcuts to switch off, of `SKIPS`.
+        stop_when_certain: pass over frames of a clip all of whose packets are certain already.
+        dump_dir: folder for the arrays of every stage boundary.
+
+    Raises:
+        ProfileError: a profile is missing or malformed.
+        UsageError: the corners are no convex quadrilateral, or a value is impossible.
+    """
+    named = (cameras,) if isinstance(cameras, (str, CameraProfile)) else tuple(cameras)
+    _check_choices(cae, min_confidence, no_skip)
+    return ReceiverOptions(
+        screens=_profiles(screens, ScreenProfile),
+        cameras=_profiles(cameras, CameraProfile),
+        force_camera=len(named) == 1 and named[0] != AUTO,
+        corners=None if corners is None else _checked_corners(corners),
+        cae=cae,
+        min_confidence=min_confidence,
+        skip=frozenset(SKIPS) - set(no_skip),
+        stop_when_certain=stop_when_certain,
+        # Absolute, for workers may stand in other folders.
+        dump_dir=None if dump_dir is None else Path(dump_dir).absolute(),
+    )
+
+
+def _profiles(
+    named: ScreenProfile | CameraProfile | str | Sequence[ScreenProfile | CameraProfile | str], kind: type[_Profile]
+) -> tuple[_Profile, ...]:
+    names: tuple[Any, ...] = (named,) if isinstance(named, (str, ScreenProfile, CameraProfile)) else tuple(named)
+    found: list[_Profile] = []
+    for name in names:
+        if isinstance(name, kind):
+            found.append(name)
+        elif not isinstance(name, str):
+            raise UsageError(f"{name!r} is no {kind.__name__}", "give a profile of this kind, its name, or a TOML file")
+        elif name != AUTO:
+            found.append(load_profile(name, kind))
+    return (*found, *(shipped_profiles(kind) if AUTO in names else ()))
+
+
+def _check_choices(cae: str, min_confidence: float, no_skip: Sequence[str]) -> None:
+    if cae not in ("auto", "always", "never"):
+        raise UsageError(f"cae must be auto, always or never (got {cae!r})")
+    if not 0 <= min_confidence <= 1:
+        raise UsageError(f"min_confidence must be in 0..1 (got {min_confidence})")
+    for name in no_skip:
+        if name not in SKIPS:
+            raise UsageError(f"no_skip: {name!r} is not one of {', '.join(SKIPS)}")
+
+
+def _checked_corners(corners: Any) -> FloatArray:
+    """The corners, where going round them always turns the same way, as it does round a screen seen by a camera."""
+    found: FloatArray = np.array(corners, dtype=np.float64)
+    if found.shape != (4, 2) or not np.all(np.isfinite(found)):
+        raise UsageError(f"corners must be four positions (x, y) in stored pixels (got shape {found.shape})")
+    edges = np.roll(found, -1, axis=0) - found
+    following = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+    if not (np.all(turns > 0) or np.all(turns < 0)):
+        raise UsageError(
+            "corners must go once round a convex outline: top-left, top-right, bottom-right, bottom-left",
+            "check their order and the numbers",
+        )
+    return found

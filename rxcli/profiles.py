@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from itertools import chain
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, overload
 
 import msgspec
 from msgspec import Meta
@@ -35,8 +35,8 @@ Triple = tuple[float, float, float]
 class ScreenProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A screen and what it sends (air interface, section 3)."""
 
-    format: Literal[1]
-    kind: Literal["screen"]
+    format: Literal[1] = 1
+    kind: Literal["screen"] = "screen"
     name: Name
     columns: Annotated[int, Meta(ge=1, le=1000)]
     slot_rate_hz: Annotated[float, Meta(ge=1, le=1e6)]
@@ -95,8 +95,8 @@ class LensModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 class CameraProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A camera body (its readout modes), a lens, or both."""
 
-    format: Literal[1]
-    kind: Literal["camera"]
+    format: Literal[1] = 1
+    kind: Literal["camera"] = "camera"
     name: Name
     #: Matched against the file's make, and its model, without regard to case; empty matches any.
     make: str = ""
@@ -146,6 +146,9 @@ def check_profile(raw: dict[str, Any], kind: type[_Profile], source: str) -> _Pr
     Raises:
         ProfileError: an unknown or missing key, or an impossible value.
     """
+    for key in ("format", "kind"):  # files must have them, though Python need not say them
+        if key not in raw:
+            raise ProfileError(f"{source}: Object missing required field `{key}`", "correct the file")
     try:
         profile = msgspec.convert(raw, kind, strict=True)
     except (msgspec.ValidationError, OverflowError, RecursionError) as error:
@@ -189,27 +192,63 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def load_profile(name_or_path: str, kind: type[_Profile]) -> _Profile:
+@overload
+def load_profile(name_or_path: str | Path) -> ScreenProfile | CameraProfile: ...
+
+
+@overload
+def load_profile(name_or_path: str | Path, kind: type[_Profile]) -> _Profile: ...
+
+
+def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any:
     """Load a shipped profile by name, or a TOML file by path.
+
+    Args:
+        name_or_path: such as "paper-17k3", "xs10" or "mine.toml".
+        kind: `ScreenProfile` or `CameraProfile`; None: whichever it is.
 
     Raises:
         ProfileError: no such profile, unreadable, or malformed.
     """
+    name = str(name_or_path)
+    if kind is None:
+        return _load_file(name) if Path(name).is_file() else _load_shipped(name)
     shipped = data_dir("calibration") / _KINDS[kind]
-    by_name = shipped / f"{name_or_path}.toml"
-    is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name_or_path) is not None
-    path = by_name if is_name and by_name.is_file() else Path(name_or_path)
+    by_name = shipped / f"{name}.toml"
+    is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) is not None
+    path = by_name if is_name and by_name.is_file() else Path(name)
     try:
         text = read_limited(path, _MOST_BYTES).decode("utf-8")
     except FileNotFoundError:
         known = ", ".join(sorted(p.stem for p in shipped.glob("*.toml")))
         raise ProfileError(
-            f"no profile {name_or_path!r} among {_KINDS[kind]}", f"name a TOML file or one of: {known}"
+            f"no profile {name!r} among {_KINDS[kind]}", f"name a TOML file or one of: {known}"
         ) from None
     except (OSError, UnicodeDecodeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise ProfileError(f"{name_or_path}: cannot be read as a profile ({reason})", "name a TOML file") from None
-    return parse_profile(text, kind, name_or_path)
+        raise ProfileError(f"{name}: cannot be read as a profile ({reason})", "name a TOML file") from None
+    return parse_profile(text, kind, name)
+
+
+def _load_file(name: str) -> ScreenProfile | CameraProfile:
+    """A screen or camera profile, by what the file says it is; what else is wrong with it, its loader tells."""
+    try:
+        kind = tomllib.loads(read_limited(Path(name), _MOST_BYTES).decode("utf-8")).get("kind")
+    except (OSError, ValueError, RecursionError):
+        return load_profile(name, ScreenProfile)
+    if kind not in ("screen", "camera"):
+        raise ProfileError(f"{name}: kind must be 'screen' or 'camera' (got {kind!r})", "correct the file")
+    return load_profile(name, CameraProfile) if kind == "camera" else load_profile(name, ScreenProfile)
+
+
+def _load_shipped(name: str) -> ScreenProfile | CameraProfile:
+    known: list[ScreenProfile | CameraProfile] = [*shipped_profiles(ScreenProfile)]
+    known += shipped_profiles(CameraProfile)
+    found = next((profile for profile in known if profile.name == name), None)
+    if found is None:
+        names = ", ".join(profile.name for profile in known)
+        raise ProfileError(f"no profile {name!r}", f"name a TOML file or one of: {names}")
+    return found
 
 
 def shipped_profiles(kind: type[_Profile]) -> list[_Profile]:

@@ -236,6 +236,11 @@ class PacketResult:
     #: What the confidence was made of, see `rxcli.receiver.decode.assemble`; for fits, not for reports.
     confidence_features: tuple[float, ...] = ()
 
+    @property
+    def payload_bytes(self) -> bytes:
+        """The payload, first bit most significant, zero-padded to whole bytes."""
+        return bytes.fromhex(self.payload)
+
 
 @dataclass(frozen=True, slots=True)
 class ColumnResult:

@@ -49,7 +49,7 @@ def calibrate_bent(frames: Sequence[Frame], screen: ScreenProfile) -> ShutterCal
 
 def _bent_line_delay(frame: Frame, screen: ScreenProfile) -> tuple[float, float] | None:
     """Line delay and its standard deviation; None where no screen is found or its stripes are not bent."""
-    options = ReceiverOptions(screens=(screen,))
+    options = ReceiverOptions(screens=(screen,), cameras=())
     corners = find_corners(frame, options)
     context = corners if isinstance(corners, Failure) else find_camera(frame, corners, options, Timer())
     if isinstance(context, Failure):

@@ -1,41 +1,38 @@
-"""`vlc-rx benchmark`: error, run time, stability, calibration, captures beside twins, folders, memory."""
+"""`vlc-rx benchmark`: error, run time, stability, calibration, unknown cameras, two checkouts, memory."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
+
+from rxcli.cli.common import options
 
 if TYPE_CHECKING:
     from rxcli.lab.benchmark.confidence import Calibration
     from rxcli.lab.benchmark.journal import Journal
+    from rxcli.lab.benchmark.speed import Medium
     from rxcli.lab.benchmark.sweeps import Summary
 
-_F = TypeVar("_F", bound=Callable[..., Any])
-
-_COMMON = (
-    click.option(
-        "--out",
-        type=click.Path(file_okay=False, path_type=Path),
-        default=Path("benchmark-results"),
-        show_default=True,
-        help="Folder of journals, CSV, JSON and plots.",
-    ),
-    click.option("--seed", type=click.IntRange(0, 10**6), default=0, show_default=True, help="Of all random scenes."),
-    click.option("--fresh", is_flag=True, help="Forget what an earlier run has left in the journal."),
-    click.option("--quiet", is_flag=True, help="No progress bar."),
+_COUNT, _SOME = click.IntRange(1), click.IntRange(0)
+_FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+_FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+_RESULTS = (
+    "--out",
+    click.Path(file_okay=False, path_type=Path),
+    Path("benchmark-results"),
+    "Folder of results.",
 )
-_JOBS = click.option(
-    "--jobs", type=click.IntRange(1, 256), default=1, show_default=True, help="Processes, one thread each."
-)
-
-
-def _common(command: _F) -> _F:
-    for option in reversed(_COMMON):
-        command = option(command)
-    return command
+_SEED = ("--seed", click.IntRange(0, 10**6), 0, "Of all random scenes.")
+_QUIET = ("--quiet", None, False, "No progress bar.")
+_FRESH = ("--fresh", None, False, "Forget what an earlier run has left in the journal.")
+_JOBS = ("--jobs", click.IntRange(1, 256), 1, "Processes, one thread each.")
+_CAE = ("--cae", ("auto", "always", "never"), "auto", "When the auto-encoder runs.")
+#: Of every run that keeps a journal, and of those over many random scenes.
+_RUN = (_RESULTS, _SEED, _FRESH, _QUIET)
+_MANY = (_JOBS, *_RUN)
 
 
 def _journal(out: Path, name: str, fresh: bool) -> Journal:
@@ -47,19 +44,25 @@ def _journal(out: Path, name: str, fresh: bool) -> Journal:
     return Journal(path)
 
 
-def _check_sweeps(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
-    from rxcli.lab.benchmark.sweeps import SWEEPS
+def _say_written(paths: Sequence[Path]) -> None:
+    click.echo("written: " + ", ".join(str(path) for path in paths), err=True)
 
-    for name in names:
-        if name not in SWEEPS:
-            raise click.BadParameter(f"{name!r} is not one of {', '.join(SWEEPS)}")
-    return names
+
+def _random(label: str, work: Callable[..., Any], count: int, run: dict[str, Any], **more: Any) -> list[Any]:
+    """Records of `count` random scenes of one kind."""
+    from rxcli.lab.benchmark.journal import run_scenes
+
+    journal = _journal(run["out"], label, run["fresh"])
+    told = {name: run[name] for name in ("seed", "jobs", "quiet")}
+    return run_scenes(label, work, count, journal, **told, **more)
 
 
 @click.group(invoke_without_command=True)
-@click.option("--quick", is_flag=True, help="Print the headline table: under three minutes on two cores.")
-@click.option("--jobs", type=click.IntRange(1, 256), default=2, show_default=True, help="Processes of --quick.")
-@_common
+@options(
+    ("--quick", None, False, "Print the headline table: under three minutes on two cores."),
+    ("--jobs", click.IntRange(1, 256), 2, "Processes of --quick."),
+    *_RUN,
+)
 @click.pass_context
 def benchmark(context: click.Context, quick: bool, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
     """Run time against error; stability.
@@ -84,34 +87,19 @@ def benchmark(context: click.Context, quick: bool, jobs: int, out: Path, seed: i
 
 
 @benchmark.command()
-@click.option(
-    "--frames", type=click.IntRange(1), default=600, show_default=True, help="Random frames, some 20 packets each."
+@options(
+    ("--frames", _COUNT, 600, "Random frames, some 20 packets each."),
+    ("--clips", _COUNT, None, "Random compressed clips in place of frames, some 70 packets each."),
+    _CAE,
+    (
+        "--also journals",
+        [_FILE],
+        None,
+        "Count an earlier run's packets too; may be given several times.",
+    ),
+    *_MANY,
 )
-@click.option(
-    "--clips", type=click.IntRange(1), help="Random compressed clips in place of frames, some 70 packets each."
-)
-@click.option("--cae", type=click.Choice(["auto", "always", "never"]), default="auto", show_default=True)
-@click.option(
-    "--also",
-    "journals",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    multiple=True,
-    metavar="JOURNAL",
-    help="Count the packets of an earlier run's journal too, of phones for instance; may be given several times.",
-)
-@_JOBS
-@_common
-def confidence(
-    frames: int,
-    clips: int | None,
-    cae: str,
-    journals: tuple[Path, ...],
-    jobs: int,
-    out: Path,
-    seed: int,
-    fresh: bool,
-    quiet: bool,
-) -> None:
+def confidence(frames: int, clips: int | None, cae: str, journals: tuple[Path, ...], **run: Any) -> None:
     """Share of error-free packets in ten bins of reported confidence."""
     from rxcli.lab.benchmark import clip_confidence, plots
     from rxcli.lab.benchmark import confidence as work
@@ -119,35 +107,17 @@ def confidence(
     from rxcli.lab.benchmark.tables import format_table, write_outputs
 
     earlier = [record for path in journals for record in Journal(path).records]
-    journal = _journal(out, "confidence", fresh)
-    run = work.run if clips is None else clip_confidence.run
-    records = run(clips or frames, journal, seed=seed, cae=cae, jobs=jobs, quiet=quiet) + earlier
-    result = work.calibration(records)
+    packets_of = work.packets_of if clips is None else clip_confidence.packets_of
+    records = _random("confidence" if clips is None else "clips", packets_of, clips or frames, run, cae=cae)
+    result = work.calibration(records + earlier)
     rows = work.rows(result)
     click.echo(format_table(rows))
     click.echo("\n".join(_calibration_notes(result)))
-    paths = write_outputs(out, "confidence", rows, work.details(result))
+    paths = write_outputs(run["out"], "confidence", rows, work.details(result))
     if plots.available():
-        paths.append(out / "confidence.png")
+        paths.append(run["out"] / "confidence.png")
         plots.plot_confidence(result.bins, paths[-1])
     _say_written(paths)
-
-
-@benchmark.command()
-@click.option("--count", type=click.IntRange(1), default=100, show_default=True, help="Random phones, a picture each.")
-@click.option("--cae", type=click.Choice(["auto", "always", "never"]), default="auto", show_default=True)
-@_JOBS
-@_common
-def phones(count: int, cae: str, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
-    """Simulated phones received without a camera profile: rows per slot, and wrong packets by confidence."""
-    from rxcli.lab.benchmark import phones as work
-    from rxcli.lab.benchmark.tables import titled, write_outputs
-
-    records = work.run(count, _journal(out, "phones", fresh), seed=seed, cae=cae, jobs=jobs, quiet=quiet)
-    rows, missed = work.rows(records), work.missed(records)
-    bound = f"rows per slot within {100 * work.BOUND:g} %"
-    click.echo(titled([(bound, rows), ("phones further off", missed)]))
-    _say_written(write_outputs(out, "phones", rows, missed))
 
 
 def _calibration_notes(result: Calibration) -> list[str]:
@@ -167,17 +137,47 @@ def _calibration_notes(result: Calibration) -> list[str]:
     return lines
 
 
-def _say_written(paths: Sequence[Path]) -> None:
-    click.echo("written: " + ", ".join(str(path) for path in paths), err=True)
+@benchmark.command()
+@options(("--count", _COUNT, 100, "Random phones, a picture each."), _CAE, *_MANY)
+def phones(count: int, cae: str, **run: Any) -> None:
+    """Simulated phones received without a camera profile: rows per slot, and wrong packets by confidence."""
+    from rxcli.lab.benchmark import phones as work
+    from rxcli.lab.benchmark.tables import titled, write_outputs
+
+    records = _random("phones", work.packets_of, count, run, cae=cae)
+    rows, missed = work.rows(records), work.missed(records)
+    bound = f"rows per slot within {100 * work.BOUND:g} %"
+    click.echo(titled([(bound, rows), ("phones further off", missed)]))
+    _say_written(write_outputs(run["out"], "phones", rows, missed))
+
+
+@benchmark.command()
+@options(("--frames", _COUNT, 80, "Random frames of full size, some seconds each."), *_MANY)
+def outline(frames: int, **run: Any) -> None:
+    """Corners of found screens against the true ones: any place, size and tilt, any room and picture."""
+    from rxcli.lab.benchmark import outline as work
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
+
+    found = [work.found_of(record) for record in _random("outline", work.search_record, frames, run)]
+    rows = work.rows(found)
+    click.echo(format_table(rows))
+    _say_written(write_outputs(run["out"], "outline", rows))
+
+
+def _check_sweeps(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
+    from rxcli.lab.benchmark.sweeps import SWEEPS
+
+    for name in names:
+        if name not in SWEEPS:
+            raise click.BadParameter(f"{name!r} is not one of {', '.join(SWEEPS)}")
+    return names
 
 
 @benchmark.command()
 @click.option(
     "--only", multiple=True, metavar="NAME", callback=_check_sweeps, help="A sweep; may be given several times."
 )
-@click.option("--frames", type=click.IntRange(1), default=12, show_default=True, help="Frames of each point.")
-@_JOBS
-@_common
+@options(("--frames", _COUNT, 12, "Frames of each point."), *_MANY)
 def sweep(only: tuple[str, ...], frames: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
     """Error and run time over slot rate, light, exposure, picture, tilt, camera, and the receiver's variants."""
     from rxcli.lab.benchmark import sweeps
@@ -209,51 +209,67 @@ def _plot_sweeps(summaries: Sequence[Summary], out: Path) -> list[Path]:
 
 
 @benchmark.command()
-@click.option("--repeats", type=click.IntRange(1), default=5, show_default=True, help="Runs whose median counts.")
-@click.option("--medium", "only", multiple=True, metavar="NAME", help="A medium; may be given several times.")
-@click.option("--growth/--no-growth", default=True, help="Also measure growth with pixels and columns.")
-@_common
-def stages(repeats: int, only: tuple[str, ...], growth: bool, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
-    """Time per stage against the bare decode, peak memory, growth with pixels and columns."""
-    from tqdm import tqdm
+@options(
+    ("--repeats", _COUNT, 5, "Runs of which the quickest counts."),
+    ("--medium only", [str], None, "A medium; may be given several times."),
+    ("--file", _FILE, None, "A photograph or clip of your own, in place of the media; needs --camera and --screen."),
+    ("--camera", str, None, "Camera profile of --file: a name or a TOML file."),
+    ("--screen", str, None, "Screen profile of --file: a name or a TOML file."),
+    ("--growth/--no-growth", None, True, "Also measure growth with pixels and columns."),
+    *_RUN,
+)
+def speed(repeats: int, only: tuple[str, ...], growth: bool, out: Path, quiet: bool, **given: Any) -> None:
+    """Time per stage against the bare decode, clips in times real time, peak memory, growth with size."""
+    from rxcli.lab.benchmark import speed as work
+    from rxcli.lab.benchmark.tables import format_table
 
-    from rxcli.lab.benchmark import plots
-    from rxcli.lab.benchmark import stages as work
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
-
+    named = given["camera"], given["screen"]
+    if given["file"] is not None:
+        if None in named:
+            raise click.UsageError("--file needs --camera and --screen")
+        camera, screen = named
+        timings = [work.time_file(given["file"], screen, camera, threads, repeats) for threads in (1, 2)]
+        click.echo(format_table(work.timing_rows(timings)))
+        return
     media = [medium for medium in work.MEDIA if not only or medium.name in only]
     if not media:
         raise click.BadParameter(f"no medium of that name; choose from: {', '.join(m.name for m in work.MEDIA)}")
-    folder = out / "media"
-    steps = 4 * len(media) + 1 + growth * (len(work.MEGAPIXELS) + len(work.COLUMNS))
-    with tqdm(total=steps, desc="stages", leave=False, disable=quiet or None) as bar:
-        paths = {}
+    if given["fresh"]:
         for medium in media:
-            if fresh:
-                (folder / f"{medium.name}{medium.suffix}").unlink(missing_ok=True)
-            paths[medium] = work.make_medium(medium, folder, seed)
+            (out / "media" / f"{medium.name}{medium.suffix}").unlink(missing_ok=True)
+    _speed_of_media(media, repeats, growth, out, given["seed"], quiet)
+
+
+def _speed_of_media(
+    media: Sequence[Medium], repeats: int, with_growth: bool, out: Path, seed: int, quiet: bool
+) -> None:
+    from tqdm import tqdm
+
+    from rxcli.lab.benchmark import plots
+    from rxcli.lab.benchmark import speed as work
+    from rxcli.lab.benchmark.tables import format_table, titled, write_outputs
+
+    axes = {"megapixels": work.MEGAPIXELS, "columns": work.COLUMNS} if with_growth else {}
+    with tqdm(
+        total=4 * len(media) + 1 + sum(map(len, axes.values())), desc="speed", leave=False, disable=quiet or None
+    ) as bar:
+
+        def counted(value: Any) -> Any:
             bar.update()
-        timings = []
-        for threads in (1, 2):
-            for medium, path in paths.items():
-                timings.append(work.time_medium(medium, path, threads, repeats))
-                bar.update()
-        memory = []
-        for medium, path in paths.items():
-            memory.append({"medium": medium.name, **work.memory_of(medium, path)})
-            bar.update()
-        growths = [work.growth(axis, repeats, bar.update) for axis in ("megapixels", "columns")] if growth else []
-        start_up = work.help_times()
-        bar.update()
+            return value
+
+        paths = {medium: counted(work.make_medium(medium, out / "media", seed)) for medium in media}
+        timings = [counted(work.time_medium(m, path, n, repeats)) for n in (1, 2) for m, path in paths.items()]
+        memory = [{"medium": m.name, **counted(work.memory_of(m, path))} for m, path in paths.items()]
+        growths = [work.growth(axis, repeats, bar.update) for axis in axes]
+        start_up = counted(work.start_times())
     rows = work.timing_rows(timings)
-    click.echo("stages as ratios to the bare one-thread decode\n" + format_table(rows))
-    click.echo("\npeak memory\n" + format_table(memory))
-    for one in growths:
-        click.echo(f"\ngrowth with {one.axis}: exponent {one.exponent:.2f}")
-        click.echo(format_table([{one.axis: x, "ms": ms} for x, ms in zip(one.x, one.ms, strict=True)]))
-    click.echo("\n" + format_table([{"start": name, "ms": ms} for name, ms in start_up.items()]))
+    grown = [(f"growth with {g.axis}: exponent {g.exponent:.2f}", g.as_rows()) for g in growths]
+    start = [{"start": name, "ms": ms} for name, ms in start_up.items()]
+    click.echo("stages as ratios to the bare decode\n" + format_table(rows) + "\n")
+    click.echo(titled([("peak memory", memory), *grown, ("start", start)]))
     details = {"memory": memory, "start_ms": start_up, "growth": {g.axis: [g.x, g.ms, g.exponent] for g in growths}}
-    written = write_outputs(out, "stages", rows, details)
+    written = write_outputs(out, "speed", rows, details)
     if growths and plots.available():
         written.append(out / "growth.png")
         plots.plot_growth(growths, written[-1])
@@ -261,9 +277,7 @@ def stages(repeats: int, only: tuple[str, ...], growth: bool, out: Path, seed: i
 
 
 @benchmark.command()
-@click.option("--scenes", type=click.IntRange(0), default=10_000, show_default=True, help="Random scenes.")
-@_JOBS
-@_common
+@options(("--scenes", _SOME, 10_000, "Random scenes."), *_MANY)
 def stability(scenes: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> int:
     """Hostile values and random scenes: no exception, no warning, no NaN, no confident nonsense.
 
@@ -286,72 +300,43 @@ def stability(scenes: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: 
 
 
 @benchmark.command()
-@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option("--twins", type=click.IntRange(1), default=3, show_default=True, help="Simulated twins of each capture.")
-@click.option(
-    "--pictures",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
-    help="Folder of the pictures shown, NAME.png or NAME.jpg for a capture with NAME in its own.",
+@click.argument("checkout", type=_FOLDER)
+@options(
+    ("--captures", _FOLDER, None, "Folder of photographs and clips.  [default: the samples]"),
+    ("--scenes", _SOME, 60, "Random scenes, camera and corners handed over."),
+    ("--phones", _SOME, 40, "Random phones, nothing but the corners handed over."),
+    ("--repeats", _COUNT, 2, "Turns of each checkout; the least time of every file counts."),
+    _RESULTS,
+    _SEED,
+    _QUIET,
 )
-@click.option("--only", multiple=True, metavar="TEXT", help="Captures with this in their name; may be repeated.")
-@_JOBS
-@_common
-def captures(
-    folder: Path,
-    twins: int,
-    pictures: Path | None,
-    only: tuple[str, ...],
-    jobs: int,
-    out: Path,
-    seed: int,
-    fresh: bool,
-    quiet: bool,
-) -> None:
-    """Captures of FOLDER that have a truth beside simulated twins of them: is either easier?
+def compare(checkout: Path, out: Path, **given: Any) -> int:
+    """This checkout against CHECKOUT, an earlier one: the same results to the last bit? In how much time?
 
-    Beside both stands the bound, on the sensor's electrons and on the delivered file.
+    Exit code 1 where a result differs.
     """
-    from rxcli.lab.benchmark import captures as work
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
+    from tqdm import tqdm
 
-    found = work.find_captures(folder, pictures)
-    wanted = [one for one in found if not only or any(text in one.path.name for text in only)]
-    if not wanted:
-        raise click.BadParameter(f"no capture with such a name; there are: {', '.join(o.path.name for o in found)}")
-    rows = work.run(wanted, twins, _journal(out, "captures", fresh), seed=seed, jobs=jobs, quiet=quiet)
-    click.echo(format_table(rows))
-    _say_written(write_outputs(out, "captures", rows))
-
-
-@benchmark.command()
-@click.option("--files", type=click.IntRange(1), default=200, show_default=True, help="Files of the folder.")
-@click.option("--bad", type=click.IntRange(0), default=20, show_default=True, help="Those of them that are bad.")
-@click.option("--kills", type=click.IntRange(0), default=10, show_default=True, help="Kills of each disturbed run.")
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("benchmark-results"))
-@click.option("--seed", type=click.IntRange(0, 10**6), default=0, show_default=True, help="Of scenes and moments.")
-def folder(files: int, bad: int, kills: int, out: Path, seed: int) -> int:
-    """A folder of good and bad files, decoded undisturbed and by runs killed at random moments and resumed.
-
-    Exit code 1 unless all good files give packets, all bad ones a reason, and all runs the same results.
-    """
     from rxcli.errors import ExitCode
-    from rxcli.lab.benchmark import folder as work
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
+    from rxcli.lab.benchmark import compare as work
+    from rxcli.lab.benchmark.tables import titled, write_outputs
+    from rxcli.resources import data_dir
 
-    if bad >= files:
-        raise click.BadParameter(f"--bad must be below --files, {files} (got {bad})")
-    contents = work.make_folder(out / f"folder-{files}-{bad}-{seed}", files - bad, bad, seed)
-    outcomes = work.run(contents, out / "folder-runs", kills, seed)
-    rows = [outcome.as_row() for outcome in outcomes]
-    reasons = work.reasons(contents, out / "folder-runs")
-    click.echo(format_table(rows) + "\n\n" + format_table(reasons))
-    _say_written(write_outputs(out, "folder", rows, reasons))
-    return ExitCode.OK if work.passed(contents, outcomes) else ExitCode.NOT_RECEIVED
+    other, seed = work.check_checkout(checkout), given["seed"]
+    screens = work.shared_screens(other)
+    jobs = work.captures((given["captures"] or data_dir("sample_frames")).resolve(), screens)
+    jobs += work.random_scenes(out / "compare", given["scenes"], seed)
+    jobs += work.random_phones(out / "compare", given["phones"], seed, screens)
+    with tqdm(total=2 * given["repeats"], desc="compare", leave=False, disable=given["quiet"] or None) as bar:
+        found = work.compare(jobs, work.this_checkout(), other, given["repeats"], bar.update)
+    rows, differing = work.rows(found), work.differing(found)
+    click.echo(titled([("this checkout against the other", rows), ("results that differ", differing)]))
+    _say_written(write_outputs(out, "compare", rows, differing))
+    return ExitCode.NOT_RECEIVED if differing else ExitCode.OK
 
 
 @benchmark.command()
-@click.option("--frames", type=click.IntRange(100), default=10_000, show_default=True, help="Frames of the clip.")
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("benchmark-results"))
+@options(("--frames", click.IntRange(100), 10_000, "Frames of the clip."), _RESULTS)
 def memory(frames: int, out: Path) -> None:
     """Memory of `vlc-rx decode` over a long clip."""
     from rxcli.lab.benchmark import long_clip as work

@@ -10,15 +10,37 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from rxcli.errors import UsageError
-
 if TYPE_CHECKING:
+    from rxcli.options import ReceiverOptions
     from rxcli.outputs import Output
-    from rxcli.profiles import CameraProfile, ScreenProfile
-    from rxcli.receiver.pipeline import ReceiverOptions
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 AUTO = "auto"
+
+
+def options(*rows: tuple[str, Any, Any, str]) -> Callable[[_F], _F]:
+    """Options of a command as a table of flags, type, default and help.
+
+    Flags are as click takes them, separated by spaces, a parameter's name of its own among them. A type of None makes a
+    switch, a list takes the option several times, and a default that is not None is shown.
+    """
+
+    def decorate(command: _F) -> _F:
+        for flags, kind, default, text in reversed(rows):
+            command = click.option(*flags.split(), **_option(kind, default), help=text)(command)
+        return command
+
+    return decorate
+
+
+def _option(kind: Any, default: Any) -> dict[str, Any]:
+    if kind is None:
+        return {"is_flag": True, "default": bool(default)} if default is not None else {"default": None}
+    if isinstance(kind, list):
+        return {"type": kind[0], "multiple": True}
+    if isinstance(kind, tuple):
+        return {"type": click.Choice(kind), "default": default, "show_default": default is not None}
+    return {"type": kind, "default": default, "show_default": default is not None}
 
 
 class _Point(click.ParamType[tuple[float, float]]):
@@ -39,7 +61,7 @@ class _Point(click.ParamType[tuple[float, float]]):
 
 
 def _check_skip(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
-    from rxcli.receiver.pipeline import SKIPS
+    from rxcli.options import SKIPS
 
     for name in names:
         if name not in SKIPS:
@@ -101,69 +123,17 @@ def receiver_arguments(command: _F) -> _F:
 
 
 def receiver_options(
-    screens: tuple[str, ...] = (),
-    cameras: tuple[str, ...] = (),
-    corners: tuple[tuple[float, float], ...] | None = None,
-    cae: str = AUTO,
-    min_confidence: float = 0.0,
-    no_skip: tuple[str, ...] = (),
-    dump_dir: Path | None = None,
-    stop_when_certain: bool = False,
+    screens: tuple[str, ...] = (), cameras: tuple[str, ...] = (), corners: Any = None, **options: Any
 ) -> ReceiverOptions:
-    """The receiver's options from what the command line gave.
-
-    A single camera that is named, not `auto`, is taken whatever a file says of itself; of several, and of the shipped
-    ones, each file takes the one that matches.
+    """`rxcli.options.receiver_options` of what the command line gave: an option not given is `auto`.
 
     Raises:
         ProfileError: a profile is missing or malformed.
         UsageError: the corners are no convex quadrilateral.
     """
-    import numpy as np
+    from rxcli.options import receiver_options as options_of
 
-    from rxcli.receiver.pipeline import SKIPS, ReceiverOptions
-
-    named = [name for name in cameras if name != AUTO]
-    return ReceiverOptions(
-        screens=_screens(screens),
-        cameras=_cameras(cameras),
-        force_camera=len(named) == 1 == len(cameras),
-        corners=_checked(np.array(corners, dtype=np.float64)) if corners else None,
-        cae=cae,  # type: ignore[arg-type]  # one of the choices
-        min_confidence=min_confidence,
-        skip=frozenset(SKIPS) - set(no_skip),
-        dump_dir=dump_dir.absolute() if dump_dir else None,  # workers may stand in other folders
-        stop_when_certain=stop_when_certain,
-    )
-
-
-def _screens(names: tuple[str, ...]) -> tuple[ScreenProfile, ...]:
-    from rxcli.profiles import ScreenProfile, load_profile, shipped_profiles
-
-    named = [load_profile(name, ScreenProfile) for name in names if name != AUTO]
-    return tuple(named if names and AUTO not in names else [*named, *shipped_profiles(ScreenProfile)])
-
-
-def _cameras(names: tuple[str, ...]) -> tuple[CameraProfile, ...]:
-    from rxcli.profiles import CameraProfile, load_profile, shipped_profiles
-
-    named = [load_profile(name, CameraProfile) for name in names if name != AUTO]
-    return tuple(named if names and AUTO not in names else [*named, *shipped_profiles(CameraProfile)])
-
-
-def _checked(corners: Any) -> Any:
-    """The corners, where going round them always turns the same way, as it does round a screen seen by a camera."""
-    import numpy as np
-
-    edges = np.roll(corners, -1, axis=0) - corners
-    following = np.roll(edges, -1, axis=0)
-    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-    if not (np.all(turns > 0) or np.all(turns < 0)):
-        raise UsageError(
-            "--corners must go once round a convex outline: top-left, top-right, bottom-right, bottom-left",
-            "check their order and the numbers",
-        )
-    return corners
+    return options_of(screens or AUTO, cameras or AUTO, corners or None, **options)
 
 
 #: For every command that writes files which may be somebody's.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rxcli.cli.common import claim_outputs, force_argument, json_output, write_json
-from rxcli.errors import ExitCode, InputError, ProfileError, ReceiverError, UsageError, worst
+from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
     from rxcli.profiles import CameraProfile, ScreenProfile
@@ -61,9 +61,9 @@ def list_profiles(json_path: str | None, force: bool) -> None:
 def show(name: str, json_path: str | None, force: bool) -> None:
     """Show the profile NAME, a shipped one or a TOML file."""
     claim_outputs([json_output(json_path, "format", "kind", "name")], profiles=(name,), force=force)
-    from rxcli.profiles import dump_profile
+    from rxcli.profiles import dump_profile, load_profile
 
-    profile = _load_any(name)
+    profile = load_profile(name)
     if json_path is not None:
         write_json(_builtins(profile), json_path)
     if json_path != "-":
@@ -74,10 +74,12 @@ def show(name: str, json_path: str | None, force: bool) -> None:
 @click.argument("names", nargs=-1, metavar="[NAME|FILE]...")
 def validate(names: tuple[str, ...]) -> int:
     """Check profiles: those named, or all shipped ones. Exit code 2 where one is wrong."""
+    from rxcli.profiles import load_profile
+
     codes = []
     for name in names or _shipped_names():
         try:
-            profile = _load_any(name)
+            profile = load_profile(name)
         except ReceiverError as error:
             click.echo(f"vlc-rx: {error}", err=True)
             codes.append(error.exit_code)
@@ -127,39 +129,6 @@ def _shipped() -> list[ScreenProfile | CameraProfile]:
     found += shipped_profiles(ScreenProfile)
     found += shipped_profiles(CameraProfile)
     return found
-
-
-def _load_any(name: str) -> ScreenProfile | CameraProfile:
-    """A screen or camera profile, by what the file says it is."""
-    from rxcli.profiles import CameraProfile, ScreenProfile, load_profile
-
-    if not Path(name).is_file():
-        return _load_shipped(name)
-    if _kind_in(Path(name)) == "camera":
-        return load_profile(name, CameraProfile)
-    return load_profile(name, ScreenProfile)
-
-
-def _load_shipped(name: str) -> ScreenProfile | CameraProfile:
-    known = _shipped()
-    found = next((profile for profile in known if profile.name == name), None)
-    if found is None:
-        names = ", ".join(profile.name for profile in known)
-        raise ProfileError(f"no profile {name!r}", f"name a TOML file or one of: {names}")
-    return found
-
-
-def _kind_in(path: Path) -> str:
-    """What a TOML file says it is; what else is wrong with it the loader tells."""
-    import tomllib
-
-    try:
-        kind = tomllib.loads(path.read_text(encoding="utf-8")).get("kind")
-    except (OSError, ValueError, RecursionError):
-        return ""
-    if kind not in ("screen", "camera"):
-        raise ProfileError(f"{path}: kind must be 'screen' or 'camera' (got {kind!r})", "correct the file")
-    return str(kind)
 
 
 def _choices(cameras: tuple[str, ...]) -> list[CameraProfile]:

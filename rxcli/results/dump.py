@@ -4,13 +4,63 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from rxcli.errors import InputError
 from rxcli.outputs import TAPS, check_replaceable, replacing, unwritable
+from rxcli.types import BurstPosteriors, Clock, FloatArray, RowProfiles, SlotSamples
+
+_Stage = TypeVar("_Stage", RowProfiles, Clock, SlotSamples, BurstPosteriors)
+
+
+@dataclass(frozen=True, slots=True)
+class Taps:
+    """The arrays of every stage boundary of one photograph: what each stage hands to the next."""
+
+    #: (4, 2) float64 stored pixels, top-left first, clockwise as a viewer sees the screen.
+    corners: FloatArray
+    #: Out of sampling: the light of every strip on every row.
+    profiles: RowProfiles
+    #: Out of sync: the link's time, and the light resampled to it.
+    clock: Clock
+    samples: SlotSamples
+    #: (C, N + memory, 2**(memory+1)) float64, out of the channel: log-likelihood of the light of slot i, given pattern
+    #: j of the slot and those before it (`protocol.slot_patterns`).
+    metrics: FloatArray
+    #: Out of detection.
+    posteriors: BurstPosteriors
+
+
+def read_taps(path: str | Path) -> Taps:
+    """Read what `--dump-dir` wrote of a photograph.
+
+    Raises:
+        InputError: no such file, or not the taps of a photograph.
+    """
+    try:
+        with np.load(path) as file:
+            arrays = dict(file)
+        return Taps(
+            arrays["geometry.corners"],
+            _stage(arrays, "sampling", RowProfiles),
+            _stage(arrays, "clock", Clock),
+            _stage(arrays, "samples", SlotSamples),
+            arrays["channel.metrics"],
+            _stage(arrays, "detect", BurstPosteriors),
+        )
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: not the taps of a photograph ({error})", "write them with --dump-dir") from None
+
+
+def _stage(arrays: Mapping[str, Any], name: str, kind: type[_Stage]) -> _Stage:
+    """One stage's dataclass; what was None was left out."""
+    found: dict[str, Any] = {item.name: arrays.get(f"{name}.{item.name}") for item in fields(kind)}
+    scalars = {key: value.item() for key, value in found.items() if value is not None and not value.ndim}
+    return kind(**(found | scalars))
 
 
 def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]) -> Path:

@@ -69,7 +69,7 @@ def test_help_loads_nothing_heavy() -> None:
         (["decode", "a", "--no-skip", "nix"], "'nix' is not one of no_screen"),
         (["decode", "a", "--corners", "1,2", "3,4", "5", "6,7"], "'5' is not two numbers, such as 120.5,80"),
         (["decode", "a", "--corners", "1,2", "3,4", "5,nan", "6,7"], "'5,nan' is no position in a picture"),
-        (["decode", "a", "--corners", "0,0", "9,9", "9,0", "0,9"], "--corners must go once round a convex outline"),
+        (["decode", "a", "--corners", "0,0", "9,9", "9,0", "0,9"], "corners must go once round a convex outline"),
     ],
 )
 def test_wrong_usage_is_one_line_and_exit_code_2(

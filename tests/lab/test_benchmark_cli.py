@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from rxcli.cli.benchmark import benchmark
 from rxcli.lab.benchmark import plots
 from rxcli.lab.benchmark.confidence import bin_outcomes
-from rxcli.lab.benchmark.stages import Growth
+from rxcli.lab.benchmark.speed import Growth
 from rxcli.lab.benchmark.sweeps import Outcome, PlanePoint, Point, Summary
 from rxcli.results.truth import Score
 
@@ -49,7 +49,7 @@ def test_confidence_counts_packets_of_earlier_journals_too(tmp_path: Path) -> No
     ("arguments", "message"),
     [
         (["sweep", "--only", "nope"], "is not one of rate"),
-        (["stages", "--medium", "nope"], "choose from: jpeg-26mp"),
+        (["speed", "--medium", "nope"], "choose from: jpeg-26mp"),
         (["--quick", "confidence"], "stands alone"),
     ],
 )

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from rxcli.cli.benchmark import benchmark
 from rxcli.lab.benchmark import phones
-from rxcli.lab.benchmark.journal import Journal
+from rxcli.lab.benchmark.journal import Journal, run_scenes
 
 
 def test_phones_are_as_asked_for() -> None:
@@ -76,7 +76,7 @@ def test_a_turned_picture_has_its_corners_turned() -> None:
     pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
     corners = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 2.0], [0.0, 2.0]])
     trial: Any = SimpleNamespace(capture=SimpleNamespace(pixels=pixels), corners=corners)
-    frame, turned = phones._as_stored(trial, True)
+    frame, turned = phones.as_stored(trial, True)
     assert frame.pixels[0, 0] == 11
     np.testing.assert_allclose(turned[0], [3, 2])
 
@@ -88,6 +88,8 @@ def test_the_command_writes_what_it_found(tmp_path: Path) -> None:
     assert "rows per slot within 0.05 %" in result.output
     rows = json.loads((tmp_path / "phones.json").read_text())["rows"]
     assert (rows[0]["phones"], rows[0]["n"]) == ("all", 1)
-    (record,) = phones.run(1, Journal(tmp_path / "phones.journal.jsonl"), seed=905, cae="never", quiet=True)
+    (record,) = run_scenes(
+        "phones", phones.packets_of, 1, Journal(tmp_path / "p.jsonl"), seed=905, cae="never", quiet=True
+    )
     assert record["rows_per_slot_hat"] == pytest.approx(record["rows_per_slot"], rel=5e-4)
     assert sum(packet["bit_errors"] == 0 for packet in record["packets"]) >= 5

@@ -11,13 +11,14 @@ import pytest
 from small_frames import BOTTOM, LEFT, RIGHT, ROWS_PER_SLOT, SCREEN, TOP, write_frame
 
 from rxcli.ingest import open_source
-from rxcli.lab.benchmark.phones import phone_record
+from rxcli.lab.benchmark import phones
+from rxcli.lab.benchmark.journal import SEEDS_A_RUN
 from rxcli.lab.benchmark.trial import Trial, score_result, simulate_trial
 from rxcli.lab.simulate.isp import Isp, Tone
 from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
-from rxcli.profiles import ScreenProfile, load_profile, parse_profile, shipped_profiles
+from rxcli.profiles import ScreenProfile, load_profile, parse_profile
 from rxcli.receiver import camera as blind
 from rxcli.receiver import unknown_camera
 from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
@@ -28,7 +29,9 @@ from rxcli.receiver.still import decode
 from rxcli.types import Frame, FrameResult
 
 CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
-OPTIONS = ReceiverOptions(screens=(parse_profile(SCREEN, ScreenProfile, "small"),), corners=CORNERS, cae="never")
+OPTIONS = ReceiverOptions(
+    screens=(parse_profile(SCREEN, ScreenProfile, "small"),), cameras=(), corners=CORNERS, cae="never"
+)
 
 
 def _frame(folder: Path) -> tuple[Frame, list[str]]:
@@ -68,7 +71,7 @@ def test_packets_of_long_exposures_are_received(seed: int, number: int, n_packet
 
     Of the second, whose picture has much texture, wrong clocks fit as well until its slots are read.
     """
-    packets = phone_record({"seed": seed, "number": number, "cae": "never"})["packets"]
+    packets = phones.packets_of({"seed": SEEDS_A_RUN * seed + number, "cae": "never"})["packets"]
     assert sum(packet["bit_errors"] == 0 for packet in packets) >= n_packets
 
 
@@ -164,7 +167,7 @@ def _small_phone(tone: Tone) -> tuple[Trial, Frame]:
 @pytest.mark.parametrize("tone", ["srgb", "linear"])
 def test_a_picture_whose_values_follow_light_is_read_as_one(tone: Tone, monkeypatch: pytest.MonkeyPatch) -> None:
     trial, frame = _small_phone(tone)
-    options = ReceiverOptions(screens=tuple(shipped_profiles(ScreenProfile)), corners=trial.corners, cae="never")
+    options = ReceiverOptions(cameras=(), corners=trial.corners, cae="never")
     read: list[str] = []
 
     def noting_the_tone(context: FrameContext, *rest: Any) -> Acquisition | Failure:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mixed_folder import scene
 
 from rxcli.errors import OutputError
-from rxcli.lab.benchmark.folder import scene
 from rxcli.lab.benchmark.trial import Trial, frame_of, simulate_trial
 from rxcli.lab.simulate.capture import prepare
 from rxcli.protocol import hex_to_bits, indices_to_bits

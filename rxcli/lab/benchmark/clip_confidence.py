@@ -13,7 +13,7 @@ import numpy as np
 
 from rxcli.ingest import open_source
 from rxcli.lab.benchmark.confidence import reported_packets
-from rxcli.lab.benchmark.journal import Journal, Record, Task, run_tasks
+from rxcli.lab.benchmark.journal import Record, Task
 from rxcli.lab.simulate.capture import Take, prepare
 from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
 from rxcli.lab.simulate.scenes import Scene, preset
@@ -113,11 +113,3 @@ def packets_of(task: Task) -> Record:
         "false": score.false,
         "packets": packets,
     }
-
-
-def run(
-    n_clips: int, journal: Journal, *, seed: int = 0, cae: str = "auto", jobs: int = 1, quiet: bool = False
-) -> list[Record]:
-    """Records of `n_clips` random clips; see `packets_of` and `rxcli.lab.benchmark.confidence.calibration`."""
-    tasks: list[Task] = [{"run": "clip-confidence", "seed": 1_000_000 * seed + n, "cae": cae} for n in range(n_clips)]
-    return run_tasks(tasks, packets_of, journal, jobs=jobs, label="clips", quiet=quiet)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.benchmark.journal import Journal, Record, Task, run_tasks
+from rxcli.lab.benchmark.journal import Record, Task
 from rxcli.lab.benchmark.statistics import wilson
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
@@ -150,14 +150,6 @@ def reported_packets(result: FrameResult, sent_w: Sequence[int]) -> list[Record]
         for column in result.columns
         for packet in column.packets
     ]
-
-
-def run(
-    n_frames: int, journal: Journal, *, seed: int = 0, cae: str = "auto", jobs: int = 1, quiet: bool = False
-) -> list[Record]:
-    """Records of `n_frames` random frames; see `packets_of`."""
-    tasks: list[Task] = [{"run": "confidence", "seed": 1_000_000 * seed + n, "cae": cae} for n in range(n_frames)]
-    return run_tasks(tasks, packets_of, journal, jobs=jobs, label="confidence", quiet=quiet)
 
 
 def calibration(records: Sequence[Record], n_bins: int = N_BINS) -> Calibration:

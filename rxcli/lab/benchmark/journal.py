@@ -119,6 +119,37 @@ def run_tasks(
     return [journal[key] for key in keys]
 
 
+#: Seeds of a run's scenes: this many times the run's, and on.
+SEEDS_A_RUN = 1_000_000
+
+
+def run_scenes(
+    label: str,
+    work: Work,
+    count: int,
+    journal: Journal,
+    *,
+    seed: int = 0,
+    jobs: int = 1,
+    quiet: bool = False,
+    **more: Any,
+) -> list[Record]:
+    """Do `work` on `count` random scenes, of which each task tells its own seed; returns their records, in order.
+
+    Args:
+        label: of the run: the same seed in another one is another task.
+        work: simulates the scene of `task["seed"]`, receives it, and says what came out.
+        count: scenes.
+        journal: what is done already.
+        seed: of the run.
+        jobs: processes.
+        quiet: show no progress bar.
+        more: what else the work needs.
+    """
+    tasks = [{"run": label, "seed": SEEDS_A_RUN * seed + number, **more} for number in range(count)]
+    return run_tasks(tasks, work, journal, jobs=jobs, label=label, quiet=quiet)
+
+
 def _each(tasks: Sequence[tuple[str, Task]], work: Work, jobs: int) -> Iterator[tuple[str, Record]]:
     if jobs <= 1 or len(tasks) <= 1:
         with _OneThread():

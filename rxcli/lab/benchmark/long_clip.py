@@ -29,34 +29,30 @@ _SCREEN = "paper-8k65"
 def clip_scene() -> Scene:
     """A small clip of an easy screen, whose payload comes again after the short clip's last frame."""
     import msgspec
-    import numpy as np
 
+    from rxcli.lab.benchmark.speed import endless
     from rxcli.lab.simulate.scenes import preset
-    from rxcli.protocol import payload_bits
 
     base = preset("video-1080p", _SCREEN)
     screen = msgspec.structs.replace(base.screen, width_px=342, height_px=192)
-    n_bits = round(_BURSTS_A_FRAME * _PERIOD_FRAMES) * screen.columns * payload_bits(5, screen.payload_symbols)
     delay = 1 / (_ROWS_PER_SLOT * screen.slot_rate_hz)
     sensor = replace(base.sensor, width=_WIDTH, height=_HEIGHT, line_delay_s=delay, full_scale_e=4000.0)
-    return replace(
+    scene = replace(
         base,
         screen=screen,
         picture="chelsea",
         sensor=sensor,
         lens=replace(base.lens, distortion=(0.0,) * 5),
         isp=replace(base.isp, tone="srgb"),
-        payload=np.random.default_rng(0).bytes(n_bits // 8),
         light_e_per_s=1300 / base.exposure_s,
-        shake_px=0.0,
-        n_frames=_PERIOD_FRAMES,
         start_slot=10.0,
-        frame_rate_hz=screen.slot_rate_hz / (screen.packet_slots * screen.repeats * _BURSTS_A_FRAME),
     )
+    return endless(scene, _PERIOD_FRAMES, _BURSTS_A_FRAME)
 
 
 def make_clip(folder: Path, n_frames: int) -> Path:
     """The clip of at least `n_frames` frames in `folder`, beside its camera profile; made unless it is there."""
+    from rxcli.lab.benchmark.speed import repeat_clip
     from rxcli.lab.simulate.capture import prepare
     from rxcli.lab.simulate.video import write_video
 
@@ -87,25 +83,6 @@ def _camera(scene: Scene) -> str:
         exposure_s=scene.exposure_s,
     )
     return dump_profile(CameraProfile(format=1, kind="camera", name="long-clip", modes=(mode,), tone="srgb"))
-
-
-def repeat_clip(short: Path, out: Path, times: int) -> None:
-    """Write the packets of a clip several times over, one time after the other, without encoding them again."""
-    import av
-
-    with av.open(str(out), "w") as target:
-        stream = None
-        for turn in range(times):
-            with av.open(str(short)) as source:
-                video = source.streams.video[0]
-                stream = stream or target.add_stream_from_template(video)
-                for packet in source.demux(video):
-                    if packet.dts is None or packet.pts is None:
-                        continue  # the empty packet at the end
-                    packet.pts += turn * video.duration
-                    packet.dts += turn * video.duration
-                    packet.stream = stream
-                    target.mux(packet)
 
 
 @dataclass(frozen=True)

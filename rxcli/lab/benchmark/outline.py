@@ -1,17 +1,17 @@
 """How near the corners of found screens are to the true ones: at any place and size, turned, in any room and picture.
 
-Run it with `python -m rxcli.lab.benchmark.outline --frames 80 --seed 2`; frames have full size, some seconds each.
+Frames have full size, and take some seconds each.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.lab.benchmark.tables import Row, format_table
+from rxcli.lab.benchmark.journal import Record, Task
+from rxcli.lab.benchmark.tables import Row
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
@@ -33,18 +33,31 @@ _BRIGHT = 0.3
 class Found:
     """One frame."""
 
-    scene: Scene
+    #: What is hard about it.
+    kind: str
     #: Largest distance of a corner in screen widths; NaN where no screen was found.
     error: float
 
-    @property
-    def kind(self) -> str:
-        """What is hard about the frame."""
-        if self.scene.picture in _DARK:
-            return "next to no light"
-        if self.scene.picture in _BLACK_SIDES:
-            return "black along a side"
-        return "bright room" if self.scene.room.light_e_per_s > _BRIGHT * self.scene.light_e_per_s else "other"
+
+def search_record(task: Task) -> Record:
+    """Simulate one frame and look for its screen."""
+    scene = scene_of(task["seed"])
+    error = search(simulate_trial(scene, 1))
+    return {"kind": kind_of(scene), "error": None if np.isnan(error) else error}
+
+
+def found_of(record: Record) -> Found:
+    """What `search_record` says."""
+    return Found(record["kind"], float("nan") if record["error"] is None else record["error"])
+
+
+def kind_of(scene: Scene) -> str:
+    """What is hard about the frame."""
+    if scene.picture in _DARK:
+        return "next to no light"
+    if scene.picture in _BLACK_SIDES:
+        return "black along a side"
+    return "bright room" if scene.room.light_e_per_s > _BRIGHT * scene.light_e_per_s else "other"
 
 
 def scene_of(seed: int) -> Scene:
@@ -118,17 +131,3 @@ def _row(name: str, errors: Sequence[float]) -> Row:
         "none_found": float(1 - seen.size / max(error.size, 1)),
         "median_error": float(np.median(seen)) if seen.size else None,
     }
-
-
-def main() -> None:
-    """Simulate, search, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=80)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    scenes = [scene_of(1_000_000 * options.seed + number) for number in range(options.frames)]
-    print(format_table(rows([Found(scene, search(simulate_trial(scene, 1))) for scene in scenes])))
-
-
-if __name__ == "__main__":
-    main()

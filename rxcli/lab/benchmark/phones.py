@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rxcli.lab.benchmark.confidence import reported_packets
-from rxcli.lab.benchmark.journal import Journal, Record, Task, run_tasks
+from rxcli.lab.benchmark.journal import SEEDS_A_RUN, Record, Task
 from rxcli.lab.benchmark.tables import Row
 from rxcli.lab.benchmark.trial import SOURCE, Trial, score_result, simulate_trial
 from rxcli.lab.simulate.isp import Isp
@@ -32,7 +32,7 @@ _FOCAL_WIDTHS, _K1, _K2_SHARE = (0.65, 1.2), 0.15, 1.2
 _EXPOSURE_SLOTS = (0.4, 0.7, 1.0, 1.5, 2.0)
 _CONFIDENT = (0.9, 0.99)
 #: Noise of a scene's simulation starts from this and the phone's number.
-_FIRST_SEED = 1000
+FIRST_SEED = 1000
 
 
 def phone_of(seed: int, number: int) -> tuple[Scene, bool]:
@@ -84,12 +84,13 @@ def _readout_of(rng: np.random.Generator) -> tuple[ScreenProfile, Sensor, float]
     return screen, Sensor(height * 4 // 3, height, line_delay_s, "bayer", **levels), fill
 
 
-def phone_record(task: Task) -> Record:
+def packets_of(task: Task) -> Record:
     """Simulate and receive one phone's picture blindly; what was estimated, and what was reported of every packet."""
-    scene, turned = phone_of(task["seed"], task["number"])
-    trial = simulate_trial(scene, _FIRST_SEED + task["number"])
-    frame, corners = _as_stored(trial, turned)
-    options = ReceiverOptions(screens=tuple(shipped_profiles(ScreenProfile)), corners=corners, cae=task["cae"])
+    seed, number = divmod(task["seed"], SEEDS_A_RUN)
+    scene, turned = phone_of(seed, number)
+    trial = simulate_trial(scene, FIRST_SEED + number)
+    frame, corners = as_stored(trial, turned)
+    options = ReceiverOptions(cameras=(), corners=corners, cae=task["cae"])
     result, _ = score_result(receive_frame(frame, options), trial.truth)
     about = {
         "screen": scene.screen.name,
@@ -103,7 +104,7 @@ def phone_record(task: Task) -> Record:
     return {**about, **_found(result, trial)}
 
 
-def _as_stored(trial: Trial, turned: bool) -> tuple[Frame, FloatArray]:
+def as_stored(trial: Trial, turned: bool) -> tuple[Frame, FloatArray]:
     """The picture without any metadata, as software may have turned it, and the screen's corners on it."""
     pixels, corners = np.asarray(trial.capture.pixels, np.uint8), trial.corners
     if turned:
@@ -122,14 +123,6 @@ def _found(result: FrameResult, trial: Trial) -> Record:
         "rows_per_slot_sd": sd,
         "packets": reported_packets(result, trial.truth.w),
     }
-
-
-def run(
-    count: int, journal: Journal, *, seed: int = 0, cae: str = "auto", jobs: int = 1, quiet: bool = False
-) -> list[Record]:
-    """Receive `count` phones' pictures; returns a record of each."""
-    tasks = [{"seed": seed, "number": number, "cae": cae} for number in range(count)]
-    return run_tasks(tasks, phone_record, journal, jobs=jobs, label="phones", quiet=quiet)
 
 
 #: Kinds of phones that the table tells apart.

@@ -13,7 +13,7 @@ from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
     from rxcli.lab.benchmark.confidence import Bin
-    from rxcli.lab.benchmark.stages import Growth
+    from rxcli.lab.benchmark.speed import Growth
     from rxcli.lab.benchmark.sweeps import PlanePoint, Summary
 
 log = logging.getLogger(__name__)

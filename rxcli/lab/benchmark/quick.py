@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rxcli.lab.benchmark import stability, stages, sweeps
+from rxcli.lab.benchmark import speed, stability, sweeps
 from rxcli.lab.benchmark.journal import Journal
 
 #: Frames of each point, and runs whose median counts.
@@ -82,15 +82,15 @@ def error_rows(summaries: Sequence[sweeps.Summary]) -> list[Row]:
 
 def _time_rows(folder: Path, seed: int) -> list[Row]:
     table = []
-    for medium in (medium for medium in stages.MEDIA if medium.name in _MEDIA):
-        timing = stages.time_medium(medium, stages.make_medium(medium, folder, seed), 2, _REPEATS)
+    for medium in (medium for medium in speed.MEDIA if medium.name in _MEDIA):
+        timing = speed.time_medium(medium, speed.make_medium(medium, folder, seed), 2, _REPEATS)
         table.append(
             {
                 "medium": medium.name,
                 "bare_ms": timing.bare_ms,
                 "total_ms": timing.total_ms,
                 "ratio": timing.ratio,
-                "target": stages.TARGETS[medium.name],
+                "target": speed.TARGETS[medium.name],
                 "status": timing.status,
             }
         )
@@ -99,7 +99,7 @@ def _time_rows(folder: Path, seed: int) -> list[Row]:
 
 def _check_rows(verdict: stability.Verdict) -> list[Row]:
     failed = [name for name, problems in verdict.cases.items() if problems]
-    start = stages.help_times(3)
+    start = speed.start_times(3)
     return [
         {"check": f"{len(verdict.cases)} hostile cases", "result": f"failed: {', '.join(failed)}" if failed else "ok"},
         *({"check": name, "result": f"{ms:.0f} ms"} for name, ms in start.items()),

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.benchmark.journal import Journal, Record, Task, run_tasks
+from rxcli.lab.benchmark.journal import SEEDS_A_RUN, Journal, Record, Task, run_scenes, run_tasks
 from rxcli.lab.benchmark.statistics import wilson
 from rxcli.lab.benchmark.trial import Trial, score_result, simulate_trial
 from rxcli.lab.benchmark.watch import problems_in, watched
@@ -468,11 +468,9 @@ def run(n_scenes: int, journal: Journal, *, seed: int = 0, jobs: int = 1, quiet:
     """All hostile cases, then `n_scenes` random scenes."""
     names: Sequence[str] = tuple(CASES)
     cases = run_tasks([{"case": n} for n in names], case_record, journal, jobs=jobs, label="hostile", quiet=quiet)
-    seeds = [1_000_000 * seed + n for n in range(n_scenes)]
-    tasks = [{"scene": True, "seed": s} for s in seeds]
-    records = run_tasks(tasks, scene_record, journal, jobs=jobs, label="scenes", quiet=quiet)
+    records = run_scenes("scenes", scene_record, n_scenes, journal, seed=seed, jobs=jobs, quiet=quiet)
     scenes: dict[str, list[int]] = {}
-    for number, record in zip(seeds, records, strict=True):
+    for number, record in enumerate(records, SEEDS_A_RUN * seed):
         for problem in record["problems"]:
             scenes.setdefault(problem, []).append(number)
     status = [str(record["status"]) for record in records]

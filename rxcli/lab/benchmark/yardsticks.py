@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.benchmark.trial import SOURCE, Trial, score_result
-from rxcli.lab.simulate.bound import Oracle
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.protocol import (
     HEADER,
@@ -24,7 +23,7 @@ from rxcli.protocol import (
 )
 from rxcli.receiver.screen.geometry import lens_for
 from rxcli.receiver.screen.geometry import undistort as undistort_points
-from rxcli.results.truth import Score, Truth
+from rxcli.results.truth import Score
 from rxcli.results.undistort import undistorted
 from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, Lens, PacketResult
 
@@ -45,21 +44,13 @@ def bound_score(trial: Trial) -> Score:
     Args:
         trial: simulated with its oracle.
     """
-    oracle = trial.capture.oracle
+    oracle, truth = trial.capture.oracle, trial.truth
     assert oracle is not None, "the bound needs a trial with oracle=True"
-    return genie_score(oracle, trial.truth)
-
-
-def genie_score(oracle: Oracle, truth: Truth) -> Score:
-    """Score of a genie on one frame, by the statistics that it was given."""
     columns = []
     for column, w in enumerate(truth.w):
-        packets = []
-        for burst in truth.frames[0].bursts:
-            decided, _, seen = oracle.decide(column, burst.burst)
-            if seen.all():
-                packets.append(_packet(decided, w))
-        columns.append(ColumnResult(column, "ok", w=w, packets=tuple(packets)))
+        decisions = [oracle.decide(column, burst.burst) for burst in truth.frames[0].bursts]
+        packets = tuple(_packet(decided, w) for decided, _, observed in decisions if observed.all())
+        columns.append(ColumnResult(column, "ok", w=w, packets=packets))
     return score_result(_result(columns), truth)[1]
 
 

@@ -312,7 +312,7 @@ def test_captures_of_unknown_cameras_decode(
     if scale != 1.0:
         small = cv2.resize(frame.pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         frame, corners = Frame(small, name), (corners + 0.5) * scale - 0.5
-    result = next(receive([frame], ReceiverOptions(screens=SCREENS, corners=corners, cae="never")))
+    result = next(receive([frame], ReceiverOptions(screens=SCREENS, cameras=(), corners=corners, cae="never")))
     assert result.screen_profile == screen
     assert result.line_delay_s == pytest.approx(camera["line_delay_s"] / scale, rel=1.5e-3)
     right = sum(

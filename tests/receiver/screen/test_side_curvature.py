@@ -14,7 +14,7 @@ from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
-from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile, shipped_profiles
+from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.find import measure_side_curvature
@@ -155,7 +155,7 @@ def test_a_picture_with_bowed_sides_is_followed_reported_and_kept() -> None:
     from rxcli.receiver import camera as blind
 
     trial = take(-0.25)
-    options = ReceiverOptions(screens=tuple(shipped_profiles(ScreenProfile)), corners=trial.corners, cae="never")
+    options = ReceiverOptions(cameras=(), corners=trial.corners, cae="never")
     result = next(receive([trial.frame], options))
     estimated = result.estimated
     assert estimated["distortion_corrected"][0] == 0
@@ -174,7 +174,7 @@ def test_stripes_are_bent_in_a_corrected_picture(mistaken: bool, monkeypatch: py
     trial = take(0.2, corrected=True)
     if mistaken:
         monkeypatch.setattr("rxcli.receiver.cameras._sides_of", lambda *_: (-0.1, 0.01))
-    options = ReceiverOptions(screens=tuple(shipped_profiles(ScreenProfile)), corners=trial.corners, cae="never")
+    options = ReceiverOptions(cameras=(), corners=trial.corners, cae="never")
     estimated = next(receive([trial.frame], options)).estimated
     assert estimated["distortion_corrected"][0] == 1
     assert estimated["rows_per_slot"][0] == pytest.approx(3.6, rel=5e-4)

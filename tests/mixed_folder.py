@@ -351,7 +351,7 @@ class _Job:
     workers: int
 
     def _start(self, resume: bool) -> subprocess.Popen[bytes]:
-        root = str(Path(__file__).resolve().parents[3])
+        root = str(Path(__file__).resolve().parents[1])
         path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
         environment = {**os.environ, "PYTHONPATH": path, **dict.fromkeys(_THREAD_VARIABLES, "1")}
         command = [sys.executable, "-m", "rxcli.cli.main", "decode", str(self.contents.folder), "--quiet"]

@@ -1,4 +1,4 @@
-"""Time per stage against the bare decode of the file, peak memory, and growth with pixels and columns.
+"""Time per stage against the bare decode of the file, clips in times real time, peak memory, growth with size.
 
 Every measurement runs in a process of its own, which prints one JSON object: so thread counts, warm caches and peak
 memory of one do not touch another.
@@ -13,17 +13,24 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
-from rxcli.errors import ReceiverError
+import numpy as np
+
+from rxcli.errors import ReceiverError, UsageError
+from rxcli.ingest.sniff import HEAD_BYTES, read_bytes, sniff
 from rxcli.lab.benchmark.statistics import power_law
 from rxcli.lab.simulate.scenes import Scene, preset
-from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile
-from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.options import receiver_options
+from rxcli.profiles import ScreenProfile, dump_profile, load_profile
+from rxcli.protocol import payload_bits
+from rxcli.receiver.pipeline import receive
 from rxcli.types import Frame, FrameResult
 
+_T = TypeVar("_T")
 #: What a whole reception may take of the bare one-thread decode, on two cores.
 TARGETS = {"jpeg-26mp": 1.6, "raw-26mp": 2.5}
 #: Megapixels and columns over which growth is measured.
@@ -45,29 +52,38 @@ class Medium:
     camera: str
     screen: str
     suffix: str
+    #: Clips: frames to simulate, times that they are written, and bursts from one frame to the next, together a whole
+    #: number, so that the clip may be repeated.
     n_frames: int = 1
+    times: int = 1
+    bursts_a_frame: float | None = None
     bit_rate: int | None = None
+    picture: str = "coffee"
 
 
 MEDIA = (
     Medium("jpeg-26mp", "xs10-still", "paper-34k6", ".jpg"),
     Medium("raw-26mp", "xs10-still", "paper-34k6", ".dng"),
     Medium("jpeg-12mp", "phone-plain", "paper-17k3", ".jpg"),
-    Medium("video-4k", "video-4k", "paper-34k6", ".mp4", 8, 108_000_000),
-    Medium("video-1080p", "video-1080p", "paper-17k3", ".mp4", 16, 20_000_000),
+    Medium("video-4k", "video-4k", "paper-34k6", ".mp4", 16, 4, 1.5, 108_000_000, "rocket"),
+    Medium("video-1080p", "video-1080p", "paper-17k3", ".mp4", 32, 6, 0.75, 28_000_000, "chelsea"),
 )
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Medians of repeated receptions of one file, milliseconds a frame."""
+    """The quickest of repeated receptions of one file, milliseconds a frame: what else a machine does only adds."""
 
     medium: str
     threads: int
-    #: Bare decode of the file on one thread.
+    #: Bare decode of the file: stills on one thread, clips on as many as FFmpeg takes. Wall, and processor.
     bare_ms: float
+    bare_cpu_ms: float
     total_ms: float
+    total_cpu_ms: float
     stages_ms: dict[str, float]
+    #: Frames a second, as the clip is to be shown; None for stills.
+    frame_rate_hz: float | None
     status: str
 
     @property
@@ -75,21 +91,65 @@ class Timing:
         """Whole reception over bare decode."""
         return self.total_ms / self.bare_ms
 
+    @property
+    def times_real_time(self) -> float | None:
+        """How much faster than it is shown a clip is received; None for stills."""
+        return None if self.frame_rate_hz is None else 1e3 / self.frame_rate_hz / self.total_ms
+
 
 def make_medium(medium: Medium, folder: Path, seed: int = 0) -> Path:
     """The medium's file in `folder`, simulated unless it is there already, beside its camera profile."""
     path = folder / f"{medium.name}{medium.suffix}"
-    if not (path.exists() and _profile_path(path).exists()):
-        scene = replace(preset(medium.camera, medium.screen), n_frames=medium.n_frames)
-        _write_capture(scene, path, seed, medium.bit_rate)
+    if path.exists() and _profile_path(path).exists():
+        return path
+    scene = replace(preset(medium.camera, medium.screen), picture=medium.picture)
+    if medium.bursts_a_frame is None:
+        write_capture(scene, path, seed)
+        return path
+    once = folder / f"{medium.name}-once{medium.suffix}"
+    write_capture(endless(scene, medium.n_frames, medium.bursts_a_frame), once, seed, medium.bit_rate)
+    repeat_clip(once, path, medium.times)
+    _profile_path(once).replace(_profile_path(path))
     return path
+
+
+def endless(scene: Scene, n_frames: int, bursts_a_frame: float) -> Scene:
+    """The scene as a clip whose payload comes again after its last frame."""
+    screen = scene.screen
+    n_bits = round(bursts_a_frame * n_frames) * screen.columns * payload_bits(5, screen.payload_symbols)
+    return replace(
+        scene,
+        payload=np.random.default_rng(0).bytes(n_bits // 8),
+        shake_px=0.0,
+        n_frames=n_frames,
+        frame_rate_hz=screen.slot_rate_hz / (screen.packet_slots * screen.repeats * bursts_a_frame),
+    )
+
+
+def repeat_clip(short: Path, out: Path, times: int) -> None:
+    """Write the packets of a clip several times over, one time after the other, without encoding them again."""
+    import av
+
+    with av.open(str(out), "w") as target:
+        stream = None
+        for turn in range(times):
+            with av.open(str(short)) as source:
+                video = source.streams.video[0]
+                stream = stream or target.add_stream_from_template(video)
+                for packet in source.demux(video):
+                    if packet.dts is None or packet.pts is None:
+                        continue  # the empty packet at the end
+                    packet.pts += turn * video.duration
+                    packet.dts += turn * video.duration
+                    packet.stream = stream
+                    target.mux(packet)
 
 
 def _profile_path(path: Path) -> Path:
     return path.with_name(path.stem + ".camera.toml")
 
 
-def _write_capture(scene: Scene, path: Path, seed: int, bit_rate: int | None = None) -> None:
+def write_capture(scene: Scene, path: Path, seed: int, bit_rate: int | None = None) -> None:
     from rxcli.lab.simulate.capture import prepare
     from rxcli.lab.simulate.tiff import write_dng
     from rxcli.lab.simulate.truth import build_camera_profile, write_truth
@@ -111,10 +171,16 @@ def _write_capture(scene: Scene, path: Path, seed: int, bit_rate: int | None = N
 
 
 def bare_decode(path: Path) -> Callable[[], int]:
-    """A function that decodes the file on one thread, nothing else, and returns the number of frames."""
-    if path.suffix == ".dng":
-        return lambda: _bare_raw(path)
-    return (lambda: bare_video(path)) if path.suffix == ".mp4" else lambda: _bare_jpeg(path)
+    """A function that decodes the file, nothing else, and returns the number of frames.
+
+    Raises:
+        UsageError: neither JPEG, RAW nor clip.
+    """
+    kind = sniff(read_bytes(path, HEAD_BYTES), path.suffix.lower())
+    bare = {"jpeg": _bare_jpeg, "video": _bare_video, "raw": _bare_raw, "tiff": _bare_raw}.get(kind or "")
+    if bare is None:
+        raise UsageError(f"{path}: there is no bare decode of this kind", "name a JPEG, a RAW file or a clip")
+    return partial(bare, path)
 
 
 def _bare_jpeg(path: Path) -> int:
@@ -131,24 +197,32 @@ def _bare_raw(path: Path) -> int:
         return int(raw.raw_image.ndim > 0)
 
 
-def bare_video(path: Path, *, threaded: bool = False) -> int:
-    """Decode every luma plane as a view, on one thread or on as many as FFmpeg takes; returns the number of frames."""
+def _bare_video(path: Path) -> int:
+    """Decode every luma plane as a view, on as many threads as FFmpeg takes; returns the number of frames."""
     import av
-    import numpy as np
 
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        stream.thread_type, stream.codec_context.thread_count = ("FRAME", 0) if threaded else ("NONE", 1)
+        stream.thread_type, stream.codec_context.thread_count = "FRAME", 0
         return sum(np.frombuffer(frame.planes[0], np.uint8).size > 0 for frame in container.decode(stream))
+
+
+def _frame_rate(path: Path) -> float | None:
+    """Frames a second of a clip; None for a still."""
+    import av
+
+    if sniff(read_bytes(path, HEAD_BYTES), path.suffix.lower()) != "video":
+        return None
+    with av.open(str(path)) as container:
+        return float(container.streams.video[0].average_rate)
 
 
 class _Reception:
     """One file, received again and again, every stage timed."""
 
-    def __init__(self, path: Path, screen: ScreenProfile) -> None:
-        camera = load_profile(str(_profile_path(path)), CameraProfile)
+    def __init__(self, path: Path, screen: str, camera: str) -> None:
         self._path = path
-        self._options = ReceiverOptions(screens=(screen,), cameras=(camera,), force_camera=True)
+        self._options = receiver_options(screen, camera)
         self._ingest_s = 0.0
 
     def __call__(self) -> tuple[float, dict[str, float], list[FrameResult]]:
@@ -177,30 +251,34 @@ class _Reception:
 
 
 def _work_timing(task: dict[str, Any]) -> dict[str, Any]:
-    """Medians over repeats of the bare decode and of the whole reception, by turns, after a warm-up."""
+    """The quickest of repeated bare decodes and whole receptions, by turns, after a warm-up."""
     import cv2
 
-    path, repeats = Path(task["path"]), int(task["repeats"])
+    path = Path(task["path"])
     cv2.setNumThreads(int(task["threads"]))
-    bare, reception = bare_decode(path), _Reception(path, load_profile(task["screen"], ScreenProfile))
-    bare(), reception()
-    bare_ms: list[float] = []
-    walls: list[float] = []
-    stages: list[dict[str, float]] = []
-    results: list[FrameResult] = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        n = bare()
-        bare_ms.append(1e3 * (time.perf_counter() - start) / n)
-        wall, by_stage, results = reception()
-        walls.append(wall)
-        stages.append(by_stage)
+    bare, reception = bare_decode(path), _Reception(path, task["screen"], task["camera"])
+    n_frames, _ = bare(), reception()
+    decodes, wholes = [], []
+    for _ in range(int(task["repeats"])):
+        decodes.append(_timed(bare)[0])
+        wholes.append(_timed(reception))
+    (wall_ms, _), (_, stages, results) = min(wholes, key=lambda timed: timed[0][0])
     return {
-        "bare_ms": median(bare_ms),
-        "total_ms": median(walls),
-        "stages_ms": {name: median(s[name] for s in stages) for name in stages[0]},
+        "bare_ms": min(wall for wall, _ in decodes) / n_frames,
+        "bare_cpu_ms": min(cpu for _, cpu in decodes) / n_frames,
+        "total_ms": wall_ms / len(results),
+        "total_cpu_ms": min(cpu for (_, cpu), _ in wholes) / len(results),
+        "stages_ms": stages,
+        "frame_rate_hz": _frame_rate(path),
         "status": results[-1].status,
     }
+
+
+def _timed(work: Callable[[], _T]) -> tuple[tuple[float, float], _T]:
+    """Milliseconds of the wall and of the processor, and what came out."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = work()
+    return (1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)), result
 
 
 def _work_memory(task: dict[str, Any]) -> dict[str, Any]:
@@ -208,7 +286,7 @@ def _work_memory(task: dict[str, Any]) -> dict[str, Any]:
     import cv2
 
     cv2.setNumThreads(int(task["threads"]))
-    reception = _Reception(Path(task["path"]), load_profile(task["screen"], ScreenProfile))
+    reception = _Reception(Path(task["path"]), task["screen"], task["camera"])
     idle = peak_memory_mb()
     reception()
     return {"idle_mb": idle, "peak_mb": peak_memory_mb()}
@@ -267,7 +345,7 @@ def in_process(task: dict[str, Any]) -> dict[str, Any]:
     environment = {**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(task.get("threads", 1)))}
     root = str(Path(__file__).resolve().parents[3])
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, (root, environment.get("PYTHONPATH"))))
-    command = [sys.executable, "-m", "rxcli.lab.benchmark.stages", json.dumps(task)]
+    command = [sys.executable, "-m", "rxcli.lab.benchmark.speed", json.dumps(task)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         reason = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
@@ -277,14 +355,20 @@ def in_process(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def time_medium(medium: Medium, path: Path, threads: int, repeats: int) -> Timing:
-    """Time the reception of one file."""
-    task = {"work": "timing", "path": str(path), "screen": medium.screen, "threads": threads, "repeats": repeats}
-    return Timing(medium.name, threads, **in_process(task))
+    """Time the reception of one of the media."""
+    return time_file(path, medium.screen, str(_profile_path(path)), threads, repeats, medium.name)
+
+
+def time_file(path: Path, screen: str, camera: str, threads: int, repeats: int, name: str = "") -> Timing:
+    """Time the reception of any photograph or clip, whose screen and camera are named."""
+    task = {"work": "timing", "path": str(path), "screen": screen, "camera": camera}
+    return Timing(name or path.name, threads, **in_process({**task, "threads": threads, "repeats": repeats}))
 
 
 def memory_of(medium: Medium, path: Path) -> dict[str, float]:
     """Peak memory, MB: `idle_mb` after the imports, `peak_mb` after one reception."""
-    return in_process({"work": "memory", "path": str(path), "screen": medium.screen, "threads": 1})
+    task = {"work": "memory", "path": str(path), "screen": medium.screen, "camera": str(_profile_path(path))}
+    return in_process({**task, "threads": 1})
 
 
 @dataclass(frozen=True)
@@ -300,6 +384,10 @@ class Growth:
         """Of the power law nearest to the points."""
         return power_law(self.x, self.ms)[0]
 
+    def as_rows(self) -> list[dict[str, Any]]:
+        """A table."""
+        return [{self.axis: x, "ms": ms} for x, ms in zip(self.x, self.ms, strict=True)]
+
 
 def growth(axis: str, repeats: int, tick: Callable[[], None] = lambda: None) -> Growth:
     """Measure growth over "megapixels" or "columns"; `tick` is called after every point."""
@@ -313,9 +401,10 @@ def growth(axis: str, repeats: int, tick: Callable[[], None] = lambda: None) -> 
     return Growth(axis, tuple(x), tuple(ms))
 
 
-def help_times(repeats: int = 7) -> dict[str, float]:
-    """Milliseconds of bare Python and of `vlc-rx --help`, medians."""
-    commands = {"bare python": ["-c", "pass"], "vlc-rx --help": ["-m", "rxcli.cli.main", "--help"]}
+def start_times(repeats: int = 7) -> dict[str, float]:
+    """Milliseconds of bare Python, `import rxcli` and `vlc-rx --help`, medians."""
+    commands = {"bare python": ["-c", "pass"], "import rxcli": ["-c", "import rxcli"]}
+    commands["vlc-rx --help"] = ["-m", "rxcli.cli.main", "--help"]
     root = Path(__file__).resolve().parents[3]
     times: dict[str, list[float]] = {name: [] for name in commands}
     for _ in range(repeats):
@@ -337,6 +426,8 @@ def timing_rows(timings: Sequence[Timing]) -> list[dict[str, Any]]:
             "total_ms": t.total_ms,
             **{name: t.stages_ms[name] / t.bare_ms if name in t.stages_ms else None for name in names},
             "ratio": t.ratio,
+            "cpu_ratio": t.total_cpu_ms / t.bare_cpu_ms,
+            "x real time": t.times_real_time,
             "target": TARGETS.get(t.medium) if t.threads > 1 else None,
             "status": t.status,
         }

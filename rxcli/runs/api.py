@@ -1,0 +1,143 @@
+"""What `import rxcli` calls: one source, received by a function."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.errors import InputError, UsageError
+from rxcli.ingest import open_source
+from rxcli.options import ReceiverOptions, receiver_options
+from rxcli.receiver.pipeline import receive as receive_frames
+from rxcli.receiver.pipeline import receive_frame
+from rxcli.results.dump import Taps, read_taps
+from rxcli.types import Frame, FrameResult
+
+#: A picture: a file, an array of grey values, or a frame with what is known of it.
+Picture = str | Path | NDArray[Any] | Frame
+
+
+class Receiver:
+    """A receiver that keeps its options: `Receiver(screens="paper-17k3", cameras="mycam.toml")`.
+
+    Args:
+        options: see `rxcli.options.receiver_options`: screens, cameras, corners, cae, min_confidence and more. None is
+            needed.
+
+    Raises:
+        ProfileError: a profile is missing or malformed.
+        UsageError: an option is impossible.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        self.options = receiver_options(**options)
+
+    @classmethod
+    def with_options(cls, options: ReceiverOptions) -> Self:
+        """A receiver whose options are made already."""
+        receiver = cls.__new__(cls)
+        receiver.options = options
+        return receiver
+
+    def decode(self, picture: Picture) -> FrameResult:
+        """Receive one photograph.
+
+        Args:
+            picture: path of a photograph or RAW file; or (height, width) array of grey values as the camera stores
+                them, uint8 or uint16; or a `Frame`, which also tells exposure, levels and whether values follow light.
+
+        Returns:
+            Its result. That nothing was received is a status with a message, not an exception.
+
+        Raises:
+            InputError: the file cannot be read.
+            UsageError: the file is a clip, or the array is no picture.
+        """
+        return receive_frame(_frame_of(picture), self.options)
+
+    def receive(self, source: str | Path | Iterable[Picture]) -> Iterator[FrameResult]:
+        """Receive a clip, a device, a photograph, or frames in order of time; one result a frame, in order.
+
+        What one frame teaches is used in the next, so a result may come some frames late. A packet stands in the last
+        frame that shows it.
+
+        Args:
+            source: path of a file or V4L2 device; or arrays or `Frame`s of one camera. Give `Frame`s with `index` and
+                `time_s` where the frame rate matters, as it does for bursts that several frames show.
+
+        Raises:
+            InputError: the file cannot be read, or, after the results before the break, it breaks off.
+            UsageError: an array is no picture.
+        """
+        frames = open_source(source) if isinstance(source, (str, Path)) else _numbered(source)
+        return receive_frames(frames, self.options)
+
+    def tap(self, picture: Picture) -> tuple[FrameResult, Taps | None]:
+        """Receive one photograph and keep the arrays of every stage boundary; None where reception ended before.
+
+        Raises:
+            InputError: the file cannot be read.
+            UsageError: the file is a clip, or the array is no picture.
+        """
+        frame = _frame_of(picture)
+        with TemporaryDirectory(prefix="vlc-rx-") as folder:
+            result = receive_frame(frame, replace(self.options, dump_dir=Path(folder)))
+            written = next(Path(folder).iterdir(), None)
+            return result, None if written is None else read_taps(written)
+
+
+def decode(picture: Picture, **options: Any) -> FrameResult:
+    """Receive one photograph: `Receiver(**options).decode(picture)`."""
+    return Receiver(**options).decode(picture)
+
+
+def receive(source: str | Path | Iterable[Picture], **options: Any) -> Iterator[FrameResult]:
+    """Receive a clip, a device, or frames in order of time: `Receiver(**options).receive(source)`."""
+    return Receiver(**options).receive(source)
+
+
+def tap(picture: Picture, **options: Any) -> tuple[FrameResult, Taps | None]:
+    """Receive one photograph and keep the arrays of every stage: `Receiver(**options).tap(picture)`."""
+    return Receiver(**options).tap(picture)
+
+
+def _frame_of(picture: Picture) -> Frame:
+    if isinstance(picture, Frame):
+        return picture
+    if not isinstance(picture, (str, Path)):
+        return frame_of_array(picture)
+    frames = open_source(picture)
+    with closing(frames):  # type: ignore[type-var]  # a generator
+        first = next(frames, None)
+        if first is None:
+            raise InputError(f"{picture}: no frame in it", "check the file")
+        if next(frames, None) is not None:
+            raise UsageError(f"{picture}: more than one frame", "use receive, which takes clips")
+    return first
+
+
+def frame_of_array(pixels: NDArray[Any], source: str = "array", index: int = 0, time_s: float = 0.0) -> Frame:
+    """A frame of grey values as a camera stores them, rows in the order of readout.
+
+    Raises:
+        UsageError: not (height, width) of uint8 or uint16.
+    """
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
+        raise UsageError(
+            f"a picture must be a (height, width) array of uint8 or uint16 (got {pixels.shape} of {pixels.dtype})",
+            "of a colour picture take the green channel, or its luma",
+        )
+    return Frame(pixels, source, index, time_s, white=float(np.iinfo(pixels.dtype).max))
+
+
+def _numbered(pictures: Iterable[Picture]) -> Iterator[Frame]:
+    for number, picture in enumerate(pictures):
+        frame = _frame_of(picture)
+        yield frame if isinstance(picture, Frame) else replace(frame, index=number)
