@@ -17,6 +17,7 @@ def test_exit_codes_of_the_command_line() -> None:
         "USAGE": 2,
         "UNREADABLE": 3,
         "INTERRUPTED": 130,
+        "TERMINATED": 143,
     }
 
 
