@@ -32,11 +32,9 @@ from rxcli.receiver.camera.curvature import curvature_terms, estimate_curvature,
 from rxcli.receiver.camera.edges import by_edges
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis
 from rxcli.receiver.camera.refit import refit
-from rxcli.receiver.camera.scan import find_clocks
 from rxcli.receiver.camera.search import MIN_EVIDENCE, BlindSearch, estimate_camera, stripes_are_curved
 from rxcli.receiver.camera.strips import Noise, Strips, in_readout_order, side_curvature_of, strips_of
 from rxcli.receiver.camera.structure import structure_llr
-from rxcli.receiver.camera.timing import refine
 from rxcli.receiver.camera.tone import is_linear
 
 __all__ = [
@@ -52,13 +50,11 @@ __all__ = [
     "curving_lens",
     "estimate_camera",
     "estimate_curvature",
-    "find_clocks",
     "in_readout_order",
     "in_time_order",
     "is_linear",
     "lens_of",
     "likely_columns",
-    "refine",
     "refit",
     "side_curvature_of",
     "straightened",

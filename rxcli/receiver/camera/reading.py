@@ -1,90 +1,131 @@
-"""Hypotheses tried by reading their slots: whatever packet they hold, and wherever it starts, must show in them.
+"""Slots read on a clock before anything is known of packets: whatever packet they hold must show in them.
 
-The scan looks for headers in the light as it is, and a trial slices it. Where long exposures or a dark picture blur
-both, slots are read through the exposure first, knowing nothing of packets. The codebook then says where symbols begin
-(their first slots are dark more often than lit), headers and dimming symbols say where packets do: every start in
-every length of packet is a matter of sums.
+Light is read through an exposure by forward-backward. The codebook then says where symbols begin (their first slots are
+dark more often than lit), headers and dimming symbols say where packets do: every start in every length of packet is a
+matter of sums.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, dimming_symbol
-from rxcli.receiver.camera.curvature import reversed_curvature
-from rxcli.receiver.camera.estimates import BentHypothesis, Hypothesis, distinct, on_one_curvature
-from rxcli.receiver.camera.scan import same_slots
-from rxcli.receiver.camera.strips import Strips, in_readout_order
-from rxcli.receiver.camera.timing import slot_time, thinned, time_terms
-from rxcli.receiver.camera.waves import WORD_SHARES, column_waves, free_log_odds
-from rxcli.types import FloatArray
+from rxcli.receiver.camera.estimates import Hypothesis
+from rxcli.receiver.camera.views import View, Views, slot_time
+from rxcli.receiver.camera.waves import WORD_SHARES, Grid, column_waves, read_freely, shared_weights
+from rxcli.types import Float32Array, FloatArray
 
 #: Exposure that slots are read through while none is known, slots.
 _EXPOSURE = 1.2
 #: Share of the slots of headers and dimming symbols that may read wrongly, and the most that a slot says, nats.
 _WRONG, _MOST = 0.02, 6.0
-#: Different clocks that are read; of how many of them the neighbours are read too, and how far those are off by the end
-#: of the picture, slots.
-_READ, _READ_AROUND = 24, 4
-_OFF_SLOTS = (-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0)
 #: (9, 20) whether slots of header and dimming symbol are lit, for every weight.
 _PREAMBLES = np.array([[*HEADER, *dimming_symbol(w)] for w in WEIGHTS], bool)
+#: Slots before the first row, so that a clock that is put right leaves none out.
+_SLOTS_BEFORE = 2
+#: Below this evidence, nats, levels are tried that a weight of five would give: stars and lamps spoil the skewness.
+_LEVELS_IN_DOUBT = 90.0
 
 
-def read(strips: Strips, found: Sequence[BentHypothesis], packet_lengths: Sequence[int]) -> list[BentHypothesis]:
-    """The hypotheses that stood out in the scan, each with every length of packet, where it starts if it is one.
+@dataclass(frozen=True, slots=True)
+class Packets:
+    """Packets of some length among slots that were read."""
+
+    packet_slots: int
+    #: Number of the slot where one starts, 0 to `packet_slots`.
+    start: int
+    #: Log-likelihood ratio of headers, dimming symbols and codewords over slots of any kind.
+    log_evidence: float
+    #: (C,) likeliest weight of every column.
+    w: NDArray[np.int64]
+
+    @property
+    def grid(self) -> Grid:
+        """Where slot 0 stands in its packet."""
+        return Grid(-self.start % self.packet_slots, self.packet_slots)
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Slots read on a clock."""
+
+    #: (6,) start, rows per slot, k1, k2, p1, p2 of the row-time map, in readout order.
+    values: FloatArray
+    #: Rows per slot of the view that it was read from.
+    rows_per_slot: float
+    is_reversed: bool
+    #: (C, N) float32: probability that a slot is lit, packets not known.
+    lit: Float32Array
+    #: Best packets of every length, likeliest first.
+    packets: tuple[Packets, ...]
+
+    @property
+    def log_evidence(self) -> float:
+        return self.packets[0].log_evidence
+
+
+def read(
+    views: Views, clock: Hypothesis, curvature: FloatArray, packet_lengths: Sequence[int], off_slots: float = 0.0
+) -> Reading:
+    """The slots of a hypothesis, whatever length and start of packets it came with.
 
     Args:
-        strips: as the picture has them.
-        found: hypotheses and the bends they were found with.
+        views: of the picture's strips.
+        clock: a clock found on strips that were straightened.
+        curvature: the bend they were straightened with.
         packet_lengths: slots of a packet, of every screen in question.
-
-    Returns:
-        Hypotheses and bends, best first; the evidence is that of headers, dimming symbols and codewords over slots of
-        any kind.
+        off_slots: slots that the clock is taken to be off by the end of the picture.
     """
-    outstanding = sorted(found, key=lambda pair: -pair[0].salience)
-    read_once = _read_all(strips, distinct(outstanding, on_one_curvature(same_slots), _READ), packet_lengths)
-    best = distinct(sorted(read_once, key=_by_evidence), on_one_curvature(same_slots), _READ_AROUND)
-    n_rows = float(strips.rows[-1] - strips.rows[0])
-    near = [
-        (replace(clock, rows_per_slot=clock.rows_per_slot * (1 + off * clock.rows_per_slot / n_rows)), curvature)
-        for clock, curvature in best
-        for off in _OFF_SLOTS
-    ]
-    return sorted(read_once + _read_all(strips, near, packet_lengths), key=_by_evidence)
+    view = views.at(clock.rows_per_slot, clock.reversed)
+    rows = view.strips.rows
+    first_row = rows[0] - 0.5 * (rows[1] - rows[0])
+    rows_per_slot = clock.rows_per_slot * (1 + off_slots * clock.rows_per_slot / float(rows[-1] - rows[0]))
+    start = first_row + clock.start_row % rows_per_slot - _SLOTS_BEFORE * rows_per_slot
+    values = np.concatenate([[start, rows_per_slot], view.curvature(curvature)])
+    return read_slots(views, clock.rows_per_slot, clock.reversed, values, packet_lengths)
 
 
-def _by_evidence(pair: BentHypothesis) -> float:
-    return -pair[0].log_evidence
+def read_slots(
+    views: Views, rows_per_slot: float, is_reversed: bool, values: FloatArray, packet_lengths: Sequence[int]
+) -> Reading:
+    """The slots on a row-time map (6,), read from the view for some rows per slot."""
+    view = views.at(rows_per_slot, is_reversed)
+    lit, packets = _read_at_levels(view, values, packet_lengths, None)
+    if packets[0].log_evidence < _LEVELS_IN_DOUBT:
+        even = _read_at_levels(view, values, packet_lengths, SLOTS_PER_SYMBOL // 2)
+        lit, packets = max((lit, packets), even, key=lambda pair: pair[1][0].log_evidence)
+    return Reading(values, rows_per_slot, is_reversed, lit, packets)
 
 
-def _read_all(strips: Strips, clocks: Sequence[BentHypothesis], packet_lengths: Sequence[int]) -> list[BentHypothesis]:
-    return [(one, curvature) for clock, curvature in clocks for one in _read(strips, clock, curvature, packet_lengths)]
-
-
-def _read(strips: Strips, clock: Hypothesis, curvature: FloatArray, packet_lengths: Sequence[int]) -> list[Hypothesis]:
-    ordered, curvature = (
-        (in_readout_order(strips), reversed_curvature(curvature)) if clock.reversed else (strips, curvature)
-    )
-    ordered = thinned(ordered, clock.rows_per_slot)
-    first_row = ordered.rows[0] - 0.5 * (ordered.rows[1] - ordered.rows[0])
-    start = clock.start_row % clock.rows_per_slot - 2 * clock.rows_per_slot
-    values = np.concatenate([[first_row + start, clock.rows_per_slot], curvature])
-    time = slot_time(ordered, time_terms(ordered), values)
-    log_odds = free_log_odds(column_waves(ordered, time, clock.rows_per_slot), _EXPOSURE)
-    out = []
-    for packet_slots, log_evidence in zip(packet_lengths, start_evidence(log_odds, packet_lengths), strict=True):
+def _read_at_levels(
+    view: View, values: FloatArray, packet_lengths: Sequence[int], w: int | None
+) -> tuple[Float32Array, tuple[Packets, ...]]:
+    waves = column_waves(view, slot_time(view.strips, view.terms, values))
+    lit, log_odds = read_freely(waves, _EXPOSURE, w)
+    found = []
+    for packet_slots, by_weight in zip(packet_lengths, start_evidence(log_odds, packet_lengths), strict=True):
+        log_evidence = over_weights(by_weight)
         at = int(log_evidence.argmax())
-        start_row = start + at * clock.rows_per_slot
-        out.append(replace(clock, packet_slots=packet_slots, start_row=start_row, log_evidence=float(log_evidence[at])))
-    return out
+        weights = shared_weights(by_weight[:, :, at].T.astype(np.float64)) + 1
+        found.append(Packets(packet_slots, at, float(log_evidence[at]), weights))
+    return lit, tuple(sorted(found, key=lambda packets: -packets.log_evidence))
 
 
-def start_evidence(log_odds: FloatArray, packet_lengths: Sequence[int]) -> list[FloatArray]:
+def over_weights(by_weight: Float32Array) -> FloatArray:
+    """(n,) evidence of all columns together from that of every weight (C, 9, n), weights alike before."""
+    top = by_weight.max(axis=1, keepdims=True)
+    columns = top[:, 0] + np.log(np.exp(by_weight - top).sum(axis=1))
+    # A column may be too dark to say anything.
+    return np.asarray((np.logaddexp(columns, 0.0) - np.log(2.0)).sum(axis=0), np.float64)
+
+
+def start_evidence(
+    log_odds: Float32Array | FloatArray, packet_lengths: Sequence[int]
+) -> list[Float32Array | FloatArray]:
     """Evidence that packets start at a slot and every packet after it, over slots of any kind, nats.
 
     Args:
@@ -92,33 +133,38 @@ def start_evidence(log_odds: FloatArray, packet_lengths: Sequence[int]) -> list[
         packet_lengths: slots of a packet, several to be compared.
 
     Returns:
-        (packet_slots,) for every length.
+        (C, 9, packet_slots) for every length: of columns of every weight, over columns of any.
     """
     odds = np.exp(np.clip(log_odds, -_MOST, _MOST))[:, None]
-    duty = np.array(WEIGHTS)[:, None] / SLOTS_PER_SYMBOL
+    kind = odds.dtype
+    duty = (np.array(WEIGHTS)[:, None] / SLOTS_PER_SYMBOL).astype(kind)
     free = np.log(1 - duty + duty * odds)
+    n = log_odds.shape[1]
     # (places, C, 9, N): every slot at every place of a codeword, and of header and dimming symbol.
-    in_words = np.stack([np.log(1 - share + share * odds) - free for share in WORD_SHARES[1:].T[..., None]])
-    dark, lit = (np.log(1 - share + share * odds) - free for share in (_WRONG, 1 - _WRONG))
+    shares = WORD_SHARES[1:].T[..., None].astype(kind)
+    in_words = np.stack([np.log(1 - share + share * odds) - free for share in shares])
+    dark, lit = (np.log(kind.type(1 - share) + kind.type(share) * odds) - free for share in (_WRONG, 1 - _WRONG))
     in_preamble = np.where(_PREAMBLES.T[:, None, :, None], lit, dark)
-    slot = np.arange(log_odds.shape[1])
-    # (10, C, 9): words that start at slots 0 to 9, over all slots.
-    places = (slot - np.arange(SLOTS_PER_SYMBOL)[:, None]) % SLOTS_PER_SYMBOL
-    words = np.stack([in_words[place, :, :, slot].sum(axis=0) for place in places])
+    # (10, C, 9): words that start at slots 0 to 9, over all slots: slots in tens, by their place in the ten.
+    by_place = np.pad(in_words, ((0, 0), (0, 0), (0, 0), (0, -n % SLOTS_PER_SYMBOL)))
+    by_place = by_place.reshape(*in_words.shape[:3], -1, SLOTS_PER_SYMBOL).sum(axis=3)
+    tens = np.arange(SLOTS_PER_SYMBOL)
+    words = np.stack([by_place[(tens - first) % SLOTS_PER_SYMBOL, :, :, tens].sum(axis=0) for first in tens])
     # (C, 9, N + 20): what a preamble says more than words, by where it starts: at most its length before slot 0.
-    more = np.zeros((*in_words.shape[1:3], slot.size + PREAMBLE_SLOTS))
+    more = np.zeros((*in_words.shape[1:3], n + PREAMBLE_SLOTS), kind)
     for place in range(PREAMBLE_SLOTS):
         first = PREAMBLE_SLOTS - place
-        more[..., first : first + slot.size] += in_preamble[place] - in_words[place % SLOTS_PER_SYMBOL]
-    return [_over_columns(words, more, free.sum(axis=2), packet_slots) for packet_slots in packet_lengths]
+        more[..., first : first + n] += in_preamble[place] - in_words[place % SLOTS_PER_SYMBOL]
+    total_free = free.sum(axis=2)
+    prior = total_free - np.logaddexp.reduce(total_free, axis=1)[:, None]
+    return [_of_length(words, more, packet_slots) + prior[..., None] for packet_slots in packet_lengths]
 
 
-def _over_columns(words: FloatArray, more: FloatArray, free: FloatArray, packet_slots: int) -> FloatArray:
-    """(packet_slots,) evidence of every start from that of words (10, C, 9), preambles (C, 9, n) and slots (C, 9)."""
+def _of_length(
+    words: Float32Array | FloatArray, more: Float32Array | FloatArray, packet_slots: int
+) -> Float32Array | FloatArray:
+    """(C, 9, packet_slots) evidence of every start from that of words (10, C, 9) and preambles (C, 9, n)."""
     start = np.arange(packet_slots)
     padded = np.pad(more, ((0, 0), (0, 0), (0, -more.shape[2] % packet_slots)))
     preambles = padded.reshape(*more.shape[:2], -1, packet_slots).sum(axis=2)
-    total = preambles[..., (start + PREAMBLE_SLOTS) % packet_slots] + words[start % SLOTS_PER_SYMBOL].transpose(1, 2, 0)
-    over_free = np.logaddexp.reduce(total + free[..., None], axis=1) - np.logaddexp.reduce(free, axis=1)[:, None]
-    # A column may be too dark to say anything.
-    return np.asarray((np.logaddexp(over_free, 0.0) - np.log(2.0)).sum(axis=0))
+    return preambles[..., (start + PREAMBLE_SLOTS) % packet_slots] + words[start % SLOTS_PER_SYMBOL].transpose(1, 2, 0)

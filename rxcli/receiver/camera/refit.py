@@ -10,20 +10,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.receiver.camera.curvature import reversed_curvature
 from rxcli.receiver.camera.estimates import BlindEstimate
 from rxcli.receiver.camera.rows import fit_rows
-from rxcli.receiver.camera.strips import Correction, Strips, in_readout_order
+from rxcli.receiver.camera.strips import Correction, Strips
 from rxcli.receiver.camera.timing import (
     FLAT,
     UNDERSTATED,
     curvature_chi_square,
     gauss_newton,
-    slot_time,
-    thinned,
-    time_terms,
 )
 from rxcli.receiver.camera.tone import tone_exponent
+from rxcli.receiver.camera.views import View, Views, slot_time
 from rxcli.receiver.camera.waves import column_waves, exposure_of_known, fitted
 from rxcli.types import Clock, Float32Array, FloatArray
 
@@ -68,20 +65,19 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
         clock: on which the slots stand.
         lit: (C, N) probability that each slot of the clock's grid is lit; C columns of the strips.
     """
-    ordered = thinned(in_readout_order(strips) if estimate.reversed else strips, estimate.rows_per_slot)
-    curvature = reversed_curvature(estimate.curvature) if estimate.reversed else estimate.curvature
+    view = Views(strips).at(estimate.rows_per_slot, estimate.reversed)
+    ordered, curvature = view.strips, view.curvature(estimate.curvature)
     first = np.concatenate([[clock.row0, clock.rows_per_slot], curvature if estimate.corrected else np.zeros(4)])
     shutter = estimate.least_exposure_slots
     may_curve = strips.correction != "no"
-    fit = _fit(ordered, first, lit, clock.exposure_slots, 6 if may_curve else 2, shutter)
+    fit = _fit(view, first, lit, clock.exposure_slots, 6 if may_curve else 2, shutter)
     corrected = curvature_chi_square(fit.values, fit.covariance) > _BENT_CHI_SQUARE[strips.correction]
     if may_curve and not corrected:
         before = fit.explained_first
-        fit = replace(_fit(ordered, first * FLAT, lit, fit.exposure_slots, 2, shutter), explained_first=before)
+        fit = replace(_fit(view, first * FLAT, lit, fit.exposure_slots, 2, shutter), explained_first=before)
     if fit.explained < max(_NOT_LESS * fit.explained_first, _LEAST_EXPLAINED):
         return estimate, 0.0
-    terms = time_terms(ordered)
-    moved = np.abs(slot_time(ordered, terms, fit.values) - slot_time(ordered, terms, first)) * ordered.inside
+    moved = np.abs(slot_time(ordered, view.terms, fit.values) - slot_time(ordered, view.terms, first)) * ordered.inside
     sd = UNDERSTATED * np.sqrt(np.diag(fit.covariance))
     found = replace(
         estimate,
@@ -89,7 +85,7 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
         rows_per_slot_sd=float(sd[1]),
         exposure_slots=max(fit.exposure_slots, estimate.least_exposure_slots),
         exposure_slots_sd=fit.exposure_sd if fit.exposure_slots > estimate.least_exposure_slots else 0.0,
-        curvature=reversed_curvature(fit.values[2:]) if estimate.reversed else fit.values[2:],
+        curvature=view.curvature(fit.values[2:]),
         curvature_sd=sd[2:],
         corrected=corrected,
         explained=fit.explained,
@@ -99,7 +95,7 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
 
 
 def _fit(
-    strips: Strips,
+    view: View,
     values: FloatArray,
     lit: Float32Array,
     exposure_slots: float,
@@ -107,14 +103,14 @@ def _fit(
     shutter_slots: float = 0.0,
 ) -> _Fit:
     """Gauss-Newton on the first `n_free` values of the row-time map, with slots that stay."""
-    terms = time_terms(strips)
+    strips, terms = view.strips, view.terms
     pitch = float(strips.rows[1] - strips.rows[0])
     exposure, exposure_sd, explained_first = exposure_slots, 0.0, 0.0
     for step in range(_STEPS):
         time = slot_time(strips, terms, values)
         slots = fitted(lit, max(int(time.max()) + 3, lit.shape[1]))
         if step in _EXPOSURE_STEPS:
-            exposure, exposure_sd = exposure_of_known(column_waves(strips, time, values[1]), lit, exposure)
+            exposure, exposure_sd = exposure_of_known(column_waves(view, time), lit, exposure)
             window = round(_LOCAL_SLOTS * values[1] / pitch)
             rows = fit_rows(strips, time, values, slots, exposure, window, shutter_slots)
         observed = rows.observed(strips, time, values, slots)

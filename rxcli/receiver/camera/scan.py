@@ -36,10 +36,13 @@ _MOST_FOR_LINE, _LINE_FINE = 30.0, 4
 _SAY_OF_LINE = 0.03
 
 #: Rows per slot this close, relative, are one hypothesis.
-_ALIKE_ROWS = 0.015
+ALIKE_ROWS = 0.015
 
 #: Hypotheses that are tried: so many of different clocks or packets, and so many of different clocks.
 _TRIALS = 24
+#: The same of the short list; lines and peaks that an octave has on it, those of every length of packet; and slots over
+#: the picture by which a period is off.
+_SHORT_TRIALS, _LINES, _PEAKS, _OFF_SLOTS = 5, 4, 3, (-1.0, 0.0, 1.0)
 
 #: Steps of the header, dark before and after.
 _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
@@ -58,8 +61,10 @@ class _Octave:
     high: float
     #: (R',) deviation of the autocorrelation at every lag from chance, in standard deviations.
     repeats: FloatArray
-    #: Nats by which the edges keep to a grid, over chance, for every quarter of a slot more over the whole picture.
+    #: Nats by which the edges keep to a grid, over chance, for every quarter of a slot more over the whole picture; as
+    #: far as they count, and all.
     line: FloatArray
+    line_uncapped: FloatArray
 
     def line_at(self, rows_per_slot: float) -> float:
         """Nats by which edges keep to a grid of slots."""
@@ -96,7 +101,9 @@ def _octaves(strips: Strips) -> list[_Octave]:
         least, most = max(least, width / HALF_WIDTH[1]), min(most, width / HALF_WIDTH[0])
         if least < most:
             surprise = _surprise(correlation, round(PREAMBLE_SLOTS * least / rows))
-            out.append(_Octave(columns, rows, least, most, surprise, _slot_line(columns)))
+            line = _slot_line(columns)
+            capped = np.minimum(line, _MOST_FOR_LINE)
+            out.append(_Octave(columns, rows, least, most, surprise, capped, line))
     return out
 
 
@@ -149,7 +156,7 @@ def _slot_line(columns: Float32Array) -> FloatArray:
     """
     power = edge_power(columns).sum(axis=0, dtype=np.float64)
     spectrum = np.abs(np.fft.rfft(power, _LINE_FINE * columns.shape[1])) ** 2
-    return np.asarray(np.minimum(spectrum / max(float(power @ power), 1e-30), _MOST_FOR_LINE))
+    return np.asarray(spectrum / max(float(power @ power), 1e-30))
 
 
 def _header_response(total: FloatArray, rows_per_slot: float) -> FloatArray:
@@ -186,19 +193,71 @@ def _comb(response: FloatArray, packet_slots: int) -> tuple[FloatArray, NDArray[
     return score[np.arange(n_signs), best], best
 
 
-def find_clocks(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesis]:
-    """Clocks that the picture may show, best first.
+def short_list(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesis]:
+    """Clocks that the picture may show, from periods that stand out by themselves, best first.
+
+    Edges fall between slots, so that their power has a line at the rate of the slots; and columns are like themselves a
+    packet later.
 
     Args:
         strips: straightened strips.
         packet_lengths: slots of a packet, of every screen in question.
     """
-    octaves = _octaves(strips)
-    found = [(h, o) for o in octaves for h in _scan_octave(o, strips.rows.size, packet_lengths)]
+    pairs = []
+    for octave in _octaves(strips):
+        total = _running_mean_sum(octave)
+        for rows_per_slot, lengths in _outstanding_periods(octave, packet_lengths):
+            for off in _OFF_SLOTS:
+                near = rows_per_slot * (1 + off * rows_per_slot / strips.rows.size)
+                pairs += [(one, octave) for one in _combs(octave, total, near, lengths)]
+    return _tried(pairs, _SHORT_TRIALS)
+
+
+def _outstanding_periods(octave: _Octave, packet_lengths: Sequence[int]) -> list[tuple[float, Sequence[int]]]:
+    """Rows per slot at the strongest lines of the edges' power and peaks of the autocorrelation, with packets' lengths.
+
+    A line says nothing of packets; a peak is one of packets of some length.
+    """
+    n_rows = octave.columns.shape[1] * octave.rows
+    low, high = (int(_LINE_FINE * n_rows / period) for period in (octave.high, octave.low))
+    lines = _strongest(octave.line_uncapped[low : high + 2], _LINES, 2 * _LINE_FINE)
+    found: list[tuple[float, Sequence[int]]] = [(_LINE_FINE * n_rows / (low + at), packet_lengths) for at in lines]
+    for packet_slots in packet_lengths:
+        least, most = (int(period * packet_slots / octave.rows) for period in (octave.low, octave.high))
+        slot = max(int(octave.low / octave.rows), 1)
+        peaks = _strongest(octave.repeats[least : most + 1], _PEAKS, 2 * slot)
+        found += [((least + at) * octave.rows / packet_slots, [packet_slots]) for at in peaks]
+    return found
+
+
+def _strongest(values: FloatArray, most: int, apart: int) -> list[float]:
+    """Places of the highest peaks, to fractions of a place by a parabola; none nearer to a higher one than `apart`."""
+    inner = np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])) + 1
+    chosen = distinct(inner[np.argsort(-values[inner])].tolist(), lambda one, other: abs(one - other) < apart, most)
+    out = []
+    for at in chosen:
+        before, here, after = values[at - 1 : at + 2]
+        out.append(at + 0.5 * (before - after) / (before - 2 * here + after))
+    return out
+
+
+def every_clock(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesis]:
+    """Clocks that the picture may show, over a grid of all periods, best first.
+
+    Args:
+        strips: straightened strips.
+        packet_lengths: slots of a packet, of every screen in question.
+    """
+    pairs = [(h, o) for o in _octaves(strips) for h in _scan_octave(o, strips.rows.size, packet_lengths)]
+    return _tried(pairs, _TRIALS)
+
+
+def _tried(found: list[tuple[Hypothesis, _Octave]], most: int) -> list[Hypothesis]:
+    """The best hypotheses, and those of different clocks, as their slots show them, best first."""
     found.sort(key=lambda pair: -pair[0].log_evidence)
     places = range(len(found))
-    chosen = distinct(places, lambda n, m: alike(found[n][0], found[m][0]), _TRIALS)
-    chosen += distinct(places, lambda n, m: same_slots(found[n][0], found[m][0]), _TRIALS)
+    chosen = distinct(places, lambda n, m: alike(found[n][0], found[m][0]), most)
+    chosen += distinct(places, lambda n, m: same_slots(found[n][0], found[m][0]), most)
     return sorted((_try(*found[n]) for n in dict.fromkeys(chosen)), key=lambda hypothesis: -hypothesis.log_evidence)
 
 
@@ -207,30 +266,36 @@ def alike(one: Hypothesis, other: Hypothesis) -> bool:
 
 
 def same_slots(one: Hypothesis | BlindEstimate, other: Hypothesis | BlindEstimate) -> bool:
-    near = abs(np.log(one.rows_per_slot / other.rows_per_slot)) < _ALIKE_ROWS
+    near = abs(np.log(one.rows_per_slot / other.rows_per_slot)) < ALIKE_ROWS
     return near and one.reversed == other.reversed
 
 
 def _scan_octave(octave: _Octave, n_rows: int, packet_lengths: Sequence[int]) -> list[Hypothesis]:
-    import cv2
-
     out = []
     total = _running_mean_sum(octave)
     rows_per_slot = octave.low
-    around = np.ones((1, 2 * SAMPLES + 1), np.uint8)
     while rows_per_slot < octave.high:
-        response = _header_response(total, rows_per_slot / octave.rows)
-        spread = 1.4826 * float(np.median(np.abs(response[0]))) + 1e-6
-        # The largest response within a slot: the grid may then miss copies by a slot.
-        near = cv2.dilate(response, around)
-        line = 2 * octave.line_near(rows_per_slot, _SCAN_STEP / 2)
-        for packet_slots in packet_lengths:
-            repeats = _repeats_near(octave, rows_per_slot, packet_slots)
-            for number, (score, sample) in enumerate(zip(*_comb(near, packet_slots), strict=True)):
-                start = (float(sample) / SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
-                log_evidence = float(score / spread) ** 2 + repeats**2 + line
-                out.append(Hypothesis(rows_per_slot, packet_slots, start, number == 1, log_evidence))
+        out += _combs(octave, total, rows_per_slot, packet_lengths)
         rows_per_slot *= 1 + _SCAN_STEP / min(n_rows / rows_per_slot, _SCAN_SLOTS)
+    return out
+
+
+def _combs(octave: _Octave, total: FloatArray, rows_per_slot: float, packet_lengths: Sequence[int]) -> list[Hypothesis]:
+    """The best comb of headers at a period, in both directions, for every length of packet."""
+    import cv2
+
+    response = _header_response(total, rows_per_slot / octave.rows)
+    spread = 1.4826 * float(np.median(np.abs(response[0]))) + 1e-6
+    # The largest response within a slot: a period may then miss copies by a slot.
+    near = cv2.dilate(response, np.ones((1, 2 * SAMPLES + 1), np.uint8))
+    line = 2 * octave.line_near(rows_per_slot, _SCAN_STEP / 2)
+    out = []
+    for packet_slots in packet_lengths:
+        repeats = _repeats_near(octave, rows_per_slot, packet_slots)
+        for number, (score, sample) in enumerate(zip(*_comb(near, packet_slots), strict=True)):
+            start = (float(sample) / SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
+            log_evidence = float(score / spread) ** 2 + repeats**2 + line
+            out.append(Hypothesis(rows_per_slot, packet_slots, start, number == 1, log_evidence))
     return out
 
 

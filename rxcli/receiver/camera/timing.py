@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.numerics import local_mean
-from rxcli.receiver.camera.curvature import BEND_PRECISION, BEND_SCALE, curvature_terms, reversed_curvature
-from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis
-from rxcli.receiver.camera.strips import Correction, Strips, in_readout_order
+from rxcli.receiver.camera.curvature import BEND_PRECISION, BEND_SCALE
+from rxcli.receiver.camera.estimates import BlindEstimate
+from rxcli.receiver.camera.reading import Packets, Reading, read_slots
+from rxcli.receiver.camera.strips import Correction, Strips
 from rxcli.receiver.camera.structure import repeat_evidence
+from rxcli.receiver.camera.views import BLOCK_ROWS, View, Views, slot_time
 from rxcli.receiver.camera.waves import (
     LOCAL_SLOTS,
     Grid,
     Moments,
     Slots,
+    Waves,
     column_shares,
     column_waves,
     decide,
-    estimate_exposure,
-    first_slots,
+    exposure_of_known,
     local_moments,
     packet_llr,
     residual_of,
@@ -39,18 +42,20 @@ ALIKE = 10.0
 #: Slots that are wrong are wrong in neighbouring columns alike: the spread between columns says this much too little.
 UNDERSTATED = 3.0
 
-_REFINE_STEPS = 10
+#: Rounds of slots and clock, at most and at least; those before which the exposure is estimated.
+_REFINE_STEPS, _LEAST_STEPS = 8, 3
+_EXPOSURE_STEPS = (0, 2)
 #: Steps in which the clock alone moves, where no bend is known: slots that are wrong yet would bend it.
-_RIGID_STEPS = 3
-
-#: Exposure before any is known, slots; and steps at which it is estimated.
-_FIRST_EXPOSURE = 1.2
-_EXPOSURE_STEPS = (1, 3)
-#: Slots that were read on a clock further off than this are read anew at this step.
-_AGAIN_STEP, _FAR = 5, 0.4
+_RIGID_STEPS = 2
+#: Steps that are this share of the one before, or more, are extrapolated, up to so many times.
+_SLOW, _MOST_EXTRAPOLATED = 0.2, 3.0
+#: Slots that were read on a clock further off than this, slots, are read anew.
+_FAR = 0.4
+#: Packets of another length that are less likely by no more than this, nats, are estimates too.
+_CLOSE = 60.0
 
 #: The descent ends when no row moves by more slots than this.
-_CONVERGED = 0.003
+_CONVERGED = 0.03
 
 #: Chi-square of the four coefficients that a bend beyond doubt has, by whether the picture was corrected. Columns share
 #: too much for it to be taken at its word: unbent pictures reach 150.
@@ -65,9 +70,6 @@ _WHITE, _LEAST_SPREAD = 1e-3, 0.2
 #: How far the light per unit of the wave differs from its usual share of the mean light.
 _GAIN_SD = 0.5
 
-#: Rows of one block of the normal equations; the bend is straight within, which in longer ones changes the period.
-BLOCK_ROWS = 16
-
 
 @dataclass(frozen=True, slots=True)
 class _Timing:
@@ -79,148 +81,139 @@ class _Timing:
     covariance: FloatArray
     exposure_slots: float
     exposure_sd: float
-    #: Log-likelihood ratio of header and weights over chance.
-    log_evidence: float
     #: Share of the strips' local variance that the slots explain.
     explained: float
     slots: Slots
+    #: Light by slot position that the slots were decided from.
+    waves: Waves
 
 
 def refine(
-    strips: Strips, hypothesis: Hypothesis, curvature: FloatArray, least_exposure_slots: float = 0.0, sure: bool = False
-) -> BlindEstimate:
-    """The clock, the bend and the exposure that fit all light of the picture best.
+    views: Views,
+    reading: Reading,
+    packet_lengths: Sequence[int],
+    exposure_of_length: Callable[[int], float],
+    sure: bool = False,
+) -> list[BlindEstimate]:
+    """The clock, the bend and the exposure that fit all light of the picture best; once for every likely packet.
 
     Args:
-        strips: the strips as the picture has them, not straightened.
-        hypothesis: a clock found on the straightened strips.
-        bend: the bend they were straightened with.
-        least_exposure_slots: exposure that the file tells, 0 where it does not; optics and demosaicing add to it.
+        views: of the picture's strips.
+        reading: slots that were read on a clock.
+        packet_lengths: slots of a packet, of every screen in question.
+        exposure_of_length: exposure that the file tells in slots of a screen with packets of a length, 0 where it
+            does not; optics and demosaicing add to it.
         sure: whether the stripes are bent without doubt.
     """
-    ordered, curvature = (
-        (in_readout_order(strips), reversed_curvature(curvature)) if hypothesis.reversed else (strips, curvature)
-    )
-    ordered = thinned(ordered, hypothesis.rows_per_slot)
-    timing, corrected = _fit_timing(ordered, hypothesis, curvature, least_exposure_slots, sure)
+    view = views.at(reading.rows_per_slot, reading.is_reversed)
+    least = exposure_of_length(reading.packets[0].packet_slots)
+    timing, corrected = _fit_timing(view, reading, least, sure)
+    again = _read_again(views, reading, timing, packet_lengths)
+    if again.packets[0].log_evidence > reading.packets[0].log_evidence and _moved(view, reading, timing) > _FAR:
+        timing, corrected = _fit_timing(view, again, least, sure)
+        again = _read_again(views, reading, timing, packet_lengths)
+    likely = [packets for packets in again.packets if packets.log_evidence > again.packets[0].log_evidence - _CLOSE]
     found, sd = timing.values[2:], UNDERSTATED * np.sqrt(np.diag(timing.covariance))
-    return BlindEstimate(
-        rows_per_slot=float(timing.values[1]),
-        rows_per_slot_sd=float(sd[1]),
-        packet_slots=hypothesis.packet_slots,
-        reversed=hypothesis.reversed,
-        exposure_slots=timing.exposure_slots,
-        exposure_slots_sd=timing.exposure_sd,
-        curvature=reversed_curvature(found) if hypothesis.reversed else found,
-        curvature_sd=sd[2:],
-        corrected=corrected,
-        log_evidence=timing.log_evidence,
-        explained=timing.explained,
-        least_exposure_slots=least_exposure_slots,
-        side_curvature=strips.side_curvature,
-    )
+    return [
+        BlindEstimate(
+            rows_per_slot=float(timing.values[1]),
+            rows_per_slot_sd=float(sd[1]),
+            packet_slots=packets.packet_slots,
+            reversed=view.reversed,
+            exposure_slots=max(timing.exposure_slots, exposure_of_length(packets.packet_slots)),
+            exposure_slots_sd=timing.exposure_sd,
+            curvature=view.curvature(found),
+            curvature_sd=sd[2:],
+            corrected=corrected,
+            log_evidence=_log_evidence(timing, packets),
+            explained=timing.explained,
+            least_exposure_slots=exposure_of_length(packets.packet_slots),
+            side_curvature=view.strips.side_curvature,
+        )
+        for packets in likely
+    ]
 
 
-def thinned(strips: Strips, rows_per_slot: float) -> Strips:
-    """Neighbouring rows averaged as far as a slot keeps at least four."""
-    join = max(1, int(rows_per_slot // 4))
-    if join == 1:
-        return strips
-    n = strips.rows.size // join
-
-    def mean(values: FloatArray | Float32Array) -> FloatArray:
-        return np.asarray(values[..., : n * join].reshape(*values.shape[:-1], n, join).mean(axis=-1))
-
-    inside = (mean(strips.inside) > 0.99).astype(np.float32)
-    return replace(
-        strips,
-        light=mean(strips.light).astype(np.float32),
-        inside=inside,
-        x=mean(strips.x),
-        rows=mean(strips.rows),
-        noise=strips.noise.over(join),
-    )
+def _read_again(views: Views, reading: Reading, timing: _Timing, packet_lengths: Sequence[int]) -> Reading:
+    """The slots read freely on a refined clock."""
+    return read_slots(views, reading.rows_per_slot, reading.is_reversed, timing.values, packet_lengths)
 
 
-def _fit_timing(
-    strips: Strips, hypothesis: Hypothesis, curvature: FloatArray, least_exposure_slots: float, sure: bool
-) -> tuple[_Timing, bool]:
+def _moved(view: View, reading: Reading, timing: _Timing) -> float:
+    """Slots by which the clock moved anywhere on the picture."""
+    before, after = (slot_time(view.strips, view.terms, one.values) for one in (reading, timing))
+    return float(np.abs(after - before)[:, ::BLOCK_ROWS].max())
+
+
+def _log_evidence(timing: _Timing, packets: Packets) -> float:
+    """Log-likelihood ratio of the slots being packets, at the levels that fit them as such."""
+    grid = packets.grid
+    slots = decide(timing.waves, timing.exposure_slots, grid, Slots(timing.slots.lit, packets.w))
+    position = (np.arange(slots.lit.shape[1]) + grid.first_slot) % grid.packet_slots
+    packets_llr = packet_llr(timing.waves, timing.exposure_slots, grid, slots)
+    return packets_llr + repeat_evidence(slots.lit > 0.5, position, grid.packet_slots)
+
+
+def _fit_timing(view: View, reading: Reading, least_exposure_slots: float, sure: bool) -> tuple[_Timing, bool]:
     """The row-time map, with a bend only where it is beyond doubt: one that is free for nothing blurs the period."""
-    first_row = strips.rows[0] - 0.5 * (strips.rows[1] - strips.rows[0])
-    before = int(hypothesis.start_row // hypothesis.rows_per_slot) + 2
-    start = first_row + hypothesis.start_row - before * hypothesis.rows_per_slot
-    grid = Grid(-before % hypothesis.packet_slots, hypothesis.packet_slots)
-    values = np.concatenate([[start, hypothesis.rows_per_slot], curvature])
-    first = _descend(strips, grid, values, least_exposure_slots, n_free=2 if strips.correction == "no" else 6)
-    if sure or curvature_chi_square(first.values, first.covariance) > _BENT_CHI_SQUARE[strips.correction]:
+    packets = reading.packets[0]
+    slots = Slots(reading.lit, packets.w)
+    correction = view.strips.correction
+    n_free = 2 if correction == "no" else 6
+    first = _descend(view, packets.grid, reading.values, slots, n_free, least_exposure_slots)
+    if sure or curvature_chi_square(first.values, first.covariance) > _BENT_CHI_SQUARE[correction]:
         return first, True
-    values = (
-        np.concatenate([[start, hypothesis.rows_per_slot], np.zeros(4)]) if not curvature.any() else first.values * FLAT
-    )
-    flat = _descend(strips, grid, values, first.exposure_slots, n_free=2, slots=first.slots)
+    if correction == "no":
+        return first, False
+    values = (first.values if reading.values[2:].any() else reading.values) * FLAT
+    flat = _descend(view, packets.grid, values, first.slots, 2, first.exposure_slots, estimating=False)
     return replace(flat, exposure_sd=first.exposure_sd), False
 
 
 def _descend(
-    strips: Strips,
+    view: View,
     grid: Grid,
     values: FloatArray,
-    exposure_slots: float,
+    slots: Slots,
     n_free: int,
-    slots: Slots | None = None,
+    exposure_slots: float,
+    *,
+    estimating: bool = True,
 ) -> _Timing:
     """Gauss-Newton on the first `n_free` values of the row-time map, deciding the slots anew at every step.
 
-    The exposure is at least the one given, or that one where slots to start from are given too.
+    The exposure is at least the one given, or that one where it is not to be estimated.
     """
-    terms = time_terms(strips)
-    estimating = slots is None
-    exposure, exposure_sd = exposure_slots or _FIRST_EXPOSURE, 0.0
-    first_time = slot_time(strips, terms, values)
-    if slots is None:
-        slots = first_slots(column_waves(strips, first_time, values[1]), exposure, grid)
+    strips, terms = view.strips, view.terms
+    exposure, exposure_sd = exposure_slots, 0.0
+    change, factor = np.zeros(6), 1.0
     for step in range(_REFINE_STEPS):
         time = slot_time(strips, terms, values)
-        waves = column_waves(strips, time, values[1])
-        again = step == _AGAIN_STEP and float(np.abs(time - first_time).max()) > _FAR
-        if again:
-            slots = first_slots(waves, exposure, grid)
-        if estimating and (again or step in _EXPOSURE_STEPS):
-            near = None if again or step == _EXPOSURE_STEPS[0] else exposure
-            exposure, exposure_sd, slots = estimate_exposure(waves, grid, slots, near)
+        waves = column_waves(view, time)
+        if estimating and step in _EXPOSURE_STEPS:
+            exposure, exposure_sd = exposure_of_known(waves, slots.lit, exposure if step else None)
             exposure, exposure_sd = (exposure, exposure_sd) if exposure > exposure_slots else (exposure_slots, 0.0)
         slots = decide(waves, exposure, grid, slots)
         free = n_free if step >= _RIGID_STEPS or values[2:].any() else 2
         observed = seen_by_strips(strips, time, slots.lit, exposure)
-        change, covariance, explained = gauss_newton(strips, terms, values, time, observed, free)
-        values = values + change
+        before, (change, covariance, explained) = (
+            change,
+            gauss_newton(strips, terms, values, time, observed, free),
+        )
+        factor = _extrapolation(before, change, covariance)
+        values = values + factor * change
         moved = float(np.abs(slot_time(strips, terms, values)[:, ::BLOCK_ROWS] - time[:, ::BLOCK_ROWS]).max())
-        if moved < _CONVERGED and step >= _AGAIN_STEP:
+        if moved < _CONVERGED and step >= _LEAST_STEPS - 1:
             break
-    position = (np.arange(slots.lit.shape[1]) + grid.first_slot) % grid.packet_slots
-    log_evidence = packet_llr(waves, exposure, grid, slots)
-    log_evidence += repeat_evidence(slots.lit > 0.5, position, grid.packet_slots)
-    return _Timing(values, covariance, exposure, exposure_sd, log_evidence, explained, slots)
+    return _Timing(values, covariance, exposure, exposure_sd, explained, slots, waves)
 
 
-def time_terms(strips: Strips) -> FloatArray:
-    """(4, M, blocks + 1) bend terms at the borders of blocks of rows."""
-    n = strips.rows.size
-    nodes = np.minimum(np.arange(-(-n // BLOCK_ROWS) + 1) * BLOCK_ROWS, n - 1)
-    return curvature_terms(strips.x[:, nodes], strips.rows[nodes], strips.width, strips.height)
-
-
-def slot_time(strips: Strips, terms: FloatArray, values: FloatArray) -> Float32Array:
-    """(M, R) slot position of every strip's row; the bend is interpolated between the blocks' borders."""
-    n = strips.rows.size
-    start, rows_per_slot = values[:2]
-    moved = np.tensordot(values[2:], terms, 1)
-    index = np.arange(n)
-    low = index // BLOCK_ROWS
-    width = np.minimum((low + 1) * BLOCK_ROWS, n - 1) - low * BLOCK_ROWS
-    f = (index - low * BLOCK_ROWS) / np.maximum(width, 1)
-    bent = moved[:, low] + (moved[:, low + 1] - moved[:, low]) * f
-    return np.asarray((strips.rows + bent - start) / rows_per_slot, np.float32)
+def _extrapolation(before: FloatArray, change: FloatArray, covariance: FloatArray) -> float:
+    """How much further than a step to go, where each is some share of the one before: slots follow the clock slowly."""
+    metric = np.linalg.pinv(covariance[:2, :2])
+    length = float(before[:2] @ metric @ before[:2])
+    ratio = float(before[:2] @ metric @ change[:2]) / length if length > 0 else 0.0
+    return min(1 / (1 - min(ratio, 0.9)), _MOST_EXTRAPOLATED) if ratio > _SLOW else 1.0
 
 
 def seen_by_strips(

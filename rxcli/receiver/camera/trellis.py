@@ -6,6 +6,9 @@ import numpy as np
 
 from rxcli.types import Float32Array, FloatArray
 
+#: Slots that are walked together, and those before them from which their first state is told.
+_BLOCK, _LEAD = 48, 16
+
 
 def pattern_light(exposure_slots: float, samples: int) -> FloatArray:
     """Light 0..1 of the middle slot's samples for every pattern of it and its neighbours.
@@ -40,46 +43,59 @@ def lit_probability(
     Returns:
         (C, N) float32; and (C,) float64, the logarithm of the likelihood's mean over all slots that the prior allows.
     """
-    n_columns, n, n_patterns = metric.shape
+    n_columns, _, n_patterns = metric.shape
     n_bits = n_patterns.bit_length() - 1
     reach = n_bits // 2
     middle = ((np.arange(n_patterns) >> reach) & 1).astype(np.float32)
-    weight = metric + (log_odds[..., None] * middle - np.logaddexp(0, log_odds)[..., None])
+    prior = np.asarray(np.logaddexp(0, log_odds), np.float32)[..., None]
+    weight = np.asarray(metric, np.float32) + (np.asarray(log_odds, np.float32)[..., None] * middle - prior)
     top = weight.max(axis=2, keepdims=True)
-    weight = np.exp(np.maximum(weight - top, -60)).astype(np.float32)
+    weight = np.exp(np.maximum(weight - top, np.float32(-60)))
     # The way back is the way forth of the mirrored sequence: both are walked together.
     mirrored = np.array([int(format(p, f"0{n_bits}b")[::-1], 2) for p in range(n_patterns)])
-    both = np.concatenate([weight, weight[:, ::-1][..., mirrored]]).transpose(1, 0, 2)
-    walked, scales = _walk(np.ascontiguousarray(both).reshape(n, 2 * n_columns, 2, n_patterns // 2))
-    ahead = walked[:, :n_columns]
-    back = walked[::-1, n_columns:]
+    walked, scales = _walk(np.concatenate([weight, weight[:, ::-1][..., mirrored]]))
+    ahead, back = walked[:n_columns], walked[n_columns:, ::-1]
     # State before slot k: its first n - 1 bits; state after it, from the other side, mirrored: its last n - 1.
     states = n_patterns // 2
     turned = np.array([int(format(s, f"0{n_bits - 1}b")[::-1], 2) for s in range(states)])
     patterns = np.arange(n_patterns)
-    joint = ahead[..., patterns >> 1] * back[..., turned[patterns & (states - 1)]] * weight.transpose(1, 0, 2)
+    joint = ahead[..., patterns >> 1] * back[..., turned[patterns & (states - 1)]] * weight
     total = joint.sum(axis=2)
-    log_evidence = np.log(scales[:, :n_columns].astype(np.float64)).sum(axis=0) + top.sum(axis=(1, 2), dtype=np.float64)
-    return np.asarray(((joint @ middle) / np.maximum(total, 1e-30)).T, np.float32), log_evidence
+    log_evidence = np.log(scales[:n_columns]).sum(axis=1, dtype=np.float64) + top.sum(axis=(1, 2), dtype=np.float64)
+    return np.asarray((joint @ middle) / np.maximum(total, np.float32(1e-30)), np.float32), log_evidence
 
 
 def _walk(weight: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """(N, 2C, states) probability of the state before each slot, from the weights (N, 2C, oldest bit, others).
+    """Probability of the state before each slot (rows, N, states) from weights (rows, N, patterns), block by block.
 
-    And (N, 2C) what the probabilities' sum was multiplied with at every slot.
+    And (rows, N) what the probabilities' sum was multiplied with at every slot. States far back tell nothing of a slot,
+    so that blocks can be walked side by side, each from a few slots before its own.
     """
-    n, n_rows, _, states = weight.shape
-    out = np.empty((n, n_rows, states), np.float32)
-    scale = np.empty((n, n_rows, 1), np.float32)
-    ones = np.ones((states, 1), np.float32)
+    n_rows, n, n_patterns = weight.shape
+    states = n_patterns // 2
+    n_blocks = -(-n // _BLOCK)
+    # Slots outside weigh all patterns alike, which leaves the state at the sequence's ends open.
+    padded = np.ones((n_rows, _LEAD + n_blocks * _BLOCK, n_patterns), np.float32)
+    padded[:, _LEAD : _LEAD + n] = weight
+    windows = np.lib.stride_tricks.sliding_window_view(padded, _LEAD + _BLOCK, axis=1)[:, ::_BLOCK]
     # A pattern is the state and one new bit; the new state drops the oldest bit.
-    weight = weight.reshape(n, n_rows, 2, states // 2, 2)
-    state = np.full((n_rows, states), 1 / states, np.float32)
-    for k in range(n):
-        out[k] = state
-        pattern = state.reshape(n_rows, 2, states // 2, 1) * weight[k]
-        state = (pattern[:, 0] + pattern[:, 1]).reshape(n_rows, states)
-        np.matmul(state, ones, out=scale[k])
-        scale[k] += np.float32(1e-30)
-        state /= scale[k]
-    return out, scale[..., 0]
+    steps = np.ascontiguousarray(windows.transpose(3, 0, 1, 2)).reshape(-1, n_rows * n_blocks, 2, states // 2, 2)
+    out = np.empty((_BLOCK, n_rows * n_blocks, states), np.float32)
+    scale = np.empty((_BLOCK, n_rows * n_blocks, 1), np.float32)
+    ones = np.ones((states, 1), np.float32)
+    state = np.full((n_rows * n_blocks, states), 1 / states, np.float32)
+    for k, step in enumerate(steps, -_LEAD):
+        if k >= 0:
+            out[k] = state
+        pattern = state.reshape(-1, 2, states // 2, 1) * step
+        state = (pattern[:, 0] + pattern[:, 1]).reshape(-1, states)
+        total = state @ ones + np.float32(1e-30)
+        state /= total
+        if k >= 0:
+            scale[k] = total
+
+    def in_order(values: Float32Array) -> Float32Array:
+        by_row = values.reshape(_BLOCK, n_rows, n_blocks, -1).transpose(1, 2, 0, 3)
+        return by_row.reshape(n_rows, n_blocks * _BLOCK, -1)[:, :n]
+
+    return in_order(out), in_order(scale)[..., 0]

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import local_mean
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook
-from rxcli.receiver.camera.strips import EXTREMES_SLOTS, SAMPLES, Strips, levelled
+from rxcli.receiver.camera.strips import SAMPLES, Strips
 from rxcli.receiver.camera.trellis import lit_probability, pattern_light
+from rxcli.receiver.camera.views import View
 from rxcli.types import Float32Array, FloatArray
 
 #: Exposures that are compared, slots; and those near one, as factors.
 _EXPOSURES = np.array([0.3, 0.7, 1.1, 1.5, 1.9, 2.3, 2.8])
-_NEAR_EXPOSURES = np.array([0.8, 1.0, 1.25])
 _AROUND_EXPOSURE = np.array([0.7, 0.85, 1.0, 1.17, 1.37])
 
 #: Reach of a column's light, columns; less than this share of a strip's light is left out.
@@ -33,7 +33,7 @@ WORD_SHARES: FloatArray = np.clip(
     [np.full(SLOTS_PER_SYMBOL, 0.5), *(codebook(w).mean(axis=0) for w in WEIGHTS)], 0.01, 0.99
 )
 #: Rounds of levels and slots that are read freely; and the share of them that may be lit.
-_FREE_ROUNDS, _FREE_DUTY = 2, (0.15, 0.85)
+_FREE_ROUNDS, _FREE_DUTY = 1, (0.15, 0.85)
 #: Noise that is expected of levelled light before any is known.
 _FIRST_POWER = 0.3
 #: Rounds of weights and how many columns have them.
@@ -89,61 +89,61 @@ def column_shares(strips: Strips) -> FloatArray:
     return np.asarray(light / light.sum(axis=1, keepdims=True))
 
 
-def column_waves(strips: Strips, time: Float32Array, rows_per_slot: float) -> Waves:
+def column_waves(view: View, time: Float32Array) -> Waves:
     """Levelled light of every column by slot position."""
-    window = round(EXTREMES_SLOTS * rows_per_slot / (strips.rows[1] - strips.rows[0]))
-    level, weight = levelled(strips.light, strips.inside, window, strips.noise)
+    n_columns, n_strips = view.strips.n_columns, view.light.shape[0]
     n = (int(time.max()) + 2) * SAMPLES
-    per_column = strips.light.shape[0] // strips.n_columns
-    column = np.arange(strips.light.shape[0]) // per_column
-    place = np.clip((time * SAMPLES).astype(np.int64), 0, n - 1) + (column * n)[:, None]
-    total = np.bincount(place.ravel(), weight.ravel(), strips.n_columns * n)
-    summed = np.bincount(place.ravel(), (level * weight).ravel(), strips.n_columns * n)
-    value = (summed / (total + 1e-3)).reshape(strips.n_columns, n)
+    column = np.arange(n_strips) // (n_strips // n_columns)
+    place = np.clip((time * np.float32(SAMPLES)).astype(np.int64), 0, n - 1) + (column * n)[:, None]
+    total = np.bincount(place.ravel(), view.weight.ravel(), n_columns * n)
+    summed = np.bincount(place.ravel(), view.light.ravel(), n_columns * n)
+    value = (summed / (total + 1e-3)).reshape(n_columns, n)
     return Waves(value.astype(np.float32), total.reshape(value.shape).astype(np.float32))
 
 
-def first_slots(waves: Waves, exposure_slots: float, grid: Grid) -> Slots:
-    """Slots at the levels that each weight would give, of the weight that explains its column best."""
-    pattern = pattern_light(exposure_slots, SAMPLES)
-    n_columns, n = waves.value.shape[0], waves.value.shape[1] // SAMPLES
-    w = np.repeat(np.array(WEIGHTS), n_columns)
-    known = grid.log_odds(w, n)
-    many = Waves(np.tile(waves.value, (len(WEIGHTS), 1)), np.tile(waves.weight, (len(WEIGHTS), 1)))
-    levels = np.array([_expected_levels(one, exposure_slots) for one in WEIGHTS], np.float32)
-    gain, offset = (np.broadcast_to(np.repeat(one, n_columns)[:, None], many.value.shape) for one in levels.T)
-    power = np.full((w.size, 1), _FIRST_POWER, np.float32)
-    lit, _ = lit_probability(_pattern_metric(many, gain, offset, power, pattern), known)
-    gain, offset, residual = _levels(many, lit, exposure_slots)
-    power = _power(many, residual)
-    lit, log_evidence = lit_probability(_pattern_metric(many, gain, offset, power, pattern), known)
-    log_evidence = log_evidence - 0.5 * _TEMPER * _trust(many).sum(axis=1) * np.log(power[:, 0])
-    best = _shared_weights(log_evidence.reshape(len(WEIGHTS), n_columns))
-    return Slots(lit.reshape(len(WEIGHTS), n_columns, n)[best, np.arange(n_columns)], np.array(WEIGHTS)[best])
+def read_freely(waves: Waves, exposure_slots: float, w: int | None = None) -> tuple[Float32Array, Float32Array]:
+    """Slots read without knowing anything of packets.
 
+    Args:
+        waves: light by slot position.
+        exposure_slots: exposure.
+        w: weight whose levels columns have to start from; None: what the skewness of their light says.
 
-def free_log_odds(waves: Waves, exposure_slots: float) -> FloatArray:
-    """(C, N) what the light says for every slot being lit, read without knowing anything of packets."""
+    Returns:
+        (C, N) probability that each slot is lit; and (C, N) what the light says for that, log-odds.
+    """
     pattern = pattern_light(exposure_slots, SAMPLES)
     shape = (waves.value.shape[0], waves.value.shape[1] // SAMPLES)
-    levels = _expected_levels(SLOTS_PER_SYMBOL // 2, exposure_slots)
-    gain, offset = (np.full_like(waves.value, level) for level in levels)
+    levels = np.array([_expected_levels(one, exposure_slots) for one in WEIGHTS], np.float32)
+    weights = likely_weights(waves, exposure_slots) if w is None else np.full(shape[0], w)
+    gain, offset = (np.broadcast_to(one[weights - 1][:, None], waves.value.shape) for one in levels.T)
     power = np.full((shape[0], 1), _FIRST_POWER, np.float32)
-    prior = np.zeros(shape)
+    prior = _log_odds(weights[:, None] / SLOTS_PER_SYMBOL) + np.zeros(shape)
     lit, _ = lit_probability(_pattern_metric(waves, gain, offset, power, pattern), prior)
     for _ in range(_FREE_ROUNDS):
         gain, offset, residual = _levels(waves, lit, exposure_slots)
-        duty = np.clip(lit.mean(axis=1, keepdims=True, dtype=np.float64), *_FREE_DUTY)
-        prior = _log_odds(duty) + np.zeros(shape)
+        prior = _log_odds(np.clip(lit.mean(axis=1, keepdims=True, dtype=np.float64), *_FREE_DUTY)) + np.zeros(shape)
         lit, _ = lit_probability(_pattern_metric(waves, gain, offset, _power(waves, residual), pattern), prior)
-    return _log_odds(np.clip(lit.astype(np.float64), 1e-4, 1 - 1e-4)) - prior
+    return lit, np.asarray(_log_odds(np.clip(lit.astype(np.float64), 1e-4, 1 - 1e-4)) - prior, np.float32)
+
+
+def likely_weights(waves: Waves, exposure_slots: float) -> NDArray[np.int64]:
+    """(C,) weight of every column by the skewness of its light: few lit slots stand out above, few dark ones below."""
+    trust = _trust(waves)
+    total = trust.sum(axis=1, keepdims=True) + np.float32(1e-6)
+    centred = waves.value - (trust * waves.value).sum(axis=1, keepdims=True) / total
+    square = centred * centred
+    second, third = ((trust * moment).sum(axis=1) / total[:, 0] for moment in (square, square * centred))
+    skewness = third / (second**1.5 + np.float32(1e-6))
+    expected = np.array([_expected_skewness(w, exposure_slots) for w in WEIGHTS])
+    return np.asarray(np.abs(skewness[:, None] - expected).argmin(axis=1) + 1)
 
 
 def _log_odds(share: FloatArray) -> FloatArray:
     return np.asarray(np.log(share / (1 - share)))
 
 
-def _shared_weights(log_evidence: FloatArray) -> NDArray[np.int64]:
+def shared_weights(log_evidence: FloatArray) -> NDArray[np.int64]:
     """(C,) most probable weight of each column, where weights that many columns have are more probable."""
     prior = np.full((log_evidence.shape[0], 1), 1 / log_evidence.shape[0])
     for _ in range(_SHARING_ROUNDS):
@@ -192,14 +192,26 @@ def packet_llr(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots) ->
 
 def _expected_levels(w: int, exposure_slots: float) -> tuple[float, float]:
     """Gain and offset of levelled light, which has no mean and a variance of one, for symbols of weight `w`."""
+    mean, variance, _ = _expected_moments(w, exposure_slots)
+    gain = 1 / np.sqrt(variance)
+    return float(gain), float(-gain * mean)
+
+
+def _expected_skewness(w: int, exposure_slots: float) -> float:
+    _, variance, third = _expected_moments(w, exposure_slots)
+    return float(third / variance**1.5)
+
+
+def _expected_moments(w: int, exposure_slots: float) -> tuple[float, float, float]:
+    """Mean, variance and third central moment of the light 0..1 of symbols of weight `w`."""
     duty = w / SLOTS_PER_SYMBOL
     light = pattern_light(exposure_slots, SAMPLES)
     n_bits = light.shape[0].bit_length() - 1
     lit = np.array([bin(p).count("1") for p in range(light.shape[0])])
     share = duty**lit * (1 - duty) ** (n_bits - lit)
-    mean = (share @ light).mean()
-    gain = 1 / np.sqrt((share @ (light - mean) ** 2).mean())
-    return float(gain), float(-gain * mean)
+    mean = float((share @ light).mean())
+    second, third = (float((share @ (light - mean) ** n).mean()) for n in (2, 3))
+    return mean, second, third
 
 
 def _duty_log_odds(w: NDArray[np.int64]) -> FloatArray:
@@ -311,29 +323,10 @@ def residual_of(
     return residual, spread
 
 
-def estimate_exposure(waves: Waves, grid: Grid, slots: Slots, near: float | None = None) -> tuple[float, float, Slots]:
-    """Exposure in slots by the blur of the slots' edges.
-
-    Args:
-        waves: light by slot position.
-        grid: where the headers are.
-        slots: to start from.
-        near: what it is near to; None to try all.
-
-    Returns:
-        The exposure, its standard deviation, and the slots at the exposure tried that is nearest to it.
-    """
-    tried = _EXPOSURES if near is None else near * _NEAR_EXPOSURES
-    found = [decide(waves, exposure, grid, slots) for exposure in tried]
-    errors = np.log([_misfit(waves, exposure, one.lit) for exposure, one in zip(tried, found, strict=True)])
-    exposure, sd = _least(tried, errors, waves)
-    return exposure, sd, found[int(errors.argmin())]
-
-
-def exposure_of_known(waves: Waves, lit: Float32Array, near: float) -> tuple[float, float]:
-    """Exposure near one, by the blur of slots (C, N) that are known; and its standard deviation."""
+def exposure_of_known(waves: Waves, lit: Float32Array, near: float | None) -> tuple[float, float]:
+    """Exposure by the blur of slots (C, N) that are known, near one or any; and its standard deviation."""
     known = fitted(lit, waves.value.shape[1] // SAMPLES)
-    tried = near * _AROUND_EXPOSURE
+    tried = _EXPOSURES if near is None else near * _AROUND_EXPOSURE
     return _least(tried, np.log([_misfit(waves, exposure, known) for exposure in tried]), waves)
 
 
