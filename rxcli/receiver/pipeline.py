@@ -18,7 +18,7 @@ from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.corners import find_corners, too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin
-from rxcli.receiver.unknown_camera import Received, likely_camera, with_refitted_camera, without_estimate
+from rxcli.receiver.unknown_camera import likely_camera, receive_unknown, without_estimate
 from rxcli.results.dump import dump_stages
 from rxcli.types import FloatArray, Frame, FrameResult
 
@@ -76,10 +76,11 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
     if isinstance(acquisition, Failure):
         return failed(replace(result, **context.camera.facts), acquisition)
     # Channel and decode, in turn: slot metrics to symbols, and what they say of the picture.
-    with timer("detect"):
-        reception = decode_likeliest(acquisition, options.skip)
-    if context.camera.blind_estimate is not None:
-        received = with_refitted_camera(Received(context, acquisition, reception), options.skip)
+    if context.camera.blind_estimate is None:
+        with timer("detect"):
+            reception = decode_likeliest(acquisition, options.skip)
+    else:
+        received = receive_unknown(context, acquisition, options.skip)
         context, acquisition, reception = received.context, received.acquisition, received.reception
     with timer("detect"):
         no_header = headerless(reception)

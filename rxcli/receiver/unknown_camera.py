@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,9 @@ from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
 
 #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
 _MATTERS_SLOTS = 0.05
-_MOST_REFITS = 3
+_MOST_INITIAL_REFITS = 3
+#: Slots, as probabilities, that differ by no more than this on average tell the same camera.
+_SLOTS_ALIKE = 0.01
 #: What is received with a refitted camera shows packets as well as before from this share of the evidence on.
 _KEPT_EVIDENCE = 0.9
 #: Headers and packets, all columns together, that an estimate with rivals must show, nats: wrong ones have next to none
@@ -70,26 +73,58 @@ def _initial_evidence(context: FrameContext) -> tuple[float, float]:
     return packets, _SAY_OF_SYMBOLS * float(reception.posteriors.log_prob.mean())
 
 
-def with_refitted_camera(received: Received, skip: frozenset[str]) -> Received:
-    """The camera that the slots tell, and what is received with it, until that moves the clock no more.
+def receive_unknown(context: FrameContext, acquisition: Acquisition, skip: frozenset[str]) -> Received:
+    """What is received of a frame whose camera was estimated, and the camera as decoded slots tell it."""
+    with context.timer("detect"):
+        first = Received(context, acquisition, initial_pass(acquisition))
+    settled = _with_settled_clock(first)
+    with context.timer("detect"):
+        reception = decode_likeliest(settled.acquisition, skip)
+    received = replace(settled, reception=reception)
+    return with_refitted_camera(received, skip, _slots_changed(settled, received))
 
-    Where packets show less then, what was received before stays. Values that seem to be light are received as such.
-    """
-    for _ in range(_MOST_REFITS):
+
+def _with_settled_clock(received: Received) -> Received:
+    """The camera that the slots of an initial pass tell, until that moves the clock no more."""
+    for _ in range(_MOST_INITIAL_REFITS):
         with received.context.timer("blind"):
             camera, moved_slots = refitted_camera(*_decided(received))
         received = _with_camera(received, camera)
         if moved_slots < _MATTERS_SLOTS:
             break
-        again = _received_again(received, skip)
+        again = _received_again(received, initial_pass)
         if again is None:
             break
         received = again
+    return received
+
+
+def _slots_changed(before: Received, after: Received) -> bool:
+    """Whether slots were decided otherwise than before, so that they may tell another camera."""
+    lit = [channel.lit_on_grid(one.reception.posteriors, one.reception.clock) for one in (before, after)]
+    return lit[0].shape != lit[1].shape or float(np.abs(lit[0] - lit[1]).mean()) > _SLOTS_ALIKE
+
+
+def with_refitted_camera(received: Received, skip: frozenset[str], slots_changed: bool = True) -> Received:
+    """The camera that decoded slots tell, and what is received with it where that moves the clock.
+
+    Where packets show less then, what was received before stays. Values that seem to be light are received as such.
+    """
+
+    def decoded(acquisition: Acquisition) -> Reception:
+        return decode_likeliest(acquisition, skip)
+
+    if slots_changed:
+        with received.context.timer("blind"):
+            camera, moved_slots = refitted_camera(*_decided(received))
+        received = _with_camera(received, camera)
+        again = _received_again(received, decoded) if moved_slots > _MATTERS_SLOTS else None
+        received = again or received
     with received.context.timer("blind"):
         linear = linear_camera(*_decided(received))
     if linear.tone == received.context.camera.tone:
         return _with_camera(received, linear)
-    again = _received_again(_with_camera(received, linear), skip)
+    again = _received_again(_with_camera(received, linear), decoded)
     if again is None:
         return _with_camera(received, received.context.camera.without_tone())
     return with_refitted_camera(again, skip)
@@ -105,14 +140,14 @@ def _with_camera(received: Received, camera: Camera) -> Received:
     return replace(received, context=replace(received.context, camera=camera))
 
 
-def _received_again(before: Received, skip: frozenset[str]) -> Received | None:
+def _received_again(before: Received, receive: Callable[[Acquisition], Reception]) -> Received | None:
     """What is received with a refitted camera; None where packets show less than in what was received before."""
     context = before.context
     acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
     if isinstance(acquisition, Failure):
         return None
     with context.timer("detect"):
-        reception = decode_likeliest(acquisition, skip)
+        reception = receive(acquisition)
     kept = packet_llr(reception) >= _KEPT_EVIDENCE * packet_llr(before.reception)
     return Received(context, acquisition, reception) if kept else None
 

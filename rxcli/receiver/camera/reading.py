@@ -68,9 +68,7 @@ class Reading:
         return self.packets[0].log_evidence
 
 
-def read(
-    views: Views, clock: Hypothesis, curvature: FloatArray, packet_lengths: Sequence[int], off_slots: float = 0.0
-) -> Reading:
+def read(views: Views, clock: Hypothesis, curvature: FloatArray, packet_lengths: Sequence[int]) -> Reading:
     """The slots of a hypothesis, whatever length and start of packets it came with.
 
     Args:
@@ -78,14 +76,12 @@ def read(
         clock: a clock found on strips that were straightened.
         curvature: the bend they were straightened with.
         packet_lengths: slots of a packet, of every screen in question.
-        off_slots: slots that the clock is taken to be off by the end of the picture.
     """
     view = views.at(clock.rows_per_slot, clock.reversed)
     rows = view.strips.rows
     first_row = rows[0] - 0.5 * (rows[1] - rows[0])
-    rows_per_slot = clock.rows_per_slot * (1 + off_slots * clock.rows_per_slot / float(rows[-1] - rows[0]))
-    start = first_row + clock.start_row % rows_per_slot - _SLOTS_BEFORE * rows_per_slot
-    values = np.concatenate([[start, rows_per_slot], view.curvature(curvature)])
+    start = first_row + clock.start_row % clock.rows_per_slot - _SLOTS_BEFORE * clock.rows_per_slot
+    values = np.concatenate([[start, clock.rows_per_slot], view.curvature(curvature)])
     return read_slots(views, clock.rows_per_slot, clock.reversed, values, packet_lengths)
 
 
@@ -115,7 +111,7 @@ def _read_at_levels(
     return lit, tuple(sorted(found, key=lambda packets: -packets.log_evidence))
 
 
-def over_weights(by_weight: Float32Array) -> FloatArray:
+def over_weights(by_weight: Float32Array | FloatArray) -> FloatArray:
     """(n,) evidence of all columns together from that of every weight (C, 9, n), weights alike before."""
     top = by_weight.max(axis=1, keepdims=True)
     columns = top[:, 0] + np.log(np.exp(by_weight - top).sum(axis=1))
@@ -167,4 +163,5 @@ def _of_length(
     start = np.arange(packet_slots)
     padded = np.pad(more, ((0, 0), (0, 0), (0, -more.shape[2] % packet_slots)))
     preambles = padded.reshape(*more.shape[:2], -1, packet_slots).sum(axis=2)
-    return preambles[..., (start + PREAMBLE_SLOTS) % packet_slots] + words[start % SLOTS_PER_SYMBOL].transpose(1, 2, 0)
+    in_words = words[start % SLOTS_PER_SYMBOL].transpose(1, 2, 0)
+    return np.asarray(preambles[..., (start + PREAMBLE_SLOTS) % packet_slots] + in_words)

@@ -20,13 +20,13 @@ from rxcli.receiver.camera.timing import (
     gauss_newton,
 )
 from rxcli.receiver.camera.tone import tone_exponent
-from rxcli.receiver.camera.views import View, Views, slot_time
+from rxcli.receiver.camera.views import BLOCK_ROWS, View, Views, slot_time
 from rxcli.receiver.camera.waves import column_waves, exposure_of_known, fitted
 from rxcli.types import Clock, Float32Array, FloatArray
 
 _STEPS = 6
-#: Steps before which the exposure is estimated.
-_EXPOSURE_STEPS = (0, 2)
+#: The fit ends when no row moves by more slots than the first; exposure and rows are fitted anew after the second.
+_CONVERGED, _ROWS_ANEW = 0.005, 0.1
 #: Slots over which the picture is taken as constant.
 _LOCAL_SLOTS = 25.0
 #: Rows by which the picture's texture in a row is foretold.
@@ -106,17 +106,24 @@ def _fit(
     strips, terms = view.strips, view.terms
     pitch = float(strips.rows[1] - strips.rows[0])
     exposure, exposure_sd, explained_first = exposure_slots, 0.0, 0.0
-    for step in range(_STEPS):
-        time = slot_time(strips, terms, values)
+    window = round(_LOCAL_SLOTS * values[1] / pitch)
+    time = slot_time(strips, terms, values)
+    moved = np.inf
+    for _ in range(_STEPS):
         slots = fitted(lit, max(int(time.max()) + 3, lit.shape[1]))
-        if step in _EXPOSURE_STEPS:
+        if moved > _ROWS_ANEW:
             exposure, exposure_sd = exposure_of_known(column_waves(view, time), lit, exposure)
-            window = round(_LOCAL_SLOTS * values[1] / pitch)
             rows = fit_rows(strips, time, values, slots, exposure, window, shutter_slots)
+            moved = 0.0
         observed = rows.observed(strips, time, values, slots)
         change, covariance, explained = gauss_newton(
             strips, terms, values, time, observed, n_free, _LOCAL_SLOTS, _ORDER
         )
         explained_first = explained_first or explained
         values = values + change
+        before, time = time, slot_time(strips, terms, values)
+        step = float(np.abs(time - before)[:, ::BLOCK_ROWS].max())
+        moved += step
+        if step < _CONVERGED:
+            break
     return _Fit(values, covariance, exposure, exposure_sd, explained_first, explained, observed[0], window)

@@ -9,9 +9,10 @@ import pytest
 
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook, encode_packet, payload_bits
 from rxcli.receiver import camera as blind
-from rxcli.receiver.camera.reading import read, start_evidence
+from rxcli.receiver.camera.reading import over_weights, read, start_evidence
 from rxcli.receiver.camera.strips import SAMPLES
-from rxcli.receiver.camera.waves import WORD_SHARES, Waves, free_log_odds
+from rxcli.receiver.camera.views import Views
+from rxcli.receiver.camera.waves import WORD_SHARES, Waves, read_freely
 from rxcli.receiver.decode.detect import free_log_evidence
 from rxcli.types import Float32Array, FloatArray
 
@@ -45,7 +46,9 @@ def _brute(log_odds: FloatArray, start: int, packet_slots: int) -> float:
 @pytest.mark.parametrize(("packet_slots", "n"), [(70, 95), (70, 61), (130, 240), (260, 245)])
 def test_evidence_is_that_of_every_slot_on_its_own(packet_slots: int, n: int) -> None:
     log_odds = np.clip(np.random.default_rng(n).normal(0, 2, (3, n)), -5, 5)
-    (found,) = start_evidence(log_odds, [packet_slots])
+    (by_weight,) = start_evidence(log_odds, [packet_slots])
+    assert by_weight.shape == (3, 9, packet_slots)
+    found = over_weights(by_weight)
     assert found.shape == (packet_slots,)
     for start in (0, 1, 9, 37, 50, 69, packet_slots - 1):
         assert found[start] == pytest.approx(_brute(log_odds, start, packet_slots), abs=1e-9)
@@ -56,13 +59,13 @@ def test_packets_start_where_they_were_sent(n_symbols: int, first: int) -> None:
     rng = np.random.default_rng(first)
     sent = _sent(rng, [3, 4, 5, 5, 6, 7], n_symbols, first, 340)
     log_odds = 2.0 * (2 * sent - 1) + rng.normal(0, 2.0, sent.shape)
-    log_evidence = dict(zip(LENGTHS, start_evidence(log_odds, LENGTHS), strict=True))
+    log_evidence = dict(zip(LENGTHS, map(over_weights, start_evidence(log_odds, LENGTHS)), strict=True))
     right = PREAMBLE_SLOTS + 10 * n_symbols
     assert max(log_evidence, key=lambda length: float(log_evidence[length].max())) == right
     assert int(log_evidence[right].argmax()) == -first % right
     assert log_evidence[right].max() > 60
     noise = rng.normal(0, 2.0, sent.shape)
-    assert max(one.max() for one in start_evidence(noise, LENGTHS)) < 20
+    assert max(over_weights(one).max() for one in start_evidence(noise, LENGTHS)) < 20
 
 
 def test_first_slots_of_words_are_dark_more_often() -> None:
@@ -78,7 +81,7 @@ def test_slots_are_read_without_knowing_anything_of_packets(exposure: float) -> 
     seen = _through(sent, exposure, SAMPLES)
     seen = (seen - seen.mean(axis=1, keepdims=True)) / seen.std(axis=1, keepdims=True)
     noisy = (seen + rng.normal(0, 0.2, seen.shape)).astype(np.float32)
-    log_odds = free_log_odds(Waves(noisy, np.ones_like(noisy)), exposure)
+    _, log_odds = read_freely(Waves(noisy, np.ones_like(noisy)), exposure)
     assert log_odds.shape == sent.shape
     assert np.mean((log_odds > 0) != (sent > 0.5)) < 0.06
 
@@ -103,21 +106,20 @@ def test_a_hypothesis_is_read_whatever_length_and_start_it_came_with() -> None:
     rows = np.arange(n_rows, dtype=np.float64)
     noise = blind.Noise(0.0064, 0.0)
     picture = blind.Strips(light, np.ones_like(light), x, rows, sent.shape[0], noise, 1000, n_rows)
-    # Another length, another start, and a wrong period that stood out more.
-    near = blind.Hypothesis(4.03, 70, 41.0, reversed=False, log_evidence=-10.0, salience=50.0)
-    off = blind.Hypothesis(5.3, 130, 12.0, reversed=False, log_evidence=-5.0, salience=90.0)
-    found = read(picture, [(off, np.zeros(4)), (near, np.zeros(4))], LENGTHS)
-    best, curvature = found[0]
-    assert not curvature.any()
+    views = Views(picture)
+    # Another length, another start; and 1.5 slots off by the end of the picture.
+    near = blind.Hypothesis(4.0, 70, 41.0, reversed=False, log_evidence=-10.0)
+    reading = read(views, near, np.zeros(4), LENGTHS)
+    best = reading.packets[0]
     assert best.packet_slots == 130
-    # The clock came 1.5 slots off by the end of the picture; those around it are read too.
-    assert best.rows_per_slot == pytest.approx(4, abs=0.012)
-    assert best.start_row % (130 * best.rows_per_slot) == pytest.approx((130 - 37) * 4, abs=4)
-    as_it_came = max(one.log_evidence for one, _ in found if one.rows_per_slot == near.rows_per_slot)
-    wrong = max(one.log_evidence for one, _ in found if one.rows_per_slot > 5)
-    assert best.log_evidence > 1.5 * as_it_came > 0
-    assert best.log_evidence > 2 * wrong
-    assert found == sorted(found, key=lambda pair: -pair[0].log_evidence)
+    row = reading.values[0] + best.start * reading.values[1]
+    assert row % (130 * 4) == pytest.approx((130 - 37) * 4, abs=4)
+    assert best.log_evidence == reading.log_evidence > 50
+    assert [one.packet_slots for one in reading.packets] != LENGTHS
+    off = blind.Hypothesis(4.03, 70, 41.0, reversed=False, log_evidence=-10.0)
+    assert best.log_evidence > 1.2 * read(views, off, np.zeros(4), LENGTHS).log_evidence
+    wrong = blind.Hypothesis(5.3, 130, 12.0, reversed=False, log_evidence=-5.0)
+    assert best.log_evidence > 2 * read(views, wrong, np.zeros(4), LENGTHS).log_evidence
 
 
 @pytest.mark.parametrize("memory", [1, 2, 3])

@@ -10,7 +10,7 @@ import pytest
 from rxcli.receiver import camera as blind
 from rxcli.receiver.camera.edges import by_edges, line_evidence
 from rxcli.receiver.camera.rows import RowModel, fit_rows
-from rxcli.receiver.camera.timing import slot_time, time_terms
+from rxcli.receiver.camera.views import slot_time, time_terms
 from rxcli.types import Float32Array, FloatArray
 
 WIDTH, ROWS, COLUMNS = 1600, 900, 20

@@ -16,9 +16,10 @@ from rxcli.receiver.camera.waves import (
     Slots,
     Waves,
     decide,
-    estimate_exposure,
-    first_slots,
+    exposure_of_known,
+    likely_weights,
     packet_llr,
+    read_freely,
 )
 
 
@@ -67,29 +68,41 @@ def _scene(rng: np.random.Generator, exposure: float, weights: list[int]) -> tup
 
 
 @pytest.mark.parametrize("exposure", [0.5, 1.2, 1.9])
-def test_slots_and_weights_are_found_at_unknown_levels(exposure: float) -> None:
+def test_slots_are_found_at_unknown_levels(exposure: float) -> None:
     weights = [2, 3, 5, 5, 7, 8]
     waves, truth, grid = _scene(np.random.default_rng(5), exposure, weights)
-    slots = first_slots(waves, exposure, grid)
-    assert np.count_nonzero(slots.w == weights) >= 5
+    lit, _ = read_freely(waves, exposure)
+    slots = Slots(lit, np.array(weights))
     for _ in range(3):
         slots = decide(waves, exposure, grid, slots)
     assert np.mean((slots.lit > 0.5) != (truth > 0.5)) < (0.02 if exposure < 1.5 else 0.06)
 
 
+@pytest.mark.parametrize("exposure", [0.5, 1.2, 1.9])
+def test_skewness_tells_the_weight(exposure: float) -> None:
+    weights = np.array([1, 2, 3, 5, 5, 7, 8, 9])
+    waves, _, _ = _scene(np.random.default_rng(5), exposure, weights.tolist())
+    found = likely_weights(waves, exposure)
+    assert np.abs(found - weights).max() <= 1
+    assert np.count_nonzero(found == weights) >= 5
+
+
 def test_evidence_knows_where_headers_are() -> None:
     waves, _, grid = _scene(np.random.default_rng(6), 1.0, [3, 4, 5, 6, 7])
-    right = packet_llr(waves, 1.0, grid, first_slots(waves, 1.0, grid))
+    lit, _ = read_freely(waves, 1.0)
+    slots = Slots(lit, np.array([3, 4, 5, 6, 7]))
+    right = packet_llr(waves, 1.0, grid, decide(waves, 1.0, grid, slots))
     wrong = Grid((grid.first_slot + 37) % 130, 130)
     assert right > 60
-    assert packet_llr(waves, 1.0, wrong, first_slots(waves, 1.0, wrong)) < 0.2 * right
+    assert packet_llr(waves, 1.0, wrong, decide(waves, 1.0, wrong, slots)) < 0.2 * right
 
 
 @pytest.mark.parametrize("exposure", [0.6, 1.3, 2.0])
 def test_exposure_is_told_by_the_blur(exposure: float) -> None:
     waves, truth, grid = _scene(np.random.default_rng(7), exposure, [3, 4, 5, 5, 6, 7, 5, 4])
     start = Slots(np.asarray(truth * 0.8 + 0.1, np.float32), np.array([3, 4, 5, 5, 6, 7, 5, 4]))
-    found, _, slots = estimate_exposure(waves, grid, start)
-    again, sd, _ = estimate_exposure(waves, grid, slots, near=found)
+    found, _ = exposure_of_known(waves, start.lit, None)
+    slots = decide(waves, found, grid, start)
+    again, sd = exposure_of_known(waves, slots.lit, found)
     assert again == pytest.approx(exposure, abs=0.2)
     assert 0.02 <= sd <= 0.5
