@@ -49,8 +49,8 @@ _EXPOSURE_STEPS = (0, 2)
 _RIGID_STEPS = 2
 #: Steps that are this share of the one before, or more, are extrapolated, up to so many times.
 _SLOW, _MOST_EXTRAPOLATED = 0.2, 3.0
-#: Slots that were read on a clock further off than this, slots, are read anew.
-_FAR = 0.4
+#: Slots that were read on a clock further off than this, slots, are read anew; so many readings at most.
+_FAR, _MOST_READINGS = 0.4, 4
 #: Packets of another length that are less likely by no more than this, nats, are estimates too.
 _CLOSE = 60.0
 
@@ -107,11 +107,12 @@ def refine(
     """
     view = views.at(reading.rows_per_slot, reading.is_reversed)
     least = exposure_of_length(reading.packets[0].packet_slots)
-    timing, corrected = _fit_timing(view, reading, least, sure)
-    again = _read_again(views, reading, timing, packet_lengths)
-    if again.packets[0].log_evidence > reading.packets[0].log_evidence and _moved(view, reading, timing) > _FAR:
-        timing, corrected = _fit_timing(view, again, least, sure)
+    for _ in range(_MOST_READINGS):
+        timing, corrected = _fit_timing(view, reading, least, sure)
         again = _read_again(views, reading, timing, packet_lengths)
+        if again.log_evidence <= reading.log_evidence or _moved(view, reading, timing) < _FAR:
+            break
+        reading = again
     likely = [packets for packets in again.packets if packets.log_evidence > again.packets[0].log_evidence - _CLOSE]
     found, sd = timing.values[2:], UNDERSTATED * np.sqrt(np.diag(timing.covariance))
     return [
