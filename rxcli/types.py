@@ -271,6 +271,12 @@ class FrameResult:
     screen_profile: str | None = None
     #: (4, 2) image pixels, top-left first, clockwise as a viewer sees the screen.
     corners: FloatArray | None = None
+    #: Probability that the columns are numbered as the screen's; the packets' confidence has it in it.
+    column_certainty: float = 1.0
+    #: Sides of the stored picture (top, right, bottom, left) that were not seen but inferred.
+    inferred_sides: tuple[str, ...] = ()
+    #: The screen's column that column 0 of the result is; None where columns are counted from the left of what is seen.
+    column_offset: int | None = 0
     camera_profile: str | None = None
     line_delay_s: float | None = None
     exposure_s: float | None = None

@@ -11,7 +11,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.context import Failure, Timer
-from rxcli.receiver.corners import find_corners
+from rxcli.receiver.outline import find_outline
 from rxcli.types import Frame
 
 _NOTE = (
@@ -50,8 +50,8 @@ def calibrate_bent(frames: Sequence[Frame], screen: ScreenProfile) -> ShutterCal
 def _bent_line_delay(frame: Frame, screen: ScreenProfile) -> tuple[float, float] | None:
     """Line delay and its standard deviation; None where no screen is found or its stripes are not bent."""
     options = ReceiverOptions(screens=(screen,), cameras=())
-    corners = find_corners(frame, options)
-    context = corners if isinstance(corners, Failure) else find_camera(frame, corners, options, Timer())
+    outline = find_outline(frame, options, Timer())
+    context = outline if isinstance(outline, Failure) else find_camera(frame, outline.corners, options, Timer())
     if isinstance(context, Failure):
         return None
     estimated = context.camera.estimated

@@ -12,7 +12,7 @@ from rxcli.receiver.acquisition import Acquisition, n_strips_of
 from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure, FrameContext, Timer
 from rxcli.receiver.corners import levels_of
 from rxcli.receiver.screen import geometry
-from rxcli.types import Clock, Float32Array, FloatArray, Frame
+from rxcli.types import Clock, Float32Array, FloatArray, Frame, Lens
 
 
 def _camera_of(frame: Frame, options: ReceiverOptions) -> Camera | Failure | None:
@@ -35,6 +35,12 @@ def _camera_of(frame: Frame, options: ReceiverOptions) -> Camera | Failure | Non
     lens = geometry.lens_for(profile.lens, frame.width, frame.height) if profile.lens else None
     tone = DEFAULT_TONE if profile.tone == "auto" else profile.tone
     return Camera(profile.name, mode.line_delay_s, _exposure_of(frame, mode), lens, tone)
+
+
+def known_lens(frame: Frame, options: ReceiverOptions) -> Lens | None:
+    """The lens of a camera that a profile tells; None where none does."""
+    known = _camera_of(frame, options)
+    return known.lens if isinstance(known, Camera) else None
 
 
 @dataclass(frozen=True, slots=True)

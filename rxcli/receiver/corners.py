@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.screen import geometry
@@ -16,28 +15,23 @@ from rxcli.types import FloatArray, Frame
 _PORTRAIT = (5, 6, 7, 8)
 
 
-def find_corners(frame: Frame, options: ReceiverOptions) -> FloatArray | Failure:
-    """(4, 2) corners of the screen, image pixels, top-left first, clockwise as a viewer sees it."""
+def unreadable_orientation(frame: Frame) -> Failure | None:
+    """Why a picture whose readout runs along the columns' width cannot be received; None for others."""
     orientation = frame.metadata.orientation
-    if orientation in _PORTRAIT:
-        return Failure(
-            "no_signal",
-            f"the picture was taken in portrait (EXIF orientation {orientation}): the sensor reads along the width of "
-            "the columns, so that they cannot be told apart; hold the camera in landscape",
-        )
-    if options.corners is not None:
-        return options.corners
-    from rxcli.receiver.screen.find import find_screen
+    if orientation not in _PORTRAIT:
+        return None
+    return Failure(
+        "no_signal",
+        f"the picture was taken in portrait (EXIF orientation {orientation}): the sensor reads along the width of "
+        "the columns, so that they cannot be told apart; hold the camera in landscape",
+    )
 
-    found = find_screen(frame.pixels, **levels_of(frame))
-    corners = found.corners
-    if corners is None and "no_screen" in options.skip:
-        return Failure("no_screen", f"no screen found: {found.reason}; give its place with --corners")
-    if corners is None:
-        # Told not to give up: the picture may show nothing but a part of the screen.
-        right, bottom = frame.width - 1.0, frame.height - 1.0
-        corners = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
-    return geometry.viewer_order(corners, orientation)
+
+def whole_picture(frame: Frame) -> FloatArray:
+    """(4, 2) the picture's own corners, the viewer's top left first: it may show nothing but a part of the screen."""
+    right, bottom = frame.width - 1.0, frame.height - 1.0
+    corners = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
+    return geometry.viewer_order(corners, frame.metadata.orientation)
 
 
 def levels_of(frame: Frame) -> dict[str, Any]:

@@ -15,8 +15,9 @@ from typing import Any
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
 from rxcli.receiver.context import Failure, Timer
-from rxcli.receiver.corners import find_corners, too_small
+from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
+from rxcli.receiver.outline import find_outline
 from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin
 from rxcli.receiver.unknown_camera import likely_camera, receive_unknown, without_estimate
 from rxcli.results.dump import dump_stages
@@ -61,11 +62,11 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
 def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
     # Screen: where the columns are.
-    with timer("geometry"):
-        corners = find_corners(frame, options)
-    if isinstance(corners, Failure):
-        return failed(result, corners)
-    result = replace(result, corners=corners)
+    outline = find_outline(frame, options, timer)
+    if isinstance(outline, Failure):
+        return failed(result, outline)
+    corners = outline.corners
+    result = replace(result, **outline.facts)
     # Camera: what a row is in time.
     context = likely_camera(frame, corners, options, timer)
     if isinstance(context, Failure):
@@ -99,6 +100,7 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
         options.min_confidence,
         denoised,
     )
+    columns = assemble.with_doubt(columns, outline.certainty, options.min_confidence)
     if context.camera.reversed:
         columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
     result = replace(

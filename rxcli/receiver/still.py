@@ -353,7 +353,12 @@ def packet_llr(reception: Reception) -> float:
     Copies that differ and words that are not in the codebook speak against it, headers or not.
     """
     # The light model is surer than it should be: a column that fits poorly, or is dark, says nothing.
-    return float(np.logaddexp(_packets_over_any(reception, np.arange(reception.snr.shape[0])), 0.0).sum())
+    return float(np.logaddexp(column_llr(reception), 0.0).sum())
+
+
+def column_llr(reception: Reception) -> FloatArray:
+    """(C,) log-likelihood ratio of each column's slots being packets, over slots that are anything."""
+    return _packets_over_any(reception, np.arange(reception.snr.shape[0]))
 
 
 def _packets_over_any(reception: Reception, columns: NDArray[np.int64]) -> FloatArray:

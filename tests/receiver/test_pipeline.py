@@ -19,8 +19,8 @@ from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
 from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.context import FrameContext, Timer
-from rxcli.receiver.corners import find_corners
 from rxcli.receiver.decode import detect
+from rxcli.receiver.outline import Outline, find_outline
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Frame, FrameResult, Metadata, Mosaic, PacketResult
@@ -420,9 +420,9 @@ def test_rows_that_developing_mixes_are_told_from_the_light(monkeypatch: pytest.
 
 
 def context_of(frame: Frame, options: ReceiverOptions) -> FrameContext:
-    corners = find_corners(frame, options)
-    assert isinstance(corners, np.ndarray)
-    context = find_camera(frame, corners, options, Timer())
+    outline = find_outline(frame, options, Timer())
+    assert isinstance(outline, Outline)
+    context = find_camera(frame, outline.corners, options, Timer())
     assert isinstance(context, FrameContext)
     return context
 

@@ -21,6 +21,7 @@ from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.receiver.channel.known_picture import KnownPicture, exposed
 from rxcli.receiver.decode.detect import detect
+from rxcli.receiver.outline import Outline
 from rxcli.receiver.pipeline import receive
 from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime
 from rxcli.results.truth import Score, Scorer, Truth
@@ -486,7 +487,7 @@ def test_the_screen_may_come_nearer(clip: Clip, monkeypatch: pytest.MonkeyPatch)
     numbers = itertools.count(2)
     monkeypatch.setattr("rxcli.receiver.clip.scene._LOOK_EVERY", 3)
     monkeypatch.setattr("rxcli.receiver.screen.find.track_screen", nearer)
-    monkeypatch.setattr("rxcli.receiver.clip.receiver.find_corners", lambda *_: start)
+    monkeypatch.setattr("rxcli.receiver.clip.receiver.find_outline", lambda *_: Outline(start))
     monkeypatch.setattr("rxcli.receiver.clip.scene.sampling.strips_per_column", lambda _px: next(numbers))
     got = list(receive(clip.frames[:8], replace(clip.options, corners=None)))
     assert [result.frame for result in got] == list(range(8))

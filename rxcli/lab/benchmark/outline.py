@@ -81,10 +81,10 @@ def scene_of(seed: int) -> Scene:
         output="raw" if base.sensor.pattern is not None and rng.random() < 0.25 else "developed",
     )
     angles = (rng.uniform(-5, 5), rng.uniform(-10, 10), rng.uniform(-10, 10))
-    return _placed(scene, rng.uniform(0.4, 0.98), angles, rng.uniform(-0.97, 0.97, 2))
+    return placed(scene, rng.uniform(0.4, 0.98), angles, rng.uniform(-0.97, 0.97, 2))
 
 
-def _placed(scene: Scene, share: float, angles: tuple[float, float, float], place: FloatArray) -> Scene:
+def placed(scene: Scene, share: float, angles: tuple[float, float, float], place: FloatArray) -> Scene:
     """The scene with a screen of a share of the picture, at `place` (-1..1) of the room that is left."""
     sensor = scene.sensor
     size = np.array([sensor.width, sensor.height])

@@ -26,7 +26,7 @@ from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
 from rxcli.receiver.context import Failure, Timer
-from rxcli.receiver.corners import find_corners
+from rxcli.receiver.outline import find_outline
 from rxcli.receiver.still import decode, doubtful_columns
 from rxcli.types import Clock, FloatArray
 
@@ -104,8 +104,8 @@ def _read(path: Path) -> list[Sample] | None:
 def acquired(trial: Trial, *, quick: bool = True) -> Acquisition | None:
     """Screen and clock of a trial's first frame; None where they are not found. For `quick` see `sample_columns`."""
     options, timer = trial.options(), Timer()
-    corners = find_corners(trial.frame, options)
-    context = corners if isinstance(corners, Failure) else find_camera(trial.frame, corners, options, timer)
+    outline = find_outline(trial.frame, options, timer)
+    context = outline if isinstance(outline, Failure) else find_camera(trial.frame, outline.corners, options, timer)
     if isinstance(context, Failure):
         return None
     found = acquire(context, sample_columns(context, context.n_columns, quick=quick))

@@ -20,8 +20,8 @@ from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.start import Start, acquisition_at, agree, shows_little
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.context import Failure, FrameContext, Timer
-from rxcli.receiver.corners import find_corners
 from rxcli.receiver.decode import assemble, detect
+from rxcli.receiver.outline import Outline, find_outline
 from rxcli.receiver.still import Reception, apply_autoencoder, decode, doubtful_columns, initial_pass
 from rxcli.receiver.sync import tracking
 from rxcli.results.dump import dump_stages
@@ -96,7 +96,7 @@ class _Clip:
         self._taken_with: tuple[object, ...] = ()
         self._corners: FloatArray | None = None
         #: Number of a frame that is yet to be received, and its corners.
-        self._found: tuple[int, FloatArray] | None = None
+        self._found: tuple[int, Outline] | None = None
         #: None where nothing is known, or frames cannot be tracked; and the one before the last search.
         self._scene: TrackedScreen | None = None
         self._scene_before: TrackedScreen | None = None
@@ -125,11 +125,11 @@ class _Clip:
 
     def _shows_little(self, frame: Frame) -> bool:
         """Whether a frame shows so little that it should find its clock with others."""
-        corners = find_corners(frame, self._options)
-        if isinstance(corners, Failure):
+        outline = find_outline(frame, self._options, Timer())
+        if isinstance(outline, Failure):
             return False
-        self._found = frame.index, corners
-        return shows_little(frame, corners, self._options)
+        self._found = frame.index, outline
+        return shows_little(frame, outline.corners, self._options)
 
     def _begin(self) -> list[FrameResult]:
         """The first frames, once they have agreed on a clock."""
@@ -239,11 +239,11 @@ class _Clip:
 
     def _context_of(self, frame: Frame, timer: Timer) -> FrameContext | Failure:
         """Where the screen is in a frame, and the camera, known from the frames before where nothing changed."""
-        with timer("geometry"):
-            found, self._found = self._found, None
-            corners = found[1] if found and found[0] == frame.index else find_corners(frame, self._options)
-        if isinstance(corners, Failure):
-            return corners
+        found, self._found = self._found, None
+        outline = found[1] if found and found[0] == frame.index else find_outline(frame, self._options, timer)
+        if isinstance(outline, Failure):
+            return outline
+        corners = outline.corners
         if self._scene_before is not None and self._scene_before.near(corners):
             corners = self._scene_before.corners
         self._corners = corners

@@ -18,7 +18,7 @@ from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sample_columns
 from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
-from rxcli.receiver.corners import find_corners
+from rxcli.receiver.outline import find_outline
 from rxcli.receiver.sync.tracking import LinkTime
 from rxcli.types import Clock, FloatArray, Frame, RowProfiles
 
@@ -50,10 +50,10 @@ def shows_little(frame: Frame, corners: FloatArray, options: ReceiverOptions) ->
 
 def agree(frames: Sequence[Frame], options: ReceiverOptions) -> Start | None:
     """The clock that the headers of several frames agree on, None where they do not."""
-    corners = find_corners(frames[0], options)
-    if isinstance(corners, Failure):
+    outline = find_outline(frames[0], options, Timer())
+    if isinstance(outline, Failure):
         return None
-    context = find_camera(frames[0], corners, options, Timer())
+    context = find_camera(frames[0], outline.corners, options, Timer())
     if isinstance(context, Failure):
         return None
     best: tuple[float, Start] | None = None

@@ -294,7 +294,8 @@ def _echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> Bool
 
 def without_header(posteriors: BurstPosteriors) -> BoolArray:
     """(C,) columns whose header does not show; all where the columns together show none: no light, no packet."""
-    by_column = posteriors.header_llr.sum(axis=0)
+    # A glare may spoil one header altogether: a good one elsewhere outweighs it.
+    by_column = np.maximum(posteriors.header_llr, -_GOOD_HEADER).sum(axis=0)
     together = np.maximum(by_column, -_GOOD_HEADER).sum() > _HEADERS_AT_LEAST
     return np.asarray(by_column < (_CONTRADICTED if together else np.inf))
 
@@ -432,6 +433,28 @@ def _log_odds(log_prob: FloatArray) -> FloatArray:
 
 def _probability(log_odds: FloatArray | float) -> FloatArray:
     return np.asarray(1 / (1 + np.exp(-log_odds)))
+
+
+def with_doubt(columns: tuple[ColumnResult, ...], certainty: float, min_confidence: float) -> tuple[ColumnResult, ...]:
+    """Columns whose packets are right with their numbers, which are right with some certainty.
+
+    Args:
+        columns: results as if their numbers were beyond doubt.
+        certainty: probability that they are right.
+        min_confidence: packets below it are left out.
+    """
+    if certainty >= 1:
+        return columns
+    return tuple(_doubted(column, certainty, min_confidence) for column in columns)
+
+
+def _doubted(column: ColumnResult, certainty: float, min_confidence: float) -> ColumnResult:
+    packets = tuple(replace(packet, confidence=certainty * packet.confidence) for packet in column.packets)
+    kept = tuple(packet for packet in packets if packet.confidence >= min_confidence)
+    status = column.status
+    if status in ("ok", "weak"):
+        status = _column_status(kept, column.snr_db)
+    return replace(column, packets=kept, status=status)
 
 
 def _header_row(copy: int, column: int, clock: Clock) -> float:

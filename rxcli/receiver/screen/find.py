@@ -64,6 +64,8 @@ class ScreenSearch:
     reason: str = ""
     #: Sides (top, right, bottom, left of the stored picture) that were inferred from the others.
     inferred: tuple[str, ...] = ()
+    #: Lines where stripes begin, in that order, whether or not they bound a screen; none where there are no stripes.
+    lines: tuple[Side, ...] = ()
 
 
 def find_screen(
@@ -140,11 +142,24 @@ def _unusable(pixels: Pixels, black: float, white: float) -> str:
 def _search(
     picture: Picture, plane: Plane, stripes: Stripes, initial: list[Side], reach: Reach, aspect: float
 ) -> ScreenSearch:
-    """Fit the four sides near a guess, infer those that do not show, refine them, and judge the result."""
+    """Fit the four sides near a guess; where they bound a screen, infer those that do not show, and refine all."""
     if not 0.02 * plane.width < reach.size < 4 * plane.width:
         return ScreenSearch(None, 0.0, _NO_SHAPE)
     sides = [fit_side(picture, plane, stripes, initial, side, reach) for side in range(4)]
     sides = [side if side.support >= _MIN_SUPPORT else replace(side, support=0.0) for side in sides]
+    return replace(_outlined(picture, plane, stripes, initial, reach, aspect, sides), lines=tuple(sides))
+
+
+def _outlined(
+    picture: Picture,
+    plane: Plane,
+    stripes: Stripes,
+    initial: list[Side],
+    reach: Reach,
+    aspect: float,
+    sides: list[Side],
+) -> ScreenSearch:
+    """The screen that sides bound."""
     rectangle = Rectangle(plane.width, plane.height, aspect)
     expected = corners_of(initial, plane.width, plane.height)
     missing = [number for number, side in enumerate(sides) if not side.support]

@@ -1,0 +1,194 @@
+"""Where the screen is: its sides, the grid of its columns, and packets where these leave it open. Part of the wiring.
+
+Two searches look at a picture. The sides are found where stripes begin and end; the grid by how alike neighbouring
+strips are, which needs no side. Where all sides agree with the grid, the sides are it. Otherwise every outline that may
+be is a candidate, and the one under which most packets show is it. What is left of doubt goes with it: a packet is
+right in the right column only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rxcli.options import ReceiverOptions
+from rxcli.receiver.acquisition import acquire, sample_columns
+from rxcli.receiver.cameras import known_lens
+from rxcli.receiver.context import Failure, FrameContext, Timer
+from rxcli.receiver.corners import levels_of, unreadable_orientation, whole_picture
+from rxcli.receiver.screen import geometry
+from rxcli.receiver.still import column_llr, initial_pass
+from rxcli.receiver.unknown_camera import likely_camera
+from rxcli.types import FloatArray, Frame
+
+if TYPE_CHECKING:
+    from rxcli.receiver.screen.find import ScreenSearch
+    from rxcli.receiver.screen.numbering import Numbering
+
+SIDE_NAMES = ("top", "right", "bottom", "left")
+#: Sides agree with a grid where columns differ less than this on average and anywhere, columns.
+_AGREE, _AGREE_ANYWHERE = 0.12, 0.45
+#: Log-odds of an outline by sides that contradict the grid; what sides that agree with a numbering add to it; what
+#: sides add that were found for one side less.
+_CONTRADICTED, _CONFIRMED, _INFERRED = -3.0, 4.0, 1.0
+#: What a grid's waveforms explain less counts so much: strips err together.
+_EXPLAINED_COUNTS = 0.05
+#: Log-odds by which an outline must lead so that packets are not asked.
+_CLEAR = 6.0
+#: What packets say counts so much: the light model is surer than it should be. At most so many outlines are received.
+_PACKETS_COUNT, _MOST_LOOKS = 0.08, 6
+#: Columns that look less like packets than this have no light, nats.
+_NO_LIGHT = 25.0
+#: Rows of the light that sides may leave out, screen heights.
+_ROWS_LEFT_OUT = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """Where the screen is."""
+
+    #: (4, 2) pixels of the stored picture, the viewer's top left first.
+    corners: FloatArray
+    #: Probability that its columns are numbered as the screen's.
+    certainty: float = 1.0
+    #: Sides of the stored picture that were inferred, not seen.
+    inferred: tuple[str, ...] = ()
+    #: Column of the screen that is the first; None where columns are counted from the left of what is seen.
+    column_offset: int | None = 0
+    log_odds: float = 0.0
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What a result says of it, by the names of its fields."""
+        return {
+            "corners": self.corners,
+            "column_certainty": self.certainty,
+            "inferred_sides": self.inferred,
+            "column_offset": self.column_offset,
+        }
+
+
+def find_outline(frame: Frame, options: ReceiverOptions, timer: Timer) -> Outline | Failure:
+    """The outline of the screen in a frame."""
+    refused = unreadable_orientation(frame)
+    if refused is not None:
+        return refused
+    if options.corners is not None:
+        with timer("geometry"):
+            return Outline(options.corners)
+    candidates, reason = possible_outlines(frame, options, timer)
+    if len(candidates) > 1:
+        candidates = _by_packets(frame, candidates, options, timer)
+    if candidates:
+        return candidates[0]
+    if "no_screen" in options.skip:
+        return Failure("no_screen", f"no screen found: {reason}; give its place with --corners")
+    return Outline(whole_picture(frame), inferred=SIDE_NAMES, column_offset=None)
+
+
+def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> tuple[list[Outline], str]:
+    """Outlines that the screen may have, likeliest first; why there are none."""
+    from rxcli.receiver.screen.columns import find_columns
+    from rxcli.receiver.screen.find import find_screen
+
+    levels = levels_of(frame)
+    with timer("geometry"):
+        sides = find_screen(frame.pixels, **levels)
+        screen = min(options.screens, key=lambda one: one.columns)
+        columns = find_columns(
+            frame.pixels,
+            n_columns=screen.columns,
+            sigma=screen.light_spread,
+            aspect=screen.aspect,
+            mosaic_period=int(levels.get("mosaic_period", 1)),
+            lens=known_lens(frame, options),
+            lines=sides.lines,
+        )
+        found = _joined(sides, columns.numberings, screen.columns)
+    orientation = frame.metadata.orientation
+    return [replace(one, corners=geometry.viewer_order(one.corners, orientation)) for one in found], sides.reason
+
+
+def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: int) -> list[Outline]:
+    """Outlines by the sides and by grids, likeliest first."""
+    by_sides = None if sides.corners is None else Outline(sides.corners, inferred=sides.inferred)
+    if not numberings:
+        return [by_sides] if by_sides else []
+    outlines = []
+    agreed = False
+    for numbering in numberings:
+        own = Outline(
+            numbering.corners, inferred=_unseen(numbering, n_columns), log_odds=_odds_of(numbering, numberings)
+        )
+        if by_sides and _agree(by_sides.corners, numbering, n_columns):
+            agreed = True
+            bonus = _INFERRED if by_sides.inferred else _CONFIRMED
+            taken = by_sides if _has_rows(by_sides.corners, numbering.corners) else own
+            own = replace(taken, log_odds=own.log_odds + bonus)
+        outlines.append(own)
+    if by_sides and not agreed:
+        outlines.append(replace(by_sides, log_odds=_CONTRADICTED))
+    outlines.sort(key=lambda one: -one.log_odds)
+    clear = len(outlines) == 1 or outlines[1].log_odds < outlines[0].log_odds - _CLEAR
+    return outlines[:1] if clear else outlines
+
+
+def _odds_of(numbering: Numbering, numberings: tuple[Numbering, ...]) -> float:
+    """Log-odds of a numbering, grids that explain less counting less."""
+    best = max(one.grid.explained for one in numberings)
+    return numbering.log_odds - _EXPLAINED_COUNTS * (best - numbering.grid.explained)
+
+
+def _unseen(numbering: Numbering, n_columns: int) -> tuple[str, ...]:
+    return SIDE_NAMES
+
+
+def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:
+    """Whether sides say the same of the columns as a grid."""
+    u, v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0.1, 0.9, 5), indexing="ij")
+    points = geometry.screen_to_picture(np.stack([u, v], axis=-1), corners, numbering.grid.lens)
+    apart = np.abs(numbering.grid.columns_at(points) - n_columns * u)
+    return bool(apart.mean() < _AGREE and apart.max() < _AGREE_ANYWHERE)
+
+
+def _has_rows(corners: FloatArray, light: FloatArray) -> bool:
+    """Whether sides leave out next to none of the rows that have light."""
+    return True
+
+
+def _by_packets(frame: Frame, candidates: list[Outline], options: ReceiverOptions, timer: Timer) -> list[Outline]:
+    """Candidates by what they were worth before and by how much their columns look like packets."""
+    context = _context_of_any(frame, candidates, options, timer)
+    if context is None:
+        return candidates
+    looks = [(one, _packets(replace(context, corners=one.corners))) for one in candidates[:_MOST_LOOKS]]
+    judged = [replace(one, log_odds=one.log_odds + _PACKETS_COUNT * packets) for one, packets in looks]
+    judged.sort(key=lambda one: -one.log_odds)
+    odds = np.array([one.log_odds for one in judged])
+    share = np.exp(odds - odds.max())
+    return [replace(one, certainty=float(p)) for one, p in zip(judged, share / share.sum(), strict=True)]
+
+
+def _context_of_any(
+    frame: Frame, candidates: list[Outline], options: ReceiverOptions, timer: Timer
+) -> FrameContext | None:
+    """The camera by the first candidate that shows one: it hardly depends on which columns are whose."""
+    for candidate in candidates:
+        context = likely_camera(frame, candidate.corners, options, timer)
+        if not isinstance(context, Failure):
+            return context
+    return None
+
+
+def _packets(context: FrameContext) -> float:
+    """How much the columns of an outline look like packets, nats."""
+    acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
+    if isinstance(acquisition, Failure):
+        return 0.0
+    with context.timer("detect"):
+        reception = initial_pass(acquisition)
+        # Columns without light say next to nothing, but not the same of every outline.
+        by_column = column_llr(reception) + np.maximum(reception.posteriors.header_llr.sum(axis=0), 0)
+    return float(np.maximum(by_column - _NO_LIGHT, 0).sum())

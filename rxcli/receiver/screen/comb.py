@@ -1,0 +1,174 @@
+"""The comb of column borders: strips that are some way apart are least alike where a border lies between them.
+
+With the columns' light spread a Gaussian of `sigma` column pitches, two strips at the places `u` and `u + d` (in
+columns) are as alike as the vectors `exp(-(u - k)^2 / 2 sigma^2)` over the columns k, see `Likeness`. Along the screen
+this goes up and down once a column, most at a distance of about 0.7. `find_combs` looks for that period by a Fourier
+sum over all pairs of about that distance: no edge of the screen, no picture and no decoding is needed for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.receiver.screen.coherence import Coherence
+from rxcli.types import Float32Array, FloatArray
+
+#: Distance of the pairs that show the comb best, columns.
+_APART = 0.72
+#: Columns a picture's width that are tried, and their step.
+_PITCHES = np.arange(9.0, 46.0, 0.25)
+#: Turns of the borders, change of pitch across and along the picture: as shares of the pitch.
+_TURNS = np.linspace(-0.12, 0.12, 17)
+_ACROSS = np.linspace(-0.2, 0.2, 7)
+_ALONG = np.linspace(-0.3, 0.3, 9)
+#: Combs that differ less than this in pitch and as much elsewhere are one.
+_SAME_PITCH, _SAME_SHAPE = 0.7, 0.8
+#: Pairs of one distance overlap, so that their noise is alike by this much more than were they independent.
+_OVERLAP = 1.5
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How alike two places of the screen are, by their middle and their distance, both in columns."""
+
+    #: (phases, distances): cosine, and its slopes with the middle and with the distance.
+    cosine: Float32Array
+    by_middle: Float32Array
+    by_distance: Float32Array
+    #: (distances,) mean and first harmonic over the phase, which is 0 at a border.
+    mean: Float32Array
+    harmonic: Float32Array
+    furthest: float
+
+    def place(self, middle: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
+        """Place in the flat tables of pairs."""
+        phases, distances = self.cosine.shape
+        phase = np.mod(middle * phases + 0.5, phases).astype(np.int64)
+        return np.asarray(phase * distances + np.minimum(self.step(distance), distances - 1), np.int64)
+
+    def step(self, distance: FloatArray) -> NDArray[np.int64]:
+        """Place in the tables over distances."""
+        return (np.abs(distance) * ((self.mean.size - 1) / self.furthest) + 0.5).astype(np.int64)
+
+
+@lru_cache(maxsize=4)
+def likeness(sigma: float, phases: int = 128, distances: int = 161, furthest: float = 1.6) -> Likeness:
+    """Tables for a light spread of `sigma` column pitches."""
+    middle, distance = np.arange(phases) / phases, np.linspace(0, furthest, distances)
+    centres = np.arange(-6, 8) + 0.5
+
+    def cosine(mid: NDArray[Any], apart: NDArray[Any]) -> FloatArray:
+        one, other = (
+            np.exp(-(((mid + sign * apart / 2)[..., None] - centres) ** 2) / (2 * sigma**2)) for sign in (-1, 1)
+        )
+        return np.asarray((one * other).sum(-1) / np.sqrt((one**2).sum(-1) * (other**2).sum(-1)))
+
+    mid, apart = np.meshgrid(middle, distance, indexing="ij")
+    table, eps = cosine(mid, apart), 1e-4
+    by_middle = (cosine(mid + eps, apart) - cosine(mid - eps, apart)) / (2 * eps)
+    by_distance = (cosine(mid, apart + eps) - cosine(mid, apart - eps)) / (2 * eps)
+    harmonic = 2 * (table * np.cos(2 * np.pi * middle)[:, None]).mean(axis=0)
+    return Likeness(
+        cosine=table.astype(np.float32),
+        by_middle=by_middle.astype(np.float32),
+        by_distance=by_distance.astype(np.float32),
+        mean=table.mean(axis=0).astype(np.float32),
+        harmonic=harmonic.astype(np.float32),
+        furthest=furthest,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Comb:
+    """A comb of column borders, at first sight: u = phase + pitch * (X + turn Y + across X^2 + along X Y).
+
+    X and Y are pixels from the picture's middle over its width.
+    """
+
+    #: Height over the standard deviation that it would have by chance.
+    score: float
+    #: Columns a picture's width.
+    pitch: float
+    turn: float
+    across: float
+    along: float
+    phase: float
+
+    def is_like(self, other: Comb) -> bool:
+        """Whether two combs differ so little that one fit finds both."""
+        shape = abs(self.turn - other.turn) + (abs(self.across - other.across) + abs(self.along - other.along)) / 4
+        return abs(self.pitch - other.pitch) < _SAME_PITCH and shape * self.pitch < _SAME_SHAPE
+
+
+def find_combs(coherence: Coherence, sigma: float, most: int = 4) -> list[Comb]:
+    """The combs that show best in the coherence of a picture, best first.
+
+    Args:
+        coherence: of its strips.
+        sigma: light spread of the screen, column pitches.
+        most: so many at most.
+    """
+    found: list[Comb] = []
+    strip = coherence.strip_px / coherence.width
+    apart = np.clip(np.round(_APART / (_PITCHES * strip)), 1, coherence.widest).astype(np.int64)
+    for distance in np.unique(apart):
+        pitches = _PITCHES[apart == distance]
+        found += _combs_at(coherence, sigma, int(distance), pitches)
+    chosen: list[Comb] = []
+    for comb in sorted(found, key=lambda one: -one.score):
+        if not any(comb.is_like(other) for other in chosen):
+            chosen.append(comb)
+        if len(chosen) == most:
+            break
+    return chosen
+
+
+def _combs_at(coherence: Coherence, sigma: float, distance: int, pitches: FloatArray) -> list[Comb]:
+    """The best comb of each pitch, by pairs of one distance."""
+    tables = likeness(sigma)
+    strip = coherence.strip_px / coherence.width
+    n = coherence.x.size - distance
+    middle = (coherence.x[:n] - (coherence.width - 1) / 2) / coherence.width + distance * strip / 2
+    y = (coherence.y - (coherence.height - 1) / 2) / coherence.width
+    both = coherence.lit[:, :n] * coherence.lit[:, distance:]
+    share, pairs = np.sqrt(both), coherence.pairs[:, :n, distance]
+    step = tables.step(pitches * distance * strip)
+    step = np.minimum(step, tables.mean.size - 1)
+    # The comb is weighed by its own height, so that pitches of unlike distances can be compared.
+    mean, harmonic = tables.mean[step].mean(), tables.harmonic[step]
+    rest = share * pairs - mean * both
+    chance = np.sqrt(_OVERLAP * float(both.sum()) / (2 * coherence.n_rows)) + 1e-9
+    sums = _fourier(rest, middle, y, pitches) / chance * np.sign(harmonic[0])
+    height = np.abs(sums)
+    out = []
+    for number, pitch in enumerate(pitches.tolist()):
+        best = np.unravel_index(int(height[number].argmax()), height[number].shape)
+        across, along, turn = (float(v[i]) for v, i in zip((_ACROSS, _ALONG, _TURNS), best, strict=True))
+        phase = -float(np.angle(sums[number][best])) / (2 * np.pi)
+        out.append(Comb(float(height[number][best]), pitch, turn, across, along, phase))
+    return out
+
+
+def _fourier(rest: Float32Array, x: FloatArray, y: FloatArray, pitches: FloatArray) -> NDArray[np.complex64]:
+    """(pitches, across, along, turns) Fourier sums of (W, n) values: along the strips first, then over the windows."""
+    fine = 4
+    step = (_PITCHES[1] - _PITCHES[0]) / fine
+    reach = float(np.abs(_ALONG).max() * np.abs(y).max() * pitches.max())
+    first = pitches.min() - reach
+    frequencies = first + step * np.arange(int(np.ceil((pitches.max() + reach - first) / step)) + 1)
+    own = pitches[:, None, None] * (1 + _ALONG[:, None] * y)
+    nearest = np.round((own - first) / step).astype(np.int64)
+    wave = np.exp((2j * np.pi) * np.outer(x, frequencies)).astype(np.complex64)
+    turns = np.exp((2j * np.pi) * pitches[:, None, None] * np.multiply.outer(y, _TURNS)).astype(np.complex64)
+    out = np.empty((pitches.size, _ACROSS.size, _ALONG.size, _TURNS.size), np.complex64)
+    for number, across in enumerate(_ACROSS.tolist()):
+        bent = np.exp((2j * np.pi) * float(pitches.mean()) * across * x**2).astype(np.complex64)
+        along_strips = (rest * bent) @ wave
+        at_pitch = along_strips[np.arange(y.size), nearest]
+        out[:, number] = np.matmul(at_pitch, turns)
+    return out
