@@ -1,8 +1,8 @@
 """A camera in a hand: how it turns while it films, and while it reads the rows of a frame.
 
-A hand turns a camera rather than it moves it: slow sway, and tremor of 5 to 12 Hz. Turns about the vertical and about the
-horizontal shift the picture, a turn about the line of sight rolls it, and a step towards the screen enlarges it. The
-speed is told as people see it: how far the picture's centre goes from one frame to the next, in pixels, on average.
+A hand turns a camera rather than it moves it: slow sway, and tremor of 5 to 12 Hz. Turns about the vertical and about
+the horizontal shift the picture, a turn about the line of sight rolls it, and a step towards the screen enlarges it.
+The speed is told as people see it: how far the picture's centre goes from frame to frame, in pixels, on average.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class HandMotion:
         """Frequency, phase and amplitude of the waves, (4, 2 * waves) each: yaw, pitch, roll, zoom."""
         rng = np.random.default_rng([self.seed, 23])
         shape = (4, _WAVES)
-        frequency = np.concatenate([np.exp(rng.uniform(*np.log(band), shape)) for band in (_SWAY_HZ, _TREMOR_HZ)], 1)
+        frequency = np.concatenate([low * (high / low) ** rng.random(shape) for low, high in (_SWAY_HZ, _TREMOR_HZ)], 1)
         phase = rng.uniform(0, 2 * np.pi, frequency.shape)
         rate = (
             self.speed / _MEAN_LENGTH * np.array([1, 1, _ROLL_SHARE / self.half_width, _ZOOM_SHARE / self.half_width])
@@ -77,4 +77,4 @@ def turned_back(points: FloatArray, motion: FloatArray) -> FloatArray:
     x, z = cy * x - sy * z, cy * z + sy * x
     x, y = x / z, y / z
     x, y = cr * x + sr * y, cr * y - sr * x
-    return np.stack([x, y], axis=-1) / (1 + zoom)[..., None]
+    return np.asarray(np.stack([x, y], axis=-1) / (1 + zoom)[..., None])

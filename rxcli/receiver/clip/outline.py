@@ -1,8 +1,8 @@
 """Where the screen is in the first frame of a clip, by more frames than that one.
 
-The strips of a whole clip lie where its first frame has the screen, and a single dark frame may be wrong by twenty pixels
-there. The texture of the picture says how the screen moved from the first frame to the next ones; what the search finds
-in these is carried back, and the median of a few counts. Where the second agrees with the first, two are enough.
+The strips of a whole clip lie where its first frame has the screen, and a single dark frame may be wrong by twenty
+pixels there. The texture of the picture says how the screen moved from the first frame to the next ones; what the
+search finds in these is carried back, and the median of a few counts. Where the second agrees, two are enough.
 """
 
 from __future__ import annotations

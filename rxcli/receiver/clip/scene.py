@@ -25,8 +25,8 @@ _STRIPS = 4
 _MANY_VIEWS = 12
 #: Movement that is none: pixels, or standard deviations of what was found.
 _STILL_PX, _STILL_SDS = 0.3, 2.5
-#: How often a still outline is looked for where the picture does not tell, looks that make it still; how far it may then
-#: have moved in screen widths to be where it was, and how far from one frame to the next to be found.
+#: How often a still outline is looked for where the picture does not tell, looks that make it still; how far it may
+#: have moved, in screen widths, to be where it was, and how far from one frame to the next to be found.
 _LOOK_EVERY, _STILL_LOOKS, _STILL_OUTLINE, _OUTLINE_REACH = 8, 3, 0.004, 0.02
 #: A screen found anew whose corners are closer than this to where they were, in screen widths, is where it was.
 _NEAR = 0.06

@@ -1,10 +1,11 @@
 """Quick sampling of strips whose place is known from the frame before: what tracked frames of a clip need.
 
-Pixels are added up along the rows in small cells as they are stored, the cells over the width of a strip; these sums are
-read at the middle of every strip on every row, between cells, and only these few values are made linear. Cells are small
-against a strip because the screen before a camera in a hand lies elsewhere among them in every frame, and its picture
-must look the same. The order of adding and of undoing the tone curve does not matter to a light that is a product of
-picture and slots, as long as the curve is near a power law; and the picture is learned from the same samples. Ten times quicker than `rxcli.receiver.sampling.rows`, which is exact.
+Pixels are added up along the rows in small cells as they are stored, the cells over the width of a strip; these sums
+are read at the middle of every strip on every row, between cells, and only these few values are made linear. Cells are
+small against a strip because the screen before a camera in a hand lies elsewhere among them in every frame, and its
+picture must look the same. The order of adding and of undoing the tone curve does not matter to a light that is a
+product of picture and slots, as long as the curve is near a power law; and the picture is learned from the same
+samples. Ten times quicker than `rxcli.receiver.sampling.rows`, which is exact.
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ class ScreenTexture:
         """What the texture says of a place, and what an outline (4, 2) that was found in the frame says, together."""
         seen, at = self._undistorted(outline), self._undistorted(found.corners)
         information = np.linalg.inv(found.covariance)
-        covariance = np.linalg.inv(information + np.eye(8) / _OUTLINE_SD**2)
+        covariance = np.asarray(np.linalg.inv(information + np.eye(8) / _OUTLINE_SD**2), np.float64)
         plane = covariance @ (information @ at.ravel() + seen.ravel() / _OUTLINE_SD**2)
         return Registration(self._lens_of(plane.reshape(4, 2)), covariance, found.correlation)
 
@@ -394,4 +394,4 @@ def _information() -> FloatArray:
     modes = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [1, -1, 1, -1]]) / 4
     sds: Sequence[float] = (_SHIFT_SD, _AFFINE_SD, _AFFINE_SD, _PERSPECTIVE_SD)
     along = (modes.T / np.square(sds)) @ modes
-    return np.kron(along, np.eye(2))
+    return np.asarray(np.kron(along, np.eye(2)), np.float64)
