@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from rxcli.receiver.screen import geometry
 from rxcli.types import Float32Array, FloatArray, Frame, Lens
 
+#: Width of a screen over its height.
+_ASPECT = 16 / 9
 #: Cells across and down the screen that its texture is known by, about.
 _CELLS_ACROSS, _CELLS_DOWN = 360, 110
 #: Share of the screen's size beyond its sides that belongs to the texture: its sides tell where it is.
@@ -44,18 +46,20 @@ _TONE, _DARKEST = 2.2, 0.03
 _DARK_PERCENT = 8.0
 #: Cells of a coarse cell across and down, smoothing of the coarse texture in such cells, and iterations.
 _COARSE_CELLS, _COARSE_BLUR, _COARSE_ITERATIONS = (4, 2), 0.8, 4
-_FINE_ITERATIONS, _CONVERGED_PX = 4, 0.04
+_FINE_ITERATIONS, _CONVERGED = 3, 3e-5
 #: Beyond how many standard deviations a cell is an outlier: a hand, a reflection.
 _OUTLIER = 2.5
-#: How far a frame may be from where it is expected, pixels: shift, affine modes, perspective modes.
-_SHIFT_SD, _AFFINE_SD, _PERSPECTIVE_SD = 12.0, 4.0, 0.6
+#: How far a frame may be from where it is expected, screen sizes: shift, affine modes, perspective modes.
+#: A screen's size is its width, or what its height makes it on pixels that are no squares.
+_SHIFT_SD, _AFFINE_SD, _PERSPECTIVE_SD = 0.008, 0.0027, 0.0004
 #: Neighbouring cells err alike: the information of so many counts once.
 _ALIKE_CELLS = 4.0
 #: Parts of the screen, across and down, of which each may err in its own way; and how well an outline that is found in
-#: a frame is known, pixels.
-_PARTS, _OUTLINE_SD = (20, 6), 3.0
-#: Standard deviation of the corners and correlation of the textures that make it certain where a screen is.
-_MOST_SD_PX, _LEAST_CORRELATION = 3.0, 0.35
+#: a frame is known, screen sizes.
+_PARTS, _OUTLINE_SD = (20, 6), 0.002
+#: Standard deviation of the corners in screen sizes, and correlation of the textures, that make it certain where a
+#: screen is.
+_MOST_SD, _LEAST_CORRELATION = 0.002, 0.35
 #: Share of the last frame's motion that the next is expected to repeat.
 _PERSISTENCE = 0.7
 #: Weight of the frames before, at most, in frames, in what is known of the texture.
@@ -85,7 +89,7 @@ class Registration:
     @property
     def tells(self) -> bool:
         """Whether there is texture enough to tell where the screen is, if it is what it was."""
-        return self.sd_px < _MOST_SD_PX
+        return self.sd_px < _MOST_SD * _size(self.corners)
 
     @property
     def certain(self) -> bool:
@@ -155,8 +159,9 @@ class ScreenTexture:
         """What the texture says of a place, and what an outline (4, 2) that was found in the frame says, together."""
         seen, at = self._undistorted(outline), self._undistorted(found.corners)
         information = np.linalg.inv(found.covariance)
-        covariance = np.asarray(np.linalg.inv(information + np.eye(8) / _OUTLINE_SD**2), np.float64)
-        plane = covariance @ (information @ at.ravel() + seen.ravel() / _OUTLINE_SD**2)
+        known = 1 / (_OUTLINE_SD * _size(outline)) ** 2
+        covariance = np.asarray(np.linalg.inv(information + known * np.eye(8)), np.float64)
+        plane = covariance @ (information @ at.ravel() + known * seen.ravel())
         return Registration(self._lens_of(plane.reshape(4, 2)), covariance, found.correlation)
 
     def seek(self, corners: FloatArray) -> None:
@@ -201,7 +206,8 @@ class ScreenTexture:
         """
         plane, expected = poses
         corner_u, corner_v = _corner_weights(known.u), _corner_weights(known.v)
-        prior = _information()
+        size = _size(plane)
+        prior = _information(size)
         for _ in range(iterations):
             value, weight = self._read(texture, plane, known.u, known.v)
             weight *= known.trust
@@ -218,7 +224,7 @@ class ScreenTexture:
             total = normal / scale + prior
             step = np.linalg.solve(total, scores.sum(axis=0) / scale + prior @ (expected - plane).ravel())
             plane = plane + step.reshape(4, 2)
-            if np.abs(step).max() < _CONVERGED_PX:
+            if np.abs(step).max() < _CONVERGED * size:
                 break
         power = float(np.vdot(weight * known.value, known.value)) * float(np.vdot(weight * value, value))
         correlation = float(np.vdot(weight * known.value, value)) / max(power, 1e-18) ** 0.5
@@ -388,10 +394,15 @@ def _sandwich(normal: FloatArray, scores: FloatArray, variance: float, prior: Fl
     return np.asarray(np.linalg.inv(np.linalg.inv(covariance) + prior))
 
 
-def _information() -> FloatArray:
+def _size(corners: FloatArray) -> float:
+    """Size of a screen (4, 2), pixels: its width, or what a screen as high is wide where that is more."""
+    return float(max(np.ptp(corners[:, 0]), np.ptp(corners[:, 1]) * _ASPECT))
+
+
+def _information(size: float) -> FloatArray:
     """(8, 8) information on how far the corners may be from where they are expected."""
     # Modes of four corners along one axis: all alike, right against left, bottom against top, and crosswise.
     modes = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [1, -1, 1, -1]]) / 4
     sds: Sequence[float] = (_SHIFT_SD, _AFFINE_SD, _AFFINE_SD, _PERSPECTIVE_SD)
-    along = (modes.T / np.square(sds)) @ modes
+    along = (modes.T / np.square(np.array(sds) * size)) @ modes
     return np.asarray(np.kron(along, np.eye(2)), np.float64)
