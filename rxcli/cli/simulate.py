@@ -26,7 +26,7 @@ _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-p
 #: Options that are fields of the scene by the same name.
 _SCENE_OPTIONS = (
     *("n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm"),
-    *("blur_px", "lcd_grid", "shake_px", "iso", "make", "model", "camera_name"),
+    *("blur_px", "lcd_grid", "shake_px", "hand_px", "iso", "make", "model", "camera_name"),
 )
 
 
@@ -87,6 +87,10 @@ _SCENE_OPTIONS = (
 @click.option("--frame-rate", "frame_rate_hz", type=float, help="Frames per second of a clip.")
 @click.option("--bit-rate", type=click.IntRange(1), help="Bits per second of a clip.  [default: constant quality]")
 @click.option("--shake", "shake_px", type=float, help="Hand shake, pixels.")
+@click.option(
+    "--hand", "hand_px", type=click.FloatRange(0), help="Hold the camera in a hand: pixels from frame to frame."
+)
+@click.option("--stabilised", is_flag=True, help="With --hand: frames are turned back and cropped, as phones do.")
 @click.option("--clock-error", "slot_rate_error_ppm", type=float, help="Error of the slot rate, ppm.")
 @click.option(
     "--column-delays", help="Delays of the columns in slots: one number each, or one for the largest random delay."
@@ -173,6 +177,7 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
 
     scene = preset(options["preset"], options["screen"])
     scene = replace(scene, picture=options["picture"], dimming=options["dimming"], **_given(options, _SCENE_OPTIONS))
+    scene = replace(scene, stabilised=options["stabilised"])
     scene = replace(scene, w=_weights(options["weights"]), payload=_payload(options["payload"]))
     scene = _with_light(_with_pose(scene, options), options)
     isp = _given(options, ("tone", "quality", "subsampling", "sharpen", "denoise_px"))
@@ -322,7 +327,6 @@ def _write_extras(take: Take, options: dict[str, Any]) -> None:
 
 def _write_still(take: Take, out: Path, file_format: str) -> None:
     from rxcli.lab.simulate.files import write_png
-    from rxcli.lab.simulate.isp import develop
     from rxcli.lab.simulate.tiff import write_dng, write_tiff
 
     capture = take.frame(0)
@@ -332,20 +336,19 @@ def _write_still(take: Take, out: Path, file_format: str) -> None:
         write_dng(capture.raw, take.scene, out, 14 if file_format == "dng14" else 16)
     else:
         bits = 16 if file_format.endswith("16") else 8
-        rgb = develop(capture.raw, take.scene.sensor, take.scene.isp, capture.exposure.view, bits)
+        rgb = capture.developed(bits)
         write_png(rgb, out) if file_format.startswith("png") else write_tiff(rgb, take.scene, out)
 
 
 def _write_clip(take: Take, out: Path, codec: str, bit_rate: int | None) -> None:
     from tqdm import tqdm
 
-    from rxcli.lab.simulate.isp import develop
     from rxcli.lab.simulate.video import CODECS, write_video
 
     scene, bits = take.scene, 16 if CODECS[codec].bits > 8 else 8
     numbers = tqdm(range(scene.n_frames), desc=out.name, unit="frame", leave=False, disable=None)
     captures = (take.frame(number) for number in numbers)
-    frames = (develop(c.raw, scene.sensor, scene.isp, c.exposure.view, bits) for c in captures)
+    frames = (capture.developed(bits) for capture in captures)
     write_video(frames, out, codec, scene.frame_rate_hz, bit_rate)
 
 

@@ -15,7 +15,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.simulate.optics import View
+from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
+from rxcli.lab.simulate.optics import View, project
 from rxcli.lab.simulate.sensor import Sensor, count_electrons, pick_colours, repeat_gains, to_raw
 from rxcli.lab.simulate.shutter import flicker, lit_share
 from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
@@ -28,6 +29,8 @@ _GRID_ROWS = 32
 _BAND_ROWS = 256
 #: Texture pixels of black around the panel, so that blur can run out of it.
 _TEXTURE_MARGIN = 12
+#: Rounds after which a place of the screen is on the row that is read when it is there.
+_MOTION_ROUNDS = 4
 #: Breadth of the dark frame around the panel, in screen widths.
 _BEZEL_WIDTHS = 0.035
 
@@ -74,14 +77,43 @@ class Exposure:
     slot_rate_hz: float
     #: (columns,) delay of every column in slots.
     delays: FloatArray
-    #: Time of row 0 against the room's mains, seconds.
+    #: Time of row 0 from the start of the clip, seconds.
     start_s: float = 0.0
+    #: How the camera moves meanwhile; None for one on a tripod.
+    motion: HandMotion | None = None
 
     @cached_property
     def row_start_slots(self) -> FloatArray:
         """(height,) slot of the common clock at which every row starts to integrate."""
         rows = np.arange(self.sensor.height, dtype=np.float64)
         return np.asarray(self.start_slot + rows * (self.sensor.line_delay_s * self.slot_rate_hz))
+
+    def pixels_to_screen(self, pixels: FloatArray) -> FloatArray:
+        """Screen places (u, v) of sensor places (..., 2), each row at the middle of its own exposure."""
+        if self.motion is None:
+            return self.view.pixels_to_screen(pixels)
+        ideal = turned_back(self.view.pixels_to_ideal(pixels), self._motion_of_rows(pixels[..., 1]))
+        return project(np.asarray(np.linalg.inv(self.view.to_normalised)), ideal)
+
+    def screen_to_pixels(self, places: FloatArray) -> FloatArray:
+        """Sensor places (..., 2) of screen places (u, v); the inverse of `pixels_to_screen`."""
+        if self.motion is None:
+            return self.view.screen_to_pixels(places)
+        at_rest = project(self.view.to_normalised, places)
+        pixels = self.view.ideal_to_pixels(at_rest)
+        for _ in range(_MOTION_ROUNDS):
+            pixels = self.view.ideal_to_pixels(turned(at_rest, self._motion_of_rows(pixels[..., 1])))
+        return pixels
+
+    @cached_property
+    def corners(self) -> FloatArray:
+        """(4, 2) sensor places of the screen's corners, top-left first, clockwise for a viewer."""
+        return self.screen_to_pixels(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]))
+
+    def _motion_of_rows(self, rows: FloatArray) -> FloatArray:
+        """(..., 4) how far the camera has moved when the rows are in the middle of their exposure."""
+        assert self.motion is not None
+        return self.motion.at(self.start_s + rows * self.sensor.line_delay_s + self.exposure_s / 2)
 
     @property
     def exposure_slots(self) -> float:
@@ -181,7 +213,7 @@ def column_light(exposure: Exposure, x: FloatArray, y: FloatArray) -> Float32Arr
     """
     screen = exposure.link.screen
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
-    place = exposure.view.pixels_to_screen(pixels)
+    place = exposure.pixels_to_screen(pixels)
     gain = exposure.light_e_per_s * exposure.exposure_s * _vignette(exposure, pixels)
     along = light_spread(place[..., 1], screen.segment_rows, screen.light_spread) @ exposure.drive.lit_light
     along *= light_spread(place[..., 0], screen.columns, screen.light_spread)
@@ -242,7 +274,7 @@ def _texture_places(exposure: Exposure, top: int, bottom: int) -> tuple[FloatArr
 
     pitch = 16
     x, y = grid_nodes(exposure.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
-    place = exposure.view.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
+    place = exposure.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
     down, across = exposure.texture_scale
     panel_height, panel_width = exposure.drive.grey.shape[:2]
     scale = np.array([panel_width * across, panel_height * down])
@@ -299,7 +331,7 @@ def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:
 
     pitch, room, screen = 8, exposure.room, exposure.link.screen
     x, y = grid_nodes(exposure.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
-    place = exposure.view.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
+    place = exposure.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
     # Pixels outside the screen's edge, negative inside; edges are ramps two nodes wide, as the grid can carry them.
     beyond = ((np.abs(place - 0.5) - 0.5) * [1.0, 1 / screen.aspect]).max(axis=-1) * exposure.view.pixels_per_width
     bezel_px = _BEZEL_WIDTHS * exposure.view.pixels_per_width

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from rxcli.lab.simulate.bound import Oracle, OracleRecorder
 from rxcli.lab.simulate.camera import Exposure, take_picture
 from rxcli.lab.simulate.isp import develop
-from rxcli.lab.simulate.optics import Pose, View
+from rxcli.lab.simulate.motion import HandMotion, turned
+from rxcli.lab.simulate.optics import Pose, View, homography
 from rxcli.lab.simulate.pictures import load_picture, picture_names
-from rxcli.lab.simulate.scenes import Scene
+from rxcli.lab.simulate.scenes import Change, Scene
 from rxcli.lab.simulate.transmitter import Dimming, Drive, Link, Weights, drive_screen
 from rxcli.lab.simulate.truth import build_truth
 from rxcli.profiles import ScreenProfile
@@ -41,7 +42,12 @@ class Capture:
     @cached_property
     def rgb(self) -> NDArray[np.uint8]:
         """(height, width, 3) uint8 developed picture, red first, before any compression."""
-        return np.asarray(develop(self.raw, self.scene.sensor, self.scene.isp, self.exposure.view), np.uint8)
+        return np.asarray(self.developed(), np.uint8)
+
+    def developed(self, bits: int = 8) -> NDArray[Any]:
+        """(height, width, 3) developed picture of 8 or 16 `bits`, red first."""
+        picture = develop(self.raw, self.scene.sensor, self.scene.isp, self.exposure.view, bits)
+        return stabilised(picture, self.exposure) if self.scene.stabilised else picture
 
     @cached_property
     def jpeg(self) -> bytes:
@@ -92,6 +98,7 @@ class Take:
         sensor = scene.sensor
         pose = shaken(scene.pose, scene.shake_px, time_s, self.seed, (sensor.width, sensor.height))
         view = View(scene.screen, scene.lens, pose, sensor.width, sensor.height, sensor.pixel_aspect)
+        change = max((c for c in scene.changes if c.frame <= frame), key=lambda c: c.frame, default=Change(0))
         return Exposure(
             view=view,
             drive=self.drive,
@@ -99,15 +106,23 @@ class Take:
             sensor=sensor,
             room=scene.room,
             exposure_s=scene.exposure_s,
-            light_e_per_s=scene.light_e_per_s,
-            blur_px=scene.blur_px,
+            light_e_per_s=scene.light_e_per_s * change.light,
+            blur_px=scene.blur_px if change.blur_px is None else change.blur_px,
             lcd_grid=scene.lcd_grid,
             vignetting=scene.vignetting,
             start_slot=self.start_slot + time_s * self.slot_rate_hz,
             slot_rate_hz=self.slot_rate_hz,
             delays=self.delays,
             start_s=time_s,
+            motion=self._motion(view),
         )
+
+    def _motion(self, view: View) -> HandMotion | None:
+        if not self.scene.hand_px:
+            return None
+        focal = view.camera_matrix[0, 0]
+        speed = self.scene.hand_px * self.scene.frame_rate_hz / focal
+        return HandMotion(self.seed, speed, view.width / 2 / focal)
 
     def frame(self, frame: int = 0, *, oracle: bool = False, threads: int = 2) -> Capture:
         """Take frame number `frame`."""
@@ -139,6 +154,29 @@ def shaken(pose: Pose, amplitude_px: float, time_s: float, seed: int, size: tupl
         shift_y=pose.shift_y + dy / size[1],
         roll_deg=pose.roll_deg + np.rad2deg(turn / size[0]),
     )
+
+
+#: Enlargement after which a stabilised frame shows no border.
+_STABILISED_ZOOM = 1.06
+
+
+def stabilised(picture: NDArray[Any], exposure: Exposure) -> NDArray[Any]:
+    """A developed picture turned back by what the camera had moved in the middle of it, enlarged and cropped.
+
+    Its rows are no instants any more: a phone that does so by default has to be told to leave it.
+    """
+    import cv2
+
+    if exposure.motion is None:
+        return picture
+    sensor, matrix = exposure.sensor, exposure.view.camera_matrix
+    middle_s = exposure.start_s + sensor.height / 2 * sensor.line_delay_s
+    square = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]) * 0.2
+    seen = turned(square, exposure.motion.at(np.full(4, middle_s)))
+    to_pixels = matrix[[0, 1], [0, 1]]
+    target = square * _STABILISED_ZOOM
+    map_back = homography(seen * to_pixels + matrix[:2, 2], target * to_pixels + matrix[:2, 2])
+    return np.asarray(cv2.warpPerspective(picture, map_back, (sensor.width, sensor.height), flags=cv2.INTER_CUBIC))
 
 
 def prepare(scene: Scene, rng: np.random.Generator | int) -> Take:

@@ -23,6 +23,17 @@ Output = Literal["raw", "developed"]
 
 
 @dataclass(frozen=True)
+class Change:
+    """What a camera does to a clip from some frame on."""
+
+    frame: int
+    #: Exposure or gain set anew: factor of the light.
+    light: float = 1.0
+    #: Focus set anew: standard deviation of the blur, pixels; None for the scene's.
+    blur_px: float | None = None
+
+
+@dataclass(frozen=True)
 class Scene:
     """Screen, payload, camera and light of a capture; what a field leaves open is drawn from the caller's generator."""
 
@@ -56,6 +67,12 @@ class Scene:
     frame_rate_hz: float = 60.0
     #: Amplitude of the hand's shake, pixels.
     shake_px: float = 0.0
+    #: How far a hand moves the picture from frame to frame, pixels on average; rows skew meanwhile.
+    hand_px: float = 0.0
+    #: Whether the camera turns and crops its frames so that the hand's motion does not show.
+    stabilised: bool = False
+    #: In ascending order of frames; each rules until the next.
+    changes: tuple[Change, ...] = ()
     #: EXIF orientation written to files.
     orientation: int = 1
     camera_name: str = "camera"
@@ -108,6 +125,7 @@ class Scene:
             pose=replace(self.pose, corners=corners),
             blur_px=self.blur_px * sqrt(x * y),
             shake_px=self.shake_px * sqrt(x * y),
+            hand_px=self.hand_px * sqrt(x * y),
         )
 
 

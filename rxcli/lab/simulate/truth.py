@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def visible_bursts(exposure: Exposure) -> list[dict[str, Any]]:
     """Bursts on the rows between the screen's highest and lowest corner, with the slots seen of each."""
-    heights = exposure.view.corners[:, 1]
+    heights = exposure.corners[:, 1]
     top, bottom = max(int(np.floor(heights.min())), 0), min(int(np.ceil(heights.max())), exposure.sensor.height - 1)
     if top >= bottom:
         return []
@@ -54,7 +54,7 @@ def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[s
         "camera": _camera_truth(scene, first),
         "w": first.link.weights.tolist(),
         "payload_bits": list(first.link.bits_per_column),
-        "corners_sensor_px": first.view.corners.tolist(),
+        "corners_sensor_px": first.corners.tolist(),
         "frames": frames,
         "payload": {str(burst): first.link.payload_hex(burst) for burst in bursts},
         "orientation": scene.orientation,
@@ -114,7 +114,7 @@ def _frame_truth(number: int, exposure: Exposure) -> dict[str, Any]:
     return {
         "frame": number,
         "bursts": visible_bursts(exposure),
-        "corners_sensor_px": exposure.view.corners.tolist(),
+        "corners_sensor_px": exposure.corners.tolist(),
         "start_slot": exposure.start_slot,
     }
 

@@ -16,6 +16,7 @@ from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
 from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.clip import results
 from rxcli.receiver.clip.bursts import BurstReader
+from rxcli.receiver.clip.outline import FirstOutline
 from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.start import Start, acquisition_at, agree, shows_little
 from rxcli.receiver.clip.views import View, Waiting
@@ -34,6 +35,8 @@ _HELD, _HELD_LONG, _MUCH_DOUBT = 6, 24, 0.03
 _TOO_MUCH_DOUBT = 0.25
 #: Share of columns that a quick look at a first frame may leave in doubt.
 _QUICK_DOUBT = 0.5
+#: Frames in a row that may be received like photographs before the picture is learned anew.
+_MOST_UNKNOWN = 3
 #: Frames that find their clock together where each shows little.
 _TOGETHER = 8
 #: Frames that may wait until it is clear which copies begin a burst.
@@ -89,6 +92,9 @@ class _Clip:
         self._link: _Link | None = None
         #: The first frames, until they have agreed on a clock; None when that is done, or not needed.
         self._first: list[Frame] | None = [] if "tracking" in options.skip else None
+        self._outline: FirstOutline | None = None
+        #: Whether a frame shows so little that it should find its clock with others.
+        self._little = False
         self._start: Start | None = None
         self._next_number = 0
         #: A frame with the camera and the screens that remain, and what they were found for.
@@ -100,6 +106,8 @@ class _Clip:
         #: None where nothing is known, or frames cannot be tracked; and the one before the last search.
         self._scene: TrackedScreen | None = None
         self._scene_before: TrackedScreen | None = None
+        #: Frames in a row that were received like photographs.
+        self._n_unknown = 0
         self._hold_first()
 
     def _hold_first(self) -> None:
@@ -117,24 +125,33 @@ class _Clip:
         """Receive the next frame; returns the results that are complete."""
         if self._first is None:
             return self._take(frame)
-        if self._first or self._shows_little(frame):
-            self._first.append(frame)
-            return self._begin() if len(self._first) == _TOGETHER else []
-        self._first = None
-        return self._take(frame)
+        if not self._first and not self._opens(frame):
+            self._first = None
+            return self._take(frame)
+        assert self._outline is not None
+        if self._first:
+            self._outline.take(frame)
+        self._first.append(frame)
+        enough = len(self._first) == _TOGETHER or not self._little
+        return self._begin() if self._outline.settled and enough else []
 
-    def _shows_little(self, frame: Frame) -> bool:
-        """Whether a frame shows so little that it should find its clock with others."""
+    def _opens(self, frame: Frame) -> bool:
+        """Whether a first frame shows a screen; its outline, and perhaps its clock, is then found with others."""
         outline = find_outline(frame, self._options, Timer())
         if isinstance(outline, Failure):
             return False
         self._found = frame.index, outline
-        return shows_little(frame, outline.corners, self._options)
+        self._outline = FirstOutline(frame, outline.corners, self._options)
+        self._little = shows_little(frame, outline.corners, self._options)
+        return True
 
     def _begin(self) -> list[FrameResult]:
-        """The first frames, once they have agreed on a clock."""
+        """The first frames, once they have agreed on an outline and, where each shows little, on a clock."""
         frames, self._first = self._first or [], None
-        self._start = agree(frames, self._options) if len(frames) > 1 else None
+        if self._outline is not None and self._found is not None:
+            index, outline = self._found
+            self._found = index, replace(outline, corners=self._outline.corners)
+        self._start = agree(frames, self._options) if self._little and len(frames) > 1 else None
         return [result for frame in frames for result in self._take(frame)]
 
     def _take(self, frame: Frame) -> list[FrameResult]:
@@ -148,9 +165,12 @@ class _Clip:
         view: View | Failure | None = self._known(frame, timer)
         if view is not None:
             waiting.skip("tracking", 1)
+            self._n_unknown = 0
         else:
             view, report = self._search(frame, timer)
             waiting.result = replace(waiting.result, denoiser=report)
+            if not isinstance(view, Failure):
+                self._go_on(view, frame)
         if isinstance(view, Failure):
             self._scene = None
             waiting.result = replace(waiting.result, status=view.status, message=view.message)
@@ -231,8 +251,10 @@ class _Clip:
         )
         if can_track:
             with timer("sampling"):
-                scene = TrackedScreen.of_frame(context, acquisition, reception.model.black_level, self._scene_before)
-                view.light, view.map = scene.strips(frame), scene.map
+                named = self._options.corners is not None
+                black_level = reception.model.black_level
+                scene = TrackedScreen.of_frame(context, acquisition, black_level, self._scene_before, named)
+                view.light, view.pose = scene.strips(frame), scene.pose
             scene.take(view, lambda: channel.lit_on_grid(reception.posteriors, reception.clock))
             self._scene = scene
         return view, report
@@ -244,7 +266,7 @@ class _Clip:
         if isinstance(outline, Failure):
             return outline
         corners = outline.corners
-        if self._scene_before is not None and self._scene_before.near(corners):
+        if self._scene_before is not None and self._scene_before.is_at(corners):
             corners = self._scene_before.corners
         self._corners = corners
         if self._context is None or self._taken_with != _taken_with(frame) or "tracking" not in self._options.skip:
@@ -253,6 +275,24 @@ class _Clip:
                 return context
             self._context, self._taken_with = context, _taken_with(frame)
         return replace(self._context, frame=frame, corners=corners, timer=timer)
+
+    def _go_on(self, view: View, frame: Frame) -> None:
+        """After a frame received like a photograph: with the scene before, as long as such frames are few.
+
+        A hand before the screen, or a frame too quick to be followed, is no reason to learn the picture anew.
+        """
+        before, begun = self._scene_before, self._scene
+        self._n_unknown += 1
+        if before is None or begun is None or self._link is None or self._n_unknown > _MOST_UNKNOWN:
+            return
+        screen, was = view.acquisition.screen, before.last and before.last.acquisition.screen
+        if (
+            screen is was
+            and before.near(begun.corners)
+            and self._link.time.agrees(frame.index, frame.time_s, view.bursts.clock)
+        ):
+            before.seek(begun.corners)
+            self._scene, view.light, view.pose = before, None, None
 
     def _decoded(
         self, acquisition: Acquisition, again: bool, timer: Timer
@@ -292,8 +332,9 @@ class _Clip:
         if scene is None or self._link is None or self._taken_with != _taken_with(frame):
             return None
         with timer("geometry"):
-            if scene.follow(frame, may_move=self._options.corners is None):
-                self._corners = scene.corners
+            if not scene.follow(frame):
+                return None
+            self._corners = scene.corners
         return scene.view(frame, self._link.time, self._n_held != _HELD_LONG, timer)
 
     # -- bursts ---------------------------------------------------------------------------------------------------

@@ -53,9 +53,9 @@ def columns_of(
 def taps(waiting: Waiting, view: View, ended: Sequence[assemble.BurstInClip]) -> dict[str, Any]:
     """What is written of a frame: as of a photograph, but strips as tracking samples them, and bursts that end here."""
     found: dict[str, Any] = {"geometry.corners": waiting.result.corners, "clock": view.bursts.clock}
-    if view.light is not None and view.map is not None:
-        rows = view.map.first_row + np.arange(view.light.shape[2])
-        found |= {"sampling.light": view.light, "sampling.inside": view.map.inside, "sampling.rows": rows}
+    if view.light is not None and view.pose is not None:
+        rows = view.pose.rows.astype(np.int64)
+        found |= {"sampling.light": view.light, "sampling.inside": view.pose.map.inside, "sampling.rows": rows}
     else:
         found["sampling"] = view.acquisition.profiles
     numbers: IntArray = np.array([burst.number for burst in ended], np.int64)

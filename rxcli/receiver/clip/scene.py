@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -12,25 +11,25 @@ from numpy.typing import NDArray
 from rxcli.receiver import channel, sampling, sync
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel import known_picture
-from rxcli.receiver.clip.views import View
+from rxcli.receiver.clip.views import Pose, View
 from rxcli.receiver.context import Camera, FrameContext, Timer
 from rxcli.receiver.sampling import tracked
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen.registration import ScreenTexture
 from rxcli.receiver.sync import tracking
-from rxcli.types import Clock, Float32Array, FloatArray, Frame, IntArray, RowProfiles
+from rxcli.types import Clock, Float32Array, FloatArray, Frame, IntArray, Lens, RowProfiles
 
 #: Strips of a column, at most: more tell no more of a picture that is known, and take time.
 _STRIPS = 4
 #: Frames beyond which each one's share of what is known of the picture does not matter.
 _MANY_VIEWS = 12
-#: How often the corners are looked at.
-_LOOK_EVERY = 30
-#: Looks whose median is where the corners are.
-_N_CORNERS = 5
+#: Movement that is none: pixels, or standard deviations of what was found.
+_STILL_PX, _STILL_SDS = 0.3, 2.5
+#: How often a still outline is looked for where the picture does not tell, looks that make it still; how far it may
+#: have moved, in screen widths, to be where it was, and how far from one frame to the next to be found.
+_LOOK_EVERY, _STILL_LOOKS, _STILL_OUTLINE, _OUTLINE_REACH = 8, 3, 0.004, 0.02
 #: A screen found anew whose corners are closer than this to where they were, in screen widths, is where it was.
 _NEAR = 0.06
-#: Movement of a corner that is followed at once, and the one below which nothing is changed, in screen widths.
-_JUMP, _STILL = 0.012, 0.0004
 #: Frames from which the picture is learned one by one, and how often from then on.
 _FIRST_UPDATES, _UPDATE_EVERY = 12, 6
 #: Frames of which the picture is known so little that strips are compared with what is expected of them.
@@ -51,23 +50,27 @@ _SNR_EVERY = 5
 
 
 class TrackedScreen:
-    """A screen that stays where it is, or moves little, and the picture on it.
+    """A screen that is followed from frame to frame, and the picture on it.
 
     Args:
-        corners: of the screen, (4, 2).
-        strip_map: how its strips are read.
-        lock: of the frame that it begins with.
-        floor: light of a dark slot there.
+        frame: that it begins with.
+        pose: of the screen there; the picture is known on its rows.
+        acquisition: of that frame.
+        lens: of the camera.
+        black_level: light of a dark slot there.
+        named: whether the user said where the screen is.
     """
 
     def __init__(
-        self, corners: FloatArray, strip_map: tracked.StripMap, acquisition: Acquisition, black_level: float
+        self, frame: Frame, pose: Pose, acquisition: Acquisition, lens: Lens | None, black_level: float, named: bool
     ) -> None:
-        self.corners, self.map = corners, strip_map
+        self.pose = self._first_pose = pose
         #: The frame that was received last.
         self.last: View | None = None
-        self._corner_history = deque([corners], maxlen=_N_CORNERS)
-        self._n_frames = 0
+        self._lens, self._named = lens, named
+        self._texture = ScreenTexture(frame, pose.corners, lens)
+        #: Frames whose picture did not tell where the screen is, and outlines in a row that were where it was.
+        self._n_untold = self._n_still = 0
         self._begun_with = acquisition, black_level
         self._n_updates = 0
         self._picture = self._new_picture(black_level)
@@ -79,32 +82,39 @@ class TrackedScreen:
         acquisition: Acquisition,
         black_level: float,
         before: TrackedScreen | None,
+        named: bool,
     ) -> TrackedScreen:
         """A new picture; the strips stay those of the scene before, where the screen is still there."""
-        n_columns, corners = acquisition.screen.columns, context.corners
-        if before is not None and corners is before.corners and before.map.inside.shape[0] == n_columns:
-            return cls(corners, before.map, acquisition, black_level)
-        strip_map = _map(context.frame, corners, context.camera, acquisition)
-        return cls(corners, strip_map, acquisition, black_level)
+        n_columns, corners, camera = acquisition.screen.columns, context.corners, context.camera
+        pose = before.pose if before is not None and corners is before.corners else None
+        if pose is None or pose.map.inside.shape[0] != n_columns:
+            pose = Pose(corners, _map(context.frame, corners, camera, acquisition))
+        return cls(context.frame, replace(pose, placement=None), acquisition, camera.lens, black_level, named)
 
     def _new_picture(self, black_level: float | Float32Array) -> known_picture.KnownPicture:
-        acquisition, profiles = self._begun_with[0], self._begun_with[0].profiles
+        acquisition, strips = self._begun_with[0], self._first_pose.map
+        profiles = acquisition.profiles
         return known_picture.KnownPicture(
-            self.map.inside,
-            channel.crosstalk_matrix(self.map.inside.shape[1], acquisition.screen.light_spread),
+            strips.inside,
+            channel.crosstalk_matrix(strips.inside.shape[1], acquisition.screen.light_spread),
             black_level,
-            max(profiles.noise_floor / self.map.pixels, 1e-7),
-            profiles.noise_slope / self.map.pixels,
+            max(profiles.noise_floor / strips.pixels, 1e-7),
+            profiles.noise_slope / strips.pixels,
         )
 
     @property
+    def corners(self) -> FloatArray:
+        """(4, 2) where the screen was last."""
+        return self.pose.corners
+
+    @property
     def rows(self) -> FloatArray:
-        """(R,) sensor rows that are read."""
-        return self.map.first_row + np.arange(self.map.inside.shape[2], dtype=np.float64)
+        """(R,) sensor rows that were read last."""
+        return self.pose.rows
 
     def strips(self, frame: Frame) -> Float32Array:
         """(C, S, R) light of the strips in a frame."""
-        return tracked.sample_strips(frame, self.map)
+        return tracked.sample_strips(frame, self.pose.map)
 
     # -- where the screen is -----------------------------------------------------------------------------------
 
@@ -112,35 +122,57 @@ class TrackedScreen:
         """Whether a screen found at the corners is where this one is."""
         return bool(np.abs(corners - self.corners).max() < _NEAR * np.ptp(self.corners[:, 0]))
 
-    def follow(self, frame: Frame, may_move: bool) -> bool:
-        """Look where the screen is, now and then; returns whether it moved."""
-        self._n_frames += 1
-        if not may_move or self._n_frames % _LOOK_EVERY:
+    def is_at(self, corners: FloatArray) -> bool:
+        """Whether a screen found at the corners may not have moved at all."""
+        return bool(np.abs(corners - self.corners).max() < _STILL_OUTLINE * np.ptp(self.corners[:, 0]))
+
+    def follow(self, frame: Frame) -> bool:
+        """Find where the screen is in a frame, by the picture on it; returns whether that is certain."""
+        found = self._texture.find(frame)
+        if not found.tells:
+            outline = self.corners if self._named else self._outline_near(frame, found.corners)
+            if outline is None:
+                return False
+            found = self._texture.with_outline(found, outline)
+        elif not found.certain:
             return False
+        if _is_still(found.corners - self.corners, found.sd_px):
+            found = replace(found, corners=self.corners)
+        else:
+            self._move(frame, found.corners)
+        self._texture.learn(frame, found)
+        return True
+
+    def _outline_near(self, frame: Frame, corners: FloatArray) -> FloatArray | None:
+        """Corners (4, 2) of the screen by its outline, where the picture on it does not tell; None where it is gone.
+
+        As long as it stays where it is, it is looked for now and then only.
+        """
         from rxcli.receiver.screen.find import track_screen
 
-        stored, order = _stored_order(self.corners)
-        found = track_screen(frame.pixels, stored, black=frame.black, white=frame.white)
+        self._n_untold += 1
+        if self._n_still >= _STILL_LOOKS and self._n_untold % _LOOK_EVERY:
+            return self.corners
+        stored, order = _stored_order(corners)
+        found = track_screen(frame.pixels, stored, black=frame.black, white=frame.white, reach=_OUTLINE_REACH)
         if found.corners is None:
-            return False
-        found_corners = found.corners[order]
-        width = float(np.linalg.norm(self.corners[1] - self.corners[0]))
-        if np.abs(found_corners - self.corners).max() > _JUMP * width:
-            self._corner_history.clear()
-        self._corner_history.append(found_corners)
-        corners = np.median(self._corner_history, axis=0)
-        moved = bool(np.abs(corners - self.corners).max() > _STILL * width)
-        if moved:
-            self._move(frame, corners)
-        return moved
+            return None
+        outline = found.corners[order]
+        width = float(np.linalg.norm(corners[1] - corners[0]))
+        still = np.abs(outline - self.corners).max() < _STILL_OUTLINE * width
+        self._n_still = self._n_still + 1 if still else 0
+        return outline
+
+    def seek(self, corners: FloatArray) -> None:
+        """Expect the screen near the corners (4, 2) next."""
+        self._texture.seek(corners)
 
     def _move(self, frame: Frame, corners: FloatArray) -> None:
-        assert self.last is not None
-        rows, before, before_map = self.rows, self.corners, self.map
-        self.map = _map(frame, corners, self.last.context.camera, self.last.acquisition, before_map.inside.shape[1])
-        self.corners = corners
-        row_of = _row_before(self.rows, corners, before, self.last.acquisition.screen.columns)
-        self._picture.moved(row_of - rows[0], self.map.inside)
+        n_columns, n_strips, _ = self._first_pose.map.inside.shape
+        outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, self._lens)
+        strips = tracked.moved_map(self._first_pose.map, outlines)
+        placement = _placement(self._first_pose, corners, strips, self._lens)
+        self.pose = Pose(corners, strips, placement)
 
     # -- a frame ------------------------------------------------------------------------------------------------
 
@@ -157,18 +189,19 @@ class TrackedScreen:
         if last is None:
             return None
         with timer("sampling"):
-            light = self.strips(frame)
-            flat = self._picture.solve(light)
+            light, pose = self.strips(frame), self.pose
+            picture = self._picture.placed(pose.placement)
+            flat = picture.solve(light)
         with timer("clock"):
             clock = self._clock(frame, flat, last.acquisition.clock, time)
             if clock is None:
                 return None
         with timer("detect"):
-            refined = self._refined(self._picture, light, flat, clock, last.isi_memory, thorough)
+            refined = self._refined(picture, pose.rows, light, flat, clock, last.isi_memory, thorough)
             if refined is None:
                 return None
             flat, clock, positions, metrics = refined
-            shown = _shown(self.map.inside, positions, clock)
+            shown = _shown(pose.map.inside, positions, clock)
             snr = _snr(flat, clock)
         return View(
             replace(last.context, frame=frame, corners=self.corners, timer=timer),
@@ -178,13 +211,14 @@ class TrackedScreen:
             frame.height,
             snr,
             light=light,
-            map=self.map,
+            pose=pose,
             flat=flat,
         )
 
     def _refined(
         self,
         picture: known_picture.KnownPicture,
+        rows: FloatArray,
         light: Float32Array,
         flat: known_picture.ColumnLight,
         clock: Clock,
@@ -196,7 +230,7 @@ class TrackedScreen:
         Not `thorough` is enough of faded frames that will be measured again.
         None where the headers are not where the clock has them: another scene, or something in front of the screen.
         """
-        positions, exposure_slots = known_picture.row_positions(self.rows, clock), clock.exposure_slots
+        positions, exposure_slots = known_picture.row_positions(rows, clock), clock.exposure_slots
         if known_picture.header_contrast(flat, positions, clock) < _LEAST_HEADER:
             return None
         lit = known_picture.first_decision(flat, positions, clock)
@@ -211,7 +245,7 @@ class TrackedScreen:
             fit = known_picture.fit_response(flat, slots)
         if abs(fit.late) > _LATE:
             clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)
-            positions = known_picture.row_positions(self.rows, clock)
+            positions = known_picture.row_positions(rows, clock)
             fit = known_picture.fit_response(flat, known_picture.exposures(lit, positions, exposure_slots))
         expected = fit.response.expected(lit, positions, exposure_slots)
         flat, ratio = picture.judge(flat, expected, _NOISE_SHARE)
@@ -232,7 +266,7 @@ class TrackedScreen:
             return predicted
         profiles = RowProfiles(
             light=flat.shrunk[:, None],
-            inside=np.asarray(self.map.inside.any(axis=1, keepdims=True)),
+            inside=np.asarray(self.pose.map.inside.any(axis=1, keepdims=True)),
             rows=rows.astype(np.int64),
             sensor_row=None,
             count=np.ones((flat.shrunk.shape[0], 1), np.float32),
@@ -272,19 +306,19 @@ class TrackedScreen:
 
         See `known_picture.KnownPicture.learn` for `keep`, and for what is returned: slots and trust.
         """
-        if view.light is None or view.light.shape[2] != self.rows.size:
+        if view.light is None or view.pose is None:
             return None
         self._n_updates += 1
         clock = view.bursts.clock
-        positions = known_picture.row_positions(self.rows, clock)
+        positions = known_picture.row_positions(view.pose.rows, clock)
         slots = known_picture.exposed(lit, positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
-        self._picture.learn(view.light, slots, trust, keep)
+        self._picture.learn(view.light, slots, trust, keep, view.pose.placement)
         return slots, trust
 
     def can_measure_again(self, view: View) -> bool:
-        """Whether a frame's strips were read where the screen is now."""
-        return view.light is not None and view.map is self.map
+        """Whether a frame's strips are those of this screen."""
+        return view.light is not None and view.pose is not None and view.pose.map.light is self._first_pose.map.light
 
     def measure_again(self, views: Sequence[View], known: Sequence[Float32Array], doubtful: Sequence[bool]) -> None:
         """Learn the picture anew from frames, and measure those in doubt by what the others say of it.
@@ -304,17 +338,26 @@ class TrackedScreen:
 
     def _dark_light(self, views: Sequence[View]) -> Float32Array:
         """(C, S) light of the strips where nothing is lit."""
-        lights = [view.light for view in views if view.light is not None]
-        clocks = [view.bursts.clock for view in views if view.light is not None]
-        dark = [known_picture.header_dark(known_picture.row_positions(self.rows, clock), clock) for clock in clocks]
-        return known_picture.dark_light(lights, dark, self.map.inside, self._begun_with[1])
+        lights, dark, inside = [], [], []
+        for view in views:
+            if view.light is not None and view.pose is not None:
+                positions = known_picture.row_positions(view.pose.rows, view.bursts.clock)
+                lights.append(view.light)
+                dark.append(known_picture.header_dark(positions, view.bursts.clock))
+                inside.append(view.pose.map.inside)
+        return known_picture.dark_light(lights, dark, inside, self._begun_with[1])
 
     def _measure_again(self, view: View, update: tuple[Float32Array, Float32Array] | None) -> None:
         """Measure a frame by the picture, less what the frame itself has shown of it where that is given."""
         assert view.light is not None
-        picture = self._picture if update is None else self._picture.without(view.light, *update)
+        assert view.pose is not None
+        placement = view.pose.placement
+        picture = self._picture if update is None else self._picture.without(view.light, *update, placement)
+        picture = picture.placed(placement)
         flat = picture.solve(view.light)
-        refined = self._refined(picture, view.light, flat, view.bursts.clock, view.isi_memory, thorough=True)
+        refined = self._refined(
+            picture, view.pose.rows, view.light, flat, view.bursts.clock, view.isi_memory, thorough=True
+        )
         if refined is not None:
             burst = view.bursts.clock.burst
             view.flat, clock, _, metrics = refined
@@ -367,12 +410,33 @@ def _stored_order(corners: FloatArray) -> tuple[FloatArray, IntArray]:
     return corners[order], np.argsort(order)
 
 
-def _row_before(rows: FloatArray, corners: FloatArray, before: FloatArray, n_columns: int) -> FloatArray:
-    """(C, R) row that showed, before the screen moved, what `rows` show now; columns as straight lines."""
-    across = ((np.arange(n_columns) + 0.5) / n_columns)[:, None]
+def _is_still(moved: FloatArray, sd_px: float) -> bool:
+    """Whether corners (4, 2) that seem to have moved may be where they were."""
+    shift, each = np.abs(moved.mean(axis=0)).max(), float(np.sqrt(np.square(moved).mean()))
+    return bool(shift < max(_STILL_PX, _STILL_SDS * sd_px / 2) and each < max(_STILL_PX, _STILL_SDS * sd_px))
 
-    def ends(c: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return c[0, 1] + across * (c[1, 1] - c[0, 1]), c[3, 1] + across * (c[2, 1] - c[3, 1])
 
-    (top, bottom), (old_top, old_bottom) = ends(corners), ends(before)
-    return np.asarray(old_top + (rows - top) * (old_bottom - old_top) / (bottom - top))
+def _placement(
+    first: Pose, corners: FloatArray, strips: tracked.StripMap, lens: Lens | None
+) -> known_picture.Placement:
+    """Where the picture of a screen lies that is elsewhere now."""
+    n_columns = strips.inside.shape[0]
+    before, after = (geometry.column_middles(c, n_columns, lens) for c in (first.corners, corners))
+    first_row, row = first.map.first_row, strips.first_row
+    picture_row = _row_at(strips.rows, after, before) - first_row
+    frame_row = _row_at(first.rows, before, after) - row
+    return known_picture.Placement(picture_row.astype(np.float32), frame_row.astype(np.float32), strips.inside)
+
+
+def _row_at(rows: FloatArray, here: FloatArray, there: FloatArray) -> FloatArray:
+    """(C, R) row of what `rows` (R,) show, where points of columns at the rows `here` (C, n) are at `there` (C, n)."""
+    return np.stack([_extended(rows, *pair) for pair in zip(here, there, strict=True)])
+
+
+def _extended(rows: FloatArray, here: FloatArray, there: FloatArray) -> FloatArray:
+    """Linear interpolation, and beyond the ends as between them."""
+    order = slice(None, None, 1 if here[-1] > here[0] else -1)
+    here, there = here[order], there[order]
+    inner = np.interp(rows, here, there)
+    slope = (there[-1] - there[0]) / (here[-1] - here[0])
+    return np.asarray(inner + slope * (np.minimum(rows - here[0], 0) + np.maximum(rows - here[-1], 0)))

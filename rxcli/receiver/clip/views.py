@@ -5,11 +5,27 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.channel.known_picture import ColumnLight
+from rxcli.receiver.channel.known_picture import ColumnLight, Placement
 from rxcli.receiver.context import FrameContext
 from rxcli.receiver.sampling import tracked
 from rxcli.receiver.sync.tracking import FrameBursts
-from rxcli.types import Float32Array, FrameResult, IntArray
+from rxcli.types import Float32Array, FloatArray, FrameResult, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """Where a screen is in a frame."""
+
+    #: (4, 2) pixels, the viewer's top-left first.
+    corners: FloatArray
+    map: tracked.StripMap
+    #: Where the known picture lies on the frame's rows; None for where it was when its screen was found.
+    placement: Placement | None = None
+
+    @property
+    def rows(self) -> FloatArray:
+        """(R,) sensor rows that are read."""
+        return self.map.rows
 
 
 @dataclass(slots=True, eq=False)
@@ -28,7 +44,7 @@ class View:
     #: (C, S, R) light of the strips as tracking samples them; None where that cannot be done.
     light: Float32Array | None = None
     #: Where the strips were then.
-    map: tracked.StripMap | None = None
+    pose: Pose | None = None
     #: The columns' own light; None where the frame was received like a photograph.
     flat: ColumnLight | None = None
 

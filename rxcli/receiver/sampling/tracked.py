@@ -1,15 +1,17 @@
 """Quick sampling of strips whose place is known from the frame before: what tracked frames of a clip need.
 
-Pixels are added up along the rows over about half a strip as they are stored, then read between these cells at the
-middle of every strip on every row, and only these few values are made linear. The order of adding and of undoing the
-tone curve does not matter to a light that is a product of picture and slots, as long as the curve is near a power law;
-and the picture is learned from the same samples. Ten times quicker than `rxcli.receiver.sampling.rows`, which is exact.
+Pixels are added up along the rows in small cells as they are stored, the cells over the width of a strip; these sums
+are read at the middle of every strip on every row, between cells, and only these few values are made linear. Cells are
+small against a strip because the screen before a camera in a hand lies elsewhere among them in every frame, and its
+picture must look the same. The order of adding and of undoing the tone curve does not matter to a light that is a
+product of picture and slots, as long as the curve is near a power law; and the picture is learned from the same
+samples. Ten times quicker than `rxcli.receiver.sampling.rows`, which is exact.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,12 +19,12 @@ from numpy.typing import NDArray
 
 from rxcli.types import BoolArray, Float32Array, FloatArray, Frame, Outlines
 
-#: Part of a strip over which pixels are added up before the strip's middle is read.
-_CELL_SHARE = 0.6
+#: Cells of a strip, about; of a picture of more than 8 bits, the part of a strip that is one cell.
+_CELLS_PER_STRIP, _CELL_SHARE = 5, 0.6
 #: Pixels of eight bits in a half word, half words whose sum 16 bits hold, and rows that fit the cache at a time.
 _HALF, _MOST_HALVES, _ROWS_AT_A_TIME = 4, 64, 128
-#: Pixels from which cells are whole half words: narrower strips would show what is beside them.
-_FROM_HALVES = 6.0
+#: Width of strips from which cells are whole half words: of narrower ones they would show what is beside them.
+_FROM_HALVES = 12.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,10 +32,12 @@ class StripMap:
     """Where the strips of C columns of S strips lie on a picture, and what their values mean."""
 
     cell_px: int
+    #: Cells that are added up for every sample.
+    n_cells: int
     first_row: int
     #: (C*S, R) float32 each: cell, and row from the first, whose values are read.
     places: tuple[Float32Array, Float32Array]
-    #: (values,) light of every value that a cell can have.
+    #: (values,) light of every value that a sample can have.
     light: Float32Array
     #: (C, S, R) bool: the strip is on the screen and in the picture.
     inside: BoolArray
@@ -41,7 +45,12 @@ class StripMap:
     @property
     def pixels(self) -> float:
         """Pixels behind each sample."""
-        return self.cell_px * 1.5
+        return float(self.cell_px * self.n_cells)
+
+    @property
+    def rows(self) -> FloatArray:
+        """(R,) sensor rows that are read."""
+        return self.first_row + np.arange(self.inside.shape[2], dtype=np.float64)
 
 
 def map_strips(outlines: Outlines, frame: Frame, light_of: Callable[[FloatArray], FloatArray]) -> StripMap:
@@ -52,13 +61,24 @@ def map_strips(outlines: Outlines, frame: Frame, light_of: Callable[[FloatArray]
         frame: says how values are stored: which are black and white, and whether they are linear.
         light_of: linear light of coded values, both 0..1.
     """
-    middles = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
     strip_px = float(np.median(np.abs(np.diff(outlines.edges_x[:, outlines.rows.size // 2]))))
-    cell_px = _cell_px(strip_px * _CELL_SHARE, frame)
-    x = np.ascontiguousarray((middles + 0.5) / cell_px - 0.5, np.float32)
-    y = np.ascontiguousarray(np.broadcast_to(np.arange(outlines.rows.size, dtype=np.float32), x.shape))
-    light = _light_of_values(frame, light_of, cell_px if _has_words(frame, cell_px) else 1)
-    return StripMap(cell_px, int(outlines.rows[0]), (x, y), light, outlines.inside)
+    cell_px, n_cells = _cells_of(strip_px, frame)
+    light = _light_of_values(frame, light_of, (cell_px if _has_words(frame, cell_px) else 1) * n_cells)
+    places = _places_of(outlines, cell_px, n_cells)
+    return StripMap(cell_px, n_cells, int(outlines.rows[0]), places, light, outlines.inside)
+
+
+def moved_map(strips: StripMap, outlines: Outlines) -> StripMap:
+    """The same strips on a screen that is elsewhere now, where `outlines` say."""
+    places = _places_of(outlines, strips.cell_px, strips.n_cells)
+    return replace(strips, first_row=int(outlines.rows[0]), places=places, inside=outlines.inside)
+
+
+def _places_of(outlines: Outlines, cell_px: int, n_cells: int) -> tuple[Float32Array, Float32Array]:
+    middles = (outlines.edges_x[1:] + outlines.edges_x[:-1]) * np.float32(0.5 / cell_px)
+    # The middle of an even number of cells lies half a cell before the one that OpenCV calls the middle one.
+    x = np.ascontiguousarray(middles + np.float32(0.5 / cell_px - 0.5 * (n_cells % 2)), np.float32)
+    return x, np.ascontiguousarray(np.broadcast_to(np.arange(outlines.rows.size, dtype=np.float32), x.shape))
 
 
 def sample_strips(frame: Frame, strips: StripMap) -> Float32Array:
@@ -77,16 +97,23 @@ def sample_strips(frame: Frame, strips: StripMap) -> Float32Array:
         cells = _sums(pixels, strips.cell_px)
     else:
         cells = cv2.resize(pixels, (pixels.shape[1] // strips.cell_px, n_rows), interpolation=cv2.INTER_AREA)
+    if strips.n_cells > 1:
+        cells = cv2.boxFilter(cells, cv2.CV_16U, (strips.n_cells, 1), normalize=False, borderType=cv2.BORDER_REPLICATE)
     values = cv2.remap(cells, *strips.places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(strips.light.take(values)).reshape(strips.inside.shape)
 
 
-def _cell_px(wanted: float, frame: Frame) -> int:
-    """Width of a cell: whole half words where there are some, for they are added up more quickly."""
-    halves = min(round(wanted / _HALF), _MOST_HALVES)
-    if wanted < _FROM_HALVES or not _has_words(frame, halves * _HALF):
-        return max(int(wanted), 1)
-    return halves * _HALF
+def _cells_of(strip_px: float, frame: Frame) -> tuple[int, int]:
+    """Width of a cell and cells of a sample: whole half words where there are some, which are added up more quickly."""
+    if frame.pixels.dtype != np.uint8:
+        return max(int(strip_px * _CELL_SHARE), 1), 1
+    halves = int(np.clip(round(strip_px / _CELLS_PER_STRIP / _HALF), 1, _MOST_HALVES))
+    if strip_px >= _FROM_HALVES and _has_words(frame, halves * _HALF):
+        cell_px = halves * _HALF
+    else:
+        cell_px = max(int(strip_px / _CELLS_PER_STRIP), 1)
+    most = max((1 << 16) // (cell_px * 256), 1)
+    return cell_px, int(np.clip(round(strip_px / cell_px), 1, most))
 
 
 def _has_words(frame: Frame, cell_px: int) -> bool:

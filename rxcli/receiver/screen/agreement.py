@@ -69,7 +69,7 @@ def _agrees(pairs: FloatArray, middle: FloatArray, where: FloatArray, sigma: flo
     step = int(tables.step(np.array(_APART)))
     full = float(tables.harmonic[step] / tables.mean[step]) * float(values.mean())
     chance = np.sqrt(2 * 1.5 / (values.size * n_rows * 2 / 3))
-    return (
+    return bool(
         full < 0
         and abs(comb) > _LEAST_HEIGHT * abs(full)
         and abs(comb) > _LEAST_SCORE * chance

@@ -21,7 +21,7 @@ _Real = TypeVar("_Real", np.float32, np.float64)
 _VIEWER_CORNERS = {1: (0, 1, 2, 3), 2: (1, 0, 3, 2), 3: (2, 3, 0, 1), 4: (3, 2, 1, 0)}
 #: Share of the screen's height beyond its corners that outlines reach, so that no edge row is lost.
 _OVERHANG = 0.02
-_OUTLINE_POINTS = 65
+_OUTLINE_POINTS, _MIDDLE_POINTS = 65, 33
 #: No lens moves a point of the picture by more than this many focal lengths.
 _LARGEST_MOVE = 10.0
 #: The inverse of the lens is found when a step moves no point by this many pixels.
@@ -158,6 +158,13 @@ def column_outlines(
     if lens is not None and lens.corrected:
         sensor_row = _between_knots(_sensor_rows(knot_x, knots, lens), knots, rows).reshape(shape)
     return Outlines(rows, edges_x, inside.reshape(shape), sensor_row)
+
+
+def column_middles(corners: FloatArray, n_columns: int, lens: Lens | None) -> FloatArray:
+    """(C, n) rows of the same points down the middle of each column, from a little above the screen to below it."""
+    u = (np.arange(n_columns) + 0.5) / n_columns
+    v = np.linspace(-_OVERHANG, 1 + _OVERHANG, _MIDDLE_POINTS)
+    return screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens)[..., 1]
 
 
 def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:

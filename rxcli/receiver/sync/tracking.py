@@ -83,6 +83,14 @@ class LinkTime:
         self._last = (frame, time_s, slot)
         return first_copy
 
+    def agrees(self, frame: int, time_s: float, clock: Clock) -> bool:
+        """Whether a frame's clock is of the time told so far, whole packets aside."""
+        predicted = self.predict(frame, time_s)
+        if predicted is None or self._period is None:
+            return True
+        apart = clock.first_slot - clock.row0 / clock.rows_per_slot - predicted
+        return abs((apart + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2) <= _MAX_JUMP_SLOTS
+
     def clock_at(self, frame: int, time_s: float, like: Clock, n_slots: int, top_row: float) -> Clock | None:
         """The clock that the frames before foretell.
 

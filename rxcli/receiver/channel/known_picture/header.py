@@ -59,7 +59,9 @@ def header_dark(positions: FloatArray, clock: Clock) -> BoolArray:
     return np.asarray((place >= _DARK_SLOTS[0] + margin) & (place <= _DARK_SLOTS[1] - margin))
 
 
-def dark_light(lights: list[Float32Array], dark: list[BoolArray], inside: BoolArray, usual: float) -> Float32Array:
+def dark_light(
+    lights: list[Float32Array], dark: list[BoolArray], inside: list[BoolArray], usual: float
+) -> Float32Array:
     """(C, S) light of the strips where nothing is lit.
 
     What a black picture or a starved encoder leaves of a strip does not change with the slots: it is no picture.
@@ -67,12 +69,12 @@ def dark_light(lights: list[Float32Array], dark: list[BoolArray], inside: BoolAr
     Args:
         lights: (C, S, R) each.
         dark: (C, R) or (1, R) each, from `header_dark`.
-        inside: (C, S, R) as for `KnownPicture`.
+        inside: (C, S, R) each, as for `KnownPicture`.
         usual: what is taken where too few rows tell.
     """
     observed = [
-        np.where(np.broadcast_to(rows[:, None], light.shape) & inside, light, np.float32(np.nan))[..., rows.any(axis=0)]
-        for light, rows in zip(lights, dark, strict=True)
+        np.where(np.broadcast_to(rows[:, None], light.shape) & on, light, np.float32(np.nan))[..., rows.any(axis=0)]
+        for light, rows, on in zip(lights, dark, inside, strict=True)
     ]
     together = np.concatenate(observed, axis=2)
     few = (~np.isnan(together)).sum(axis=2) < _LEAST_DARK_ROWS

@@ -56,8 +56,20 @@ class _System:
     precision: Float32Array
 
 
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where the picture lies in a frame that shows it elsewhere than the first one did."""
+
+    #: (C, R) row of the picture that each row of the frame shows.
+    picture_row: Float32Array
+    #: (C, P) row of the frame that shows each row of the picture.
+    frame_row: Float32Array
+    #: (C, S, R) bool: the strip is on the screen there.
+    inside: BoolArray
+
+
 class KnownPicture:
-    """The picture without stripes, learned frame by frame.
+    """The picture without stripes, learned frame by frame, on the rows of the screen as the first frame showed it.
 
     Args:
         inside: (C, S, R) the strip is on the screen there.
@@ -87,7 +99,29 @@ class KnownPicture:
         #: (C,) variance of the columns' light over what was foreseen.
         self._excess = np.ones(inside.shape[0], np.float32)
 
-    def learn(self, light: Float32Array, slots: Float32Array, trust: Float32Array, keep: float = MEMORY) -> None:
+    def placed(self, placement: Placement | None) -> KnownPicture:
+        """The picture on the rows of a frame; itself where the frame shows it where the first one did.
+
+        What is found of the columns' noise belongs to both.
+        """
+        if placement is None:
+            return self
+        other = copy(self)
+        other._light, other._observed = (
+            _resampled(values, placement.picture_row, beyond=False) for values in (self._light, self._observed)
+        )
+        other._inside = placement.inside.astype(np.float32)
+        other._system = other._of_one = None
+        return other
+
+    def learn(
+        self,
+        light: Float32Array,
+        slots: Float32Array,
+        trust: Float32Array,
+        keep: float = MEMORY,
+        placement: Placement | None = None,
+    ) -> None:
         """Take a frame whose slots are known into the picture.
 
         Args:
@@ -95,13 +129,16 @@ class KnownPicture:
             slots: (C, R) exposure-averaged slots, 0..1.
             trust: (C, R) 0..1.
             keep: share of their weight that the frames before keep.
+            placement: where the frame shows the picture; None for where the first one did.
         """
-        lit, observed = self._update_of(light, slots, trust)
+        lit, observed = self._update_of(light, slots, trust, placement)
         self._light = self._light * np.float32(keep) + lit
         self._observed = self._observed * np.float32(keep) + observed
         self._system = None
 
-    def without(self, light: Float32Array, slots: Float32Array, trust: Float32Array) -> KnownPicture:
+    def without(
+        self, light: Float32Array, slots: Float32Array, trust: Float32Array, placement: Placement | None = None
+    ) -> KnownPicture:
         """What the other frames say alone, for a frame that was learned last or with nothing forgotten since.
 
         A picture learned from a frame's own light bears out whatever was decided there, wrong or right.
@@ -110,21 +147,27 @@ class KnownPicture:
             light: (C, S, R) as it was learned.
             slots: (C, R) likewise.
             trust: (C, R) likewise.
+            placement: likewise.
         """
-        lit, observed = self._update_of(light, slots, trust)
+        lit, observed = self._update_of(light, slots, trust, placement)
         other = copy(self)
         other._light, other._observed = self._light - lit, np.maximum(self._observed - observed, 0)
         other._system, other._excess = None, self._excess.copy()
         return other
 
     def _update_of(
-        self, light: Float32Array, slots: Float32Array, trust: Float32Array
+        self, light: Float32Array, slots: Float32Array, trust: Float32Array, placement: Placement | None
     ) -> tuple[Float32Array, Float32Array]:
-        """Light and light expected of a picture of 1, each weighted with the latter."""
+        """Light and light expected of a picture of 1, each weighted with the latter, on the rows of the picture."""
         expected = self._crosstalk @ _with_neighbours(slots)
         doubt = self._crosstalk @ (1 - _with_neighbours(trust, 1.0))
-        weighted = expected * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * self._inside
-        return weighted * (light - self._black_level), weighted * expected
+        inside = self._inside if placement is None else placement.inside
+        weighted = expected * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * inside
+        lit, observed = weighted * (light - self._black_level), weighted * expected
+        if placement is None:
+            return lit, observed
+        row = placement.frame_row
+        return _resampled(lit, row, beyond=True), _resampled(observed, row, beyond=True)
 
     def solve(self, light: Float32Array) -> ColumnLight:
         """The columns' own light in a frame.
@@ -259,6 +302,18 @@ def _around(values: Float32Array, rows_per_slot: float) -> Float32Array:
     """Sum over the slots around, a row's own left out; last axis."""
     near, far = (int(slots * rows_per_slot) for slots in (_OWN_SLOTS, _ERROR_SLOTS))
     return box_sums(values, far) - box_sums(values, near)
+
+
+def _resampled(values: Float32Array, rows: Float32Array, *, beyond: bool) -> Float32Array:
+    """(C, S, M) values (C, S, N) at the rows (C, M), linearly between; `beyond` the ends there are none."""
+    import cv2
+
+    n_columns, n_strips, n_rows = values.shape
+    x = np.repeat(rows, n_strips, axis=0)
+    y = np.broadcast_to(np.arange(len(x), dtype=np.float32)[:, None], x.shape)
+    border = cv2.BORDER_CONSTANT if beyond else cv2.BORDER_REPLICATE
+    read = cv2.remap(values.reshape(-1, n_rows), x, np.ascontiguousarray(y), cv2.INTER_LINEAR, borderMode=border)
+    return np.asarray(read).reshape(n_columns, n_strips, -1)
 
 
 def _factored(

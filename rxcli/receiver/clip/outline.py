@@ -1,0 +1,64 @@
+"""Where the screen is in the first frame of a clip, by more frames than that one.
+
+The strips of a whole clip lie where its first frame has the screen, and a single dark frame may be wrong by twenty
+pixels there. The texture of the picture says how the screen moved from the first frame to the next ones; what the
+search finds in these is carried back, and the median of a few counts. Where the second agrees, two are enough.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rxcli.options import ReceiverOptions
+from rxcli.receiver.context import Failure, Timer
+from rxcli.receiver.outline import find_outline
+from rxcli.receiver.screen.registration import ScreenTexture
+from rxcli.types import FloatArray, Frame
+
+#: Corners of two searches that differ by less than this, in screen widths, agree; searches where they do not.
+_AGREE, _MOST_SEARCHES = 0.003, 5
+
+
+class FirstOutline:
+    """The outline in the first frame.
+
+    Args:
+        frame: the first.
+        corners: (4, 2) of the screen as found there.
+        options: where they name the corners, there is nothing to find.
+    """
+
+    def __init__(self, frame: Frame, corners: FloatArray, options: ReceiverOptions) -> None:
+        self._options = options
+        self._first = corners
+        self._width = float(np.linalg.norm(corners[1] - corners[0]))
+        self._differences = [np.zeros_like(corners)]
+        self._texture = None if options.corners is not None else ScreenTexture(frame, corners, None)
+
+    @property
+    def settled(self) -> bool:
+        """Whether no further frame is asked."""
+        if self._texture is None or len(self._differences) >= _MOST_SEARCHES:
+            return True
+        return len(self._differences) == 2 and bool(np.abs(self._differences[1]).max() < _AGREE * self._width)
+
+    @property
+    def corners(self) -> FloatArray:
+        """(4, 2) in the first frame, by all frames so far."""
+        return self._first + np.median(self._differences, axis=0)
+
+    def take(self, frame: Frame) -> None:
+        """Search the next frame, too."""
+        if self.settled or self._texture is None:
+            return
+        moved = self._texture.find(frame)
+        found = find_outline(frame, self._options, Timer())
+        if isinstance(found, Failure) or not moved.certain or self._is_far(found.corners - moved.corners):
+            # Nothing to compare with: what was found so far must do.
+            self._texture = None
+            return
+        self._texture.learn(frame, moved)
+        self._differences.append(found.corners - moved.corners)
+
+    def _is_far(self, difference: FloatArray) -> bool:
+        return bool(np.abs(difference).max() > self._width / 2)

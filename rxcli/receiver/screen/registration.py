@@ -1,0 +1,408 @@
+"""Where the screen is in every frame of a clip, by the picture on it: what a hand that holds the camera asks for.
+
+The outline alone does not tell: on a dark picture a side is found to several pixels, and what is learned of a picture
+must lie where it was to a fraction of one. The picture's own texture tells to a tenth of a pixel, and stripes hardly
+disturb it: the backlight is smooth across a row, so light over its mean over a few neighbouring pixels is texture.
+What stripes leave of themselves is told from texture by its incoherence: columns send different things, so where
+stripes are all there is, parts of the screen disagree about where it went. The scatter of these parts says how well
+the place is known (a sandwich estimate of the covariance); what it leaves open the outline has to say.
+
+The texture lives in the screen's coordinates (u, v). A frame is read at the place where the screen should be, and the
+four corners are moved until it agrees: weighted least squares on the corners' eight coordinates, coarse, then fine
+(Lucas and Kanade 1981; gradients of both textures as Benhimane and Malis 2004 have them). Four free corners follow
+more than a flat screen before a lens: while a camera moves, rows are read one after the other, so that a steady motion
+shears and stretches the screen. That, too, is a motion of corners, and a row remains one instant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.receiver.screen import geometry
+from rxcli.types import Float32Array, FloatArray, Frame, Lens
+
+#: Width of a screen over its height.
+_ASPECT = 16 / 9
+#: Cells across and down the screen that its texture is known by, about.
+_CELLS_ACROSS, _CELLS_DOWN = 360, 110
+#: Share of the screen's size beyond its sides that belongs to the texture: its sides tell where it is.
+_MARGIN = 0.01
+#: Cells across over whose mean light is texture.
+_NEIGHBOURS = 7
+#: Error of a cell, parts of white before the tone curve is undone, and what stripes leave of themselves in the texture.
+_CELL_NOISE, _STRIPE_NOISE = 0.004, 0.08
+#: What stripes make of texture on its way down the screen, squared, in parts of it: rows are lit more or less.
+_UNEVEN_ROWS = 0.1
+#: How much more than its expected noise a change of the texture must be; cells around over which that is judged.
+_ABOVE_NOISE, _LOCAL_CELLS = 1.3, 15
+#: Exponent of the tone curve; value below which it is taken to be as steep as there.
+_TONE, _DARKEST = 2.2, 0.03
+#: Percentage of the cells that are darker than what a dark column is taken to show.
+_DARK_PERCENT = 8.0
+#: Cells of a coarse cell across and down, smoothing of the coarse texture in such cells, and iterations.
+_COARSE_CELLS, _COARSE_BLUR, _COARSE_ITERATIONS = (4, 2), 0.8, 4
+_FINE_ITERATIONS, _CONVERGED = 3, 3e-5
+#: Beyond how many standard deviations a cell is an outlier: a hand, a reflection.
+_OUTLIER = 2.5
+#: How far a frame may be from where it is expected, screen sizes: shift, affine modes, perspective modes.
+#: A screen's size is its width, or what its height makes it on pixels that are no squares.
+_SHIFT_SD, _AFFINE_SD, _PERSPECTIVE_SD = 0.008, 0.0027, 0.0004
+#: Neighbouring cells err alike: the information of so many counts once.
+_ALIKE_CELLS = 4.0
+#: Parts of the screen, across and down, of which each may err in its own way; and how well an outline that is found in
+#: a frame is known, screen sizes.
+_PARTS, _OUTLINE_SD = (20, 6), 0.002
+#: Standard deviation of the corners in screen sizes, and correlation of the textures, that make it certain where a
+#: screen is.
+_MOST_SD, _LEAST_CORRELATION = 0.002, 0.35
+#: Share of the last frame's motion that the next is expected to repeat.
+_PERSISTENCE = 0.7
+#: Weight of the frames before, at most, in frames, in what is known of the texture.
+_MOST_WEIGHT = 40.0
+#: Corners clockwise from the top-left: their u and v.
+_AT_U, _AT_V = np.array([0, 1, 1, 0]), np.array([0, 0, 1, 1])
+#: Points across and down through which the screen is projected.
+_KNOTS_U, _KNOTS_V = 17, 9
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """Where the screen is in a frame."""
+
+    #: (4, 2) pixels of the stored picture, the viewer's top-left first.
+    corners: FloatArray
+    #: (8, 8) covariance of the corners, x and y of each in turn, pixels squared.
+    covariance: FloatArray
+    #: Correlation of the frame's texture with the one known, -1..1.
+    correlation: float
+
+    @property
+    def sd_px(self) -> float:
+        """Standard deviation of the corners, root mean square."""
+        return float(np.sqrt(np.trace(self.covariance) / 8))
+
+    @property
+    def tells(self) -> bool:
+        """Whether there is texture enough to tell where the screen is, if it is what it was."""
+        return self.sd_px < _MOST_SD * _size(self.corners)
+
+    @property
+    def certain(self) -> bool:
+        """Whether the screen is there."""
+        return self.tells and self.correlation > _LEAST_CORRELATION
+
+
+@dataclass(frozen=True, slots=True)
+class _Texture:
+    """Light over the mean of its neighbours along the row, less 1, and its weight 0..1; of cells of a picture."""
+
+    value: Float32Array
+    weight: Float32Array
+    cell_x: int
+    cell_y: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """What is known of the texture at the places v x u, (V, U) each."""
+
+    value: Float32Array
+    #: Its change along u and along v as far as it is more than noise.
+    along_u: Float32Array
+    along_v: Float32Array
+    #: How well it is known, 0..1.
+    trust: Float32Array
+    u: FloatArray
+    v: FloatArray
+
+
+class ScreenTexture:
+    """The texture of a screen, and where the screen was in the last frames.
+
+    Args:
+        frame: a frame in which the screen is known.
+        corners: (4, 2) where it is there, the viewer's top-left first.
+        lens: of the camera, None for one without.
+    """
+
+    def __init__(self, frame: Frame, corners: FloatArray, lens: Lens | None) -> None:
+        self._lens = lens if lens is not None and not lens.corrected else None
+        width = (np.linalg.norm(corners[1] - corners[0]) + np.linalg.norm(corners[2] - corners[3])) / 2
+        height = (np.linalg.norm(corners[3] - corners[0]) + np.linalg.norm(corners[2] - corners[1])) / 2
+        self._cell_x = max(round(float(width) / _CELLS_ACROSS), 1)
+        self._cell_y = max(round(float(height) / _CELLS_DOWN), 1)
+        n_u, n_v = int(width / self._cell_x), int(height / self._cell_y)
+        self._u = np.linspace(-_MARGIN, 1 + _MARGIN, n_u)
+        self._v = np.linspace(-_MARGIN, 1 + _MARGIN, n_v)
+        self._plane = self._undistorted(corners)
+        self._before = self._plane
+        self._read_last: tuple[Frame, _Texture] | None = None
+        self._value: Float32Array = np.zeros((n_v, n_u), np.float32)
+        self._weight: Float32Array = np.zeros((n_v, n_u), np.float32)
+        self.learn(frame, Registration(corners, np.zeros((8, 8)), 1.0))
+
+    def find(self, frame: Frame) -> Registration:
+        """Where the screen is in the next frame."""
+        texture = self._texture_of(frame)
+        expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
+        coarse, fine = self._known()
+        plane, _, _ = self._fit(_coarser(texture), coarse, (expected, expected), _COARSE_ITERATIONS)
+        plane, covariance, correlation = self._fit(texture, fine, (plane, expected), _FINE_ITERATIONS)
+        return Registration(self._lens_of(plane), covariance, correlation)
+
+    def with_outline(self, found: Registration, outline: FloatArray) -> Registration:
+        """What the texture says of a place, and what an outline (4, 2) that was found in the frame says, together."""
+        seen, at = self._undistorted(outline), self._undistorted(found.corners)
+        information = np.linalg.inv(found.covariance)
+        known = 1 / (_OUTLINE_SD * _size(outline)) ** 2
+        covariance = np.asarray(np.linalg.inv(information + known * np.eye(8)), np.float64)
+        plane = covariance @ (information @ at.ravel() + known * seen.ravel())
+        return Registration(self._lens_of(plane.reshape(4, 2)), covariance, found.correlation)
+
+    def seek(self, corners: FloatArray) -> None:
+        """The screen was found at the corners (4, 2) in another way: the next frame is expected there."""
+        self._before = self._plane = self._undistorted(corners)
+
+    def learn(self, frame: Frame, found: Registration) -> None:
+        """Take the texture of a frame in which the screen was found."""
+        self._before, self._plane = self._plane, self._undistorted(found.corners)
+        value, weight = self._read(self._texture_of(frame), self._plane, self._u, self._v)
+        total = self._weight + weight
+        self._value += (value - self._value) * (weight / np.maximum(total, np.float32(1e-6)))
+        self._weight = np.minimum(total, np.float32(_MOST_WEIGHT))
+
+    def _known(self) -> tuple[_Known, _Known]:
+        """The texture so far, coarse and fine."""
+        across, down = _COARSE_CELLS
+        fine = _Texture(self._value, self._weight, 1, 1)
+        places = _middles(self._u, across), _middles(self._v, down)
+        # Blurred means of so many cells have so much less noise.
+        fewer = across * down * (1 + 4 * np.pi * _COARSE_BLUR**2) / 2
+        return _known(_coarser(fine), fewer, places), _known(fine, 1.0, (self._u, self._v))
+
+    def _texture_of(self, frame: Frame) -> _Texture:
+        """The texture of a frame; of the one that was asked for last, without reading it again."""
+        if self._read_last is None or self._read_last[0] is not frame:
+            self._read_last = frame, _texture_of(frame, self._cell_x, self._cell_y)
+        return self._read_last[1]
+
+    # -- one fit ---------------------------------------------------------------------------------------------------
+
+    def _fit(
+        self,
+        texture: _Texture,
+        known: _Known,
+        poses: tuple[FloatArray, FloatArray],
+        iterations: int,
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Corners (4, 2) on the undistorted picture, their covariance (8, 8), and the textures' correlation.
+
+        `poses` are where to begin, and where the corners are expected.
+        """
+        plane, expected = poses
+        corner_u, corner_v = _corner_weights(known.u), _corner_weights(known.v)
+        size = _size(plane)
+        prior = _information(size)
+        for _ in range(iterations):
+            value, weight = self._read(texture, plane, known.u, known.v)
+            weight *= known.trust
+            error = known.value - value
+            squared = error * error
+            variance = max(float(np.vdot(weight, squared)) / max(float(weight.sum()), 1e-6), 1e-6)
+            weight /= 1 + squared * np.float32(1 / (_OUTLIER**2 * variance))
+            along = _per_pixel(known, plane)
+            weighted = (weight * along[0], weight * along[1])
+            normal = _normal_matrix(along, weighted, corner_u, corner_v)
+            scores = _scores_of_parts((weighted[0] * error, weighted[1] * error), corner_u, corner_v)
+            # The prior counts against as much information as the parts' scatter leaves.
+            scale = max(float(np.trace(scores.T @ scores) / max(np.trace(normal), 1e-12)), 1e-9)
+            total = normal / scale + prior
+            step = np.linalg.solve(total, scores.sum(axis=0) / scale + prior @ (expected - plane).ravel())
+            plane = plane + step.reshape(4, 2)
+            if np.abs(step).max() < _CONVERGED * size:
+                break
+        power = float(np.vdot(weight * known.value, known.value)) * float(np.vdot(weight * value, value))
+        correlation = float(np.vdot(weight * known.value, value)) / max(power, 1e-18) ** 0.5
+        return plane, _sandwich(normal, scores, variance, prior), correlation
+
+    def _read(
+        self, texture: _Texture, plane: FloatArray, u: FloatArray, v: FloatArray
+    ) -> tuple[Float32Array, Float32Array]:
+        """Value and weight of a frame's texture at the screen places v x u, were the screen at `plane`."""
+        import cv2
+
+        x, y = self._project(plane, u, v)
+        x = (x + np.float32(0.5)) / np.float32(texture.cell_x) - np.float32(0.5)
+        y = (y + np.float32(0.5)) / np.float32(texture.cell_y) - np.float32(0.5)
+        value, weight = (
+            np.asarray(cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
+            for part in (texture.value, texture.weight)
+        )
+        return value, weight
+
+    def _project(self, plane: FloatArray, u: FloatArray, v: FloatArray) -> tuple[Float32Array, Float32Array]:
+        """Pixels (V, U) of screen places: exactly at some knots, and bilinearly between."""
+        knots_u, knots_v = np.linspace(u[0], u[-1], _KNOTS_U), np.linspace(v[0], v[-1], _KNOTS_V)
+        points = np.stack(np.meshgrid(knots_u, knots_v), axis=-1)
+        projected = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ geometry.homography(plane).T
+        pixels = self._lens_of(projected[..., :2] / projected[..., 2:])
+        across, down = _between(u, knots_u), _between(v, knots_v)
+        return tuple(down @ pixels[..., k].astype(np.float32) @ across.T for k in (0, 1))  # type: ignore[return-value]
+
+    def _lens_of(self, points: FloatArray) -> FloatArray:
+        return points if self._lens is None else geometry.distort(points, self._lens)
+
+    def _undistorted(self, corners: FloatArray) -> FloatArray:
+        return corners.copy() if self._lens is None else geometry.undistort(corners, self._lens)
+
+
+def _texture_of(frame: Frame, cell_x: int, cell_y: int) -> _Texture:
+    """The texture of a whole frame."""
+    import cv2
+
+    n_y, n_x = frame.height // cell_y, frame.width // cell_x
+    pixels: NDArray[Any] = frame.pixels[: n_y * cell_y, : n_x * cell_x]
+    wide = np.uint16 if pixels.dtype == np.uint8 else np.uint32
+    rows = np.add.reduce(pixels.reshape(n_y, cell_y, -1), axis=1, dtype=wide).astype(np.float32)
+    cells = cv2.resize(rows, (n_x, n_y), interpolation=cv2.INTER_AREA)
+    gain = 1 / (frame.white - frame.black)
+    coded = np.clip(cells * np.float32(gain / cell_y) - np.float32(frame.black * gain), 0, 1)
+    tone = np.float32(1.0 if frame.linear else _TONE)
+    light = coded**tone
+    mean = cv2.boxFilter(light, -1, (_NEIGHBOURS, 1), borderType=cv2.BORDER_REPLICATE)
+    # A strip of the screen that is dark shows the room's light; its texture is nobody's.
+    lit = mean - np.float32(np.percentile(mean[_some_rows(n_y)], _DARK_PERCENT))
+    slope = tone * np.maximum(coded, np.float32(_DARKEST)) ** (tone - 1)
+    lit = np.maximum(lit, np.float32(1e-4))
+    noise = slope * np.float32(_CELL_NOISE / _STRIPE_NOISE) / lit
+    return _Texture(np.clip((light - mean) / lit, -1, 1), 1 / (1 + noise * noise), cell_x, cell_y)
+
+
+def _some_rows(n_rows: int) -> slice:
+    """The middle of a picture, where the screen is."""
+    return slice(n_rows // 4, n_rows - n_rows // 4)
+
+
+def _coarser(texture: _Texture) -> _Texture:
+    """Weighted means over coarse cells; what is left over at the right and at the bottom is left out."""
+    import cv2
+
+    across, down = _COARSE_CELLS
+    n_y, n_x = texture.value.shape[0] // down, texture.value.shape[1] // across
+    part = np.s_[: n_y * down, : n_x * across]
+    both = (texture.weight[part], (texture.value * texture.weight)[part])
+    coarse = [cv2.resize(values, (n_x, n_y), interpolation=cv2.INTER_AREA) for values in both]
+    weight, value = (cv2.GaussianBlur(values, (0, 0), _COARSE_BLUR) for values in coarse)
+    return _Texture(
+        np.asarray(value / np.maximum(weight, np.float32(1e-6))),
+        np.asarray(weight),
+        texture.cell_x * across,
+        texture.cell_y * down,
+    )
+
+
+def _middles(places: FloatArray, cells: int) -> FloatArray:
+    """Middles of so many neighbouring places each."""
+    return np.asarray(places[: places.size // cells * cells].reshape(-1, cells).mean(axis=1))
+
+
+def _between(places: FloatArray, knots: FloatArray) -> Float32Array:
+    """(n, knots) weights of linear interpolation at ascending places."""
+    step = (places - knots[0]) * ((knots.size - 1) / (knots[-1] - knots[0]))
+    return np.asarray(np.maximum(1 - np.abs(step[:, None] - np.arange(knots.size)), 0), np.float32)
+
+
+def _corner_weights(places: FloatArray) -> Float32Array:
+    """(2, n) how much of the motion of the corners at 0 and at 1 a place takes part in."""
+    return np.stack([1 - places, places]).astype(np.float32)
+
+
+def _known(texture: _Texture, fewer: float, places: tuple[FloatArray, FloatArray]) -> _Known:
+    """The texture at some places, its changes drawn to none where noise could make them; that is `fewer` times less."""
+    import cv2
+
+    def around(values: Float32Array) -> Float32Array:
+        return np.asarray(cv2.boxFilter(values, -1, (_LOCAL_CELLS, _LOCAL_CELLS)))
+
+    u, v = places
+    value, weight = texture.value, texture.weight
+    along_u, along_v = np.zeros_like(value), np.zeros_like(value)
+    along_u[:, 1:-1] = (value[:, 2:] - value[:, :-2]) * np.float32(0.5)
+    along_v[1:-1] = (value[2:] - value[:-2]) * np.float32(0.5)
+    noise = np.float32(0.5 * _STRIPE_NOISE**2 / fewer)
+    uneven = np.float32(_UNEVEN_ROWS) * around(value * value * weight)
+    total = np.maximum(around(weight), np.float32(1e-3))
+    n = total / np.maximum(around((weight > 0).astype(np.float32)), np.float32(1e-6))
+    for change, more, step in ((along_u, np.float32(0), u[1] - u[0]), (along_v, uneven / total, v[1] - v[0])):
+        power = around(change * change * weight) / total
+        least = np.float32(_ABOVE_NOISE) * (noise + more) / np.maximum(n, np.float32(1e-3))
+        change *= np.maximum(1 - least / np.maximum(power, np.float32(1e-12)), 0) / np.float32(step)
+    return _Known(value, along_u, along_v, weight / (weight + np.float32(1.0)), u, v)
+
+
+def _per_pixel(known: _Known, plane: FloatArray) -> tuple[Float32Array, Float32Array]:
+    """Change of the texture per pixel to the right and down, were the screen a parallelogram."""
+    side_u, side_v = (plane[1] - plane[0] + plane[2] - plane[3]) / 2, (plane[3] - plane[0] + plane[2] - plane[1]) / 2
+    (ux, uy), (vx, vy) = np.linalg.inv(np.stack([side_u, side_v], axis=1)).astype(np.float32)
+    return known.along_u * ux + known.along_v * vx, known.along_u * uy + known.along_v * vy
+
+
+def _normal_matrix(
+    along: tuple[Float32Array, Float32Array],
+    weighted: tuple[Float32Array, Float32Array],
+    corner_u: Float32Array,
+    corner_v: Float32Array,
+) -> FloatArray:
+    """(8, 8) normal matrix of the motion of the corners, x and y of each in turn."""
+    # Products of two corners' weights are products along u times products along v.
+    pairs_u, pairs_v = (np.stack([w[0] * w[0], w[0] * w[1], w[1] * w[1]]) for w in (corner_u, corner_v))
+    normal: FloatArray = np.zeros((8, 8))
+    for a, b in ((0, 0), (0, 1), (1, 1)):
+        moment = pairs_v @ (weighted[a] * along[b]) @ pairs_u.T
+        normal[a::2, b::2] = normal[b::2, a::2] = moment[_AT_V[:, None] + _AT_V, _AT_U[:, None] + _AT_U]
+    return normal
+
+
+def _scores_of_parts(
+    moments: tuple[Float32Array, Float32Array], corner_u: Float32Array, corner_v: Float32Array
+) -> FloatArray:
+    """(parts, 8) what every part of the screen says of the motion of the corners: its share of the normal equations."""
+    across, down = _PARTS
+    n_v, n_u = moments[0].shape
+    first_u, first_v = (np.arange(parts) * n // parts for parts, n in ((across, n_u), (down, n_v)))
+    scores = np.zeros((down * across, 8))
+    for axis, moment in enumerate(moments):
+        for k in range(4):
+            by_column = np.add.reduceat(moment * corner_u[_AT_U[k]], first_u, axis=1)
+            parts = np.add.reduceat(by_column * corner_v[_AT_V[k]][:, None], first_v, axis=0)
+            scores[:, 2 * k + axis] = parts.ravel()
+    return scores
+
+
+def _sandwich(normal: FloatArray, scores: FloatArray, variance: float, prior: FloatArray) -> FloatArray:
+    """(8, 8) covariance of a fit: by the scatter of its parts, not below that of even noise of a `variance`, and no
+    larger than the prior allows."""
+    bread = np.linalg.inv(normal + (1e-6 * np.trace(normal) + 1e-9) * np.eye(8))
+    spread = scores - scores.mean(axis=0)
+    noise = _ALIKE_CELLS * variance * (normal + 1e-9 * np.eye(8))
+    covariance = bread @ (spread.T @ spread + noise) @ bread + 1e-4 * np.eye(8)
+    return np.asarray(np.linalg.inv(np.linalg.inv(covariance) + prior))
+
+
+def _size(corners: FloatArray) -> float:
+    """Size of a screen (4, 2), pixels: its width, or what a screen as high is wide where that is more."""
+    return float(max(np.ptp(corners[:, 0]), np.ptp(corners[:, 1]) * _ASPECT))
+
+
+def _information(size: float) -> FloatArray:
+    """(8, 8) information on how far the corners may be from where they are expected."""
+    # Modes of four corners along one axis: all alike, right against left, bottom against top, and crosswise.
+    modes = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [1, -1, 1, -1]]) / 4
+    sds: Sequence[float] = (_SHIFT_SD, _AFFINE_SD, _AFFINE_SD, _PERSPECTIVE_SD)
+    along = (modes.T / np.square(np.array(sds) * size)) @ modes
+    return np.asarray(np.kron(along, np.eye(2)), np.float64)
