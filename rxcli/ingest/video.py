@@ -32,6 +32,10 @@ _END_TOLERANCE = 1.5
 _MJPEG_THREADS = min(4, os.cpu_count() or 1)
 #: Threads of the other decoders: one more than FFmpeg takes, for theirs wait for one another.
 _DECODER_THREADS = min((os.cpu_count() or 1) + 2, 16)
+#: Decoders hold some ten frames for others to refer to, and one in every thread.
+_BYTES_A_PIXEL = 1.5 * (10 + _DECODER_THREADS)
+#: Times of a clip that are believed: a claim of more would be years.
+_MOST_S = 1e6
 
 
 @dataclass(slots=True)
@@ -86,7 +90,7 @@ def _read(path: Path) -> Generator[Frame, None, None]:
         stream = container.streams.video[0]
         if stream.codec_context is None:
             raise InputError(f"{path}: its codec is unknown", "save it as H.264, HEVC or MJPEG")
-        check_size(path, stream.codec_context.width, stream.codec_context.height)
+        check_size(path, stream.codec_context.width, stream.codec_context.height, _BYTES_A_PIXEL)
         yield from _frames(path, container, stream, progress)
         _check_whole(path, container, stream, progress)
 
@@ -164,8 +168,11 @@ def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) 
 
 
 def _time_s(stamped: Any, stream: Any, progress: _Progress) -> float:
-    """Presentation time of a frame or packet; that of the one before where it has none."""
-    return float(stamped.pts * stream.time_base) if stamped.pts is not None else progress.last_time_s
+    """Presentation time of a frame or packet; that of the one before where it has none, or none to be believed."""
+    if stamped.pts is None or not stream.time_base:
+        return progress.last_time_s
+    time_s = float(stamped.pts * stream.time_base)
+    return time_s if abs(time_s) < _MOST_S else progress.last_time_s
 
 
 def _picture(frame: Any, time_s: float) -> _Picture:
