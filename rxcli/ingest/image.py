@@ -157,13 +157,20 @@ def _tiff_luma(pixels: NDArray[Any], path: Path) -> tuple[Luma, bool]:
         pixels = pixels.view(np.uint8) * np.uint8(255)
     if pixels.dtype in (np.uint8, np.uint16):
         return luma_of(pixels), False
-    if pixels.dtype == np.uint32:  # some software fills the upper bits, some the lower ones
-        shift = max(int(pixels.max(initial=0)).bit_length() - 16, 0)
-        return luma_of((pixels >> shift).astype(np.uint16)), False
+    if pixels.dtype == np.uint32:
+        return luma_of(_fewer_bits(pixels)), False
     if pixels.dtype.kind != "f":
         raise InputError(f"{path}: TIFF samples of type {pixels.dtype}", "save it with 8 or 16 bits a sample")
     light = luma_of(_light_of(pixels))
     return np.rint(np.clip(light, 0, 1, out=light) * 65535).astype(np.uint16), True
+
+
+def _fewer_bits(pixels: NDArray[np.uint32]) -> NDArray[Any]:
+    """The upper 16 bits that are used, or the lower 8 where no more are: software fills either end of 32 bits."""
+    bits = int(pixels.max(initial=0)).bit_length()
+    if bits <= 8:
+        return pixels.astype(np.uint8)
+    return ((pixels >> (bits - 16)) if bits > 16 else (pixels << (16 - bits))).astype(np.uint16)
 
 
 def _light_of(pixels: NDArray[Any]) -> NDArray[np.float32]:
