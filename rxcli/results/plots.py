@@ -120,7 +120,7 @@ def photo_figure(frame: Frame, result: FrameResult, outlines: Outlines | None) -
     extent = (-0.5, frame.width - 0.5, frame.height - 0.5, -0.5)
     axes.imshow(grey_levels(frame)[::step, ::step], cmap="gray", vmin=0, vmax=255, extent=extent)
     title = f"{printable(result.source)}: {result.status}" + (f" ({result.message})" if result.message else "")
-    axes.set_title(title, parse_math=False, wrap=True)  # $ in a name is no formula
+    axes.set_title(title, parse_math=False)  # $ in a name is no formula
     if result.corners is not None:
         closed = result.corners[[0, 1, 2, 3, 0]]
         axes.plot(closed[:, 0], closed[:, 1], color="tab:blue", linewidth=1)
