@@ -32,6 +32,8 @@ class Metadata:
     focal_length_35mm: float | None = None
     #: EXIF orientation, 1..8; 1 where the file has none.
     orientation: int = 1
+    #: What the file says and no camera does, in words; it is None above.
+    not_believed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

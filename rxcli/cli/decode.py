@@ -133,7 +133,9 @@ def _outputs(options: dict[str, Any]) -> Iterator[Output]:
     summary = options["summary"]
     is_table = summary is not None and summary.suffix.casefold() == ".csv"
     looks = {
-        "json": outputs.JOURNAL,
+        "json": outputs.ANYTHING
+        if options["resume"]
+        else outputs.JOURNAL,  # resuming looks closer, and knows half lines
         "junit": outputs.JUNIT,
         "summary": outputs.CSV_SUMMARY if is_table else outputs.PARQUET_SUMMARY,
         "save_camera": outputs.ESTIMATED_CAMERA,

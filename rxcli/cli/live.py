@@ -69,11 +69,18 @@ def live(device: Path, **options: Any) -> int:
     from rxcli.ingest.v4l2 import LiveSource
     from rxcli.receiver.pipeline import receive
 
-    source = LiveSource(device, _settings(options), on_lost=lambda reason: _say(f"waiting: {reason}"))
+    source = LiveSource(
+        device,
+        _settings(options),
+        on_lost=lambda reason: _say(f"waiting: {reason}"),
+        duration_s=options["duration"],
+        on_idle=lambda: status.show_if_due(),
+    )
+    status = Status(source, quiet=options["quiet"])
     with ExitStack() as stack:
         write = _writer(options["json_path"], stack)
-        status = stack.enter_context(Status(source, quiet=options["quiet"]))
-        frames = stack.enter_context(closing(_limited(source, options["n_frames"], options["duration"])))
+        stack.enter_context(status)
+        frames = stack.enter_context(closing(_limited(source, options["n_frames"])))
         for result in receive(frames, configured):
             write(result)
             status.update(result)
@@ -114,14 +121,12 @@ def _show_modes(device: Path) -> int:
     return ExitCode.OK
 
 
-def _limited(source: LiveSource, n_frames: int | None, duration_s: float | None) -> Generator[Frame, None, None]:
-    """Frames of the camera up to a number or a time, which counts from the first frame."""
+def _limited(source: LiveSource, n_frames: int | None) -> Generator[Frame, None, None]:
+    """Frames of the camera up to a number."""
     with closing(iter(source)) as frames:
-        end_s: float | None = None
         for number, frame in enumerate(frames, 1):
-            end_s = end_s or (time.monotonic() + duration_s if duration_s else None)
             yield frame
-            if number == n_frames or (end_s is not None and time.monotonic() >= end_s):
+            if number == n_frames:
                 return
 
 
@@ -178,7 +183,7 @@ class Status:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._recent:
+        if self._recent or self.source.counts.damaged:
             self._show(final=True)
 
     def update(self, result: FrameResult) -> None:
@@ -188,6 +193,11 @@ class Status:
         self.n_packets += sum(len(column.packets) for column in result.columns)
         while self._recent[0].time_s < now - _WINDOW_S:
             self._recent.popleft()
+        self.show_if_due(now)
+
+    def show_if_due(self, now: float | None = None) -> None:
+        """Show the state if it is time, also where no whole frame comes."""
+        now = time.monotonic() if now is None else now
         if now - self._shown_s >= (_TERMINAL_S if sys.stderr.isatty() else _LOG_S):
             self._shown_s = now
             self._show()
@@ -207,9 +217,12 @@ def format_status(recent: list[_Moment], counts: CameraCounts) -> str:
     """The state of reception in one line.
 
     Args:
-        recent: what the frames of the last second brought; at least one.
+        recent: what the frames of the last second brought; none where no whole frame has come yet.
         counts: what became of the camera's frames so far.
     """
+    lost = [f"dropped {counts.dropped}", f"damaged {counts.damaged}"]
+    if not recent:
+        return " | ".join(["no whole frame yet", *lost])
     last = recent[-1]
     span_s = max(last.time_s - recent[0].time_s, 1e-3)
     bits = sum(moment.bits for moment in recent)
@@ -220,8 +233,7 @@ def format_status(recent: list[_Moment], counts: CameraCounts) -> str:
         parts += [f"{(len(recent) - 1) / span_s:.1f} frames/s", f"{new_bits / span_s / 1e3:.1f} kb/s"]
     if bits:
         parts.append(f"BER about {sum(moment.wrong_bits for moment in recent) / bits:.1e}")
-    parts += [f"dropped {counts.dropped}", f"damaged {counts.damaged}"]
-    return " | ".join(parts)
+    return " | ".join(parts + lost)
 
 
 def _moment(result: FrameResult, now: float) -> _Moment:

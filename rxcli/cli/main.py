@@ -222,13 +222,11 @@ def _leave_stdout() -> None:
 def _say_system(error: OSError) -> int:
     """The system refuses something: no space, no right, too many files."""
     reason = error.strerror or str(error)
-    try:
-        sys.stdout.flush()
-    except (OSError, ReceiverError):
+    if error.filename is None:  # files of ours say their names
         _say(f"stdout: cannot be written ({reason}); redirect it to where there is room")
         _leave_stdout()
     else:
-        _say(f"{error.filename or 'the system refuses'}: {reason}; make room or correct the permissions, and try again")
+        _say(f"{error.filename}: {reason}; make room or correct the permissions, and try again")
     return ExitCode.UNREADABLE
 
 

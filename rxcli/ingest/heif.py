@@ -37,7 +37,8 @@ def read_heif(data: bytes, path: Path) -> tuple[Luma, Metadata]:
         raise InputError(f"{path}: HEIC needs an extra", "run `pip install 'vlc-rx[heic]'`, or save as JPEG") from None
     try:
         file = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
-        check_size(path, *file.size)
+        width, height = file.size
+        check_size(path, width, height, 12, len(data))  # planes, interleaved RGB of up to 16 bits, luma
         pixels = np.asarray(file)
     except InputError:
         raise

@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError
+from rxcli.ingest.extent import claims_too_much
 from rxcli.ingest.luma import Luma, luma_of
 from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
+from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import Kind, check_size, read_bytes, reason_of
 from rxcli.types import Frame, Metadata
 
@@ -60,16 +62,23 @@ def _read_png(data: bytes, path: Path) -> Frame:
     import cv2
 
     chunks = dict(_png_chunks(data, path))
-    header = chunks.get(b"IHDR", b"")
-    check_size(path, int.from_bytes(header[:4]), int.from_bytes(header[4:8]))
+    header = chunks.get(b"IHDR", b"").ljust(13, b"\0")
+    depth, samples = (2 if header[8] == 16 else 1), _PNG_SAMPLES.get(header[9], 4)
+    held = depth * (samples + (samples > 1))  # and the luma that is made of colour
+    check_size(path, int.from_bytes(header[:4]), int.from_bytes(header[4:8]), held, len(data))
     try:
-        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        with quiet_libraries():
+            bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         bgr = None
     if bgr is None:
         raise InputError(f"{path}: the PNG is damaged", "copy the file again")
     rgb = bgr if bgr.ndim == 2 else bgr[:, :, 2::-1]
     return _frame(path, luma_of(rgb), exif_metadata(chunks.get(b"eXIf", b"")))
+
+
+#: ISO 15948, table 11.1: samples of a pixel as OpenCV decodes it, by colour type; some may get an alpha.
+_PNG_SAMPLES = {0: 1, 2: 4, 3: 4, 4: 4, 6: 4}
 
 
 def _png_chunks(data: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
@@ -93,11 +102,13 @@ def _read_tiff(path: Path) -> Frame:
 
     logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)  # what matters comes as an exception
     with path.open("rb") as file:
+        if claims_too_much(file):
+            raise InputError(f"{path}: the TIFF's directories claim more than the file holds", "copy it again")
         metadata = tiff_metadata(file)
     try:
         with tifffile.TiffFile(path) as tiff:
             page = tiff.pages[0]
-            check_size(path, page.imagewidth, page.imagelength)
+            _check_page(page, path)
             pixels, min_is_white = _tiff_pixels(page, path), page.photometric == tifffile.PHOTOMETRIC.MINISWHITE
     except InputError:
         raise
@@ -109,6 +120,13 @@ def _read_tiff(path: Path) -> Frame:
         raise InputError(f"{path}: the TIFF is damaged", "copy it again")
     luma, linear = _tiff_luma(pixels, path)
     return _frame(path, np.iinfo(luma.dtype).max - luma if min_is_white else luma, metadata, linear)
+
+
+def _check_page(page: Any, path: Path) -> None:
+    """Refuse what would fill the memory: samples as they are, as float32 or 16 bits, and luma."""
+    size, samples = page.bitspersample // 8 or 1, max(page.samplesperpixel, 1)
+    held = size * samples + (4 * samples if size > 2 else 0) + (size if samples > 1 else 0)
+    check_size(path, page.imagewidth, page.imagelength, held, page.rowsperstrip * page.imagewidth * size * samples)
 
 
 def _tiff_pixels(page: Any, path: Path) -> NDArray[Any]:
@@ -129,7 +147,7 @@ def _pillow_tiff(path: Path, page: Any) -> NDArray[Any]:
 
     tag = page.tags.get("Orientation")
     orientation = int(tag.value) if tag is not None and tag.value in range(1, 9) else 1
-    with _quiet(), Image.open(path, formats=("TIFF",)) as image:
+    with _quiet(), quiet_libraries(), Image.open(path, formats=("TIFF",)) as image:
         return as_stored(_pillow_pixels(image), orientation)  # Pillow turns TIFFs for viewing
 
 
@@ -140,12 +158,28 @@ def _tiff_luma(pixels: NDArray[Any], path: Path) -> tuple[Luma, bool]:
     if pixels.dtype in (np.uint8, np.uint16):
         return luma_of(pixels), False
     if pixels.dtype == np.uint32:
-        return luma_of((pixels >> 16).astype(np.uint16)), False
+        return luma_of(_fewer_bits(pixels)), False
     if pixels.dtype.kind != "f":
         raise InputError(f"{path}: TIFF samples of type {pixels.dtype}", "save it with 8 or 16 bits a sample")
-    light = luma_of(np.nan_to_num(pixels.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0))
-    top = float(light.max(initial=0.0)) or 1.0
-    return np.rint(np.clip(light / top, 0, 1) * 65535).astype(np.uint16), True
+    light = luma_of(_light_of(pixels))
+    return np.rint(np.clip(light, 0, 1, out=light) * 65535).astype(np.uint16), True
+
+
+def _fewer_bits(pixels: NDArray[np.uint32]) -> NDArray[Any]:
+    """The upper 16 bits that are used, or the lower 8 where no more are: software fills either end of 32 bits."""
+    bits = int(pixels.max(initial=0)).bit_length()
+    if bits <= 8:
+        return pixels.astype(np.uint8)
+    return ((pixels >> (bits - 16)) if bits > 16 else (pixels << (16 - bits))).astype(np.uint16)
+
+
+def _light_of(pixels: NDArray[Any]) -> NDArray[np.float32]:
+    """Float samples as shares of the brightest one; what is no number is dark."""
+    finite = np.isfinite(pixels)
+    top = float(np.max(pixels, initial=0.0, where=finite)) or 1.0
+    light = np.zeros(pixels.shape, np.float32)
+    np.divide(pixels, pixels.dtype.type(top), out=light, where=finite, casting="same_kind")
+    return light
 
 
 def _read_with_pillow(data: bytes, path: Path) -> NDArray[np.uint8]:
@@ -154,7 +188,7 @@ def _read_with_pillow(data: bytes, path: Path) -> NDArray[np.uint8]:
 
     try:
         with _quiet(), Image.open(io.BytesIO(data), formats=("BMP", "WEBP")) as image:
-            check_size(path, *image.size)
+            check_size(path, *image.size, 8, len(data))  # as it is stored, as RGB twice, luma
             return np.asarray(luma_of(_pillow_pixels(image)), np.uint8)
     except InputError:
         raise

@@ -13,6 +13,10 @@ from rxcli.ingest.sniff import check_size, reason_of
 
 #: What simplejpeg raises; KeyError for a subsampling that it does not know.
 _FAULTS = (ValueError, KeyError, MemoryError, OverflowError)
+#: Frames whose coefficients are gathered from several scans; baseline ones may be, too, in separate scans.
+_PROGRESSIVE = (0xC2, 0xC6, 0xCA, 0xCE)
+#: Encoders use some ten; every scan goes over the whole picture.
+_MAX_SCANS = 100
 _PADDING = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
 
 
@@ -32,11 +36,29 @@ def decode_luma(data: Any, source: object) -> NDArray[np.uint8]:
         height, width, _, _ = simplejpeg.decode_jpeg_header(data, strict=False)
     except _FAULTS:
         raise InputError(f"{source}: the JPEG header is damaged or cut", "copy the file again") from None
-    check_size(source, width, height)
+    check_size(source, width, height, _held(data), len(data))
+    if bytes(data).count(b"\xff\xda") > _MAX_SCANS:
+        raise InputError(f"{source}: the JPEG has more than {_MAX_SCANS} scans", "the file is damaged or a bomb")
     try:
         return _gray(data)
     except _FAULTS as error:
         return _second_look(data, reason_of(error), source)
+
+
+def _held(data: Any) -> float:
+    """Bytes a pixel that decoding takes: luma, and the coefficients of all components where they come in several scans.
+
+    ITU-T T.81, B.2.2: the frame header's marker tells the process, its sixth byte the number of components.
+    """
+    at, data = 2, memoryview(data)
+    while at + 10 <= len(data) and data[at] == 0xFF:
+        marker, length = data[at + 1], data[at + 2] << 8 | data[at + 3]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            return 1 + (2 * data[at + 9] if marker in _PROGRESSIVE else 0)
+        if marker == 0xDA:
+            break
+        at += 1 if marker == 0xFF else 2 + max(length, 2)
+    return 1
 
 
 def _gray(data: Any, strict: bool = True) -> NDArray[np.uint8]:

@@ -12,6 +12,7 @@ Luma = NDArray[np.uint8] | NDArray[np.uint16]
 #: Luma weights of red, green, blue (ITU-R BT.601 and BT.709).
 BT601 = (0.299, 0.587, 0.114)
 BT709 = (0.2126, 0.7152, 0.0722)
+_BAND_PIXELS = 1 << 22
 
 
 def luma_of(pixels: NDArray[Any], weights: tuple[float, float, float] = BT601) -> NDArray[Any]:
@@ -22,7 +23,12 @@ def luma_of(pixels: NDArray[Any], weights: tuple[float, float, float] = BT601) -
         return np.ascontiguousarray(pixels[:, :, 0])
     import cv2
 
-    rgb = np.ascontiguousarray(pixels[:, :, :3])
-    if weights == BT601:
-        return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY))
-    return np.asarray(cv2.transform(rgb, np.array([weights], np.float32)))
+    luma = np.empty(pixels.shape[:2], pixels.dtype)
+    step = max(_BAND_PIXELS // max(pixels.shape[1], 1), 1)
+    for top in range(0, pixels.shape[0], step):  # in bands: a copy of the whole would double the memory
+        rgb = np.ascontiguousarray(pixels[top : top + step, :, :3])
+        if weights == BT601:
+            luma[top : top + step] = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        else:
+            luma[top : top + step] = cv2.transform(rgb, np.array([weights], np.float32))
+    return luma

@@ -15,6 +15,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from rxcli.ingest.extent import claims_too_much
 from rxcli.types import Metadata
 
 # EXIF 2.32, tables 3 to 8.
@@ -25,6 +26,24 @@ _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
 _ISO_OVERFLOW = 65535
 #: Enough of a file for its directories, where they must be copied.
 _HEADER_BYTES = 1 << 20
+#: An EXIF block that fits into a JPEG file; other files could hold longer ones.
+_EXIF_BYTES = 1 << 16
+#: Longer names of makers, models and lenses are none.
+_MOST_CHARACTERS = 200
+
+#: What a receiver can use of what files say: field -> least, most, unit. A second is thousands of slots.
+_BOUNDS = {
+    "exposure_s": (1e-7, 1.0, "s"),
+    "iso": (0.1, 1e8, ""),
+    "focal_length_mm": (0.01, 1e5, "mm"),
+    "focal_length_35mm": (0.01, 1e5, "mm"),
+}
+_NAMES = {
+    "exposure_s": "exposure",
+    "iso": "ISO",
+    "focal_length_mm": "focal length",
+    "focal_length_35mm": "focal length",
+}
 
 Tags = Mapping[int, Any]
 
@@ -36,7 +55,7 @@ def jpeg_metadata(data: bytes) -> Metadata:
 
 def exif_metadata(exif: bytes) -> Metadata:
     """Metadata of an EXIF block: a TIFF header and its directories, with or without `Exif\\0\\0` before it."""
-    return tiff_metadata(io.BytesIO(exif.removeprefix(b"Exif\0\0")))
+    return tiff_metadata(io.BytesIO(exif.removeprefix(b"Exif\0\0")[:_EXIF_BYTES]))
 
 
 def tiff_metadata(stream: BinaryIO) -> Metadata:
@@ -73,6 +92,19 @@ def clip_metadata(tags: Mapping[str, str]) -> Metadata:
         make=text("make", "com.apple.quicktime.make", "com.android.manufacturer"),
         model=text("model", "com.apple.quicktime.model", "com.android.model"),
     )
+
+
+def believed(metadata: Metadata) -> Metadata:
+    """The metadata without what no receiver can use, which is named in `not_believed` instead."""
+    doubts = {}
+    for name, (least, most, unit) in _BOUNDS.items():
+        value = getattr(metadata, name)
+        if value is not None and not least <= value <= most:
+            doubts[name] = f"{_NAMES[name]} of {value:.4g} {unit}".rstrip()
+    if not doubts:
+        return metadata
+    unknown: dict[str, Any] = dict.fromkeys(doubts)
+    return replace(metadata, not_believed=(*metadata.not_believed, *doubts.values()), **unknown)
 
 
 def merge(first: Metadata, second: Metadata) -> Metadata:
@@ -115,6 +147,9 @@ def _load_directories(stream: BinaryIO) -> tuple[Tags, Tags]:
     """First and EXIF directory as plain dictionaries, empty where they are broken."""
     from PIL import Image
 
+    stream.seek(0)
+    if claims_too_much(stream):
+        return {}, {}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -132,15 +167,17 @@ def _from_tags(main: Tags, exif: Tags) -> Metadata:
         return next((value for value in values if value is not None), None)
 
     iso = number(_SENSITIVITY)
-    return Metadata(
-        make=_text(main.get(_MAKE)),
-        model=_text(main.get(_MODEL)),
-        lens=_text(exif.get(_LENS_MODEL)),
-        exposure_s=number(_EXPOSURE),
-        iso=number(_ISO_SPEED, _RECOMMENDED_INDEX, _SENSITIVITY) if iso == _ISO_OVERFLOW else iso,
-        focal_length_mm=number(_FOCAL_LENGTH),
-        focal_length_35mm=number(_FOCAL_LENGTH_35MM),
-        orientation=_orientation(main.get(_ORIENTATION)),
+    return believed(
+        Metadata(
+            make=_text(main.get(_MAKE)),
+            model=_text(main.get(_MODEL)),
+            lens=_text(exif.get(_LENS_MODEL)),
+            exposure_s=number(_EXPOSURE),
+            iso=number(_ISO_SPEED, _RECOMMENDED_INDEX, _SENSITIVITY) if iso == _ISO_OVERFLOW else iso,
+            focal_length_mm=number(_FOCAL_LENGTH),
+            focal_length_35mm=number(_FOCAL_LENGTH_35MM),
+            orientation=_orientation(main.get(_ORIENTATION)),
+        )
     )
 
 
@@ -148,7 +185,7 @@ def _text(value: Any) -> str | None:
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     text = value.split("\0")[0].strip() if isinstance(value, str) else ""
-    return "".join(c for c in text if c.isprintable()) or None
+    return "".join(c for c in text[:_MOST_CHARACTERS] if c.isprintable()) or None
 
 
 def _positive(value: Any) -> float | None:

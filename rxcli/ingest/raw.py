@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError
-from rxcli.ingest.extent import bytes_claimed
-from rxcli.ingest.metadata import merge, raw_metadata
+from rxcli.ingest.extent import bytes_claimed, claims_too_much
+from rxcli.ingest.metadata import believed, merge, raw_metadata
+from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import check_size, reason_of
 from rxcli.types import Frame, Metadata, Mosaic
 
@@ -23,6 +24,9 @@ from rxcli.types import Frame, Metadata, Mosaic
 _FLIP_ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}
 #: Colour filter arrays repeat with one of these periods: Bayer, X-Trans, and what LibRaw calls 16 x 16.
 _PERIODS = (2, 4, 6, 8, 16)
+
+#: LibRaw keeps values of two bytes, and where all colours stand at each pixel, four of them.
+_BYTES_A_PIXEL = 2
 
 Window = tuple[int, int, int, int]
 
@@ -37,8 +41,10 @@ def read_raw(path: Path) -> Frame:
 
     _check_whole(path)
     try:
-        raw = rawpy.imread(str(path))
-        image = raw.raw_image
+        raw = rawpy.imread(str(path))  # its directories only; sensor values are decoded when they are asked for
+        check_size(path, raw.sizes.raw_width, raw.sizes.raw_height, _BYTES_A_PIXEL)
+        with quiet_libraries():
+            image = raw.raw_image
     except rawpy.LibRawFileUnsupportedError:
         raise InputError(f"{path}: no RAW format that LibRaw knows", "convert it to DNG, or use the JPEG") from None
     except (rawpy.LibRawError, RuntimeError, OSError, MemoryError, ValueError) as error:
@@ -72,6 +78,8 @@ def default_crop(sizes: Any) -> Window:
 
 def _check_whole(path: Path) -> None:
     with path.open("rb") as file:
+        if claims_too_much(file):
+            raise InputError(f"{path}: the RAW file's directories claim more than the file holds", "copy it again")
         size, claimed = path.stat().st_size, bytes_claimed(file)
     if size < claimed:
         reason = f"{path}: the RAW file is cut: {size} of at least {claimed} bytes are there"
@@ -146,7 +154,7 @@ def _metadata(path: Path, raw: Any) -> Metadata:
         focal_length_mm=other.focal_length if other.focal_length > 0 else None,
     )
     orientation = exif.orientation if exif.orientation != 1 else _FLIP_ORIENTATION.get(raw.sizes.flip, 1)
-    return replace(merge(exif, libraw), orientation=orientation)
+    return replace(merge(exif, believed(libraw)), orientation=orientation)
 
 
 def _libraw_reason(error: BaseException) -> str:

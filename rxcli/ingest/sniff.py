@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from pathlib import Path
 from typing import Literal
@@ -27,6 +28,8 @@ KNOWN_SUFFIXES = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
 HEAD_BYTES = 64
 #: No camera makes larger pictures; what claims to be larger is damaged or a decompression bomb.
 MAX_PIXELS = 400_000_000
+#: What a reader may hold at a time: the file's bytes, its samples, and the luma made of them.
+MAX_BYTES = 1_250_000_000
 
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _RAW_MAGIC = (b"FUJIFILMCCD-RAW", b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FOVb", b"\0MRM", b"II\x1a\0\0\0HEAPCCDR")
@@ -70,6 +73,8 @@ def read_bytes(path: Path, size: int = -1) -> bytes:
     """
     try:
         with path.open("rb") as file:
+            if size < 0 and os.fstat(file.fileno()).st_size > MAX_BYTES:
+                raise InputError(f"{path}: the file has more than {MAX_BYTES / 1e9:g} GB", "save the picture smaller")
             return file.read(size)
     except (OSError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read ({reason_of(error)})", "check permissions and disk") from None
@@ -85,23 +90,36 @@ def is_raw_tiff(path: Path) -> bool:
     from rxcli.ingest.metadata import tiff_tags
 
     tags = tiff_tags(path)
+    if not tags:
+        return path.suffix.lower() in RAW_SUFFIXES
     if _DNG_VERSION in tags or tags.get(_PHOTOMETRIC) in _RAW_PHOTOMETRICS:
         return True
     preview = tags.get(_SUBFILE_TYPE) == 1
     return _MAKE in tags and (preview or path.suffix.lower() in RAW_SUFFIXES)
 
 
-def check_size(source: object, width: int, height: int) -> None:
-    """Refuse a picture that no camera can have made.
+def check_size(source: object, width: int, height: int, bytes_a_pixel: float = 1, further_bytes: int = 0) -> None:
+    """Refuse a picture that no camera can have made, or that would fill the memory.
+
+    Args:
+        source: names the picture in messages.
+        width: pixels.
+        height: pixels.
+        bytes_a_pixel: that the reader holds at a time.
+        further_bytes: that it holds besides, the file's for instance.
 
     Raises:
-        InputError: no pixels, or more than `MAX_PIXELS`.
+        InputError: no pixels, more than `MAX_PIXELS`, or more than `MAX_BYTES`.
     """
     if width < 1 or height < 1:
         raise InputError(f"{source}: the picture is {width} x {height} pixels", "the file is damaged; copy it again")
     if width * height > MAX_PIXELS:
         reason = f"{source}: claims {width} x {height} pixels, more than {MAX_PIXELS // 1_000_000} million"
         raise InputError(reason, "the file is damaged or no photo")
+    needed = width * height * bytes_a_pixel + further_bytes
+    if needed > MAX_BYTES:
+        reason = f"{source}: {width} x {height} pixels would take {needed / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:g}"
+        raise InputError(reason, "save it with fewer bits a sample or in grey, if it is no bomb")
 
 
 def _by_magic(head: bytes) -> Kind | None:

@@ -7,6 +7,7 @@ driver dropped, gives the time of each, refuses a pixel format instead of silent
 from __future__ import annotations
 
 import errno
+import math
 import mmap
 import os
 import select
@@ -108,6 +109,10 @@ class CameraCounts:
     start_s: float | None = None
 
 
+class _TimeUpError(Exception):
+    """The time of a live source is over."""
+
+
 class CameraLost(InputError):
     """A camera that is missing, busy, silent or unplugged: it may come back."""
 
@@ -119,10 +124,17 @@ class LiveSource:
         path: the device, `/dev/video0`.
         settings: what is asked of it.
         on_lost: told the reason when waiting begins.
+        duration_s: frames end so long after the first is asked for, whether any came or not; None: never.
+        on_idle: called now and then while no whole frame comes.
     """
 
     def __init__(
-        self, path: Path, settings: CameraSettings | None = None, on_lost: Callable[[str], None] | None = None
+        self,
+        path: Path,
+        settings: CameraSettings | None = None,
+        on_lost: Callable[[str], None] | None = None,
+        duration_s: float | None = None,
+        on_idle: Callable[[], None] | None = None,
     ) -> None:
         self.settings = settings or CameraSettings()
         self.counts = CameraCounts()
@@ -130,21 +142,40 @@ class LiveSource:
         self.mode: Mode | None = None
         self._path = path
         self._on_lost = on_lost or (lambda reason: None)
+        self._duration_s, self._end_s = duration_s, math.inf
+        self._on_idle = on_idle or (lambda: None)
+
+    def _idle(self) -> None:
+        self._on_idle()
+        if time.monotonic() >= self._end_s:
+            raise _TimeUpError
 
     def __iter__(self) -> Generator[Frame, None, None]:
+        if self._duration_s is not None:
+            self._end_s = time.monotonic() + self._duration_s
+        try:
+            yield from self._frames()
+        except _TimeUpError:
+            return
+
+    def _frames(self) -> Generator[Frame, None, None]:
         waiting = False
         while True:
             try:
-                with Camera(self._path, self.settings, self.counts) as camera:
+                with Camera(self._path, self.settings, self.counts, self._idle) as camera:
                     self.mode, waiting = camera.mode, False
-                    yield from camera
+                    for frame in camera:
+                        yield frame
+                        if time.monotonic() >= self._end_s:
+                            return
             except CameraLost as error:
                 if not self.settings.wait:
                     raise
                 if not waiting:
                     self._on_lost(str(error))
                 waiting = True
-                time.sleep(_RETRY_S)
+                time.sleep(min(_RETRY_S, max(self._end_s - time.monotonic(), 0.0)))
+                self._idle()
 
 
 class Camera:
@@ -157,8 +188,15 @@ class Camera:
         InputError: no camera, or not in the mode that is asked for.
     """
 
-    def __init__(self, path: Path, settings: CameraSettings, counts: CameraCounts | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        settings: CameraSettings,
+        counts: CameraCounts | None = None,
+        on_idle: Callable[[], None] | None = None,
+    ) -> None:
         self.counts = counts or CameraCounts()
+        self._on_idle = on_idle or (lambda: None)
         self._path, self._settings = path, settings
         self._descriptor = _open(path)
         self._maps: list[mmap.mmap] = []
@@ -190,6 +228,7 @@ class Camera:
             luma = self._luma(capture)
             if luma is None:
                 self.counts.damaged += 1
+                self._on_idle()
                 continue
             self.counts.delivered += 1
             yield self._frame(luma, capture.time_s)
@@ -289,7 +328,8 @@ class Camera:
             while self._newest is None:
                 if self._failure is not None:
                     raise self._failure
-                self._fresh.wait(_POLL_S)
+                if not self._fresh.wait(_POLL_S):
+                    self._on_idle()
             capture, self._newest = self._newest, None
         return capture
 

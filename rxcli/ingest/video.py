@@ -32,6 +32,11 @@ _END_TOLERANCE = 1.5
 _MJPEG_THREADS = min(4, os.cpu_count() or 1)
 #: Threads of the other decoders: one more than FFmpeg takes, for theirs wait for one another.
 _DECODER_THREADS = min((os.cpu_count() or 1) + 2, 16)
+#: Decoders hold some ten frames for others to refer to, and one in every thread.
+_BYTES_A_PIXEL = 1.5 * (10 + _DECODER_THREADS)
+_TS_SYNC = 0x47
+#: Times of a clip that are believed: a claim of more would be years.
+_MOST_S = 1e6
 
 
 @dataclass(slots=True)
@@ -86,7 +91,7 @@ def _read(path: Path) -> Generator[Frame, None, None]:
         stream = container.streams.video[0]
         if stream.codec_context is None:
             raise InputError(f"{path}: its codec is unknown", "save it as H.264, HEVC or MJPEG")
-        check_size(path, stream.codec_context.width, stream.codec_context.height)
+        check_size(path, stream.codec_context.width, stream.codec_context.height, _BYTES_A_PIXEL)
         yield from _frames(path, container, stream, progress)
         _check_whole(path, container, stream, progress)
 
@@ -164,8 +169,11 @@ def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) 
 
 
 def _time_s(stamped: Any, stream: Any, progress: _Progress) -> float:
-    """Presentation time of a frame or packet; that of the one before where it has none."""
-    return float(stamped.pts * stream.time_base) if stamped.pts is not None else progress.last_time_s
+    """Presentation time of a frame or packet; that of the one before where it has none, or none to be believed."""
+    if stamped.pts is None or not stream.time_base:
+        return progress.last_time_s
+    time_s = float(stamped.pts * stream.time_base)
+    return time_s if abs(time_s) < _MOST_S else progress.last_time_s
 
 
 def _picture(frame: Any, time_s: float) -> _Picture:
@@ -218,11 +226,26 @@ def _ends_early(path: Path, container: Any, stream: Any, progress: _Progress) ->
     """Whether the container's own index, frame count or duration asks for more than there was."""
     if container.format.name == "avi":
         return bool(stream.frames > progress.n_packets)
+    if container.format.name == "mpegts":
+        return _ends_within_packet(path)
     entries = stream.index_entries
     if "mp4" in container.format.name:
         return _boxes_end(path) > container.size or any(entry.pos + entry.size > container.size for entry in entries)
     frame_s = 1 / float(stream.average_rate or 30)
     return progress.last_time_s + _END_TOLERANCE * frame_s < _stated_end_s(container, stream)
+
+
+def _ends_within_packet(path: Path) -> bool:
+    """Whether a transport stream ends within one of its packets (ISO/IEC 13818-1, 2.4.3.2), which begin with 0x47.
+
+    On discs a time of four bytes stands before each, in broadcasts sixteen of correction after it.
+    """
+    with path.open("rb") as file:
+        head, length = file.read(1024), file.seek(0, os.SEEK_END)
+    for size, first in ((188, 0), (192, 4), (204, 0)):
+        if len(head) > first + size and head[first] == head[first + size] == _TS_SYNC:
+            return length % size != 0
+    return False
 
 
 def _boxes_end(path: Path) -> int:

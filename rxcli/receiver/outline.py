@@ -17,7 +17,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.receiver.acquisition import acquire, sample_columns
 from rxcli.receiver.cameras import known_lens
 from rxcli.receiver.context import Failure, FrameContext, Timer
-from rxcli.receiver.corners import levels_of, unreadable_orientation, whole_picture
+from rxcli.receiver.corners import levels_of, outside_the_picture, unreadable_orientation, whole_picture
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.still import column_llr, initial_pass
 from rxcli.receiver.unknown_camera import likely_camera
@@ -77,7 +77,7 @@ def find_outline(frame: Frame, options: ReceiverOptions, timer: Timer) -> Outlin
         return refused
     if options.corners is not None:
         with timer("geometry"):
-            return Outline(options.corners)
+            return outside_the_picture(options.corners, frame) or Outline(options.corners)
     candidates, reason = possible_outlines(frame, options, timer)
     if len(candidates) > 1:
         candidates = _by_packets(frame, candidates, options, timer)

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _PHOTO_PX = 1600
+#: Height of the picture of a picture, whatever its shape.
+_TALLEST_IN = 24
 _COLUMNS_PER_PICTURE = 20
 #: Colour of a confidence from 0 to 1.
 _COLOURS = "RdYlGn"
@@ -112,12 +114,13 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 def photo_figure(frame: Frame, result: FrameResult, outlines: Outlines | None) -> Figure:
     """The photo with corners, and every column's outline in the colour of its confidence."""
-    step = max(1, math.ceil(frame.width / _PHOTO_PX))
-    figure = new_figure(12, 12 * frame.height / frame.width + 0.5)
+    step = max(1, math.ceil(max(frame.width, frame.height) / _PHOTO_PX))
+    figure = new_figure(12, min(max(12 * frame.height / frame.width, 1), _TALLEST_IN) + 0.5)
     axes = figure.add_subplot()
     extent = (-0.5, frame.width - 0.5, frame.height - 0.5, -0.5)
     axes.imshow(grey_levels(frame)[::step, ::step], cmap="gray", vmin=0, vmax=255, extent=extent)
-    axes.set_title(f"{printable(result.source)}: {result.status}" + (f" ({result.message})" if result.message else ""))
+    title = f"{printable(result.source)}: {result.status}" + (f" ({result.message})" if result.message else "")
+    axes.set_title(title, parse_math=False)  # $ in a name is no formula
     if result.corners is not None:
         closed = result.corners[[0, 1, 2, 3, 0]]
         axes.plot(closed[:, 0], closed[:, 1], color="tab:blue", linewidth=1)

@@ -151,6 +151,9 @@ class Decoder:
     def _frames(self, source: Source) -> Iterator[Frame]:
         for frame in self.open_source(source.path):
             frame = replace(frame, source=source.name)  # as the user named it, wherever it is opened
+            if frame.index == 0 and frame.metadata.not_believed:
+                claims = ", ".join(frame.metadata.not_believed)
+                log.warning("%s: not believed, and taken as unknown: %s", source.name, claims)
             if self.tap is not None:
                 self.tap(frame, source.subfolder)
             yield frame
