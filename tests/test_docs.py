@@ -122,7 +122,7 @@ def _runs(words: tuple[str, ...]) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", filter(_runs, COMMANDS), ids=" ".join)
+@pytest.mark.parametrize("words", list(filter(_runs, COMMANDS)), ids=" ".join)
 def test_commands_run(words: tuple[str, ...], desk: Path) -> None:
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); from rxcli.cli.main import main; main()"
     done = subprocess.run([sys.executable, "-c", code, *words], cwd=desk, capture_output=True, text=True, check=False)
