@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
 from rxcli.errors import UsageError
 from rxcli.profiles import CameraProfile, ScreenProfile, load_profile, shipped_profiles
 from rxcli.types import FloatArray
+
+if TYPE_CHECKING:
+    from rxcli.receiver.channel.denoise import Denoiser
 
 CaeMode = Literal["auto", "always", "never"]
 #: Names of the shortcuts that `ReceiverOptions.skip` may hold; every one is counted in the report.
@@ -40,6 +43,8 @@ class ReceiverOptions:
     skip: frozenset[str] = field(default_factory=lambda: frozenset(SKIPS))
     #: Pass over frames of a clip all of whose bursts are certain already.
     stop_when_certain: bool = False
+    #: In place of the shipped auto-encoder; see `rxcli.receiver.channel.denoise.Denoiser`.
+    denoiser: Denoiser | None = None
     #: Folder for the arrays of every stage boundary; None: none are written.
     dump_dir: Path | None = None
 
@@ -53,6 +58,7 @@ def receiver_options(
     min_confidence: float = 0.0,
     no_skip: Sequence[str] = (),
     stop_when_certain: bool = False,
+    denoiser: Denoiser | None = None,
     dump_dir: str | Path | None = None,
 ) -> ReceiverOptions:
     """The receiver's options from names, files or profiles.
@@ -68,6 +74,7 @@ def receiver_options(
         min_confidence: packets below it are not reported.
         no_skip: shortcuts to switch off, of `SKIPS`.
         stop_when_certain: pass over frames of a clip all of whose packets are certain already.
+        denoiser: in place of the shipped auto-encoder.
         dump_dir: folder for the arrays of every stage boundary.
 
     Raises:
@@ -85,6 +92,7 @@ def receiver_options(
         min_confidence=min_confidence,
         skip=frozenset(SKIPS) - set(no_skip),
         stop_when_certain=stop_when_certain,
+        denoiser=denoiser,
         # Absolute, for workers may stand in other folders.
         dump_dir=None if dump_dir is None else Path(dump_dir).absolute(),
     )

@@ -279,7 +279,7 @@ def _speed_of_media(
 @benchmark.command()
 @options(("--scenes", _SOME, 10_000, "Random scenes."), *_MANY)
 def stability(scenes: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> int:
-    """Hostile values and random scenes: no exception, no warning, no NaN, no confident nonsense.
+    """Random scenes: no exception, no warning, no NaN, no confident nonsense.
 
     Exit code 1 where something was found.
     """

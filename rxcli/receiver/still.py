@@ -258,7 +258,7 @@ def apply_autoencoder(
         return reception, frozenset(), None
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
     try:
-        denoiser = _denoiser()
+        denoiser = options.denoiser or _denoiser()
         corrections = np.zeros((columns.size, reception.clock.n_slots), np.float32)
         shown = (
             np.arange(columns.size) if options.cae == "always" else _worth_showing(reception, reception.scene, columns)

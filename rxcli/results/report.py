@@ -236,7 +236,7 @@ def format_frame(result: FrameResult) -> str:
 def format_heading(result: FrameResult) -> str:
     """Source, screen, camera, status and counts in one line."""
     parts = [printable(result.source)]
-    if result.frame or _is_clip(result):
+    if _is_clip(result):
         parts.append(f"frame {result.frame} at {result.time_s:.3f} s")
     parts.append(result.status)
     if result.screen_profile:
@@ -251,18 +251,26 @@ def format_heading(result: FrameResult) -> str:
 
 
 def _counts(result: FrameResult) -> str:
+    if _goes_on(result):
+        return "its packets end in later frames"
     with_packets = sum(bool(column.packets) for column in result.columns)
     n_packets = sum(len(column.packets) for column in result.columns)
     return f"{n_packets} packets in {with_packets} of {len(result.columns)} columns"
 
 
 def _is_clip(result: FrameResult) -> bool:
-    return any(packet.burst is not None for column in result.columns for packet in column.packets)
+    bursts = any(packet.burst is not None for column in result.columns for packet in column.packets)
+    return result.frame > 0 or bursts or _goes_on(result)
+
+
+def _goes_on(result: FrameResult) -> bool:
+    """Whether a frame of a clip was received, and all its bursts go on in the next."""
+    return result.status == "ok" and bool(result.columns) and not any(column.packets for column in result.columns)
 
 
 def _rows(result: FrameResult) -> Iterator[str]:
     """Rows of the table. A clip's frames leave out columns in which no packet ended: most frames have some."""
-    clip = result.frame > 0 or _is_clip(result)
+    clip = _is_clip(result)
     for key, group in groupby(result.columns, key=_alike):
         columns = list(group)
         if isinstance(key, tuple):

@@ -58,7 +58,7 @@ class SourceSummary:
         self.time_ms += total if math.isfinite(total) else 0.0
         if result.message:
             self.reasons[result.message] += 1
-        self.reasons.update(column.message for column in result.columns if column.message)
+        self.reasons.update(column.message for column in result.columns if column.message and column.status != "ok")
 
     @property
     def confidence(self) -> float | None:

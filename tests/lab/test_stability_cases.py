@@ -1,4 +1,4 @@
-"""Hostile values: the small part; `vlc-rx benchmark stability` is the long one."""
+"""Hostile values; and the watch over random scenes, of which `vlc-rx benchmark stability` does thousands."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hostile_cases import CASES, base_trial
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -16,16 +17,10 @@ from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.benchmark.watch import problems_in, watched
 from rxcli.receiver.decode import detect
 
-_QUICK = (
-    *(name for name in stability.CASES if name.startswith(("frame:", "outline:", "detector:"))),
-    *("float32 against float64", "8 against 16 bits", "integers at the edge of their type", "tiny pictures"),
-    *("exposure of 0.01 slots", "exposure of 20 slots", "1.5 rows per slot", "1e+09 electrons", "order of threads"),
-)
 
-
-@pytest.mark.parametrize("case", _QUICK)
+@pytest.mark.parametrize("case", CASES)
 def test_hostile_case(case: str) -> None:
-    assert stability.case_record({"case": case}) == {"problems": []}
+    assert CASES[case]() == []
 
 
 @settings(max_examples=12, deadline=None, derandomize=True)
@@ -40,7 +35,7 @@ def test_hostile_case(case: str) -> None:
 def test_no_block_of_extremes_upsets_the_receiver(
     block: NDArray[np.uint8], row: float, column: float, shift: float
 ) -> None:
-    base = stability._base()
+    base = base_trial()
     pixels = np.array(base.frame.pixels, np.uint8)
     top, left = int(row * (pixels.shape[0] - 1)), int(column * (pixels.shape[1] - 1))
     part = pixels[top : top + block.shape[0] * 10, left : left + block.shape[1]]
@@ -95,7 +90,7 @@ def test_the_watch_names_the_stage(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_random_scenes_are_counted() -> None:
     records = [stability.scene_record({"seed": seed}) for seed in (3, 4)]
     assert all(record["problems"] == [] for record in records)
-    verdict = stability.Verdict({"a": []}, {}, 2, 40, 400, 30, {"ok": 2})
+    verdict = stability.Verdict({}, 2, 40, 400, 30, {"ok": 2})
     assert not verdict.within_rate
     assert not verdict.stable
     assert replace(verdict, wrong=2).stable

@@ -246,3 +246,15 @@ def test_confidence_without_a_number_is_unknown() -> None:
     packet = replace(PACKET, confidence=math.nan)
     found = summary(replace(OK, columns=(replace(OK.columns[0], packets=(packet,)),)))
     assert found.row(Limits())["confidence"] is None
+
+
+def test_a_frame_whose_bursts_go_on_does_not_look_like_a_failure() -> None:
+    """The first frame of a clip: received, and all it shows is reported with the next one."""
+    goes_on = ColumnResult(0, "ok", message="its burst goes on in the next frame and is reported there")
+    first = replace(OK, columns=(goes_on, replace(goes_on, column=1)))
+    text = format_frame(first)
+    assert "its packets end in later frames" in text.splitlines()[0]
+    assert len(text.splitlines()) == 1
+    second = replace(OK, frame=1, columns=(replace(OK.columns[0], packets=(replace(PACKET, burst=0),)), goes_on))
+    line = format_summary([summary(first, second)], Limits()).splitlines()[-1]
+    assert "goes on" not in line

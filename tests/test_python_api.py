@@ -1,0 +1,186 @@
+"""`import rxcli`: cheap, complete, and the same receiver as the command line's."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import rxcli
+from rxcli.errors import ReceiverError
+from rxcli.options import SKIPS
+from rxcli.profiles import shipped_profiles
+from rxcli.receiver.channel import by_burst
+from rxcli.receiver.channel.denoise import DenoiserInput
+from rxcli.receiver.decode.detect import detect
+from rxcli.resources import data_dir
+
+SAMPLES = data_dir("sample_frames")
+PHOTO, CLIP = SAMPLES / "xtrans_sky_17k3.dng", SAMPLES / "video1080_chelsea_17k3.mp4"
+KNOWN = rxcli.Receiver(screens="paper-17k3", cameras=str(SAMPLES / "xs10-small.toml"), cae="never")
+
+
+@pytest.fixture(scope="module")
+def tapped() -> tuple[rxcli.FrameResult, rxcli.Taps]:
+    result, taps = KNOWN.tap(PHOTO)
+    assert taps is not None
+    return result, taps
+
+
+def payloads(result: rxcli.FrameResult) -> list[str]:
+    return [packet.payload for column in result.columns for packet in column.packets]
+
+
+def test_import_loads_nothing_heavy() -> None:
+    code = "import sys; before = set(sys.modules); import rxcli; print(*sorted(set(sys.modules) - before))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) <= {"rxcli", "__future__"}
+
+
+@pytest.mark.parametrize("name", rxcli.__all__)
+def test_every_name_is_there(name: str) -> None:
+    assert getattr(rxcli, name) is getattr(rxcli, name)
+    assert name in dir(rxcli)
+
+
+def test_other_names_are_not() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'decoed'"):
+        _ = rxcli.decoed  # type: ignore[attr-defined]
+
+
+def test_types_and_names_agree() -> None:
+    """What type checkers are told is what is loaded."""
+    text = Path(rxcli.__file__).read_text(encoding="utf-8")
+    told = {line.split()[-1] for line in text.splitlines() if line.startswith("    from rxcli.")}
+    assert told == set(rxcli.__all__) - {"__version__"}
+    assert (Path(rxcli.__file__).parent / "py.typed").is_file()
+
+
+def test_defaults_are_the_command_lines() -> None:
+    options = rxcli.ReceiverOptions()
+    assert rxcli.receiver_options() == options
+    assert options.screens == tuple(shipped_profiles(rxcli.ScreenProfile))
+    assert options.cameras == tuple(shipped_profiles(rxcli.CameraProfile))
+    assert options.skip == frozenset(SKIPS)
+
+
+def test_profiles_come_as_names_files_and_values() -> None:
+    file = str(SAMPLES / "phone12.toml")
+    camera = rxcli.load_profile(file, rxcli.CameraProfile)
+    by_name = rxcli.receiver_options("paper-17k3", file)
+    by_value = rxcli.receiver_options([rxcli.load_profile("paper-17k3", rxcli.ScreenProfile)], camera)
+    assert by_name == by_value
+    assert by_name.force_camera
+    several = rxcli.receiver_options(cameras=[camera, "auto"])
+    assert not several.force_camera
+    assert several.cameras == (camera, *shipped_profiles(rxcli.CameraProfile))
+    assert rxcli.receiver_options(cameras=()).cameras == ()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cae": "sometimes"}, "cae must be auto, always or never"),
+        ({"min_confidence": 1.5}, r"min_confidence must be in 0\.\.1 \(got 1\.5\)"),
+        ({"no_skip": ["nothing"]}, "no_skip: 'nothing' is not one of"),
+        ({"corners": [[0, 0], [9, 9], [9, 0], [0, 9]]}, "once round a convex outline"),
+        ({"corners": [[0, 0], [9, 9]]}, r"four positions \(x, y\)"),
+        ({"screens": [7]}, "7 is no ScreenProfile"),
+        ({"screens": "nope"}, "no profile 'nope' among screens"),
+    ],
+)
+def test_impossible_options_are_told(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ReceiverError, match=message):
+        rxcli.Receiver(**options)
+
+
+def test_profiles_need_no_formalities() -> None:
+    screen = rxcli.ScreenProfile(name="mine", columns=12, slot_rate_hz=12000.0, payload_symbols=8)
+    assert (screen.format, screen.kind, screen.packet_slots) == (1, "screen", 100)
+    assert rxcli.load_profile("xs10").kind == "camera"
+    assert rxcli.load_profile("paper-17k3").kind == "screen"
+
+
+def test_a_photo_gives_its_packets(tapped: tuple[rxcli.FrameResult, rxcli.Taps]) -> None:
+    result, _ = tapped
+    assert result.status == "ok"
+    packet = result.columns[5].packets[0]
+    assert packet.payload_bytes == bytes.fromhex(packet.payload)
+    assert len(packet.payload_bytes) == -(-packet.payload_bits // 8)
+
+
+def test_frames_and_paths_are_one(tapped: tuple[rxcli.FrameResult, rxcli.Taps]) -> None:
+    frame = next(iter(rxcli.open_source(PHOTO)))
+    assert payloads(KNOWN.decode(frame)) == payloads(next(KNOWN.receive([frame]))) == payloads(tapped[0])
+
+
+def test_an_array_is_a_picture() -> None:
+    frame = next(iter(rxcli.open_source(SAMPLES / "phone_chelsea_17k3.jpg")))
+    receiver = rxcli.Receiver(screens="paper-17k3", cameras=str(SAMPLES / "phone12.toml"), cae="never")
+    wide = (frame.pixels.astype(np.uint16) * 257).astype(np.uint16)
+    (first,), (second,) = receiver.receive([np.asarray(frame.pixels)]), receiver.receive([wide])
+    assert payloads(first)
+    assert payloads(first) == payloads(second)
+
+
+@pytest.mark.parametrize("pixels", [np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4)), np.zeros(9, np.uint8)])
+def test_what_is_no_picture_is_told(pixels: NDArray[np.generic]) -> None:
+    with pytest.raises(rxcli.UsageError, match="must be a"):
+        KNOWN.decode(pixels)
+
+
+def test_a_clip_is_no_photo() -> None:
+    with pytest.raises(rxcli.UsageError, match="more than one frame; use receive"):
+        KNOWN.decode(CLIP)
+
+
+def test_numbers_of_arrays_go_on() -> None:
+    dark = [np.zeros((60, 80), np.uint8)] * 3
+    assert [result.frame for result in KNOWN.receive(dark)] == [0, 1, 2]
+
+
+def test_nothing_received_has_no_taps() -> None:
+    result, taps = KNOWN.tap(np.zeros((60, 80), np.uint8))
+    assert result.status == "no_screen"
+    assert taps is None
+
+
+def test_taps_feed_the_detector(tapped: tuple[rxcli.FrameResult, rxcli.Taps]) -> None:
+    _, taps = tapped
+    memory = taps.metrics.shape[1] - taps.clock.n_slots
+    again = detect(by_burst(taps.metrics, taps.clock, memory))
+    assert (again.index == taps.posteriors.index).mean() > 0.99
+
+
+def test_taps_that_are_none_are_told(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", corners=np.zeros((4, 2)))
+    for name in ("a.npz", "b.npz"):
+        with pytest.raises(rxcli.InputError, match="not the taps of a photograph"):
+            rxcli.read_taps(tmp_path / name)
+
+
+class Recorder:
+    """A denoiser that corrects nothing and remembers what it was asked."""
+
+    name = "recorder"
+
+    def __init__(self) -> None:
+        self.columns: list[int] = []
+
+    def slot_corrections(self, scene: DenoiserInput, columns: NDArray[np.int64]) -> NDArray[np.float32]:
+        self.columns += columns.tolist()
+        return np.zeros((columns.size, scene.clock.n_slots), np.float32)
+
+
+def test_a_denoiser_may_be_ones_own() -> None:
+    recorder = Recorder()
+    options = replace(KNOWN.options, cae="always", denoiser=recorder)
+    result = rxcli.Receiver.with_options(options).decode(PHOTO)
+    assert recorder.columns == list(range(20))
+    assert result.denoiser is not None
+    assert result.denoiser["model"] == "recorder"
