@@ -173,27 +173,23 @@ def decode(
         (batch,) which blocks were accepted.
     """
     n_rows = code.rows_for(buffer_llr.shape[1])
-    total = _decoder_input(code, buffer_llr, n_rows)
-    messages = [np.zeros((len(row), code.z, total.shape[2]), np.int16) for row in code.rows[:n_rows]]
+    layers = _Layers(code, n_rows, _decoder_input(code, buffer_llr, n_rows))
     places = np.arange(buffer_llr.shape[0])
     accepted = np.zeros(places.size, bool)
-    for iteration in range(max_iterations):
-        unsatisfied = 0
-        for row, message in zip(code.rows, messages, strict=False):
-            unsatisfied = unsatisfied + _update_row(total, row, message)
-        if iteration < 1 and max_iterations > 1:
+    for iteration in range(1, max_iterations + 1):
+        layers.update()
+        if iteration == 1 and max_iterations > 1:
             continue
-        bits = (total[: code.information_columns] < 0).reshape(-1, places.size).T[:, : code.k].astype(np.uint8)
-        good = accept(places, bits)
+        good = accept(places, layers.information())
         accepted[places[good]] = True
         keep = ~good
-        if patience is not None and iteration + 1 == patience:
-            keep &= np.asarray(unsatisfied) < _HOPELESS * n_rows * code.z
+        if iteration == patience:
+            keep &= layers.unsatisfied() < _HOPELESS
         if not keep.any():
             break
         if not keep.all():
-            total, places = np.ascontiguousarray(total[:, :, keep]), places[keep]
-            messages = [np.ascontiguousarray(message[:, :, keep]) for message in messages]
+            layers.keep(keep)
+            places = places[keep]
     return accepted
 
 
@@ -213,29 +209,77 @@ def _decoder_input(code: Code, buffer_llr: NDArray[np.int8], n_rows: int) -> NDA
     return flat.reshape(kb + n_rows, z, batch)
 
 
-def _update_row(total: NDArray[np.int16], row: tuple[Edge, ...], message: NDArray[np.int16]) -> NDArray[np.int64]:
-    """One layer: new messages of a row of checks to its bits, in place; returns (batch,) unsatisfied checks before."""
-    z = total.shape[1]
-    incoming = np.empty_like(message)
-    for place, (column, shift) in enumerate(row):
-        incoming[place, : z - shift] = total[column, shift:]
-        incoming[place, z - shift :] = total[column, :shift]
-    sign = np.bitwise_xor.reduce(incoming, axis=0) < 0
-    np.subtract(incoming, message, out=incoming)
-    parity = np.bitwise_xor.reduce(incoming, axis=0)
-    magnitude = np.abs(incoming)
-    smallest, second = _two_smallest(magnitude)
-    if_smallest, otherwise = _normalised(second), _normalised(smallest)
-    for place, (column, shift) in enumerate(row):
-        new = np.where(magnitude[place] == smallest, if_smallest, otherwise)
-        negative = (parity ^ incoming[place]) >> 15
-        new ^= negative
-        new -= negative
-        message[place] = new
-        new += incoming[place]
-        total[column, : shift] = new[z - shift :]
-        total[column, shift:] = new[: z - shift]
-    return np.asarray(np.count_nonzero(sign, axis=0))
+class _Layers:
+    """The state of a batch in the decoder.
+
+    Args:
+        code: the code.
+        n_rows: rows in use.
+        total: (block columns, z, batch) int16 ratios, ln p(0)/p(1).
+    """
+
+    def __init__(self, code: Code, n_rows: int, total: NDArray[np.int16]) -> None:
+        self._code, self._rows = code, code.rows[:n_rows]
+        self._begin(total, [np.zeros((len(row), *total.shape[1:]), np.int16) for row in self._rows])
+
+    def _begin(self, total: NDArray[np.int16], messages: list[NDArray[np.int16]]) -> None:
+        self._total, self._messages = total, messages
+        # Fresh arrays of this size cost more than what is computed in them.
+        degree = max(len(row) for row in self._rows)
+        self._incoming = np.empty((degree, *total.shape[1:]), np.int16)
+        self._work = np.empty_like(self._incoming)
+
+    def keep(self, blocks: NDArray[np.bool_]) -> None:
+        """Go on with some blocks of the batch."""
+        total = np.ascontiguousarray(self._total[:, :, blocks])
+        self._begin(total, [np.ascontiguousarray(message[:, :, blocks]) for message in self._messages])
+
+    def information(self) -> Bits:
+        """(batch, k) hard decisions."""
+        code = self._code
+        return (self._total[: code.information_columns] < 0).reshape(-1, self._total.shape[2]).T[:, : code.k]
+
+    def unsatisfied(self) -> NDArray[np.float64]:
+        """(batch,) share of checks that the hard decisions do not satisfy."""
+        count = np.zeros(self._total.shape[2])
+        for row in self._rows:
+            parity = np.bitwise_xor.reduce(self._gather(row), axis=0) < 0
+            count += np.count_nonzero(parity, axis=0)
+        return count / (len(self._rows) * self._code.z)
+
+    def _gather(self, row: tuple[Edge, ...]) -> NDArray[np.int16]:
+        z, incoming = self._code.z, self._incoming[: len(row)]
+        for place, (column, shift) in enumerate(row):
+            incoming[place, : z - shift] = self._total[column, shift:]
+            incoming[place, z - shift :] = self._total[column, :shift]
+        return incoming
+
+    def update(self) -> None:
+        """One iteration: every row of checks in turn sends new messages to its bits."""
+        for row, message in zip(self._rows, self._messages, strict=True):
+            self._update_row(row, message)
+
+    def _update_row(self, row: tuple[Edge, ...], message: NDArray[np.int16]) -> None:
+        z, incoming, work = self._code.z, self._gather(row), self._work[: len(row)]
+        incoming -= message
+        parity = np.bitwise_xor.reduce(incoming, axis=0)
+        np.abs(incoming, out=work)
+        smallest, second = _two_smallest(work)
+        # The smallest goes to all bits but the one that it came from, which gets the second smallest: `work` becomes
+        # -1 where a magnitude is larger than the smallest, else 0, then what is sent, then that with its sign.
+        np.subtract(smallest, work, out=work)
+        work >>= 15
+        if_smallest = _normalised(second)
+        work &= if_smallest ^ _normalised(smallest)
+        work ^= if_smallest
+        np.bitwise_xor(incoming, parity, out=message)
+        message >>= 15
+        work ^= message
+        np.subtract(work, message, out=message)
+        incoming += message
+        for place, (column, shift) in enumerate(row):
+            self._total[column, :shift] = incoming[place, z - shift :]
+            self._total[column, shift:] = incoming[place, : z - shift]
 
 
 def _two_smallest(magnitude: NDArray[np.int16]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
