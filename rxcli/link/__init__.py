@@ -44,7 +44,7 @@ _HOME = {
     "ObjectProgress": "softbits",
     "ReceivedObject": "softbits",
 }
-__all__ = list(_HOME)  # noqa: PLE0604
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str) -> Any:

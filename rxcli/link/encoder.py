@@ -172,7 +172,7 @@ class FileSending:
 
 
 def _encode_blocks(layout: FileLayout, blocks: list[bytes]) -> NDArray[np.uint8]:
-    return ldpc.encode(layout.code, np.stack([_bits(block) for block in blocks]))[:, : layout.n_bits]
+    return np.asarray(ldpc.encode(layout.code, np.stack([_bits(block) for block in blocks]))[:, : layout.n_bits])
 
 
 def file_object(name: str, data: bytes, object_id: int | None = None, mother: int = 2) -> FileSending:

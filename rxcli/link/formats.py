@@ -115,9 +115,7 @@ class Announcement:
 
     def protected(self) -> bytes:
         """The information of the announcement's codeword."""
-        body = _ANNOUNCEMENT.pack(
-            _VERSION, self.mother, self.object_id, self.length, self.burst, self.container_crc, 0
-        )
+        body = _ANNOUNCEMENT.pack(_VERSION, self.mother, self.object_id, self.length, self.burst, self.container_crc, 0)
         return protect(body, ANNOUNCEMENT_ID, len(body))
 
     @property

@@ -151,7 +151,7 @@ Accept = Callable[[NDArray[np.int64], Bits], NDArray[np.bool_]]
 
 def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
     """Ratios as the decoder takes them, in steps of `LLR_STEP`."""
-    return np.clip(np.rint(llr / LLR_STEP), -_MAX_INPUT, _MAX_INPUT).astype(np.int8)
+    return np.asarray(np.clip(np.rint(llr / LLR_STEP), -_MAX_INPUT, _MAX_INPUT), np.int8)
 
 
 def decode(
@@ -237,7 +237,8 @@ class _Layers:
     def information(self) -> Bits:
         """(batch, k) hard decisions."""
         code = self._code
-        return (self._total[: code.information_columns] < 0).reshape(-1, self._total.shape[2]).T[:, : code.k]
+        negative = (self._total[: code.information_columns] < 0).reshape(-1, self._total.shape[2])
+        return np.asarray(negative.T[:, : code.k], np.uint8)
 
     def unsatisfied(self) -> NDArray[np.float64]:
         """(batch,) share of checks that the hard decisions do not satisfy."""
@@ -295,4 +296,4 @@ def _two_smallest(magnitude: NDArray[np.int16]) -> tuple[NDArray[np.int16], NDAr
 def _normalised(magnitude: NDArray[np.int16]) -> NDArray[np.int16]:
     """Three quarters of a message, limited."""
     limited = np.minimum(magnitude, _MAX_MESSAGE)
-    return limited - (limited >> 2)
+    return np.asarray(limited - (limited >> 2), np.int16)

@@ -1,0 +1,177 @@
+"""Beacons: copies, bursts and photos of one message are added until it can be read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.link import ldpc
+from rxcli.link.formats import MessageKind, unprotect_beacon
+from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
+from rxcli.link.softbits import Float32, FrameSoftBits, alike, information, log_likelihood, surprise
+
+#: Information from which on a beacon is tried, and by how much it must have grown to be tried again, in its bits.
+_TRY_FROM, _TRY_AGAIN, _TRY_UP_TO = 1.02, 0.08, 2.5
+_ITERATIONS, _PATIENCE = 25, 8
+#: Bursts less alike than this, a log-likelihood, are not of one message; so are copies within one.
+_NOT_ALIKE = -8.0
+#: Bursts at least so much alike are copies of each other.
+_COPIES = 8.0
+#: A decoded word must be at least so likely, as a share of its bits' ln 2: by chance the CRC of one fits that is not.
+_MIN_LIKELIHOOD = 0.5
+#: Rounds that may be under way at a time, and fruitless trials of single bursts that are made at once; after these a
+#: burst is tried only every so many as were fruitless, up to a limit.
+_MAX_ROUNDS, _FREE_TRIALS, _MAX_PAUSE = 4, 12, 512
+
+
+@dataclass(slots=True, eq=False)
+class _Round:
+    """Bursts that are taken to be of one message, added up by their place in a round of P."""
+
+    period: int
+    #: (P, N, C, 7) sums.
+    total: Float32
+    #: Sum of `surprise` of everything that was added.
+    alone: float = 0.0
+    epoch: int = 0
+    #: Place of burst number 0 of the epoch.
+    phase: int = 0
+    n_bursts: int = 0
+    #: Information at the last trial of (length, phase).
+    tried: dict[tuple[int, int], float] = field(default_factory=dict)
+    #: What it turned out to be.
+    found: tuple[MessageKind, bytes] | None = None
+
+    def likeness(self) -> float:
+        """Log-likelihood that all bursts are of one message."""
+        return alike(self.total, self.alone)
+
+    def with_bursts(self, soft: FrameSoftBits, phase: int) -> _Round:
+        """This and a frame's bursts."""
+        total = self.total.copy()
+        np.add.at(total, (soft.burst + phase) % self.period, soft.llr)
+        more = float(surprise(soft.llr).sum(dtype=np.float64))
+        return _Round(
+            self.period,
+            total,
+            self.alone + more,
+            soft.epoch,
+            phase,
+            self.n_bursts + len(soft.burst),
+            self.tried,
+            self.found,
+        )
+
+
+class BeaconSearch:
+    """Looks for beacons of every length.
+
+    Args:
+        columns: C.
+        payload_symbols: N.
+    """
+
+    def __init__(self, columns: int, payload_symbols: int) -> None:
+        layouts = [beacon_layout(length, columns, payload_symbols) for length in BEACON_LENGTHS]
+        self._layouts = {
+            period: [layout for layout in layouts if layout.period == period]
+            for period in {layout.period for layout in layouts}
+        }
+        self._shape = (payload_symbols, columns, 7)
+        #: By period, latest last.
+        self._rounds: dict[int, list[_Round]] = {period: [] for period in self._layouts}
+        self._fruitless = dict.fromkeys(self._layouts, 0)
+        self._waited = dict.fromkeys(self._layouts, 0)
+
+    def add(self, soft: FrameSoftBits) -> list[tuple[MessageKind, bytes]]:
+        """Add bursts; returns the messages that they show, known ones too."""
+        found = []
+        for period in self._layouts:
+            now = self._joined(period, soft)
+            self._try(now)
+            if now.found is not None:
+                found.append(now.found)
+        return found
+
+    def _joined(self, period: int, soft: FrameSoftBits) -> _Round:
+        """The round that the bursts belong to, with them; a new one where they are like none."""
+        rounds = self._rounds[period]
+        best: tuple[float, int, _Round] | None = None
+        for place, known in enumerate(rounds):
+            before = known.likeness()
+            phases = [known.phase] if known.epoch == soft.epoch else range(period)
+            for phase in phases:
+                joined = known.with_bursts(soft, phase)
+                gain = joined.likeness() - before
+                if best is None or gain > best[0]:
+                    best = gain, place, joined
+        if best is not None and best[0] > _NOT_ALIKE:
+            _, place, joined = best
+            rounds.pop(place)
+        else:
+            joined = _Round(period, np.zeros((period, *self._shape), np.float32)).with_bursts(soft, 0)
+        rounds.append(joined)
+        del rounds[:-_MAX_ROUNDS]
+        return joined
+
+    def _try(self, now: _Round) -> None:
+        if now.found is not None or not self._worth_while(now):
+            return
+        for layout in self._layouts[now.period]:
+            for phase in range(now.period):
+                now.found = self._tried(now, layout, phase)
+                if now.found is not None:
+                    self._fruitless[now.period] = 0
+                    return
+
+    def _worth_while(self, now: _Round) -> bool:
+        """Whether to try at all: most clips send something else, and their bursts are not alike."""
+        if now.likeness() > _COPIES or self._fruitless[now.period] < _FREE_TRIALS:
+            return True
+        self._waited[now.period] += 1
+        if self._waited[now.period] < min(self._fruitless[now.period], _MAX_PAUSE):
+            return False
+        self._waited[now.period] = 0
+        return True
+
+    def _tried(self, now: _Round, layout: BeaconLayout, phase: int) -> tuple[MessageKind, bytes] | None:
+        buffer = gathered(layout, np.roll(now.total, phase, axis=0))
+        bits = float(information(buffer).sum()) / layout.code.k
+        last = now.tried.get((layout.length, phase), _TRY_FROM - _TRY_AGAIN)
+        if bits < min(last + _TRY_AGAIN, _TRY_UP_TO) or last >= _TRY_UP_TO:
+            return None
+        if alike(buffer, float(surprise(now.total).sum(dtype=np.float64))) < _NOT_ALIKE:
+            return None
+        now.tried[layout.length, phase] = bits
+        self._fruitless[now.period] += 1
+        words = read_words(layout, buffer[None])
+        return None if words[0] is None else unprotect_beacon(words[0])
+
+
+def gathered(layout: BeaconLayout, llr: Float32) -> Float32:
+    """(n_bits,) sums of a round's ratios (P, N, C, 7) by the bit of the buffer that they are of."""
+    return np.bincount(layout.places.ravel(), llr.ravel(), layout.n_bits).astype(np.float32)
+
+
+def read_words(layout: BeaconLayout, buffers: Float32, accept: object = None) -> list[bytes | None]:
+    """Decode buffers (n, n_bits) of a layout; None where nothing is found that is as likely as it should be."""
+    found: list[bytes | None] = [None] * len(buffers)
+    check = unprotect_beacon if accept is None else accept
+
+    def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        good = np.zeros(places.size, bool)
+        for i, (place, coded) in enumerate(zip(places, np.packbits(bits, axis=1), strict=True)):
+            if check(coded.tobytes()) is not None and is_likely(layout, bits[i], buffers[place]):  # type: ignore[operator]
+                found[place], good[i] = coded.tobytes(), True
+        return good
+
+    ldpc.decode(layout.code, ldpc.quantised(buffers), accepted, _ITERATIONS, _PATIENCE)
+    return found
+
+
+def is_likely(layout: BeaconLayout, information_bits: NDArray[np.uint8], buffer: Float32) -> bool:
+    """Whether a decoded word agrees with what was seen."""
+    word = ldpc.encode(layout.code, np.asarray(information_bits, np.uint8)[None])[0, : buffer.size]
+    return bool(log_likelihood(word, buffer) > _MIN_LIKELIHOOD * layout.code.k * np.log(2.0))
