@@ -73,7 +73,8 @@ class MessageSending:
         return _labels(self._buffer(layout), layout.places[bursts % layout.period])
 
     def _buffer(self, layout: BeaconLayout) -> NDArray[np.uint8]:
-        return ldpc.encode(layout.code, _bits(_protect_beacon(self.body))[None])[0]
+        buffer: NDArray[np.uint8] = ldpc.encode(layout.code, _bits(_protect_beacon(self.body))[None])[0]
+        return buffer
 
     @property
     def information_bits(self) -> int:

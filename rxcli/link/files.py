@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.link import ldpc
-from rxcli.link.beacons import gathered, read_words
+from rxcli.link.beacons import gathered, is_likely, read_words
 from rxcli.link.formats import (
     Announcement,
     Container,
     ContainerError,
     block_prefix,
+    has_crc,
     unpack_container,
-    unprotect,
     unprotect_announcement,
 )
-from rxcli.link.layout import ANNOUNCEMENT_PERIOD, FileLayout, announcement_layout
+from rxcli.link.layout import ANNOUNCEMENT_PERIOD, CRC_BYTES, FileLayout, announcement_layout
+from rxcli.link.sequences import whiten
 from rxcli.link.softbits import (
     INFORMATION_OF_STEPS,
     Float32,
@@ -35,14 +36,14 @@ _LN2 = float(np.log(2.0))
 _TRY_ANNOUNCEMENT, _NOT_ALIKE = 1.02, -8.0
 #: Announcements that are tried at a time, where copies do not tell.
 _ANNOUNCEMENTS_AT_ONCE = 32
-#: Blocks that are decoded at a time, and frames after which fewer are.
-_BLOCKS_AT_ONCE, _PATIENT_FRAMES = 32, 12
+#: Blocks that are decoded at a time, the share of those left that is enough, and frames after which fewer are.
+_BLOCKS_AT_ONCE, _SHARE_AT_ONCE, _PATIENT_FRAMES = 32, 0.5, 30
 _ITERATIONS = 25
 #: A block is tried again with so much more information, in its bits.
 _TRY_AGAIN = 0.02
-#: Blocks of which a file has so many wait until others of it were read with as little.
-_LEARN_FROM = 64
-#: A decoded block must be at least so likely, as a share of its bits' ln 2.
+#: Files of so many blocks learn from the first that are tried, of so many, with how much information it goes.
+_LEARN_FROM, _PROBES, _FEW = 16, 8, 0.25
+#: A decoded block must be at least so likely, as a share of what was seen.
 _MIN_LIKELIHOOD = 0.5
 #: Bytes of bursts that wait for an announcement, and bursts that an object that changes may claim back.
 _MAX_WAITING, _MAX_RECENT = 32 << 20, 96
@@ -74,6 +75,8 @@ class FileState:
     blocks: dict[int, bytes] = field(default_factory=dict)
     #: Information at which blocks were read, in their bits.
     read_at: list[float] = field(default_factory=list)
+    #: Information below which no block is tried, in its bits.
+    least: float = 0.0
     done: bool = False
     #: Why it can never be complete.
     failure: str | None = None
@@ -111,9 +114,10 @@ class FileState:
         wanted = np.broadcast_to(self._open()[blocks][..., None], bits.shape) & (llr != 0)
         block = np.broadcast_to(blocks[..., None], bits.shape)[wanted]
         place = block * self.layout.n_bits + bits[wanted]
-        values = llr[wanted].astype(np.int16) * sign
-        place, turn = np.unique(place, return_inverse=True)
-        more = np.bincount(turn, values, place.size)
+        more = llr[wanted].astype(np.int16) * sign
+        if not self.layout.all_differ(bursts):
+            place, turn = np.unique(place, return_inverse=True)
+            more = np.bincount(turn, more, place.size)
         flat = self.total.reshape(-1)
         before = flat[place]
         after = np.clip(before + more, -127, 127).astype(np.int8)
@@ -129,39 +133,50 @@ class FileState:
     def ready(self, at_last: bool) -> NDArray[np.int64]:
         """Blocks to be tried now."""
         ready = np.flatnonzero((self.known >= self._thresholds(at_last)) & self._open())
-        if at_last or ready.size >= min(_BLOCKS_AT_ONCE, self.layout.n_blocks - len(self.blocks)):
+        left = self.layout.n_blocks - len(self.blocks)
+        if at_last or self.frames_waited >= _PATIENT_FRAMES or ready.size >= min(_BLOCKS_AT_ONCE, _SHARE_AT_ONCE * left):
             return ready
-        return ready if self.frames_waited >= _PATIENT_FRAMES else ready[:0]
+        return ready[:0]
 
     def _thresholds(self, at_last: bool) -> NDArray[np.float64]:
         if at_last:
             return self.threshold - 2 * _TRY_AGAIN * self.layout.code.k
-        if self.layout.n_blocks < _LEARN_FROM or len(self.read_at) < _BLOCKS_AT_ONCE:
-            return self.threshold
-        usual = float(np.median(self.read_at[-4 * _BLOCKS_AT_ONCE :])) - _TRY_AGAIN
-        return np.maximum(self.threshold, usual * self.layout.code.k)
+        least = self.least
+        if self.layout.n_blocks >= _LEARN_FROM and len(self.read_at) >= _PROBES:
+            least = max(least, float(np.median(self.read_at[-4 * _BLOCKS_AT_ONCE :])) - _TRY_AGAIN)
+        return np.maximum(self.threshold, least * self.layout.code.k)
 
     def read(self, which: NDArray[np.int64]) -> None:
-        """Decode blocks."""
+        """Decode blocks; where the first fail, the others wait too."""
+        self.frames_waited = 0
+        if self.layout.n_blocks >= _LEARN_FROM and not self.read_at:
+            most = which[np.argsort(-self.known[which])]
+            self._read_batch(most[:_PROBES])
+            which = np.sort(most[_PROBES:])
+            if not self.read_at:
+                return
         for start in range(0, which.size, _BLOCKS_AT_ONCE):
             self._read_batch(which[start : start + _BLOCKS_AT_ONCE])
-        self.frames_waited = 0
 
     def _read_batch(self, which: NDArray[np.int64]) -> None:
         layout, object_id = self.layout, self.layout.object_id
         llr = self.total[which]
 
+        masks = [np.frombuffer(whiten(bytes(layout.block_bytes + CRC_BYTES), object_id, int(b)), np.uint8) for b in which]
+        mask, prefixes = np.stack(masks), [block_prefix(object_id, int(number)) for number in which]
+
         def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
             good = np.zeros(places.size, bool)
-            for i, coded in enumerate(np.packbits(bits, axis=1)):
-                number = int(which[places[i]])
-                data = unprotect(coded.tobytes(), object_id, number, block_prefix(object_id, number))
-                if data is not None and _is_likely(layout, bits[i], llr[places[i]]):
-                    self.blocks[number], good[i] = data, True
+            for i, plain in enumerate(np.packbits(bits, axis=1) ^ mask[places]):
+                coded = plain.tobytes()
+                if has_crc(coded, prefixes[places[i]]) and _is_likely(layout, bits[i], llr[places[i]]):
+                    self.blocks[int(which[places[i]])], good[i] = coded[:-CRC_BYTES], True
             return good
 
         read = ldpc.decode(layout.code, llr, accepted, _ITERATIONS)
         self.read_at += (self.known[which[read]] / layout.code.k).tolist()
+        if read.mean() < _FEW:
+            self.least = float(self.known[which].mean()) / layout.code.k + _TRY_AGAIN
         failed = which[~read]
         self.threshold[failed] = self.known[failed] + _TRY_AGAIN * layout.code.k
 
@@ -188,8 +203,10 @@ class FileState:
 
 
 def _is_likely(layout: FileLayout, information_bits: NDArray[np.uint8], llr: NDArray[np.int8]) -> bool:
-    word = ldpc.encode(layout.code, np.asarray(information_bits, np.uint8)[None])[0, : llr.size]
-    return bool(log_likelihood(word, llr * ldpc.LLR_STEP) > _MIN_LIKELIHOOD * layout.code.k * _LN2)
+    """Whether a decoded block agrees with what was seen of its own bits, which any fragment has some of."""
+    sent = information_bits[layout.code.first_sent :]
+    seen = llr[: sent.size] * ldpc.LLR_STEP
+    return bool(log_likelihood(sent, seen) > _MIN_LIKELIHOOD * _LN2 * information(seen).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +261,7 @@ class FileSearch:
 
     def finish(self) -> list[tuple[FileState, Container]]:
         """Try what is left."""
-        self._try_candidates()
+        self._try_gathered()
         self._flush_entered()
         return self._complete(at_last=True)
 
@@ -253,21 +270,33 @@ class FileSearch:
     def _look_for_announcements(self, soft: FrameSoftBits) -> None:
         for number, llr in zip(soft.burst, soft.llr, strict=True):
             buffer = gathered(self._layout, llr)
-            if information(buffer).sum() < _TRY_ANNOUNCEMENT * self._layout.code.k:
-                continue
             likeness = alike(buffer, float(surprise(llr).sum(dtype=np.float64)))
-            if likeness < _NOT_ALIKE:
+            if likeness < _NOT_ALIKE or information(buffer).sum() < _TRY_ANNOUNCEMENT * self._layout.code.k:
                 continue
-            self._candidates.append((soft.epoch, int(number), buffer))
-            # Copies within the burst agree: it is one, or nearly surely. Where they are too few to tell, trials are
-            # gathered, for a batch costs what a single one does.
-            if likeness > -_NOT_ALIKE or len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
-                self._try_candidates()
+            if likeness > -_NOT_ALIKE:
+                if not self._is_expected(soft.epoch, int(number), buffer):
+                    self._try_candidates([(soft.epoch, int(number), buffer)])
+            elif not self.knows(soft.epoch):
+                self._candidates.append((soft.epoch, int(number), buffer))
+        # Copies within these are too few to tell. Trials are gathered, for a batch costs little more than a single one.
+        if len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
+            self._try_gathered()
 
-    def _try_candidates(self) -> None:
+    def _is_expected(self, epoch: int, number: int, buffer: Float32) -> bool:
+        """Whether a burst is the announcement that its timeline has it be."""
+        line = _line_of(self._timelines.get(epoch, []), number)
+        burst = 0 if line is None else number + line.offset
+        if line is None or burst % ANNOUNCEMENT_PERIOD or burst >= 1 << 32:
+            return False
+        coded = replace(line.file.announcement, burst=burst).protected()
+        return is_likely(self._layout, np.unpackbits(np.frombuffer(coded, np.uint8)), buffer)
+
+    def _try_gathered(self) -> None:
         candidates, self._candidates = self._candidates, []
-        if not candidates:
-            return
+        if candidates:
+            self._try_candidates(candidates)
+
+    def _try_candidates(self, candidates: list[tuple[int, int, Float32]]) -> None:
         words = read_words(self._layout, np.stack([buffer for *_, buffer in candidates]), unprotect_announcement)
         for (epoch, number, _), word in zip(candidates, words, strict=True):
             announcement = None if word is None else unprotect_announcement(word)

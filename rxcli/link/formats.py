@@ -37,8 +37,13 @@ def protect(data: bytes, object_id: int, block: int, crc_prefix: bytes = b"") ->
 def unprotect(coded: bytes, object_id: int, block: int, crc_prefix: bytes = b"") -> bytes | None:
     """The data of a block as `protect` made it; None where the CRC does not fit."""
     plain = whiten(coded, object_id, block)
-    data, crc = plain[:-CRC_BYTES], plain[-CRC_BYTES:]
-    return data if zlib.crc32(crc_prefix + data).to_bytes(CRC_BYTES, "big") == crc else None
+    return plain[:-CRC_BYTES] if has_crc(plain, crc_prefix) else None
+
+
+def has_crc(plain: bytes, crc_prefix: bytes = b"") -> bool:
+    """Whether a block that is no longer whitened ends with its CRC."""
+    crc = zlib.crc32(plain[:-CRC_BYTES], zlib.crc32(crc_prefix))
+    return crc == int.from_bytes(plain[-CRC_BYTES:], "big")
 
 
 def block_prefix(object_id: int, block: int) -> bytes:

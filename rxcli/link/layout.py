@@ -137,11 +137,19 @@ class FileLayout:
         """Bits of information from which on a block is tried."""
         return READY[self.mother] * self.code.k
 
+    def _first_unit(self, bursts: Places) -> Places:
+        data = bursts - bursts // ANNOUNCEMENT_PERIOD - 1
+        return np.asarray(data * (self.payload_symbols * self.columns))
+
+    def all_differ(self, bursts: Places) -> bool:
+        """Whether no bit is sent twice in data bursts `bursts`: they lie within one pass."""
+        unit, per_pass = self._first_unit(bursts), self.n_blocks * self.n_labels
+        return bool(unit.min() // per_pass == (unit.max() + self.payload_symbols * self.columns - 1) // per_pass)
+
     def places(self, bursts: Places) -> tuple[Places, Places]:
         """Blocks (n, N, C) and bits of their buffers (n, N, C, 7) of data bursts `bursts` (n,)."""
-        data = bursts - bursts // ANNOUNCEMENT_PERIOD - 1
         shape = (self.payload_symbols, self.columns)
-        unit = data[:, None, None] * (shape[0] * shape[1]) + np.arange(shape[0] * shape[1]).reshape(shape)
+        unit = self._first_unit(bursts)[:, None, None] + np.arange(shape[0] * shape[1]).reshape(shape)
         cycle, turn = np.divmod(unit, self.n_blocks)
         number, label = np.divmod(cycle, self.n_labels)
         shift = (splitmix64(number.astype(np.uint64)) % np.uint64(self._window)).astype(np.int64)
@@ -151,16 +159,7 @@ class FileLayout:
     def _blocks(self, cycle: Places, turn: Places) -> Places:
         if self.n_blocks == 1:
             return np.zeros_like(turn)
-        first = int(cycle.min())
-        orders = np.stack([self._order(c & 0xFFFF) for c in range(first, int(cycle.max()) + 1)])
-        return np.asarray(orders[cycle - first, turn], np.int64)
-
-    def _order(self, cycle: int) -> NDArray[np.int64]:
-        return _block_order(self.object_id, self.n_blocks, cycle)
-
-
-@lru_cache(maxsize=256)
-def _block_order(object_id: int, n_blocks: int, cycle: int) -> NDArray[np.int64]:
-    """All blocks in the order of a cycle."""
-    seeds = np.uint64((object_id << 48) | (cycle << 32)) | np.arange(n_blocks, dtype=np.uint64)
-    return np.argsort(splitmix64(seeds), kind="stable")
+        different, place = np.unique(cycle, return_inverse=True)
+        seeds = (np.uint64(self.object_id) << np.uint64(48)) | ((different & 0xFFFF).astype(np.uint64) << np.uint64(32))
+        order = splitmix64(seeds[:, None] | np.arange(self.n_blocks, dtype=np.uint64))
+        return np.asarray(np.argsort(order, axis=1, kind="stable")[place.reshape(cycle.shape), turn], np.int64)

@@ -52,6 +52,11 @@ class Code:
         return self.information_columns * self.z - self.k
 
     @property
+    def first_sent(self) -> int:
+        """Information bits before it are never sent; the buffer begins with it."""
+        return _PUNCTURED * self.z
+
+    @property
     def n_columns(self) -> int:
         """Block columns."""
         return self.information_columns + len(self.rows)
@@ -176,23 +181,27 @@ def decode(
     layers = _Layers(code, n_rows, _decoder_input(code, buffer_llr, n_rows))
     places = np.arange(buffer_llr.shape[0])
     accepted = np.zeros(places.size, bool)
+    still = np.ones(places.size, bool)
     for iteration in range(1, max_iterations + 1):
         layers.update()
         if iteration == 1 and max_iterations > 1:
             continue
-        good = accept(places, layers.information())
-        accepted[places[good]] = True
-        keep = ~good
+        which = np.flatnonzero(still)
+        good = accept(places[which], layers.information(which))
+        accepted[places[which[good]]] = True
+        still[which[good]] = False
         if iteration == patience:
-            keep &= layers.unsatisfied() < _HOPELESS
-        if not keep.any():
+            still &= layers.unsatisfied() < _HOPELESS
+        if not still.any():
             break
-        if not keep.all():
-            layers.keep(keep)
-            places = places[keep]
+        if still.mean() < _CROWDED:
+            layers.keep(still)
+            places, still = places[still], still[still]
     return accepted
 
 
+#: Blocks that are done go along until fewer than this share of the batch are not: to sort them out takes time too.
+_CROWDED = 0.7
 #: Share of checks that a block leaves unsatisfied after some iterations where it is no codeword at all.
 _HOPELESS = 0.33
 
@@ -234,11 +243,11 @@ class _Layers:
         total = np.ascontiguousarray(self._total[:, :, blocks])
         self._begin(total, [np.ascontiguousarray(message[:, :, blocks]) for message in self._messages])
 
-    def information(self) -> Bits:
-        """(batch, k) hard decisions."""
+    def information(self, blocks: NDArray[np.int64]) -> Bits:
+        """(n, k) hard decisions of some blocks of the batch."""
         code = self._code
         negative = (self._total[: code.information_columns] < 0).reshape(-1, self._total.shape[2])
-        return np.asarray(negative.T[:, : code.k], np.uint8)
+        return np.asarray(negative.T[blocks, : code.k], np.uint8)
 
     def unsatisfied(self) -> NDArray[np.float64]:
         """(batch,) share of checks that the hard decisions do not satisfy."""

@@ -103,7 +103,7 @@ Event = Message | ReceivedObject
 
 def surprise(llr: Float32) -> Float32:
     """ln(1 + e^llr) - ln 2: what sums of ratios are weighed with, see `alike`."""
-    return np.asarray(np.logaddexp(llr, np.float32(0.0)) - np.float32(_LN2), np.float32)
+    return np.asarray(np.log1p(np.exp(-np.abs(llr))) + np.maximum(llr, 0) - np.float32(_LN2), np.float32)
 
 
 def alike(together: Float32, alone: float) -> float:
@@ -130,4 +130,4 @@ INFORMATION_OF_STEPS = information(np.arange(256, dtype=np.uint8).view(np.int8) 
 def log_likelihood(bits: NDArray[np.uint8], llr: NDArray[np.floating]) -> NDArray[np.float64]:
     """Log-likelihood of bits over bits of any kind, summed over the last axis."""
     signed = np.where(bits > 0, llr, -llr).astype(np.float64)
-    return np.asarray((_LN2 - np.logaddexp(0.0, -signed)).sum(axis=-1))
+    return np.asarray((_LN2 - np.log1p(np.exp(-np.abs(signed))) + np.minimum(signed, 0)).sum(axis=-1))
