@@ -42,6 +42,8 @@ class ReceiverOptions:
     stop_when_certain: bool = False
     #: Folder for the arrays of every stage boundary; None: none are written.
     dump_dir: Path | None = None
+    #: Whether results carry the payload's soft bits, for the link layer.
+    soft_bits: bool = False
 
 
 def receiver_options(
@@ -54,6 +56,7 @@ def receiver_options(
     no_skip: Sequence[str] = (),
     stop_when_certain: bool = False,
     dump_dir: str | Path | None = None,
+    soft_bits: bool = False,
 ) -> ReceiverOptions:
     """The receiver's options from names, files or profiles.
 
@@ -69,6 +72,7 @@ def receiver_options(
         no_skip: shortcuts to switch off, of `SKIPS`.
         stop_when_certain: pass over frames of a clip all of whose packets are certain already.
         dump_dir: folder for the arrays of every stage boundary.
+        soft_bits: whether results carry the payload's soft bits, for the link layer.
 
     Raises:
         ProfileError: a profile is missing or malformed.
@@ -87,6 +91,7 @@ def receiver_options(
         stop_when_certain=stop_when_certain,
         # Absolute, for workers may stand in other folders.
         dump_dir=None if dump_dir is None else Path(dump_dir).absolute(),
+        soft_bits=soft_bits,
     )
 
 

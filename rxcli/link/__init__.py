@@ -29,20 +29,20 @@ if TYPE_CHECKING:
     from rxcli.link.encoder import file_object as file_object
     from rxcli.link.encoder import message as message
     from rxcli.link.receiver import LinkReceiver as LinkReceiver
-    from rxcli.link.softbits import FrameSoftBits as FrameSoftBits
-    from rxcli.link.softbits import Message as Message
-    from rxcli.link.softbits import ObjectProgress as ObjectProgress
-    from rxcli.link.softbits import ReceivedObject as ReceivedObject
+    from rxcli.types import FrameSoftBits as FrameSoftBits
+    from rxcli.types import Message as Message
+    from rxcli.types import ObjectProgress as ObjectProgress
+    from rxcli.types import ReceivedObject as ReceivedObject
 
 _HOME = {
-    "Sending": "encoder",
-    "file_object": "encoder",
-    "message": "encoder",
-    "LinkReceiver": "receiver",
-    "FrameSoftBits": "softbits",
-    "Message": "softbits",
-    "ObjectProgress": "softbits",
-    "ReceivedObject": "softbits",
+    "Sending": "rxcli.link.encoder",
+    "file_object": "rxcli.link.encoder",
+    "message": "rxcli.link.encoder",
+    "LinkReceiver": "rxcli.link.receiver",
+    "FrameSoftBits": "rxcli.types",
+    "Message": "rxcli.types",
+    "ObjectProgress": "rxcli.types",
+    "ReceivedObject": "rxcli.types",
 }
 __all__ = list(_HOME)
 
@@ -50,4 +50,4 @@ __all__ = list(_HOME)
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    return getattr(import_module(_HOME[name]), name)

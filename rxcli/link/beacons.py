@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.link import ldpc
-from rxcli.link.formats import MessageKind, unprotect_beacon
+from rxcli.link.formats import unprotect_beacon
 from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
-from rxcli.link.softbits import Float32, FrameSoftBits, alike, information, log_likelihood, surprise
+from rxcli.link.softbits import Float32, alike, information, log_likelihood, surprise
+from rxcli.types import FrameSoftBits, MessageKind
 
 #: Information from which on a beacon is tried, and by how much it must have grown to be tried again, in its bits.
 _TRY_FROM, _TRY_AGAIN, _TRY_UP_TO = 1.02, 0.08, 2.5

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rxcli.errors import UsageError
 from rxcli.link import ldpc
-from rxcli.link.formats import Announcement, MessageKind, beacon_body, block_prefix, pack_container, protect
+from rxcli.link.formats import Announcement, beacon_body, block_prefix, pack_container, protect
 from rxcli.link.formats import protect_beacon as _protect_beacon
 from rxcli.link.layout import (
     ANNOUNCEMENT_PERIOD,
@@ -24,6 +24,7 @@ from rxcli.link.layout import (
     beacon_layout,
 )
 from rxcli.protocol import HEADER, bits_per_symbol, codebook, dimming_symbol
+from rxcli.types import MessageKind
 
 #: Information of a beacon from which on one photo is enough, in its bits.
 BEACON_NEED = 1.2

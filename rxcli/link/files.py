@@ -24,12 +24,12 @@ from rxcli.link.sequences import whiten
 from rxcli.link.softbits import (
     INFORMATION_OF_STEPS,
     Float32,
-    FrameSoftBits,
     alike,
     information,
     log_likelihood,
     surprise,
 )
+from rxcli.types import FrameSoftBits
 
 _LN2 = float(np.log(2.0))
 #: Information of an announcement from which on it is tried, in its bits, and the log-likelihood of its copies.
@@ -134,7 +134,11 @@ class FileState:
         """Blocks to be tried now."""
         ready = np.flatnonzero((self.known >= self._thresholds(at_last)) & self._open())
         left = self.layout.n_blocks - len(self.blocks)
-        if at_last or self.frames_waited >= _PATIENT_FRAMES or ready.size >= min(_BLOCKS_AT_ONCE, _SHARE_AT_ONCE * left):
+        if (
+            at_last
+            or self.frames_waited >= _PATIENT_FRAMES
+            or ready.size >= min(_BLOCKS_AT_ONCE, _SHARE_AT_ONCE * left)
+        ):
             return ready
         return ready[:0]
 
@@ -162,7 +166,9 @@ class FileState:
         layout, object_id = self.layout, self.layout.object_id
         llr = self.total[which]
 
-        masks = [np.frombuffer(whiten(bytes(layout.block_bytes + CRC_BYTES), object_id, int(b)), np.uint8) for b in which]
+        masks = [
+            np.frombuffer(whiten(bytes(layout.block_bytes + CRC_BYTES), object_id, int(b)), np.uint8) for b in which
+        ]
         mask, prefixes = np.stack(masks), [block_prefix(object_id, int(number)) for number in which]
 
         def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:

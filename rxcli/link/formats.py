@@ -7,13 +7,12 @@ import struct
 import unicodedata
 import zlib
 from dataclasses import dataclass
-from typing import Literal
 
 from rxcli.errors import UsageError
 from rxcli.link.layout import ANNOUNCEMENT_ID, ANNOUNCEMENT_PERIOD, BEACON_ID, BEACON_LENGTHS, CRC_BYTES
 from rxcli.link.sequences import whiten
+from rxcli.types import MessageKind
 
-MessageKind = Literal["raw", "text", "uri"]
 KINDS: tuple[MessageKind, ...] = ("raw", "text", "uri")
 #: Bytes of the longest message.
 MAX_MESSAGE_BYTES = BEACON_LENGTHS[-1] - 1

@@ -8,9 +8,10 @@ import numpy as np
 
 from rxcli.link.beacons import BeaconSearch
 from rxcli.link.files import MAX_OBJECT_BYTES, FileSearch, FileState
-from rxcli.link.formats import Container, MessageKind
+from rxcli.link.formats import Container
 from rxcli.link.layout import LABEL_BITS
-from rxcli.link.softbits import MAX_LLR, Event, FrameSoftBits, Message, ObjectProgress, ReceivedObject
+from rxcli.link.softbits import MAX_LLR, Event
+from rxcli.types import FrameSoftBits, Message, MessageKind, ObjectProgress, ReceivedObject
 
 
 class LinkReceiver:
@@ -69,6 +70,7 @@ class LinkReceiver:
         made = ReceivedObject(
             name=found.name,
             data=found.data,
+            size=len(found.data),
             sha256=found.sha256,
             object_id=file.layout.object_id,
             n_blocks=file.layout.n_blocks,
