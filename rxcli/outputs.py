@@ -34,6 +34,7 @@ _PNG_HEADER_BYTES = 33
 NEVER = re.compile(rb"(?!)")
 ANYTHING = re.compile(rb"")
 JOURNAL = re.compile(rb'\A\{"source": "[^\n]*?", "frame": \d+, "time_s": ')
+PAYLOADS = re.compile(rb"\Asource,frame,column,burst,")
 CSV_SUMMARY = re.compile(rb"\Asource,exit_code,frames,")
 PARQUET_SUMMARY = re.compile(rb"\APAR1.*frames_failed", re.DOTALL)
 JUNIT = re.compile(rb'<testsuite name="vlc-rx ')

@@ -358,3 +358,6 @@ class FrameResult:
     #: What the link layer has complete with this frame.
     messages: tuple[Message, ...] = ()
     objects: tuple[ReceivedObject, ...] = ()
+    #: In the last result of a source: files under way, and sentences about what was refused.
+    progress: tuple[ObjectProgress, ...] = ()
+    link_notes: tuple[str, ...] = ()

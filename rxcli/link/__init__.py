@@ -11,6 +11,10 @@ Receiving::
     receiver.objects                     # every `ReceivedObject` so far: name, size, sha256, data
     receiver.progress                    # every file under way, `ObjectProgress`: blocks, share received
 
+`Collector` does this for `FrameResult`s: `collector.add(result)` gives the result with `messages` and `objects` filled
+in (`ReceiverOptions.soft_bits` must be set), `collector.finish(last_result)` adds `progress` and `link_notes`, and
+`rxcli.link.saving.save_object` writes a file.
+
 Sending: `message(...)` and `file_object(...)` give a `Sending`, whose `labels(first, n, N, C)` are what a transmitter
 sends, and `rxcli.link.encoder.slots` makes slots of them. `simulate` uses the same.
 
@@ -25,6 +29,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rxcli.link.collector import Collector as Collector
     from rxcli.link.encoder import Sending as Sending
     from rxcli.link.encoder import file_object as file_object
     from rxcli.link.encoder import message as message
@@ -35,6 +40,7 @@ if TYPE_CHECKING:
     from rxcli.types import ReceivedObject as ReceivedObject
 
 _HOME = {
+    "Collector": "rxcli.link.collector",
     "Sending": "rxcli.link.encoder",
     "file_object": "rxcli.link.encoder",
     "message": "rxcli.link.encoder",

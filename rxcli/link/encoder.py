@@ -245,3 +245,20 @@ def ready_bits(sending: FileSending) -> float:
     """Bits of information that a receiver must see of a file before it is complete."""
     layout = sending.layout(1, 1)
     return READY[sending.mother] * layout.code.k * layout.n_blocks
+
+
+def check_file(weights: NDArray[np.int64], payload_symbols: int) -> None:
+    """Refuse a screen whose single bursts cannot carry an announcement.
+
+    Raises:
+        UsageError: the columns' weights leave too few bits.
+    """
+    bits = visible_bits_of_burst(weights, payload_symbols)
+    layout = announcement_layout(len(weights), payload_symbols)
+    need = BEACON_NEED * layout.code.k
+    if min(bits, layout.n_bits) < need:
+        per_column = bits / len(weights)
+        raise UsageError(
+            f"a file's announcement needs {need:.0f} bits in one burst, this screen sends {bits}",
+            f"use at least {int(np.ceil(need / max(per_column, 1)))} such columns, longer packets, or brighter columns",
+        )
