@@ -78,7 +78,7 @@ def _n_bursts(options: dict[str, Any], sending: FileSending | MessageSending, sc
     if options["bursts"] is not None:
         return int(options["bursts"])
     if options["seconds"] is not None:
-        return max(1, ceil(options["seconds"] / burst_s))
+        return max(1, ceil(float(options["seconds"]) / burst_s))
     return _default_bursts(sending, screen)
 
 
