@@ -19,7 +19,7 @@ from rxcli.link.formats import (
     unpack_container,
     unprotect_announcement,
 )
-from rxcli.link.layout import ANNOUNCEMENT_PERIOD, CRC_BYTES, FileLayout, announcement_layout
+from rxcli.link.layout import ANNOUNCEMENT_PERIOD, CRC_BYTES, LABEL_BITS, FileLayout, announcement_layout
 from rxcli.link.sequences import whiten
 from rxcli.link.softbits import (
     INFORMATION_OF_STEPS,
@@ -110,20 +110,22 @@ class FileState:
 
     def add(self, bursts: NDArray[np.int64], llr: NDArray[np.int8], sign: int = 1) -> None:
         """Add data bursts, counted from the object's start; `sign` -1 takes them back."""
-        blocks, bits = self.layout.places(bursts)
-        wanted = np.broadcast_to(self._open()[blocks][..., None], bits.shape) & (llr != 0)
-        block = np.broadcast_to(blocks[..., None], bits.shape)[wanted]
-        place = block * self.layout.n_bits + bits[wanted]
-        more = llr[wanted].astype(np.int16) * sign
+        blocks, labels, passes = (part.ravel() for part in self.layout.labels(bursts))
+        ratios = llr.reshape(-1, LABEL_BITS)
+        seen = np.flatnonzero(ratios.any(axis=1) & self._open()[blocks])
+        block = blocks[seen]
+        place = block[:, None] * self.layout.n_bits + self.layout.bits_of(labels[seen], passes[seen])
+        more = ratios[seen].astype(np.int16) * sign
         if not self.layout.all_differ(bursts):
             place, turn = np.unique(place, return_inverse=True)
-            more = np.bincount(turn, more, place.size)
+            more = np.rint(np.bincount(turn.ravel(), more.ravel(), place.size)).astype(np.int16)
+            block = place // self.layout.n_bits
         flat = self.total.reshape(-1)
         before = flat[place]
         after = np.clip(before + more, -127, 127).astype(np.int8)
         flat[place] = after
         gain = INFORMATION_OF_STEPS[after.view(np.uint8)] - INFORMATION_OF_STEPS[before.view(np.uint8)]
-        self.known += np.bincount(place // self.layout.n_bits, gain, self.layout.n_blocks)
+        self.known += np.bincount(block, gain.reshape(block.size, -1).sum(axis=1), self.layout.n_blocks)
 
     def _open(self) -> NDArray[np.bool_]:
         still = np.ones(self.layout.n_blocks, bool)

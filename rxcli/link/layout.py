@@ -146,15 +146,24 @@ class FileLayout:
         unit, per_pass = self._first_unit(bursts), self.n_blocks * self.n_labels
         return bool(unit.min() // per_pass == (unit.max() + self.payload_symbols * self.columns - 1) // per_pass)
 
-    def places(self, bursts: Places) -> tuple[Places, Places]:
-        """Blocks (n, N, C) and bits of their buffers (n, N, C, 7) of data bursts `bursts` (n,)."""
+    def labels(self, bursts: Places) -> tuple[Places, Places, Places]:
+        """Block, label and pass (n, N, C) of every symbol of data bursts `bursts` (n,)."""
         shape = (self.payload_symbols, self.columns)
         unit = self._first_unit(bursts)[:, None, None] + np.arange(shape[0] * shape[1]).reshape(shape)
         cycle, turn = np.divmod(unit, self.n_blocks)
         number, label = np.divmod(cycle, self.n_labels)
         shift = (splitmix64(number.astype(np.uint64)) % np.uint64(self._window)).astype(np.int64)
-        label = (label + shift) * stride(self.n_labels) % self.n_labels
-        return self._blocks(cycle, turn), LABEL_BITS * label[..., None] + _rotation(number)
+        return self._blocks(cycle, turn), (label + shift) * stride(self.n_labels) % self.n_labels, number
+
+    @staticmethod
+    def bits_of(label: Places, number: Places) -> Places:
+        """(..., 7) bits of a block's buffer that labels carry in their passes."""
+        return LABEL_BITS * label[..., None] + _rotation(number)
+
+    def places(self, bursts: Places) -> tuple[Places, Places]:
+        """Blocks (n, N, C) and bits of their buffers (n, N, C, 7) of data bursts `bursts` (n,)."""
+        blocks, label, number = self.labels(bursts)
+        return blocks, self.bits_of(label, number)
 
     def _blocks(self, cycle: Places, turn: Places) -> Places:
         if self.n_blocks == 1:

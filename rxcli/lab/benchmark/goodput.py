@@ -147,7 +147,8 @@ def _packet_crc_bits(shown: FrameSoftBits, observed: NDArray[np.bool_], labels: 
     """Bits of whole packets without a wrong bit, less a CRC each."""
     k = bits_per_symbol(point.w)
     bits = (labels[..., None] >> np.arange(6, 6 - k, -1)) & 1
-    right = ((shown.llr[..., :k] > 0) == bits).all(axis=(1, 3)) & observed.all(axis=1)[:, None]
+    agree = np.asarray((shown.llr[..., :k] > 0) == bits)
+    right = agree.all(axis=(1, 3)) & observed.all(axis=1, keepdims=True)
     return int(right.sum()) * max(k * point.screen.payload_symbols - _CRC_BITS, 0)
 
 
