@@ -44,6 +44,8 @@ ESTIMATED_CAMERA = re.compile(rb'^description = "[^"\n]*estimated', re.MULTILINE
 # Of `vlc-rx simulate`: truth, camera, what drives a screen.
 TRUTH = re.compile(rb'"written_by": "vlc-rx simulate"')
 SIMULATED_CAMERA = re.compile(rb'^description = "written by vlc-rx simulate"', re.MULTILINE)
+#: Labels or slots of `vlc-rx encode`, and the line that says their order.
+ENCODED = re.compile(rb"\A\x93NUMPY|\Aburst,symbol,column_0|one row a slot at")
 WAVEFORMS = re.compile(rb"\Acolumn_0|\A\x93NUMPY")
 #: Arrays of the stages (`rxcli.results.dump`).
 TAPS = re.compile(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rxcli.cli.common import claim_outputs, force_argument
 from rxcli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ _USUAL_READOUT = 0.61
     "--mother", type=click.Choice(list(_RATES)), default="1/3", show_default=True, help="Mother rate of a file's code."
 )
 @click.option("--object-id", type=click.IntRange(0, 0xFFFD), help="Number of a file. [default: from its content]")
+@force_argument
 def encode(path: Path | None, out: Path, **options: Any) -> None:
     """Encode the file PATH, a text or a URI as labels, or slots, for a transmitter."""
     from rxcli.cli.sending import sending_of
@@ -51,6 +53,7 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
 
     screen = load_profile(options["screen"], ScreenProfile)
     _check(out, options)
+    _claim(path, out, options)
     sending = sending_of(path, options["text"], options["uri"], _RATES[options["mother"]], options["object_id"])
     n_bursts = _n_bursts(options, sending, screen)
     weights = _weights(options["weights"], n_bursts, screen.columns)
@@ -69,8 +72,22 @@ def _check(out: Path, options: dict[str, Any]) -> None:
         raise UsageError(f"--out must end in .npy or .csv (got {str(out)!r})", "name such a file")
     if options["slots"] and out.suffix != ".npy":
         raise UsageError("--slots are written as .npy only", "name such a file, or leave --slots out")
-    if not out.parent.is_dir():
-        raise UsageError(f"--out {out}: there is no such folder", "make it, or name another")
+
+
+def _claim(path: Path | None, out: Path, options: dict[str, Any]) -> None:
+    """Refuse outputs that would destroy something."""
+    from rxcli.outputs import ENCODED, Output
+
+    found = [Output("--out", out, ENCODED)]
+    if options["slots"]:
+        found.append(Output("--slots", _readme_of(out), ENCODED))
+    inputs = [path] if path is not None else []
+    inputs += [Path(options["weights"])] if options["weights"].endswith(".json") else []
+    claim_outputs(found, inputs, (options["screen"],), options["force"])
+
+
+def _readme_of(out: Path) -> Path:
+    return out.with_name(out.name + ".README.txt")
 
 
 def _n_bursts(options: dict[str, Any], sending: FileSending | MessageSending, screen: ScreenProfile) -> int:
@@ -203,8 +220,7 @@ def _write_slots(
         repeated = np.tile(packets, (1, screen.repeats, 1)).reshape(-1, width)
         target[first * burst_slots : first * burst_slots + len(repeated)] = repeated
     target.flush()
-    readme = out.with_name(out.name + ".README.txt")
-    readme.write_text(
+    _readme_of(out).write_text(
         f"{out.name}: uint8 ({n_bursts * burst_slots}, {width}); one row a slot at {screen.slot_rate_hz:g} Hz, first "
         f"sent first; {screen.columns} columns as bits, column 0 (the viewer's leftmost) is the most significant bit "
         "of the first byte; 1 is lit.\n",
@@ -222,12 +238,13 @@ def _summary(
     from rxcli.link.encoder import FileSending, ready_bits, visible_bits_of_burst
 
     burst_s = screen.packet_s * screen.repeats
-    lines = [f"{out}: {sending.summary}; {n_bursts} bursts of {screen.name}, {n_bursts * burst_s:.3g} s"]
+    many = "s" * (n_bursts > 1)
+    lines = [f"{out}: {sending.summary}; {n_bursts} burst{many} of {screen.name}, {n_bursts * burst_s:.3g} s"]
     bits = sum(visible_bits_of_burst(row, screen.payload_symbols) for row in weights) / len(weights)
     if isinstance(sending, FileSending):
         needed = ready_bits(sending) / (bits * 31 / 32) * burst_s / _USUAL_READOUT
         lines.append(
-            f"a camera that sees all columns for {_USUAL_READOUT:.0%} of the time needs about {needed:.1f} s; send on "
-            "until it has come"
+            f"a camera that sees all columns for {_USUAL_READOUT:.0%} of the time needs about {needed:.1f} s, and an "
+            f"announcement, which comes every {32 * burst_s:.2g} s; send on until it has come"
         )
     return "\n".join(lines)

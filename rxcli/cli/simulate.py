@@ -153,7 +153,8 @@ def _claim(out: Path, options: dict[str, Any]) -> None:
         for name in WAVEFORM_FILES:
             look = outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS
             found.append(outputs.Output("--waveforms", options["waveforms"] / name, look))
-    claim_outputs(found, (options["picture"], options["payload"]), (options["screen"],), options["force"])
+    inputs = [options["picture"], options["payload"], *([options["file_path"]] if options["file_path"] else [])]
+    claim_outputs(found, inputs, (options["screen"],), options["force"])
 
 
 def _list(context: click.Context, wanted: bool) -> None:
