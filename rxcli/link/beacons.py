@@ -15,31 +15,32 @@ from rxcli.types import FrameSoftBits, MessageKind
 
 #: Information from which on a beacon is tried, and by how much it must have grown to be tried again, in its bits.
 _TRY_FROM, _TRY_AGAIN, _TRY_UP_TO = 1.02, 0.08, 2.5
-_ITERATIONS, _PATIENCE = 25, 8
+_ITERATIONS, _PATIENCE = 25, 6
 #: Bursts less alike than this, a log-likelihood, are not of one message; so are copies within one.
 _NOT_ALIKE = -8.0
+#: A first look takes only every so manieth column and bit.
+_COARSE_STEP = 3
 #: Bursts at least so much alike are copies of each other.
 _COPIES = 8.0
 #: A decoded word must be at least so likely, as a share of its bits' ln 2: by chance the CRC of one fits that is not.
 _MIN_LIKELIHOOD = 0.5
 #: Rounds that may be under way at a time, and fruitless trials of single bursts that are made at once; after these a
 #: burst is tried only every so many as were fruitless, up to a limit.
-_MAX_ROUNDS, _FREE_TRIALS, _MAX_PAUSE = 4, 12, 512
+_MAX_ROUNDS, _FREE_TRIALS, _MAX_PAUSE = 3, 12, 512
 
 
 @dataclass(slots=True, eq=False)
 class _Round:
     """Bursts that are taken to be of one message, added up by their place in a round of P."""
 
-    period: int
-    #: (P, N, C, 7) sums.
+    #: (P, N, C, 7) sums, and (P,) their `surprise` over all bits.
     total: Float32
+    levels: NDArray[np.float64]
     #: Sum of `surprise` of everything that was added.
-    alone: float = 0.0
-    epoch: int = 0
+    alone: float
+    epoch: int
     #: Place of burst number 0 of the epoch.
-    phase: int = 0
-    n_bursts: int = 0
+    phase: int
     #: Information at the last trial of (length, phase).
     tried: dict[tuple[int, int], float] = field(default_factory=dict)
     #: What it turned out to be.
@@ -47,23 +48,48 @@ class _Round:
 
     def likeness(self) -> float:
         """Log-likelihood that all bursts are of one message."""
-        return alike(self.total, self.alone)
+        return float(self.levels.sum()) - self.alone
 
-    def with_bursts(self, soft: FrameSoftBits, phase: int) -> _Round:
-        """This and a frame's bursts."""
-        total = self.total.copy()
-        np.add.at(total, (soft.burst + phase) % self.period, soft.llr)
-        more = float(surprise(soft.llr).sum(dtype=np.float64))
-        return _Round(
-            self.period,
-            total,
-            self.alone + more,
-            soft.epoch,
-            phase,
-            self.n_bursts + len(soft.burst),
-            self.tried,
-            self.found,
-        )
+    def gain(self, frame: _FrameSum, phase: int) -> float:
+        """What a frame adds to the likeness if its burst number 0 has a place."""
+        slots = (frame.slots + phase) % len(self.total)
+        joined = self.total[slots] + frame.total
+        return float(surprise(joined).sum(dtype=np.float64) - self.levels[slots].sum()) - frame.alone
+
+    def add(self, frame: _FrameSum, phase: int, epoch: int) -> None:
+        """Add a frame."""
+        slots = (frame.slots + phase) % len(self.total)
+        self.total[slots] += frame.total
+        self.levels[slots] = _levels(self.total[slots])
+        self.alone += frame.alone
+        self.epoch, self.phase = epoch, phase
+
+
+@dataclass(frozen=True, slots=True)
+class _FrameSum:
+    """The bursts of a frame, added up by their number modulo P."""
+
+    #: (S,) different places, and (S, N, C, 7) sums.
+    slots: NDArray[np.int64]
+    total: Float32
+    #: Sum of `surprise` of every ratio.
+    alone: float
+
+    def likeness(self) -> float:
+        """Log-likelihood that bursts at the same place are alike."""
+        return float(_levels(self.total).sum()) - self.alone
+
+
+def _levels(total: Float32) -> NDArray[np.float64]:
+    return np.asarray(surprise(total).sum(axis=(1, 2, 3), dtype=np.float64))
+
+
+def _frame_sum(soft: FrameSoftBits, period: int) -> _FrameSum:
+    slots, place = np.unique(soft.burst % period, return_inverse=True)
+    total = np.zeros((slots.size, *soft.llr.shape[1:]), np.float32)
+    for burst, slot in enumerate(place):
+        total[slot] += soft.llr[burst]
+    return _FrameSum(slots, total, float(surprise(soft.llr).sum(dtype=np.float64)))
 
 
 class BeaconSearch:
@@ -91,50 +117,54 @@ class BeaconSearch:
         found = []
         for period in self._layouts:
             now = self._joined(period, soft)
-            self._try(now)
-            if now.found is not None:
-                found.append(now.found)
+            if now is not None:
+                self._try(now)
+                if now.found is not None:
+                    found.append(now.found)
         return found
 
-    def _joined(self, period: int, soft: FrameSoftBits) -> _Round:
-        """The round that the bursts belong to, with them; a new one where they are like none."""
+    def _joined(self, period: int, soft: FrameSoftBits) -> _Round | None:
+        """The round that the bursts belong to, with them, or a new one; None where they contradict each other."""
+        if len(soft.burst) > period and _contradicts(soft, period):
+            return None
+        frame = _frame_sum(soft, period)
+        if frame.likeness() < _NOT_ALIKE:
+            return None
         rounds = self._rounds[period]
-        best: tuple[float, int, _Round] | None = None
-        for place, known in enumerate(rounds):
-            before = known.likeness()
-            phases = [known.phase] if known.epoch == soft.epoch else range(period)
-            for phase in phases:
-                joined = known.with_bursts(soft, phase)
-                gain = joined.likeness() - before
-                if best is None or gain > best[0]:
-                    best = gain, place, joined
-        if best is not None and best[0] > _NOT_ALIKE:
-            _, place, joined = best
-            rounds.pop(place)
+        choices = [
+            (known.gain(frame, phase), place, phase)
+            for place, known in enumerate(rounds)
+            for phase in ((known.phase,) if known.epoch == soft.epoch else range(period))
+        ]
+        gain, place, phase = max(choices, default=(-np.inf, 0, 0))
+        if gain > _NOT_ALIKE:
+            now = rounds.pop(place)
         else:
-            joined = _Round(period, np.zeros((period, *self._shape), np.float32)).with_bursts(soft, 0)
-        rounds.append(joined)
+            blank = np.zeros((period, *self._shape), np.float32)
+            now, phase = _Round(blank, np.zeros(period), 0.0, soft.epoch, 0), 0
+        now.add(frame, phase, soft.epoch)
+        rounds.append(now)
         del rounds[:-_MAX_ROUNDS]
-        return joined
+        return now
 
     def _try(self, now: _Round) -> None:
         if now.found is not None or not self._worth_while(now):
             return
-        for layout in self._layouts[now.period]:
-            for phase in range(now.period):
+        for layout in self._layouts[len(now.total)]:
+            for phase in range(len(now.total)):
                 now.found = self._tried(now, layout, phase)
                 if now.found is not None:
-                    self._fruitless[now.period] = 0
+                    self._fruitless[len(now.total)] = 0
                     return
 
     def _worth_while(self, now: _Round) -> bool:
         """Whether to try at all: most clips send something else, and their bursts are not alike."""
-        if now.likeness() > _COPIES or self._fruitless[now.period] < _FREE_TRIALS:
+        if now.likeness() > _COPIES or self._fruitless[len(now.total)] < _FREE_TRIALS:
             return True
-        self._waited[now.period] += 1
-        if self._waited[now.period] < min(self._fruitless[now.period], _MAX_PAUSE):
+        self._waited[len(now.total)] += 1
+        if self._waited[len(now.total)] < min(self._fruitless[len(now.total)], _MAX_PAUSE):
             return False
-        self._waited[now.period] = 0
+        self._waited[len(now.total)] = 0
         return True
 
     def _tried(self, now: _Round, layout: BeaconLayout, phase: int) -> tuple[MessageKind, bytes] | None:
@@ -143,12 +173,18 @@ class BeaconSearch:
         last = now.tried.get((layout.length, phase), _TRY_FROM - _TRY_AGAIN)
         if bits < min(last + _TRY_AGAIN, _TRY_UP_TO) or last >= _TRY_UP_TO:
             return None
-        if alike(buffer, float(surprise(now.total).sum(dtype=np.float64))) < _NOT_ALIKE:
+        if alike(buffer, float(now.levels.sum())) < _NOT_ALIKE:
             return None
         now.tried[layout.length, phase] = bits
-        self._fruitless[now.period] += 1
+        self._fruitless[len(now.total)] += 1
         words = read_words(layout, buffer[None])
         return None if words[0] is None else unprotect_beacon(words[0])
+
+
+def _contradicts(soft: FrameSoftBits, period: int) -> bool:
+    """Whether bursts of a frame that have the same place differ plainly, by a few of their bits."""
+    some = FrameSoftBits(soft.burst, soft.llr[:, :, ::_COARSE_STEP, ::_COARSE_STEP])
+    return _frame_sum(some, period).likeness() < 2 * _NOT_ALIKE
 
 
 def gathered(layout: BeaconLayout, llr: Float32) -> Float32:

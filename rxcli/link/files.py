@@ -36,6 +36,8 @@ _LN2 = float(np.log(2.0))
 _TRY_ANNOUNCEMENT, _NOT_ALIKE = 1.02, -8.0
 #: Announcements that are tried at a time, where copies do not tell.
 _ANNOUNCEMENTS_AT_ONCE = 32
+#: Gathered trials that are made one after the other; later only every so manieth is, for most clips send no file.
+_GATHERED_AT_FIRST, _THEN_EVERY = 8, 4
 #: Blocks that are decoded at a time, the share of those left that is enough, and frames after which fewer are.
 _BLOCKS_AT_ONCE, _SHARE_AT_ONCE, _PATIENT_FRAMES = 32, 0.5, 30
 _ITERATIONS = 25
@@ -244,6 +246,7 @@ class FileSearch:
         self._waiting: list[_Burst] = []
         self._recent: list[_Burst] = []
         self._candidates: list[tuple[int, int, Float32]] = []
+        self._n_gathered = 0
         #: Of the frame at hand.
         self._fresh: list[tuple[_Timeline, _Burst]] = []
         #: Sentences about what was refused.
@@ -288,7 +291,10 @@ class FileSearch:
                 self._candidates.append((soft.epoch, int(number), buffer))
         # Copies within these are too few to tell. Trials are gathered, for a batch costs little more than a single one.
         if len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
-            self._try_gathered()
+            if self._n_gathered < _GATHERED_AT_FIRST or self._n_gathered % _THEN_EVERY == 0:
+                self._try_gathered()
+            self._n_gathered += 1
+            self._candidates.clear()
 
     def _is_expected(self, epoch: int, number: int, buffer: Float32) -> bool:
         """Whether a burst is the announcement that its timeline has it be."""
