@@ -406,7 +406,7 @@ def _cell(value: float | None, form: str) -> str:
 
 def _confidence(value: float) -> str:
     """Rounded downwards, so that only certainty reads 1.0000."""
-    return _cell(math.floor(value * 1e4) / 1e4 if math.isfinite(value) else None, ".4f")
+    return _cell(math.floor(value * 1e4) / 1e4 if math.isfinite(value * 1e4) else None, ".4f")
 
 
 def shorten(payload: str, digits: int = _SHOWN_DIGITS) -> str:
