@@ -47,6 +47,8 @@ class ReceiverOptions:
     denoiser: Denoiser | None = None
     #: Folder for the arrays of every stage boundary; None: none are written.
     dump_dir: Path | None = None
+    #: Whether results carry the payload's soft bits, for the link layer.
+    soft_bits: bool = False
 
 
 def receiver_options(
@@ -60,6 +62,7 @@ def receiver_options(
     stop_when_certain: bool = False,
     denoiser: Denoiser | None = None,
     dump_dir: str | Path | None = None,
+    soft_bits: bool = False,
 ) -> ReceiverOptions:
     """The receiver's options from names, files or profiles.
 
@@ -76,6 +79,7 @@ def receiver_options(
         stop_when_certain: pass over frames of a clip all of whose packets are certain already.
         denoiser: in place of the shipped auto-encoder.
         dump_dir: folder for the arrays of every stage boundary.
+        soft_bits: whether results carry the payload's soft bits, for the link layer.
 
     Raises:
         ProfileError: a profile is missing or malformed.
@@ -95,6 +99,7 @@ def receiver_options(
         denoiser=denoiser,
         # Absolute, for workers may stand in other folders.
         dump_dir=None if dump_dir is None else Path(dump_dir).absolute(),
+        soft_bits=soft_bits,
     )
 
 

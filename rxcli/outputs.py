@@ -34,6 +34,7 @@ _PNG_HEADER_BYTES = 33
 NEVER = re.compile(rb"(?!)")
 ANYTHING = re.compile(rb"")
 JOURNAL = re.compile(rb'\A\{"source": "[^\n]*?", "frame": \d+, "time_s": ')
+PAYLOADS = re.compile(rb"\Asource,frame,column,burst,")
 CSV_SUMMARY = re.compile(rb"\Asource,exit_code,frames,")
 PARQUET_SUMMARY = re.compile(rb"\APAR1.*frames_failed", re.DOTALL)
 JUNIT = re.compile(rb'<testsuite name="vlc-rx ')
@@ -43,6 +44,8 @@ ESTIMATED_CAMERA = re.compile(rb'^description = "[^"\n]*estimated', re.MULTILINE
 # Of `vlc-rx simulate`: truth, camera, what drives a screen.
 TRUTH = re.compile(rb'"written_by": "vlc-rx simulate"')
 SIMULATED_CAMERA = re.compile(rb'^description = "written by vlc-rx simulate"', re.MULTILINE)
+#: Labels or slots of `vlc-rx encode`, and the line that says their order.
+ENCODED = re.compile(rb"\A\x93NUMPY|\Aburst,symbol,column_0|one row a slot at")
 WAVEFORMS = re.compile(rb"\Acolumn_0|\A\x93NUMPY")
 #: Arrays of the stages (`rxcli.results.dump`).
 TAPS = re.compile(

@@ -261,6 +261,76 @@ class ColumnResult:
 
 
 @dataclass(frozen=True, slots=True)
+class FrameSoftBits:
+    """What one frame, or one burst, says of the payload's bits: B bursts, N payload symbols, C columns."""
+
+    #: (B,) int64 number of every burst in its epoch, ascending.
+    burst: NDArray[np.int64]
+    #: (B, N, C, 7) float32 ln p(1)/p(0) of every label's bits, first bit first; 0 or NaN where nothing is known.
+    llr: Float32Array
+    #: Burst numbers of one epoch count on one clock; those of different epochs cannot be compared.
+    epoch: int = 0
+    source: str = ""
+    frame: int = 0
+    time_s: float = 0.0
+
+
+MessageKind = Literal["raw", "text", "uri"]
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A short message that came."""
+
+    kind: MessageKind
+    data: bytes
+    source: str
+    #: Frame in which it was complete.
+    frame: int
+    time_s: float
+
+    @property
+    def text(self) -> str | None:
+        """Text or URI; None for raw bytes."""
+        return None if self.kind == "raw" else self.data.decode("utf-8")
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedObject:
+    """A file that came whole; its SHA-256 fits."""
+
+    #: Safe to be used as a file's name.
+    name: str
+    #: Its bytes; empty where a report was read back.
+    data: bytes
+    size: int
+    sha256: str
+    object_id: int
+    n_blocks: int
+    source: str
+    #: Frame in which it was complete.
+    frame: int
+    time_s: float
+    #: Where it was written, None where it was not.
+    path: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectProgress:
+    """A file under way."""
+
+    object_id: int
+    #: Bytes of the container, a little more or less than the file's.
+    container_bytes: int
+    n_blocks: int
+    blocks_done: int
+    #: Of what must be seen, 0..1.
+    share: float
+    #: More seconds of such a clip that would do; None where nothing says how many.
+    seconds_left: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class FrameResult:
     """What became of one frame; `rxcli.results.report` turns it into JSON and tables."""
 
@@ -291,3 +361,11 @@ class FrameResult:
     skipped: dict[str, int] = field(default_factory=dict)
     #: What the auto-encoder did, None where it did not run.
     denoiser: dict[str, Any] | None = None
+    #: For the link layer, where it was asked for; never part of a report.
+    soft_bits: FrameSoftBits | None = None
+    #: What the link layer has complete with this frame.
+    messages: tuple[Message, ...] = ()
+    objects: tuple[ReceivedObject, ...] = ()
+    #: In the last result of a source: files under way, and sentences about what was refused.
+    progress: tuple[ObjectProgress, ...] = ()
+    link_notes: tuple[str, ...] = ()

@@ -77,7 +77,23 @@ def test_every_shipped_file_loads_under_its_own_name(kind: Any) -> None:
 
 def test_shipped_screens_are_those_of_the_air_interface() -> None:
     packet_slots = {profile.name: profile.packet_slots for profile in shipped_profiles(ScreenProfile)}
-    assert packet_slots == {"paper-8k65": 70, "paper-17k3": 130, "paper-34k6": 260, "wide-100": 260}
+    assert packet_slots == {
+        "paper-8k65": 70,
+        "paper-17k3": 130,
+        "paper-34k6": 260,
+        "wide-100": 260,
+        "data-8k65": 70,
+        "data-17k3": 130,
+        "data-34k6": 260,
+        "data-wide": 260,
+    }
+
+
+def test_screens_for_texts_and_files_differ_from_the_papers_in_their_repeats_alone() -> None:
+    for data, paper in (("data-34k6", "paper-34k6"), ("data-17k3", "paper-17k3"), ("data-8k65", "paper-8k65")):
+        ours, theirs = (load_profile(name, ScreenProfile) for name in (data, paper))
+        assert (ours.repeats, theirs.repeats) == (1, 3)
+        assert msgspec.structs.replace(ours, name=paper, repeats=3, description=theirs.description) == theirs
 
 
 @pytest.mark.parametrize(

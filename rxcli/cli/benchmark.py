@@ -348,3 +348,50 @@ def memory(frames: int, out: Path) -> None:
     click.echo(format_table(work.rows(found)))
     click.echo(f"{found.growth_kb:.3g} kB a frame, {found.packets} packets")
     _say_written(write_outputs(out, "memory", work.rows(found), {"growth_kb": found.growth_kb}))
+
+
+@benchmark.command()
+@click.option("--screen", "screens", multiple=True, default=("data-34k6",), show_default=True, help="Screen profiles.")
+@click.option(
+    "--picture", "pictures", multiple=True, type=click.Choice(["bright", "china"]), default=("bright", "china")
+)
+@click.option("--camera", "cameras", multiple=True, metavar="FPS,READOUT", help="[default: five, see docs/link.md]")
+@click.option("--size", "sizes", multiple=True, type=click.IntRange(1), default=(100, 1000, 10_000, 100_000))
+@click.option("--starts", type=click.IntRange(1), default=20, show_default=True, help="Random starts of each point.")
+@click.option("--mother", type=click.IntRange(0, 2), default=2, show_default=True, help="0: 1/1.5, 1: 1/2, 2: 1/3.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("benchmark-results"))
+def goodput(
+    screens: tuple[str, ...],
+    pictures: tuple[str, ...],
+    cameras: tuple[str, ...],
+    sizes: tuple[int, ...],
+    starts: int,
+    mother: int,
+    seed: int,
+    out: Path,
+) -> None:
+    """Texts and files from clips that begin anywhere: bytes a second, byte-exact or not counted."""
+    from dataclasses import replace
+
+    from tqdm import tqdm
+
+    from rxcli.lab.benchmark import goodput as work
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
+
+    chosen = [_camera_of(text) for text in cameras] or work.CAMERAS
+    grid = [replace(point, mother=mother) for point in work.points(screens, pictures, chosen, sizes)]
+    bar = tqdm(grid, unit="point", leave=False, disable=None)
+    rows = [work.row(point, work.measure(point, starts, seed)) for point in bar]
+    click.echo(format_table(rows))
+    _say_written(write_outputs(out, "goodput", rows, {"starts": starts, "seed": seed, "mother": mother}))
+
+
+def _camera_of(text: str) -> tuple[float, float]:
+    try:
+        rate, readout = (float(part) for part in text.split(","))
+    except ValueError:
+        raise click.BadParameter(f"--camera {text}: give frames a second and share read, such as 30,0.61") from None
+    if not (0 < rate <= 1000 and 0 < readout <= 1):
+        raise click.BadParameter(f"--camera {text}: the share read is between 0 and 1")
+    return rate, readout

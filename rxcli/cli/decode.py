@@ -30,7 +30,7 @@ _FOLDER = click.Path(file_okay=False, path_type=Path)
 _NO_MATTER = frozenset(
     {
         *("json_path", "junit", "summary", "save_camera", "dump_dir", "save_undistorted", "quiet", "force", "resume"),
-        *("workers", "cluster", "max_ber", "min_packets"),
+        *("workers", "cluster", "max_ber", "min_packets", "out", "payloads"),
     }
 )
 #: The source that is read from stdin.
@@ -59,6 +59,8 @@ STDIN = "-"
 @click.option(
     "--stop-when-certain", is_flag=True, help="Pass over frames of a clip all of whose packets are certain already."
 )
+@click.option("--out", type=_FOLDER, help="Write files that came whole into this folder, under their own names.")
+@click.option("--payloads", type=_FILE, help="Write one row a packet (CSV): where it is from, bits, hex, confidence.")
 @click.option("--quiet", is_flag=True, help="No table, no summary, no progress.")
 @force_argument
 def decode(paths: tuple[str, ...], **options: Any) -> int:
@@ -79,7 +81,7 @@ def decode(paths: tuple[str, ...], **options: Any) -> int:
     }
     from rxcli.runs.batch import standard_decoder
 
-    configured = receiver_options(**receiver)
+    configured = receiver_options(**receiver, soft_bits=True)
     tap = None
     if options["save_undistorted"]:
         from rxcli.results.undistort import UndistortedWriter
@@ -121,7 +123,7 @@ def _claim(options: dict[str, Any], sources: list[Source]) -> None:
     truths = [_truth_of(source.name, truth) for source in sources]
     inputs = [source.path for source in sources] + [str(path) for path in truths if path is not None]
     claim_outputs(_outputs(options), inputs, (*options["screens"], *options["cameras"]), options["force"])
-    for name in ("dump_dir", "save_undistorted"):
+    for name in ("dump_dir", "save_undistorted", "out"):
         if options[name] is not None:
             claim_folder("--" + name.replace("_", "-"), options[name])
 
@@ -139,6 +141,7 @@ def _outputs(options: dict[str, Any]) -> Iterator[Output]:
         "junit": outputs.JUNIT,
         "summary": outputs.CSV_SUMMARY if is_table else outputs.PARQUET_SUMMARY,
         "save_camera": outputs.ESTIMATED_CAMERA,
+        "payloads": outputs.PAYLOADS,
     }
     paths = {**options, "json": None if options["json_path"] == "-" else options["json_path"]}
     for name, ours in looks.items():
@@ -185,6 +188,7 @@ class _Run:
     """One run over many sources: where results go, and what is kept for the summary."""
 
     def __init__(self, decoder: Decoder, options: dict[str, Any]) -> None:
+        from rxcli.link.collector import Collector
         from rxcli.results.summary import Limits
 
         self._decoder = decoder
@@ -192,6 +196,9 @@ class _Run:
         self._limits = Limits(options["max_ber"], options["min_packets"])
         self._summaries: list[SourceSummary] = []
         self._to_stdout = options["json_path"] == "-"
+        self._photos = Collector(decoder.link_screens)
+        self._n_photos = 0
+        self._write_payloads: Callable[[FrameResult], None] = lambda result: None
         #: The frame with the most packets of those whose camera was estimated.
         self._estimated: FrameResult | None = None
         #: Name of a source -> where it is opened.
@@ -210,6 +217,7 @@ class _Run:
             journal = self._journal(stack)
             done = self._recover() if self._options["resume"] else set()
             writer = self._writer(journal, begun=bool(done))
+            self._write_payloads = self._payloads(stack)
             try:
                 self._decode([source for source in sources if source.name not in done], writer, len(sources))
             except BaseException:
@@ -263,6 +271,14 @@ class _Run:
         lines = Lines(self._head(), self._files(), begun)
         return _JsonLines(lines, _print_line if journal is None else journal.append)
 
+    def _payloads(self, stack: ExitStack) -> Callable[[FrameResult], None]:
+        """What writes the packets of a result, where --payloads asks for it."""
+        if self._options["payloads"] is None:
+            return lambda result: None
+        from rxcli.results.payloads import PayloadWriter
+
+        return stack.enter_context(PayloadWriter(self._options["payloads"], self._options["resume"])).write
+
     def _decode(self, sources: list[Source], writer: _Writer, n_total: int) -> None:
         with _progress(n_total, n_total - len(sources), self._options["quiet"]) as progress:
             for source, results in self._decoded(sources):
@@ -271,13 +287,38 @@ class _Run:
                 try:
                     for result, last in _with_last(results):
                         result = scorer.add(result) if scorer else result
+                        result = self._saved(self._combined(result), summary)
                         summary.add(result)
                         self._keep_estimate(result)
+                        self._write_payloads(result)
                         with progress.paused():
                             writer.write(result, last)
                 finally:
                     self._end(summary, scorer)
                 progress.finished(summary.n_frames)
+
+    def _combined(self, result: FrameResult) -> FrameResult:
+        """The result of a photograph with what it and those before it show together."""
+        if result.soft_bits is None:
+            return result
+        self._n_photos += 1
+        soft = replace(result.soft_bits, epoch=self._n_photos, source=result.source)
+        return self._photos.add(replace(result, soft_bits=soft))
+
+    def _saved(self, result: FrameResult, summary: SourceSummary) -> FrameResult:
+        """The result with the paths of its files, once they are written."""
+        if not self._options["out"] or not result.objects:
+            return result
+        from rxcli.link.saving import save_object
+
+        objects = []
+        for received in result.objects:
+            try:
+                objects.append(save_object(received, self._options["out"], self._options["force"]))
+            except InputError as error:
+                objects.append(received)
+                summary.unwritten.append(str(error))
+        return replace(result, objects=tuple(objects))
 
     def _decoded(self, sources: list[Source]) -> Iterator[Decoded]:
         from rxcli.runs.batch import decode_here, decode_in_processes
@@ -422,8 +463,10 @@ class _Nowhere:
 
 class _Table(_Nowhere):
     def write(self, result: FrameResult, last: bool) -> None:
-        from rxcli.results.report import format_frame
+        from rxcli.results.report import format_frame, format_link
 
+        for line in format_link(result):
+            click.echo(line)
         click.echo(format_frame(result) + "\n")
 
 

@@ -5,26 +5,29 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
 from rxcli.cli.common import claim_outputs, force_argument, receiver_arguments, receiver_options
-from rxcli.errors import ExitCode, UsageError
+from rxcli.errors import ExitCode, InputError, UsageError
 
 if TYPE_CHECKING:
     from rxcli.ingest.v4l2 import CameraCounts, LiveSource
-    from rxcli.types import Frame, FrameResult
+    from rxcli.types import Frame, FrameResult, ObjectProgress
 
 #: Rates and states are those of the last so many seconds.
 _WINDOW_S = 1.0
 #: How often the status is written: on a terminal over itself, elsewhere line by line.
 _TERMINAL_S, _LOG_S = 0.2, 1.0
 _LOCKED = ("ok", "partial")
+#: Characters of a progress bar.
+_BAR = 20
+_FOLDER = click.Path(file_okay=False, path_type=Path)
 
 
 class _Exposure(click.ParamType[float]):
@@ -56,6 +59,8 @@ class _Exposure(click.ParamType[float]):
 @click.option("--frames", "n_frames", type=click.IntRange(1), help="Stop after this many frames.")
 @click.option("--duration", type=click.FloatRange(0, min_open=True), metavar="SECONDS", help="Stop after this time.")
 @click.option("--json", "json_path", metavar="FILE|-", help="Write one JSON object a frame, instead of tables.")
+@click.option("--out", type=_FOLDER, help="Write files that came whole into this folder, under their own names.")
+@click.option("--until-complete", is_flag=True, help="Stop when a message or a file has come whole.")
 @click.option("--quiet", is_flag=True, help="No status line.")
 @receiver_arguments
 @force_argument
@@ -64,9 +69,10 @@ def live(device: Path, **options: Any) -> int:
     if options["list_only"]:
         return _show_modes(device)
     names = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
-    configured = receiver_options(**{name: options[name] for name in names})
+    configured = receiver_options(**{name: options[name] for name in names}, soft_bits=True)
     _claim(device, options)
     from rxcli.ingest.v4l2 import LiveSource
+    from rxcli.link.collector import Collector
     from rxcli.receiver.pipeline import receive
 
     source = LiveSource(
@@ -81,16 +87,38 @@ def live(device: Path, **options: Any) -> int:
         write = _writer(options["json_path"], stack)
         stack.enter_context(status)
         frames = stack.enter_context(closing(_limited(source, options["n_frames"])))
-        for result in receive(frames, configured):
+        collector = Collector(configured.screens)
+        for received in receive(frames, configured):
+            result = _saved(collector.add(received), options["out"], options["force"])
             write(result)
-            status.update(result)
-    return ExitCode.OK if status.n_packets else ExitCode.NOT_RECEIVED
+            status.update(result, collector.progress)
+            if options["until_complete"] and (result.messages or result.objects):
+                break
+    return ExitCode.OK if status.n_packets or status.n_complete else ExitCode.NOT_RECEIVED
+
+
+def _saved(result: FrameResult, folder: Path | None, force: bool) -> FrameResult:
+    """The result with the paths of its files, once they are written."""
+    if folder is None or not result.objects:
+        return result
+    from rxcli.link.saving import save_object
+
+    objects = []
+    for received in result.objects:
+        try:
+            objects.append(save_object(received, folder, force))
+        except InputError as error:
+            _say(str(error))
+            objects.append(received)
+    return replace(result, objects=tuple(objects))
 
 
 def _claim(device: Path, options: dict[str, Any]) -> None:
     """Refuse to write over what is no earlier output."""
-    from rxcli.outputs import JOURNAL, Output
+    from rxcli.outputs import JOURNAL, Output, claim_folder
 
+    if options["out"] is not None:
+        claim_folder("--out", options["out"])
     if options["json_path"] not in (None, "-"):
         output = Output("--json", Path(options["json_path"]), JOURNAL)
         claim_outputs([output], (device,), (*options["screens"], *options["cameras"]), options["force"])
@@ -132,9 +160,11 @@ def _limited(source: LiveSource, n_frames: int | None) -> Generator[Frame, None,
 
 def _writer(json_path: str | None, stack: ExitStack) -> Callable[[FrameResult], None]:
     """What is done with a result: a JSON line for each frame, or a table for those with packets."""
-    from rxcli.results.report import format_frame, to_json_line
+    from rxcli.results.report import format_frame, format_link, to_json_line
 
     def show(result: FrameResult) -> None:
+        for line in format_link(result):
+            click.echo(line)
         if any(column.packets for column in result.columns):
             click.echo(format_frame(result))
 
@@ -175,6 +205,9 @@ class Status:
     source: LiveSource
     quiet: bool = False
     n_packets: int = 0
+    #: Messages and files that came whole.
+    n_complete: int = 0
+    _files: list[ObjectProgress] = field(default_factory=list)
     _recent: deque[_Moment] = field(default_factory=deque)
     _shown_s: float = 0.0
     _width: int = 0
@@ -186,10 +219,12 @@ class Status:
         if self._recent or self.source.counts.damaged:
             self._show(final=True)
 
-    def update(self, result: FrameResult) -> None:
+    def update(self, result: FrameResult, files: Sequence[ObjectProgress] = ()) -> None:
         """Take a frame's result into account, and show the state if it is time."""
         now = time.monotonic()
         self._recent.append(_moment(result, now))
+        self._files = list(files)
+        self.n_complete += len(result.messages) + len(result.objects)
         self.n_packets += sum(len(column.packets) for column in result.columns)
         while self._recent[0].time_s < now - _WINDOW_S:
             self._recent.popleft()
@@ -206,6 +241,7 @@ class Status:
         if self.quiet:
             return
         line = format_status(list(self._recent), self.source.counts)
+        line = " | ".join([line, *map(format_file, self._files)])
         if not sys.stderr.isatty():
             _say(line)
             return
@@ -234,6 +270,17 @@ def format_status(recent: list[_Moment], counts: CameraCounts) -> str:
     if bits:
         parts.append(f"BER about {sum(moment.wrong_bits for moment in recent) / bits:.1e}")
     return " | ".join(parts + lost)
+
+
+def format_file(progress: ObjectProgress) -> str:
+    """A file under way: bar, share, rate, time left."""
+    filled = int(_BAR * progress.share)
+    parts = [f"[{'#' * filled}{'.' * (_BAR - filled)}] {100 * progress.share:.0f} %"]
+    left = progress.seconds_left
+    if left is not None and progress.share < 1:
+        missing = 8 * progress.container_bytes * (1 - progress.share)
+        parts += [f"{missing / max(left, 1e-3) / 1e3:.0f} kb/s", f"{left:.0f} s left"]
+    return " ".join(parts)
 
 
 def _moment(result: FrameResult, now: float) -> _Moment:

@@ -24,8 +24,9 @@ from rxcli import __version__
 from rxcli.errors import ExitCode, OutputError, ReceiverError, Terminated
 
 _COMMANDS = {
-    "decode": "Payloads of photos, RAW files, clips and folders.",
-    "live": "Payloads of a V4L2 camera as they come.",
+    "decode": "Texts, files and payloads of photos, clips and folders.",
+    "live": "Texts, files and payloads of a V4L2 camera.",
+    "encode": "What a screen must send: a text or a file as labels.",
     "inspect": "Pictures of every stage for one photo.",
     "calibrate": "Measure a lens or a shutter; writes a camera profile.",
     "simulate": "Captures with known truth, from a picture and a payload.",

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rxcli.lab.simulate.capture import Take
     from rxcli.lab.simulate.scenes import Scene
     from rxcli.lab.simulate.transmitter import Weights
+    from rxcli.link.encoder import Sending
 
 _STILLS = ("jpeg", "dng", "dng14", "png", "png16", "tiff", "tiff16")
 _CODECS = ("h264", "h264-10", "hevc", "hevc-10", "mjpeg")
@@ -38,6 +39,9 @@ _SCENE_OPTIONS = (
 @click.option(
     "--payload", default="random", show_default=True, help="'random', 'hex:...', or a file; sent over and over."
 )
+@click.option("--text", help="Send this text (a longer one as a file), for the link layer to receive.")
+@click.option("--uri", help="Send this URI.")
+@click.option("--file", "file_path", type=click.Path(path_type=Path), help="Send this file.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Same seed, same pixels.")
 @click.option(
     "--format",
@@ -126,6 +130,7 @@ def simulate(out: Path, **options: Any) -> None:
     _claim(out, options)
     scene = _scene(options, file_format)
     take = prepare(scene, options["seed"])
+    _warn_of_cut_packets(take)
     try:
         truth = _write(take, out, file_format, options["bit_rate"])
         _write_extras(take, options)
@@ -152,7 +157,8 @@ def _claim(out: Path, options: dict[str, Any]) -> None:
         for name in WAVEFORM_FILES:
             look = outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS
             found.append(outputs.Output("--waveforms", options["waveforms"] / name, look))
-    claim_outputs(found, (options["picture"], options["payload"]), (options["screen"],), options["force"])
+    inputs = [options["picture"], options["payload"], *([options["file_path"]] if options["file_path"] else [])]
+    claim_outputs(found, inputs, (options["screen"],), options["force"])
 
 
 def _list(context: click.Context, wanted: bool) -> None:
@@ -179,6 +185,7 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     scene = replace(scene, picture=options["picture"], dimming=options["dimming"], **_given(options, _SCENE_OPTIONS))
     scene = replace(scene, stabilised=options["stabilised"])
     scene = replace(scene, w=_weights(options["weights"]), payload=_payload(options["payload"]))
+    scene = replace(scene, labels=_labels(options))
     scene = _with_light(_with_pose(scene, options), options)
     isp = _given(options, ("tone", "quality", "subsampling", "sharpen", "denoise_px"))
     if options["correct"] is not None:
@@ -279,6 +286,31 @@ def _weights(text: str) -> Weights:
     except ValueError:
         raise UsageError(f"--w: {text!r} is no weight", "give 1..9, a list of them, or 'dimming'") from None
     return values[0] if len(values) == 1 else values
+
+
+def _labels(options: dict[str, Any]) -> Sending | None:
+    """What the link layer sends; None for payload as it is."""
+    from rxcli.cli.sending import sending_of
+
+    given = [name for name in ("text", "uri", "file_path") if options[name] is not None]
+    if not given:
+        return None
+    if len(given) > 1 or options["payload"] != "random":
+        raise UsageError("--payload, --text, --uri and --file exclude each other", "give one of them")
+    return sending_of(options["file_path"], options["text"], options["uri"])
+
+
+def _warn_of_cut_packets(take: Take) -> None:
+    """Say so where no frame can show a packet as a whole."""
+    sensor, corners = take.scene.sensor, take.exposure(0).view.corners
+    top, bottom = max(float(corners[:, 1].min()), 0.0), min(float(corners[:, 1].max()), sensor.height - 1.0)
+    shown_s, packet_s = max(bottom - top, 0.0) * sensor.line_delay_s, take.scene.screen.packet_s
+    if shown_s < packet_s:
+        click.echo(
+            f"vlc-rx: no packet fits a frame: the screen is read in {1e3 * shown_s:.1f} ms, a packet of "
+            f"{take.scene.screen.name} lasts {1e3 * packet_s:.1f} ms; only clips put packets together",
+            err=True,
+        )
 
 
 def _payload(text: str) -> bytes | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,12 +67,23 @@ class Acquisition:
     clock: Clock
     #: Another that it may be: of columns which are not spread in time, where they seem to be.
     rival: Clock | None = None
+    #: The screen, and others that differ from it in how often a packet is sent; the copies are to tell.
+    variants: tuple[ScreenProfile, ...] = ()
     #: (n_copies,) burst of every copy; None where the light is to tell.
     burst: IntArray | None = None
 
     @property
     def profiles(self) -> RowProfiles:
         return self.sampler.profiles
+
+    @property
+    def repeats(self) -> tuple[int, ...]:
+        """How many copies a burst may have."""
+        return tuple(screen.repeats for screen in self.variants) or (self.screen.repeats,)
+
+    def variant(self, repeats: int) -> ScreenProfile:
+        """The screen that sends a packet so often."""
+        return next((screen for screen in self.variants if screen.repeats == repeats), self.screen)
 
     def binned(self) -> Acquisition:
         """The same with strips pooled in pairs."""
@@ -122,13 +133,14 @@ def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Fail
     n_columns = context.n_columns
     with context.timer("clock"):
         pooled = sync.pooled_strips(sampler.binned())
-        rates = {(s.slot_rate_hz, s.packet_slots): s for s in context.screens}
+        different = told_apart_by_clock(context.screens)
+        rates = {(s.slot_rate_hz, s.packet_slots): s for s in different}
         clocks = {rate: found for rate, screen in rates.items() if (found := _clocks_of(context, screen, pooled))}
         clocks = {rate: found for rate, found in clocks.items() if found[0].header_peak_ratio >= _MIN_PEAK_RATIO}
         if not clocks:
             return Failure("no_signal", _why_no_signal(context))
         rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(pooled, clocks[r][0]))
-    alike = [screen for screen in context.screens if (screen.slot_rate_hz, screen.packet_slots) == rate]
+    alike = [screen for screen in different if (screen.slot_rate_hz, screen.packet_slots) == rate]
     acquisitions = [_acquired(alike[0], sampler, clocks[rate])] if alike[0].columns == n_columns else []
     for screen in alike[len(acquisitions) :]:
         finer = sample_columns(context, screen.columns, quick=sampler.read is not None)
@@ -138,7 +150,29 @@ def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Fail
             acquisitions.append(_acquired(screen, finer, found))
     if not acquisitions:
         return Failure("no_signal", _why_no_signal(context))
-    return acquisitions[0] if len(acquisitions) == 1 else _with_likely_columns(acquisitions)
+    likely = acquisitions[0] if len(acquisitions) == 1 else _with_likely_columns(acquisitions)
+    return replace(likely, variants=variants_of(likely.screen, context.screens))
+
+
+def _shape_of(screen: ScreenProfile) -> tuple[float, int, int]:
+    return screen.slot_rate_hz, screen.packet_slots, screen.columns
+
+
+def told_apart_by_clock(screens: Sequence[ScreenProfile]) -> list[ScreenProfile]:
+    """The screens without those that differ in nothing but how often a packet is sent: the one that does it most."""
+    by_shape: dict[tuple[float, int, int], ScreenProfile] = {}
+    for screen in screens:
+        known = by_shape.setdefault(_shape_of(screen), screen)
+        if screen.repeats > known.repeats:
+            by_shape[_shape_of(screen)] = screen
+    return list(by_shape.values())
+
+
+def variants_of(screen: ScreenProfile, screens: Sequence[ScreenProfile]) -> tuple[ScreenProfile, ...]:
+    """The screen, and others that differ in nothing but how often a packet is sent; the one that does it most first."""
+    others = {s.repeats: s for s in reversed(screens) if _shape_of(s) == _shape_of(screen)}
+    others[screen.repeats] = screen
+    return tuple(others[repeats] for repeats in sorted(others, reverse=True))
 
 
 def _acquired(screen: ScreenProfile, sampler: ColumnSampler, clocks: tuple[Clock, ...]) -> Acquisition:

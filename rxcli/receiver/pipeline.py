@@ -13,12 +13,13 @@ from itertools import chain
 from typing import Any
 
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
+from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.outline import find_outline
-from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin
+from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin, soft_bits
 from rxcli.receiver.unknown_camera import likely_camera, receive_unknown, without_estimate
 from rxcli.results.dump import dump_stages
 from rxcli.types import FloatArray, Frame, FrameResult
@@ -106,12 +107,14 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
     result = replace(
         result,
         **context.camera.facts,
-        screen_profile=acquisition.screen.name,
+        screen_profile=acquisition.variant(sync.likely_repeats(reception.clock, acquisition.repeats)).name,
         columns=columns,
         status=assemble.frame_status(columns),
         denoiser=report,
         skipped=reception.skipped,
     )
+    if options.soft_bits:
+        result = replace(result, soft_bits=soft_bits(frame, reception, no_header, denoised))
     if result.status != "no_signal":
         return result
     message = too_small(context, acquisition.screen) or assemble.why_no_packet(columns)

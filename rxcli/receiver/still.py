@@ -16,7 +16,8 @@ from rxcli.receiver import channel, sync
 from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import assemble, detect
-from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
+from rxcli.receiver.decode.soft_bits import of_observed, still_soft_bits
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, SlotSamples
 
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
 _COARSE, _FINE = 2, 4
@@ -91,7 +92,7 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
     confidence = np.where(_complete(reception), _confidence(reception), 0.0).max(axis=0)
     if not confidence.any() or (confidence > _CLEAR).mean() >= _CLEAR_COLUMNS:
         return reception
-    possible = sync.possible_bursts(reception.clock, detect.slot_llr(reception.metrics), acquisition.screen.repeats)
+    possible = sync.possible_bursts(reception.clock, detect.slot_llr(reception.metrics), acquisition.repeats)
     plain = len(possible) == 1 or possible[0][1] - possible[1][1] > _PLAIN_BURSTS
     if plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
         return reception
@@ -389,6 +390,23 @@ def slot_margin(reception: Reception) -> Float32Array:
     return detect.slot_margin(reception.metrics, channel.lit_on_grid(reception.posteriors, reception.clock) > 0.5)
 
 
+def soft_bits(
+    frame: Frame, reception: Reception, no_header: NDArray[np.bool_], denoised: frozenset[int] = frozenset()
+) -> FrameSoftBits:
+    """What a photograph says of the payload's bits, cut packets included."""
+    n_observed = assemble.slots_observed(reception.samples, reception.clock)
+    n_columns, n_strips = reception.samples.light.shape[:2]
+    features = assemble.confidence_features(
+        of_observed(reception.posteriors, n_observed),
+        assemble.slot_margin_by_burst(slot_margin(reception), reception.clock),
+        np.isin(np.arange(n_columns), list(denoised)),
+        n_strips,
+    )
+    snr_db = assemble.snr_db_of_columns(reception.snr)
+    soft = still_soft_bits(reception.posteriors, n_observed, features, snr_db, no_header)
+    return replace(soft, source=frame.source, frame=frame.index, time_s=frame.time_s)
+
+
 def _best_packet(reception: Reception) -> FloatArray:
     """(C,) mean log probability of the symbols of each column's surest packet that could be reported."""
     return np.asarray(np.where(_complete(reception), reception.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0))
@@ -430,7 +448,7 @@ def _scene_of(reception: Reception, samples: SlotSamples, model: channel.LightMo
 def _in_bursts(acquisition: Acquisition, clock: Clock, log_odds: Float32Array) -> Clock:
     if acquisition.burst is not None:
         return replace(clock, burst=acquisition.burst)
-    return sync.assign_bursts(clock, log_odds, acquisition.screen.repeats)
+    return sync.assign_bursts(clock, log_odds, acquisition.repeats)
 
 
 def _with_bursts_of(acquisition: Acquisition, reception: Reception, log_odds: Float32Array) -> Reception:

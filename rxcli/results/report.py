@@ -9,7 +9,16 @@ from itertools import groupby
 from typing import Any, TypeVar, get_args
 
 from rxcli.errors import UsageError
-from rxcli.types import ColumnResult, ColumnStatus, FrameResult, FrameStatus, PacketResult
+from rxcli.types import (
+    ColumnResult,
+    ColumnStatus,
+    FrameResult,
+    FrameStatus,
+    Message,
+    ObjectProgress,
+    PacketResult,
+    ReceivedObject,
+)
 
 _T = TypeVar("_T")
 #: Hex digits of a payload that a table shows.
@@ -48,7 +57,99 @@ def _details(result: FrameResult) -> dict[str, Any]:
         details["skipped"] = _plain(result.skipped)
     if result.denoiser is not None:
         details["denoiser"] = _plain(result.denoiser)
+    if result.messages:
+        details["messages"] = [_message_record(message) for message in result.messages]
+    if result.objects:
+        details["objects"] = [_object_record(received) for received in result.objects]
+    if result.progress:
+        details["objects_incomplete"] = [_progress_record(progress) for progress in result.progress]
+    if result.link_notes:
+        details["link_notes"] = list(result.link_notes)
     return details
+
+
+def _message_record(message: Message) -> dict[str, Any]:
+    record: dict[str, Any] = {"kind": message.kind}
+    if message.text is not None:
+        record["text"] = message.text
+    return record | {"hex": message.data.hex()}
+
+
+def _object_record(received: ReceivedObject) -> dict[str, Any]:
+    return {
+        "name": received.name,
+        "size": received.size,
+        "sha256": received.sha256,
+        "share": 1.0,
+        "blocks": received.n_blocks,
+        "object_id": received.object_id,
+        "path": received.path,
+    }
+
+
+def _progress_record(progress: ObjectProgress) -> dict[str, Any]:
+    return {
+        "object_id": progress.object_id,
+        "container_bytes": progress.container_bytes,
+        "share": _rounded(progress.share, 4),
+        "blocks": progress.n_blocks,
+        "blocks_done": progress.blocks_done,
+        "seconds_left": _rounded(progress.seconds_left, 2),
+    }
+
+
+def _place_of(record: dict[str, Any]) -> tuple[str, int, float]:
+    return str(record["source"]), int(record["frame"]), _number(record["time_s"])
+
+
+def _messages_from(record: dict[str, Any]) -> tuple[Message, ...]:
+    place = _place_of(record)
+    return tuple(Message(m["kind"], bytes.fromhex(m["hex"]), *place) for m in record.get("messages", ()))
+
+
+def _objects_from(record: dict[str, Any]) -> tuple[ReceivedObject, ...]:
+    place = _place_of(record)
+    return tuple(
+        ReceivedObject(o["name"], b"", o["size"], o["sha256"], o["object_id"], o["blocks"], *place, o["path"])
+        for o in record.get("objects", ())
+    )
+
+
+def _progress_from(record: dict[str, Any]) -> tuple[ObjectProgress, ...]:
+    return tuple(
+        ObjectProgress(
+            p["object_id"], p["container_bytes"], p["blocks"], p["blocks_done"], p["share"], p["seconds_left"]
+        )
+        for p in record.get("objects_incomplete", ())
+    )
+
+
+def format_link(result: FrameResult) -> list[str]:
+    """What came through the link layer with a frame, one line each, for people."""
+    lines = [_message_line(message) for message in result.messages]
+    lines += [format_object(received) for received in result.objects]
+    lines += [format_progress(progress) for progress in result.progress]
+    return lines + [f"note: {printable(note)}" for note in result.link_notes]
+
+
+def _message_line(message: Message) -> str:
+    if message.text is None:
+        return f"bytes: {message.data.hex()}"
+    return f"{message.kind}: {printable(message.text)}"
+
+
+def format_object(received: ReceivedObject) -> str:
+    """A file in one line."""
+    where = f"written to {printable(received.path)}" if received.path else "not written; give --out FOLDER to have it"
+    return f"file: {printable(received.name)}, {received.size} bytes, SHA-256 {received.sha256[:16]}…, {where}"
+
+
+def format_progress(progress: ObjectProgress) -> str:
+    """A file under way in one line."""
+    share = f"{math.floor(100 * progress.share)} % of a file of about {progress.container_bytes} bytes"
+    if progress.seconds_left is None:
+        return f"incomplete: {share}; take a clip, or more of it"
+    return f"incomplete: {share}, {math.ceil(progress.seconds_left)} more seconds of this clip would do"
 
 
 def _corners(result: FrameResult) -> list[list[float | None]] | None:
@@ -145,6 +246,10 @@ def from_record(record: dict[str, Any]) -> FrameResult:
             timing_ms={stage: _number(value) for stage, value in record["timing_ms"].items()},
             skipped={name: _count(value) for name, value in record.get("skipped", {}).items()},
             denoiser=_unless_none(dict, record.get("denoiser")),
+            messages=_messages_from(record),
+            objects=_objects_from(record),
+            progress=_progress_from(record),
+            link_notes=tuple(str(note) for note in record.get("link_notes", ())),
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         shown = f"{error!r:.200}"
@@ -309,7 +414,7 @@ def _cell(value: float | None, form: str) -> str:
 
 def _confidence(value: float) -> str:
     """Rounded downwards, so that only certainty reads 1.0000."""
-    return _cell(math.floor(value * 1e4) / 1e4 if math.isfinite(value) else None, ".4f")
+    return _cell(math.floor(value * 1e4) / 1e4 if math.isfinite(value * 1e4) else None, ".4f")
 
 
 def shorten(payload: str, digits: int = _SHOWN_DIGITS) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 
 from rxcli.errors import ExitCode, UsageError, worst
 from rxcli.outputs import replacing, write_whole
-from rxcli.results.report import format_table, printable
+from rxcli.results.report import format_progress, format_table, printable
 from rxcli.results.truth import Score
 from rxcli.types import FrameResult
 
@@ -41,6 +41,11 @@ class SourceSummary:
     #: Reasons of failure of frames and columns, with how often each came up.
     reasons: Counter[str] = field(default_factory=Counter)
     time_ms: float = 0.0
+    #: Messages and files that came whole, files that did not, and those that could not be written.
+    n_messages: int = 0
+    n_objects: int = 0
+    incomplete: list[str] = field(default_factory=list)
+    unwritten: list[str] = field(default_factory=list)
     #: None where no truth is known.
     score: Score | None = None
     #: Why truth that was asked for is not there.
@@ -56,6 +61,9 @@ class SourceSummary:
         self.n_combined += sum(packet.frames is not None and len(packet.frames) > 1 for packet in packets)
         total = result.timing_ms.get("total", math.nan)
         self.time_ms += total if math.isfinite(total) else 0.0
+        self.n_messages += len(result.messages)
+        self.n_objects += len(result.objects)
+        self.incomplete += [format_progress(progress) for progress in result.progress]
         if result.message:
             self.reasons[result.message] += 1
         self.reasons.update(column.message for column in result.columns if column.message and column.status != "ok")
@@ -79,10 +87,11 @@ class SourceSummary:
         found: list[tuple[ExitCode, str]] = []
         if self.statuses["unreadable"]:
             found.append((ExitCode.UNREADABLE, self.reason))
-        elif not self.n_packets:
+        elif not self.n_packets and not self.n_messages and not self.n_objects:
             found.append((ExitCode.NOT_RECEIVED, f"no packet: {self.reason}" if self.reason else "no packet"))
         elif self.n_packets < limits.min_packets:
             found.append((ExitCode.NOT_RECEIVED, f"{self.n_packets} packets, {limits.min_packets} were asked for"))
+        found += [(ExitCode.NOT_RECEIVED, problem) for problem in self.unwritten]
         if self.truth_problem:
             found.append((ExitCode.UNREADABLE, self.truth_problem))
         if limits.max_ber is not None:
@@ -115,8 +124,12 @@ class SourceSummary:
             "extra": score.extra if score else None,
             "wrong_w": score.wrong_w if score else None,
             "ber": score.ber if score else None,
+            "messages": self.n_messages,
+            "files": self.n_objects,
             "time_ms": round(self.time_ms, 1),
-            "reason": (failures[0][1] if failures else self.reason).removeprefix(f"{self.source}: "),
+            "reason": (failures[0][1] if failures else "; ".join(self.incomplete) or self.reason).removeprefix(
+                f"{self.source}: "
+            ),
         }
 
 
@@ -128,7 +141,7 @@ def total(summaries: Sequence[SourceSummary]) -> SourceSummary:
     """All sources as one, named "total"; scored over those of which the truth is known."""
     whole = SourceSummary("total")
     for summary in summaries:
-        for name in ("n_frames", "n_packets", "confidence_sum", "n_combined", "time_ms"):
+        for name in ("n_frames", "n_packets", "confidence_sum", "n_combined", "time_ms", "n_messages", "n_objects"):
             setattr(whole, name, getattr(whole, name) + getattr(summary, name))
         whole.statuses.update(summary.statuses)
         whole.reasons.update(summary.reasons)

@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Any
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
 from rxcli.runs.journal import Journal as Journal
 from rxcli.runs.journal import recover as recover
-from rxcli.types import Frame, FrameResult
+from rxcli.types import Frame, FrameResult, FrameSoftBits
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from multiprocessing.context import SpawnContext
     from multiprocessing.process import BaseProcess
 
+    from rxcli.profiles import ScreenProfile
     from rxcli.receiver.pipeline import ReceiverOptions
 
 log = logging.getLogger(__name__)
@@ -124,6 +125,8 @@ class Decoder:
     receive: Receive
     #: Sees every frame before it is received, and the subfolder of its source.
     tap: Callable[[Frame, str], None] | None = None
+    #: Screens whose messages and files are looked for; empty: none are.
+    link_screens: tuple[ScreenProfile, ...] = ()
 
     def results(self, source: Source) -> Iterator[FrameResult]:
         """The results of all frames of `source`, at least one; an input that fails ends in an `unreadable` one.
@@ -138,7 +141,7 @@ class Decoder:
         try:
             if source.problem:
                 raise InputError(source.problem)
-            for result in self.receive(failure.guard(self._frames(source)), self._options_of(source)):
+            for result in self._linked(self.receive(failure.guard(self._frames(source)), self._options_of(source))):
                 yield replace(result, source=source.name)
                 count += 1
         except (UsageError, ProfileError, OutputError):
@@ -147,6 +150,30 @@ class Decoder:
             failure.note(error)
         if failure.message or not count:
             yield unreadable(source, count, failure.message or f"{source.name}: holds no picture; name another file")
+
+    def _linked(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
+        """Results with the messages and files that are complete with them.
+
+        A photograph without any keeps its soft bits, for others may show the same.
+        """
+        if not self.link_screens:
+            yield from results
+            return
+        from rxcli.link.collector import Collector
+
+        collector = Collector(self.link_screens)
+        before: FrameResult | None = None
+        alone: FrameSoftBits | None = None
+        for result in results:
+            if before is not None:
+                alone = None
+                yield before
+            else:
+                alone = result.soft_bits
+            before = collector.add(result)
+        if before is not None:
+            before = collector.finish(before)
+            yield replace(before, soft_bits=None if before.messages or before.objects else alone)
 
     def _frames(self, source: Source) -> Iterator[Frame]:
         for frame in self.open_source(source.path):
@@ -204,7 +231,7 @@ def standard_decoder(options: ReceiverOptions, tap: Callable[[Frame, str], None]
     from rxcli.ingest import open_source
     from rxcli.receiver.pipeline import receive
 
-    return Decoder(options, open_source, receive, tap)
+    return Decoder(options, open_source, receive, tap, options.screens if options.soft_bits else ())
 
 
 def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded]:

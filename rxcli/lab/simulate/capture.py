@@ -189,7 +189,7 @@ def prepare(scene: Scene, rng: np.random.Generator | int) -> Take:
     rng = np.random.default_rng(rng)
     link_seed, noise_seed = (int(s) for s in rng.integers(0, 2**62, 2))
     drive = _drive(scene)
-    link = Link(scene.screen, drive.weights, link_seed, scene.payload)
+    link = Link(scene.screen, drive.weights, link_seed, scene.payload, scene.labels)
     start = rng.uniform(_LEAD_SLOTS, link.burst_slots) if scene.start_slot is None else scene.start_slot
     return Take(scene, drive, link, noise_seed, float(start), _delays(scene, rng))
 

@@ -16,7 +16,7 @@ from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
 from rxcli.lab.simulate.sensor import Sensor
-from rxcli.lab.simulate.transmitter import Dimming, Weights
+from rxcli.lab.simulate.transmitter import Dimming, LabelSource, Weights
 from rxcli.profiles import ScreenProfile, load_profile
 
 Output = Literal["raw", "developed"]
@@ -44,6 +44,8 @@ class Scene:
     dimming: Dimming = "max"
     #: Sent over and over; None for random bits.
     payload: bytes | None = None
+    #: Gives labels to send instead, as the link layer has them.
+    labels: LabelSource | None = None
     sensor: Sensor = field(default_factory=Sensor)
     lens: Lens = field(default_factory=Lens)
     pose: Pose = field(default_factory=Pose)

@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import UsageError
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS, bits_to_hex, encode_packet, payload_bits
+from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS, bits_per_symbol, bits_to_hex, encode_packet, payload_bits
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -25,6 +25,8 @@ Float32Array = NDArray[np.float32]
 PANEL_GAMMA = 2.2
 #: What a black pixel of the panel still lets through (contrast 1000 : 1).
 PANEL_LEAKAGE = 1e-3
+#: A column of weight w sends the first k(w) bits of a label.
+LABEL_BITS = 7
 
 Weights = int | tuple[int, ...] | Literal["dimming"]
 Dimming = Literal["max", "none"]
@@ -143,6 +145,14 @@ def backlight_average(levels: FloatArray, screen: ScreenProfile, height: int, wi
     return np.asarray(along @ levels @ across.T)
 
 
+class LabelSource(Protocol):
+    """What gives labels of 7 bits to send, one a payload symbol."""
+
+    def labels(self, bursts: NDArray[np.int64], columns: int, payload_symbols: int) -> NDArray[np.uint8]:
+        """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
+        ...
+
+
 @dataclass(frozen=True)
 class Link:
     """The endless stream of bursts that the columns send; burst 0 starts at slot 0, before it all is dark."""
@@ -154,6 +164,8 @@ class Link:
     seed: int
     #: Sent over and over, burst by burst and column by column; None for random bits.
     message: bytes | None = None
+    #: What to send instead of it; None for `message`.
+    labels: LabelSource | None = None
 
     @property
     def burst_slots(self) -> int:
@@ -167,6 +179,8 @@ class Link:
 
     def payload(self, burst: int) -> list[NDArray[np.uint8]]:
         """Payload bits of one burst, per column."""
+        if self.labels is not None:
+            return self._payload_of_labels(self.labels, burst)
         total = sum(self.bits_per_column)
         if self.message is None:
             rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, burst])))
@@ -175,6 +189,12 @@ class Link:
             message = np.unpackbits(np.frombuffer(self.message, np.uint8))
             bits = np.take(message, np.arange(burst * total, (burst + 1) * total), mode="wrap")
         return np.split(bits, np.cumsum(self.bits_per_column)[:-1])
+
+    def _payload_of_labels(self, source: LabelSource, burst: int) -> list[NDArray[np.uint8]]:
+        """The first bits of every symbol's label, as many as the column's weight carries."""
+        label = source.labels(np.array([burst]), self.screen.columns, self.screen.payload_symbols)[0]
+        bits = (label[..., None] >> np.arange(LABEL_BITS - 1, -1, -1)) & 1
+        return [bits[:, c, : bits_per_symbol(int(w))].astype(np.uint8).ravel() for c, w in enumerate(self.weights)]
 
     def payload_hex(self, burst: int) -> list[str]:
         """Payload of one burst as hex, per column."""

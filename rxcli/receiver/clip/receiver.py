@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
@@ -22,11 +22,12 @@ from rxcli.receiver.clip.start import Start, acquisition_at, agree, shows_little
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.decode import assemble, detect
+from rxcli.receiver.decode.soft_bits import clip_soft_bits
 from rxcli.receiver.outline import Outline, find_outline
 from rxcli.receiver.still import Reception, apply_autoencoder, decode, doubtful_columns, initial_pass
 from rxcli.receiver.sync import tracking
 from rxcli.results.dump import dump_stages
-from rxcli.types import FloatArray, Frame, FrameResult, IntArray
+from rxcli.types import FloatArray, Frame, FrameResult, FrameSoftBits, IntArray
 
 #: Frames at the start of a scene that are looked at once more when the picture is known better; how many are waited for
 #: where compression has taken much; and the share of the well lit packets that are then in doubt.
@@ -97,6 +98,8 @@ class _Clip:
         self._little = False
         self._start: Start | None = None
         self._next_number = 0
+        #: Counts the times that the link's time was begun anew: burst numbers of different ones cannot be compared.
+        self._epoch = 0
         #: A frame with the camera and the screens that remain, and what they were found for.
         self._context: FrameContext | None = None
         self._taken_with: tuple[object, ...] = ()
@@ -368,9 +371,10 @@ class _Clip:
         screen = view.acquisition.screen
         offset = self._next_number
         if self._link is not None and offset:
-            offset += int((frame.time_s - self._link.last_time_s) / (screen.packet_s * screen.repeats))
+            offset += int((frame.time_s - self._link.last_time_s) / (screen.packet_s * self._link.phase.repeats))
         time = self._start.time if self._start else tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz)
-        self._link = _Link(time, tracking.BurstPhase(screen.repeats), offset)
+        self._link = _Link(time, tracking.BurstPhase(view.acquisition.repeats), offset)
+        self._epoch += 1
         self._bursts.begin()
 
     def _compare(self, view: View) -> None:
@@ -491,7 +495,18 @@ class _Clip:
         if self._options.dump_dir is not None:
             found = results.taps(waiting, view, ended)
             dump_stages(self._options.dump_dir, waiting.result.source, waiting.result.frame, found)
-        return replace(waiting.result, columns=columns, status=assemble.clip_status(columns))
+        result = replace(waiting.result, columns=columns, status=assemble.clip_status(columns))
+        if self._link is not None:
+            result = replace(result, screen_profile=view.acquisition.variant(self._link.phase.repeats).name)
+        return replace(result, soft_bits=self._soft_bits(result, view, ended)) if self._options.soft_bits else result
+
+    def _soft_bits(
+        self, result: FrameResult, view: View, ended: Sequence[assemble.BurstInClip]
+    ) -> FrameSoftBits | None:
+        soft = clip_soft_bits(ended, assemble.snr_db_of_columns(view.snr), self._epoch)
+        if soft is None:
+            return None
+        return replace(soft, source=result.source, frame=result.frame, time_s=result.time_s)
 
 
 def _taken_with(frame: Frame) -> tuple[object, ...]:

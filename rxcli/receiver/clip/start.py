@@ -15,7 +15,14 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver import sync
-from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sample_columns
+from rxcli.receiver.acquisition import (
+    Acquisition,
+    ColumnSampler,
+    noise_of,
+    sample_columns,
+    told_apart_by_clock,
+    variants_of,
+)
 from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.outline import find_outline
@@ -36,6 +43,8 @@ class Start:
     """What the first frames agree on."""
 
     screen: ScreenProfile
+    #: It and those that differ from it in how often a packet is sent.
+    variants: tuple[ScreenProfile, ...]
     time: LinkTime
 
 
@@ -59,12 +68,12 @@ def agree(frames: Sequence[Frame], options: ReceiverOptions) -> Start | None:
     best: tuple[float, Start] | None = None
     for n_columns in sorted({screen.columns for screen in context.screens}):
         profiles_of = [sample_columns(replace(context, frame=frame), n_columns).profiles for frame in frames]
-        for screen in (s for s in context.screens if s.columns == n_columns):
+        for screen in (s for s in told_apart_by_clock(context.screens) if s.columns == n_columns):
             lead, slot, period = _phase(frames, profiles_of, screen, context.camera)
             if lead > _MIN_LEAD and (best is None or lead > best[0]):
                 time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
                 time.begin(frames[0].index, frames[0].time_s, slot, period)
-                best = lead, Start(screen, time)
+                best = lead, Start(screen, variants_of(screen, context.screens), time)
     return best[1] if best else None
 
 
@@ -90,7 +99,7 @@ def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:
     n_slots = int(np.ceil((rows[-1] - rows[0] + 1) / rows_per_slot)) + 1
     top = float(profiles.rows[rows[0]]) - 0.5
     clock = start.time.clock_at(frame.index, frame.time_s, template, n_slots, top)
-    return None if clock is None else Acquisition(screen, ColumnSampler(profiles), clock)
+    return None if clock is None else Acquisition(screen, ColumnSampler(profiles), clock, variants=start.variants)
 
 
 def _phase(

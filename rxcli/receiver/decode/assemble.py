@@ -36,7 +36,7 @@ _CLIP_CALIBRATION = (0.103, 0.477, -0.83)
 _AGAINST_AT_LEAST = 0.5
 #: Wrong bits of packets as likely right as wrong, the least share of them, and the power of the odds of being wrong
 #: that it goes with.
-_WRONG_AT_EVENS, _BER_AT_EVENS, _BER_EXPONENT = 1.4, 0.018, 0.85
+WRONG_AT_EVENS, BER_AT_EVENS, BER_EXPONENT = 1.4, 0.018, 0.85
 #: Headers of a column, all bursts together, less likely than this against slots that are anything, nats, are none.
 _CONTRADICTED = -2.0
 #: Together the columns' headers must be this much more likely than slots that are anything; one good header gives 12,
@@ -52,7 +52,7 @@ _MOST_DOUBT = 500.0
 #: A column with a packet below this confidence is weak.
 _WEAK_CONFIDENCE = 0.5
 #: A weight is reported from this probability on.
-_MIN_WEIGHT_PROBABILITY = 0.99
+MIN_WEIGHT_PROBABILITY = 0.99
 #: A column below this signal-to-noise ratio is too dark to try.
 _DARK_SNR_DB = 0.0
 
@@ -84,10 +84,10 @@ def column_results(
     was_denoised = np.isin(np.arange(len(snr)), list(denoised))
     by_burst = slot_margin_by_burst(slot_margin, clock)
     doubts = _doubts(posteriors, confidence_features(posteriors, by_burst, was_denoised, samples.light.shape[1]))
-    snr_db = _snr_db_of_columns(snr)
-    echoes: BoolArray = np.any(_echoes(posteriors, snr_db) & whole, axis=0)
+    snr_db = snr_db_of_columns(snr)
+    echoing: BoolArray = np.any(echoes(posteriors, snr_db) & whole, axis=0)
     reported = whole & doubts.reported(min_confidence)
-    against = [_HEADERLESS if h else _ECHO if e else None for h, e in zip(headerless, echoes, strict=True)]
+    against = [_HEADERLESS if h else _ECHO if e else None for h, e in zip(headerless, echoing, strict=True)]
     return tuple(
         _column_result(
             column,
@@ -135,10 +135,10 @@ def clip_results(
         snr: (C, N) squared contrast over variance of every slot of the grid.
         min_confidence: packets below it are left out.
     """
-    snr_db = _snr_db_of_columns(snr)
+    snr_db = snr_db_of_columns(snr)
     doubts = [_clip_doubts(burst) for burst in bursts]
     reported = [
-        complete(burst.n_observed[None])[0] & ~_echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]
+        complete(burst.n_observed[None])[0] & ~echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]
         for burst, doubt in zip(bursts, doubts, strict=True)
     ]
     own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
@@ -178,7 +178,7 @@ def _clip_column(
     )
 
 
-def _snr_db_of_columns(snr: Float32Array) -> list[float | None]:
+def snr_db_of_columns(snr: Float32Array) -> list[float | None]:
     """Median over the slots of each column that show anything."""
     if (snr > 0).all():
         return [float(db) for db in 10 * np.log10(np.maximum(np.median(snr, axis=1), 1e-6))]
@@ -206,7 +206,7 @@ def _snr_db(snr: Float32Array) -> float | None:
 
 def all_dark(snr: Float32Array) -> bool:
     """Whether no column has light enough; `snr` is (C, N), squared contrast over variance of every slot."""
-    return all(db is None or db < _DARK_SNR_DB for db in _snr_db_of_columns(snr))
+    return all(db is None or db < _DARK_SNR_DB for db in snr_db_of_columns(snr))
 
 
 def clip_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
@@ -261,7 +261,7 @@ def _column_result(
 ) -> ColumnResult:
     bursts = () if against else np.flatnonzero(reported)
     packets = tuple(_packet(int(burst), column, clock, posteriors, n_observed[burst], doubts) for burst in bursts)
-    sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(_MIN_WEIGHT_PROBABILITY)
+    sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
     return ColumnResult(
         column=column,
@@ -275,7 +275,7 @@ def _column_result(
     )
 
 
-def _echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolArray:
+def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolArray:
     """(B, C) whether a column says word for word what a brighter one beside it says, and no other column does.
 
     A column under black shows its neighbour's light, blurred; where all columns send the same, more than two agree.
@@ -352,13 +352,20 @@ def _clip_doubts(burst: BurstInClip) -> _Doubts:
     doubts = _doubts(burst.posteriors, burst.confidence_features[None])
     if burst.against is None:
         return doubts
+    log_odds = clip_log_odds(burst)
+    n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
+    at_evens = np.maximum(WRONG_AT_EVENS / n_bits, BER_AT_EVENS)
+    wrong = np.minimum(at_evens * np.exp(-BER_EXPONENT * log_odds), 0.5)
+    return replace(doubts, confidence=_probability(log_odds), ber_hat=np.maximum(doubts.ber_hat, wrong))
+
+
+def clip_log_odds(burst: BurstInClip) -> FloatArray:
+    """(1, C) calibrated log-odds of the packets of a burst of a clip being error-free."""
+    if burst.against is None:
+        return confidence_log_odds(burst.confidence_features[None])
     offset, slope, slope_against = _CLIP_CALIBRATION
     log_odds = _log_odds(burst.posteriors.log_prob.sum(axis=2))
-    log_odds = offset + slope * log_odds + slope_against * np.log(burst.against + _AGAINST_AT_LEAST)
-    n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
-    at_evens = np.maximum(_WRONG_AT_EVENS / n_bits, _BER_AT_EVENS)
-    wrong = np.minimum(at_evens * np.exp(-_BER_EXPONENT * log_odds), 0.5)
-    return replace(doubts, confidence=_probability(log_odds), ber_hat=np.maximum(doubts.ber_hat, wrong))
+    return np.asarray(offset + slope * log_odds + slope_against * np.log(burst.against + _AGAINST_AT_LEAST))
 
 
 def _packet(
@@ -414,7 +421,12 @@ def confidence_features(
 
 def confidence(confidence_features: FloatArray) -> FloatArray:
     """Probability (...) that packets are error-free, from their evidence (..., 8)."""
-    return _probability(confidence_features @ np.array(_CALIBRATION))
+    return _probability(confidence_log_odds(confidence_features))
+
+
+def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
+    """Log-odds (...) of packets being error-free, from their evidence (..., 8)."""
+    return np.asarray(confidence_features @ np.array(_CALIBRATION))
 
 
 def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Array:

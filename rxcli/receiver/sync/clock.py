@@ -8,6 +8,7 @@ visible copies. Copies of one burst are alike, copies of different bursts are no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -406,33 +407,43 @@ def _of_columns(profiles: RowProfiles, columns: IntArray | slice) -> RowProfiles
     )
 
 
-def assign_bursts(clock: Clock, llr: Float32Array, repeats: int) -> Clock:
-    """The clock with its copies assigned to bursts of `repeats` copies, by the likeness of adjacent copies.
+def assign_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> Clock:
+    """The clock with its copies assigned to bursts, by the likeness of adjacent copies.
 
     Args:
         clock: the clock.
         llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
-        repeats: copies of a burst.
+        repeats: how many copies a burst may have.
     """
     return possible_bursts(clock, llr, repeats)[0][0]
 
 
-def possible_bursts(clock: Clock, llr: Float32Array, repeats: int) -> list[tuple[Clock, float]]:
-    """The clock with its copies in bursts of `repeats` in every way, and how likely each is, nats; likeliest first.
+def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> list[tuple[Clock, float]]:
+    """The clock with its copies in bursts in every way, and how likely each is, nats; likeliest first.
 
     Args:
         clock: the clock.
         llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
-        repeats: copies of a burst.
+        repeats: how many copies a burst may have.
     """
     likeness = copy_likeness(llr, clock)
     out: dict[bytes, tuple[Clock, float]] = {}
-    for phase in range(repeats):
-        burst = (np.arange(clock.n_copies) + phase) // repeats
+    for n, phase in [(copies, phase) for copies in repeats for phase in range(copies)]:
+        burst = (np.arange(clock.n_copies) + phase) // n
         score = float(np.where(burst[1:] == burst[:-1], likeness, -likeness).sum())
         burst -= burst[0]
         out.setdefault(burst.tobytes(), (replace(clock, burst=burst), score))
     return sorted(out.values(), key=lambda one: -one[1])
+
+
+def likely_repeats(clock: Clock, repeats: Sequence[int]) -> int:
+    """The first of `repeats` that bursts as they were told apart can be of."""
+    for n in repeats:
+        for phase in range(n):
+            burst = (np.arange(clock.n_copies) + phase) // n
+            if np.array_equal(burst - burst[0], clock.burst - clock.burst[0]):
+                return n
+    return repeats[0]
 
 
 def copy_likeness(llr: Float32Array, clock: Clock) -> FloatArray:

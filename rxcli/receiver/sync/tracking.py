@@ -8,6 +8,7 @@ clip, and with the phase of the bursts (`BurstPhase`) every burst too, those in 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -134,25 +135,34 @@ class BurstPhase:
     """Which copies begin a burst: copies of one burst are alike, copies of different bursts are not.
 
     Args:
-        repeats: copies of a burst.
+        repeats: how many copies a burst has, or may have.
     """
 
-    def __init__(self, repeats: int) -> None:
-        self._repeats = repeats
-        self._score = np.zeros(repeats)
+    def __init__(self, repeats: int | Sequence[int]) -> None:
+        several = (repeats,) if isinstance(repeats, int) else tuple(repeats)
+        #: (n, 2) copies of a burst, and phase: what it may be.
+        self._hypotheses = np.array([(n, phase) for n in several for phase in range(n)], np.int64)
+        self._most = max(several)
+        self._score = np.zeros(len(self._hypotheses))
         self._copies: dict[int, FloatArray] = {}
 
     @property
     def settled(self) -> bool:
         """Whether the phase is beyond doubt."""
-        if self._repeats == 1:
+        if self._score.size == 1:
             return True
         rival, best = np.sort(self._score)[-2:]
         return bool(best - rival > _SETTLED)
 
     def burst_of(self, copies: IntArray) -> IntArray:
         """Number of the burst of each copy, by its number in the clip."""
-        return np.asarray((copies + int(self._score.argmax())) // self._repeats, np.int64)
+        repeats, phase = self._hypotheses[int(self._score.argmax())]
+        return np.asarray((copies + phase) // repeats, np.int64)
+
+    @property
+    def repeats(self) -> int:
+        """Copies of a burst, as far as is known."""
+        return int(self._hypotheses[int(self._score.argmax()), 0])
 
     def take(self, first_copy: int, llr: FloatArray) -> None:
         """Compare the copies of a frame with one another and with those before.
@@ -163,15 +173,15 @@ class BurstPhase:
         """
         llr = np.clip(llr, -_SURE, _SURE)
         for copy, slots in enumerate(llr, first_copy):
-            for other in range(copy - self._repeats + 1, copy):
+            for other in range(copy - self._most + 1, copy):
                 if other in self._copies:
                     self._compare(other, copy, _alike(self._copies[other], slots))
             self._copies[copy] = self._copies[copy] + slots if copy in self._copies else slots
-        self._copies = {c: s for c, s in self._copies.items() if c > first_copy + len(llr) - 1 - self._repeats}
+        self._copies = {c: s for c, s in self._copies.items() if c > first_copy + len(llr) - 1 - self._most}
 
     def _compare(self, first: int, second: int, alike: float) -> None:
-        phases = np.arange(self._repeats)
-        same = (first + phases) // self._repeats == (second + phases) // self._repeats
+        repeats, phases = self._hypotheses.T
+        same = (first + phases) // repeats == (second + phases) // repeats
         self._score += np.where(same, alike / 2, -alike / 2)
 
 

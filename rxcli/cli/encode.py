@@ -1,0 +1,250 @@
+"""`vlc-rx encode`: what a transmitter has to send so that a text or a file comes out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from math import ceil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rxcli.cli.common import claim_outputs, force_argument
+from rxcli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rxcli.link.encoder import FileSending, MessageSending
+    from rxcli.profiles import ScreenProfile
+
+_RATES = {"1/1.5": 0, "1/2": 1, "1/3": 2}
+#: Bursts that are computed at a time.
+_CHUNK = 256
+#: Share of the time that a usual 4K video shows: what a time needed is reckoned with.
+_USUAL_READOUT = 0.61
+
+
+@click.command()
+@click.argument("path", type=click.Path(path_type=Path), required=False)
+@click.option("--text", help="Send this text; one of more than 199 bytes goes as a file.")
+@click.option("--uri", help="Send this URI, of at most 199 bytes.")
+@click.option("--screen", default="data-34k6", show_default=True, help="Screen profile: a name or a TOML file.")
+@click.option(
+    "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), help="Where to write: .npy, or .csv."
+)
+@click.option("--bursts", type=click.IntRange(1), help="How many bursts. [default: what a receiver needs, and more]")
+@click.option("--seconds", type=click.FloatRange(0, min_open=True), help="How much time of the link, instead.")
+@click.option("--slots", is_flag=True, help="Write the slots themselves, bit-packed (.npy), instead of labels.")
+@click.option(
+    "--weights", default="5", show_default=True, help="Lit slots of ten: N, a list N,N,..., or a JSON file per burst."
+)
+@click.option(
+    "--mother", type=click.Choice(list(_RATES)), default="1/3", show_default=True, help="Mother rate of a file's code."
+)
+@click.option("--object-id", type=click.IntRange(0, 0xFFFD), help="Number of a file. [default: from its content]")
+@force_argument
+def encode(path: Path | None, out: Path, **options: Any) -> None:
+    """Encode the file PATH, a text or a URI as labels, or slots, for a transmitter."""
+    from rxcli.cli.sending import sending_of
+    from rxcli.profiles import ScreenProfile, load_profile
+
+    screen = load_profile(options["screen"], ScreenProfile)
+    _check(out, options)
+    _claim(path, out, options)
+    sending = sending_of(path, options["text"], options["uri"], _RATES[options["mother"]], options["object_id"])
+    n_bursts = _n_bursts(options, sending, screen)
+    weights = _weights(options["weights"], n_bursts, screen.columns)
+    _check_fits(sending, weights, screen)
+    try:
+        _write(sending, screen, weights, n_bursts, out, as_slots=options["slots"])
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror or error})", "name another file") from None
+    click.echo(_summary(sending, screen, weights, n_bursts, out), err=True)
+
+
+def _check(out: Path, options: dict[str, Any]) -> None:
+    if options["bursts"] is not None and options["seconds"] is not None:
+        raise UsageError("--bursts and --seconds exclude each other", "give one of them")
+    if out.suffix not in (".npy", ".csv"):
+        raise UsageError(f"--out must end in .npy or .csv (got {str(out)!r})", "name such a file")
+    if options["slots"] and out.suffix != ".npy":
+        raise UsageError("--slots are written as .npy only", "name such a file, or leave --slots out")
+
+
+def _claim(path: Path | None, out: Path, options: dict[str, Any]) -> None:
+    """Refuse outputs that would destroy something."""
+    from rxcli.outputs import ENCODED, Output
+
+    found = [Output("--out", out, ENCODED)]
+    if options["slots"]:
+        found.append(Output("--slots", _readme_of(out), ENCODED))
+    inputs = [path] if path is not None else []
+    inputs += [Path(options["weights"])] if options["weights"].endswith(".json") else []
+    claim_outputs(found, inputs, (options["screen"],), options["force"])
+
+
+def _readme_of(out: Path) -> Path:
+    return out.with_name(out.name + ".README.txt")
+
+
+def _n_bursts(options: dict[str, Any], sending: FileSending | MessageSending, screen: ScreenProfile) -> int:
+    burst_s = screen.packet_s * screen.repeats
+    if options["bursts"] is not None:
+        return int(options["bursts"])
+    if options["seconds"] is not None:
+        return max(1, ceil(float(options["seconds"]) / burst_s))
+    return _default_bursts(sending, screen)
+
+
+def _default_bursts(sending: FileSending | MessageSending, screen: ScreenProfile) -> int:
+    """A round of a message; of a file, everything that is coded, once."""
+    from rxcli.link.encoder import FileSending
+    from rxcli.link.layout import beacon_layout
+
+    if not isinstance(sending, FileSending):
+        return beacon_layout(len(sending.body), screen.columns, screen.payload_symbols).period
+    layout = sending.layout(screen.columns, screen.payload_symbols)
+    units = layout.n_blocks * layout.n_labels
+    data = ceil(units / (screen.columns * screen.payload_symbols))
+    return data + ceil(data / 31)
+
+
+def _weights(text: str, n_bursts: int, columns: int) -> NDArray[np.int64]:
+    """(n_bursts or 1, columns) weights."""
+    import numpy as np
+
+    try:
+        values = np.asarray(_weight_values(text), np.int64)
+        weights = np.broadcast_to(values, (values.shape[0] if values.ndim == 2 else 1, columns))
+    except (ValueError, TypeError, OverflowError):
+        raise UsageError(
+            f"--weights {text}: no number, list of {columns} numbers, or JSON file of {n_bursts} such lists",
+            "give 1..9 for every column",
+        ) from None
+    if weights.min() < 1 or weights.max() > 9:
+        raise UsageError(f"--weights {text}: weights are 1 to 9", "choose from 1..9")
+    if len(weights) not in (1, n_bursts):
+        raise UsageError(
+            f"--weights {text} holds {len(weights)} bursts, {n_bursts} are sent", f"give {n_bursts}, or --bursts"
+        )
+    return weights
+
+
+def _weight_values(text: str) -> Any:
+    if not text.endswith(".json"):
+        return [int(part) for part in text.split(",")]
+    try:
+        return json.loads(Path(text).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"--weights {text}: cannot be read ({error.strerror})", "name a JSON file") from None
+
+
+def _check_fits(sending: FileSending | MessageSending, weights: NDArray[np.int64], screen: ScreenProfile) -> None:
+    from rxcli.link.encoder import FileSending, check_file, check_message
+
+    for row in weights:
+        if isinstance(sending, FileSending):
+            check_file(row, screen.payload_symbols)
+        else:
+            check_message(sending, row, screen.payload_symbols)
+
+
+def _write(
+    sending: FileSending | MessageSending,
+    screen: ScreenProfile,
+    weights: NDArray[np.int64],
+    n_bursts: int,
+    out: Path,
+    *,
+    as_slots: bool,
+) -> None:
+    chunks = _label_chunks(sending, screen, n_bursts)
+    if out.suffix == ".csv":
+        _write_csv(chunks, screen, out)
+    elif as_slots:
+        _write_slots(chunks, screen, weights, n_bursts, out)
+    else:
+        _write_labels(chunks, screen, n_bursts, out)
+
+
+def _label_chunks(
+    sending: FileSending | MessageSending, screen: ScreenProfile, n_bursts: int
+) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    import numpy as np
+
+    for first in range(0, n_bursts, _CHUNK):
+        bursts = np.arange(first, min(first + _CHUNK, n_bursts))
+        yield first, sending.labels(bursts, screen.columns, screen.payload_symbols)
+
+
+def _write_labels(
+    chunks: Iterator[tuple[int, NDArray[np.uint8]]], screen: ScreenProfile, n_bursts: int, out: Path
+) -> None:
+    import numpy as np
+
+    shape = (n_bursts, screen.payload_symbols, screen.columns)
+    target = np.lib.format.open_memmap(out, "w+", np.uint8, shape)
+    for first, labels in chunks:
+        target[first : first + len(labels)] = labels
+    target.flush()
+
+
+def _write_csv(chunks: Iterator[tuple[int, NDArray[np.uint8]]], screen: ScreenProfile, out: Path) -> None:
+    with out.open("w", encoding="utf-8") as file:
+        file.write("burst,symbol," + ",".join(f"column_{c}" for c in range(screen.columns)) + "\n")
+        for first, labels in chunks:
+            for burst, symbols in enumerate(labels, first):
+                for symbol, row in enumerate(symbols):
+                    file.write(f"{burst},{symbol},{','.join(map(str, row))}\n")
+
+
+def _write_slots(
+    chunks: Iterator[tuple[int, NDArray[np.uint8]]],
+    screen: ScreenProfile,
+    weights: NDArray[np.int64],
+    n_bursts: int,
+    out: Path,
+) -> None:
+    import numpy as np
+
+    from rxcli.link.encoder import packet_slots_of
+
+    burst_slots, width = screen.packet_slots * screen.repeats, -(-screen.columns // 8)
+    target = np.lib.format.open_memmap(out, "w+", np.uint8, (n_bursts * burst_slots, width))
+    for first, labels in chunks:
+        mine = weights if len(weights) == 1 else weights[first : first + len(labels)]
+        packets = np.packbits(packet_slots_of(labels, mine).transpose(0, 2, 1), axis=2)
+        repeated = np.tile(packets, (1, screen.repeats, 1)).reshape(-1, width)
+        target[first * burst_slots : first * burst_slots + len(repeated)] = repeated
+    target.flush()
+    _readme_of(out).write_text(
+        f"{out.name}: uint8 ({n_bursts * burst_slots}, {width}); one row a slot at {screen.slot_rate_hz:g} Hz, first "
+        f"sent first; {screen.columns} columns as bits, column 0 (the viewer's leftmost) is the most significant bit "
+        "of the first byte; 1 is lit.\n",
+        encoding="utf-8",
+    )
+
+
+def _summary(
+    sending: FileSending | MessageSending,
+    screen: ScreenProfile,
+    weights: NDArray[np.int64],
+    n_bursts: int,
+    out: Path,
+) -> str:
+    from rxcli.link.encoder import FileSending, ready_bits, visible_bits_of_burst
+
+    burst_s = screen.packet_s * screen.repeats
+    many = "s" * (n_bursts > 1)
+    lines = [f"{out}: {sending.summary}; {n_bursts} burst{many} of {screen.name}, {n_bursts * burst_s:.3g} s"]
+    bits = sum(visible_bits_of_burst(row, screen.payload_symbols) for row in weights) / len(weights)
+    if isinstance(sending, FileSending):
+        needed = ready_bits(sending) / (bits * 31 / 32) * burst_s / _USUAL_READOUT
+        lines.append(
+            f"a camera that sees all columns for {_USUAL_READOUT:.0%} of the time needs about {needed:.1f} s, and an "
+            f"announcement, which comes every {32 * burst_s:.2g} s; send on until it has come"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,59 @@
+"""The link layer: soft bits of packets to messages and files, and back to labels for transmitters.
+
+Receiving::
+
+    receiver = LinkReceiver(columns=20, payload_symbols=24)
+    for soft in frames:                  # `FrameSoftBits`: what one frame, or one burst, says of the payload's bits
+        for event in receiver.add(soft): # `Message` or `ReceivedObject`, each once, when it is complete
+            ...
+    receiver.finish()                    # tries what is left; again a list of events
+    receiver.messages                    # every `Message` so far: kind, text, data
+    receiver.objects                     # every `ReceivedObject` so far: name, size, sha256, data
+    receiver.progress                    # every file under way, `ObjectProgress`: blocks, share received
+
+`Collector` does this for `FrameResult`s: `collector.add(result)` gives the result with `messages` and `objects` filled
+in (`ReceiverOptions.soft_bits` must be set), `collector.finish(last_result)` adds `progress` and `link_notes`, and
+`rxcli.link.saving.save_object` writes a file.
+
+Sending: `message(...)` and `file_object(...)` give a `Sending`, whose `labels(first, n, N, C)` are what a transmitter
+sends, and `rxcli.link.encoder.slots` makes slots of them. `simulate` uses the same.
+
+A bit's ratio is ln p(1)/p(0) everywhere, 0 where nothing is known. Burst numbers count through a clip; `epoch` changes
+where the count may have jumped (a new photo, a lost clock). The room stands on the ground alone: it knows nothing of
+pixels.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rxcli.link.collector import Collector as Collector
+    from rxcli.link.encoder import Sending as Sending
+    from rxcli.link.encoder import file_object as file_object
+    from rxcli.link.encoder import message as message
+    from rxcli.link.receiver import LinkReceiver as LinkReceiver
+    from rxcli.types import FrameSoftBits as FrameSoftBits
+    from rxcli.types import Message as Message
+    from rxcli.types import ObjectProgress as ObjectProgress
+    from rxcli.types import ReceivedObject as ReceivedObject
+
+_HOME = {
+    "Collector": "rxcli.link.collector",
+    "Sending": "rxcli.link.encoder",
+    "file_object": "rxcli.link.encoder",
+    "message": "rxcli.link.encoder",
+    "LinkReceiver": "rxcli.link.receiver",
+    "FrameSoftBits": "rxcli.types",
+    "Message": "rxcli.types",
+    "ObjectProgress": "rxcli.types",
+    "ReceivedObject": "rxcli.types",
+}
+__all__ = list(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)

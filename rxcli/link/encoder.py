@@ -1,0 +1,264 @@
+"""What a transmitter has to send: labels, and slots made of them."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.errors import UsageError
+from rxcli.link import ldpc
+from rxcli.link.formats import Announcement, beacon_body, block_prefix, pack_container, protect
+from rxcli.link.formats import protect_beacon as _protect_beacon
+from rxcli.link.layout import (
+    ANNOUNCEMENT_PERIOD,
+    LABEL_BITS,
+    READY,
+    BeaconLayout,
+    FileLayout,
+    Places,
+    announcement_layout,
+    beacon_layout,
+)
+from rxcli.protocol import HEADER, bits_per_symbol, codebook, dimming_symbol
+from rxcli.types import MessageKind
+
+#: Information of a beacon from which on one photo is enough, in its bits.
+BEACON_NEED = 1.2
+_LABEL_WEIGHTS = 1 << np.arange(LABEL_BITS - 1, -1, -1)
+#: Blocks coded at a time.
+_BATCH = 64
+
+Labels = NDArray[np.uint8]
+
+
+class Sending(Protocol):
+    """Something that is sent until it is stopped."""
+
+    def labels(self, bursts: Places, columns: int, payload_symbols: int) -> Labels:
+        """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
+        ...
+
+    @property
+    def information_bits(self) -> int:
+        """Bits with CRCs, before coding."""
+        ...
+
+    @property
+    def summary(self) -> str:
+        """One line for people."""
+        ...
+
+
+def _bits(data: bytes) -> NDArray[np.uint8]:
+    return np.unpackbits(np.frombuffer(data, np.uint8))
+
+
+def _labels(buffer: NDArray[np.uint8], places: Places) -> Labels:
+    return np.asarray(buffer[places] @ _LABEL_WEIGHTS, np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class MessageSending:
+    """A short message, sent as a beacon."""
+
+    kind: MessageKind
+    body: bytes
+
+    def labels(self, bursts: Places, columns: int, payload_symbols: int) -> Labels:
+        """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
+        layout = beacon_layout(len(self.body), columns, payload_symbols)
+        return _labels(self._buffer(layout), layout.places[bursts % layout.period])
+
+    def _buffer(self, layout: BeaconLayout) -> NDArray[np.uint8]:
+        buffer: NDArray[np.uint8] = ldpc.encode(layout.code, _bits(_protect_beacon(self.body))[None])[0]
+        return buffer
+
+    @property
+    def information_bits(self) -> int:
+        """Bits with the CRC, before coding."""
+        return 8 * (len(self.body) + 4)
+
+    @property
+    def summary(self) -> str:
+        """One line for people."""
+        return f"a {self.kind} message in a beacon of {len(self.body)} bytes"
+
+
+def message(text: str | bytes, kind: MessageKind = "text") -> MessageSending:
+    """A text, a URI or raw bytes as a beacon.
+
+    Raises:
+        UsageError: it is empty, too long, or a text with a zero byte.
+    """
+    return MessageSending(kind, beacon_body(kind, text.encode("utf-8") if isinstance(text, str) else text))
+
+
+class FileSending:
+    """A file, with an announcement every 32 bursts.
+
+    Args:
+        container: the packed file.
+        object_id: 0..0xFFFD.
+        mother: 0, 1, 2 for mother rates 1/1.5, 1/2, 1/3.
+        name: for people.
+
+    Raises:
+        UsageError: the object id is reserved or the container too long to announce.
+    """
+
+    def __init__(self, container: bytes, object_id: int, mother: int, name: str) -> None:
+        if not 0 <= object_id < 0xFFFE:
+            raise UsageError(f"an object id is 0 to 65533 (got {object_id})", "give another")
+        if len(container) >= 1 << 32:
+            raise UsageError(f"{name} has {len(container)} bytes; a file must stay below 4 GiB", "send parts of it")
+        self.container, self.object_id, self.mother, self.name = container, object_id, mother, name
+        self._crc = zlib.crc32(container)
+        self._coded: NDArray[np.uint8] | None = None
+
+    def layout(self, columns: int, payload_symbols: int) -> FileLayout:
+        """Where the bits go on a screen."""
+        return FileLayout(self.object_id, len(self.container), self.mother, columns, payload_symbols)
+
+    def labels(self, bursts: Places, columns: int, payload_symbols: int) -> Labels:
+        """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
+        layout = self.layout(columns, payload_symbols)
+        out = np.empty((len(bursts), payload_symbols, columns), np.uint8)
+        announcing = bursts % ANNOUNCEMENT_PERIOD == 0
+        for place in np.flatnonzero(announcing):
+            out[place] = self._announcement(int(bursts[place]), columns, payload_symbols)
+        if not announcing.all():
+            blocks, bits = layout.places(bursts[~announcing])
+            packed = self._buffers(layout)[blocks[..., None], bits >> 3]
+            out[~announcing] = ((packed >> (7 - (bits & 7)).astype(np.uint8)) & 1) @ _LABEL_WEIGHTS
+        return out
+
+    def _announcement(self, burst: int, columns: int, payload_symbols: int) -> Labels:
+        layout = announcement_layout(columns, payload_symbols)
+        told = Announcement(self.mother, self.object_id, len(self.container), burst, self._crc)
+        return _labels(ldpc.encode(layout.code, _bits(told.protected())[None])[0], layout.places[0])
+
+    def _buffers(self, layout: FileLayout) -> NDArray[np.uint8]:
+        """(B, bytes) every block's coded bits, packed."""
+        if self._coded is None:
+            size = layout.block_bytes
+            pieces = [self.container[i : i + size].ljust(size, b"\0") for i in range(0, len(self.container), size)]
+            blocks = [
+                protect(piece, self.object_id, number, block_prefix(self.object_id, number))
+                for number, piece in enumerate(pieces)
+            ]
+            self._coded = np.concatenate(
+                [
+                    np.packbits(_encode_blocks(layout, blocks[i : i + _BATCH]), axis=1)
+                    for i in range(0, len(blocks), _BATCH)
+                ]
+            )
+        return self._coded
+
+    @property
+    def information_bits(self) -> int:
+        """Bits with CRCs, before coding."""
+        return 8 * (len(self.container) + 4 * -(-len(self.container) // 1052))
+
+    @property
+    def summary(self) -> str:
+        """One line for people."""
+        layout = self.layout(1, 1)
+        return (
+            f"file {self.name}, container of {len(self.container)} bytes in {layout.n_blocks} "
+            f"block{'s' * (layout.n_blocks > 1)}"
+        )
+
+
+def _encode_blocks(layout: FileLayout, blocks: list[bytes]) -> NDArray[np.uint8]:
+    return np.asarray(ldpc.encode(layout.code, np.stack([_bits(block) for block in blocks]))[:, : layout.n_bits])
+
+
+def file_object(name: str, data: bytes, object_id: int | None = None, mother: int = 2) -> FileSending:
+    """A file to be sent; without an id, one that follows from what is sent.
+
+    Raises:
+        UsageError: the name or the id cannot be sent.
+    """
+    container = pack_container(name, data)
+    if object_id is None:
+        object_id = zlib.crc32(container) % 0xFFFE
+    return FileSending(container, object_id, mother, name)
+
+
+# -- slots -------------------------------------------------------------------------------------------------------------
+
+
+def packet_slots_of(labels: Labels, weights: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Slots of packets: header, dimming symbol and payload.
+
+    Args:
+        labels: (n, N, C) labels.
+        weights: (n, C) or (C,) weight of every column, 1..9.
+
+    Returns:
+        (n, C, 20 + 10 N) uint8 of 0/1.
+
+    Raises:
+        ValueError: a weight is not in 1..9.
+    """
+    n, payload_symbols, columns = labels.shape
+    weights = np.broadcast_to(weights, (n, columns))
+    out = np.empty((n, columns, 2 + payload_symbols, len(HEADER)), np.uint8)
+    out[:, :, 0] = HEADER
+    for w in np.unique(weights):
+        burst, column = np.nonzero(weights == w)
+        index = labels[burst, :, column] >> (LABEL_BITS - bits_per_symbol(int(w)))
+        out[burst, column, 1] = dimming_symbol(int(w))
+        out[burst, column, 2:] = codebook(int(w))[index]
+    return out.reshape(n, columns, -1)
+
+
+# -- what can work -----------------------------------------------------------------------------------------------------
+
+
+def visible_bits_of_burst(weights: NDArray[np.int64], payload_symbols: int) -> int:
+    """Bits that one burst carries over all columns of some weights (C,)."""
+    return payload_symbols * sum(bits_per_symbol(int(w)) for w in weights)
+
+
+def check_message(sending: MessageSending, weights: NDArray[np.int64], payload_symbols: int) -> None:
+    """Refuse a message that a round of bursts cannot carry.
+
+    Raises:
+        UsageError: the columns' weights leave too few bits.
+    """
+    layout = beacon_layout(len(sending.body), len(weights), payload_symbols)
+    bits = layout.period * visible_bits_of_burst(weights, payload_symbols)
+    need = BEACON_NEED * layout.code.k
+    if bits < need:
+        raise UsageError(
+            f"a message of this length needs {need:.0f} bits a round, these weights send {bits}",
+            "shorten the message, brighten the columns towards w = 5, or send it as a file",
+        )
+
+
+def ready_bits(sending: FileSending) -> float:
+    """Bits of information that a receiver must see of a file before it is complete."""
+    layout = sending.layout(1, 1)
+    return READY[sending.mother] * layout.code.k * layout.n_blocks
+
+
+def check_file(weights: NDArray[np.int64], payload_symbols: int) -> None:
+    """Refuse a screen whose single bursts cannot carry an announcement.
+
+    Raises:
+        UsageError: the columns' weights leave too few bits.
+    """
+    bits = visible_bits_of_burst(weights, payload_symbols)
+    layout = announcement_layout(len(weights), payload_symbols)
+    need = BEACON_NEED * layout.code.k
+    if min(bits, layout.n_bits) < need:
+        per_column = bits / len(weights)
+        raise UsageError(
+            f"a file's announcement needs {need:.0f} bits in one burst, this screen sends {bits}",
+            f"use at least {int(np.ceil(need / max(per_column, 1)))} such columns, longer packets, or brighter columns",
+        )

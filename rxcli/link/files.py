@@ -1,0 +1,403 @@
+"""Files: announcements give the count of bursts, and what was seen of every block is added up until all are read."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.link import ldpc
+from rxcli.link.beacons import gathered, is_likely, read_words
+from rxcli.link.formats import (
+    Announcement,
+    Container,
+    ContainerError,
+    block_prefix,
+    has_crc,
+    unpack_container,
+    unprotect_announcement,
+)
+from rxcli.link.layout import ANNOUNCEMENT_PERIOD, CRC_BYTES, LABEL_BITS, FileLayout, announcement_layout
+from rxcli.link.sequences import whiten
+from rxcli.link.softbits import (
+    INFORMATION_OF_STEPS,
+    Float32,
+    alike,
+    information,
+    log_likelihood,
+    surprise,
+)
+from rxcli.types import FrameSoftBits
+
+_LN2 = float(np.log(2.0))
+#: Information of an announcement from which on it is tried, in its bits, and the log-likelihood of its copies.
+_TRY_ANNOUNCEMENT, _NOT_ALIKE = 1.02, -8.0
+#: Announcements that are tried at a time, where copies do not tell.
+_ANNOUNCEMENTS_AT_ONCE = 32
+#: Gathered trials that are made one after the other; later only every so manieth is, for most clips send no file.
+_GATHERED_AT_FIRST, _THEN_EVERY = 8, 4
+#: Blocks that are decoded at a time, the share of those left that is enough, and frames after which fewer are.
+_BLOCKS_AT_ONCE, _SHARE_AT_ONCE, _PATIENT_FRAMES = 32, 0.5, 30
+_ITERATIONS = 25
+#: A block is tried again with so much more information, in its bits.
+_TRY_AGAIN = 0.02
+#: Files of so many blocks learn from the first that are tried, of so many, with how much information it goes.
+_LEARN_FROM, _PROBES, _FEW = 16, 8, 0.25
+#: A decoded block must be at least so likely, as a share of what was seen.
+_MIN_LIKELIHOOD = 0.5
+#: Bytes of bursts that wait for an announcement, and bursts that an object that changes may claim back.
+_MAX_WAITING, _MAX_RECENT = 32 << 20, 96
+#: Bytes of a file that are accepted where nothing else is said.
+MAX_OBJECT_BYTES = 16 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class _Burst:
+    """A burst that may have to be read again."""
+
+    epoch: int
+    number: int
+    #: (N, C, 7) int8 in steps of the decoder.
+    llr: NDArray[np.int8]
+
+
+@dataclass(slots=True, eq=False)
+class FileState:
+    """What is known of one file."""
+
+    announcement: Announcement
+    layout: FileLayout
+    #: (B, M) int8 sums of ratios in the decoder's steps.
+    total: NDArray[np.int8]
+    #: (B,) bits of information, and those from which on a block is tried.
+    known: NDArray[np.float64]
+    threshold: NDArray[np.float64]
+    blocks: dict[int, bytes] = field(default_factory=dict)
+    #: Information at which blocks were read, in their bits.
+    read_at: list[float] = field(default_factory=list)
+    #: Information below which no block is tried, in its bits.
+    least: float = 0.0
+    done: bool = False
+    #: Why it can never be complete.
+    failure: str | None = None
+    frames_waited: int = 0
+    first_time_s: float | None = None
+    last_time_s: float = 0.0
+
+    @classmethod
+    def begin(cls, announcement: Announcement, columns: int, payload_symbols: int) -> FileState:
+        """Nothing received yet."""
+        layout = FileLayout(announcement.object_id, announcement.length, announcement.mother, columns, payload_symbols)
+        n = layout.n_blocks
+        # Memory that is not touched is not taken, so that a length that lies costs nothing.
+        total = np.zeros((n, layout.n_bits), np.int8)
+        return cls(announcement, layout, total, np.zeros(n), np.full(n, layout.ready))
+
+    @property
+    def share(self) -> float:
+        """Share received of what must be seen."""
+        if self.done:
+            return 1.0
+        part = np.minimum(self.known / self.layout.ready, 0.999)
+        part[list(self.blocks)] = 1.0
+        return float(part.mean())
+
+    def seconds_left(self) -> float | None:
+        """More seconds of such a clip that would do."""
+        passed = self.last_time_s - self.first_time_s if self.first_time_s is not None else 0.0
+        share = self.share
+        return passed * (1 - share) / share if passed > 0 and share > 0 else None
+
+    def add(self, bursts: NDArray[np.int64], llr: NDArray[np.int8], sign: int = 1) -> None:
+        """Add data bursts, counted from the object's start; `sign` -1 takes them back."""
+        blocks, labels, passes = (part.ravel() for part in self.layout.labels(bursts))
+        ratios = llr.reshape(-1, LABEL_BITS)
+        seen = np.flatnonzero(ratios.any(axis=1) & self._open()[blocks])
+        block = blocks[seen]
+        place = block[:, None] * self.layout.n_bits + self.layout.bits_of(labels[seen], passes[seen])
+        more = ratios[seen].astype(np.int16) * sign
+        if not self.layout.all_differ(bursts):
+            place, turn = np.unique(place, return_inverse=True)
+            more = np.rint(np.bincount(turn.ravel(), more.ravel(), place.size)).astype(np.int16)
+            block = place // self.layout.n_bits
+        flat = self.total.reshape(-1)
+        before = flat[place]
+        after = np.clip(before + more, -127, 127).astype(np.int8)
+        flat[place] = after
+        gain = INFORMATION_OF_STEPS[after.view(np.uint8)] - INFORMATION_OF_STEPS[before.view(np.uint8)]
+        self.known += np.bincount(block, gain.reshape(block.size, -1).sum(axis=1), self.layout.n_blocks)
+
+    def _open(self) -> NDArray[np.bool_]:
+        still = np.ones(self.layout.n_blocks, bool)
+        still[list(self.blocks)] = False
+        return still
+
+    def ready(self, at_last: bool) -> NDArray[np.int64]:
+        """Blocks to be tried now."""
+        ready = np.flatnonzero((self.known >= self._thresholds(at_last)) & self._open())
+        left = self.layout.n_blocks - len(self.blocks)
+        if (
+            at_last
+            or self.frames_waited >= _PATIENT_FRAMES
+            or ready.size >= min(_BLOCKS_AT_ONCE, _SHARE_AT_ONCE * left)
+        ):
+            return ready
+        return ready[:0]
+
+    def _thresholds(self, at_last: bool) -> NDArray[np.float64]:
+        if at_last:
+            return self.threshold - 2 * _TRY_AGAIN * self.layout.code.k
+        least = self.least
+        if self.layout.n_blocks >= _LEARN_FROM and len(self.read_at) >= _PROBES:
+            least = max(least, float(np.median(self.read_at[-4 * _BLOCKS_AT_ONCE :])) - _TRY_AGAIN)
+        return np.maximum(self.threshold, least * self.layout.code.k)
+
+    def read(self, which: NDArray[np.int64]) -> None:
+        """Decode blocks; where the first fail, the others wait too."""
+        self.frames_waited = 0
+        if self.layout.n_blocks >= _LEARN_FROM and not self.read_at:
+            most = which[np.argsort(-self.known[which])]
+            self._read_batch(most[:_PROBES])
+            which = np.sort(most[_PROBES:])
+            if not self.read_at:
+                return
+        for start in range(0, which.size, _BLOCKS_AT_ONCE):
+            self._read_batch(which[start : start + _BLOCKS_AT_ONCE])
+
+    def _read_batch(self, which: NDArray[np.int64]) -> None:
+        layout, object_id = self.layout, self.layout.object_id
+        llr = self.total[which]
+
+        masks = [
+            np.frombuffer(whiten(bytes(layout.block_bytes + CRC_BYTES), object_id, int(b)), np.uint8) for b in which
+        ]
+        mask, prefixes = np.stack(masks), [block_prefix(object_id, int(number)) for number in which]
+
+        def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
+            good = np.zeros(places.size, bool)
+            for i, plain in enumerate(np.packbits(bits, axis=1) ^ mask[places]):
+                coded = plain.tobytes()
+                if has_crc(coded, prefixes[places[i]]) and _is_likely(layout, bits[i], llr[places[i]]):
+                    self.blocks[int(which[places[i]])], good[i] = coded[:-CRC_BYTES], True
+            return good
+
+        read = ldpc.decode(layout.code, llr, accepted, _ITERATIONS)
+        self.read_at += (self.known[which[read]] / layout.code.k).tolist()
+        if read.mean() < _FEW:
+            self.least = float(self.known[which].mean()) / layout.code.k + _TRY_AGAIN
+        failed = which[~read]
+        self.threshold[failed] = self.known[failed] + _TRY_AGAIN * layout.code.k
+
+    def unpacked(self, max_bytes: int) -> Container | None:
+        """The file, where all blocks are read and the hash fits; `failure` says what is wrong."""
+        if self.done or self.failure or len(self.blocks) < self.layout.n_blocks:
+            return None
+        container = b"".join(self.blocks[number] for number in range(self.layout.n_blocks))[: self.layout.length]
+        try:
+            if zlib.crc32(container) != self.announcement.container_crc:
+                raise ContainerError("its blocks do not give the CRC-32 that was announced", wrong_hash=True)
+            found = unpack_container(container, max_bytes)
+        except ContainerError as error:
+            self.failure = str(error)
+            return None
+        finally:
+            self.release()
+        self.done = True
+        return found
+
+    def release(self) -> None:
+        """Give back the memory of the sums."""
+        self.total = np.zeros((0, self.layout.n_bits), np.int8)
+
+
+def _is_likely(layout: FileLayout, information_bits: NDArray[np.uint8], llr: NDArray[np.int8]) -> bool:
+    """Whether a decoded block agrees with what was seen of its own bits, which any fragment has some of."""
+    sent = information_bits[layout.code.first_sent :]
+    seen = llr[: sent.size] * ldpc.LLR_STEP
+    return bool(log_likelihood(sent, seen) > _MIN_LIKELIHOOD * _LN2 * information(seen).sum())
+
+
+@dataclass(frozen=True, slots=True)
+class _Timeline:
+    """From burst numbers of an epoch to those of an object."""
+
+    epoch: int
+    offset: int
+    file: FileState
+
+
+class FileSearch:
+    """Finds announcements, and gives bursts to the file that they are of.
+
+    Args:
+        columns: C.
+        payload_symbols: N.
+        max_object_bytes: longer files are refused.
+    """
+
+    def __init__(self, columns: int, payload_symbols: int, max_object_bytes: int = MAX_OBJECT_BYTES) -> None:
+        self._columns, self._payload_symbols, self._max_bytes = columns, payload_symbols, max_object_bytes
+        self._layout = announcement_layout(columns, payload_symbols)
+        self.files: dict[tuple[int, int, int, int], FileState] = {}
+        #: Of every epoch, latest last.
+        self._timelines: dict[int, list[_Timeline]] = {}
+        self._waiting: list[_Burst] = []
+        self._recent: list[_Burst] = []
+        self._candidates: list[tuple[int, int, Float32]] = []
+        self._n_gathered = 0
+        #: Of the frame at hand.
+        self._fresh: list[tuple[_Timeline, _Burst]] = []
+        #: Sentences about what was refused.
+        self.notes: list[str] = []
+
+    @property
+    def in_file(self) -> bool:
+        """Whether the latest epoch is known to send a file."""
+        return bool(self._timelines)
+
+    def knows(self, epoch: int) -> bool:
+        """Whether an announcement of this epoch was read."""
+        return epoch in self._timelines
+
+    def add(self, soft: FrameSoftBits, at_last: bool = False) -> list[tuple[FileState, Container]]:
+        """Add bursts; returns the files that they complete."""
+        self._look_for_announcements(soft)
+        quantised = ldpc.quantised(soft.llr)
+        for number, llr in zip(soft.burst, quantised, strict=True):
+            self._enter(_Burst(soft.epoch, int(number), llr), soft.time_s)
+        self._flush_entered()
+        return self._complete(at_last)
+
+    def finish(self) -> list[tuple[FileState, Container]]:
+        """Try what is left."""
+        self._try_gathered()
+        self._flush_entered()
+        return self._complete(at_last=True)
+
+    # -- announcements -------------------------------------------------------------------------------------------------
+
+    def _look_for_announcements(self, soft: FrameSoftBits) -> None:
+        for number, llr in zip(soft.burst, soft.llr, strict=True):
+            buffer = gathered(self._layout, llr)
+            likeness = alike(buffer, float(surprise(llr).sum(dtype=np.float64)))
+            if likeness < _NOT_ALIKE or information(buffer).sum() < _TRY_ANNOUNCEMENT * self._layout.code.k:
+                continue
+            if likeness > -_NOT_ALIKE:
+                if not self._is_expected(soft.epoch, int(number), buffer):
+                    self._try_candidates([(soft.epoch, int(number), buffer)])
+            elif not self.knows(soft.epoch):
+                self._candidates.append((soft.epoch, int(number), buffer))
+        # Copies within these are too few to tell. Trials are gathered, for a batch costs little more than a single one.
+        if len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
+            if self._n_gathered < _GATHERED_AT_FIRST or self._n_gathered % _THEN_EVERY == 0:
+                self._try_gathered()
+            self._n_gathered += 1
+            self._candidates.clear()
+
+    def _is_expected(self, epoch: int, number: int, buffer: Float32) -> bool:
+        """Whether a burst is the announcement that its timeline has it be."""
+        line = _line_of(self._timelines.get(epoch, []), number)
+        burst = 0 if line is None else number + line.offset
+        if line is None or burst % ANNOUNCEMENT_PERIOD or burst >= 1 << 32:
+            return False
+        coded = replace(line.file.announcement, burst=burst).protected()
+        return is_likely(self._layout, np.unpackbits(np.frombuffer(coded, np.uint8)), buffer)
+
+    def _try_gathered(self) -> None:
+        candidates, self._candidates = self._candidates, []
+        if candidates:
+            self._try_candidates(candidates)
+
+    def _try_candidates(self, candidates: list[tuple[int, int, Float32]]) -> None:
+        words = read_words(self._layout, np.stack([buffer for *_, buffer in candidates]), unprotect_announcement)
+        for (epoch, number, _), word in zip(candidates, words, strict=True):
+            announcement = None if word is None else unprotect_announcement(word)
+            if announcement is not None:
+                self._announced(announcement, epoch, number)
+
+    def _announced(self, announcement: Announcement, epoch: int, number: int) -> None:
+        known = self.files.get(announcement.key)
+        if known is None:
+            if announcement.length > self._max_bytes:
+                self._note(
+                    f"a file of {announcement.length} bytes was announced, more than the {self._max_bytes} that are "
+                    "accepted; it was not received"
+                )
+                return
+            known = self.files[announcement.key] = FileState.begin(announcement, self._columns, self._payload_symbols)
+        offset = announcement.burst - number
+        lines = self._timelines.setdefault(epoch, [])
+        if not lines or (lines[-1].offset, lines[-1].file) != (offset, known):
+            lines.append(_Timeline(epoch, offset, known))
+            self._claim(lines[-1])
+
+    def _note(self, sentence: str) -> None:
+        if sentence not in self.notes:
+            self.notes.append(sentence)
+
+    def _claim(self, line: _Timeline) -> None:
+        """Give a new timeline what came before its first announcement: what waits, and what an earlier one took."""
+        mine = [b for b in self._waiting if b.epoch == line.epoch]
+        self._waiting = [b for b in self._waiting if b.epoch != line.epoch]
+        taken = [b for b in self._recent if b.epoch == line.epoch and b.number + line.offset >= 0]
+        earlier = self._timelines[line.epoch][:-1]
+        for burst in taken:
+            before = _line_of(earlier, burst.number)
+            if before is not None:
+                _enter_bursts(before, [burst], -1)
+        _enter_bursts(line, [b for b in mine + taken if b.number + line.offset >= 0], 1)
+
+    # -- data ----------------------------------------------------------------------------------------------------------
+
+    def _enter(self, burst: _Burst, time_s: float) -> None:
+        line = _line_of(self._timelines.get(burst.epoch, []), burst.number)
+        if line is None:
+            self._waiting.append(burst)
+            most = max(1, _MAX_WAITING // max(burst.llr.size, 1))
+            del self._waiting[:-most]
+            return
+        file = line.file
+        file.first_time_s = time_s if file.first_time_s is None else file.first_time_s
+        file.last_time_s = time_s
+        self._fresh.append((line, burst))
+
+    def _flush_entered(self) -> None:
+        """Add what a frame showed, all its bursts at once."""
+        fresh, lines = list(self._fresh), {id(line): line for line, _ in self._fresh}
+        self._fresh.clear()
+        for key, line in lines.items():
+            _enter_bursts(line, [burst for owner, burst in fresh if id(owner) == key], 1)
+            line.file.frames_waited += 1
+        self._recent += [burst for _, burst in fresh]
+        del self._recent[:-_MAX_RECENT]
+
+    def _complete(self, at_last: bool) -> list[tuple[FileState, Container]]:
+        found = []
+        for file in self.files.values():
+            if file.done or file.failure:
+                continue
+            which = file.ready(at_last)
+            if which.size:
+                file.read(which)
+            container = file.unpacked(self._max_bytes)
+            if container is not None:
+                found.append((file, container))
+            elif file.failure:
+                self._note(f"a file of {file.layout.length} bytes came whole but is not what was sent: {file.failure}")
+        return found
+
+
+def _line_of(lines: list[_Timeline], number: int) -> _Timeline | None:
+    """The latest timeline that a burst can be of."""
+    return next((line for line in reversed(lines) if number + line.offset >= 0), None)
+
+
+def _enter_bursts(line: _Timeline, bursts: list[_Burst], sign: int) -> None:
+    if line.file.done or line.file.failure:
+        return
+    counted = np.array([burst.number + line.offset for burst in bursts], np.int64)
+    data = np.flatnonzero(counted % ANNOUNCEMENT_PERIOD)
+    if data.size:
+        line.file.add(counted[data], np.stack([bursts[i].llr for i in data]), sign)

@@ -1,0 +1,247 @@
+"""What blocks hold: bodies of beacons, announcements, containers. Pure; every rule of acceptance stands here."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+import unicodedata
+import zlib
+from dataclasses import dataclass
+
+from rxcli.errors import UsageError
+from rxcli.link.layout import ANNOUNCEMENT_ID, ANNOUNCEMENT_PERIOD, BEACON_ID, BEACON_LENGTHS, CRC_BYTES
+from rxcli.link.sequences import whiten
+from rxcli.types import MessageKind
+
+KINDS: tuple[MessageKind, ...] = ("raw", "text", "uri")
+#: Bytes of the longest message.
+MAX_MESSAGE_BYTES = BEACON_LENGTHS[-1] - 1
+_ANNOUNCEMENT = struct.Struct(">BBHIIII")
+_VERSION = 1
+_N_MOTHER_RATES = 3
+_CONTAINER_HEAD = struct.Struct(">4sBBB")
+_CONTAINER_TAIL = struct.Struct(">Q32s")
+_MAGIC, _DEFLATED = b"VLRX", 0x01
+#: Head, a name of one byte, length, hash.
+MIN_CONTAINER_BYTES = _CONTAINER_HEAD.size + 1 + _CONTAINER_TAIL.size
+_MAX_NAME_BYTES = 255
+
+
+def protect(data: bytes, object_id: int, block: int, crc_prefix: bytes = b"") -> bytes:
+    """`data` with its CRC-32 (over `crc_prefix` too), whitened."""
+    crc = zlib.crc32(crc_prefix + data)
+    return whiten(data + crc.to_bytes(CRC_BYTES, "big"), object_id, block)
+
+
+def unprotect(coded: bytes, object_id: int, block: int, crc_prefix: bytes = b"") -> bytes | None:
+    """The data of a block as `protect` made it; None where the CRC does not fit."""
+    plain = whiten(coded, object_id, block)
+    return plain[:-CRC_BYTES] if has_crc(plain, crc_prefix) else None
+
+
+def has_crc(plain: bytes, crc_prefix: bytes = b"") -> bool:
+    """Whether a block that is no longer whitened ends with its CRC."""
+    crc = zlib.crc32(plain[:-CRC_BYTES], zlib.crc32(crc_prefix))
+    return crc == int.from_bytes(plain[-CRC_BYTES:], "big")
+
+
+def block_prefix(object_id: int, block: int) -> bytes:
+    """What the CRC of a file's block covers before its data."""
+    return object_id.to_bytes(2, "big") + block.to_bytes(4, "big")
+
+
+# -- beacons -----------------------------------------------------------------------------------------------------------
+
+
+def beacon_body(kind: MessageKind, data: bytes) -> bytes:
+    """A beacon's body: kind, message, padding.
+
+    Raises:
+        UsageError: the message is empty, too long, or a text with a zero byte.
+    """
+    if not data:
+        raise UsageError("a message must hold at least one byte (got none)", "give a text")
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise UsageError(
+            f"a message holds at most {MAX_MESSAGE_BYTES} bytes (got {len(data)})", "send it as a file instead"
+        )
+    if kind != "raw" and b"\0" in data:
+        raise UsageError("a text holds no zero byte", "send it as a file instead")
+    length = next(n for n in BEACON_LENGTHS if n > len(data))
+    return (bytes([KINDS.index(kind)]) + data).ljust(length, b"\0")
+
+
+def parse_beacon(body: bytes) -> tuple[MessageKind, bytes] | None:
+    """Kind and message of a body whose CRC fits; None where it is no message after all."""
+    kind, data = body[0], body[1:]
+    if kind >= len(KINDS):
+        return None
+    if KINDS[kind] == "raw":
+        return "raw", data
+    text = data.rstrip(b"\0")
+    if not text or b"\0" in text or not _is_utf8(text):
+        return None
+    return KINDS[kind], text
+
+
+def _is_utf8(data: bytes) -> bool:
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def protect_beacon(body: bytes) -> bytes:
+    """The information of a beacon's codeword."""
+    return protect(body, BEACON_ID, len(body))
+
+
+def unprotect_beacon(coded: bytes) -> tuple[MessageKind, bytes] | None:
+    """Kind and message, None where the information is no beacon's."""
+    body = unprotect(coded, BEACON_ID, len(coded) - CRC_BYTES)
+    return None if body is None else parse_beacon(body)
+
+
+# -- announcements -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Announcement:
+    """What burst b of a file says of it."""
+
+    mother: int
+    object_id: int
+    #: Bytes of the container.
+    length: int
+    burst: int
+    container_crc: int
+
+    def protected(self) -> bytes:
+        """The information of the announcement's codeword."""
+        body = _ANNOUNCEMENT.pack(_VERSION, self.mother, self.object_id, self.length, self.burst, self.container_crc, 0)
+        return protect(body, ANNOUNCEMENT_ID, len(body))
+
+    @property
+    def key(self) -> tuple[int, int, int, int]:
+        """What is the same in all announcements of one object."""
+        return self.object_id, self.length, self.mother, self.container_crc
+
+
+def unprotect_announcement(coded: bytes) -> Announcement | None:
+    """The announcement, None where the information is none or lies about what cannot be."""
+    body = unprotect(coded, ANNOUNCEMENT_ID, len(coded) - CRC_BYTES)
+    if body is None:
+        return None
+    version, mother, object_id, length, burst, crc, zero = _ANNOUNCEMENT.unpack(body)
+    if version != _VERSION or mother >= _N_MOTHER_RATES or object_id >= ANNOUNCEMENT_ID or zero:
+        return None
+    if length < MIN_CONTAINER_BYTES or burst % ANNOUNCEMENT_PERIOD:
+        return None
+    return Announcement(mother, object_id, length, burst, crc)
+
+
+# -- containers --------------------------------------------------------------------------------------------------------
+
+
+def pack_container(name: str, data: bytes) -> bytes:
+    """A file as it is sent, deflated where that is shorter.
+
+    Raises:
+        UsageError: the name is empty, holds a folder, or is too long.
+    """
+    encoded = name.encode("utf-8")
+    if not 1 <= len(encoded) <= _MAX_NAME_BYTES or "/" in name or "\\" in name:
+        raise UsageError(f"a file's name has 1 to {_MAX_NAME_BYTES} bytes and no folder (got {name!r})", "rename it")
+    compressor = zlib.compressobj(9, zlib.DEFLATED, -15)
+    deflated = compressor.compress(data) + compressor.flush()
+    flags, body = (_DEFLATED, deflated) if len(deflated) < len(data) else (0, data)
+    return pack_parts(encoded, len(data), hashlib.sha256(data).digest(), flags, body)
+
+
+def pack_parts(name: bytes, length: int, digest: bytes, flags: int, body: bytes) -> bytes:
+    """The bytes of a container from its fields."""
+    head = _CONTAINER_HEAD.pack(_MAGIC, _VERSION, flags, len(name))
+    return head + name + _CONTAINER_TAIL.pack(length, digest) + body
+
+
+@dataclass(frozen=True, slots=True)
+class Container:
+    """A file as it came out of its container; the hash fits."""
+
+    name: str
+    data: bytes
+    sha256: str
+
+
+class ContainerError(ValueError):
+    """A container that cannot be what was sent, or lies; `wrong_hash` where only its hash does not fit."""
+
+    def __init__(self, message: str, wrong_hash: bool = False) -> None:
+        super().__init__(message)
+        self.wrong_hash = wrong_hash
+
+
+def unpack_container(container: bytes, max_bytes: int) -> Container:
+    """The file in a container.
+
+    Args:
+        container: all its bytes.
+        max_bytes: a declared original length above this is refused.
+
+    Raises:
+        ContainerError: it is malformed, too large, or its SHA-256 does not fit.
+    """
+    if len(container) < MIN_CONTAINER_BYTES:
+        raise ContainerError(f"the container has {len(container)} bytes, fewer than any file needs")
+    magic, version, flags, name_length = _CONTAINER_HEAD.unpack_from(container)
+    if magic != _MAGIC or version != _VERSION or flags & ~_DEFLATED or not name_length:
+        raise ContainerError("the container's head is not one of version 1")
+    at = _CONTAINER_HEAD.size + name_length
+    if at + _CONTAINER_TAIL.size > len(container):
+        raise ContainerError("the container ends within its head")
+    length, digest = _CONTAINER_TAIL.unpack_from(container, at)
+    body = container[at + _CONTAINER_TAIL.size :]
+    if length > max_bytes:
+        raise ContainerError(f"the file says it has {length} bytes, more than the {max_bytes} that are accepted")
+    data = _inflated(body, length) if flags & _DEFLATED else body
+    if len(data) != length:
+        raise ContainerError(f"the file says it has {length} bytes and has {'more' if len(data) > length else 'fewer'}")
+    found = hashlib.sha256(data).digest()
+    if found != digest:
+        raise ContainerError("the file's SHA-256 does not fit", wrong_hash=True)
+    name = container[_CONTAINER_HEAD.size : at].decode("utf-8", "replace")
+    return Container(safe_name(name), data, found.hex())
+
+
+def _inflated(body: bytes, length: int) -> bytes:
+    """The inflated body, at most one byte more than `length`."""
+    inflater = zlib.decompressobj(-15)
+    try:
+        data = inflater.decompress(body, length + 1)
+    except zlib.error as error:
+        raise ContainerError(f"the file's deflate stream is broken ({error})") from None
+    if len(data) <= length and (not inflater.eof or inflater.unused_data):
+        raise ContainerError("the file's deflate stream does not end with the container")
+    return data
+
+
+_DEVICES = frozenset(
+    ["con", "prn", "aux", "nul", "conin$", "conout$"] + [f"{d}{n}" for d in ("com", "lpt") for n in "0123456789¹²³"]
+)
+#: Bytes of a name that every file system takes, with room for a number.
+_MAX_SAFE_BYTES = 200
+
+
+def safe_name(name: str) -> str:
+    """A name that can do no harm: no folder, no control or bidirectional character, no device, no hidden file."""
+    name = name.replace("\\", "/").rsplit("/", 1)[-1]
+    name = "".join(c for c in name if unicodedata.category(c) not in ("Cc", "Cf", "Cs", "Zl", "Zp"))
+    name = "".join("_" if c in ':*?"<>|' else c for c in name)
+    name = name.lstrip(".- ").rstrip(". ")
+    while len(name.encode("utf-8")) > _MAX_SAFE_BYTES:
+        stem, dot, suffix = name.rpartition(".")
+        name = f"{stem[:-1]}{dot}{suffix}" if stem and len(suffix) < 20 else name[:-1]
+    if name.split(".")[0].strip().casefold() in _DEVICES:
+        name = f"_{name}"
+    return name or "unnamed"

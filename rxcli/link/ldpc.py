@@ -1,0 +1,308 @@
+"""The quasi-cyclic LDPC codes of 3GPP TS 38.212, section 5.3.2: encoder and layered min-sum decoder.
+
+A code of `k` information bits has base graph 1 or 2 lifted by `z`. Block column c, lane i is coded bit c * z + i; the
+first 2 z bits are never sent and filler bits are known zeros; all others, in order, are the *buffer*.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+_INFORMATION_COLUMNS = {1: 22, 2: 10}
+#: Lifting sizes are a * 2**i up to 384; the place of a is the number of the set.
+_LIFTING_BASES, _MAX_LIFTING = (2, 3, 5, 7, 9, 11, 13, 15), 384
+_CORE_ROWS = 4
+#: Block columns whose bits are never sent.
+_PUNCTURED = 2
+#: Ratios in the decoder are whole multiples of this; those that come in are limited to 127 of them.
+LLR_STEP = 1 / 8
+_MAX_INPUT = 127
+#: Messages are limited so that the sum of all that meet at a bit (30 at most) stays within 16 bits.
+_MAX_MESSAGE = 1000
+#: A ratio of filler bits, which are known.
+_KNOWN = 8000
+
+Bits = NDArray[np.uint8]
+Edge = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """One code; rows are lists of (block column, shift)."""
+
+    graph: int
+    k: int
+    z: int
+    rows: tuple[tuple[Edge, ...], ...]
+
+    @property
+    def information_columns(self) -> int:
+        """Block columns of information and filler bits."""
+        return _INFORMATION_COLUMNS[self.graph]
+
+    @property
+    def filler(self) -> int:
+        """Known zeros after the information bits."""
+        return self.information_columns * self.z - self.k
+
+    @property
+    def first_sent(self) -> int:
+        """Information bits before it are never sent; the buffer begins with it."""
+        return _PUNCTURED * self.z
+
+    @property
+    def n_columns(self) -> int:
+        """Block columns."""
+        return self.information_columns + len(self.rows)
+
+    @property
+    def buffer_bits(self) -> int:
+        """Bits that may be sent."""
+        return (self.n_columns - _PUNCTURED) * self.z - self.filler
+
+    def rows_for(self, buffer_bits: int) -> int:
+        """Rows that the first `buffer_bits` bits of the buffer take part in."""
+        last = _PUNCTURED * self.z + buffer_bits + self.filler
+        return min(len(self.rows), max(_CORE_ROWS, -(-last // self.z) - self.information_columns))
+
+
+@cache
+def _base_graph(graph: int) -> NDArray[np.int64]:
+    text = files("rxcli.link").joinpath(f"nr_base_graph_{graph}.csv").read_text(encoding="ascii")
+    return np.array([[int(v) for v in line.split(",")] for line in text.split()[1:]], np.int64)
+
+
+def _lifting(k: int, graph: int) -> tuple[int, int]:
+    """The smallest lifting size that holds `k` bits, and its set."""
+    sizes = ((a << i, number) for number, a in enumerate(_LIFTING_BASES) for i in range(8) if a << i <= _MAX_LIFTING)
+    return min((z, number) for z, number in sizes if _INFORMATION_COLUMNS[graph] * z >= k)
+
+
+@cache
+def nr_code(graph: int, k: int) -> Code:
+    """The code of base graph 1 or 2 for `k` information bits.
+
+    Raises:
+        ValueError: no lifting size holds so many bits, or they are too few to send all but the punctured ones.
+    """
+    if not 0 < k <= _INFORMATION_COLUMNS[graph] * _MAX_LIFTING:
+        raise ValueError(f"k must be in 1..{_INFORMATION_COLUMNS[graph] * _MAX_LIFTING} for graph {graph} (got {k})")
+    z, lifting_set = _lifting(k, graph)
+    if k < _PUNCTURED * z:
+        raise ValueError(f"k must be at least {_PUNCTURED * z} (got {k})")
+    table = _base_graph(graph)
+    rows: list[list[Edge]] = [[] for _ in range(int(table[:, 0].max()) + 1)]
+    for row, column, *shifts in table.tolist():
+        rows[row].append((column, shifts[lifting_set] % z))
+    return Code(graph, k, z, tuple(tuple(row) for row in rows))
+
+
+def encode(code: Code, information: Bits) -> Bits:
+    """The buffers of codewords.
+
+    Args:
+        code: the code.
+        information: (batch, k) uint8 of 0/1.
+
+    Returns:
+        (batch, code.buffer_bits) uint8.
+    """
+    batch = information.shape[0]
+    coded = np.zeros((batch, code.n_columns, code.z), np.uint8)
+    kb = code.information_columns
+    coded[:, :kb] = np.pad(information, ((0, 0), (0, code.filler))).reshape(batch, kb, code.z)
+    _solve_core(code, coded)
+    for number, row in enumerate(code.rows[_CORE_ROWS:], _CORE_ROWS):
+        coded[:, kb + number] = _sum(coded, [edge for edge in row if edge[0] != kb + number])
+    flat = coded.reshape(batch, -1)
+    return np.concatenate([flat[:, _PUNCTURED * code.z : code.k], flat[:, kb * code.z :]], axis=1)
+
+
+def _sum(coded: Bits, edges: list[Edge]) -> Bits:
+    """(batch, z) what some edges of a row add up to."""
+    total = np.zeros((coded.shape[0], coded.shape[2]), np.uint8)
+    for column, shift in edges:
+        total ^= np.roll(coded[:, column], -shift, axis=1)
+    return total
+
+
+def _solve_core(code: Code, coded: Bits) -> None:
+    """Fill in the four core parity columns: their sum over the four rows leaves one shift of the first of them."""
+    kb = code.information_columns
+    core = code.rows[:_CORE_ROWS]
+    shifts = [shift for row in core for column, shift in row if column == kb]
+    (left,) = {shift for shift in shifts if shifts.count(shift) % 2}
+    known = [edge for row in core for edge in row if edge[0] < kb]
+    coded[:, kb] = np.roll(_sum(coded, known), left, axis=1)
+    solved = set(range(kb + 1))
+    while len(solved) < kb + _CORE_ROWS:
+        for row in core:
+            missing = [edge for edge in row if edge[0] not in solved]
+            if len(missing) == 1:
+                (column, shift), *_ = missing
+                coded[:, column] = np.roll(_sum(coded, [e for e in row if e[0] in solved]), shift, axis=1)
+                solved.add(column)
+
+
+#: Asked of hard decisions: (batch places (n,), information bits (n, k)) -> which of them are accepted, (n,) bool.
+Accept = Callable[[NDArray[np.int64], Bits], NDArray[np.bool_]]
+
+
+def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
+    """Ratios as the decoder takes them, in steps of `LLR_STEP`."""
+    return np.asarray(np.clip(np.rint(llr / LLR_STEP), -_MAX_INPUT, _MAX_INPUT), np.int8)
+
+
+def decode(
+    code: Code, buffer_llr: NDArray[np.int8], accept: Accept, max_iterations: int = 22, patience: int | None = None
+) -> NDArray[np.bool_]:
+    """Layered normalised min-sum over a batch of blocks, in 16-bit numbers; stops where `accept` says so.
+
+    Parity is no stopping rule: bits that were never seen need not satisfy it.
+
+    Args:
+        code: the code.
+        buffer_llr: (batch, M) int8: ln p(1)/p(0) in steps of `LLR_STEP` of the first M bits of the buffer, 0 unseen.
+        accept: told the places in the batch and the information bits as they stand after every iteration.
+        max_iterations: iterations at most.
+        patience: iterations after which a block is given up whose checks are no better satisfied than by chance; None
+            to go on to the end.
+
+    Returns:
+        (batch,) which blocks were accepted.
+    """
+    n_rows = code.rows_for(buffer_llr.shape[1])
+    layers = _Layers(code, n_rows, _decoder_input(code, buffer_llr, n_rows))
+    places = np.arange(buffer_llr.shape[0])
+    accepted = np.zeros(places.size, bool)
+    still = np.ones(places.size, bool)
+    for iteration in range(1, max_iterations + 1):
+        layers.update()
+        if iteration == 1 and max_iterations > 1:
+            continue
+        which = np.flatnonzero(still)
+        good = accept(places[which], layers.information(which))
+        accepted[places[which[good]]] = True
+        still[which[good]] = False
+        if iteration == patience:
+            still &= layers.unsatisfied() < _HOPELESS
+        if not still.any():
+            break
+        if still.mean() < _CROWDED:
+            layers.keep(still)
+            places, still = places[still], still[still]
+    return accepted
+
+
+#: Blocks that are done go along until fewer than this share of the batch are not: to sort them out takes time too.
+_CROWDED = 0.7
+#: Share of checks that a block leaves unsatisfied after some iterations where it is no codeword at all.
+_HOPELESS = 0.33
+
+
+def _decoder_input(code: Code, buffer_llr: NDArray[np.int8], n_rows: int) -> NDArray[np.int16]:
+    """(block columns, z, batch) int16, ln p(0)/p(1), filler known to be zero."""
+    batch, n_bits = buffer_llr.shape
+    kb, z = code.information_columns, code.z
+    flat = np.zeros(((kb + n_rows) * z, batch), np.int16)
+    systematic = min(n_bits, code.k - _PUNCTURED * z)
+    flat[_PUNCTURED * z : _PUNCTURED * z + systematic] = -buffer_llr[:, :systematic].T.astype(np.int16)
+    flat[code.k : kb * z] = _KNOWN
+    flat[kb * z : kb * z + n_bits - systematic] = -buffer_llr[:, systematic:].T.astype(np.int16)
+    return flat.reshape(kb + n_rows, z, batch)
+
+
+class _Layers:
+    """The state of a batch in the decoder.
+
+    Args:
+        code: the code.
+        n_rows: rows in use.
+        total: (block columns, z, batch) int16 ratios, ln p(0)/p(1).
+    """
+
+    def __init__(self, code: Code, n_rows: int, total: NDArray[np.int16]) -> None:
+        self._code, self._rows = code, code.rows[:n_rows]
+        self._begin(total, [np.zeros((len(row), *total.shape[1:]), np.int16) for row in self._rows])
+
+    def _begin(self, total: NDArray[np.int16], messages: list[NDArray[np.int16]]) -> None:
+        self._total, self._messages = total, messages
+        # Fresh arrays of this size cost more than what is computed in them.
+        degree = max(len(row) for row in self._rows)
+        self._incoming = np.empty((degree, *total.shape[1:]), np.int16)
+        self._work = np.empty_like(self._incoming)
+
+    def keep(self, blocks: NDArray[np.bool_]) -> None:
+        """Go on with some blocks of the batch."""
+        total = np.ascontiguousarray(self._total[:, :, blocks])
+        self._begin(total, [np.ascontiguousarray(message[:, :, blocks]) for message in self._messages])
+
+    def information(self, blocks: NDArray[np.int64]) -> Bits:
+        """(n, k) hard decisions of some blocks of the batch."""
+        code = self._code
+        negative = (self._total[: code.information_columns] < 0).reshape(-1, self._total.shape[2])
+        return np.asarray(negative.T[blocks, : code.k], np.uint8)
+
+    def unsatisfied(self) -> NDArray[np.float64]:
+        """(batch,) share of checks that the hard decisions do not satisfy."""
+        count = np.zeros(self._total.shape[2])
+        for row in self._rows:
+            parity = np.bitwise_xor.reduce(self._gather(row), axis=0) < 0
+            count += np.count_nonzero(parity, axis=0)
+        return count / (len(self._rows) * self._code.z)
+
+    def _gather(self, row: tuple[Edge, ...]) -> NDArray[np.int16]:
+        z, incoming = self._code.z, self._incoming[: len(row)]
+        for place, (column, shift) in enumerate(row):
+            incoming[place, : z - shift] = self._total[column, shift:]
+            incoming[place, z - shift :] = self._total[column, :shift]
+        return incoming
+
+    def update(self) -> None:
+        """One iteration: every row of checks in turn sends new messages to its bits."""
+        for row, message in zip(self._rows, self._messages, strict=True):
+            self._update_row(row, message)
+
+    def _update_row(self, row: tuple[Edge, ...], message: NDArray[np.int16]) -> None:
+        z, incoming, work = self._code.z, self._gather(row), self._work[: len(row)]
+        incoming -= message
+        parity = np.bitwise_xor.reduce(incoming, axis=0)
+        np.abs(incoming, out=work)
+        smallest, second = _two_smallest(work)
+        # The smallest goes to all bits but the one that it came from, which gets the second smallest: `work` becomes
+        # -1 where a magnitude is larger than the smallest, else 0, then what is sent, then that with its sign.
+        np.subtract(smallest, work, out=work)
+        work >>= 15
+        if_smallest = _normalised(second)
+        work &= if_smallest ^ _normalised(smallest)
+        work ^= if_smallest
+        np.bitwise_xor(incoming, parity, out=message)
+        message >>= 15
+        work ^= message
+        np.subtract(work, message, out=message)
+        incoming += message
+        for place, (column, shift) in enumerate(row):
+            self._total[column, :shift] = incoming[place, z - shift :]
+            self._total[column, shift:] = incoming[place, : z - shift]
+
+
+def _two_smallest(magnitude: NDArray[np.int16]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """The smallest along the first axis, and the second smallest (the same where two are)."""
+    smallest = np.minimum(magnitude[0], magnitude[1])
+    second = np.maximum(magnitude[0], magnitude[1])
+    for values in magnitude[2:]:
+        np.minimum(second, np.maximum(smallest, values), out=second)
+        np.minimum(smallest, values, out=smallest)
+    return smallest, second
+
+
+def _normalised(magnitude: NDArray[np.int16]) -> NDArray[np.int16]:
+    """Three quarters of a message, limited."""
+    limited = np.minimum(magnitude, _MAX_MESSAGE)
+    return np.asarray(limited - (limited >> 2), np.int16)

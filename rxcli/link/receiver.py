@@ -1,0 +1,112 @@
+"""The link layer's receiver: soft bits in, messages and files out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rxcli.link.beacons import BeaconSearch
+from rxcli.link.files import MAX_OBJECT_BYTES, FileSearch, FileState
+from rxcli.link.formats import Container
+from rxcli.link.layout import LABEL_BITS
+from rxcli.link.softbits import MAX_LLR, Event
+from rxcli.types import FrameSoftBits, Message, MessageKind, ObjectProgress, ReceivedObject
+
+
+class LinkReceiver:
+    """Collects the soft bits of one sending: a clip, a camera, a photo, or photos of one beacon.
+
+    Args:
+        columns: C.
+        payload_symbols: N.
+        max_object_bytes: files longer than this are refused.
+    """
+
+    def __init__(self, columns: int, payload_symbols: int, max_object_bytes: int = MAX_OBJECT_BYTES) -> None:
+        self._shape = (payload_symbols, columns, LABEL_BITS)
+        self._beacons = BeaconSearch(columns, payload_symbols)
+        self._files = FileSearch(columns, payload_symbols, max_object_bytes)
+        self._last: FrameSoftBits | None = None
+        #: All that came, in order.
+        self.messages: list[Message] = []
+        self.objects: list[ReceivedObject] = []
+
+    def add(self, soft: FrameSoftBits) -> list[Event]:
+        """Add what a frame shows; returns what it completes.
+
+        Raises:
+            ValueError: the shapes do not fit the screen.
+        """
+        if soft.llr.shape[1:] != self._shape or soft.burst.shape != soft.llr.shape[:1]:
+            raise ValueError(f"llr must be (B, {', '.join(map(str, self._shape))}) of B bursts (got {soft.llr.shape})")
+        soft = _cleaned(soft)
+        if soft.burst.size == 0:
+            return []
+        self._last = soft
+        events: list[Event] = [self._object(soft, *found) for found in self._files.add(soft)]
+        if not self._files.knows(soft.epoch):
+            events += self._new_messages(soft, self._beacons.add(soft))
+        return events
+
+    def finish(self) -> list[Event]:
+        """Try what is left; nothing more comes."""
+        if self._last is None:
+            return []
+        last = self._last
+        return [self._object(last, *found) for found in self._files.finish()]
+
+    def _new_messages(self, soft: FrameSoftBits, found: Sequence[tuple[MessageKind, bytes]]) -> list[Event]:
+        known = {(message.kind, message.data) for message in self.messages}
+        new = [
+            Message(kind, data, soft.source, soft.frame, soft.time_s)
+            for kind, data in dict.fromkeys(found)
+            if (kind, data) not in known
+        ]
+        self.messages += new
+        return list(new)
+
+    def _object(self, soft: FrameSoftBits, file: FileState, found: Container) -> ReceivedObject:
+        made = ReceivedObject(
+            name=found.name,
+            data=found.data,
+            size=len(found.data),
+            sha256=found.sha256,
+            object_id=file.layout.object_id,
+            n_blocks=file.layout.n_blocks,
+            source=soft.source,
+            frame=soft.frame,
+            time_s=soft.time_s,
+        )
+        self.objects.append(made)
+        return made
+
+    @property
+    def progress(self) -> list[ObjectProgress]:
+        """Files under way."""
+        return [_progress(file) for file in self._files.files.values() if not file.done and not file.failure]
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences about what was seen and refused."""
+        return list(self._files.notes)
+
+
+def _progress(file: FileState) -> ObjectProgress:
+    return ObjectProgress(
+        object_id=file.layout.object_id,
+        container_bytes=file.layout.length,
+        n_blocks=file.layout.n_blocks,
+        blocks_done=len(file.blocks),
+        share=file.share,
+        seconds_left=file.seconds_left(),
+    )
+
+
+def _cleaned(soft: FrameSoftBits) -> FrameSoftBits:
+    """Bursts that show anything, within limits."""
+    llr = np.clip(np.nan_to_num(soft.llr, nan=0.0, posinf=MAX_LLR, neginf=-MAX_LLR), -MAX_LLR, MAX_LLR)
+    shown = llr.any(axis=(1, 2, 3))
+    return FrameSoftBits(
+        soft.burst[shown], llr[shown].astype(np.float32), soft.epoch, soft.source, soft.frame, soft.time_s
+    )

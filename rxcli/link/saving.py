@@ -1,0 +1,71 @@
+"""Received files on disk: under their own name, in one folder, never over another file unless asked."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from rxcli.errors import InputError
+from rxcli.link.formats import safe_name
+from rxcli.types import ReceivedObject
+
+
+def save_object(received: ReceivedObject, folder: Path, force: bool = False) -> ReceivedObject:
+    """Write a file that came whole; returns it with its path.
+
+    It is written beside its place first, so that nobody sees half of it. A file of the same name and content is left
+    as it is.
+
+    Raises:
+        InputError: another file has its name, or the folder cannot be written.
+    """
+    path = folder / safe_name(received.name)
+    if _is_same(path, received):
+        return replace(received, path=str(path))
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".vlc-rx-", delete=False) as file:
+            file.write(received.data)
+        try:
+            _put(Path(file.name), path, force)
+        finally:
+            Path(file.name).unlink(missing_ok=True)
+    except FileExistsError:
+        raise InputError(
+            f"{path} exists and is another file; {received.name} ({received.size} bytes) was not written",
+            "give --force to overwrite it, or another folder",
+        ) from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})", "name another folder") from None
+    return replace(received, path=str(path))
+
+
+def _put(written: Path, path: Path, force: bool) -> None:
+    os.chmod(written, 0o666 & ~_umask())
+    if force:
+        os.replace(written, path)  # replaces a link itself, never what it points to
+        return
+    try:
+        os.link(written, path)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        with path.open("xb") as file:
+            file.write(written.read_bytes())
+
+
+def _umask() -> int:
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
+
+
+def _is_same(path: Path, received: ReceivedObject) -> bool:
+    if path.is_symlink() or not path.is_file() or path.stat().st_size != received.size:
+        return False
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest() == received.sha256
+    except OSError:
+        return False

@@ -1,0 +1,308 @@
+"""Soft bits to messages and files: over whole transfers, from anywhere, and from what is no transfer at all."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rxcli.errors import InputError, UsageError
+from rxcli.lab.benchmark.goodput import detect
+from rxcli.link import ldpc
+from rxcli.link.encoder import (
+    FileSending,
+    MessageSending,
+    check_file,
+    check_message,
+    file_object,
+    message,
+    packet_slots_of,
+)
+from rxcli.link.formats import protect
+from rxcli.link.layout import announcement_layout
+from rxcli.link.receiver import LinkReceiver
+from rxcli.link.saving import save_object
+from rxcli.protocol import encode_packet, indices_to_bits
+from rxcli.types import FrameSoftBits, Message, ReceivedObject
+
+COLUMNS, SYMBOLS = 20, 24
+BRIGHT = (16.0,) * COLUMNS
+
+
+def clip(
+    sending: FileSending | MessageSending,
+    first: int,
+    n_frames: int,
+    rng: np.random.Generator,
+    snr_db: tuple[float, ...] = BRIGHT,
+    symbols: int = SYMBOLS,
+    epoch: int = 0,
+    w: int = 5,
+) -> Iterator[FrameSoftBits]:
+    """Frames that show a burst and most of its neighbours, then miss two."""
+    for frame in range(n_frames):
+        bursts = first + 5 * frame + np.arange(3)
+        llr = detect(sending.labels(bursts, len(snr_db), symbols), w, snr_db, rng)
+        llr[0, : symbols // 3] = 0
+        llr[2, symbols // 2 :] = 0
+        yield FrameSoftBits(bursts - first + 1000, llr, epoch, frame=frame, time_s=frame / 30)
+
+
+def receive(frames: Iterator[FrameSoftBits], receiver: LinkReceiver | None = None) -> list[Message | ReceivedObject]:
+    receiver = receiver or LinkReceiver(COLUMNS, SYMBOLS)
+    events = [event for frame in frames for event in receiver.add(frame)]
+    return events + receiver.finish()
+
+
+@pytest.mark.parametrize("first", [0, 1, 31, 32, 77, 100_003, (1 << 32) - 400])
+def test_a_file_comes_from_a_clip_that_begins_anywhere(first: int) -> None:
+    rng = np.random.default_rng(first)
+    data = rng.bytes(6000)
+    (event,) = receive(clip(file_object("a.bin", data), first, 60, rng))
+    assert isinstance(event, ReceivedObject)
+    assert (event.name, event.data) == ("a.bin", data)
+
+
+@pytest.mark.parametrize("mother", [0, 1, 2])
+def test_every_mother_rate(mother: int) -> None:
+    rng = np.random.default_rng(mother)
+    data = rng.bytes(30_000)
+    (event,) = receive(clip(file_object("a.bin", data, mother=mother), 5, 90, rng))
+    assert isinstance(event, ReceivedObject)
+    assert event.data == data
+
+
+def test_what_was_seen_before_the_first_announcement_counts() -> None:
+    rng = np.random.default_rng(3)
+    data = rng.bytes(2000)
+    frames = list(clip(file_object("a.bin", data), 33, 40, rng))
+    receiver = LinkReceiver(COLUMNS, SYMBOLS)
+    complete_at = next(n for n, frame in enumerate(frames) if receiver.add(frame))
+    # Burst 64 announces; the frame that shows it is enough, for all before it was kept.
+    assert frames[complete_at].burst[0] - 1000 + 33 <= 64 <= frames[complete_at].burst[-1] - 1000 + 33
+
+
+def test_columns_in_the_dark_and_small_weights() -> None:
+    rng = np.random.default_rng(4)
+    data = rng.bytes(3000)
+    dark = tuple(-np.inf if c in (0, 7, 8) else 12.0 for c in range(COLUMNS))
+    (event,) = receive(clip(file_object("a.bin", data), 9, 120, rng, dark, w=2))
+    assert isinstance(event, ReceivedObject)
+    assert event.data == data
+
+
+@pytest.mark.parametrize("length", [1, 7, 8, 31, 63, 127, 199])
+@pytest.mark.parametrize("symbols", [24, 11, 5])
+def test_messages_of_every_length(length: int, symbols: int) -> None:
+    rng = np.random.default_rng(length)
+    frames = clip(message("x" * length), int(rng.integers(0, 1000)), 6, rng, symbols=symbols)
+    events = receive(frames, LinkReceiver(COLUMNS, symbols))
+    assert [event.text for event in events if isinstance(event, Message)] == ["x" * length]
+
+
+def test_ten_columns_in_the_dark_leave_a_text_of_32_bytes_in_one_photo() -> None:
+    rng = np.random.default_rng(5)
+    dark = tuple(-np.inf if c % 2 else 14.0 for c in range(COLUMNS))
+    for symbols in (24, 11):
+        sending = message("m" * 31)
+        llr = detect(sending.labels(np.arange(1), COLUMNS, symbols), 5, dark, rng)
+        receiver = LinkReceiver(COLUMNS, symbols)
+        assert [e.text for e in receiver.add(FrameSoftBits(np.arange(1), llr)) if isinstance(e, Message)] == ["m" * 31]
+
+
+def test_photos_of_one_beacon_are_combined() -> None:
+    rng = np.random.default_rng(6)
+    sending, receiver = message("z" * 150), LinkReceiver(COLUMNS, 11)
+    came = []
+    for photo in range(8):
+        burst = int(rng.integers(0, 100))
+        llr = detect(sending.labels(np.arange(burst, burst + 1), COLUMNS, 11), 5, (7.0,) * COLUMNS, rng)
+        llr[:, rng.permutation(11)[:4]] = 0
+        came.append(receiver.add(FrameSoftBits(np.arange(1), llr, epoch=photo)))
+    assert came[0] == []
+    assert [e.text for events in came for e in events if isinstance(e, Message)] == ["z" * 150]
+
+
+def test_another_message_in_mid_clip() -> None:
+    rng = np.random.default_rng(7)
+    receiver = LinkReceiver(COLUMNS, SYMBOLS)
+    first = receive(clip(message("one"), 3, 5, rng), receiver)
+    second = receive(clip(message("another"), 400, 5, rng), receiver)
+    assert [e.text for e in first + second if isinstance(e, Message)] == ["one", "another"]
+
+
+def test_another_file_in_mid_clip_does_not_spoil_either() -> None:
+    rng = np.random.default_rng(8)
+    one, two = rng.bytes(2500), rng.bytes(20_000)
+    receiver = LinkReceiver(COLUMNS, SYMBOLS)
+    events = []
+    for n, sending in enumerate((file_object("1", one, 1), file_object("2", two, 2))):
+        for frame in clip(sending, 40 * (1 - n), 25 if n == 0 else 70, rng):
+            shift = 100 * n
+            events += receiver.add(FrameSoftBits(frame.burst + shift, frame.llr))
+    assert [e.data for e in events if isinstance(e, ReceivedObject)] == [one, two]
+
+
+def test_clips_of_an_object_whose_start_is_not_shared_add_up() -> None:
+    """Two clips of one object: each needs an announcement of its own, and then what both saw is added."""
+    rng = np.random.default_rng(9)
+    data = rng.bytes(12_000)
+    sending, receiver = file_object("a", data), LinkReceiver(COLUMNS, SYMBOLS)
+    events = receive(clip(sending, 20, 14, rng, epoch=1), receiver)
+    events += receive(clip(sending, 5000, 25, rng, epoch=2), receiver)
+    assert [e.data for e in events if isinstance(e, ReceivedObject)] == [data]
+
+
+def test_progress_says_what_is_missing() -> None:
+    rng = np.random.default_rng(10)
+    receiver = LinkReceiver(COLUMNS, SYMBOLS)
+    assert receive(clip(file_object("a", rng.bytes(100_000)), 0, 30, rng), receiver) == []
+    (progress,) = receiver.progress
+    assert 0.1 < progress.share < 0.9
+    assert progress.seconds_left is not None
+    assert 0.2 < progress.seconds_left < 20
+
+
+# -- what is no transfer -----------------------------------------------------------------------------------------------
+
+
+def noise(rng: np.random.Generator, n: int, symbols: int = SYMBOLS) -> FrameSoftBits:
+    scale = rng.choice([0.5, 2.0, 8.0])
+    llr = rng.normal(0, scale, (n, symbols, COLUMNS, 7)).astype(np.float32)
+    return FrameSoftBits(np.arange(n), np.clip(llr, -9, 9))
+
+
+@pytest.mark.parametrize("symbols", [24, 5])
+def test_noise_gives_nothing(symbols: int) -> None:
+    rng = np.random.default_rng(11)
+    receiver = LinkReceiver(COLUMNS, symbols)
+    for epoch in range(60):
+        soft = noise(rng, 3, symbols)
+        assert receiver.add(FrameSoftBits(soft.burst, soft.llr, epoch)) == []
+    assert receiver.finish() == []
+    assert not receiver.messages
+    assert not receiver.progress
+
+
+def announced(fields: tuple[int, ...], rng: np.random.Generator) -> FrameSoftBits:
+    layout = announcement_layout(COLUMNS, SYMBOLS)
+    coded = protect(struct.pack(">BBHIIII", *fields), 0xFFFE, 20)
+    (buffer,) = ldpc.encode(layout.code, np.unpackbits(np.frombuffer(coded, np.uint8))[None])
+    labels = (buffer[layout.places[0]] @ (1 << np.arange(6, -1, -1))).astype(np.uint8)
+    return FrameSoftBits(np.array([0]), detect(labels[None], 5, BRIGHT, rng))
+
+
+def test_an_announcement_of_four_gigabytes_takes_no_memory() -> None:
+    rng = np.random.default_rng(12)
+    receiver = LinkReceiver(COLUMNS, SYMBOLS)
+    tracemalloc.start()
+    assert receiver.add(announced((1, 2, 5, 0xFFFFFFFF, 32, 1, 0), rng)) == []
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 32 << 20
+    assert any("4294967295 bytes" in note for note in receiver.notes)
+    assert not receiver.progress
+
+
+def test_memory_is_bounded_while_no_announcement_comes() -> None:
+    rng = np.random.default_rng(13)
+    receiver = LinkReceiver(COLUMNS, SYMBOLS)
+    soft = noise(rng, 3)
+    tracemalloc.start()
+    for frame in range(0, 12_000, 3000):
+        # Four jumps of the clock stand for as many thousand bursts each.
+        receiver._files._waiting += receiver._files._waiting[:1] * 3000
+        receiver.add(FrameSoftBits(soft.burst + frame, soft.llr))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert sum(burst.llr.size for burst in receiver._files._waiting) <= 32 << 20
+    assert peak < 64 << 20
+
+
+def test_a_container_that_is_not_what_was_announced_gives_no_file() -> None:
+    rng = np.random.default_rng(14)
+    sending = file_object("a", rng.bytes(900))
+    sending._crc ^= 1
+    receiver = LinkReceiver(COLUMNS, SYMBOLS)
+    assert receive(clip(sending, 0, 20, rng), receiver) == []
+    assert any("not what was sent" in note for note in receiver.notes)
+    assert not receiver.objects
+
+
+def test_ratios_that_are_no_numbers_are_erasures() -> None:
+    rng = np.random.default_rng(15)
+    frames = list(clip(message("hello"), 0, 2, rng))
+    frames[0].llr[:, :, 3] = np.nan
+    frames[0].llr[:, 1] = np.copysign(np.inf, frames[0].llr[:, 1])
+    frames[0].llr[1:, 0] = -np.nan
+    assert [e.text for e in receive(iter(frames)) if isinstance(e, Message)] == ["hello"]
+
+
+def test_wrong_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match="llr must be"):
+        LinkReceiver(COLUMNS, SYMBOLS).add(noise(np.random.default_rng(0), 2, symbols=5))
+
+
+# -- sending -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("w", range(1, 10))
+def test_slots_are_packets_of_the_air_interface(w: int) -> None:
+    labels = np.random.default_rng(w).integers(0, 128, (2, SYMBOLS, 3), dtype=np.uint8)
+    slots = packet_slots_of(labels, np.full(3, w))
+    k = (3, 5, 6, 7, 7, 7, 6, 5, 3)[w - 1]
+    index = labels[1, :, 2].astype(np.int64) >> (7 - k)
+    assert np.array_equal(slots[1, 2], encode_packet(indices_to_bits(index, w), w))
+
+
+def test_what_cannot_work_is_refused_with_what_would() -> None:
+    with pytest.raises(UsageError, match="1958 bits a round"):
+        check_message(message("y" * 190), np.full(20, 1), 24)
+    with pytest.raises(UsageError, match=r"at least \d+ such columns"):
+        check_file(np.full(4, 5), 5)
+    check_file(np.full(20, 5), 5)
+    with pytest.raises(UsageError, match="at most 199 bytes"):
+        message("x" * 200)
+    with pytest.raises(UsageError, match="object id"):
+        file_object("a", b"x", 0xFFFE)
+
+
+# -- saving ------------------------------------------------------------------------------------------------------------
+
+
+def received_file(name: str, data: bytes) -> ReceivedObject:
+    (event,) = receive(clip(file_object(name, data), 0, 20, np.random.default_rng(1)))
+    assert isinstance(event, ReceivedObject)
+    return event
+
+
+def test_files_are_written_once_and_never_over_others(tmp_path: Path) -> None:
+    received = received_file("x.txt", b"content")
+    assert save_object(received, tmp_path).path == str(tmp_path / "x.txt")
+    assert (tmp_path / "x.txt").read_bytes() == b"content"
+    save_object(received, tmp_path)  # the same content is no conflict
+    (tmp_path / "x.txt").write_bytes(b"precious")
+    with pytest.raises(InputError, match="exists and is another file"):
+        save_object(received, tmp_path)
+    assert (tmp_path / "x.txt").read_bytes() == b"precious"
+    save_object(received, tmp_path, force=True)
+    assert (tmp_path / "x.txt").read_bytes() == b"content"
+    assert [p.name for p in tmp_path.iterdir()] == ["x.txt"]
+
+
+def test_a_link_is_not_followed(tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.write_bytes(b"safe")
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (folder / "x.txt").symlink_to(outside)
+    received = received_file("x.txt", b"content")
+    with pytest.raises(InputError):
+        save_object(received, folder)
+    save_object(received, folder, force=True)
+    assert outside.read_bytes() == b"safe"
+    assert (folder / "x.txt").read_bytes() == b"content"
