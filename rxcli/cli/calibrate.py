@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rxcli.cli.common import claim_outputs, force_argument, json_output, write_json
+from rxcli.cli.groups import SuggestingGroup
 from rxcli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -19,24 +20,23 @@ if TYPE_CHECKING:
     from rxcli.profiles import ReadoutMode
     from rxcli.types import Frame, Metadata
 
-_PROFILES = Path("calibration") / "cameras"
 _NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 _SAVE = click.option(
     "--save", type=click.Path(dir_okay=False, path_type=Path), help="Camera profile to write, or to add to."
 )
-_NAME = click.option("--name", help=f"The same as --save {_PROFILES}/NAME.toml.")
+_NAME = click.option("--name", help="Keep it as the camera NAME, for --camera NAME from anywhere.")
 _JSON = click.option(
     "--json", "json_path", type=click.Path(allow_dash=True), metavar="FILE|-", help="Write the result as JSON."
 )
 _PATHS = click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
 
 
-@click.group()
+@click.group(cls=SuggestingGroup)
 def calibrate() -> None:
     """Measure a camera's lens or shutter and keep it in a camera profile."""
 
 
-@calibrate.command()
+@calibrate.command(short_help="A lens, from pictures of a chessboard.")
 @_PATHS
 @click.option("--board", "board_size", default="9x6", show_default=True, help="Inner corners, across x down.")
 @click.option("--square", "square_mm", type=float, default=25.0, show_default=True, help="Side of a square, mm.")
@@ -121,7 +121,9 @@ def _target(save: Path | None, name: str | None) -> Path | None:
         raise UsageError("--save and --name both say where the profile goes", "give one of them")
     if not re.fullmatch(_NAME_PATTERN, name):
         raise UsageError(f"--name {name!r} cannot name a profile", "use letters, digits, dots, dashes and underscores")
-    return _PROFILES / f"{name}.toml"
+    from rxcli.resources import user_dir
+
+    return user_dir() / "cameras" / f"{name}.toml"
 
 
 class _BoardReader:
@@ -195,7 +197,7 @@ def _lens_record(result: LensCalibration, target: Path | None) -> dict[str, Any]
     }
 
 
-@calibrate.command()
+@calibrate.command(short_help="Readout and line delay, from a blinking lamp.")
 @_PATHS
 @click.option("--frequency", "frequencies", type=float, multiple=True, metavar="HZ", help="Lamp; may be repeated.")
 @click.option("--screen", metavar="NAME|FILE", help="Screen profile, whose slot rate is known, instead of a lamp.")
@@ -392,7 +394,7 @@ def _shutter_record(result: ShutterCalibration, target: Path | None) -> dict[str
     }
 
 
-@calibrate.command()
+@calibrate.command(short_help="A lens that the lensfun database knows.")
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--make", help="Camera maker, where the file does not tell it.")
 @click.option("--camera-model", "model", help="Camera model, where the file does not tell it.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import receiver_arguments, receiver_options
+from rxcli.cli.common import complete_files, receiver_arguments, receiver_options
 from rxcli.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("path")
+@click.argument("path", shell_complete=complete_files)
 @receiver_arguments
 @click.option("--frame", type=click.IntRange(0), default=0, show_default=True, help="Frame of a clip.")
 @click.option(

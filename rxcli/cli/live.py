@@ -27,7 +27,7 @@ _TERMINAL_S, _LOG_S = 0.2, 1.0
 _LOCKED = ("ok", "partial")
 
 
-class _Exposure(click.ParamType[float]):
+class Exposure(click.ParamType[float]):
     """Seconds, as a number or a fraction."""
 
     name = "seconds"
@@ -49,7 +49,7 @@ class _Exposure(click.ParamType[float]):
 @click.option("--height", type=click.IntRange(1), help="Rows. [default: the largest that is fast enough]")
 @click.option("--fps", type=click.FloatRange(0, min_open=True), help="Frames a second. [default: the camera's most]")
 @click.option("--format", "pixel_format", metavar="FOURCC", help="GREY, Y10, Y12, Y16, NV12, YUYV, UYVY or MJPG.")
-@click.option("--exposure", type=_Exposure(), help="Seconds, or 1/8000. [default: as short as the camera can]")
+@click.option("--exposure", type=Exposure(), help="Seconds, or 1/8000. [default: as short as the camera can]")
 @click.option("--gain", type=int, help="In the camera's own units. [default: as it is]")
 @click.option("--wait", is_flag=True, help="Wait for a camera that is missing, busy or unplugged.")
 @click.option("--list", "list_only", is_flag=True, help="Show the camera's modes and leave.")
