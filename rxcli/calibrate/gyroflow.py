@@ -26,8 +26,6 @@ _GRID = (33, 21)
 _WIDEST_RAD = math.radians(70)
 #: Newton steps; an angle is found to 1e-12 in five.
 _STEPS = 20
-#: Where the polynomial is this near, it is taken; a quotient whose divisor falls below the least has a pole nearby.
-_GOOD_PX, _LEAST_DIVISOR = 0.5, 0.2
 _HINT = "use `vlc-rx calibrate lens`, or another profile"
 
 
@@ -138,11 +136,13 @@ def _pinhole(
         raise ProfileError(f"{path}: the lens sees too wide for a screen to look flat", _HINT)
     ray = seen * (np.tan(angle) / np.maximum(radius, 1e-12))[:, None]
     ray[radius < 1e-12] = 0
-    fits = [_fit(ray, seen, n_below) for n_below in (0, 3)]
-    apart = [float(np.max(np.linalg.norm((fitted - seen) * focal, axis=1))) for _, _, fitted in fits]
-    # A quotient is taken where the polynomial alone misses the fisheye's corners.
-    chosen = 0 if apart[0] < _GOOD_PX or not apart[1] < apart[0] / 2 else 1
-    scale, terms, _ = fits[chosen]
+    reach = float(np.max(np.linalg.norm(ray, axis=1)))
+    terms = (np.sum(ray**2, axis=1) / reach**2)[:, None] ** np.arange(4)
+    design = (ray[:, :, None] * terms[:, None, :]).reshape(-1, 4)
+    weights = np.linalg.lstsq(design, seen.ravel(), rcond=None)[0]
+    apart = ((design @ weights).reshape(-1, 2) - seen) * focal
+    scale = float(weights[0])
+    k1, k2, k3 = (float(w) / scale / reach ** (2 * n) for n, w in enumerate(weights[1:], start=1))
     model = LensModel(
         width=width,
         height=height,
@@ -151,36 +151,9 @@ def _pinhole(
             (0.0, scale * float(focal[1]), float(matrix[1, 2])),
             (0.0, 0.0, 1.0),
         ),
-        dist_coeffs=(terms[0], terms[1], 0.0, 0.0, *terms[2:]),
+        dist_coeffs=(k1, k2, 0.0, 0.0, k3),
     )
-    return model, apart[chosen]
-
-
-def _fit(ray: FloatArray, seen: FloatArray, n_below: int) -> tuple[float, tuple[float, ...], FloatArray]:
-    """Scale and k1 k2 k3 (k4 k5 k6) with `seen = scale ray (1 + k1 r^2 + ..) / (1 + k4 r^2 + ..)`; linear after both
-    sides are multiplied by the divisor.
-
-    Args:
-        ray: (n, 2) tangents of the rays.
-        seen: (n, 2) where they fall, focal lengths.
-        n_below: terms of the divisor.
-
-    Returns:
-        The scale, the terms, and (n, 2) where the model has the points.
-    """
-    reach = float(np.max(np.linalg.norm(ray, axis=1)))
-    powers = (np.sum(ray**2, axis=1) / reach**2)[:, None] ** np.arange(4)
-    above = ray[:, :, None] * powers[:, None, :]
-    below = -seen[:, :, None] * powers[:, None, 1 : n_below + 1]
-    design = np.concatenate([above, below], axis=2).reshape(seen.size, -1)
-    weights = np.linalg.lstsq(design, seen.ravel(), rcond=None)[0]
-    scale, divisor = float(weights[0]), 1 + powers[:, 1 : n_below + 1] @ weights[4:]
-    fitted = (above @ weights[:4]) / divisor[:, None]
-    up = [float(w) / scale / reach ** (2 * n) for n, w in enumerate(weights[1:4], start=1)]
-    down = [float(w) / reach ** (2 * n) for n, w in enumerate(weights[4:], start=1)]
-    if np.any(divisor < _LEAST_DIVISOR):  # a pole between the points would tear the picture
-        fitted = np.full_like(seen, np.inf)
-    return scale, (*up, *down), np.asarray(fitted)
+    return model, float(np.max(np.linalg.norm(apart, axis=1)))
 
 
 def _angles(radius: FloatArray, coefficients: FloatArray) -> FloatArray | None:
