@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,10 +82,19 @@ def _received(
     found = find_truth(path) if truth == "auto" else truth
     scorer = Scorer(load_truth(found)) if found else None
     n_frames = max(_MOST_FRAMES, (number or 0) + 1)
-    received = list(receive(islice(open_source(path), n_frames), options))
+    first: list[Frame] = []
+    received = list(receive(_noting(islice(open_source(path), n_frames), first), options))
     results = [scorer.add(result) if scorer else result for result in received]
     best = max(results, key=lambda result: sum(len(column.packets) for column in result.columns), default=None)
     if best is None or (number is not None and number >= len(results)):
         raise InputError(f"{path}: has no frame {number or 0}", "choose a lower --frame")
     shown = best.frame if number is None else number
-    return results, next(islice(open_source(path), shown, None))
+    return results, first[0] if shown == 0 else next(islice(open_source(path), shown, None))
+
+
+def _noting(frames: Iterator[Frame], first: list[Frame]) -> Iterator[Frame]:
+    """The frames; the first one is kept, so that a photo is read once."""
+    for frame in frames:
+        if not first:
+            first.append(frame)
+        yield frame

@@ -13,8 +13,6 @@ from rxcli.types import FloatArray, Frame, FrameResult
 
 #: Rates are those of the last so many seconds.
 WINDOW_S = 1.0
-#: For so long after the last packet a lock is believed: bursts end in some frames only.
-_HOLD_S = 0.5
 _LOCKED = ("ok", "partial")
 #: Share of light below which a picture is dark, and of pixels at white above which it is overexposed.
 _DARK, _BRIGHT = 0.02, 0.1
@@ -89,8 +87,6 @@ class Aim:
     """Follows the results of a live camera."""
 
     _recent: deque[_Moment] = field(default_factory=deque)
-    _locked_s: float = -1e9
-    _columns: tuple[int, int] = (0, 0)
 
     def update(self, result: FrameResult, now_s: float, height: int, light: Light | None = None) -> AimState:
         """The state with one more result.
@@ -107,18 +103,13 @@ class Aim:
         self._recent.append(_Moment(now_s, len(packets), bits, wrong))
         while len(self._recent) > 2 and self._recent[0].time_s < now_s - WINDOW_S:
             self._recent.popleft()
-        good = result.status in _LOCKED
-        if good:
-            self._locked_s = now_s
-            received = sum(column.status in ("ok", "weak") for column in result.columns)
-            self._columns = (received, len(result.columns))
-        locked = good or now_s - self._locked_s < _HOLD_S
+        locked = result.status in _LOCKED
         reason, advice = ("", "") if locked else split_message(result, light)
         return AimState(
             word="locked" if locked else _WORDS.get(result.status, result.status.replace("_", " ")),
             locked=locked,
-            n_columns=self._columns[1] if locked else len(result.columns),
-            n_received=self._columns[0] if locked else 0,
+            n_columns=len(result.columns),
+            n_received=sum(column.status in ("ok", "weak") for column in result.columns) if locked else 0,
             light=light,
             height_share=height_share(result.corners, height),
             reason=reason,

@@ -40,7 +40,7 @@ class Preview:
 
 def preview(frame: Frame, width_px: int = 1000) -> Preview:
     """A copy of `frame` at most about `width_px` wide: every so many pixels, so that stripes stay stripes."""
-    step = max(1, math.ceil(frame.width / width_px))
+    step = max(1, math.ceil(max(frame.width, frame.height) / width_px))
     return Preview(grey_levels(frame)[::step, ::step], step)
 
 

@@ -30,7 +30,7 @@ _STATUS = {
 }
 _STYLE = Path(__file__).parents[1] / "web" / "page" / "app.css"
 #: Width of drawings, in their own units; rows are thinned out to so many points.
-_WIDTH, _POINTS = 1000, 1200
+_WIDTH, _POINTS, _FEW_POINTS = 1000, 1200, 500
 _MANY_COLUMNS = 24
 _MORE_STYLE = """
 main { max-width: 75rem; }
@@ -46,6 +46,7 @@ svg .dot { fill: var(--accent); fill-opacity: .6; }
 svg .lit { fill: #f0a63c; fill-opacity: .55; } svg .unlit { fill: #5b7fb5; fill-opacity: .55; }
 .view svg { background: none; } .view svg text { fill: #fff; stroke: #000; stroke-width: 3px; font-size: 14px; }
 .wide { overflow-x: auto; } .wide > svg { min-width: 44rem; }
+p, td, dd { overflow-wrap: anywhere; } img { max-width: 100%; } th.number { white-space: normal; }
 .steps { list-style: none; padding: 0; display: flex; flex-wrap: wrap; gap: .5rem; }
 .steps li { border: 1px solid var(--line); border-radius: .5rem; padding: .25rem .6rem; }
 .steps .done { border-color: var(--ok); color: var(--ok); } .steps .failed { border-color: var(--no_packet); color: var(--no_packet); }
@@ -317,7 +318,8 @@ def _traces(known: Inspection) -> str:
     low, high = float(rows.min()), float(rows.max())
     scale = (_WIDTH - 60) / max(high - low, 1.0)
     body = "".join(
-        _one_trace(trace, 6 + place * height, height - 8, low, scale) for place, trace in enumerate(known.traces)
+        _one_trace(trace, 6 + place * height, height - 8, low, scale, _FEW_POINTS if many else _POINTS)
+        for place, trace in enumerate(known.traces)
     )
     total = 6 + len(known.traces) * height + 22
     body += f'<text x="50" y="{total - 6}">row {low:.0f}</text><text x="{_WIDTH}" y="{total - 6}" text-anchor="end">row {high:.0f} of the sensor</text>'
@@ -330,7 +332,7 @@ def _traces(known: Inspection) -> str:
     return _section("Light and slots", f'<div class="wide">{_svg(total, body, told)}</div>', caption)
 
 
-def _one_trace(trace: Trace, top: float, height: float, low: float, scale: float) -> str:
+def _one_trace(trace: Trace, top: float, height: float, low: float, scale: float, points: int) -> str:
     status = trace.column.status
     label = (
         f'<text x="44" y="{top + height / 2 + 4:.0f}" text-anchor="end">{trace.column.column}'
@@ -348,8 +350,10 @@ def _one_trace(trace: Trace, top: float, height: float, low: float, scale: float
     def y(values: FloatArray) -> FloatArray:
         return np.asarray(top + height * (1 - np.clip(values / most, 0, 1.08)))
 
-    step = max(1, trace.rows.size // _POINTS)
-    spans = "".join(f"M{x(a):.1f} {top:.0f}h{(b - a) * scale:.1f}v{height:.0f}H{x(a):.1f}z" for a, b in trace.lit_spans)
+    step = max(1, trace.rows.size // points)
+    first, last = float(trace.rows[0]), float(trace.rows[-1])
+    shown = [(max(a, first), min(b, last)) for a, b in trace.lit_spans if b > first and a < last]
+    spans = "".join(f"M{x(a):.1f} {top:.0f}h{(b - a) * scale:.1f}v{height:.0f}H{x(a):.1f}z" for a, b in shown)
     light = _path(x(trace.rows[::step]), y(root[::step]))
     model = _path(x(trace.rows[::step]), y(np.sqrt(np.maximum(trace.model, 0))[::step]))
     borders = "".join(
