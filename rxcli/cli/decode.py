@@ -19,6 +19,7 @@ from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
     from rxcli.outputs import Output
+    from rxcli.results.baseline import Baseline
     from rxcli.results.summary import SourceSummary
     from rxcli.results.truth import Scorer
     from rxcli.runs.batch import Decoded, Decoder, Source
@@ -33,6 +34,7 @@ _NO_MATTER = frozenset(
     {
         *("json_path", "junit", "summary", "save_camera", "dump_dir", "save_undistorted", "quiet", "force", "resume"),
         *("workers", "cluster", "max_ber", "min_packets", "min_packet_confidence"),
+        *("baseline", "slower"),
     }
 )
 #: The source that is read from stdin.
@@ -53,6 +55,16 @@ STDIN = "-"
     default=1,
     show_default=True,
     help="Fail a file with fewer packets; those below --min-confidence (0.5, where it is not given) do not count.",
+)
+@click.option(
+    "--baseline", type=_FILE, metavar="FILE", help="Fail a file that lost packets, or is slower, since this --json run."
+)
+@click.option(
+    "--slower",
+    type=click.FloatRange(1),
+    default=1.5,
+    show_default=True,
+    help="How many times as long as in the --baseline a file may take.",
 )
 @click.option(
     "--min-packet-confidence",
@@ -205,6 +217,7 @@ class _Run:
 
         self._decoder = decoder
         self._options = options
+        self._baseline = _baseline(options)
         self._limits = Limits(options["max_ber"], options["min_packets"], options["min_packet_confidence"])
         self._summaries: list[SourceSummary] = []
         self._to_stdout = options["json_path"] == "-"
@@ -291,6 +304,8 @@ class _Run:
                     for result, last in _with_last(results):
                         result = scorer.add(result) if scorer else result
                         summary.add(result)
+                        if self._baseline is not None:
+                            self._baseline.add(result)
                         self._keep_estimate(result)
                         log.info("%s", result_in_words(result))
                         with progress.paused():
@@ -331,6 +346,7 @@ class _Run:
     def _end(self, summary: SourceSummary, scorer: Scorer | None) -> None:
         if summary.n_frames:  # none: interrupted before the first
             summary.score = scorer.score() if scorer else None
+            summary.regressions = self._baseline.regressions(summary.source) if self._baseline else []
             self._summaries.append(summary)
 
     def _keep_estimate(self, result: FrameResult) -> None:
@@ -387,6 +403,17 @@ class _Run:
             if self._options["json_path"] is None and any(summary.n_packets for summary in self._summaries):
                 _print_text(LEGEND + "\n")
             _print_text(format_summary(self._summaries, self._limits), err=self._to_stdout)
+
+
+def _baseline(options: dict[str, Any]) -> Baseline | None:
+    """The run to hold this one against, where one is named."""
+    if options["baseline"] is None:
+        return None
+    from rxcli.results.baseline import load_baseline
+    from rxcli.results.summary import MIN_CONFIDENCE
+
+    asked = options["min_confidence"]
+    return load_baseline(options["baseline"], MIN_CONFIDENCE if asked is None else asked, options["slower"])
 
 
 def _n_packets(result: FrameResult) -> int:

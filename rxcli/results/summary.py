@@ -55,6 +55,8 @@ class SourceSummary:
     score: Score | None = None
     #: Why truth that was asked for is not there.
     truth_problem: str | None = None
+    #: In what it is worse than an earlier run.
+    regressions: list[str] = field(default_factory=list)
 
     def add(self, result: FrameResult) -> None:
         """Count one frame."""
@@ -100,6 +102,7 @@ class SourceSummary:
                 f"a packet has a confidence of {self.lowest_confidence:.4g}, below {limits.min_packet_confidence:g}"
             )
             found.append((ExitCode.NOT_RECEIVED, reason))
+        found += [(ExitCode.NOT_RECEIVED, reason) for reason in self.regressions]
         if self.truth_problem:
             found.append((ExitCode.UNREADABLE, self.truth_problem))
         if limits.max_ber is not None:

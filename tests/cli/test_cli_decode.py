@@ -142,6 +142,31 @@ def test_a_case_has_one_failure_with_all_reasons(tmp_path: Path, decode: Decode)
     assert "99 were asked for; a packet has a confidence of" in failure.get("message", "")
 
 
+def test_a_run_is_held_against_an_earlier_one(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    base = tmp_path / "base.jsonl"
+    assert decode(tmp_path / "a.png", "--json", base)[0] == 0
+    assert decode(tmp_path / "a.png", "--baseline", base, "--slower", 1000)[0] == 0
+    lines = base.read_text()
+    other = lines.replace(json.loads(lines)["columns"][3]["packets"][0]["payload"], "00" * 5)
+    base.write_text(other)
+    code, out, _ = decode(tmp_path / "a.png", "--baseline", base, "--slower", 1000)
+    assert code == 1
+    assert "1 packet of the baseline lost (column 3)" in out
+    record = json.loads(lines)
+    record["timing_ms"] = {"total": 1e-3}
+    base.write_text(json.dumps(record) + "\n")
+    code, out, _ = decode(tmp_path / "a.png", "--baseline", base)
+    assert code == (1 if "times the baseline's" in out else 0)
+    record["timing_ms"] = {"total": -1e9}
+    base.write_text(json.dumps(record) + "\n")
+    assert decode(tmp_path / "a.png", "--baseline", base)[0] == 1
+    base.write_text("{}\n")
+    code, _, err = decode(tmp_path / "a.png", "--baseline", base)
+    assert code == 2
+    assert "base.jsonl line 1: no result of `vlc-rx decode --json`" in err
+
+
 def test_a_legend_stands_under_the_tables(tmp_path: Path, decode: Decode) -> None:
     write_frame(tmp_path / "a.png", 1)
     assert decode(tmp_path / "a.png")[1].count("w: lit slots of ten") == 1
