@@ -13,16 +13,15 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import rxcli
 from rxcli.cli.main import run
 from rxcli.protocol import HEADER, hex_to_bits
-from rxcli.results.plots import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 #: 192 bytes fill the 20 columns of one burst. Column 8 starts with byte 77.
 MESSAGE = (
@@ -46,7 +45,7 @@ def draw(frame: rxcli.Frame) -> Figure:
     """Photo; stripes, light, slots and bits of one column; the text of all of them."""
     result, taps = rxcli.tap(frame)
     assert taps is not None
-    figure = new_figure(13, 6.6)
+    figure = Figure(figsize=(13, 6.6), layout="constrained")
     grid = figure.add_gridspec(6, 2, width_ratios=(1, 1.75), height_ratios=(1.0, 1.5, 0.5, 0.5, 0.55, 0.75))
     rows = _rows(taps)
     _draw_photo(figure.add_subplot(grid[:5, 0]), frame, taps, rows)

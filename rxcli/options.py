@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 
 from rxcli.errors import UsageError
-from rxcli.profiles import CameraProfile, ScreenProfile, load_profile, shipped_profiles
+from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles, load_profile, shipped_profiles
 from rxcli.types import FloatArray
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 CaeMode = Literal["auto", "always", "never"]
 #: Names of the shortcuts that `ReceiverOptions.skip` may hold; every one is counted in the report.
 SKIPS = ("no_screen", "dark_columns", "certain_columns", "tracking")
-#: In place of a profile's name: all shipped ones, of which the picture decides.
+#: In place of a profile's name: all that are known, of which the picture decides.
 AUTO = "auto"
 _Profile = TypeVar("_Profile", ScreenProfile, CameraProfile)
 
@@ -70,7 +70,7 @@ def receiver_options(
     ones, each file takes the one that matches its make, model and size.
 
     Args:
-        screens: profile, name of a shipped one, TOML file, or several of these; "auto": all shipped ones.
+        screens: profile, name of one, TOML file, or several of these; "auto": all shipped ones and the user's own.
         cameras: likewise; an empty sequence: estimate every camera from its picture.
         corners: (4, 2) stored pixels, top-left first, clockwise as a viewer sees the screen; None: find them.
         cae: when the auto-encoder runs.
@@ -115,7 +115,7 @@ def _profiles(
             raise UsageError(f"{name!r} is no {kind.__name__}", "give a profile of this kind, its name, or a TOML file")
         elif name != AUTO:
             found.append(load_profile(name, kind))
-    return (*found, *(shipped_profiles(kind) if AUTO in names else ()))
+    return (*found, *([profile for profile, _, _ in known_profiles(kind)] if AUTO in names else ()))
 
 
 def _check_choices(cae: str, min_confidence: float, no_skip: Sequence[str]) -> None:

@@ -6,6 +6,7 @@ Times in seconds, lengths in pixels of the stored picture (integer coordinates a
 
 from __future__ import annotations
 
+import logging
 import re
 import tomllib
 from collections.abc import Iterable
@@ -19,7 +20,9 @@ from msgspec import Meta
 
 from rxcli.errors import ProfileError
 from rxcli.protocol import packet_slots
-from rxcli.resources import data_dir, read_limited
+from rxcli.resources import data_dir, profile_dirs, read_limited
+
+log = logging.getLogger(__name__)
 
 PositiveInt = Annotated[int, Meta(gt=0, le=1_000_000)]
 Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
@@ -201,7 +204,7 @@ def load_profile(name_or_path: str | Path, kind: type[_Profile]) -> _Profile: ..
 
 
 def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any:
-    """Load a shipped profile by name, or a TOML file by path.
+    """Load a profile by name, the user's own before shipped ones, or a TOML file by path.
 
     Args:
         name_or_path: such as "paper-17k3", "xs10" or "mine.toml".
@@ -212,15 +215,12 @@ def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any
     """
     name = str(name_or_path)
     if kind is None:
-        return _load_file(name) if Path(name).is_file() else _load_shipped(name)
-    shipped = data_dir("calibration") / _KINDS[kind]
-    by_name = shipped / f"{name}.toml"
-    is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) is not None
-    path = by_name if is_name and by_name.is_file() else Path(name)
+        return _load_file(name) if Path(name).is_file() else _load_by_name(name)
+    path = _file_of(name, kind)
     try:
         text = read_limited(path, _MOST_BYTES).decode("utf-8")
     except FileNotFoundError:
-        known = ", ".join(sorted(p.stem for p in shipped.glob("*.toml")))
+        known = ", ".join(sorted({path.stem for _, path in _profile_files(kind)}))
         raise ProfileError(
             f"no profile {name!r} among {_KINDS[kind]}", f"name a TOML file or one of: {known}"
         ) from None
@@ -228,6 +228,14 @@ def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any
         reason = getattr(error, "strerror", None) or error
         raise ProfileError(f"{name}: cannot be read as a profile ({reason})", "name a TOML file") from None
     return parse_profile(text, kind, name)
+
+
+def _file_of(name: str, kind: type[Any]) -> Path:
+    """The file of a profile that goes by `name`, the user's first; else `name` is a path."""
+    if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) is None:
+        return Path(name)
+    by_name = (folder / _KINDS[kind] / f"{name}.toml" for _, folder in profile_dirs())
+    return next((path for path in by_name if path.is_file()), Path(name))
 
 
 def _load_file(name: str) -> ScreenProfile | CameraProfile:
@@ -241,20 +249,43 @@ def _load_file(name: str) -> ScreenProfile | CameraProfile:
     return load_profile(name, CameraProfile) if kind == "camera" else load_profile(name, ScreenProfile)
 
 
-def _load_shipped(name: str) -> ScreenProfile | CameraProfile:
-    known: list[ScreenProfile | CameraProfile] = [*shipped_profiles(ScreenProfile)]
-    known += shipped_profiles(CameraProfile)
-    found = next((profile for profile in known if profile.name == name), None)
-    if found is None:
-        names = ", ".join(profile.name for profile in known)
-        raise ProfileError(f"no profile {name!r}", f"name a TOML file or one of: {names}")
-    return found
+def _load_by_name(name: str) -> ScreenProfile | CameraProfile:
+    for kind in (ScreenProfile, CameraProfile):
+        if _file_of(name, kind) != Path(name):
+            return load_profile(name, kind)
+    names = ", ".join(path.stem for kind in (ScreenProfile, CameraProfile) for _, path in _profile_files(kind))
+    raise ProfileError(f"no profile {name!r}", f"name a TOML file or one of: {names}")
+
+
+def _profile_files(kind: type[Any]) -> list[tuple[str, Path]]:
+    """Files of profiles that go by their names, with where each comes from: the user's, then the shipped ones."""
+    found: dict[str, tuple[str, Path]] = {}
+    for origin, folder in profile_dirs():
+        for path in sorted((folder / _KINDS[kind]).glob("*.toml")):
+            found.setdefault(path.stem, (origin, path))
+    return list(found.values())
+
+
+def known_profiles(kind: type[_Profile]) -> list[tuple[_Profile, str, Path]]:
+    """All profiles of one kind that go by their names, with origin and file: the user's first, then the shipped ones.
+
+    One of the user's that is broken is passed over with a warning: it must not stop what does not need it.
+    """
+    known = []
+    for origin, path in _profile_files(kind):
+        try:
+            known.append((load_profile(path, kind), origin, path))
+        except ProfileError as error:
+            if origin == "shipped":
+                raise
+            log.warning("%s; passed over", error)
+    return known
 
 
 def shipped_profiles(kind: type[_Profile]) -> list[_Profile]:
     """All shipped profiles of one kind, by name."""
     folder = data_dir("calibration") / _KINDS[kind]
-    return [load_profile(path.stem, kind) for path in sorted(folder.glob("*.toml"))]
+    return [load_profile(str(path), kind) for path in sorted(folder.glob("*.toml"))]
 
 
 def dump_profile(profile: ScreenProfile | CameraProfile) -> str:

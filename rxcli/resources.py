@@ -1,8 +1,12 @@
-"""Where models, profiles and sample frames lie: inside an installed wheel, or beside the package in a checkout."""
+"""Where models, profiles and sample frames lie: inside an installed wheel, or beside the package in a checkout.
+
+What a user adds lies in the folder that the system has for it (`platformdirs`), or where `VLC_RX_HOME` says.
+"""
 
 from __future__ import annotations
 
 import errno
+import os
 import stat
 from pathlib import Path
 
@@ -28,3 +32,22 @@ def read_limited(path: Path, most_bytes: int) -> bytes:
     if info.st_size > most_bytes:
         raise OSError(errno.EFBIG, f"has {info.st_size} bytes, more than {most_bytes}")
     return path.read_bytes()
+
+
+#: Names another folder for the user's profiles and settings.
+HOME_VARIABLE = "VLC_RX_HOME"
+
+
+def user_dir() -> Path:
+    """The folder of the user's own profiles (`cameras/`, `screens/`) and `config.toml`; it need not exist."""
+    told = os.environ.get(HOME_VARIABLE)
+    if told:
+        return Path(told)
+    from platformdirs import user_config_path
+
+    return user_config_path("vlc-rx", appauthor=False)
+
+
+def profile_dirs() -> list[tuple[str, Path]]:
+    """Folders that hold `cameras/` and `screens/`, with what each is called; of two of one name the first wins."""
+    return [("user", user_dir()), ("shipped", data_dir("calibration"))]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 from pathlib import Path
 
@@ -11,7 +12,8 @@ _SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
 
 def pytest_configure() -> None:
-    """Be heard: a shell makes what runs in the background deaf to Ctrl-C, and so what the tests start."""
+    """Be heard, though a shell makes what it runs in the background deaf to Ctrl-C; and use no settings of the user."""
+    os.environ["VLC_RX_HOME"] = os.path.join(os.devnull, "none")
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -21,7 +21,7 @@ STAGES = ("screen", "sampling", "camera", "sync", "channel", "decode")
 MOST_FOLDERS, MOST_FILES = 9, 9
 #: Too heavy to be loaded by a module that does not need it at once (milliseconds each on import: 70 to 1000).
 HEAVY = {"cv2", "rawpy", "av", "onnxruntime", "matplotlib", "scipy", "skimage", "simplejpeg", "tifffile"}
-HEAVY |= {"distributed", "dask", "pyarrow", "torch", "onnx", "lensfunpy", "pillow_heif", "tqdm"}
+HEAVY |= {"distributed", "dask", "pyarrow", "torch", "onnx", "lensfunpy", "pillow_heif", "tqdm", "aiohttp", "segno"}
 
 
 def module_name(path: Path) -> str:
@@ -109,6 +109,7 @@ def test_stages_stand_on_the_ground_and_never_on_each_other(stage: str) -> None:
         ("results", ("receiver", "ingest", "link")),
         ("runs", ("receiver", "ingest", "results", "link")),
         ("calibrate", ("receiver", "ingest")),
+        ("web", ("receiver", "ingest", "results", "runs", "link")),
     ],
 )
 def test_data_flows_down_the_listing(room: str, allowed: tuple[str, ...]) -> None:
@@ -165,7 +166,7 @@ def test_reports_know_results_only(part: str) -> None:
 
 def test_only_those_above_it_call_the_pipeline() -> None:
     callers = {part_of(name) for name, tree in MODULES.items() if "rxcli.receiver.pipeline" in imports(tree)}
-    assert callers <= {"", "cli", "lab", "runs"}
+    assert callers <= {"", "cli", "lab", "runs", "web"}
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))
@@ -173,7 +174,8 @@ def test_heavy_libraries_are_imported_where_they_are_used(name: str) -> None:
     if name in below("lab.training"):
         pytest.skip("training is loaded by `vlc-rx train` alone")
     found = {other.split(".")[0] for other in imports_at_load(MODULES[name])} & HEAVY
-    readers = {"rxcli.ingest.jpeg", "rxcli.ingest.raw", "rxcli.ingest.video"}  # loaded when a file of their kind comes
+    # Loaded when a file of their kind comes, or when a page is served.
+    readers = {"rxcli.ingest.jpeg", "rxcli.ingest.raw", "rxcli.ingest.video", "rxcli.web.server"}
     assert not found or name in readers, found
 
 

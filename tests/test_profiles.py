@@ -30,6 +30,27 @@ from rxcli.profiles import (
 )
 from rxcli.resources import data_dir
 
+
+def test_the_users_profiles_go_by_their_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From anywhere, listed with their origin; one that is broken stops nothing."""
+    monkeypatch.setenv("VLC_RX_HOME", str(tmp_path / "home"))
+    folder = tmp_path / "home" / "cameras"
+    folder.mkdir(parents=True)
+    (folder / "mycam.toml").write_text(tomli_w.dumps(CAMERA | {"name": "mycam"}))
+    (folder / "broken.toml").write_text("x = [")
+    monkeypatch.chdir(tmp_path)
+    assert load_profile("mycam", CameraProfile).models == ("M 1",)
+    assert run(["profiles"]) == 0
+    captured = capsys.readouterr()
+    assert "camera  mycam            user     still 640x480; lens" in captured.out
+    assert "camera  xs10             shipped " in captured.out
+    assert "broken.toml: not valid TOML" in captured.err
+    assert run(["decode", "none.jpg", "--camera", "mycam", "--quiet"]) == ExitCode.UNREADABLE
+    assert run(["decode", "none.jpg", "--camera", "broken", "--quiet"]) == ExitCode.USAGE
+
+
 SCREEN: dict[str, Any] = {
     "format": 1,
     "kind": "screen",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rxcli.cli.common import options
+from rxcli.cli.groups import SuggestingGroup
 
 if TYPE_CHECKING:
     from rxcli.lab.benchmark.confidence import Calibration
@@ -57,7 +58,7 @@ def _random(label: str, work: Callable[..., Any], count: int, run: dict[str, Any
     return run_scenes(label, work, count, journal, **told, **more)
 
 
-@click.group(invoke_without_command=True)
+@click.group(cls=SuggestingGroup, invoke_without_command=True)
 @options(
     ("--quick", None, False, "Print the headline table: under three minutes on two cores."),
     ("--jobs", click.IntRange(1, 256), 2, "Processes of --quick."),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rxcli.cli.common import claim_outputs, force_argument, json_output, write_json
+from rxcli.cli.groups import SuggestingGroup
 from rxcli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -19,24 +20,23 @@ if TYPE_CHECKING:
     from rxcli.profiles import ReadoutMode
     from rxcli.types import Frame, Metadata
 
-_PROFILES = Path("calibration") / "cameras"
 _NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 _SAVE = click.option(
     "--save", type=click.Path(dir_okay=False, path_type=Path), help="Camera profile to write, or to add to."
 )
-_NAME = click.option("--name", help=f"The same as --save {_PROFILES}/NAME.toml.")
+_NAME = click.option("--name", help="Keep it as the camera NAME, for --camera NAME from anywhere.")
 _JSON = click.option(
     "--json", "json_path", type=click.Path(allow_dash=True), metavar="FILE|-", help="Write the result as JSON."
 )
 _PATHS = click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
 
 
-@click.group()
+@click.group(cls=SuggestingGroup)
 def calibrate() -> None:
     """Measure a camera's lens or shutter and keep it in a camera profile."""
 
 
-@calibrate.command()
+@calibrate.command(short_help="A lens, from pictures of a chessboard.")
 @_PATHS
 @click.option("--board", "board_size", default="9x6", show_default=True, help="Inner corners, across x down.")
 @click.option("--square", "square_mm", type=float, default=25.0, show_default=True, help="Side of a square, mm.")
@@ -121,7 +121,9 @@ def _target(save: Path | None, name: str | None) -> Path | None:
         raise UsageError("--save and --name both say where the profile goes", "give one of them")
     if not re.fullmatch(_NAME_PATTERN, name):
         raise UsageError(f"--name {name!r} cannot name a profile", "use letters, digits, dots, dashes and underscores")
-    return _PROFILES / f"{name}.toml"
+    from rxcli.resources import user_dir
+
+    return user_dir() / "cameras" / f"{name}.toml"
 
 
 class _BoardReader:
@@ -195,7 +197,7 @@ def _lens_record(result: LensCalibration, target: Path | None) -> dict[str, Any]
     }
 
 
-@calibrate.command()
+@calibrate.command(short_help="Readout and line delay, from a blinking lamp.")
 @_PATHS
 @click.option("--frequency", "frequencies", type=float, multiple=True, metavar="HZ", help="Lamp; may be repeated.")
 @click.option("--screen", metavar="NAME|FILE", help="Screen profile, whose slot rate is known, instead of a lamp.")
@@ -392,7 +394,7 @@ def _shutter_record(result: ShutterCalibration, target: Path | None) -> dict[str
     }
 
 
-@calibrate.command()
+@calibrate.command(short_help="A lens that the lensfun database knows.")
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--make", help="Camera maker, where the file does not tell it.")
 @click.option("--camera-model", "model", help="Camera model, where the file does not tell it.")
@@ -454,3 +456,95 @@ def lensfun(
         click.echo(f"conversion  within {found.worst_px:.2f} px of lensfun's own")
         if target is not None:
             click.echo(f"written     {target}")
+
+
+@calibrate.command(short_help="A lens from a Gyroflow profile; its readout, checked.")
+@click.argument("path", type=click.Path(path_type=Path))
+@click.option("--size", metavar="WxH", help="Size of the pictures it is for. [default: as calibrated]")
+@click.option("--photo", type=click.Path(path_type=Path), help="Check the readout with this picture of a screen.")
+@click.option("--screen", metavar="NAME|FILE", help="The screen of --photo.")
+@_SAVE
+@_NAME
+@_JSON
+@force_argument
+def gyroflow(
+    path: Path,
+    size: str | None,
+    photo: Path | None,
+    screen: str | None,
+    save: Path | None,
+    name: str | None,
+    json_path: str | None,
+    force: bool,
+) -> None:
+    """Lens model from PATH, a lens profile of the Gyroflow community (.json).
+
+    The readout in such a profile is what some user told. It is written only where a picture of a known screen (--photo
+    and --screen) bears it out, and then as the picture measures it.
+    """
+    from rxcli.calibrate.gyroflow import load_gyroflow
+    from rxcli.calibrate.saving import profile_to_extend, with_lens, with_mode, write_profile
+    from rxcli.types import Metadata
+
+    if (photo is None) != (screen is None):
+        raise UsageError("--photo and --screen belong together", "give both, or neither")
+    target = _target(save, name)
+    read = [path] if photo is None else [path, photo]
+    _claim(read, (screen,), target, json_path, ("camera", "lens", "camera_matrix"), force)
+    found = load_gyroflow(path, _size(size))
+    measured = None if photo is None else _measure(_some_frames(photo, 8), (), screen, "auto", None, None)
+    notes = [*found.notes, *([] if measured is None else [_agreement(found.readout_s, measured.readout_s)])]
+    if target is not None:
+        metadata = Metadata(make=found.make or None, model=found.model or None)
+        profile = with_lens(profile_to_extend(target, metadata), found.lens, found.lens_name or None)
+        if measured is not None:
+            profile = with_mode(profile, _mode(measured, None))
+        write_profile(profile, target)
+    record = {
+        "camera": f"{found.make} {found.model}".strip(),
+        "lens": found.lens_name,
+        "camera_matrix": [list(row) for row in found.lens.camera_matrix],
+        "dist_coeffs": list(found.lens.dist_coeffs),
+        "width": found.lens.width,
+        "height": found.lens.height,
+        "worst_px": found.worst_px,
+        "readout_told_s": found.readout_s,
+        "readout_measured_s": measured.readout_s if measured else None,
+        "reversed": found.reversed,
+        "notes": notes,
+        "profile": str(target) if target is not None else None,
+    }
+    if json_path is not None:
+        write_json(record, json_path)
+    if json_path != "-":
+        _say_gyroflow(record)
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    found = re.fullmatch(r"([1-9]\d{0,4})[xX]([1-9]\d{0,4})", text)
+    if not found:
+        raise UsageError(f"--size {text!r} is not WIDTHxHEIGHT", "write it as 3840x2160")
+    return int(found[1]), int(found[2])
+
+
+def _agreement(told_s: float | None, measured_s: float) -> str:
+    """What the picture says of the readout that the profile tells."""
+    if told_s is None:
+        return f"the picture says {measured_s * 1e3:.2f} ms"
+    apart = told_s / measured_s - 1
+    verdict = "agrees with" if abs(apart) < 0.01 else f"is {100 * abs(apart):.0f} % {'above' if apart > 0 else 'below'}"
+    return f"the readout told ({told_s * 1e3:.2f} ms) {verdict} what the picture says ({measured_s * 1e3:.2f} ms)"
+
+
+def _say_gyroflow(record: dict[str, Any]) -> None:
+    click.echo(f"camera      {record['camera'] or 'not told'}")
+    click.echo(f"lens        {record['lens'] or 'not told'}, {record['width']} x {record['height']}")
+    click.echo(f"focal       {record['camera_matrix'][0][0]:.1f} px")
+    click.echo("distortion  " + " ".join(f"{v:.5f}" for v in record["dist_coeffs"]) + "  (k1 k2 p1 p2 k3)")
+    click.echo(f"conversion  within {record['worst_px']:.2f} px of the fisheye model")
+    for note in record["notes"]:
+        click.echo(f"readout     {note}")
+    if record["profile"]:
+        click.echo(f"written     {record['profile']}")

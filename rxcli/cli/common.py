@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
 if TYPE_CHECKING:
     from rxcli.options import ReceiverOptions
@@ -69,21 +70,48 @@ def _check_skip(_context: click.Context, _parameter: click.Parameter, names: tup
     return names
 
 
+def complete_files(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Names of files and folders, for the shell."""
+    return [CompletionItem(incomplete, type="file")]
+
+
+def complete_screens(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Names of screen profiles, then files, for the shell."""
+    return _complete_profiles("screens", incomplete)
+
+
+def complete_cameras(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Names of camera profiles, then files, for the shell."""
+    return _complete_profiles("cameras", incomplete)
+
+
+def _complete_profiles(folder: str, incomplete: str) -> list[CompletionItem]:
+    from rxcli.resources import profile_dirs
+
+    stems = {path.stem for _, parent in profile_dirs() for path in (parent / folder).glob("*.toml")}
+    names = sorted(name for name in [AUTO, *stems] if name.startswith(incomplete))
+    return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+
+
 _OPTIONS = (
     click.option(
         "--screen",
         "screens",
+        shell_complete=complete_screens,
         multiple=True,
+        envvar="VLC_RX_SCREEN",
         metavar="NAME|FILE|auto",
         help="Screen profile; may be given several times. [default: auto, the one whose clock fits best]",
     ),
     click.option(
         "--camera",
         "cameras",
+        shell_complete=complete_cameras,
         multiple=True,
+        envvar="VLC_RX_CAMERA",
         metavar="NAME|FILE|auto",
         help="Camera profile; of several, each file takes the one that matches its make, model and size. "
-        "[default: auto, all shipped ones]",
+        "[default: auto, all that are known]",
     ),
     click.option(
         "--corners",
@@ -102,8 +130,7 @@ _OPTIONS = (
     click.option(
         "--min-confidence",
         type=click.FloatRange(0, 1),
-        default=0.0,
-        help="Report only packets of at least this confidence.",
+        help="Report only packets of at least this confidence. [default: all]",
     ),
     click.option(
         "--no-skip",
@@ -133,6 +160,8 @@ def receiver_options(
     """
     from rxcli.options import receiver_options as options_of
 
+    if options.get("min_confidence") is None:
+        options["min_confidence"] = 0.0
     return options_of(screens or AUTO, cameras or AUTO, corners or None, **options)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import shutil
 import sys
@@ -13,24 +14,27 @@ from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 import click
 
-from rxcli.cli.common import claim_outputs, force_argument, receiver_arguments, receiver_options
+from rxcli.cli.common import claim_outputs, complete_files, force_argument, receiver_arguments, receiver_options
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
     from rxcli.outputs import Output
+    from rxcli.results.baseline import Baseline
     from rxcli.results.summary import SourceSummary
     from rxcli.results.truth import Scorer
     from rxcli.runs.batch import Decoded, Decoder, Source
     from rxcli.runs.journal import Head, Journal, Lines
     from rxcli.types import FrameResult
 
+log = logging.getLogger(__name__)
 _FILE = click.Path(dir_okay=False, path_type=Path, allow_dash=False)
 _FOLDER = click.Path(file_okay=False, path_type=Path)
 #: Options that change nothing of a source's results: where they go, who decodes, what is asked of them.
 _NO_MATTER = frozenset(
     {
         *("json_path", "junit", "summary", "save_camera", "dump_dir", "save_undistorted", "quiet", "force", "resume"),
-        *("workers", "cluster", "max_ber", "min_packets", "out", "payloads"),
+        *("workers", "cluster", "max_ber", "min_packets", "min_packet_confidence"),
+        *("baseline", "slower", "out", "payloads"),
     }
 )
 #: The source that is read from stdin.
@@ -38,18 +42,41 @@ STDIN = "-"
 
 
 @click.command()
-@click.argument("paths", nargs=-1, required=True, metavar="PATH...")
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...", shell_complete=complete_files)
 @receiver_arguments
 @click.option("--json", "json_path", metavar="FILE|-", help="Write one JSON object a frame, instead of the table.")
 @click.option("--truth", metavar="FILE|auto", help="Score against this truth, or the NAME.truth.json beside each file.")
 @click.option(
     "--max-ber", type=click.FloatRange(0, 1), help="Fail a file whose bit error rate is above (needs --truth)."
 )
-@click.option("--min-packets", type=click.IntRange(1), default=1, help="Fail a file with fewer packets.")
+@click.option(
+    "--min-packets",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Fail a file with fewer packets; those below --min-confidence (0.5, where it is not given) do not count.",
+)
+@click.option(
+    "--baseline", type=_FILE, metavar="FILE", help="Fail a file that lost packets, or is slower, since this --json run."
+)
+@click.option(
+    "--slower",
+    type=click.FloatRange(1),
+    default=1.5,
+    show_default=True,
+    help="How many times as long as in the --baseline a file may take.",
+)
+@click.option(
+    "--min-packet-confidence",
+    type=click.FloatRange(0, 1),
+    help="Fail a file with a packet of lower confidence, which is still reported.",
+)
 @click.option("--junit", type=_FILE, help="Write one JUnit test case per file.")
 @click.option("--summary", type=_FILE, help="Write one row per file, as .csv or .parquet.")
 @click.option("--resume", is_flag=True, help="Go on with the run that wrote the file of --json.")
-@click.option("--workers", type=click.IntRange(1), default=1, help="Decode in this many processes.")
+@click.option(
+    "--workers", type=click.IntRange(1), default=1, envvar="VLC_RX_WORKERS", help="Decode in this many processes."
+)
 @click.option("--cluster", metavar="ADDRESS", help="Decode on the Dask cluster whose scheduler is at this address.")
 @click.option("--dump-dir", type=_FOLDER, help="Write the arrays of every stage boundary into this folder.")
 @click.option(
@@ -66,6 +93,7 @@ STDIN = "-"
 def decode(paths: tuple[str, ...], **options: Any) -> int:
     """Decode photos, RAW files and clips; PATH may be a folder, or - for one picture on stdin."""
     _check(paths, options)
+    log.info("paths: %s", ", ".join(paths))
     receiver = {
         name: options[name]
         for name in (
@@ -193,7 +221,8 @@ class _Run:
 
         self._decoder = decoder
         self._options = options
-        self._limits = Limits(options["max_ber"], options["min_packets"])
+        self._baseline = _baseline(options)
+        self._limits = Limits(options["max_ber"], options["min_packets"], options["min_packet_confidence"])
         self._summaries: list[SourceSummary] = []
         self._to_stdout = options["json_path"] == "-"
         self._photos = Collector(decoder.link_screens)
@@ -280,6 +309,9 @@ class _Run:
         return stack.enter_context(PayloadWriter(self._options["payloads"], self._options["resume"])).write
 
     def _decode(self, sources: list[Source], writer: _Writer, n_total: int) -> None:
+        from rxcli.results.report import plural, result_in_words
+
+        log.info("%s to decode, %d done before", plural(len(sources), "source"), n_total - len(sources))
         with _progress(n_total, n_total - len(sources), self._options["quiet"]) as progress:
             for source, results in self._decoded(sources):
                 summary, scorer = self._begin(source.name)
@@ -289,8 +321,11 @@ class _Run:
                         result = scorer.add(result) if scorer else result
                         result = self._saved(self._combined(result), summary)
                         summary.add(result)
+                        if self._baseline is not None:
+                            self._baseline.add(result)
                         self._keep_estimate(result)
                         self._write_payloads(result)
+                        log.info("%s", result_in_words(result))
                         with progress.paused():
                             writer.write(result, last)
                 finally:
@@ -335,7 +370,8 @@ class _Run:
         from rxcli.results.summary import SourceSummary
         from rxcli.results.truth import Scorer, find_truth, load_truth
 
-        summary = SourceSummary(name)
+        asked = self._options["min_confidence"]
+        summary = SourceSummary(name) if asked is None else SourceSummary(name, min_confidence=asked)
         truth = self._options["truth"]
         path = find_truth(name) if truth == "auto" else truth
         if path is None:
@@ -351,6 +387,7 @@ class _Run:
     def _end(self, summary: SourceSummary, scorer: Scorer | None) -> None:
         if summary.n_frames:  # none: interrupted before the first
             summary.score = scorer.score() if scorer else None
+            summary.regressions = self._baseline.regressions(summary.source) if self._baseline else []
             self._summaries.append(summary)
 
     def _keep_estimate(self, result: FrameResult) -> None:
@@ -400,10 +437,24 @@ class _Run:
         return codes
 
     def _print_summary(self) -> None:
+        from rxcli.results.report import LEGEND
         from rxcli.results.summary import format_summary
 
         if self._summaries and not self._options["quiet"]:
-            click.echo(format_summary(self._summaries, self._limits), err=self._to_stdout)
+            if self._options["json_path"] is None and any(summary.n_packets for summary in self._summaries):
+                _print_text(LEGEND + "\n")
+            _print_text(format_summary(self._summaries, self._limits), err=self._to_stdout)
+
+
+def _baseline(options: dict[str, Any]) -> Baseline | None:
+    """The run to hold this one against, where one is named."""
+    if options["baseline"] is None:
+        return None
+    from rxcli.results.baseline import load_baseline
+    from rxcli.results.summary import MIN_CONFIDENCE
+
+    asked = options["min_confidence"]
+    return load_baseline(options["baseline"], MIN_CONFIDENCE if asked is None else asked, options["slower"])
 
 
 def _n_packets(result: FrameResult) -> int:
@@ -466,8 +517,8 @@ class _Table(_Nowhere):
         from rxcli.results.report import format_frame, format_link
 
         for line in format_link(result):
-            click.echo(line)
-        click.echo(format_frame(result) + "\n")
+            _print_text(line)
+        _print_text(format_frame(result) + "\n")
 
 
 class _JsonLines:
@@ -484,6 +535,13 @@ class _JsonLines:
 def _print_line(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
+
+
+def _print_text(text: str, err: bool = False) -> None:
+    """Text for people: on a terminal, lines end between words and states have colours."""
+    from rxcli.cli.terminal import for_terminal
+
+    click.echo(for_terminal(text, sys.stderr if err else sys.stdout), err=err)
 
 
 class _Progress:

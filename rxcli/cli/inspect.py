@@ -1,74 +1,100 @@
-"""`vlc-rx inspect`: pictures of every stage for one photo or frame."""
+"""`vlc-rx inspect`: a page that tells the whole story of one photo, or of a clip and one of its frames."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import receiver_arguments, receiver_options
-from rxcli.errors import ExitCode, InputError
+from rxcli.cli.common import claim_outputs, complete_files, force_argument, receiver_arguments, receiver_options
+from rxcli.errors import ExitCode, InputError, OutputError
 
 if TYPE_CHECKING:
-    from rxcli.profiles import CameraProfile, ScreenProfile
-    from rxcli.receiver.pipeline import ReceiverOptions
+    from rxcli.options import ReceiverOptions
     from rxcli.types import Frame, FrameResult
+
+#: Frames of a clip that its timeline shows.
+_MOST_FRAMES = 240
+#: A folder with a file of this name is passed over by runs over folders.
+_MARKER = ".vlc-rx-output"
 
 
 @click.command()
-@click.argument("path")
+@click.argument("path", shell_complete=complete_files)
 @receiver_arguments
-@click.option("--frame", type=click.IntRange(0), default=0, show_default=True, help="Frame of a clip.")
+@click.option("--frame", type=click.IntRange(0), help="Frame of a clip. [default: the one with the most packets]")
 @click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), help="Folder to write. [default: PATH.inspect]"
+    "--out", type=click.Path(file_okay=False, path_type=Path), help="Folder to write. [default: ./inspect-NAME]"
 )
 @click.option("--truth", metavar="FILE|auto", help="Count wrong bits against this truth.")
-def inspect(path: str, frame: int, out: Path | None, truth: str | None, **options: Any) -> int:
-    """Write pictures of every stage of PATH, and an HTML page that shows them; prints the page's path."""
-    from rxcli.results.plots import new_figure, write_pictures
+@force_argument
+def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, force: bool, **options: Any) -> int:
+    """Write a page that shows how PATH was received, stage by stage, or why not; prints the page's path.
 
-    new_figure(1, 1)  # a missing extra is told before the work, not after it
+    Of a clip, the first frames are received, and one is shown in full.
+    """
+    from rxcli.outputs import Output, write_whole
+    from rxcli.results.overlay import camera_of
+    from rxcli.results.page import MARK, inspection_page
+
+    folder = out if out is not None else Path(f"inspect-{_stem(path)}")
+    page = folder / "index.html"
+    own = re.compile(re.escape(MARK.encode()))
+    claim_outputs([Output("--out", page, own, makes_folder=True)], (path,), (), force)
     configured = receiver_options(**options)
-    picture = _frame_of(path, frame)
-    result = _scored(_receive(picture, configured), path, truth)
-    screen, camera = _profiles_of(picture, result, configured)
-    folder = out if out is not None else Path(f"{path}.inspect")
-    click.echo(write_pictures(folder, picture, result, screen, camera))
-    received = any(column.packets for column in result.columns)
+    results, picture = _received(path, frame, configured, truth)
+    shown = next(result for result in results if result.frame == picture.index)
+    screen = next((s for s in configured.screens if s.name == shown.screen_profile), None)
+    timeline = results if len(results) > 1 else []
+    text = inspection_page(picture, shown, screen, camera_of(picture, shown, configured.cameras), timeline)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / _MARKER).touch()
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error.strerror})", "name another folder with --out") from None
+    write_whole(page, text)
+    click.echo(page)
+    received = any(column.packets for result in results for column in result.columns)
     return ExitCode.OK if received else ExitCode.NOT_RECEIVED
 
 
-def _frame_of(path: str, number: int) -> Frame:
+def _stem(path: str) -> str:
+    """A folder's name from a file's: what any system takes."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", Path(path).name).strip("._") or "picture"
+
+
+def _received(
+    path: str, number: int | None, options: ReceiverOptions, truth: str | None
+) -> tuple[list[FrameResult], Frame]:
+    """Results of a source's frames, and the one frame that is shown.
+
+    Raises:
+        InputError: the source cannot be read, or has no such frame.
+    """
     from rxcli.ingest import open_source
-
-    found = next(islice(open_source(path), number, None), None)
-    if found is None:
-        raise InputError(f"{path}: has no frame {number}", "choose a lower --frame")
-    return found
-
-
-def _receive(picture: Frame, options: ReceiverOptions) -> FrameResult:
     from rxcli.receiver.pipeline import receive
-
-    return next(iter(receive([picture], options)))
-
-
-def _scored(result: FrameResult, path: str, truth: str | None) -> FrameResult:
     from rxcli.results.truth import Scorer, find_truth, load_truth
 
     found = find_truth(path) if truth == "auto" else truth
-    return Scorer(load_truth(found)).add(result) if found else result
+    scorer = Scorer(load_truth(found)) if found else None
+    n_frames = max(_MOST_FRAMES, (number or 0) + 1)
+    first: list[Frame] = []
+    received = list(receive(_noting(islice(open_source(path), n_frames), first), options))
+    results = [scorer.add(result) if scorer else result for result in received]
+    best = max(results, key=lambda result: sum(len(column.packets) for column in result.columns), default=None)
+    if best is None or (number is not None and number >= len(results)):
+        raise InputError(f"{path}: has no frame {number or 0}", "choose a lower --frame")
+    shown = best.frame if number is None else number
+    return results, first[0] if shown == 0 else next(islice(open_source(path), shown, None))
 
 
-def _profiles_of(
-    picture: Frame, result: FrameResult, options: ReceiverOptions
-) -> tuple[ScreenProfile | None, CameraProfile | None]:
-    from rxcli.receiver.camera import camera_profile
-
-    screen = next((s for s in options.screens if s.name == result.screen_profile), None)
-    camera = next((c for c in options.cameras if c.name == result.camera_profile), None)
-    if camera is None and "line_delay_s" in result.estimated:
-        camera = camera_profile(result.estimated, "estimated", None, None, picture.width, picture.height)
-    return screen, camera
+def _noting(frames: Iterator[Frame], first: list[Frame]) -> Iterator[Frame]:
+    """The frames; the first one is kept, so that a photo is read once."""
+    for frame in frames:
+        if not first:
+            first.append(frame)
+        yield frame

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
-from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,19 +18,17 @@ from rxcli.errors import ExitCode, InputError, UsageError
 
 if TYPE_CHECKING:
     from rxcli.ingest.v4l2 import CameraCounts, LiveSource
+    from rxcli.results.aim import Aim, AimState, Light
     from rxcli.types import Frame, FrameResult, ObjectProgress
 
-#: Rates and states are those of the last so many seconds.
-_WINDOW_S = 1.0
 #: How often the status is written: on a terminal over itself, elsewhere line by line.
 _TERMINAL_S, _LOG_S = 0.2, 1.0
-_LOCKED = ("ok", "partial")
 #: Characters of a progress bar.
 _BAR = 20
 _FOLDER = click.Path(file_okay=False, path_type=Path)
 
 
-class _Exposure(click.ParamType[float]):
+class Exposure(click.ParamType[float]):
     """Seconds, as a number or a fraction."""
 
     name = "seconds"
@@ -52,7 +50,7 @@ class _Exposure(click.ParamType[float]):
 @click.option("--height", type=click.IntRange(1), help="Rows. [default: the largest that is fast enough]")
 @click.option("--fps", type=click.FloatRange(0, min_open=True), help="Frames a second. [default: the camera's most]")
 @click.option("--format", "pixel_format", metavar="FOURCC", help="GREY, Y10, Y12, Y16, NV12, YUYV, UYVY or MJPG.")
-@click.option("--exposure", type=_Exposure(), help="Seconds, or 1/8000. [default: as short as the camera can]")
+@click.option("--exposure", type=Exposure(), help="Seconds, or 1/8000. [default: as short as the camera can]")
 @click.option("--gain", type=int, help="In the camera's own units. [default: as it is]")
 @click.option("--wait", is_flag=True, help="Wait for a camera that is missing, busy or unplugged.")
 @click.option("--list", "list_only", is_flag=True, help="Show the camera's modes and leave.")
@@ -88,7 +86,7 @@ def live(device: Path, **options: Any) -> int:
         stack.enter_context(status)
         frames = stack.enter_context(closing(_limited(source, options["n_frames"])))
         collector = Collector(configured.screens)
-        for received in receive(frames, configured):
+        for received in receive(status.watched(frames), configured):
             result = _saved(collector.add(received), options["out"], options["force"])
             write(result)
             status.update(result, collector.progress)
@@ -166,7 +164,7 @@ def _writer(json_path: str | None, stack: ExitStack) -> Callable[[FrameResult], 
         for line in format_link(result):
             click.echo(line)
         if any(column.packets for column in result.columns):
-            click.echo(format_frame(result))
+            _print_above(format_frame(result))
 
     if json_path is None:
         return show
@@ -179,6 +177,16 @@ def _writer(json_path: str | None, stack: ExitStack) -> Callable[[FrameResult], 
     return write
 
 
+def _print_above(text: str) -> None:
+    """Print to stdout, above the block of the status where one stays on the terminal."""
+    from tqdm import tqdm
+
+    from rxcli.cli.terminal import for_terminal
+
+    with tqdm.external_write_mode():
+        click.echo(for_terminal(text, sys.stdout))
+
+
 def _open(path: str) -> TextIO:
     try:
         return Path(path).open("w", encoding="utf-8")
@@ -186,21 +194,12 @@ def _open(path: str) -> TextIO:
         raise UsageError(f"--json {path}: {error.strerror}", "name another file") from None
 
 
-@dataclass(frozen=True, slots=True)
-class _Moment:
-    """What one frame brought."""
-
-    time_s: float
-    status: str
-    n_alive: int
-    n_columns: int
-    bits: int
-    wrong_bits: float
-
-
 @dataclass
 class Status:
-    """The line on stderr: lock, columns alive, rates, and what was lost; a context manager that ends it properly."""
+    """What is said on stderr of lock, light and rates; a context manager that ends it properly.
+
+    On a terminal a block of lines stays in place and payloads scroll above it; elsewhere a line comes now and then.
+    """
 
     source: LiveSource
     quiet: bool = False
@@ -208,68 +207,96 @@ class Status:
     #: Messages and files that came whole.
     n_complete: int = 0
     _files: list[ObjectProgress] = field(default_factory=list)
-    _recent: deque[_Moment] = field(default_factory=deque)
+    #: Of the newest frame.
+    state: AimState | None = None
+    _aim: Aim | None = None
+    _light: Light | None = None
+    _height: int = 1
+    _bars: list[Any] = field(default_factory=list)
     _shown_s: float = 0.0
-    _width: int = 0
 
     def __enter__(self) -> Status:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._recent or self.source.counts.damaged:
-            self._show(final=True)
+        if self.state is not None or self.source.counts.damaged:
+            self._show()
+        for bar in self._bars:
+            bar.close()
+
+    def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """The frames, whose light and height are looked at as they pass."""
+        from rxcli.results.aim import light_of
+
+        for frame in frames:
+            self._light, self._height = light_of(frame), frame.height
+            yield frame
 
     def update(self, result: FrameResult, files: Sequence[ObjectProgress] = ()) -> None:
         """Take a frame's result into account, and show the state if it is time."""
+        from rxcli.results.aim import Aim
+
         now = time.monotonic()
-        self._recent.append(_moment(result, now))
+        self._aim = self._aim or Aim()
+        before, self.state = self.state, self._aim.update(result, now, self._height, self._light)
         self._files = list(files)
         self.n_complete += len(result.messages) + len(result.objects)
         self.n_packets += sum(len(column.packets) for column in result.columns)
-        while self._recent[0].time_s < now - _WINDOW_S:
-            self._recent.popleft()
-        self.show_if_due(now)
+        self.show_if_due(now, changed=before is None or before.word != self.state.word)
 
-    def show_if_due(self, now: float | None = None) -> None:
+    def show_if_due(self, now: float | None = None, changed: bool = False) -> None:
         """Show the state if it is time, also where no whole frame comes."""
         now = time.monotonic() if now is None else now
-        if now - self._shown_s >= (_TERMINAL_S if sys.stderr.isatty() else _LOG_S):
+        if changed or now - self._shown_s >= (_TERMINAL_S if self._on_terminal() else _LOG_S):
             self._shown_s = now
             self._show()
 
-    def _show(self, final: bool = False) -> None:
+    @staticmethod
+    def _on_terminal() -> bool:
+        return sys.stderr is not None and sys.stderr.isatty()
+
+    def _show(self) -> None:
         if self.quiet:
             return
-        line = format_status(list(self._recent), self.source.counts)
-        line = " | ".join([line, *map(format_file, self._files)])
-        if not sys.stderr.isatty():
-            _say(line)
+        lines = [*format_status(self.state, self.source.counts), " | ".join(map(format_file, self._files))]
+        if not self._on_terminal():
+            _say(" | ".join(filter(None, lines)))
             return
-        padded, self._width = line.ljust(self._width), len(line)
-        click.echo(f"\r{padded}", err=True, nl=final)
+        from tqdm import tqdm
+
+        if not self._bars:
+            form = {"bar_format": "{desc}", "dynamic_ncols": True, "leave": True, "file": sys.stderr}
+            self._bars = [tqdm(position=place, **form) for place in range(len(lines))]
+        for place, (bar, line) in enumerate(zip(self._bars, lines, strict=True)):
+            bar.set_description_str(
+                _coloured(line, self.state is not None and self.state.locked) if place == 0 else line
+            )
 
 
-def format_status(recent: list[_Moment], counts: CameraCounts) -> str:
-    """The state of reception in one line.
+def format_status(state: AimState | None, counts: CameraCounts) -> list[str]:
+    """The state of reception in three lines: lock and rates; light, size and losses; why there is no lock, and what to
+    do about it.
 
     Args:
-        recent: what the frames of the last second brought; none where no whole frame has come yet.
+        state: of the newest frame; None where no whole one has come yet.
         counts: what became of the camera's frames so far.
     """
     lost = [f"dropped {counts.dropped}", f"damaged {counts.damaged}"]
-    if not recent:
-        return " | ".join(["no whole frame yet", *lost])
-    last = recent[-1]
-    span_s = max(last.time_s - recent[0].time_s, 1e-3)
-    bits = sum(moment.bits for moment in recent)
-    new_bits = sum(moment.bits for moment in recent[1:])  # those of the span; the first frame only starts it
-    lock = "LOCKED" if last.status in _LOCKED else last.status.replace("_", " ")
-    parts = [f"{lock:<9}", f"columns {last.n_alive}/{last.n_columns}"]
-    if len(recent) > 1:
-        parts += [f"{(len(recent) - 1) / span_s:.1f} frames/s", f"{new_bits / span_s / 1e3:.1f} kb/s"]
-    if bits:
-        parts.append(f"BER about {sum(moment.wrong_bits for moment in recent) / bits:.1e}")
-    return " | ".join(parts + lost)
+    if state is None:
+        return ["no whole frame yet", " | ".join(lost), ""]
+    rates = [
+        state.word.upper() if state.locked else state.word,
+        f"columns {state.n_received}/{state.n_columns}",
+        f"{state.frames_per_s:.1f} frames/s",
+        f"{state.packets_per_s:.0f} packets/s",
+        f"{state.bits_per_s / 1e3:.1f} kb/s",
+    ]
+    if state.ber_hat is not None:
+        rates.append(f"BER about {state.ber_hat:.1e}")
+    seen = [] if state.light is None else [f"light {state.light.word}"]
+    if state.height_share is not None:
+        seen.append(f"screen fills {100 * state.height_share:.0f} % of the height")
+    return [" | ".join(rates), " | ".join(seen + lost), " ".join(filter(None, (state.reason, state.advice)))]
 
 
 def format_file(progress: ObjectProgress) -> str:
@@ -283,16 +310,12 @@ def format_file(progress: ObjectProgress) -> str:
     return " ".join(parts)
 
 
-def _moment(result: FrameResult, now: float) -> _Moment:
-    packets = [packet for column in result.columns for packet in column.packets]
-    return _Moment(
-        time_s=now,
-        status=result.status,
-        n_alive=sum(column.status in ("ok", "weak") for column in result.columns),
-        n_columns=len(result.columns),
-        bits=sum(packet.payload_bits for packet in packets),
-        wrong_bits=sum(packet.payload_bits * packet.ber_hat for packet in packets),
-    )
+def _coloured(line: str, locked: bool) -> str:
+    """The first word in colour, unless NO_COLOR is set."""
+    if os.environ.get("NO_COLOR"):
+        return line
+    word, bar, rest = line.partition(" |")
+    return click.style(word, fg="green" if locked else "red", bold=True) + bar + rest
 
 
 def _say(line: str) -> None:

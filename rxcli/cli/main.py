@@ -7,6 +7,7 @@ same reason.
 from __future__ import annotations
 
 import io
+import json
 import logging
 import math
 import os
@@ -21,10 +22,12 @@ from typing import Any
 import click
 
 from rxcli import __version__
+from rxcli.cli.groups import PlainContext, SuggestingGroup
 from rxcli.errors import ExitCode, OutputError, ReceiverError, Terminated
 
 _COMMANDS = {
     "decode": "Texts, files and payloads of photos, clips and folders.",
+    "serve": "A page for photos from a phone and for a live camera.",
     "live": "Texts, files and payloads of a V4L2 camera.",
     "encode": "What a screen must send: a text or a file as labels.",
     "inspect": "Pictures of every stage for one photo.",
@@ -51,11 +54,26 @@ _VERBOSE = click.Option(
 )
 
 
+def _set_log_json(_context: click.Context, _parameter: click.Parameter, as_json: bool) -> None:
+    if as_json:
+        _StderrHandler.as_json = True
+
+
+_LOG_JSON = click.Option(
+    ["--log-json"],
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_set_log_json,
+    help="Write logs and errors to stderr as JSON, one object a line.",
+)
+
+
 class _PipeClosedError(Exception):
     """The reader of our output has gone."""
 
 
-class _LazyGroup(click.Group):
+class _LazyGroup(SuggestingGroup):
     """A group whose commands are modules of `rxcli.cli`, imported when they are run."""
 
     def list_commands(self, _context: click.Context) -> list[str]:
@@ -66,8 +84,9 @@ class _LazyGroup(click.Group):
             return None
         command = getattr(import_module(f"rxcli.cli.{name}"), name)
         assert isinstance(command, click.Command)
+        command.context_class = PlainContext
         if _VERBOSE not in command.params:
-            command.params.append(_VERBOSE)
+            command.params += [_VERBOSE, _LOG_JSON]
             _take_finite_numbers_only(command)
         return command
 
@@ -107,17 +126,24 @@ def _finite_then(callback: Callable[..., Any] | None) -> Callable[..., Any]:
 @click.group(
     name="vlc-rx",
     cls=_LazyGroup,
-    params=[_VERBOSE],
+    params=[_VERBOSE, _LOG_JSON],
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
 )
 @click.version_option(__version__, prog_name="vlc-rx", message="%(prog)s %(version)s")
-def cli() -> None:
+@click.pass_context
+def cli(context: click.Context) -> None:
     """Receive data that the mini-LED backlight of a display sends to rolling-shutter cameras.
+
+    Try it: vlc-rx decode photo.jpg, or vlc-rx inspect photo.jpg for a page that shows what was seen, or vlc-rx serve
+    for photos from a phone.
 
     stdout carries data only; logs and progress go to stderr. Exit codes: 0 every input gave a packet, 1 some input gave
     none, 2 bad usage or profile, 3 an input could not be read or an output could not be written, 130 interrupted, 143
     terminated.
     """
+    from rxcli.cli.config import option_defaults
+
+    context.default_map = option_defaults(list(_COMMANDS))
 
 
 def main() -> None:
@@ -154,8 +180,12 @@ class _ClosedStream(io.TextIOBase):
 def run(arguments: Sequence[str]) -> int:
     """Run `vlc-rx` with `arguments`; errors become one line on stderr. Returns the exit code."""
     _log_to_stderr()
+    color = False if os.environ.get("NO_COLOR") else None  # https://no-color.org
     try:
-        code = cli.main(args=list(arguments), prog_name="vlc-rx", standalone_mode=False)
+        code = cli.main(args=list(arguments), prog_name="vlc-rx", standalone_mode=False, color=color)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.ctx.get_help())
+        return ExitCode.OK
     except click.ClickException as error:
         return _say_usage(error)
     except (click.Abort, KeyboardInterrupt):
@@ -183,6 +213,7 @@ def run(arguments: Sequence[str]) -> int:
 def _log_to_stderr() -> None:
     log = logging.getLogger("rxcli")
     log.setLevel(logging.WARNING)
+    _StderrHandler.as_json = False
     if not log.handlers:
         log.addHandler(_StderrHandler())
 
@@ -190,17 +221,31 @@ def _log_to_stderr() -> None:
 class _StderrHandler(logging.Handler):
     """Writes to what stderr is at the time, around a progress bar if there is one."""
 
+    #: One JSON object a line, where `--log-json` asks for it.
+    as_json = False
+
     def __init__(self) -> None:
         super().__init__()
         self.setFormatter(logging.Formatter("vlc-rx: %(levelname)s: %(message)s"))
 
     def emit(self, record: logging.LogRecord) -> None:
         with suppress(OSError):  # nobody hears that nobody hears
-            click.echo(self.format(record), err=True)
+            click.echo(_json_line(record) if self.as_json else self.format(record), err=True)
+
+
+def _json_line(record: logging.LogRecord) -> str:
+    """Time (Unix seconds), level, message, and a traceback where there is one."""
+    line = {"time": round(record.created, 3), "level": record.levelname.lower(), "message": record.getMessage()}
+    if record.exc_info:
+        line["traceback"] = logging.Formatter().formatException(record.exc_info)
+    return json.dumps(line)
 
 
 def _say(message: str) -> None:
-    """One line on stderr, if it can be written."""
+    """One line on stderr, for people or as JSON, if it can be written."""
+    if _StderrHandler.as_json:
+        logging.getLogger("rxcli").error("%s", message)
+        return
     with suppress(OSError):
         click.echo(f"vlc-rx: {message}", err=True)
 

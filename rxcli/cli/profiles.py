@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import claim_outputs, force_argument, json_output, write_json
+from rxcli.cli.common import (
+    claim_outputs,
+    complete_cameras,
+    complete_files,
+    force_argument,
+    json_output,
+    write_json,
+)
+from rxcli.cli.groups import SuggestingGroup
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
@@ -19,12 +28,13 @@ _CAMERAS = click.option(
     "--camera",
     "cameras",
     multiple=True,
+    shell_complete=complete_cameras,
     metavar="NAME|FILE",
-    help="Cameras to choose from; may be given several times. [default: all shipped ones]",
+    help="Cameras to choose from; may be given several times. [default: all that are known]",
 )
 
 
-@click.group(invoke_without_command=True)
+@click.group(cls=SuggestingGroup, invoke_without_command=True)
 @click.pass_context
 def profiles(context: click.Context) -> None:
     """Screen and camera profiles: list, show, validate, and which one a file would get."""
@@ -36,22 +46,37 @@ def profiles(context: click.Context) -> None:
 @_JSON
 @force_argument
 def list_profiles(json_path: str | None, force: bool) -> None:
-    """List the shipped profiles."""
+    """List the profiles that go by their names: the user's own and the shipped ones."""
     claim_outputs([json_output(json_path, "screens", "cameras")], force=force)
-    from rxcli.profiles import CameraProfile, ScreenProfile, shipped_profiles
+    from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles
+    from rxcli.resources import user_dir
 
-    screens, cameras = shipped_profiles(ScreenProfile), shipped_profiles(CameraProfile)
+    screens, cameras = known_profiles(ScreenProfile), known_profiles(CameraProfile)
     if json_path is not None:
-        write_json({"screens": [_builtins(s) for s in screens], "cameras": [_builtins(c) for c in cameras]}, json_path)
+        write_json(
+            {"screens": [_listed(*known) for known in screens], "cameras": [_listed(*known) for known in cameras]},
+            json_path,
+        )
     if json_path == "-":
         return
-    for screen in screens:
-        click.echo(
-            f"screen  {screen.name:<16} {screen.columns} columns, {screen.slot_rate_hz:g} Hz  {screen.description}"
-        )
-    for camera in cameras:
+    for screen, origin, _ in screens:
+        about = f"{screen.columns} columns, {screen.slot_rate_hz:g} Hz"
+        _say_profile("screen", screen.name, origin, about, screen.description)
+    for camera, origin, _ in cameras:
         modes = ", ".join(f"{mode.name} {mode.width}x{mode.height}" for mode in camera.modes) or "no readout modes"
-        click.echo(f"camera  {camera.name:<16} {modes}{'; lens' if camera.lens else ''}  {camera.description}")
+        _say_profile("camera", camera.name, origin, modes + ("; lens" if camera.lens else ""), camera.description)
+    click.echo(f"\nuser profiles lie in {user_dir()} (cameras/, screens/); `profiles show NAME` prints one")
+
+
+def _say_profile(kind: str, name: str, origin: str, about: str, description: str) -> None:
+    from rxcli.cli.terminal import for_terminal
+
+    line = f"{kind}  {name:<16} {origin:<8} {about}" + (f"; {description}" if description else "")
+    click.echo(for_terminal(line, sys.stdout))
+
+
+def _listed(profile: ScreenProfile | CameraProfile, origin: str, path: Path) -> Any:
+    return {**_builtins(profile), "origin": origin, "path": str(path)}
 
 
 @profiles.command()
@@ -59,7 +84,7 @@ def list_profiles(json_path: str | None, force: bool) -> None:
 @_JSON
 @force_argument
 def show(name: str, json_path: str | None, force: bool) -> None:
-    """Show the profile NAME, a shipped one or a TOML file."""
+    """Show the profile NAME, one that is known or a TOML file."""
     claim_outputs([json_output(json_path, "format", "kind", "name")], profiles=(name,), force=force)
     from rxcli.profiles import dump_profile, load_profile
 
@@ -73,11 +98,11 @@ def show(name: str, json_path: str | None, force: bool) -> None:
 @profiles.command()
 @click.argument("names", nargs=-1, metavar="[NAME|FILE]...")
 def validate(names: tuple[str, ...]) -> int:
-    """Check profiles: those named, or all shipped ones. Exit code 2 where one is wrong."""
+    """Check profiles: those named, or all that are known. Exit code 2 where one is wrong."""
     from rxcli.profiles import load_profile
 
     codes = []
-    for name in names or _shipped_names():
+    for name in names or _known_names():
         try:
             profile = load_profile(name)
         except ReceiverError as error:
@@ -89,7 +114,7 @@ def validate(names: tuple[str, ...]) -> int:
 
 
 @profiles.command()
-@click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path), shell_complete=complete_files)
 @_CAMERAS
 @_JSON
 @force_argument
@@ -118,23 +143,25 @@ def _builtins(profile: ScreenProfile | CameraProfile) -> Any:
     return msgspec.to_builtins(profile)
 
 
-def _shipped_names() -> list[str]:
-    return [profile.name for profile in _shipped()]
+def _known_names() -> list[str]:
+    return [profile.name for profile in _known()]
 
 
-def _shipped() -> list[ScreenProfile | CameraProfile]:
-    from rxcli.profiles import CameraProfile, ScreenProfile, shipped_profiles
+def _known() -> list[ScreenProfile | CameraProfile]:
+    from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles
 
     found: list[ScreenProfile | CameraProfile] = []
-    found += shipped_profiles(ScreenProfile)
-    found += shipped_profiles(CameraProfile)
+    found += [profile for profile, _, _ in known_profiles(ScreenProfile)]
+    found += [profile for profile, _, _ in known_profiles(CameraProfile)]
     return found
 
 
 def _choices(cameras: tuple[str, ...]) -> list[CameraProfile]:
-    from rxcli.profiles import CameraProfile, load_profile, shipped_profiles
+    from rxcli.profiles import CameraProfile, known_profiles, load_profile
 
-    return [load_profile(name, CameraProfile) for name in cameras] or shipped_profiles(CameraProfile)
+    if cameras:
+        return [load_profile(name, CameraProfile) for name in cameras]
+    return [profile for profile, _, _ in known_profiles(CameraProfile)]
 
 
 def _first_frame(path: Path) -> Frame:

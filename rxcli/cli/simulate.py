@@ -47,7 +47,8 @@ _SCENE_OPTIONS = (
     "--format",
     "file_format",
     type=click.Choice((*_STILLS, *_CODECS)),
-    help="Format of OUT; by its suffix where not given.",
+    metavar="NAME",
+    help=f"Format of OUT, {', '.join((*_STILLS, *_CODECS))}; by its suffix where not given.",
 )
 @click.option(
     "--w", "weights", default="5", show_default=True, help="Lit slots of ten: N, a list N,N,..., or 'dimming'."

@@ -49,6 +49,10 @@ def check_file(path: Path) -> Kind | None:
     try:
         info = path.stat()
     except (FileNotFoundError, NotADirectoryError):
+        if path.parts and path.parts[0].lower() in ("http:", "https:", "ftp:", "rtsp:"):
+            address = str(path).replace(":/", "://", 1)
+            reason = f"{address}: is an address, and nothing is fetched from the network"
+            raise InputError(reason, "download it first, and name the file") from None
         raise InputError(f"{path}: no such file", "check the name") from None
     except (OSError, ValueError) as error:
         raise InputError(

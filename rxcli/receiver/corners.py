@@ -63,6 +63,19 @@ def whole_picture(frame: Frame) -> FloatArray:
     return geometry.viewer_order(corners, frame.metadata.orientation)
 
 
+def turned_pixels(frame: Frame) -> str | None:
+    """What to say of a picture whose pixels lie on their side; None where they do not. Of a clip the first is asked."""
+    from rxcli.receiver.screen.find import find_screen
+
+    turned: Any = np.ascontiguousarray(frame.pixels.T)
+    if frame.index or find_screen(turned, **levels_of(frame)).corners is None:
+        return None
+    return (
+        "the picture was turned by 90 degrees after it was taken, or taken in portrait: its stripes run downwards; use "
+        "the camera's own file, taken in landscape"
+    )
+
+
 def levels_of(frame: Frame) -> dict[str, Any]:
     """What pixel values mean, by the names of the arguments of `find_screen` and `measure_side_curvature`."""
     levels = frame.mosaic

@@ -17,7 +17,13 @@ from rxcli.options import ReceiverOptions
 from rxcli.receiver.acquisition import acquire, sample_columns
 from rxcli.receiver.cameras import known_lens
 from rxcli.receiver.context import Failure, FrameContext, Timer
-from rxcli.receiver.corners import levels_of, outside_the_picture, unreadable_orientation, whole_picture
+from rxcli.receiver.corners import (
+    levels_of,
+    outside_the_picture,
+    turned_pixels,
+    unreadable_orientation,
+    whole_picture,
+)
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.still import column_llr, initial_pass
 from rxcli.receiver.unknown_camera import likely_camera
@@ -84,12 +90,12 @@ def find_outline(frame: Frame, options: ReceiverOptions, timer: Timer) -> Outlin
     if candidates:
         return candidates[0]
     if "no_screen" in options.skip:
-        return Failure("no_screen", f"no screen found: {reason}; give its place with --corners")
+        return Failure("no_screen", f"no screen found: {turned_pixels(frame) or reason}")
     return Outline(whole_picture(frame), inferred=SIDE_NAMES, column_offset=None)
 
 
 def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> tuple[list[Outline], str]:
-    """Outlines that the screen may have, likeliest first; why there are none."""
+    """Outlines that the screen may have, likeliest first; why there are none, and what to do."""
     from rxcli.receiver.screen.columns import find_columns
     from rxcli.receiver.screen.find import find_screen
 
@@ -108,7 +114,9 @@ def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> t
         )
         found = _joined(sides, columns.numberings, screen.columns)
     orientation = frame.metadata.orientation
-    return [replace(one, corners=geometry.viewer_order(one.corners, orientation)) for one in found], sides.reason
+    return [
+        replace(one, corners=geometry.viewer_order(one.corners, orientation)) for one in found
+    ], f"{sides.reason}; {sides.advice}"
 
 
 def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: int) -> list[Outline]:

@@ -13,6 +13,7 @@ from itertools import chain
 from typing import Any
 
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
+from rxcli.profiles import ScreenProfile
 from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
 from rxcli.receiver.context import Failure, Timer
@@ -57,7 +58,15 @@ def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
 def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     """Receive one frame as a photograph."""
     timer = Timer()
-    return replace(_receive_still(frame, options, timer), timing_ms=timer.total())
+    result = _receive_still(frame, options, timer)
+    return replace(result, message=_with_tried(result, options.screens), timing_ms=timer.total())
+
+
+def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str | None:
+    """Why nothing was received, and where a single screen was tried, that it may be the wrong one."""
+    if result.status != "no_signal" or result.message is None or len(screens) != 1:
+        return result.message
+    return f"{result.message}; only the screen {screens[0].name} was tried, --screen auto tries all"
 
 
 def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:

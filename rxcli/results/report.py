@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import textwrap
 from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
 from typing import Any, TypeVar, get_args
@@ -21,8 +22,13 @@ from rxcli.types import (
 )
 
 _T = TypeVar("_T")
-#: Hex digits of a payload that a table shows.
-_SHOWN_DIGITS = 24
+#: Hex digits of a payload that a table of 80 characters shows.
+_SHOWN_DIGITS = 20
+#: What the columns of the table mean, for those who see it for the first time.
+LEGEND = (
+    "w: lit slots of ten. copies: how often the packet is in view. confidence: probability that every bit is right.\n"
+    "payload: hex. *: corrected by the auto-encoder. weak: confidence below 0.5. dark: too little light to try."
+)
 
 
 def to_record(result: FrameResult) -> dict[str, Any]:
@@ -324,7 +330,7 @@ def printable(text: str) -> str:
     return "".join(character if character.isprintable() else "�" for character in text)
 
 
-_HEADER = "      col  status     w  snr dB  confidence  copies  errors  payload"
+_HEADER = "    col  status     w  snr dB  confidence  copies  errors  payload"
 
 
 def format_frame(result: FrameResult) -> str:
@@ -360,7 +366,43 @@ def _counts(result: FrameResult) -> str:
         return "its packets end in later frames"
     with_packets = sum(bool(column.packets) for column in result.columns)
     n_packets = sum(len(column.packets) for column in result.columns)
-    return f"{n_packets} packets in {with_packets} of {len(result.columns)} columns"
+    return f"{plural(n_packets, 'packet')} in {with_packets} of {plural(len(result.columns), 'column')}"
+
+
+def result_in_words(result: FrameResult) -> str:
+    """What was done for a frame, in one line: screen, camera, time by stage, what was left out."""
+    parts = [f"{printable(result.source)} frame {result.frame}: {result.status}"]
+    if result.corners is not None:
+        parts.append("screen at " + " ".join(f"{x:.0f},{y:.0f}" for x, y in result.corners))
+    if result.line_delay_s:
+        known = result.camera_profile or "estimated"
+        parts.append(f"camera {known}: {result.line_delay_s * 1e6:.4g} us a row")
+    if result.columns:
+        parts.append(_counts(result))
+    parts += [f"{stage} {value:.0f} ms" for stage, value in result.timing_ms.items()]
+    parts += [f"left out: {name} {count}" for name, count in result.skipped.items()]
+    if result.denoiser:
+        parts.append(f"auto-encoder: {_plain(result.denoiser)}")
+    return "; ".join(parts)
+
+
+def plural(number: int, noun: str) -> str:
+    """`1 packet`, `2 packets`."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
+def wrapped(text: str, width: int) -> str:
+    """`text` with lines longer than `width` broken between words; those that follow are indented by as much and four.
+
+    Rows of tables and file names are never longer by more than one word, which is left whole.
+    """
+    lines = []
+    for line in text.split("\n"):
+        indent = " " * (len(line) - len(line.lstrip()) + 4)
+        lines += textwrap.wrap(
+            line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+        ) or [""]
+    return "\n".join(lines)
 
 
 def _is_clip(result: FrameResult) -> bool:
@@ -394,12 +436,12 @@ def _alike(column: ColumnResult) -> tuple[str, str | None] | int:
 def _empty_row(columns: list[ColumnResult]) -> str:
     first, last = columns[0].column, columns[-1].column
     span = str(first) if first == last else f"{first}-{last}"
-    return f"  {span:>7}  {columns[0].status:<9}  {columns[0].message or ''}".rstrip()
+    return f"  {span:>5}  {columns[0].status:<9}  {columns[0].message or ''}".rstrip()
 
 
 def _packet_rows(column: ColumnResult) -> Iterator[str]:
     status = column.status + ("*" if column.denoised else "")
-    lead = f"  {column.column:>7}  {status:<9}  {_cell(column.w, 'd'):>1}  {_cell(column.snr_db, '.1f'):>6}"
+    lead = f"  {column.column:>5}  {status:<9}  {_cell(column.w, 'd'):>1}  {_cell(column.snr_db, '.1f'):>6}"
     for packet in column.packets:
         yield (
             f"{lead}  {_confidence(packet.confidence):>10}  {_cell(packet.copies, '.2f'):>6}"

@@ -12,9 +12,12 @@ from typing import Any
 
 from rxcli.errors import ExitCode, UsageError, worst
 from rxcli.outputs import replacing, write_whole
-from rxcli.results.report import format_progress, format_table, printable
+from rxcli.results.report import format_progress, format_table, plural, printable
 from rxcli.results.truth import Score
 from rxcli.types import FrameResult
+
+#: Packets of less are as likely wrong as right: they are shown, but they do not make an input a success.
+MIN_CONFIDENCE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +26,10 @@ class Limits:
 
     #: Highest bit error rate, lost packets included; None: any.
     max_ber: float | None = None
-    #: Fewest packets.
+    #: Fewest packets of `SourceSummary.min_confidence`.
     min_packets: int = 1
+    #: Lowest confidence that a packet may have; None: any.
+    min_packet_confidence: float | None = None
 
 
 @dataclass(slots=True)
@@ -35,6 +40,11 @@ class SourceSummary:
     n_frames: int = 0
     n_packets: int = 0
     confidence_sum: float = 0.0
+    #: Packets below this confidence do not count for the limits.
+    min_confidence: float = MIN_CONFIDENCE
+    #: Packets that count.
+    n_sure: int = 0
+    lowest_confidence: float = math.inf
     #: Packets that were put together from several frames.
     n_combined: int = 0
     statuses: Counter[str] = field(default_factory=Counter)
@@ -50,6 +60,8 @@ class SourceSummary:
     score: Score | None = None
     #: Why truth that was asked for is not there.
     truth_problem: str | None = None
+    #: In what it is worse than an earlier run.
+    regressions: list[str] = field(default_factory=list)
 
     def add(self, result: FrameResult) -> None:
         """Count one frame."""
@@ -58,6 +70,8 @@ class SourceSummary:
         self.statuses[result.status] += 1
         self.n_packets += len(packets)
         self.confidence_sum += sum(packet.confidence for packet in packets)
+        self.n_sure += sum(packet.confidence >= self.min_confidence for packet in packets)
+        self.lowest_confidence = min((packet.confidence for packet in packets), default=self.lowest_confidence)
         self.n_combined += sum(packet.frames is not None and len(packet.frames) > 1 for packet in packets)
         total = result.timing_ms.get("total", math.nan)
         self.time_ms += total if math.isfinite(total) else 0.0
@@ -89,14 +103,25 @@ class SourceSummary:
             found.append((ExitCode.UNREADABLE, self.reason))
         elif not self.n_packets and not self.n_messages and not self.n_objects:
             found.append((ExitCode.NOT_RECEIVED, f"no packet: {self.reason}" if self.reason else "no packet"))
-        elif self.n_packets < limits.min_packets:
-            found.append((ExitCode.NOT_RECEIVED, f"{self.n_packets} packets, {limits.min_packets} were asked for"))
-        found += [(ExitCode.NOT_RECEIVED, problem) for problem in self.unwritten]
+        elif self.n_sure < limits.min_packets:
+            found.append((ExitCode.NOT_RECEIVED, self._too_few(limits.min_packets)))
+        if limits.min_packet_confidence is not None and self.lowest_confidence < limits.min_packet_confidence:
+            reason = (
+                f"a packet has a confidence of {self.lowest_confidence:.4g}, below {limits.min_packet_confidence:g}"
+            )
+            found.append((ExitCode.NOT_RECEIVED, reason))
+        found += [(ExitCode.NOT_RECEIVED, problem) for problem in (*self.regressions, *self.unwritten)]
         if self.truth_problem:
             found.append((ExitCode.UNREADABLE, self.truth_problem))
         if limits.max_ber is not None:
             found += self._ber_failures(limits.max_ber)
         return found
+
+    def _too_few(self, asked: int) -> str:
+        of_them = (
+            "" if self.n_sure == self.n_packets else f", {self.n_sure} of confidence {self.min_confidence:g} or more"
+        )
+        return f"{plural(self.n_packets, 'packet')}{of_them}; {asked} {'was' if asked == 1 else 'were'} asked for"
 
     def _ber_failures(self, max_ber: float) -> list[tuple[ExitCode, str]]:
         if self.score is None or self.score.ber is None:
@@ -141,7 +166,10 @@ def total(summaries: Sequence[SourceSummary]) -> SourceSummary:
     """All sources as one, named "total"; scored over those of which the truth is known."""
     whole = SourceSummary("total")
     for summary in summaries:
-        for name in ("n_frames", "n_packets", "confidence_sum", "n_combined", "time_ms", "n_messages", "n_objects"):
+        for name in (
+            *("n_frames", "n_packets", "n_sure", "confidence_sum", "n_combined", "time_ms"),
+            *("n_messages", "n_objects"),
+        ):
             setattr(whole, name, getattr(whole, name) + getattr(summary, name))
         whole.statuses.update(summary.statuses)
         whole.reasons.update(summary.reasons)
@@ -165,7 +193,7 @@ def format_summary(summaries: Sequence[SourceSummary], limits: Limits) -> str:
     if len(summaries) > 1:
         whole = total(summaries).row(Limits())
         failed = sum(row["exit_code"] != 0 for row in rows)
-        ending = f"{failed} of {len(rows)} failed" if failed else f"{len(rows)} without failure"
+        ending = f"{failed} of {len(rows)} failed" if failed else "all received"
         cells.append([_text(whole[name]) for name in names] + [ending])
     return format_table([name.replace("_", "-") for name in names] + [""], cells)
 
@@ -250,9 +278,12 @@ def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) 
     for summary in summaries:
         seconds = f"{summary.time_ms / 1e3:.3f}"
         case = ElementTree.SubElement(suite, "testcase", classname="decode", name=_xml(summary.source), time=seconds)
-        for code, reason in summary.failures(limits):
+        failures = summary.failures(limits)
+        if failures:  # one a case, as the readers of these files expect it: the worst, with all reasons
+            code = worst([code for code, _ in failures])
             kind = "error" if code is ExitCode.UNREADABLE else "failure"
-            ElementTree.SubElement(case, kind, message=_xml(reason), type=code.name.lower())
+            reasons = "; ".join(dict.fromkeys(reason for _, reason in failures))
+            ElementTree.SubElement(case, kind, message=_xml(reasons), type=code.name.lower())
         n_errors += case.find("error") is not None
         n_failures += case.find("error") is None and case.find("failure") is not None
     suite.set("errors", str(n_errors))

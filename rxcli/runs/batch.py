@@ -36,6 +36,8 @@ Decoded = tuple["Source", Iterator[FrameResult]]
 
 #: What these signals mean is decided by the first process; they often come to all at once.
 _FIRST_DECIDES = (signal.SIGINT, signal.SIGTERM)
+#: A folder with a file of this name holds what a command has written, and nothing to decode.
+OUTPUT_MARKER = ".vlc-rx-output"
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
 _AHEAD = 32
 _THREAD_VARIABLES = (
@@ -109,6 +111,9 @@ def _sources_of(path: str, suffixes: frozenset[str]) -> Iterator[Source]:
 def _walk(folder: str) -> Iterator[str]:
     for parent, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
+        if OUTPUT_MARKER in files:  # what `inspect` has written
+            folders.clear()
+            continue
         yield from (os.path.join(parent, name) for name in sorted(files) if not name.startswith("."))
 
 

@@ -17,6 +17,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import cv2
+import numpy as np
 import pytest
 from small_frames import N_COLUMNS, W, write_frame, write_profiles
 
@@ -111,6 +112,102 @@ def test_limits_for_continuous_integration(tmp_path: Path, decode: Decode) -> No
     assert f"bit error rate {1 / (35 * N_COLUMNS):.3g} is above 0.001" in out
     [[case]] = ElementTree.parse(tmp_path / "j.xml").getroot()
     assert case.find("failure") is not None
+
+
+def test_packets_below_the_asked_confidence_do_not_count_and_are_told(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    path = tmp_path / "a.png"
+    code, out, _ = decode(path, "--json", "-")
+    sure = [column["packets"][0]["confidence"] for column in json.loads(out)["columns"]]
+    assert code == 0
+    least = (min(sure) + max(sure)) / 2
+    n_sure = sum(value >= least for value in sure)
+    assert 0 < n_sure < N_COLUMNS
+    code, out, _ = decode(path, "--min-confidence", least)
+    assert code == 0
+    assert f"{n_sure} packet" in out
+    assert f"below --min-confidence {least:g}" in out
+    assert "uncertain" not in out
+    assert decode(path, "--min-confidence", least, "--min-packets", n_sure + 1)[0] == 1
+    code, out, _ = decode(path, "--min-packet-confidence", least)
+    assert code == 1
+    assert f"a packet has a confidence of {min(sure):.4g}, below {least:g}" in out
+
+
+def test_a_case_has_one_failure_with_all_reasons(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    decode(tmp_path / "a.png", "--min-packets", 99, "--min-packet-confidence", 1, "--junit", tmp_path / "j.xml")
+    [[case]] = ElementTree.parse(tmp_path / "j.xml").getroot()
+    [failure] = case
+    assert "99 were asked for; a packet has a confidence of" in failure.get("message", "")
+
+
+def test_a_run_is_held_against_an_earlier_one(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    base = tmp_path / "base.jsonl"
+    assert decode(tmp_path / "a.png", "--json", base)[0] == 0
+    assert decode(tmp_path / "a.png", "--baseline", base, "--slower", 1000)[0] == 0
+    lines = base.read_text()
+    other = lines.replace(json.loads(lines)["columns"][3]["packets"][0]["payload"], "00" * 5)
+    base.write_text(other)
+    code, out, _ = decode(tmp_path / "a.png", "--baseline", base, "--slower", 1000)
+    assert code == 1
+    assert "1 packet of the baseline lost (column 3)" in out
+    record = json.loads(lines)
+    record["timing_ms"] = {"total": 1e-3}
+    base.write_text(json.dumps(record) + "\n")
+    code, out, _ = decode(tmp_path / "a.png", "--baseline", base)
+    assert code == (1 if "times the baseline's" in out else 0)
+    record["timing_ms"] = {"total": -1e9}
+    base.write_text(json.dumps(record) + "\n")
+    assert decode(tmp_path / "a.png", "--baseline", base)[0] == 1
+    base.write_text("{}\n")
+    code, _, err = decode(tmp_path / "a.png", "--baseline", base)
+    assert code == 2
+    assert "base.jsonl line 1: no result of `vlc-rx decode --json`" in err
+
+
+def test_a_legend_stands_under_the_tables(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    assert decode(tmp_path / "a.png")[1].count("w: lit slots of ten") == 1
+    (tmp_path / "b.png").write_bytes(b"")
+    assert "lit slots of ten" not in decode(tmp_path / "b.png")[1]
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: np.zeros((600, 800), np.uint8), "is black; expose longer"),
+        (lambda: np.full((600, 800), 255, np.uint8), "is saturated; expose shorter"),
+        (lambda: np.zeros((60, 80), np.uint8), "use the picture in its full size"),
+        (lambda: np.random.default_rng(1).integers(90, 99, (600, 800), np.uint8), "photograph a screen that sends"),
+    ],
+)
+def test_advice_is_by_what_was_seen(make: Any, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), make())
+    assert run(["decode", str(tmp_path / "a.png")]) == 1
+    said = capsys.readouterr().out
+    assert told in said
+    assert "--corners" not in said
+
+
+def test_advice_for_a_picture_turned_on_its_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sample = Path(__file__).resolve().parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
+    cv2.imwrite(str(tmp_path / "a.png"), np.rot90(cv2.imread(str(sample), cv2.IMREAD_GRAYSCALE)))
+    assert run(["decode", str(tmp_path / "a.png")]) == 1
+    assert "was turned by 90 degrees" in capsys.readouterr().out
+
+
+def test_advice_where_the_wrong_screen_was_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    samples = Path(__file__).resolve().parents[2] / "sample_frames"
+    named = ["--screen", "paper-34k6", "--camera", str(samples / "xs10-small.toml")]
+    assert run(["decode", str(samples / "xtrans_sky_17k3.dng"), *named]) == 1
+    assert "only the screen paper-34k6 was tried, --screen auto tries all" in capsys.readouterr().out
+
+
+def test_an_address_is_not_fetched(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["decode", "http://a.b/c.jpg"]) == 3
+    assert "is an address, and nothing is fetched" in capsys.readouterr().out
 
 
 def test_a_broken_truth_file_is_told_and_the_packets_are_still_there(tmp_path: Path, decode: Decode) -> None:

@@ -1,50 +1,114 @@
-"""`vlc-rx inspect`: pictures of every stage, and what they are drawn from."""
+"""`vlc-rx inspect`: the page, and what is drawn on it."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from small_frames import BOTTOM, N_COLUMNS, ROWS_PER_SLOT, TOP, W, write_frame, write_profiles
 
 from rxcli.cli.common import receiver_options
 from rxcli.cli.main import run
 from rxcli.ingest import open_source
 from rxcli.receiver.pipeline import receive
-from rxcli.results import plots
+from rxcli.results.inspection import inspect_frame
+from rxcli.results.overlay import camera_of
 from rxcli.results.plots import column_light, decided_slots
+from rxcli.runs.batch import collect_sources
 
 SAMPLE = Path(__file__).parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
 
-pytest.importorskip("matplotlib", reason="matplotlib is not installed (extra plot)")
 
-
-def test_pictures_and_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     payloads = write_frame(tmp_path / "a<b>.png", 1)
-    out = tmp_path / "pictures"
+    out = tmp_path / "page"
     code = run(["inspect", str(tmp_path / "a<b>.png"), "--out", str(out), "--truth", "auto", *write_profiles(tmp_path)])
     assert code == 0
     assert capsys.readouterr().out == f"{out / 'index.html'}\n"
-    names = {path.name for path in out.iterdir()}
-    assert names == {"index.html", "photo.png", "confidence.png", f"profiles-000-{N_COLUMNS - 1:03}.png"}
     page = (out / "index.html").read_text()
+    assert {path.name for path in out.iterdir()} == {"index.html", ".vlc-rx-output"}
     assert "a&lt;b&gt;.png" in page
-    assert all(f'src="{name}"' in page for name in names - {"index.html"})
-    assert payloads[0] in page
+    assert "<b>" not in page
+    assert not re.search(r'(src|href)="(?!data:)', page)
+    assert all(payload in page for payload in payloads)
+    assert page.count('<polygon class="ok"') == N_COLUMNS
+    titles = ["The picture", "Packets", "Light and slots", "How clear slots are", "Is the clock right?"]
+    titles += ["Light of neighbours", "Confidence", "Auto-encoder", "Time"]
+    for title in titles:
+        assert f"<h2>{title}</h2>" in page
+    drawings = re.findall(r"<svg[^>]*>", page)
+    assert all("aria-label=" in drawing or "aria-hidden" in drawing for drawing in drawings)
+    assert all("alt=" in image for image in re.findall(r"<img[^>]*>", page))
 
 
-def test_a_picture_without_a_signal_is_still_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_writes_beside_no_photo_and_is_passed_over_by_runs_over_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "here").mkdir()
+    write_frame(tmp_path / "photos" / "a$ b.png", 1)
+    monkeypatch.chdir(tmp_path / "here")
+    assert run(["inspect", str(tmp_path / "photos" / "a$ b.png"), *write_profiles(tmp_path)]) == 0
+    assert capsys.readouterr().out == "inspect-a_b.png/index.html\n"
+    assert {path.name for path in (tmp_path / "photos").iterdir()} == {"a$ b.png", "a$ b.truth.json"}
+    write_frame(tmp_path / "here" / "inspect-a_b.png" / "copy.png", 1)
+    assert not [
+        source for source in collect_sources([str(tmp_path / "here")], frozenset({".png"})) if not source.problem
+    ]
+
+
+def test_it_never_overwrites_what_others_wrote(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "index.html").write_text("<p>mine</p>")
+    command = ["inspect", str(tmp_path / "a.png"), "--out", str(tmp_path / "out"), *write_profiles(tmp_path)]
+    assert run(command) == 2
+    assert (tmp_path / "out" / "index.html").read_text() == "<p>mine</p>"
+    assert run([*command, "--force"]) == 0
+    assert run(command) == 0  # its own page may be replaced
+
+
+def test_a_failure_says_how_far_it_came_and_the_next_step(tmp_path: Path) -> None:
     import cv2
 
-    noise = np.random.default_rng(1).integers(0, 255, (620, 340), dtype=np.uint8)
-    cv2.imwrite(str(tmp_path / "noise.png"), noise)
-    assert run(["inspect", str(tmp_path / "noise.png"), *write_profiles(tmp_path)]) == 1
-    folder = tmp_path / "noise.png.inspect"
-    assert (folder / "photo.png").stat().st_size > 10_000
-    assert "no_signal" in (folder / "index.html").read_text()
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((620, 840), np.uint8))
+    assert run(["inspect", str(tmp_path / "black.png"), "--out", str(tmp_path / "page")]) == 1
+    page = (tmp_path / "page" / "index.html").read_text()
+    assert "<h2>No screen found</h2>" in page
+    assert '<li class="failed"><span aria-hidden="true">✗</span> screen found' in page
+    assert "Expose longer, raise ISO" in page
+
+
+def test_a_clip_has_a_timeline(tmp_path: Path) -> None:
+    samples = SAMPLE.parent
+    profile = str(samples / "video1080.toml")
+    clip = str(samples / "video1080_chelsea_17k3.mp4")
+    assert run(["inspect", clip, "--camera", profile, "--out", str(tmp_path)]) == 0
+    page = (tmp_path / "index.html").read_text()
+    assert "<h2>The clip</h2>" in page
+    assert "24 frames, 360 packets, 0 frames without reception." in page
+
+
+def test_what_is_measured_agrees_with_what_was_sent(tmp_path: Path) -> None:
+    """Small frames have no crosstalk, an even picture and the clock of their profile."""
+    write_frame(tmp_path / "a.png", 3)
+    names = write_profiles(tmp_path)
+    corners = [tuple(float(part) for part in text.split(",")) for text in names[5:]]
+    options = receiver_options(screens=(names[1],), cameras=(names[3],), corners=tuple(corners))
+    [frame] = open_source(tmp_path / "a.png")
+    [result] = receive([frame], options)
+    known = inspect_frame(frame, result, options.screens[0], options.cameras[0])
+    assert known is not None
+    assert known.rows_per_slot == pytest.approx(ROWS_PER_SLOT)
+    np.testing.assert_allclose(known.crosstalk[:, 1], 1, atol=0.1)
+    assert np.nanmax(np.abs(known.crosstalk[:, [0, 2]])) < 0.1
+    late = np.concatenate([trace.residuals[:, 1] for trace in known.traces if trace.residuals is not None])
+    assert late.size >= N_COLUMNS
+    assert np.abs(late).max() < 0.15
+    dark, lit = known.histogram
+    assert dark[20:].sum() == lit[:20].sum() == 0
 
 
 @pytest.mark.parametrize(
@@ -52,7 +116,7 @@ def test_a_picture_without_a_signal_is_still_shown(tmp_path: Path, capsys: pytes
     [
         (["missing.png"], 3, "missing.png"),
         (["a.png", "--frame", "1"], 3, "has no frame 1; choose a lower --frame"),
-        (["a.png", "--out", "/dev/null/x"], 3, "/dev/null/x: cannot be written (Not a directory)"),
+        (["a.png", "--out", "/dev/null/x"], 2, "--out /dev/null/x/index.html: cannot be looked at (Not a directory)"),
         (["a.png", "--truth", "none.json"], 3, "none.json: cannot be read as truth"),
     ],
 )
@@ -97,30 +161,20 @@ def test_the_shaded_slots_are_where_the_light_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_slots_of_an_unknown_camera_are_shaded_along_bent_stripes(
-    turned: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_slots_of_an_unknown_camera_lie_along_bent_stripes(turned: bool, tmp_path: Path) -> None:
     import cv2
 
-    seen: list[tuple[Any, ...]] = []
-    figure, drawn = plots.new_figure(1, 1), plots.profile_figure
-    monkeypatch.setattr(plots, "profile_figure", lambda *arguments: seen.append(arguments) or figure)
     stored = cv2.imread(str(SAMPLE), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(tmp_path / "phone.png"), stored[::-1, ::-1] if turned else stored)
-    assert run(["inspect", str(tmp_path / "phone.png"), "--screen", "paper-17k3"]) == 0
-    [(profiles, result, columns, screen)] = seen
+    options = receiver_options(screens=("paper-17k3",))
+    [frame] = open_source(tmp_path / "phone.png")
+    [result] = receive([frame], options)
     assert result.camera_profile is None
-    shaded: list[tuple[float, NDArray[np.uint8]]] = []
-    monkeypatch.setattr(plots, "_shade", lambda axes, start, rows_per_slot, slots: shaded.append((start, slots)))
-    rows_per_slot = 1 / (screen.slot_rate_hz * result.line_delay_s)
+    known = inspect_frame(frame, result, options.screens[0], camera_of(frame, result, options.cameras))
+    assert known is not None
     agreement = []
-    for column in columns:
-        rows, light = column_light(profiles, column.column)
-        drawn(profiles, result, (column,), screen)
-        for start, slots in shaded:
-            number = np.floor((rows - start) / rows_per_slot).astype(int)
-            shown = (number >= 0) & (number < slots.size)
-            agreement.append(np.corrcoef(light[shown], slots[number[shown]])[0, 1])
-        shaded.clear()
+    for trace in known.traces:
+        good = np.isfinite(trace.relative) & np.isfinite(trace.share)
+        agreement.append(np.corrcoef(trace.light[good], trace.share[good])[0, 1])
     assert len(agreement) >= 18
     assert np.median(agreement) > 0.7

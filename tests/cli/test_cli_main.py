@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 from rxcli import __version__
 from rxcli.cli import main as cli_main
 from rxcli.cli.main import run
+from rxcli.cli.terminal import coloured
 from rxcli.errors import InputError
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
@@ -51,7 +53,9 @@ def test_help_loads_nothing_heavy() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nonsense"], "No such command 'nonsense'; see `vlc-rx --help`"),
+        (["nonsense"], "no command 'nonsense'; there are decode"),
+        (["decoed"], "no command 'decoed'; did you mean 'decode'?; see `vlc-rx --help`"),
+        (["calibrate", "lense"], "no command 'lense'; did you mean 'lens'?; see `vlc-rx calibrate --help`"),
         (["decode"], "Missing argument 'PATH...'; see `vlc-rx decode --help`"),
         (["decode", "a", "--max-ber", "2"], "Invalid value for '--max-ber'"),
         (["decode", "a", "--nonsense"], "No such option"),
@@ -81,6 +85,77 @@ def test_wrong_usage_is_one_line_and_exit_code_2(
     assert captured.err.startswith("vlc-rx: ")
     assert message in captured.err
     assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [[], ["calibrate"]])
+def test_bare_groups_show_help_and_are_no_error(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(arguments) == 0
+    captured = capsys.readouterr()
+    assert "Commands:" in captured.out
+    assert captured.err == ""
+
+
+def test_help_breaks_no_words_at_80_characters(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    group = cli_main.cli
+    for name in group.list_commands(click.Context(group)):
+        run([name, "--help"])
+        lines = capsys.readouterr().out.splitlines()
+        assert max(map(len, lines)) <= 80, name
+        assert not [line for line in lines if line.endswith("-") and line[-2:-1].isalpha()], name
+        assert not any("\u2011" in line for line in lines)
+
+
+def test_logs_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["decode", "a", "--resume", "--log-json"]) == 2
+    line = json.loads(capsys.readouterr().err)
+    assert line["level"] == "error"
+    assert line["message"].startswith("--resume needs the file")
+    assert run(["decode", "a", "--resume"]) == 2
+    assert capsys.readouterr().err.startswith("vlc-rx: --resume")  # the next run logs as before
+
+
+def test_defaults_from_the_environment_and_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command line before the environment before the file."""
+    monkeypatch.setenv("VLC_RX_HOME", str(tmp_path))
+    (tmp_path / "config.toml").write_text('camera = "from-file"\n')
+    picture = ["decode", str(tmp_path / "no.jpg"), "--quiet"]
+    assert run(picture) == 2
+    assert "no profile 'from-file' among cameras" in capsys.readouterr().err
+    monkeypatch.setenv("VLC_RX_CAMERA", "from-env")
+    assert run(picture) == 2
+    assert "no profile 'from-env' among cameras" in capsys.readouterr().err
+    assert run([*picture, "--camera", "xs10"]) == 3
+    (tmp_path / "config.toml").write_text('kamera = "x"\n')
+    assert run(picture) == 2
+    assert "config.toml: unknown key 'kamera'; known are screen, camera, workers" in capsys.readouterr().err
+    (tmp_path / "config.toml").write_text('workers = "x"\n')
+    assert run(picture) == 2
+    assert "workers has a value of the wrong kind ('x')" in capsys.readouterr().err
+
+
+def test_completion_names_profiles_and_files(tmp_path: Path) -> None:
+    def complete(line: str) -> str:
+        told = {"_VLC_RX_COMPLETE": "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(len(line.split()) - 1)}
+        code = "import sys; sys.argv[0] = 'vlc-rx'; from rxcli.cli.main import main; main()"
+        command = [sys.executable, "-c", code]
+        return subprocess.run(command, env=ENVIRONMENT | told, capture_output=True, text=True, check=False).stdout
+
+    assert "plain,paper-17k3" in complete("vlc-rx decode --screen paper-1")
+    assert "plain,xs10" in complete("vlc-rx decode --camera x")
+    assert complete("vlc-rx decode a").startswith("file,")
+
+
+def test_states_have_colours_on_a_terminal_alone() -> None:
+    text = "a.jpg | partial | 3 packets\n    col  status     w\n      0  ok*        5\n    1-3  dark       none"
+    shown = coloured(text)
+    assert click.unstyle(shown) == text
+    assert shown.count("\x1b[0m") == 3
+    assert coloured(text, plain=True) == text
 
 
 def with_command(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import pty
 import shutil
 import signal
 import subprocess
 import sys
+import termios
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +27,7 @@ from rxcli.errors import ExitCode, InputError
 from rxcli.ingest import open_source
 from rxcli.ingest.v4l2 import Camera, CameraCounts, CameraLost, CameraSettings, LiveSource
 from rxcli.profiles import ScreenProfile, dump_profile, load_profile
-from rxcli.types import ColumnResult, FrameResult, PacketResult
+from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
 
 FAKE = Path(__file__).parents[1] / "fake_v4l2"
 SYSTEM_PYTHON = "/usr/bin/python3"
@@ -306,12 +310,54 @@ class TestStatus:
             for _ in range(5):
                 status.update(result("partial", 10))
         line = capsys.readouterr().err.splitlines()[-1]
-        expected = "LOCKED    | columns 15/20 | 4.0 frames/s | 4.0 kb/s | BER about 1.0e-02 | dropped 7 | damaged 2"
-        assert line == expected
+        expected = "LOCKED | columns 15/20 | 4.0 frames/s | 40 packets/s | 4.0 kb/s | BER about 1.0e-02 | "
+        assert line == expected + "dropped 7 | damaged 2"
         assert status.n_packets == 50
 
-    def test_loss_of_lock_shows_at_once(self, tmp_path: Path) -> None:
-        status = Status(LiveSource(tmp_path), quiet=True)
+    def test_loss_of_lock_shows_at_once_with_reason_and_next_step(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        status = Status(LiveSource(tmp_path))
         status.update(result("ok", 20))
-        status.update(FrameResult("/dev/video0", 1, 0.1, "no_screen"))
-        assert format_status(list(status._recent), CameraCounts()).startswith("no screen | columns 0/0")
+        lost = FrameResult("/dev/video0", 1, 0.1, "no_screen", "no screen found: it is black; expose longer")
+        status.update(lost)
+        line = capsys.readouterr().err.splitlines()[-1]
+        assert line.startswith("no screen | columns 0/0")
+        assert line.endswith("No screen found: it is black. Expose longer.")
+
+    def test_light_and_height_are_told(self, tmp_path: Path) -> None:
+        status = Status(LiveSource(tmp_path), quiet=True)
+        frame = Frame(np.full((100, 200), 255, np.uint8), "/dev/video0")
+        corners = np.array([[0, 20], [99, 20], [99, 50], [0, 50]], np.float64)
+        for _ in status.watched([frame]):
+            status.update(replace(result("ok", 20), corners=corners))
+        assert status.state is not None
+        assert format_status(status.state, CameraCounts())[1].startswith("light overexposed | screen fills 30 % of the")
+
+    def test_on_a_terminal_a_block_stays_in_place(self, tmp_path: Path) -> None:
+        """Three lines that are written over, payloads above them; not a line for every frame."""
+        code = (
+            "import sys, time; from pathlib import Path; sys.path.insert(0, sys.argv[1]);"
+            "from test_live import result, LiveSource, Status; from rxcli.cli.live import _print_above\n"
+            "with Status(LiveSource(Path('x'))) as status:\n"
+            "    for _ in range(4):\n"
+            "        _print_above('payload'); status.update(result('ok', 20)); time.sleep(0.25)\n"
+        )
+        shown = bytearray()
+        told = environment() | {"COLUMNS": "100", "NO_COLOR": "1"}
+        leader, follower = pty.openpty()
+        termios.tcsetwinsize(follower, (24, 100))
+        path = [str(Path(__file__).parent)]
+        with subprocess.Popen(
+            [sys.executable, "-c", code, *path], stdout=follower, stderr=follower, env=told
+        ) as started:
+            os.close(follower)
+            with suppress(OSError):
+                while part := os.read(leader, 65536):
+                    shown += part
+            assert started.wait() == 0
+        os.close(leader)
+        text = shown.decode()
+        assert text.count("payload\r\n") == 4
+        assert text.count("LOCKED | columns 15/20") >= 4
+        assert "\x1b[A" in text  # goes back up instead of writing on

@@ -42,9 +42,11 @@ _CONTRADICTED = -2.0
 #: Together the columns' headers must be this much more likely than slots that are anything; one good header gives 12,
 #: and a bad one takes no more than a good one gives.
 _HEADERS_AT_LEAST, _GOOD_HEADER = 6.0, 12.0
-_HEADERLESS = (
-    "the header does not show where it should; check for overexposure, or give the screen's place with --corners"
-)
+_HEADERLESS = "no packet header shows where this screen's packets have one; "
+_OVEREXPOSED = "the column is overexposed: expose shorter"
+_OTHER_SCREEN = "the screen may be another one (--screen auto tries all), or its place wrong (--corners)"
+#: Light of white, and the share of a column's samples at which its lit slots are cut off there.
+_WHITE, _CUT_OFF = 0.98, 0.2
 _ECHO = "it shows nothing but the light of the column beside it; show a brighter picture there"
 #: Doubt that is left in the surest packet, and at most in any, nats.
 _LEAST_DOUBT = 1e-9
@@ -87,7 +89,11 @@ def column_results(
     snr_db = snr_db_of_columns(snr)
     echoing: BoolArray = np.any(echoes(posteriors, snr_db) & whole, axis=0)
     reported = whole & doubts.reported(min_confidence)
-    against = [_HEADERLESS if h else _ECHO if e else None for h, e in zip(headerless, echoing, strict=True)]
+    against = [
+        _why_headerless(samples, column) if headerless[column] else _ECHO if echo else None
+        for column, echo in enumerate(echoing)
+    ]
+    held_back = np.where(whole & (doubts.ber_hat <= MAX_BER_HAT) & ~reported, doubts.confidence, 0.0).max(axis=0)
     return tuple(
         _column_result(
             column,
@@ -98,10 +104,25 @@ def column_results(
             reported[:, column],
             doubts,
             against[column],
+            _held_back(held_back[column], min_confidence),
             bool(was_denoised[column]),
         )
         for column, db in enumerate(snr_db)
     )
+
+
+def _why_headerless(samples: SlotSamples, column: int) -> str:
+    """What may be wrong with a column that shows slots but no header, by whether its light is cut off at white."""
+    light = samples.light[column][samples.valid[column] > 0]
+    overexposed = light.size > 0 and float(np.mean(light >= _WHITE)) > _CUT_OFF
+    return _HEADERLESS + (_OVEREXPOSED if overexposed else _OTHER_SCREEN)
+
+
+def _held_back(confidence: float, min_confidence: float) -> str | None:
+    """What to say of a column whose surest packet is not sure enough to be reported; None where there is none."""
+    if not 0 < confidence < min_confidence:
+        return None
+    return f"its packet has a confidence of {confidence:.4f}, below --min-confidence {min_confidence:g}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +162,10 @@ def clip_results(
         complete(burst.n_observed[None])[0] & ~echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]
         for burst, doubt in zip(bursts, doubts, strict=True)
     ]
+    surest = [
+        complete(burst.n_observed[None])[0] & (doubt.ber_hat[0] <= MAX_BER_HAT)
+        for burst, doubt in zip(bursts, doubts, strict=True)
+    ]
     own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
     out = []
     for column in range(snr.shape[0]):
@@ -149,7 +174,14 @@ def clip_results(
             for burst, clock, doubt, shown in zip(bursts, own, doubts, reported, strict=True)
             if shown[column]
         )
-        out.append(_clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], packets))
+        held_back = max(
+            (float(doubt.confidence[0, column]) for doubt, sure in zip(doubts, surest, strict=True) if sure[column]),
+            default=0.0,
+        )
+        result = _clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], packets)
+        if not packets and result.status != "ok" and (message := _held_back(held_back, min_confidence)):
+            result = replace(result, message=message)
+        out.append(result)
     return tuple(out)
 
 
@@ -257,6 +289,7 @@ def _column_result(
     reported: BoolArray,
     doubts: _Doubts,
     against: str | None,
+    held_back: str | None,
     denoised: bool,
 ) -> ColumnResult:
     bursts = () if against else np.flatnonzero(reported)
@@ -271,7 +304,7 @@ def _column_result(
         denoised=denoised,
         delay_slots=float(clock.delay_slots[column]),
         packets=packets,
-        message=None if packets else _cut_off(n_observed) or against or _why_none(status, snr_db),
+        message=None if packets else _cut_off(n_observed) or against or held_back or _why_none(status, snr_db),
     )
 
 

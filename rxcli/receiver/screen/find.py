@@ -47,6 +47,16 @@ _CONTRADICTION, _TRUST, _SUSPICION = 6.0, 12.0, 3.0
 _MIN_SCORE = 0.25
 #: Smallest picture that is searched, pixels each way.
 _MIN_SIZE = 96
+_GIVE_CORNERS = (
+    "take the whole screen into view, straight from the front; if the picture does show a screen that sends, give its "
+    "place with --corners"
+)
+_LANDSCAPE = "hold the camera so that the long side of the picture lies along the long side of the screen"
+_NO_STRIPES = "no area with the stripes of a modulated backlight was found in the picture"
+_MAKE_STRIPES = (
+    "photograph a screen that sends, from near, with the electronic shutter and a short exposure (1/8000 s), and use "
+    "the picture in its full size"
+)
 _NO_OUTLINE = "what looks like stripes in the picture has no clear outline of a screen"
 _NO_SHAPE = "the stripes in the picture do not have the shape of a screen"
 
@@ -62,6 +72,8 @@ class ScreenSearch:
     score: float
     #: Why none was found: thing and reason. Empty where one was.
     reason: str = ""
+    #: What to do about it, by what was seen.
+    advice: str = _GIVE_CORNERS
     #: Sides (top, right, bottom, left of the stored picture) that were inferred from the others.
     inferred: tuple[str, ...] = ()
     #: Lines where stripes begin, in that order, whether or not they bound a screen; none where there are no stripes.
@@ -82,13 +94,13 @@ def find_screen(
     """
     trouble = _unusable(pixels, black, white)
     if trouble:
-        return ScreenSearch(None, 0.0, trouble)
+        return ScreenSearch(None, 0.0, *trouble)
     picture = Picture(pixels, black, white, mosaic_period)
     plane = reduce(picture)
     stripes = find_stripes(plane)
     initial = coarse_sides(plane, stripes)
     if initial is None:
-        return ScreenSearch(None, 0.0, "no area with the stripes of a modulated backlight was found in the picture")
+        return ScreenSearch(None, 0.0, _NO_STRIPES, _MAKE_STRIPES)
     size = extent(initial, plane.height)
     out = max(0.025 * size, 1.5 * plane.cell_rows * plane.fy)
     return _search(picture, plane, stripes, initial, Reach(out, max(0.09 * size, 3 * out), size), aspect)
@@ -117,7 +129,7 @@ def track_screen(
     """
     trouble = _unusable(pixels, black, white)
     if trouble:
-        return ScreenSearch(None, 0.0, trouble)
+        return ScreenSearch(None, 0.0, *trouble)
     picture = Picture(pixels, black, white, mosaic_period)
     plane = reduce(picture)
     stripes = find_stripes(plane)
@@ -126,17 +138,18 @@ def track_screen(
     return _search(picture, plane, stripes, initial, Reach(reach * size, 3 * reach * size, size), aspect)
 
 
-def _unusable(pixels: Pixels, black: float, white: float) -> str:
-    """Why a picture cannot show a screen at all; empty where it can."""
+def _unusable(pixels: Pixels, black: float, white: float) -> tuple[str, str] | None:
+    """Why a picture cannot show a screen at all, and what to do; None where it can."""
     height, width = pixels.shape
     if min(height, width) < _MIN_SIZE:
-        return f"the picture has {width} x {height} pixels, a screen needs at least {_MIN_SIZE} each way"
+        size = f"the picture has {width} x {height} pixels, a screen needs at least {_MIN_SIZE} each way"
+        return size, "use the picture in its full size, not a thumbnail or a messenger's copy"
     sample = (pixels[:: max(1, height // 64), :: max(1, width // 64)] - np.float32(black)) / (white - black)
     if np.mean(sample >= 0.004) < 0.005:
-        return "the picture is black"
+        return "the picture is black", "expose longer, raise ISO, or show a brighter picture on the screen"
     if np.mean(sample > 0.98) > 0.99:
-        return "the picture is saturated"
-    return ""
+        return "the picture is saturated", "expose shorter, or lower ISO"
+    return None
 
 
 def _search(
@@ -164,12 +177,13 @@ def _outlined(
     expected = corners_of(initial, plane.width, plane.height)
     missing = [number for number, side in enumerate(sides) if not side.support]
     if len(missing) > 1:
-        names = " and ".join(SIDE_NAMES[side] for side in missing)
-        return ScreenSearch(None, 0.0, f"stripes were found, but the {names} sides of the screen do not show")
+        names = [SIDE_NAMES[side] for side in missing]
+        listed = " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+        return ScreenSearch(None, 0.0, f"something like stripes was found, but no {listed} side of a screen")
     sides, pose = _agreed(sides, missing, expected, reach.size, rectangle)
     trouble = _implausible(corners_of(sides, plane.width, plane.height), plane, aspect)
     if trouble:
-        return ScreenSearch(None, 0.0, trouble)
+        return ScreenSearch(None, 0.0, *trouble)
     corners, support = refine(picture, sides, pose, rectangle)
     return _judged(corners, sides, support, stripes, plane, aspect)
 
@@ -179,12 +193,12 @@ def _judged(
 ) -> ScreenSearch:
     trouble = _implausible(corners, plane, aspect)
     if trouble:
-        return ScreenSearch(None, 0.0, trouble)
+        return ScreenSearch(None, 0.0, *trouble)
     score = float(np.mean([side.support for side in sides])) ** 0.5 * stripes.share_inside(corners)
     if score < _MIN_SCORE:
         return ScreenSearch(None, score, _NO_OUTLINE)
     names = tuple(SIDE_NAMES[i] for i, side in enumerate(sides) if not side.support and not support[i])
-    return ScreenSearch(from_top_left(corners), min(score, 1.0), "", names)
+    return ScreenSearch(from_top_left(corners), min(score, 1.0), inferred=names)
 
 
 def _agreed(
@@ -235,19 +249,21 @@ def _inside(side: Side, number: int, pose: FloatArray, rectangle: Rectangle) -> 
     return max(INWARD[number] * (expected.at(side.middle) - side.at(side.middle)), 0.0)
 
 
-def _implausible(corners: FloatArray, plane: Plane, aspect: float) -> str:
-    """Why four corners cannot be a screen's; empty where they can."""
+def _implausible(corners: FloatArray, plane: Plane, aspect: float) -> tuple[str, str] | None:
+    """Why four corners cannot be a screen's, and what to do; None where they can."""
     edges = np.roll(corners, -1, axis=0) - corners
     following = np.roll(edges, -1, axis=0)
     turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
     top, right, bottom, left = np.linalg.norm(edges, axis=1)
     ratio = (top + bottom) / (left + right) / aspect
     if not (turns > 0).all() or not (0.6 < top / bottom < 1.6 and 0.6 < left / right < 1.6):
-        return _NO_SHAPE
+        return _NO_SHAPE, _GIVE_CORNERS
     if 0.8 < ratio * aspect**2 < 1.25:
-        return "the screen stands upright in the picture, so its columns lie along the rows"
+        return "the screen stands upright in the picture, so its columns lie along the rows", _LANDSCAPE
     if not 0.92 < ratio < 1.09:
-        return f"the striped area is {ratio * aspect:.2f} times as wide as high, the screen {aspect:.2f} times"
+        shape = f"the striped area is {ratio * aspect:.2f} times as wide as high, the screen {aspect:.2f} times"
+        return shape, _GIVE_CORNERS
     if (left + right) / 2 < 0.12 * plane.height:
-        return f"the screen fills only {(left + right) / 2 / plane.height:.0%} of the picture's height"
-    return ""
+        fill = f"the screen fills only {(left + right) / 2 / plane.height:.0%} of the picture's height"
+        return fill, "move closer, or zoom with the lens"
+    return None

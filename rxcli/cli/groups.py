@@ -1,0 +1,57 @@
+"""Groups of commands as people meet them: help where nothing is said, a suggestion where a name is mistyped."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+
+import click
+
+#: A hyphen at which no line is broken; written as a plain one in the end, so that options can be copied.
+_UNBROKEN = "\u2011"
+
+
+class PlainFormatter(click.HelpFormatter):
+    """Help whose lines end between words, never at a hyphen inside one; headings are bold where colours are shown."""
+
+    def write_text(self, text: str) -> None:
+        super().write_text(text.replace("-", _UNBROKEN))
+
+    def write_dl(  # type: ignore[override]
+        self, rows: Sequence[tuple[str, str]], col_max: int = 30, col_spacing: int = 2
+    ) -> None:
+        super().write_dl([(name, text.replace("-", _UNBROKEN)) for name, text in rows], col_max, col_spacing)
+
+    def write_heading(self, heading: str) -> None:
+        self.write(f"{'':>{self.current_indent}}{click.style(f'{heading}:', bold=True)}\n")
+
+    def getvalue(self) -> str:
+        return super().getvalue().replace(_UNBROKEN, "-")
+
+
+class PlainContext(click.Context):
+    """A context whose help is laid out by `PlainFormatter`."""
+
+    formatter_class = PlainFormatter
+
+
+class SuggestingGroup(click.Group):
+    """A group that names the nearest command where one is mistyped, and lays out its commands' help."""
+
+    context_class = PlainContext
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        command = super().get_command(ctx, cmd_name)
+        if command is not None:
+            command.context_class = PlainContext
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        name = args[0] if args else ""
+        if args and not name.startswith("-") and self.get_command(ctx, name) is None:
+            near = difflib.get_close_matches(name, self.list_commands(ctx), n=1, cutoff=0.5)
+            hint = f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(self.list_commands(ctx))}"
+            raise click.UsageError(f"no command {name!r}{hint}", ctx)
+        return super().resolve_command(ctx, args)

@@ -1,0 +1,102 @@
+"""`vlc-rx serve`: a local page for photos from a phone, and for a live camera."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rxcli.cli.common import receiver_arguments, receiver_options
+from rxcli.cli.live import Exposure
+from rxcli.errors import ExitCode, UsageError
+
+if TYPE_CHECKING:
+    from rxcli.web.server import Site
+
+
+@click.command()
+@click.argument("device", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "--host",
+    help="Address to listen at, such as 0.0.0.0 for phones in the same network. [default: this machine alone]",
+)
+@click.option("--port", type=click.IntRange(0, 65535), default=8017, show_default=True, help="0 takes any free one.")
+@click.option("--keep", type=click.Path(file_okay=False, path_type=Path), help="Keep uploads in this folder.")
+@click.option("--max-upload", type=click.IntRange(1, 4096), default=96, show_default=True, help="Megabytes a file.")
+@click.option("--exposure", type=Exposure(), help="Of the live camera: seconds, or 1/8000. [default: the shortest]")
+@click.option("--gain", type=int, help="Of the live camera, in its own units. [default: as it is]")
+@receiver_arguments
+def serve(device: Path | None, **options: Any) -> int:
+    """Serve a page that decodes photos from a phone, and shows the live camera DEVICE where one is named.
+
+    Without --host the page can be opened on this machine alone. With --host it can be opened by whoever has the
+    address that is shown, which holds a secret; a phone reads it from the QR code.
+    """
+    _check_extra()
+    import asyncio
+
+    site = _site(device, options)
+    try:
+        asyncio.run(_run(site))
+    except KeyboardInterrupt:
+        click.echo("stopped", err=True)
+    return ExitCode.OK
+
+
+def _check_extra() -> None:
+    from importlib.util import find_spec
+
+    missing = [name for name in ("aiohttp", "segno") if find_spec(name) is None]
+    if missing:
+        raise UsageError(f"the page needs the package {missing[0]}", "pip install 'vlc-rx[web]'")
+
+
+def _site(device: Path | None, options: dict[str, Any]) -> Site:
+    import secrets
+
+    from rxcli.ingest.v4l2 import CameraSettings
+    from rxcli.web.server import Bounds, Site
+
+    names = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
+    return Site(
+        options=receiver_options(**{name: options[name] for name in names}),
+        host=options["host"] or "127.0.0.1",
+        port=options["port"],
+        token=secrets.token_urlsafe(12) if options["host"] else None,
+        device=device,
+        camera=CameraSettings(exposure_s=options["exposure"], gain=options["gain"], wait=True),
+        keep=options["keep"],
+        bounds=Bounds(upload_bytes=options["max_upload"] << 20),
+    )
+
+
+async def _run(site: Site) -> None:
+    import asyncio
+    import signal
+
+    from rxcli.web.server import Server
+
+    async with Server(site) as server:
+        if site.token is not None:
+            _show_qr(server.address)
+        click.echo(server.address)
+        hint = "Ctrl-C stops it."
+        if site.token is None:
+            hint += " For a phone in the same network: vlc-rx serve --host 0.0.0.0"
+        click.echo(hint, err=True)
+        sys.stdout.flush()
+        stopped = asyncio.Event()
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stopped.set)
+        await stopped.wait()
+
+
+def _show_qr(address: str) -> None:
+    import io
+
+    import segno
+
+    text = io.StringIO()
+    segno.make(address, micro=False).terminal(text, compact=True, border=2)
+    click.echo(text.getvalue(), err=True)

@@ -1,0 +1,149 @@
+"""What a person who aims a camera needs to know: is it locked, and if not, why, and what to do."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rxcli.results.report import printable
+from rxcli.types import FloatArray, Frame, FrameResult
+
+#: Rates are those of the last so many seconds.
+WINDOW_S = 1.0
+_LOCKED = ("ok", "partial")
+#: Share of light below which a picture is dark, and of pixels at white above which it is overexposed.
+_DARK, _BRIGHT = 0.02, 0.1
+_WORDS = {"no_screen": "no screen", "no_signal": "no signal", "unreadable": "no picture"}
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """How bright a picture is."""
+
+    #: Mean, 0..1 of the values between black and white.
+    mean: float
+    #: Share of pixels at white.
+    clipped: float
+
+    @property
+    def word(self) -> str:
+        """For people."""
+        if self.mean < _DARK:
+            return "too dark"
+        return "overexposed" if self.clipped > _BRIGHT else "good"
+
+
+def light_of(frame: Frame) -> Light:
+    """How bright a picture is, from some thousand of its pixels; a clip's black and white are those of its format."""
+    step = max(1, min(frame.width, frame.height) // 64)
+    black, white = frame.black, frame.white
+    if frame.mosaic is not None:
+        black, white = float(np.mean(frame.mosaic.black)), frame.mosaic.white
+    share = (frame.pixels[::step, ::step].astype(np.float32) - black) / max(white - black, 1.0)
+    return Light(float(np.clip(share, 0, 1).mean()), float(np.mean(share > 0.98)))
+
+
+def height_share(corners: FloatArray | None, height: int) -> float | None:
+    """Share of the picture's height that the screen fills; None where there is no screen."""
+    if corners is None:
+        return None
+    return float(np.ptp(np.clip(corners[:, 1], 0, height - 1)) / height)
+
+
+@dataclass(frozen=True, slots=True)
+class AimState:
+    """The state of reception, in what a person asks for."""
+
+    #: In a word: "locked", "no screen", ...
+    word: str
+    locked: bool
+    n_columns: int = 0
+    #: Columns that give packets.
+    n_received: int = 0
+    frames_per_s: float = 0.0
+    packets_per_s: float = 0.0
+    bits_per_s: float = 0.0
+    ber_hat: float | None = None
+    light: Light | None = None
+    height_share: float | None = None
+    #: Why there is no lock, and what to do; empty where there is one.
+    reason: str = ""
+    advice: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Moment:
+    time_s: float
+    n_packets: int
+    bits: int
+    wrong_bits: float
+
+
+@dataclass(slots=True)
+class Aim:
+    """Follows the results of a live camera."""
+
+    _recent: deque[_Moment] = field(default_factory=deque)
+
+    def update(self, result: FrameResult, now_s: float, height: int, light: Light | None = None) -> AimState:
+        """The state with one more result.
+
+        Args:
+            result: of the newest frame that has one.
+            now_s: on any steady clock.
+            height: of the frame, pixels.
+            light: of the newest frame.
+        """
+        packets = [packet for column in result.columns for packet in column.packets]
+        bits = sum(packet.payload_bits for packet in packets)
+        wrong = sum(packet.payload_bits * packet.ber_hat for packet in packets)
+        self._recent.append(_Moment(now_s, len(packets), bits, wrong))
+        while len(self._recent) > 2 and self._recent[0].time_s < now_s - WINDOW_S:
+            self._recent.popleft()
+        locked = result.status in _LOCKED
+        reason, advice = ("", "") if locked else split_message(result, light)
+        return AimState(
+            word="locked" if locked else _WORDS.get(result.status, result.status.replace("_", " ")),
+            locked=locked,
+            n_columns=len(result.columns),
+            n_received=sum(column.status in ("ok", "weak") for column in result.columns) if locked else 0,
+            light=light,
+            height_share=height_share(result.corners, height),
+            reason=reason,
+            advice=advice,
+            **self._rates(),
+        )
+
+    def _rates(self) -> dict[str, Any]:
+        """Of the last second; what the first frame brought only starts the span."""
+        recent = list(self._recent)
+        span_s = max(recent[-1].time_s - recent[0].time_s, 1e-3)
+        later = recent[1:]
+        bits = sum(moment.bits for moment in recent)
+        return {
+            "frames_per_s": len(later) / span_s,
+            "packets_per_s": sum(moment.n_packets for moment in later) / span_s,
+            "bits_per_s": sum(moment.bits for moment in later) / span_s,
+            "ber_hat": sum(moment.wrong_bits for moment in recent) / bits if bits else None,
+        }
+
+
+def split_message(result: FrameResult, light: Light | None = None) -> tuple[str, str]:
+    """Why nothing was received, and the next step, as two sentences; the second says what the picture's light asks for.
+
+    Messages are `what; next step`, see `rxcli.errors`.
+    """
+    text = printable((result.message or "no packet was found").removeprefix(result.source + ": "))
+    reason, _, advice = text.partition("; ")
+    if light is not None and result.status != "unreadable" and light.word != "good" and "expos" not in advice:
+        more = "expose longer or open the lens" if light.word == "too dark" else "expose shorter"
+        reason = f"{reason} (the picture is {light.word})"
+        advice = f"{more}; {advice}" if advice else more
+    return _sentence(reason), _sentence(advice)
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + "." if text else ""

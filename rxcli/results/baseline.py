@@ -1,0 +1,105 @@
+"""An earlier run to hold a new one against: packets that it had, and the time that it took."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rxcli.errors import UsageError
+from rxcli.results.report import plural
+from rxcli.types import FrameResult
+
+#: Of a slower source: less than this is the machine's noise, ms.
+_NOISE_MS = 200.0
+
+
+@dataclass(slots=True)
+class Run:
+    """One source in one run."""
+
+    #: (column, payload) of packets that are sure enough.
+    packets: set[tuple[int, str]] = field(default_factory=set)
+    time_ms: float = 0.0
+
+
+@dataclass(slots=True)
+class Baseline:
+    """What an earlier run gave, source by source; and what the run now gives."""
+
+    earlier: dict[str, Run]
+    #: Packets of less do not count, then or now.
+    min_confidence: float
+    #: A source may take so many times as long as then.
+    slower: float
+    now: dict[str, Run] = field(default_factory=dict)
+
+    def add(self, result: FrameResult) -> None:
+        """Count a frame of the run now."""
+        run = self.now.setdefault(_key(result.source), Run())
+        run.packets |= {
+            (column.column, packet.payload)
+            for column in result.columns
+            for packet in column.packets
+            if packet.confidence >= self.min_confidence
+        }
+        total = result.timing_ms.get("total", 0.0)
+        run.time_ms += total if total == total else 0.0
+
+    def regressions(self, source: str) -> list[str]:
+        """In what a source is worse than in the earlier run; empty where it is not, or was not in that run."""
+        before, now = self.earlier.get(_key(source)), self.now.get(_key(source), Run())
+        if before is None:
+            return []
+        found = []
+        lost = before.packets - now.packets
+        if lost:
+            columns = sorted({column for column, _ in lost})
+            named = ", ".join(map(str, columns[:8])) + (", ..." if len(columns) > 8 else "")
+            found.append(f"{plural(len(lost), 'packet')} of the baseline lost (column {named})")
+        if now.time_ms > self.slower * before.time_ms + _NOISE_MS:
+            found.append(
+                f"{now.time_ms:.0f} ms, {now.time_ms / max(before.time_ms, 1e-3):.2f} times the baseline's "
+                f"{before.time_ms:.0f} ms ({self.slower:g} times is allowed)"
+            )
+        return found
+
+
+def load_baseline(path: Path, min_confidence: float, slower: float) -> Baseline:
+    """The run that `decode --json` wrote to `path`.
+
+    Raises:
+        UsageError: it cannot be read, or is none.
+    """
+    earlier: dict[str, Run] = {}
+    try:
+        with path.open(encoding="utf-8") as file:
+            for number, line in enumerate(file, start=1):
+                try:
+                    _take(json.loads(line), earlier, min_confidence)
+                except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+                    raise UsageError(
+                        f"--baseline {path} line {number}: no result of `vlc-rx decode --json`", "name such a file"
+                    ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UsageError(f"--baseline {path}: cannot be read ({reason})", "name a file that --json wrote") from None
+    return Baseline(earlier, min_confidence, slower)
+
+
+def _take(record: dict[str, Any], runs: dict[str, Run], min_confidence: float) -> None:
+    run = runs.setdefault(_key(str(record["source"])), Run())
+    run.packets |= {
+        (int(column["column"]), str(packet["payload"]))
+        for column in record["columns"]
+        for packet in column["packets"]
+        if (packet["confidence"] or 0.0) >= min_confidence
+    }
+    run.time_ms += float(record["timing_ms"].get("total") or 0.0)
+
+
+def _key(source: str) -> str:
+    """A source as both runs name it."""
+    return os.path.normpath(source)

@@ -1,0 +1,80 @@
+"""What is drawn over a picture: a small copy of it, and the outline of every column with what became of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.profiles import CameraProfile, ScreenProfile
+from rxcli.receiver.camera import camera_profile
+from rxcli.receiver.screen import geometry
+from rxcli.results.undistort import grey_levels
+from rxcli.types import FloatArray, Frame, FrameResult, Outlines
+
+#: Points on each side of an outline: a bent side looks smooth.
+_POINTS = 17
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """A small grey copy of a frame."""
+
+    #: (height, width) uint8.
+    pixels: NDArray[np.uint8]
+    #: Pixels of the frame for one of these.
+    step: int
+
+    def jpeg(self, quality: int = 80) -> bytes:
+        """The picture as JPEG."""
+        import simplejpeg
+
+        return bytes(
+            simplejpeg.encode_jpeg(
+                np.ascontiguousarray(self.pixels)[:, :, None], quality, colorspace="GRAY", colorsubsampling="Gray"
+            )
+        )
+
+
+def preview(frame: Frame, width_px: int = 1000) -> Preview:
+    """A copy of `frame` at most about `width_px` wide: every so many pixels, so that stripes stay stripes."""
+    step = max(1, math.ceil(max(frame.width, frame.height) / width_px))
+    return Preview(grey_levels(frame)[::step, ::step], step)
+
+
+def camera_of(frame: Frame, result: FrameResult, cameras: tuple[CameraProfile, ...]) -> CameraProfile | None:
+    """The camera that a frame was received with: the profile that is named, or the one that was estimated."""
+    named = next((camera for camera in cameras if camera.name == result.camera_profile), None)
+    if named is not None or "line_delay_s" not in result.estimated:
+        return named
+    return camera_profile(result.estimated, "estimated", None, None, frame.width, frame.height)
+
+
+def outlines_of(
+    corners: FloatArray, n_columns: int, frame: Frame, camera: CameraProfile | None, n_strips: int = 1
+) -> Outlines:
+    """Outlines of the columns of a screen, along the bends of a lens that is known or estimated."""
+    lens = geometry.lens_for(camera.lens, frame.width, frame.height) if camera and camera.lens else None
+    return geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
+
+
+def column_polygons(
+    result: FrameResult, frame: Frame, screen: ScreenProfile | None, camera: CameraProfile | None
+) -> list[tuple[int, str, FloatArray]]:
+    """Number, status and outline (n, 2), in pixels of the frame, of every column; none where no screen was found."""
+    if result.corners is None or screen is None or not result.columns:
+        return []
+    outlines = outlines_of(result.corners, screen.columns, frame, camera)
+    found: list[tuple[int, str, FloatArray]] = []
+    for column in result.columns:
+        on_screen = np.flatnonzero(outlines.inside[column.column].any(axis=0))
+        if not on_screen.size:
+            continue
+        chosen = on_screen[np.linspace(0, on_screen.size - 1, min(_POINTS, on_screen.size)).astype(int)]
+        rows = outlines.rows[chosen].astype(np.float64)
+        left, right = (outlines.edges_x[column.column + side, chosen].astype(np.float64) for side in (0, 1))
+        sides = np.concatenate([np.column_stack([left, rows]), np.column_stack([right, rows])[::-1]])
+        found.append((column.column, column.status, sides))
+    return found

@@ -1,0 +1,324 @@
+"""Pictures are decoded in a process of its own, with limits: it may die, hang or swell, and another takes its place."""
+
+from __future__ import annotations
+
+import base64
+import logging
+import os
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rxcli.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from multiprocessing.connection import Connection
+    from multiprocessing.process import BaseProcess
+
+    from rxcli.options import ReceiverOptions
+    from rxcli.types import Frame, FrameResult
+
+log = logging.getLogger(__name__)
+
+#: Larger pictures are refused before they are decoded: no phone makes them, and they cost memory.
+MAX_PIXELS = 64_000_000
+#: Clips are read for so long; then what was received till then is shown.
+_CLIP_S = 12.0
+_MAX_PACKETS = 2000
+_POLL_S = 0.05
+#: Address space of the process: far more than it uses, far less than would hurt the machine.
+_ADDRESS_SPACE = 6 << 30
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What one picture may cost."""
+
+    time_s: float = 45.0
+    #: Resident memory of the process, bytes.
+    memory: int = 1 << 30
+
+
+class DecodingProcess:
+    """A process that decodes one file after the other; not for several threads at once.
+
+    Args:
+        options: of the receiver.
+        limits: when it is ended and replaced.
+    """
+
+    def __init__(self, options: ReceiverOptions, limits: Limits | None = None) -> None:
+        self._options = options
+        self._limits = limits or Limits()
+        self._process: BaseProcess | None = None
+        self._connection: Connection | None = None
+
+    def start(self) -> None:
+        """Start the process before it is needed, so that the first picture need not wait for it."""
+        from multiprocessing import get_context
+
+        context = get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_work, args=(theirs, self._options), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def close(self) -> None:
+        """End the process; may be called again."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+        if self._connection is not None:
+            self._connection.close()
+        self._process = self._connection = None
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process, None where there is none."""
+        return self._process.pid if self._process is not None else None
+
+    def decode(self, path: Path, name: str) -> dict[str, Any]:
+        """What became of the file at `path`, as plain data for the page; a failure is an answer like any other.
+
+        Args:
+            path: the file.
+            name: what messages call it.
+        """
+        if self._process is None or not self._process.is_alive():
+            self.close()
+            self.start()
+        assert self._connection is not None
+        try:
+            self._connection.send((str(path), name))
+            return self._answer()
+        except _EndedError as ended:
+            reason, step = ended.args
+        except (EOFError, OSError):
+            reason, step = "reading it ended the program that reads pictures", "try another picture"
+        log.warning("%s: %s", name, reason)
+        self.close()
+        return refusal(reason, step)
+
+    def _answer(self) -> dict[str, Any]:
+        assert self._connection is not None
+        end_s = time.monotonic() + self._limits.time_s
+        while not self._connection.poll(_POLL_S):
+            if time.monotonic() > end_s:
+                raise _EndedError(f"it took more than {self._limits.time_s:.0f} s", "try a smaller picture")
+            if resident_bytes(self.pid) > self._limits.memory:
+                raise _EndedError("it takes too much memory", "try a smaller picture")
+        answer: dict[str, Any] = self._connection.recv()
+        return answer
+
+
+class _EndedError(Exception):
+    """A limit was passed: reason and next step."""
+
+
+def resident_bytes(pid: int | None) -> int:
+    """Resident memory of a process, 0 where that cannot be told."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
+def refusal(reason: str, step: str) -> dict[str, Any]:
+    """The answer for a file that is not received."""
+    return {"status": "unreadable", "reason": _sentence(reason), "advice": _sentence(step)}
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:].rstrip(".") + "." if text else ""
+
+
+def _work(connection: Connection, options: ReceiverOptions) -> None:
+    """The process's life: take a file, send the answer, until the other end is closed."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides what an interrupt means
+    _confine()
+    _warm_up()
+    try:
+        while True:
+            path, name = connection.recv()
+            connection.send(answer_for(Path(path), name, options))
+    except (EOFError, OSError):
+        return
+
+
+def _confine() -> None:
+    """No file is written, no core dumped; libraries' own messages about broken pictures go nowhere."""
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.dup2(nowhere, 2)
+
+
+def _warm_up() -> None:
+    """Import what the first picture would otherwise wait for."""
+    from rxcli.ingest import image, raw, video  # noqa: F401
+    from rxcli.receiver import clip, pipeline  # noqa: F401
+    from rxcli.runs.batch import use_one_thread
+
+    use_one_thread()
+
+
+def answer_for(path: Path, name: str, options: ReceiverOptions) -> dict[str, Any]:
+    """The answer for one file; see `DecodingProcess.decode`."""
+    from rxcli.runs.batch import Source, standard_decoder
+
+    started_s = time.monotonic()
+    frames = _Frames(started_s + _CLIP_S)
+    try:
+        _check_pixels(path)
+    except InputError as error:
+        return refusal(error.message, error.hint)
+    decoder = standard_decoder(options, frames.tap)
+    results = (_without(result, path) for result in decoder.results(Source(name, str(path))))
+    try:
+        answer = _gathered(results, frames, options)
+    except MemoryError:
+        return refusal("it takes too much memory", "try a smaller picture")
+    return answer | {"name": name, "seconds": round(time.monotonic() - started_s, 2)}
+
+
+def _without(result: FrameResult, path: Path) -> FrameResult:
+    """The result, with a message that does not tell where the upload lies."""
+    return replace(result, message=result.message.replace(f"{path}: ", "")) if result.message else result
+
+
+def _check_pixels(path: Path) -> None:
+    """Refuse a picture by the size that its header claims, before memory is taken for it."""
+    import warnings
+
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as picture:
+                width, height = picture.size
+    except Exception:  # no picture that Pillow knows: the readers say what is wrong with it
+        return
+    if width * height > MAX_PIXELS:
+        raise InputError(
+            f"the picture claims {width} x {height} pixels, more than {MAX_PIXELS // 1_000_000} million",
+            "send a photo as the camera makes it",
+        )
+
+
+class _Frames:
+    """Sees every frame before it is received: keeps those that may be shown, and ends a clip in good time."""
+
+    def __init__(self, end_s: float) -> None:
+        self._end_s = end_s
+        self._kept: dict[int, Frame] = {}
+        self.cut_short = False
+
+    def tap(self, frame: Frame, _name: str) -> None:
+        if time.monotonic() > self._end_s and frame.index:
+            self.cut_short = True
+            raise InputError("only the beginning of the clip was read", "send a shorter one for the rest")
+        self._kept[frame.index] = frame
+        while len(self._kept) > 40:  # results come some frames later than frames
+            del self._kept[min(self._kept)]
+
+    def take(self, index: int) -> Frame | None:
+        """The frame of a result, if it is still there."""
+        return self._kept.get(index)
+
+
+def _gathered(results: Iterator[FrameResult], frames: _Frames, options: ReceiverOptions) -> dict[str, Any]:
+    """All results of a source as one answer, shown with the frame that gave most."""
+    best: tuple[int, FrameResult, dict[str, Any]] | None = None
+    packets: list[dict[str, Any]] = []
+    texts: list[dict[str, Any]] = []
+    n_frames = 0
+    for result in results:
+        if frames.cut_short and result.status == "unreadable":
+            continue
+        n_frames += 1
+        texts += texts_of(result)
+        found = packets_of(result)
+        packets += found[: _MAX_PACKETS - len(packets)]
+        if best is None or len(found) > best[0]:
+            best = len(found), result, _picture(result, frames.take(result.frame), options)
+    if best is None:
+        return refusal("it holds no picture", "send another file")
+    from rxcli.results.aim import split_message
+    from rxcli.results.report import to_record
+
+    _, result, picture = best
+    reason, advice = ("", "") if packets else split_message(result)
+    return {
+        "status": result.status if not packets or result.status != "unreadable" else "partial",
+        "reason": reason,
+        "advice": advice,
+        "texts": texts,
+        "packets": packets,
+        "n_frames": n_frames,
+        "cut_short": frames.cut_short,
+        "screen": result.screen_profile,
+        "camera": result.camera_profile,
+        "columns": [
+            {"column": column.column, "status": column.status, "message": column.message} for column in result.columns
+        ],
+        "record": to_record(result),
+        **picture,
+    }
+
+
+def texts_of(result: FrameResult) -> list[dict[str, Any]]:
+    """Texts and files that the link layer has complete with a frame: the one place where they come to the page."""
+    texts: list[dict[str, Any]] = []
+    for message in getattr(result, "messages", ()):
+        text = message.text if message.text is not None else message.data.hex()
+        texts.append({"kind": message.kind, "text": text})
+    for received in getattr(result, "objects", ()):
+        data = base64.b64encode(received.data).decode()
+        texts.append({"kind": "file", "name": received.name, "size": received.size, "base64": data})
+    return texts
+
+
+def packets_of(result: FrameResult) -> list[dict[str, Any]]:
+    return [
+        {
+            "column": column.column,
+            "payload": packet.payload,
+            "confidence": round(packet.confidence, 4),
+            "frame": result.frame,
+        }
+        for column in result.columns
+        for packet in column.packets
+    ]
+
+
+def _picture(result: FrameResult, frame: Frame | None, options: ReceiverOptions) -> dict[str, Any]:
+    """The picture as JPEG, and outlines in its pixels; empty where there is no frame."""
+    if frame is None:
+        return {}
+    from rxcli.results.overlay import camera_of, column_polygons, preview
+
+    small = preview(frame)
+    screen = next((screen for screen in options.screens if screen.name == result.screen_profile), None)
+    polygons = column_polygons(result, frame, screen, camera_of(frame, result, options.cameras))
+    corners = [] if result.corners is None else (result.corners / small.step).round(1).tolist()
+    return {
+        "picture": {
+            "jpeg": base64.b64encode(small.jpeg()).decode(),
+            "width": int(small.pixels.shape[1]),
+            "height": int(small.pixels.shape[0]),
+            "corners": corners,
+            "outlines": [
+                {"column": number, "status": status, "points": (points / small.step).round(1).tolist()}
+                for number, status, points in polygons
+            ],
+        }
+    }

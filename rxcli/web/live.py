@@ -1,0 +1,198 @@
+"""A live camera in a process of its own: its picture, its state, its payloads, as the page shows them."""
+
+from __future__ import annotations
+
+import base64
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+    from multiprocessing.process import BaseProcess
+
+    from rxcli.ingest.v4l2 import CameraSettings
+    from rxcli.options import ReceiverOptions
+    from rxcli.results.overlay import Preview
+    from rxcli.types import Frame, FrameResult
+
+log = logging.getLogger(__name__)
+
+#: Events a second at most, and the width of their pictures: what a phone on a poor network can follow.
+_EVENTS_PER_S = 8.0
+_WIDTH_PX = 720
+#: Previews kept for results that come some frames later.
+_KEPT = 40
+_RESTART_S = 2.0
+#: Texts and packets that a page which is opened later still gets.
+_HISTORY = 50
+
+
+class LiveCamera:
+    """Follows a camera and tells `publish` what comes, from a thread of its own.
+
+    Args:
+        device: the camera.
+        settings: what is asked of it.
+        options: of the receiver.
+        publish: given each event, plain data.
+    """
+
+    def __init__(
+        self,
+        device: Path,
+        settings: CameraSettings,
+        options: ReceiverOptions,
+        publish: Callable[[dict[str, Any]], None],
+    ) -> None:
+        self._arguments = (device, settings, options)
+        self._publish = publish
+        self._process: BaseProcess | None = None
+        self._running = False
+        self._thread = threading.Thread(target=self._follow, name=f"follow {device}", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._running = True
+        self._thread.start()
+
+    def close(self) -> None:
+        """End."""
+        self._running = False
+        if self._process is not None:
+            self._process.kill()
+        self._thread.join(timeout=5)
+
+    def _follow(self) -> None:
+        """Pass on what the process sends; start it again where it dies."""
+        from multiprocessing import get_context
+
+        context = get_context("spawn")
+        while self._running:
+            ours, theirs = context.Pipe(duplex=False)
+            self._process = context.Process(target=_work, args=(theirs, *self._arguments), daemon=True)
+            self._process.start()
+            theirs.close()
+            try:
+                while True:
+                    self._publish(ours.recv())
+            except (EOFError, OSError):
+                ours.close()
+            self._process.join()
+            if self._running:
+                log.warning("the process of the live camera ended (code %s); starting again", self._process.exitcode)
+                self._publish({"problem": "The camera's program ended; it is starting again."})
+                time.sleep(_RESTART_S)
+
+
+def _work(connection: Connection, device: Path, settings: CameraSettings, options: ReceiverOptions) -> None:
+    """The process's life."""
+    import signal
+
+    from rxcli.errors import ReceiverError
+    from rxcli.ingest.v4l2 import LiveSource
+    from rxcli.runs.batch import use_one_thread
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    use_one_thread()
+    source = LiveSource(device, settings, on_lost=lambda reason: connection.send({"problem": _sentence(reason)}))
+    try:
+        for event in live_events(source, options):
+            connection.send(event)
+    except ReceiverError as error:
+        connection.send({"problem": _sentence(str(error))})
+        time.sleep(_RESTART_S)
+    except (BrokenPipeError, EOFError):
+        return
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + "."
+
+
+def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any]]:
+    """What the page is told, at most some times a second: picture, outline, state, and packets and texts since then.
+
+    Args:
+        frames: of one camera, without end; where it has `counts`, dropped and damaged ones are told too.
+        options: of the receiver.
+    """
+    from rxcli.results.aim import Aim
+    from rxcli.runs.batch import Source, standard_decoder
+    from rxcli.web.decoding import packets_of, texts_of
+
+    watched, aim = _Watched(), Aim()
+    decoder = replace(standard_decoder(options, watched.tap), open_source=lambda path: frames)
+    packets: deque[dict[str, Any]] = deque(maxlen=_HISTORY)
+    texts: list[dict[str, Any]] = []
+    last_s = 0.0
+    for result in decoder.results(Source("camera", "camera")):
+        now_s = time.monotonic()
+        state = aim.update(result, now_s, watched.height, watched.light)
+        found = packets_of(result)
+        packets.extend(found)
+        texts += texts_of(result)
+        if now_s - last_s < 1 / _EVENTS_PER_S and not texts and result.status != "unreadable":
+            continue
+        last_s = now_s
+        yield {
+            "state": asdict(state),
+            "light": state.light.word if state.light else None,
+            "columns": [[column.column, column.status] for column in result.columns],
+            "packets": list(packets),
+            "texts": texts,
+            "picture": watched.picture(result, options),
+            "screen": result.screen_profile,
+            "camera": result.camera_profile,
+        }
+        packets.clear()
+        texts = []
+
+
+class _Watched:
+    """Sees every frame before it is received, and keeps small copies of the last ones."""
+
+    def __init__(self) -> None:
+        from rxcli.results.aim import Light
+
+        self._previews: dict[int, Preview] = {}
+        self._frame: Frame | None = None
+        self.light: Light | None = None
+
+    def tap(self, frame: Frame, _name: str) -> None:
+        from rxcli.results.aim import light_of
+        from rxcli.results.overlay import preview
+
+        self._frame, self.light = frame, light_of(frame)
+        self._previews[frame.index] = preview(frame, _WIDTH_PX)
+        while len(self._previews) > _KEPT:
+            del self._previews[min(self._previews)]
+
+    @property
+    def height(self) -> int:
+        return self._frame.height if self._frame is not None else 1
+
+    def picture(self, result: FrameResult, options: ReceiverOptions) -> dict[str, Any] | None:
+        """The picture of a result with its outlines, in its pixels."""
+        from rxcli.results.overlay import camera_of, column_polygons
+
+        small = self._previews.get(result.frame)
+        if small is None or self._frame is None:
+            return None
+        screen = next((screen for screen in options.screens if screen.name == result.screen_profile), None)
+        polygons = column_polygons(result, self._frame, screen, camera_of(self._frame, result, options.cameras))
+        return {
+            "jpeg": base64.b64encode(small.jpeg(70)).decode(),
+            "width": int(small.pixels.shape[1]),
+            "height": int(small.pixels.shape[0]),
+            "corners": [] if result.corners is None else (result.corners / small.step).round(1).tolist(),
+            "outlines": [
+                {"column": number, "status": status, "points": (points / small.step).round(1).tolist()}
+                for number, status, points in polygons
+            ],
+        }

@@ -1,0 +1,487 @@
+"""The page's server: what it answers, who may ask, what it costs; and the page itself in a browser."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from small_frames import N_COLUMNS, write_frame, write_profiles
+
+aiohttp = pytest.importorskip("aiohttp")
+pytest.importorskip("segno")
+
+from rxcli.cli.common import receiver_options  # noqa: E402
+from rxcli.cli.main import run  # noqa: E402
+from rxcli.ingest import open_source  # noqa: E402
+from rxcli.options import ReceiverOptions  # noqa: E402
+from rxcli.results.aim import Aim, Light, light_of  # noqa: E402
+from rxcli.types import ColumnResult, FrameResult, PacketResult  # noqa: E402
+from rxcli.web.decoding import DecodingProcess, Limits, resident_bytes  # noqa: E402
+from rxcli.web.live import live_events  # noqa: E402
+from rxcli.web.server import Bounds, Server, Site  # noqa: E402
+
+sys.path.insert(0, str(Path(__file__).parent))
+from browser import CHROMIUM, Browser  # noqa: E402
+
+SAMPLES = Path(__file__).resolve().parents[2] / "sample_frames"
+MEGABYTE = 1 << 20
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+
+
+@pytest.fixture
+def options(tmp_path: Path) -> ReceiverOptions:
+    """Of a receiver of small frames."""
+    names = write_profiles(tmp_path)
+    corners = tuple(tuple(float(part) for part in text.split(",")) for text in names[5:])
+    return receiver_options(screens=(names[1],), cameras=(names[3],), corners=corners)  # type: ignore[arg-type]
+
+
+def serving(site: Site, work: Callable[[Server, Any], Awaitable[None]]) -> None:
+    """Run `work` with a server and a client."""
+
+    async def body() -> None:
+        async with Server(site) as server, aiohttp.ClientSession() as client:
+            await work(server, client)
+
+    asyncio.run(body())
+
+
+async def post(server: Server, client: Any, data: Any, **more: Any) -> tuple[int, Any]:
+    body = io.BytesIO(data) if isinstance(data, bytes) else data
+    async with client.post(server.address + "photo", data=body, **more) as answer:
+        return answer.status, await answer.json()
+
+
+def leftovers() -> list[str]:
+    return [name for name in os.listdir(tempfile.gettempdir()) if name.startswith("vlc-rx-serve-")]
+
+
+def test_a_photo_gives_payloads_and_outlines_and_is_not_kept(tmp_path: Path, options: ReceiverOptions) -> None:
+    payloads = write_frame(tmp_path / "a.png", 3)
+    before = leftovers()
+
+    async def work(server: Server, client: Any) -> None:
+        status, answer = await post(server, client, (tmp_path / "a.png").read_bytes())
+        assert (status, answer["status"]) == (200, "ok")
+        assert [packet["payload"] for packet in answer["packets"]] == payloads
+        assert len(answer["picture"]["outlines"]) == N_COLUMNS
+        [folder] = set(leftovers()) - set(before)
+        assert not os.listdir(Path(tempfile.gettempdir()) / folder)
+
+    serving(Site(options, port=0), work)
+    assert leftovers() == before
+
+
+def test_a_bad_file_gives_a_reason_without_a_path(options: ReceiverOptions) -> None:
+    async def work(server: Server, client: Any) -> None:
+        for data, told in ((b"hello", "Neither a picture nor a clip"), (b"", "The file is empty (0 bytes)")):
+            _, answer = await post(server, client, data)
+            assert answer["status"] == "unreadable"
+            assert answer["reason"].startswith(told)
+            assert "/" not in answer["reason"]
+            assert answer["advice"]
+
+    serving(Site(options, port=0), work)
+
+
+def test_uploads_are_kept_where_that_is_asked_for(tmp_path: Path, options: ReceiverOptions) -> None:
+    write_frame(tmp_path / "a.png", 3)
+    data = (tmp_path / "a.png").read_bytes()
+
+    async def work(server: Server, client: Any) -> None:
+        await post(server, client, data, headers={"X-Name": "../../evil"})
+
+    serving(Site(options, port=0, keep=tmp_path / "kept"), work)
+    record, picture = sorted((tmp_path / "kept").iterdir())
+    assert (record.suffix, picture.suffix) == (".json", ".png")
+    assert picture.read_bytes() == data
+    assert len(json.loads(record.read_text())["packets"]) == N_COLUMNS
+
+
+def test_who_may_ask(options: ReceiverOptions) -> None:
+    async def status(client: Any, address: str, **more: Any) -> int:
+        async with client.get(address, **more) as answer:
+            assert answer.status != 200 or "script-src 'self'" in answer.headers["Content-Security-Policy"]
+            return int(answer.status)
+
+    async def local(server: Server, client: Any) -> None:
+        assert await status(client, server.address) == 200
+        assert await status(client, server.address, headers={"Host": "evil.example"}) == 403
+        assert await status(client, server.address, headers={"Origin": "http://evil.example"}) == 403
+        assert await status(client, server.address + "asset/app.js") == 200
+        for name in (
+            "asset/server.py",
+            "asset/..%2fserver.py",
+            "asset/%2e%2e/server.py",
+            "live",
+            "etc/passwd",
+            "photo",
+        ):
+            assert await status(client, server.address + name) in (404, 405), name
+
+    async def elsewhere(server: Server, client: Any) -> None:
+        assert "/secret/" in server.address
+        assert await status(client, server.address) == 200
+        root = server.address.removesuffix("secret/")
+        for path in ("", "photo", "secre/", "asset/app.js"):
+            assert await status(client, root + path) == 404
+
+    serving(Site(options, port=0), local)
+    serving(Site(options, port=0, host="0.0.0.0", token="secret"), elsewhere)
+
+
+def test_the_address_for_phones_holds_a_new_secret(monkeypatch: pytest.MonkeyPatch) -> None:
+    from rxcli.cli import serve
+
+    site = [serve._site(None, {**dict.fromkeys(("keep", "exposure", "gain")), **asked}) for asked in (_ASKED, _ASKED)]
+    assert site[0].token != site[1].token
+    assert len(site[0].token or "") >= 16
+    assert serve._site(None, {**dict.fromkeys(("keep", "exposure", "gain")), **_ASKED, "host": None}).token is None
+
+
+_ASKED = {"host": "0.0.0.0", "port": 0, "max_upload": 96, "screens": (), "cameras": (), "corners": None, "cae": "auto"}
+_ASKED |= {"min_confidence": None, "no_skip": ()}
+
+
+def test_a_port_that_is_taken_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert run(["serve", "--port", str(port)]) == 2
+    assert f"cannot serve at 127.0.0.1:{port}" in capsys.readouterr().err
+
+
+def test_the_decoding_process_may_die_hang_and_swell(tmp_path: Path, options: ReceiverOptions) -> None:
+    write_frame(tmp_path / "a.png", 3)
+    (tmp_path / "pipe").write_bytes(b"x")
+    decoder = DecodingProcess(options)
+    try:
+        assert decoder.decode(tmp_path / "a.png", "a")["status"] == "ok"
+        assert decoder.pid is not None
+        os.kill(decoder.pid, signal.SIGKILL)
+        time.sleep(0.2)
+        assert decoder.decode(tmp_path / "a.png", "a")["status"] == "ok"
+    finally:
+        decoder.close()
+    for limits, told in (
+        (Limits(time_s=0.0), "It took more than 0 s."),
+        (Limits(memory=0), "It takes too much memory."),
+    ):
+        decoder = DecodingProcess(options, limits)
+        try:
+            assert decoder.decode(tmp_path / "a.png", "a")["reason"] == told
+            assert decoder.pid is None
+        finally:
+            decoder.close()
+
+
+def bomb(side: int) -> bytes:
+    """A PNG of little bytes and many pixels."""
+    import struct
+
+    def chunk(name: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+    rows = zlib.compress(bytes(side + 1) * 64, 9)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 0, 0, 0, 0))
+        + chunk(b"IDAT", rows)
+        + chunk(b"IEND", b"")
+    )
+
+
+def hostile(picture: bytes) -> list[tuple[Any, dict[str, str]]]:
+    """A hundred bodies with headers: sizes, types, names."""
+    rng = np.random.default_rng(20)
+    magic = [b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"\0\0\0\x18ftypheic", b"\0\0\0\x18ftypisom"]
+    magic += [
+        b"FUJIFILMCCD-RAW",
+        b"BM",
+        b"RIFF1234WEBP",
+        b"\x1aE\xdf\xa3",
+        b"GIF89a",
+        b"%PDF-1.7",
+        b"PK\x03\x04",
+        b"\x7fELF",
+    ]
+    bodies = [head + rng.integers(0, 256, int(size), np.uint8).tobytes() for head in magic for size in (0, 60, 5000)]
+    bodies += [picture[: len(picture) * part // 8] for part in range(8)]
+    for _ in range(20):
+        damaged = bytearray(picture)
+        for place in rng.integers(0, len(damaged), 20):
+            damaged[place] = int(rng.integers(0, 256))
+        bodies.append(bytes(damaged))
+    bodies += [
+        bomb(20_000),
+        bomb(8_100),
+        bytes(5 * MEGABYTE),
+        b"\xff\xd8\xff" * MEGABYTE * 2,
+        b"<script>alert(1)</script>",
+    ]
+    names = ["../../etc/passwd", "a\\b.jpg", "con", "x" * 4000, "%00", "-rf", "$(reboot)", "<b>.jpg"]
+    whole: list[tuple[Any, dict[str, str]]] = [
+        (body, {"X-Name": names[i % len(names)], "Content-Type": "image/jpeg" if i % 2 else "text/html"})
+        for i, body in enumerate(bodies)
+    ]
+    inflated = zlib.compress(bytes(64 * MEGABYTE), 9)
+    whole += [(inflated, {"Content-Encoding": "deflate"})] * 3
+    while len(whole) < 120:
+        whole.append((rng.integers(0, 256, int(rng.integers(0, 300_000)), np.uint8).tobytes(), {}))
+    return whole
+
+
+def test_two_hundred_hostile_uploads(tmp_path: Path, options: ReceiverOptions) -> None:
+    """Afterwards the server answers as before, it is no larger, and the disk is as it was."""
+    write_frame(tmp_path / "a.png", 3)
+    good = (tmp_path / "a.png").read_bytes()
+    before, files_before = leftovers(), set(Path("/tmp").glob("*"))
+    bounds = Bounds(upload_bytes=4 * MEGABYTE, upload_s=1.5, connections=20, idle_s=2.0)
+    most = [0, 0]
+
+    async def watch(server: Server) -> None:
+        while True:
+            most[0] = max(most[0], resident_bytes(os.getpid()))
+            most[1] = max(most[1], resident_bytes(server._decoder.pid))
+            await asyncio.sleep(0.05)
+
+    async def slow_body() -> AsyncIterator[bytes]:
+        for _ in range(100):
+            yield b"\xff"
+            await asyncio.sleep(0.1)
+
+    async def endless_body() -> AsyncIterator[bytes]:
+        while True:
+            yield bytes(MEGABYTE)
+
+    async def quietly(call: Awaitable[Any]) -> Any:
+        try:
+            return await call
+        except (aiohttp.ClientError, ConnectionError, TimeoutError, asyncio.IncompleteReadError):
+            return None
+
+    async def raw(server: Server, text: bytes, hold_s: float) -> None:
+        _, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        writer.write(text)
+        await quietly(writer.drain())
+        await asyncio.sleep(hold_s)
+        writer.close()
+
+    async def work(server: Server, client: Any) -> None:
+        watcher = asyncio.create_task(watch(server))
+        assert (await post(server, client, good))[1]["status"] == "ok"
+        memory = resident_bytes(os.getpid())
+        n = 0
+        for body, headers in hostile(good):
+            answer = await quietly(post(server, client, body, headers=headers))
+            assert answer is None or answer[0] in (200, 400, 408, 413, 503), answer
+            n += 1
+        calls = [quietly(post(server, client, slow_body())) for _ in range(3)]
+        calls += [quietly(post(server, client, endless_body())) for _ in range(3)]
+        calls += [quietly(post(server, client, good)) for _ in range(24)]  # a flood of good ones: some are told to wait
+        calls += [quietly(raw(server, b"POST /photo HTTP/1.1\r\nHost: localhost\r\n", 3.0)) for _ in range(30)]
+        calls += [quietly(raw(server, b"GET / HTTP/1.1\r\nX: " + b"y" * 200_000, 0.5)) for _ in range(5)]
+        calls += [
+            quietly(raw(server, b"POST /photo HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n", 3.0))
+        ] * 1
+        calls += [quietly(raw(server, b"\x16\x03\x01 no HTTP at all", 0.2)) for _ in range(14)]
+        n += len(calls)
+        assert n >= 200
+        answers = [answer for answer in await asyncio.gather(*calls) if answer]
+        assert {status for status, _ in answers} <= {200, 408, 413, 503}
+        for _ in range(50):  # slow ones are let go in time
+            status, answer = await post(server, client, good)
+            if status == 200:
+                break
+            await asyncio.sleep(0.2)
+        assert answer["status"] == "ok"
+        [folder] = set(leftovers()) - set(before)
+        assert not os.listdir(Path(tempfile.gettempdir()) / folder)
+        watcher.cancel()
+        assert resident_bytes(os.getpid()) < memory + 100 * MEGABYTE
+
+    serving(Site(options, port=0, bounds=bounds), work)
+    print(f"server and client {most[0] / MEGABYTE:.0f} MB, decoding process {most[1] / MEGABYTE:.0f} MB")
+    assert most[1] < 500 * MEGABYTE
+    assert leftovers() == before
+    assert {path for path in set(Path("/tmp").glob("*")) - files_before if path.name.startswith("vlc-rx")} == set()
+
+
+# -- the live camera --------------------------------------------------------------------------------------------------
+
+
+def result_of(status: str, message: str | None = None, packets: int = 0) -> FrameResult:
+    packet = PacketResult(1.0, 2.0, 35, "ab", confidence=0.99, ber_hat=1e-3)
+    columns = tuple(ColumnResult(i, "ok", packets=(packet,)) for i in range(packets))
+    corners = np.array([[0, 100], [50, 100], [50, 400], [0, 400]], np.float64)
+    return FrameResult("camera", 0, 0.0, status, message, corners=corners, columns=columns)  # type: ignore[arg-type]
+
+
+def test_the_state_says_why_there_is_no_lock_and_what_to_do() -> None:
+    aim = Aim()
+    state = aim.update(result_of("no_signal", "the screen fills 30 % of the height; move closer"), 0.0, 1000)
+    assert (state.word, state.locked, state.height_share) == ("no signal", False, 0.3)
+    assert (state.reason, state.advice) == ("The screen fills 30 % of the height.", "Move closer.")
+    state = aim.update(result_of("ok", packets=3), 0.1, 1000)
+    assert (state.word, state.n_received, state.reason) == ("locked", 3, "")
+    state = aim.update(result_of("ok", packets=3), 0.2, 1000)
+    assert state.packets_per_s == pytest.approx(30)
+    dark = aim.update(result_of("no_screen", "no screen found: nothing; look"), 2.0, 1000, Light(0.001, 0.0))
+    assert dark.reason == "No screen found: nothing (the picture is too dark)."
+    assert dark.advice == "Expose longer or open the lens; look."
+
+
+def test_light_is_told_in_words(tmp_path: Path) -> None:
+    for value, word in ((0, "too dark"), (120, "good"), (255, "overexposed")):
+        cv2.imwrite(str(tmp_path / "a.png"), np.full((200, 300), value, np.uint8))
+        [frame] = open_source(tmp_path / "a.png")
+        assert light_of(frame).word == word
+
+
+def test_a_live_camera_gives_state_picture_and_packets() -> None:
+    """The clip's frames as a camera gives them."""
+    options = receiver_options(cameras=(str(SAMPLES / "video1080.toml"),))
+    events = list(live_events(open_source(SAMPLES / "video1080_chelsea_17k3.mp4"), options))
+    assert events[-1]["state"]["locked"]
+    assert len(events[-1]["picture"]["outlines"]) == 20
+    assert sum(len(event["packets"]) for event in events) >= 20
+    assert 0.7 < events[-1]["state"]["height_share"] < 1
+    json.dumps(events)
+
+
+# -- in a browser -----------------------------------------------------------------------------------------------------
+
+
+@asynccontextmanager
+async def page(site: Site, **how: Any) -> AsyncIterator[tuple[Server, Browser]]:
+    async with Server(site) as server, Browser(**how) as browser:
+        await browser.open(server.address)
+        yield server, browser
+
+
+@needs_chromium
+@pytest.mark.parametrize("dark", [False, True])
+def test_a_phone_sends_the_samples_and_a_bad_file(dark: bool, tmp_path: Path) -> None:
+    (tmp_path / "bad.jpg").write_bytes(b"\xff\xd8\xff nothing")
+    expected = {
+        SAMPLES / "phone_chelsea_17k3.jpg": ("Received: 20 packets from 20 of 20 columns", 20),
+        SAMPLES / "xtrans_sky_17k3.dng": ("Received: 20 packets from 20 of 20 columns", 20),
+        SAMPLES / "video1080_chelsea_17k3.mp4": ("Received: 360 packets from 20 of 20 columns", 20),
+        tmp_path / "bad.jpg": ("This file could not be read", 0),
+    }
+    profiles = tuple(str(SAMPLES / f"{name}.toml") for name in ("phone12", "xs10-small", "video1080"))
+
+    async def body() -> None:
+        async with page(Site(receiver_options(cameras=profiles), port=0), dark=dark) as (_, browser):
+            for path, (title, n_outlines) in expected.items():
+                await browser.choose("#file", path)
+                await browser.until("document.getElementById('progress').textContent !== ''")
+                await browser.until("!document.getElementById('result').hidden")
+                assert await browser.run("document.getElementById('result-title').textContent") == title
+                assert await browser.run("document.activeElement.id") == "result-title"
+                assert (
+                    await browser.run("document.querySelectorAll('#picture polygon:not(.corners)').length")
+                    == n_outlines
+                )
+                assert await browser.run("document.documentElement.scrollWidth <= innerWidth")
+            assert browser.complaints == []
+
+    asyncio.run(body())
+
+
+@needs_chromium
+def test_the_page_is_for_keyboards_and_screen_readers(options: ReceiverOptions) -> None:
+    async def body() -> None:
+        async with page(Site(options, port=0)) as (_, browser):
+            await browser.press("Tab", 9)
+            assert await browser.run("document.activeElement.id") == "file"
+            tree = await browser.call("Accessibility.getFullAXTree")
+            named = {
+                (node["role"]["value"], node.get("name", {}).get("value"))
+                for node in tree["nodes"]
+                if not node["ignored"]
+            }
+            assert ("heading", "A photo") in named
+            assert any(role == "button" and name and "Take or choose a photo" in name for role, name in named), named
+            assert not {role for role, name in named if role in ("button", "link", "image") and not name}
+            assert await browser.run("document.documentElement.lang") == "en"
+            for scheme in ("light", "dark"):
+                features = [{"name": "prefers-color-scheme", "value": scheme}]
+                await browser.call("Emulation.setEmulatedMedia", features=features)
+                for selector in ("body", "header p", ".hint", ".button"):
+                    assert await browser.run(_CONTRAST % selector) >= 4.5, (scheme, selector)
+
+    asyncio.run(body())
+
+
+#: WCAG 2 contrast of an element's text against the nearest ground below it.
+_CONTRAST = """(() => {
+  const light = (text) => {
+    const [r, g, b] = text.match(/[\\d.]+/g).map(Number).map((v) => v / 255)
+      .map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+  };
+  let node = document.querySelector("%s");
+  const ink = light(getComputedStyle(node).color);
+  while (getComputedStyle(node).backgroundColor === "rgba(0, 0, 0, 0)") node = node.parentElement;
+  const ground = light(getComputedStyle(node).backgroundColor);
+  return (Math.max(ink, ground) + 0.05) / (Math.min(ink, ground) + 0.05);
+})()"""
+
+
+def _umockdev_is_there() -> bool:
+    if shutil.which("/usr/bin/python3") is None:
+        return False
+    probe = "import gi; gi.require_version('UMockdev', '1.0'); from gi.repository import UMockdev"
+    return subprocess.run(["/usr/bin/python3", "-c", probe], capture_output=True, check=False).returncode == 0
+
+
+@needs_chromium
+@pytest.mark.skipif(not _umockdev_is_there(), reason="needs Debian's umockdev, gir1.2-umockdev-1.0 and python3-gi")
+def test_the_live_page_locks_on_the_camera(tmp_path: Path) -> None:
+    clip = np.stack([frame.pixels for frame in open_source(SAMPLES / "video1080_chelsea_17k3.mp4")])
+    blank = np.full((20, *clip.shape[1:]), 24, np.uint8)
+    np.concatenate([blank, *[clip] * 5]).tofile(tmp_path / "frames.luma")
+    scene = {"width": 1920, "height": 1080, "luma": str(tmp_path / "frames.luma"), "formats": ["NV12"], "fps": 15.0}
+    (tmp_path / "scene.json").write_text(json.dumps(scene))
+    fake = Path(__file__).parents[1] / "fake_v4l2" / "serve.py"
+    command = ["/usr/bin/python3", str(fake), str(tmp_path / "scene.json"), sys.executable, "-m", "rxcli.cli.main"]
+    command += ["serve", "/dev/video0", "--port", "0", "--camera", str(SAMPLES / "video1080.toml")]
+    environment = dict(os.environ, PYTHONPATH=str(Path(__file__).resolve().parents[2]))
+
+    async def body(address: str) -> None:
+        async with Browser() as browser:
+            await browser.open(address)
+            await browser.until("document.getElementById('lock').textContent === 'no screen'")
+            assert "Photograph a screen that sends" in await browser.run("document.getElementById('aim').textContent")
+            await browser.until("document.getElementById('lock').textContent === 'locked'")
+            assert await browser.run("document.querySelectorAll('#live-picture polygon:not(.corners)').length") == 20
+            await browser.until("document.querySelectorAll('#live-packets li').length > 0")
+            assert browser.complaints == []
+
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, start_new_session=True
+    ) as started:
+        try:
+            assert started.stdout is not None
+            asyncio.run(body(started.stdout.readline().strip()))
+        finally:
+            os.killpg(started.pid, signal.SIGTERM)
