@@ -53,9 +53,10 @@ class _Claims:
 
     def total(self, head: bytes) -> float:
         """Bytes claimed; infinity where a directory has more entries than any has."""
-        waiting, seen, claimed = [struct.unpack_from(self._next, head, self._first_at)[0]], set[int](), 0
+        first = struct.unpack_from(self._next, head, self._first_at)[0]
+        waiting, seen, claimed = [(first, True)], set[int](), 0
         while waiting and len(seen) < _MAX_DIRECTORIES:
-            at = waiting.pop()
+            at, in_chain = waiting.pop()
             if not at or at in seen:
                 continue
             seen.add(at)
@@ -66,9 +67,11 @@ class _Claims:
             entries = self._file.read(count * struct.calcsize(self._entry))
             for tag, kind, n, value in struct.iter_unpack(self._entry, entries):
                 claimed += n * _SIZES.get(kind, 0)
-                waiting += [value] if tag in _POINTERS and n == 1 else []
+                waiting += [(value, False)] if tag in _POINTERS and n == 1 else []
             following = self._file.read(struct.calcsize(self._next))
-            waiting += struct.unpack(self._next, following) if len(following) == struct.calcsize(self._next) else []
+            # What follows a directory of EXIF or GPS is no pointer: some cameras write none there.
+            if in_chain and len(following) == struct.calcsize(self._next):
+                waiting.append((struct.unpack(self._next, following)[0], True))
         return claimed
 
 

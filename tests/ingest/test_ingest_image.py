@@ -15,7 +15,7 @@ from PIL import Image
 
 from rxcli.errors import InputError
 from rxcli.ingest import KNOWN_SUFFIXES, open_source
-from rxcli.ingest.metadata import jpeg_metadata
+from rxcli.ingest.metadata import exif_metadata, jpeg_metadata
 from rxcli.ingest.orientation import as_stored, as_viewed, orientation_of, orientation_of_turn
 from rxcli.types import Frame, Metadata
 
@@ -212,3 +212,19 @@ def _write(path: Path, pixels: NDArray[np.generic]) -> None:
     import cv2
 
     cv2.imwrite(str(path), pixels[:, :, ::-1] if pixels.ndim == 3 else pixels)
+
+
+def test_exif_whose_second_directory_has_no_pointer_after_it_is_read() -> None:
+    """Some cameras end the EXIF directory where its values begin: what stands there is no next directory."""
+    entry = struct.Struct(">HHII")
+    first = b"".join(
+        [
+            entry.pack(0x0112, 3, 1, 3 << 16),  # orientation 3
+            entry.pack(0x8769, 4, 1, 38),  # the EXIF directory
+        ]
+    )
+    second = struct.pack(">H", 1) + entry.pack(0x829A, 5, 1, 52)  # the exposure's value follows at once
+    exif = b"MM\0*\0\0\0\x08" + struct.pack(">H", 2) + first + bytes(4) + second + struct.pack(">II", 1, 24000)
+    found = exif_metadata(exif)
+    assert found.orientation == 3
+    assert found.exposure_s == pytest.approx(1 / 24000)
