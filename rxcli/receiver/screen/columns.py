@@ -85,7 +85,7 @@ def _grids(coherence: Coherence, sigma: float, lens: Lens | None) -> list[Grid]:
         if not any(_same(grid, other) for other in distinct):
             distinct.append(grid)
     least = min(_RIVAL_GAIN * distinct[0].gain, distinct[0].gain - _RIVAL_NATS)
-    refined = [refine_by_waveforms(coherence, grid, sigma) for grid in distinct if grid.gain > max(least, 0)]
+    refined = [refine_by_waveforms(coherence, grid, sigma) for grid in distinct if grid.gain > least]
     refined.sort(key=lambda one: -one.explained)
     return [grid for grid in refined if grid.explained > refined[0].explained - _RIVAL_EXPLAINED]
 
