@@ -42,6 +42,8 @@ _EXPLAINED_COUNTS = 0.05
 _CLEAR = 6.0
 #: What packets say counts so much: the light model is surer than it should be. At most so many outlines are received.
 _PACKETS_COUNT, _MOST_LOOKS = 0.08, 6
+#: Outlines whose packets differ by less than this, nats, show the same; and the certainty from which one is likely.
+_SAME_PACKETS, _LIKELY = 40.0, 0.5
 #: Columns that look less like packets than this have no light, nats.
 _NO_LIGHT = 25.0
 
@@ -161,12 +163,19 @@ def _by_packets(frame: Frame, candidates: list[Outline], options: ReceiverOption
     context = _context_of_any(frame, candidates, options, timer)
     if context is None:
         return candidates
-    looks = [(one, _packets(replace(context, corners=one.corners))) for one in candidates[:_MOST_LOOKS]]
-    judged = [replace(one, log_odds=one.log_odds + _PACKETS_COUNT * packets) for one, packets in looks]
-    judged.sort(key=lambda one: -one.log_odds)
-    odds = np.array([one.log_odds for one in judged])
+    packets = np.array([_packets(replace(context, corners=one.corners)) for one in candidates[:_MOST_LOOKS]])
+    # Without a column more or less the same packets are seen a little better or worse, by chance.
+    lost = np.maximum(packets.max() - packets - _SAME_PACKETS, 0)
+    # Those that nobody looked at may show as many.
+    odds = np.array([one.log_odds for one in candidates])
+    odds[: lost.size] -= _PACKETS_COUNT * lost
     share = np.exp(odds - odds.max())
-    return [replace(one, certainty=float(p)) for one, p in zip(judged, share / share.sum(), strict=True)]
+    share /= share.sum()
+    judged = [
+        replace(one, log_odds=float(score), certainty=float(p), column_offset=0 if p >= _LIKELY else None)
+        for one, score, p in zip(candidates, odds, share, strict=True)
+    ]
+    return sorted(judged, key=lambda one: -one.certainty)
 
 
 def _context_of_any(
