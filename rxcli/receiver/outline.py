@@ -27,13 +27,16 @@ from rxcli.receiver.corners import (
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.still import column_llr, initial_pass
 from rxcli.receiver.unknown_camera import likely_camera
-from rxcli.types import FloatArray, Frame
+from rxcli.types import FloatArray, Frame, Lens
 
 if TYPE_CHECKING:
+    from rxcli.receiver.screen.columns import ColumnLayout
     from rxcli.receiver.screen.find import ScreenSearch
     from rxcli.receiver.screen.numbering import Numbering
 
 SIDE_NAMES = ("top", "right", "bottom", "left")
+#: Shares of the rows, one of so many, by which sides are held against the columns' borders.
+_PARTS = (3, 1)
 #: Sides agree with a grid where columns differ less than this on average and anywhere, columns.
 _AGREE, _AGREE_ANYWHERE = 0.12, 0.45
 #: Log-odds of an outline by sides that contradict the grid; what sides that agree with a numbering add to it; what
@@ -45,10 +48,10 @@ _EXPLAINED_COUNTS = 0.05
 _CLEAR = 6.0
 #: What packets say counts so much: the light model is surer than it should be. At most so many outlines are received.
 _PACKETS_COUNT, _MOST_LOOKS = 0.08, 6
+#: Outlines whose packets differ by less than this, nats, show the same; and the certainty from which one is likely.
+_SAME_PACKETS, _LIKELY = 40.0, 0.5
 #: Columns that look less like packets than this have no light, nats.
 _NO_LIGHT = 25.0
-#: Rows of the light that sides may leave out, screen heights.
-_ROWS_LEFT_OUT = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,27 +99,36 @@ def find_outline(frame: Frame, options: ReceiverOptions, timer: Timer) -> Outlin
 
 def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> tuple[list[Outline], str]:
     """Outlines that the screen may have, likeliest first; why there are none, and what to do."""
-    from rxcli.receiver.screen.columns import find_columns
+    from rxcli.receiver.screen.columns import ColumnLayout, find_columns
     from rxcli.receiver.screen.find import find_screen
 
     levels = levels_of(frame)
     with timer("geometry"):
         sides = find_screen(frame.pixels, **levels)
         screen = min(options.screens, key=lambda one: one.columns)
-        columns = find_columns(
-            frame.pixels,
-            n_columns=screen.columns,
-            sigma=screen.light_spread,
-            aspect=screen.aspect,
-            mosaic_period=int(levels.get("mosaic_period", 1)),
-            lens=known_lens(frame, options),
-            lines=sides.lines,
-        )
-        found = _joined(sides, columns.numberings, screen.columns)
+        layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
+        period, lens = int(levels.get("mosaic_period", 1)), known_lens(frame, options)
+        found = _by_sides(frame, sides, layout, period, lens)
+        if not found:
+            columns = find_columns(frame.pixels, layout, mosaic_period=period, lens=lens, lines=sides.lines)
+            found = _joined(sides, columns.numberings, screen.columns)
     orientation = frame.metadata.orientation
     return [
         replace(one, corners=geometry.viewer_order(one.corners, orientation)) for one in found
     ], f"{sides.reason}; {sides.advice}"
+
+
+def _by_sides(frame: Frame, sides: ScreenSearch, layout: ColumnLayout, period: int, lens: Lens | None) -> list[Outline]:
+    """The outline by the sides, where the borders of the columns stand between them as they should."""
+    from rxcli.receiver.screen.agreement import sides_agree
+
+    if sides.corners is None:
+        return []
+    # A part of the rows tells most of the time.
+    for part in _PARTS:
+        if sides_agree(frame.pixels, sides.corners, layout, mosaic_period=period, lens=lens, part=part):
+            return [Outline(sides.corners, inferred=sides.inferred)]
+    return []
 
 
 def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: int) -> list[Outline]:
@@ -127,14 +139,11 @@ def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: i
     outlines = []
     agreed = False
     for numbering in numberings:
-        own = Outline(
-            numbering.corners, inferred=_unseen(numbering, n_columns), log_odds=_odds_of(numbering, numberings)
-        )
+        own = Outline(numbering.corners, inferred=SIDE_NAMES, log_odds=_odds_of(numbering, numberings))
         if by_sides and _agree(by_sides.corners, numbering, n_columns):
             agreed = True
             bonus = _INFERRED if by_sides.inferred else _CONFIRMED
-            taken = by_sides if _has_rows(by_sides.corners, numbering.corners) else own
-            own = replace(taken, log_odds=own.log_odds + bonus)
+            own = replace(by_sides, log_odds=own.log_odds + bonus)
         outlines.append(own)
     if by_sides and not agreed:
         outlines.append(replace(by_sides, log_odds=_CONTRADICTED))
@@ -149,10 +158,6 @@ def _odds_of(numbering: Numbering, numberings: tuple[Numbering, ...]) -> float:
     return numbering.log_odds - _EXPLAINED_COUNTS * (best - numbering.grid.explained)
 
 
-def _unseen(numbering: Numbering, n_columns: int) -> tuple[str, ...]:
-    return SIDE_NAMES
-
-
 def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:
     """Whether sides say the same of the columns as a grid."""
     u, v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0.1, 0.9, 5), indexing="ij")
@@ -161,22 +166,24 @@ def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:
     return bool(apart.mean() < _AGREE and apart.max() < _AGREE_ANYWHERE)
 
 
-def _has_rows(corners: FloatArray, light: FloatArray) -> bool:
-    """Whether sides leave out next to none of the rows that have light."""
-    return True
-
-
 def _by_packets(frame: Frame, candidates: list[Outline], options: ReceiverOptions, timer: Timer) -> list[Outline]:
     """Candidates by what they were worth before and by how much their columns look like packets."""
     context = _context_of_any(frame, candidates, options, timer)
     if context is None:
         return candidates
-    looks = [(one, _packets(replace(context, corners=one.corners))) for one in candidates[:_MOST_LOOKS]]
-    judged = [replace(one, log_odds=one.log_odds + _PACKETS_COUNT * packets) for one, packets in looks]
-    judged.sort(key=lambda one: -one.log_odds)
-    odds = np.array([one.log_odds for one in judged])
+    packets = np.array([_packets(replace(context, corners=one.corners)) for one in candidates[:_MOST_LOOKS]])
+    # Without a column more or less the same packets are seen a little better or worse, by chance.
+    lost = np.maximum(packets.max() - packets - _SAME_PACKETS, 0)
+    # Those that nobody looked at may show as many.
+    odds = np.array([one.log_odds for one in candidates])
+    odds[: lost.size] -= _PACKETS_COUNT * lost
     share = np.exp(odds - odds.max())
-    return [replace(one, certainty=float(p)) for one, p in zip(judged, share / share.sum(), strict=True)]
+    share /= share.sum()
+    judged = [
+        replace(one, log_odds=float(score), certainty=float(p), column_offset=0 if p >= _LIKELY else None)
+        for one, score, p in zip(candidates, odds, share, strict=True)
+    ]
+    return sorted(judged, key=lambda one: -one.certainty)
 
 
 def _context_of_any(

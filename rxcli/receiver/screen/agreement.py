@@ -10,35 +10,41 @@ import numpy as np
 
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.coherence import Pixels, strip_changes
+from rxcli.receiver.screen.columns import ColumnLayout
 from rxcli.receiver.screen.comb import likeness
-from rxcli.types import FloatArray, Lens
+from rxcli.types import Float32Array, FloatArray, Lens
 
-#: Distance of the strips, columns; rows that are read, of so many; and parts of the screen that must agree each.
-_APART, _PART, _PARTS = 0.72, 3, 4
-#: Height of the comb over what it should be, and over chance, in every part; and how far its phase may be off, columns.
-_LEAST_HEIGHT, _LEAST_SCORE, _MOST_OFF = 0.45, 5.0, 0.1
+#: Distance of the strips, columns; and parts of the screen.
+_APART, _PARTS = 0.72, 4
+#: Height of the comb over what it would be without noise, and over chance; how far its phase may be off, columns.
+_LEAST_HEIGHT, _LEAST_SCORE, _MOST_OFF = 0.1, 6.0, 0.06
+#: Height over chance from which a part of the screen says anything, and how far the phase may be off there, columns.
+_SAYS, _MOST_OFF_IN_PART = 3.0, 0.15
+#: Neighbouring pairs overlap, and neighbouring rows: so much less do they tell.
+_OVERLAP = 2.2
 
 
 def sides_agree(
     pixels: Pixels,
     corners: FloatArray,
-    n_columns: int,
-    sigma: float,
+    layout: ColumnLayout,
     *,
     mosaic_period: int = 1,
     lens: Lens | None = None,
+    part: int = 1,
 ) -> bool:
     """Whether columns have their borders where the corners of a screen put them.
 
     Args:
         pixels: (height, width): luma or mosaic.
         corners: (4, 2) the screen's corners, pixels, by turns from the stored picture's top left.
-        n_columns: columns of the screen.
-        sigma: its light spread, column pitches.
+        layout: of its columns.
         mosaic_period: pixels after which the colours of a mosaic repeat; 1 for luma.
         lens: of the picture, where it is known.
+        part: read one of so many equal parts of the rows.
     """
-    scaled, x, y = strip_changes(pixels, mosaic_period=mosaic_period, part=_PART)
+    n_columns = layout.n_columns
+    scaled, x, y = strip_changes(pixels, mosaic_period=mosaic_period, part=part)
     flat = corners if lens is None or lens.corrected else geometry.undistort(corners, lens)
     inverse = np.linalg.inv(geometry.homography(flat))
     points = np.stack(np.meshgrid(x, y), axis=-1)
@@ -50,28 +56,28 @@ def sides_agree(
     pairs = np.mean(scaled[:, :, apart:] * scaled[:, :, :-apart], axis=1)
     ui, uj = u[:, :-apart], u[:, apart:]
     inside = (np.minimum(ui, uj) > 0) & (np.maximum(ui, uj) < n_columns) & (np.abs(v[:, apart:] - 0.5) < 0.5)
-    return all(_agrees(pairs, (ui + uj) / 2, inside & part, sigma, scaled.shape[1]) for part in _parts(ui, n_columns))
+    return _agree(
+        pairs, (ui + uj) / 2, np.where(inside, np.floor(ui * _PARTS / n_columns), -1), layout.sigma, scaled.shape[1]
+    )
 
 
-def _parts(u: FloatArray, n_columns: int) -> list[FloatArray]:
-    """Masks of equal parts of the screen, from left to right."""
-    part = np.floor(u * _PARTS / n_columns)
-    return [part == number for number in range(_PARTS)]
-
-
-def _agrees(pairs: FloatArray, middle: FloatArray, where: FloatArray, sigma: float, n_rows: int) -> bool:
-    """Whether pairs are least alike at the borders, and as much as they should be."""
-    if where.sum() < 20:
-        return False
-    values, phase = pairs[where], np.exp(2j * np.pi * middle[where])
-    comb = complex(2 * ((values - values.mean()) * phase).mean())
+def _agree(pairs: Float32Array, middle: FloatArray, part: FloatArray, sigma: float, n_rows: int) -> bool:
+    """Whether pairs are least alike at the borders: over the whole screen, and in each part that says anything."""
     tables = likeness(sigma)
     step = int(tables.step(np.array(_APART)))
-    full = float(tables.harmonic[step] / tables.mean[step]) * float(values.mean())
-    chance = np.sqrt(2 * 1.5 / (values.size * n_rows * 2 / 3))
+    depth = float(tables.harmonic[step] / tables.mean[step])
+    combs, full, counts = np.zeros(_PARTS, np.complex128), np.zeros(_PARTS), np.zeros(_PARTS)
+    for number in range(_PARTS):
+        values = pairs[part == number]
+        if values.size:
+            combs[number] = 2 * ((values - values.mean()) * np.exp(2j * np.pi * middle[part == number])).sum() / depth
+            full[number], counts[number] = values.sum(), values.size
+    chance = np.sqrt(2 * _OVERLAP * counts / n_rows) / abs(depth) + 1e-9
+    total, noise = complex(combs.sum()), float(np.sqrt((chance**2).sum()))
+    off = np.abs(np.angle(combs)) / (2 * np.pi)
     return bool(
-        full < 0
-        and abs(comb) > _LEAST_HEIGHT * abs(full)
-        and abs(comb) > _LEAST_SCORE * chance
-        and abs(np.angle(comb / full)) < 2 * np.pi * _MOST_OFF
+        abs(total) > max(_LEAST_SCORE * noise, _LEAST_HEIGHT * full.sum())
+        and abs(np.angle(total)) < 2 * np.pi * _MOST_OFF
+        and (off[np.abs(combs) > _SAYS * chance] < _MOST_OFF_IN_PART).all()
+        and (np.abs(combs) > _SAYS * chance)[[0, -1]].all()
     )

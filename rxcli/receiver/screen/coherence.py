@@ -27,8 +27,9 @@ _LOW_ROWS, _LOW_SHORT_ROWS, _LOW_LONG_ROWS = 1500, 3, 25
 _CLIP = 2.5
 #: Share of the strips, the least coherent, that are taken to be without light.
 _DARK_SHARE = 0.3
-#: Averaged rows that count as independent ones: the short box joins neighbours that are half its length apart.
-_INDEPENDENT = 2 / 3
+#: Rows apart at which light may still be alike, as so many slots have, in averaged rows; and share of the strips by
+#: which that is measured.
+_LAGS, _BRIGHT_SHARE = 40, 0.2
 _TINY = 1e-6
 
 
@@ -76,8 +77,8 @@ def measure_coherence(
     """
     scaled, x, starts = strip_changes(pixels, mosaic_period=mosaic_period, n_strips=n_strips)
     height, width = pixels.shape
-    n_rows = scaled.shape[1] * _INDEPENDENT
     quiet, lit = _without_row_noise(scaled)
+    n_rows = _independent_rows(quiet, lit)
     pairs = _pairs(quiet, int(np.ceil(reach * width / float(x[1] - x[0]))))
     step = (_LOW_SHORT_ROWS if height < _LOW_ROWS else _SHORT_ROWS) // 2
     at = starts[:, None] + step * (np.arange(scaled.shape[1], dtype=np.float64) - (scaled.shape[1] - 1) / 2)
@@ -140,6 +141,15 @@ def _without_row_noise(scaled: Float32Array) -> tuple[Float32Array, Float32Array
     quiet = scaled - noise[..., None] * share[:, None]
     lit = np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1)
     return np.asarray(quiet, np.float32), np.asarray(lit, np.float32)
+
+
+def _independent_rows(quiet: Float32Array, lit: Float32Array) -> float:
+    """Rows of a window that count as independent: two strips' chance coherence has a variance of one over these."""
+    bright = np.argsort(-lit.mean(axis=0))[: max(int(_BRIGHT_SHARE * lit.shape[1]), 1)]
+    strips, rows = quiet[:, :, bright], quiet.shape[1]
+    power = float(np.mean(strips * strips)) + _TINY
+    alike = [float(np.mean(strips[:, lag:] * strips[:, :-lag])) / power for lag in range(1, min(_LAGS, rows // 2))]
+    return rows / (1 + 2 * float(np.sum(np.square(alike))))
 
 
 def _neighbours(scaled: Float32Array) -> Float32Array:

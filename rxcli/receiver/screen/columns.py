@@ -27,6 +27,17 @@ _MIN_SIZE = 96
 
 
 @dataclass(frozen=True, slots=True)
+class ColumnLayout:
+    """What is known of a screen's columns."""
+
+    n_columns: int = 20
+    #: Light spread, column pitches.
+    sigma: float = 0.45
+    #: Width over height of the screen.
+    aspect: float = 16 / 9
+
+
+@dataclass(frozen=True, slots=True)
 class ColumnSearch:
     """What a picture's coherence says of its columns."""
 
@@ -38,10 +49,8 @@ class ColumnSearch:
 
 def find_columns(
     pixels: Pixels,
+    layout: ColumnLayout,
     *,
-    n_columns: int = 20,
-    sigma: float = 0.45,
-    aspect: float = 16 / 9,
     mosaic_period: int = 1,
     lens: Lens | None = None,
     lines: Sequence[Side] = (),
@@ -50,9 +59,7 @@ def find_columns(
 
     Args:
         pixels: (height, width) uint8 or uint16: luma, or a mosaic.
-        n_columns: columns of the screen.
-        sigma: its light spread, column pitches.
-        aspect: width over height of the screen.
+        layout: of the screen.
         mosaic_period: pixels after which the colours of a mosaic repeat; 1 for luma.
         lens: of the picture, where it is known.
         lines: top, right, bottom, left, where stripes begin; none: nothing is known of them.
@@ -61,9 +68,8 @@ def find_columns(
         return ColumnSearch(None, ())
     coherence = measure_coherence(pixels, mosaic_period=mosaic_period)
     found = []
-    for grid in _grids(coherence, sigma, lens):
-        numberings = possible_numberings(coherence, grid, n_columns, aspect, lines=lines)
-        found += numberings
+    for grid in _grids(coherence, layout.sigma, lens):
+        found += possible_numberings(coherence, grid, layout.n_columns, layout.aspect, lines=lines)
     return ColumnSearch(coherence, tuple(found))
 
 
@@ -79,7 +85,7 @@ def _grids(coherence: Coherence, sigma: float, lens: Lens | None) -> list[Grid]:
         if not any(_same(grid, other) for other in distinct):
             distinct.append(grid)
     least = min(_RIVAL_GAIN * distinct[0].gain, distinct[0].gain - _RIVAL_NATS)
-    refined = [refine_by_waveforms(coherence, grid, sigma) for grid in distinct if grid.gain > max(least, 0)]
+    refined = [refine_by_waveforms(coherence, grid, sigma) for grid in distinct if grid.gain > least]
     refined.sort(key=lambda one: -one.explained)
     return [grid for grid in refined if grid.explained > refined[0].explained - _RIVAL_EXPLAINED]
 

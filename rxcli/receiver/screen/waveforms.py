@@ -16,7 +16,9 @@ from rxcli.receiver.screen.coherence import Coherence
 from rxcli.receiver.screen.grid import Grid, columns_of_strips, gain_of, grid_prior, grid_slopes
 from rxcli.types import Float32Array, FloatArray
 
-_ROUNDS = 8
+_ROUNDS = 16
+#: Waveforms have noise in them, so that steps come out too short.
+_LONGER = 1.5
 #: Weight against waveforms of columns that hardly show, strips.
 _RIDGE = 0.5
 #: Strips whose mixes are further off than so many standard deviations count less.
@@ -44,7 +46,7 @@ def refine_by_waveforms(coherence: Coherence, grid: Grid, sigma: float) -> Grid:
         normal = (flat * weight.ravel()) @ flat.T + np.diag(prior)
         gradient = flat @ (weight * off).ravel() - prior * numbers
         step = np.linalg.solve(normal + 1e-3 * np.diag(np.diag(normal)), gradient)
-        numbers = numbers + np.clip(step, -_LARGEST, _LARGEST)
+        numbers = numbers + np.clip(_LONGER * step, -_LARGEST, _LARGEST)
         if np.abs(step[:3]).max() < 2e-3:
             break
     refined = replace(grid, numbers=numbers)
