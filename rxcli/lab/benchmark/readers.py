@@ -1,9 +1,9 @@
 """Mutated files of every kind through the whole program: an answer within limits, and never an internal error.
 
 Every case is one call of `vlc-rx decode` (or `profiles validate`) on a valid file with something done to it: bytes
-changed, cut, repeated, moved; or on a mutated truth, profile, journal or option. Cases run in processes of their own
-kind, many in one, which report a line each; a case that takes too long, or too much memory, ends its process and is
-named by its seed. The same seed makes the same case.
+changed, cut, repeated, moved; or on a mutated truth, profile, journal or option. Many cases run in one process, which
+reports a line each; a case that takes too long, or too much memory, ends the process and is named by its seed. The same
+seed makes the same case.
 """
 
 from __future__ import annotations
