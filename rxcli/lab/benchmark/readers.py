@@ -108,7 +108,7 @@ def make_samples(folder: Path) -> dict[str, bytes]:
     folder.mkdir(parents=True, exist_ok=True)
     source = cv2.imread(str(data_dir("sample_frames") / "phone_chelsea_17k3.jpg"))
     assert source is not None
-    picture = np.ascontiguousarray(cv2.resize(source, (640, 480), interpolation=cv2.INTER_AREA)[..., ::-1])
+    picture = np.ascontiguousarray(cv2.resize(source, (256, 192), interpolation=cv2.INTER_AREA)[..., ::-1])
     image, exif = Image.fromarray(picture), Image.Exif()
     exif[0x010F], exif[0x0110], exif.get_ifd(0x8769)[0x829A] = "Example", "Camera", 1 / 8000
     image.save(folder / "a.jpg", exif=exif)
@@ -138,9 +138,9 @@ def make_samples(folder: Path) -> dict[str, bytes]:
     for name, codec in (("a.mp4", "libx264"), ("a.avi", "mjpeg"), ("a.mkv", "mjpeg"), ("a.ts", "libx264")):
         with av.open(str(folder / name), "w") as container:
             stream = container.add_stream(codec, rate=30)
-            stream.width, stream.height = 320, 240
+            stream.width, stream.height = 160, 120
             stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-            small = cv2.resize(picture, (320, 240), interpolation=cv2.INTER_AREA)
+            small = cv2.resize(picture, (160, 120), interpolation=cv2.INTER_AREA)
             for _ in range(4):
                 frame = av.VideoFrame.from_ndarray(small, "rgb24").reformat(format=stream.pix_fmt)
                 container.mux(stream.encode(frame))
