@@ -277,13 +277,37 @@ def _speed_of_media(
     _say_written(written)
 
 
+def _mutated_readers(n: int, seconds: float | None, out: Path, seed: int) -> int:
+    from rxcli.errors import ExitCode
+    from rxcli.lab.benchmark import readers as work
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
+
+    first = 1_000_000 * seed
+    verdict = work.run(n, first, out / "readers", seconds)
+    table = work.rows(verdict)
+    click.echo(format_table(table))
+    click.echo(
+        f"{verdict.n} cases with seeds from {first} on; exit codes {dict(sorted(verdict.codes.items()))}; slowest "
+        f"{verdict.slowest_s:.1f} s (seed {verdict.slowest_seed}); at most {verdict.most_mb:.0f} MB"
+    )
+    _say_written(write_outputs(out, "readers", table, {"n": verdict.n, "seed": first}))
+    return ExitCode.NOT_RECEIVED if verdict.problems else ExitCode.OK
+
+
 @benchmark.command()
 @options(("--scenes", _SOME, 10_000, "Random scenes."), *_MANY)
-def stability(scenes: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> int:
+@click.option("--readers", type=click.IntRange(1), metavar="N", help="N mutated files and options, instead of scenes.")
+@click.option("--seconds", type=click.FloatRange(1), help="With --readers: begin nothing after so long.")
+def stability(
+    scenes: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool, readers: int | None, seconds: float | None
+) -> int:
     """Random scenes: no exception, no warning, no NaN, no confident nonsense.
 
-    Exit code 1 where something was found.
+    With --readers: mutated files of all formats, truths, profiles, journals and options through the whole program: no
+    internal error, no process above 1.5 GB, no case above 60 s. Exit code 1 where something was found.
     """
+    if readers is not None:
+        return _mutated_readers(readers, seconds, out, seed)
     from rxcli.errors import ExitCode
     from rxcli.lab.benchmark import stability as work
     from rxcli.lab.benchmark.tables import format_table, format_value, write_outputs

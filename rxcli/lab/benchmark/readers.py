@@ -1,9 +1,9 @@
 """Mutated files of every kind through the whole program: an answer within limits, and never an internal error.
 
 Every case is one call of `vlc-rx decode` (or `profiles validate`) on a valid file with something done to it: bytes
-changed, cut, repeated, moved; or on a mutated truth, profile, journal or option. Cases run in processes of their own
-kind, many in one, which report a line each; a case that takes too long, or too much memory, ends its process and is
-named by its seed. The same seed makes the same case.
+changed, cut, repeated, moved; or on a mutated truth, profile, journal or option. Many cases run in one process, which
+reports a line each; a case that takes too long, or too much memory, ends the process and is named by its seed. The same
+seed makes the same case.
 """
 
 from __future__ import annotations
@@ -51,6 +51,9 @@ _OPTIONS = (
 )
 
 Mutate = Callable[[bytes, random.Random], bytes]
+Program = Callable[[list[str]], int]
+#: The program is handed in by those above it.
+_START = "from rxcli.cli.main import run; from rxcli.lab.benchmark.readers import serve; serve(run)"
 
 
 def _change_bytes(data: bytes, rng: random.Random) -> bytes:
@@ -108,7 +111,7 @@ def make_samples(folder: Path) -> dict[str, bytes]:
     folder.mkdir(parents=True, exist_ok=True)
     source = cv2.imread(str(data_dir("sample_frames") / "phone_chelsea_17k3.jpg"))
     assert source is not None
-    picture = np.ascontiguousarray(cv2.resize(source, (640, 480), interpolation=cv2.INTER_AREA)[..., ::-1])
+    picture = np.ascontiguousarray(cv2.resize(source, (256, 192), interpolation=cv2.INTER_AREA)[..., ::-1])
     image, exif = Image.fromarray(picture), Image.Exif()
     exif[0x010F], exif[0x0110], exif.get_ifd(0x8769)[0x829A] = "Example", "Camera", 1 / 8000
     image.save(folder / "a.jpg", exif=exif)
@@ -138,9 +141,9 @@ def make_samples(folder: Path) -> dict[str, bytes]:
     for name, codec in (("a.mp4", "libx264"), ("a.avi", "mjpeg"), ("a.mkv", "mjpeg"), ("a.ts", "libx264")):
         with av.open(str(folder / name), "w") as container:
             stream = container.add_stream(codec, rate=30)
-            stream.width, stream.height = 320, 240
+            stream.width, stream.height = 160, 120
             stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-            small = cv2.resize(picture, (320, 240), interpolation=cv2.INTER_AREA)
+            small = cv2.resize(picture, (160, 120), interpolation=cv2.INTER_AREA)
             for _ in range(4):
                 frame = av.VideoFrame.from_ndarray(small, "rgb24").reformat(format=stream.pix_fmt)
                 container.mux(stream.encode(frame))
@@ -178,9 +181,11 @@ class Cases:
 
     Args:
         folder: of samples and scratch files.
+        program: takes the arguments of the command line and returns the exit code.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, program: Program) -> None:
+        self._program = program
         self._samples = make_samples(folder / "samples")
         self._work = folder / f"work-{os.getpid()}"
         self._work.mkdir(exist_ok=True)
@@ -198,7 +203,7 @@ class Cases:
         kind = rng.choices(("file", "screen", "camera", "truth", "journal", "option"), (60, 8, 8, 8, 8, 8))[0]
         name, arguments = self._file(rng) if kind == "file" else (kind, getattr(self, f"_{kind}")(rng))
         began, cpu = time.monotonic(), time.process_time()
-        code, text = _call(arguments)
+        code, text = _call(self._program, arguments)
         problems = [f"{name}: {line}" for line in text.splitlines() if "internal error" in line or "Traceback" in line]
         cpu_s, mb = time.process_time() - cpu, _peak_mb()
         if code not in (0, 1, 2, 3):
@@ -244,7 +249,7 @@ class Cases:
         picture = self._good()
         if self._whole is None:
             out = self._work / "whole.jsonl"
-            _call(["decode", picture, "--json", str(out), "--force"])
+            _call(self._program, ["decode", picture, "--json", str(out), "--force"])
             self._whole = out.read_bytes()
         path = self._write("journal.jsonl", _mutated_text(self._whole, rng))
         return ["decode", picture, "--json", path, "--resume"]
@@ -267,13 +272,11 @@ def _mutated_text(data: bytes, rng: random.Random) -> bytes:
     return b"".join(words)
 
 
-def _call(arguments: list[str]) -> tuple[int, str]:
+def _call(program: Program, arguments: list[str]) -> tuple[int, str]:
     """Exit code, and all that is said."""
-    from rxcli.cli import main
-
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main.run(arguments)
+        code = program(arguments)
     return int(code), f"{out.getvalue()}\n{err.getvalue()}"
 
 
@@ -301,7 +304,7 @@ def _run_process(verdict: Verdict, first: int, stop: int, folder: Path, end: flo
     root = str(Path(__file__).resolve().parents[3])
     path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    command = [sys.executable, "-m", "rxcli.lab.benchmark.readers", str(folder), str(first), str(stop)]
+    command = [sys.executable, "-c", _START, str(folder), str(first), str(stop)]
     environment = {**os.environ, "PYTHONPATH": path, **threads}
     with tempfile.TemporaryFile() as complaints:
         process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=complaints)
@@ -365,19 +368,15 @@ def rows(verdict: Verdict) -> list[dict[str, Any]]:
     return table
 
 
-def main() -> None:
-    """Run cases FIRST to STOP in FOLDER, a line of JSON each; ends early where the process has grown."""
+def serve(program: Program) -> None:
+    """Run the cases that the process is called with, a line of JSON each; ends early where the process has grown."""
     folder, first, stop = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
     resource.setrlimit(resource.RLIMIT_AS, (_ADDRESSES_MB << 20, _ADDRESSES_MB << 20))
     logging.raiseExceptions = False
-    cases, out = Cases(folder), os.fdopen(os.dup(1), "w")
+    cases, out = Cases(folder, program), os.fdopen(os.dup(1), "w")
     for seed in range(first, stop):
         record = cases.run(seed)
         out.write(json.dumps(record) + "\n")
         out.flush()
         if record["mb"] > MOST_MB:
             sys.exit(_ENOUGH)
-
-
-if __name__ == "__main__":
-    main()
