@@ -209,10 +209,14 @@ class _Clip:
         """Whether a frame is the one before once more, as a change of the frame rate makes them: its time is wrong."""
         if "tracking" not in self._options.skip or self._corners is None:
             return False
-        (left, top), (right, bottom) = self._corners.min(axis=0).clip(0), self._corners.max(axis=0)
-        some = frame.pixels[int(top) : int(bottom) : _SAME_STEP, int(left) : int(right) : _SAME_STEP].astype(np.float32)
+        some = frame.pixels[::_SAME_STEP, ::_SAME_STEP].astype(np.float32)
         before, self._some = self._some, some
-        if before is None or before.shape != some.shape or some.size == 0:
+        if before is None or before.shape != some.shape:
+            return False
+        (left, top), (right, bottom) = (self._corners[[0, 2]] / _SAME_STEP).astype(int).clip(0)
+        screen = np.s_[min(top, bottom) : max(top, bottom), min(left, right) : max(left, right)]
+        some, before = some[screen], before[screen]
+        if min(some.shape) < 2:
             return False
         # Stripes are elsewhere in every other frame.
         unit = (frame.white - frame.black) / 255
