@@ -70,6 +70,8 @@ class Frame:
     mosaic: Mosaic | None = None
     #: True where developed values are proportional to light (linear TIFF).
     linear: bool = False
+    #: True where the source's own times do not advance, so that `time_s` is by its nominal frame rate.
+    nominal_time: bool = False
 
     @property
     def height(self) -> int:

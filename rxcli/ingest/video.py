@@ -29,6 +29,8 @@ _FULL_RANGE = 2
 _LIMITED_BLACK, _LIMITED_WHITE = 16, 235
 #: A clip is cut where its last frame starts more than this many frames before its stated end; times are rounded.
 _END_TOLERANCE = 1.5
+#: Frame rates that a stream may state, and the one that is taken where it states none.
+_RATES_HZ, _USUAL_RATE_HZ = (1.0, 1000.0), 30.0
 _MJPEG_THREADS = min(4, os.cpu_count() or 1)
 #: Threads of the other decoders: one more than FFmpeg takes, for theirs wait for one another.
 _DECODER_THREADS = min((os.cpu_count() or 1) + 2, 16)
@@ -45,6 +47,8 @@ class _Progress:
 
     n_packets: int = 0
     last_time_s: float = 0.0
+    #: Time of the last frame that was given one; None before any.
+    stamp_s: float | None = None
     #: Time of the last whole frame before the first fault.
     broken_at_s: float | None = None
     n_damaged: int = 0
@@ -66,6 +70,8 @@ class _Picture:
     black: float
     white: float
     orientation: int = 1
+    #: Whether `time_s` is by the nominal frame rate, for the file's own time does not advance.
+    nominal: bool = False
 
 
 def read_video(path: Path) -> Iterator[Frame]:
@@ -109,6 +115,7 @@ def _frames(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
             metadata=replace(metadata, orientation=picture.orientation),
             black=picture.black,
             white=picture.white,
+            nominal_time=picture.nominal,
         )
 
 
@@ -147,7 +154,7 @@ def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
             if frame.is_corrupt:
                 progress.damage()
             else:
-                yield _picture(frame, _time_s(frame, stream, progress))
+                yield _picture(frame, *_time_s(frame, stream, progress))
 
 
 def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[_Picture]:
@@ -155,28 +162,42 @@ def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) 
 
     limited = stream.codec_context.color_range not in (0, _FULL_RANGE)
     black, white = (_LIMITED_BLACK, _LIMITED_WHITE) if limited else (0, 255)
-    waiting: deque[tuple[float, Future[NDArray[np.uint8]]]] = deque()
+    waiting: deque[tuple[tuple[float, bool], Future[NDArray[np.uint8]]]] = deque()
     with ThreadPoolExecutor(_MJPEG_THREADS) as pool:
         for packet in _packets(container, stream, progress):
             if packet is not None:
                 waiting.append((_time_s(packet, stream, progress), pool.submit(decode_luma, bytes(packet), path)))
             while len(waiting) > (_MJPEG_THREADS if packet is not None else 0):
-                time_s, picture = waiting.popleft()
+                (time_s, nominal), picture = waiting.popleft()
                 try:
-                    yield _Picture(picture.result(), time_s, black, white)
+                    yield _Picture(picture.result(), time_s, black, white, nominal=nominal)
                 except InputError:
                     progress.damage()
 
 
-def _time_s(stamped: Any, stream: Any, progress: _Progress) -> float:
-    """Presentation time of a frame or packet; that of the one before where it has none, or none to be believed."""
-    if stamped.pts is None or not stream.time_base:
-        return progress.last_time_s
-    time_s = float(stamped.pts * stream.time_base)
-    return time_s if abs(time_s) < _MOST_S else progress.last_time_s
+def _time_s(stamped: Any, stream: Any, progress: _Progress) -> tuple[float, bool]:
+    """Presentation time of a frame or packet, and whether it is by the nominal frame rate.
+
+    That is taken where a file gives no time, or one that does not advance: zeros, or times that run backwards.
+    """
+    own = float(stamped.pts * stream.time_base) if stamped.pts is not None and stream.time_base else None
+    if own is not None and abs(own) >= _MOST_S:
+        own = None
+    before = progress.stamp_s
+    nominal = before is not None and (own is None or own <= before)
+    progress.stamp_s = before + _frame_s(stream) if before is not None and nominal else (own or 0.0)
+    return progress.stamp_s, nominal
 
 
-def _picture(frame: Any, time_s: float) -> _Picture:
+def _frame_s(stream: Any) -> float:
+    """Nominal time from frame to frame: by the codec, by the container, or by guess."""
+    for rate in (stream.codec_context.framerate, stream.guessed_rate, stream.average_rate):
+        if rate and _RATES_HZ[0] <= float(rate) <= _RATES_HZ[1]:
+            return 1 / float(rate)
+    return 1 / _USUAL_RATE_HZ
+
+
+def _picture(frame: Any, time_s: float, nominal: bool) -> _Picture:
     if not _has_luma_plane(frame.format):
         frame = frame.reformat(format="gray")
     bits = frame.format.components[0].bits
@@ -187,6 +208,7 @@ def _picture(frame: Any, time_s: float) -> _Picture:
         black=black,
         white=white,
         orientation=orientation_of_turn(frame.rotation),
+        nominal=nominal,
     )
 
 

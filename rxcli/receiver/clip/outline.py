@@ -52,8 +52,10 @@ class FirstOutline:
         if self.settled or self._texture is None:
             return
         moved = self._texture.find(frame)
+        if not moved.tells:
+            moved = self._texture.with_outline(moved, self._first)
         found = find_outline(frame, self._options, Timer())
-        if isinstance(found, Failure) or not moved.certain or self._is_far(found.corners - moved.corners):
+        if isinstance(found, Failure) or not moved.fits or self._is_far(found.corners - moved.corners):
             # Nothing to compare with: what was found so far must do.
             self._texture = None
             return

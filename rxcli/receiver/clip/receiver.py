@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import channel, sync
@@ -36,6 +37,11 @@ _HELD, _HELD_LONG, _MUCH_DOUBT = 6, 24, 0.03
 _TOO_MUCH_DOUBT = 0.25
 #: Share of columns that a quick look at a first frame may leave in doubt.
 _QUICK_DOUBT = 0.5
+#: Pixels of which one is compared with the frame before; least change from row to row, grey levels of 255, and share of
+#: it that a frame shown twice differs from itself.
+_SAME_STEP, _SAME_CONTRAST, _SAME_SHARE = 7, 3.0, 0.25
+_SAME = "it shows the frame before once more, so that its time is not that of its rows; it was left out"
+_NOMINAL_TIME = "the clip's time stamps do not advance here; its nominal frame rate was taken"
 #: Frames in a row that may be received like photographs before the picture is learned anew.
 _MOST_UNKNOWN = 3
 #: Frames that find their clock together where each shows little.
@@ -104,6 +110,8 @@ class _Clip:
         self._context: FrameContext | None = None
         self._taken_with: tuple[object, ...] = ()
         self._corners: FloatArray | None = None
+        #: Some pixels of the last frame.
+        self._some: NDArray[np.float32] | None = None
         #: Number of a frame that is yet to be received, and its corners.
         self._found: tuple[int, Outline] | None = None
         #: None where nothing is known, or frames cannot be tracked; and the one before the last search.
@@ -159,7 +167,13 @@ class _Clip:
 
     def _take(self, frame: Frame) -> list[FrameResult]:
         timer = Timer()
-        waiting = Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok"))
+        message = _NOMINAL_TIME if frame.nominal_time else None
+        waiting = Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok", message=message))
+        if self._shows_the_same(frame):
+            waiting.result = replace(waiting.result, message=_SAME)
+            waiting.skip("doubled_frames", 1)
+            self._waiting.append(waiting)
+            return self._ready()
         if self._options.stop_when_certain and self._shows_nothing_new(frame):
             waiting.result = replace(waiting.result, message="its bursts are certain from the frames before")
             waiting.skip("certain_frames", 1)
@@ -190,6 +204,25 @@ class _Clip:
             done = self._enter(waiting, frame, timer)
         waiting.result = replace(waiting.result, timing_ms=timer.total())
         return done
+
+    def _shows_the_same(self, frame: Frame) -> bool:
+        """Whether a frame is the one before once more, as a change of the frame rate makes them: its time is wrong."""
+        if "tracking" not in self._options.skip or self._corners is None:
+            return False
+        some = frame.pixels[::_SAME_STEP, ::_SAME_STEP].astype(np.float32)
+        before, self._some = self._some, some
+        if before is None or before.shape != some.shape:
+            return False
+        (left, top), (right, bottom) = (self._corners[[0, 2]] / _SAME_STEP).astype(int).clip(0)
+        screen = np.s_[min(top, bottom) : max(top, bottom), min(left, right) : max(left, right)]
+        some, before = some[screen], before[screen]
+        if min(some.shape) < 2:
+            return False
+        # Stripes are elsewhere in every other frame.
+        unit = (frame.white - frame.black) / 255
+        contrast = float(np.abs(np.diff(some, axis=0)).mean())
+        changed = float(np.abs(some - before).mean())
+        return contrast > _SAME_CONTRAST * unit and changed < _SAME_SHARE * contrast
 
     def _shows_nothing_new(self, frame: Frame) -> bool:
         """Whether all bursts that a frame should show are certain already in all columns that are lit."""

@@ -25,9 +25,13 @@ _STRIPS = 4
 _MANY_VIEWS = 12
 #: Movement that is none: pixels, or standard deviations of what was found.
 _STILL_PX, _STILL_SDS = 0.3, 2.5
-#: How often a still outline is looked for where the picture does not tell, looks that make it still; how far it may
-#: have moved, in screen widths, to be where it was, and how far from one frame to the next to be found.
-_LOOK_EVERY, _STILL_LOOKS, _STILL_OUTLINE, _OUTLINE_REACH = 8, 3, 0.004, 0.02
+#: Where texture tells little: how well rest is known in screen sizes, and standard deviations of what may be rest.
+_REST_SD, _REST_SDS = 0.0005, 4.0
+#: How often a still outline is looked for where the picture does not tell, and looks that make it still.
+_LOOK_EVERY, _STILL_LOOKS = 8, 3
+#: In screen widths: how far an outline may be from where the screen was to be there still; from where it objects to
+#: what the picture says; and how far it may move from one frame to the next to be found.
+_STILL_OUTLINE, _OBJECTION, _OUTLINE_REACH = 0.004, 0.008, 0.02
 #: A screen found anew whose corners are closer than this to where they were, in screen widths, is where it was.
 _NEAR = 0.06
 #: Frames from which the picture is learned one by one, and how often from then on.
@@ -129,12 +133,17 @@ class TrackedScreen:
     def follow(self, frame: Frame) -> bool:
         """Find where the screen is in a frame, by the picture on it; returns whether that is certain."""
         found = self._texture.find(frame)
+        confirmed = found.fits
         if not found.tells:
-            outline = self.corners if self._named else self._outline_near(frame, found.corners)
-            if outline is None:
-                return False
-            found = self._texture.with_outline(found, outline)
-        elif not found.certain:
+            # What the texture leaves open does not matter to it: it stays, unless the outline objects.
+            outline = self._outline_near(frame, found.corners)
+            confirmed = confirmed or outline is not None or self._named
+            at_rest = self._texture.with_outline(found, self.corners, _REST_SD)
+            if _is_possible(self.corners - found.corners, found.covariance):
+                at_rest = replace(at_rest, corners=self.corners)
+            moved = outline is not None and np.abs(outline - at_rest.corners).max() > _OBJECTION * self._width
+            found = self._texture.with_outline(found, outline) if outline is not None and moved else at_rest
+        if not confirmed:
             return False
         if _is_still(found.corners - self.corners, found.sd_px):
             found = replace(found, corners=self.corners)
@@ -144,24 +153,29 @@ class TrackedScreen:
         return True
 
     def _outline_near(self, frame: Frame, corners: FloatArray) -> FloatArray | None:
-        """Corners (4, 2) of the screen by its outline, where the picture on it does not tell; None where it is gone.
+        """Corners (4, 2) of the screen by its outline, where the picture on it does not tell; None where it shows none.
 
-        As long as it stays where it is, it is looked for now and then only.
+        It is looked for in every other frame, and less often as long as it stays where it is.
         """
         from rxcli.receiver.screen.find import track_screen
 
         self._n_untold += 1
-        if self._n_still >= _STILL_LOOKS and self._n_untold % _LOOK_EVERY:
-            return self.corners
+        if self._n_untold % (_LOOK_EVERY if self._n_still >= _STILL_LOOKS else 2):
+            return None
         stored, order = _stored_order(corners)
         found = track_screen(frame.pixels, stored, black=frame.black, white=frame.white, reach=_OUTLINE_REACH)
         if found.corners is None:
             return None
         outline = found.corners[order]
-        width = float(np.linalg.norm(corners[1] - corners[0]))
-        still = np.abs(outline - self.corners).max() < _STILL_OUTLINE * width
+        if np.abs(outline - corners).max() > 2 * _OUTLINE_REACH * self._width:
+            return None
+        still = np.abs(outline - self.corners).max() < _OBJECTION * self._width
         self._n_still = self._n_still + 1 if still else 0
         return outline
+
+    @property
+    def _width(self) -> float:
+        return float(np.ptp(self.corners[:, 0]))
 
     def seek(self, corners: FloatArray) -> None:
         """Expect the screen near the corners (4, 2) next."""
@@ -408,6 +422,11 @@ def _stored_order(corners: FloatArray) -> tuple[FloatArray, IntArray]:
     order = np.arange(4) if area > 0 else np.arange(4)[::-1]
     order = np.roll(order, -int(corners[order].sum(axis=1).argmin()))
     return corners[order], np.argsort(order)
+
+
+def _is_possible(moved: FloatArray, covariance: FloatArray) -> bool:
+    """Whether corners (4, 2) that seem to have moved may have stayed, each coordinate for itself."""
+    return bool((np.square(moved.ravel()) < _REST_SDS**2 * np.diag(covariance)).all())
 
 
 def _is_still(moved: FloatArray, sd_px: float) -> bool:

@@ -59,7 +59,7 @@ _ALIKE_CELLS = 4.0
 _PARTS, _OUTLINE_SD = (20, 6), 0.002
 #: Standard deviation of the corners in screen sizes, and correlation of the textures, that make it certain where a
 #: screen is.
-_MOST_SD, _LEAST_CORRELATION = 0.002, 0.35
+_MOST_SD, _LEAST_CORRELATION = 0.0012, 0.35
 #: Share of the last frame's motion that the next is expected to repeat.
 _PERSISTENCE = 0.7
 #: Weight of the frames before, at most, in frames, in what is known of the texture.
@@ -94,7 +94,12 @@ class Registration:
     @property
     def certain(self) -> bool:
         """Whether the screen is there."""
-        return self.tells and self.correlation > _LEAST_CORRELATION
+        return self.tells and self.fits
+
+    @property
+    def fits(self) -> bool:
+        """Whether the picture there is the one known, be there ever so little texture."""
+        return self.correlation > _LEAST_CORRELATION
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,11 +160,11 @@ class ScreenTexture:
         plane, covariance, correlation = self._fit(texture, fine, (plane, expected), _FINE_ITERATIONS)
         return Registration(self._lens_of(plane), covariance, correlation)
 
-    def with_outline(self, found: Registration, outline: FloatArray) -> Registration:
-        """What the texture says of a place, and what an outline (4, 2) that was found in the frame says, together."""
+    def with_outline(self, found: Registration, outline: FloatArray, sd: float = _OUTLINE_SD) -> Registration:
+        """What the texture says of a place, and what an outline (4, 2) says, together; `sd` in screen sizes."""
         seen, at = self._undistorted(outline), self._undistorted(found.corners)
         information = np.linalg.inv(found.covariance)
-        known = 1 / (_OUTLINE_SD * _size(outline)) ** 2
+        known = 1 / (sd * _size(outline)) ** 2
         covariance = np.asarray(np.linalg.inv(information + known * np.eye(8)), np.float64)
         plane = covariance @ (information @ at.ravel() + known * seen.ravel())
         return Registration(self._lens_of(plane.reshape(4, 2)), covariance, found.correlation)

@@ -1,0 +1,190 @@
+"""Clips from a hand: the screen moves from frame to frame and from row to row, and what else such clips do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from types import SimpleNamespace
+
+import msgspec
+import numpy as np
+import pytest
+
+from rxcli.ingest.video import _Progress, _time_s
+from rxcli.lab.simulate.capture import Take, prepare
+from rxcli.lab.simulate.scenes import Change, Scene, preset
+from rxcli.lab.simulate.truth import build_camera_profile
+from rxcli.options import SKIPS, ReceiverOptions
+from rxcli.receiver.pipeline import receive
+from rxcli.results.truth import Score, Scorer, Truth
+from rxcli.types import Frame, FrameResult
+
+N_FRAMES, SPEED_PX, SEED = 12, 3.0, 5
+Clip = tuple[tuple[Frame, ...], Truth, ReceiverOptions]
+
+
+def scene_in_hand(hand_px: float, n_frames: int = N_FRAMES, **changes: object) -> Scene:
+    base = preset("video-1080p", "paper-8k65").scaled(0.5, 0.5, keep_readout=True)
+    pose = replace(base.pose, fill=0.86, roll_deg=0.5)
+    scene = replace(base, picture="coffee", pose=pose, shake_px=0.0, hand_px=hand_px, n_frames=n_frames)
+    return replace(scene, **changes)  # type: ignore[arg-type]
+
+
+def filmed(scene: Scene, seed: int = SEED) -> Clip:
+    take = prepare(scene, seed)
+    frames = tuple(
+        Frame(np.asarray(take.frame(k).pixels), "clip", k, k / scene.frame_rate_hz) for k in range(scene.n_frames)
+    )
+    return frames, truth_of(take), options_of(take)
+
+
+def truth_of(take: Take) -> Truth:
+    return msgspec.json.decode(msgspec.json.encode(take.truth("clip")), type=Truth)
+
+
+def shaky_corners() -> list[list[list[float]]]:
+    take = prepare(scene_in_hand(SPEED_PX), SEED)
+    return [frame["corners_sensor_px"] for frame in take.truth("clip")["frames"]]
+
+
+def options_of(take: Take) -> ReceiverOptions:
+    camera = build_camera_profile(take.scene, take.exposure())
+    return ReceiverOptions(screens=(take.scene.screen,), cameras=(camera,), force_camera=True, cae="never")
+
+
+def received(clip: Clip, frames: tuple[Frame, ...] | None = None, **changes: object) -> tuple[list[FrameResult], Score]:
+    own, truth, options = clip
+    scorer = Scorer(truth)
+    chosen = replace(options, **changes)  # type: ignore[arg-type]
+    results = [scorer.add(result) for result in receive(own if frames is None else frames, chosen)]
+    return results, scorer.score()
+
+
+def surely_wrong(results: list[FrameResult]) -> int:
+    return sum(p.bit_errors != 0 for r in results for c in r.columns for p in c.packets if p.confidence >= 0.99)
+
+
+@pytest.fixture(scope="module")
+def shaky() -> Clip:
+    return filmed(scene_in_hand(SPEED_PX))
+
+
+def test_the_screen_is_followed(shaky: Clip) -> None:
+    results, score = received(shaky)
+    assert score.error_free >= 0.95 * score.expected
+    assert score.false == 0
+    assert surely_wrong(results) == 0
+    assert sum(result.skipped.get("tracking", 0) for result in results) >= N_FRAMES - 2
+
+
+def test_a_clip_gives_no_less_than_its_frames_one_by_one(shaky: Clip) -> None:
+    _, one_by_one = received(shaky, skip=frozenset(SKIPS) - {"tracking"})
+    assert received(shaky)[1].error_free >= one_by_one.error_free
+
+
+def test_corners_are_those_of_each_frame(shaky: Clip) -> None:
+    results, _ = received(shaky)
+    sent = np.array(shaky_corners(), np.float64)
+    found = np.array([result.corners for result in results])
+    assert np.abs(np.diff(sent, axis=0)).max() > 3
+    assert np.sqrt(np.square(found - sent).mean()) < 2.0
+
+
+def test_a_picture_without_texture_is_followed_by_its_outline() -> None:
+    flat = filmed(scene_in_hand(4.0, picture=np.full((90, 160, 3), 190, np.uint8)))
+    results, score = received(flat)
+    assert score.error_free >= 0.9 * score.expected
+    assert surely_wrong(results) == 0
+
+
+@pytest.mark.parametrize("change", [Change(5, light=0.5), Change(5, light=1.6), Change(5, blur_px=2.5)])
+def test_a_step_of_exposure_or_focus(change: Change) -> None:
+    results, score = received(filmed(scene_in_hand(2.0, changes=(change,))))
+    assert score.error_free >= 0.85 * score.expected
+    assert surely_wrong(results) == 0
+
+
+def test_a_hand_across_the_screen_costs_its_own_frames_only(shaky: Clip) -> None:
+    def covered(frame: Frame) -> Frame:
+        pixels = frame.pixels.copy()
+        pixels[:, : frame.width // 2] = 30
+        return replace(frame, pixels=pixels)
+
+    frames, truth, _ = shaky
+    results, score = received(shaky, (*frames[:5], *map(covered, frames[5:7]), *frames[7:]))
+    lost = sum(5 <= f.frame <= 7 and bool(f.bursts) for f in truth.frames) * 20
+    assert score.error_free >= 0.95 * score.expected - lost
+    assert surely_wrong(results) == 0
+
+
+def test_a_screen_that_leaves_the_picture_and_comes_back(shaky: Clip) -> None:
+    frames, truth, _ = shaky
+    wall = np.random.default_rng(1).integers(60, 64, frames[0].pixels.shape, np.uint8)
+    results, score = received(shaky, (*frames[:4], *(replace(f, pixels=wall) for f in frames[4:6]), *frames[6:]))
+    assert all(r.status in ("no_screen", "no_signal") and r.message for r in results[4:6])
+    gone = sum(4 <= f.frame < 6 for f in truth.frames) * 20
+    assert score.error_free >= 0.9 * (score.expected - gone)
+    assert surely_wrong(results) == 0
+
+
+def test_dropped_frames(shaky: Clip) -> None:
+    """They have no number; their time has passed."""
+    kept = [k for k in range(N_FRAMES) if k not in (4, 7, 8)]
+    frames = tuple(replace(shaky[0][k], index=n) for n, k in enumerate(kept))
+    results = list(receive(frames, shaky[2]))
+    scorer = Scorer(shaky[1])
+    marked = [scorer.add(replace(result, frame=kept[result.frame])) for result in results]
+    shown = {b.burst for k in kept for b in shaky[1].frames[k].bursts if b.visible_slots >= 72}
+    right = [p for r in marked for c in r.columns for p in c.packets if p.bit_errors == 0]
+    assert len(right) >= 0.9 * 20 * len(shown)
+    assert surely_wrong(marked) == 0
+
+
+def test_a_frame_shown_twice_is_left_out(shaky: Clip) -> None:
+    """As where 24 frames a second are stored as 30."""
+    twice = [0, 1, 2, 3, 3, 4, 5, 6, 7, 7, 8, 9, 10, 11]
+    frames = tuple(replace(shaky[0][k], index=n) for n, k in enumerate(twice))
+    results = list(receive(frames, shaky[2]))
+    assert [n for n, result in enumerate(results) if "doubled_frames" in result.skipped] == [4, 9]
+    assert all("once more" in (results[n].message or "") for n in (4, 9))
+    scorer = Scorer(shaky[1])
+    marked = [scorer.add(replace(r, frame=twice[r.frame])) for n, r in enumerate(results) if n not in (4, 9)]
+    assert scorer.score().error_free >= 0.9 * scorer.score().expected
+    assert surely_wrong(marked) == 0
+
+
+@pytest.mark.parametrize("stamps", [[0] * 6, [9, 8, 7, 6, 5, 4], [None] * 6, [0, 1, 1, 2, 3, 3]])
+def test_times_that_do_not_advance_go_on_at_the_nominal_rate(stamps: list[int | None]) -> None:
+    codec = SimpleNamespace(framerate=Fraction(60000, 1001))
+    stream = SimpleNamespace(time_base=Fraction(1, 600), codec_context=codec, guessed_rate=None, average_rate=None)
+    progress = _Progress()
+    times, nominal = zip(*(_time_s(SimpleNamespace(pts=pts), stream, progress) for pts in stamps), strict=True)
+    assert (np.diff(times) > 0).all()
+    assert not nominal[0]
+    assert np.diff(times)[np.array(nominal[1:])] == pytest.approx(1001 / 60000)
+
+
+def test_a_clip_without_times_says_so(shaky: Clip) -> None:
+    frames = tuple(replace(frame, nominal_time=frame.index > 0) for frame in shaky[0])
+    results, score = received(shaky, frames)
+    assert all("nominal frame rate" in (result.message or "") for result in results[1:])
+    assert score.error_free >= 0.9 * score.expected
+
+
+def test_two_clips_cut_together(shaky: Clip) -> None:
+    other = filmed(scene_in_hand(3.0, picture="chelsea", n_frames=8), seed=9)
+    moved = tuple(replace(f, index=8 + f.index, time_s=8 / 59.94 + f.time_s) for f in other[0])
+    results = list(receive((*shaky[0][:8], *moved), shaky[2]))
+    for part, truth in ((results[:8], shaky[1]), (results[8:], other[1])):
+        scorer = Scorer(truth)
+        marked = [scorer.add(replace(result, frame=result.frame % 8)) for result in part]
+        assert surely_wrong(marked) == 0
+        shown = [b.burst for f in truth.frames[:8] for b in f.bursts if b.visible_slots >= 72]
+        right = [p for r in marked for c in r.columns for p in c.packets if p.bit_errors == 0]
+        assert len(right) >= 0.85 * 20 * len(set(shown))
+
+
+def test_a_clip_in_portrait_says_why_nothing_comes(shaky: Clip) -> None:
+    turned = tuple(replace(f, metadata=replace(f.metadata, orientation=6)) for f in shaky[0][:3])
+    results, _ = received(shaky, turned)
+    assert all(result.status == "no_signal" and "portrait" in (result.message or "") for result in results)
