@@ -93,7 +93,7 @@ def find_outline(frame: Frame, options: ReceiverOptions, timer: Timer) -> Outlin
     if candidates:
         return candidates[0]
     if "no_screen" in options.skip:
-        return Failure("no_screen", f"no screen found: {turned_pixels(frame) or reason}")
+        return Failure("no_screen", f"no screen found: {reason}")
     return Outline(whole_picture(frame), inferred=SIDE_NAMES, column_offset=None)
 
 
@@ -105,6 +105,8 @@ def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> t
     levels = levels_of(frame)
     with timer("geometry"):
         sides = find_screen(frame.pixels, **levels)
+        if sides.corners is None and (turned := turned_pixels(frame)):
+            return [], turned
         screen = min(options.screens, key=lambda one: one.columns)
         layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
         period, lens = int(levels.get("mosaic_period", 1)), known_lens(frame, options)

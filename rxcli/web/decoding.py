@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 #: Larger pictures are refused before they are decoded: no phone makes them, and they cost memory.
 MAX_PIXELS = 64_000_000
-#: Clips are read for so long; then what was received till then is shown.
+#: Clips are read until they have cost so much time of the processor; then what was received till then is shown.
 _CLIP_S = 12.0
 _MAX_PACKETS = 2000
 _POLL_S = 0.05
@@ -60,10 +60,11 @@ class DecodingProcess:
         from multiprocessing import get_context
 
         context = get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_work, args=(theirs, self._options), daemon=True)
-        self._process.start()
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_work, args=(theirs, self._options), daemon=True)
+        process.start()
         theirs.close()
+        self._process, self._connection = process, ours
 
     def close(self) -> None:
         """End the process; may be called again."""
@@ -175,7 +176,7 @@ def answer_for(path: Path, name: str, options: ReceiverOptions) -> dict[str, Any
     from rxcli.runs.batch import Source, standard_decoder
 
     started_s = time.monotonic()
-    frames = _Frames(started_s + _CLIP_S)
+    frames = _Frames(time.process_time() + _CLIP_S)
     try:
         _check_pixels(path)
     except InputError as error:
@@ -223,7 +224,7 @@ class _Frames:
         self.cut_short = False
 
     def tap(self, frame: Frame, _name: str) -> None:
-        if time.monotonic() > self._end_s and frame.index:
+        if time.process_time() > self._end_s and frame.index:
             self.cut_short = True
             raise InputError("only the beginning of the clip was read", "send a shorter one for the rest")
         self._kept[frame.index] = frame
