@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,7 +46,7 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
     page = folder / "index.html"
     own = re.compile(re.escape(MARK.encode()))
     claim_outputs([Output("--out", page, own, makes_folder=True)], (path,), (), force)
-    configured = receiver_options(**options)
+    configured = receiver_options(**options, soft_bits=True)
     results, picture = _received(path, frame, configured, truth)
     shown = next(result for result in results if result.frame == picture.index)
     screen = next((s for s in configured.screens if s.name == shown.screen_profile), None)
@@ -76,14 +77,16 @@ def _received(
         InputError: the source cannot be read, or has no such frame.
     """
     from rxcli.ingest import open_source
-    from rxcli.receiver.pipeline import receive
     from rxcli.results.truth import Scorer, find_truth, load_truth
+    from rxcli.runs.batch import standard_decoder
 
     found = find_truth(path) if truth == "auto" else truth
     scorer = Scorer(load_truth(found)) if found else None
     n_frames = max(_MOST_FRAMES, (number or 0) + 1)
     first: list[Frame] = []
-    received = list(receive(_noting(islice(open_source(path), n_frames), first), options))
+    decoder = replace(standard_decoder(options), open_source=lambda name: islice(open_source(name), n_frames))
+    frames = _noting(decoder.open_source(path), first)
+    received = list(decoder.linked(decoder.receive(frames, options)))
     results = [scorer.add(result) if scorer else result for result in received]
     best = max(results, key=lambda result: sum(len(column.packets) for column in result.columns), default=None)
     if best is None or (number is not None and number >= len(results)):
@@ -92,7 +95,7 @@ def _received(
     return results, first[0] if shown == 0 else next(islice(open_source(path), shown, None))
 
 
-def _noting(frames: Iterator[Frame], first: list[Frame]) -> Iterator[Frame]:
+def _noting(frames: Iterable[Frame], first: list[Frame]) -> Iterator[Frame]:
     """The frames; the first one is kept, so that a photo is read once."""
     for frame in frames:
         if not first:

@@ -61,7 +61,7 @@ def _site(device: Path | None, options: dict[str, Any]) -> Site:
 
     names = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
     return Site(
-        options=receiver_options(**{name: options[name] for name in names}),
+        options=receiver_options(**{name: options[name] for name in names}, soft_bits=True),
         host=options["host"] or "127.0.0.1",
         port=options["port"],
         token=secrets.token_urlsafe(12) if options["host"] else None,

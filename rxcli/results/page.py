@@ -172,12 +172,10 @@ def _steps(result: FrameResult) -> str:
 def _texts(result: FrameResult) -> str:
     """Texts and files that the link layer has complete with the frame: the one place where they come to the page."""
     lines = [
-        f"<blockquote>{html.escape(message.text or message.data.hex())}</blockquote>"
-        for message in getattr(result, "messages", ())
+        f"<blockquote>{html.escape(message.text or message.data.hex())}</blockquote>" for message in result.messages
     ]
     lines += [
-        f"<p>File: {html.escape(received.name)} ({plural(received.size, 'byte')})</p>"
-        for received in getattr(result, "objects", ())
+        f"<p>File: {html.escape(received.name)} ({plural(received.size, 'byte')})</p>" for received in result.objects
     ]
     return f'<div class="texts">{"".join(lines)}</div>' if lines else ""
 

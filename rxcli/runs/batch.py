@@ -146,7 +146,7 @@ class Decoder:
         try:
             if source.problem:
                 raise InputError(source.problem)
-            for result in self._linked(self.receive(failure.guard(self._frames(source)), self._options_of(source))):
+            for result in self.linked(self.receive(failure.guard(self._frames(source)), self._options_of(source))):
                 yield replace(result, source=source.name)
                 count += 1
         except (UsageError, ProfileError, OutputError):
@@ -156,7 +156,7 @@ class Decoder:
         if failure.message or not count:
             yield unreadable(source, count, failure.message or f"{source.name}: holds no picture; name another file")
 
-    def _linked(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
+    def linked(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
         """Results with the messages and files that are complete with them.
 
         A photograph without any keeps its soft bits, for others may show the same.

@@ -279,10 +279,10 @@ def _gathered(results: Iterator[FrameResult], frames: _Frames, options: Receiver
 def texts_of(result: FrameResult) -> list[dict[str, Any]]:
     """Texts and files that the link layer has complete with a frame: the one place where they come to the page."""
     texts: list[dict[str, Any]] = []
-    for message in getattr(result, "messages", ()):
+    for message in result.messages:
         text = message.text if message.text is not None else message.data.hex()
         texts.append({"kind": message.kind, "text": text})
-    for received in getattr(result, "objects", ()):
+    for received in result.objects:
         data = base64.b64encode(received.data).decode()
         texts.append({"kind": "file", "name": received.name, "size": received.size, "base64": data})
     return texts

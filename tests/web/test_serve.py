@@ -16,6 +16,7 @@ import time
 import zlib
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +33,8 @@ from rxcli.cli.main import run  # noqa: E402
 from rxcli.ingest import open_source  # noqa: E402
 from rxcli.options import ReceiverOptions  # noqa: E402
 from rxcli.results.aim import Aim, Light, light_of  # noqa: E402
-from rxcli.types import ColumnResult, FrameResult, PacketResult  # noqa: E402
-from rxcli.web.decoding import DecodingProcess, Limits, resident_bytes  # noqa: E402
+from rxcli.types import ColumnResult, FrameResult, Message, PacketResult, ReceivedObject  # noqa: E402
+from rxcli.web.decoding import DecodingProcess, Limits, resident_bytes, texts_of  # noqa: E402
 from rxcli.web.live import live_events  # noqa: E402
 from rxcli.web.server import Bounds, Server, Site  # noqa: E402
 
@@ -347,6 +348,17 @@ def test_the_state_says_why_there_is_no_lock_and_what_to_do() -> None:
     dark = aim.update(result_of("no_screen", "no screen found: nothing; look"), 2.0, 1000, Light(0.001, 0.0))
     assert dark.reason == "No screen found: nothing (the picture is too dark)."
     assert dark.advice == "Expose longer or open the lens; look."
+
+
+def test_texts_and_files_come_to_the_page() -> None:
+    result = result_of("ok", packets=1)
+    texts = (Message("text", "Grüße".encode(), "camera", 0, 0.0), Message("uri", b"https://a.b", "camera", 0, 0.0))
+    received = ReceivedObject("a.txt", b"abc", 3, "00", 1, 1, "camera", 0, 0.0)
+    assert texts_of(replace(result, messages=texts, objects=(received,))) == [
+        {"kind": "text", "text": "Grüße"},
+        {"kind": "uri", "text": "https://a.b"},
+        {"kind": "file", "name": "a.txt", "size": 3, "base64": "YWJj"},
+    ]
 
 
 def test_light_is_told_in_words(tmp_path: Path) -> None:
