@@ -29,7 +29,7 @@ _FILES = {
 }
 _FOLDERS = ("p777", "p888", "captures", "boards", "lab", "../other", "other")
 #: Commands that run here; of all others the arguments are read, as they need a camera, a board, a lamp or an hour.
-_RUN = ("profiles", "decode sample_frames/", "decode photo.jpg", "inspect sample_frames/", "inspect photo.jpg")
+_RUN = ("profiles", "decode sample_frames/", "inspect sample_frames/")
 
 
 def blocks(page: Path, *languages: str) -> list[str]:

@@ -64,6 +64,7 @@ def test_types_and_names_agree() -> None:
 def test_defaults_are_the_command_lines() -> None:
     options = rxcli.ReceiverOptions()
     assert rxcli.receiver_options() == options
+    assert rxcli.Receiver().options == replace(options, soft_bits=True)
     assert options.screens == tuple(shipped_profiles(rxcli.ScreenProfile))
     assert options.cameras == tuple(shipped_profiles(rxcli.CameraProfile))
     assert options.skip == frozenset(SKIPS)
@@ -184,3 +185,13 @@ def test_a_denoiser_may_be_ones_own() -> None:
     assert recorder.columns == list(range(20))
     assert result.denoiser is not None
     assert result.denoiser["model"] == "recorder"
+
+
+def test_a_text_comes_out(tmp_path: Path) -> None:
+    from rxcli.cli.main import run
+
+    path = tmp_path / "hello.jpg"
+    arguments = ["--preset", "phone-plain", "--scale", "0.4", "--keep-readout", "--text", "hello", "--seed", "1"]
+    assert run(["simulate", str(path), "--screen", "data-17k3", "--picture", "sky", *arguments]) == 0
+    result = rxcli.decode(path, cae="never")
+    assert [message.text for message in result.messages] == ["hello"]

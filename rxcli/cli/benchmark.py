@@ -165,6 +165,18 @@ def outline(frames: int, **run: Any) -> None:
     _say_written(write_outputs(run["out"], "outline", rows))
 
 
+@benchmark.command()
+@options(("--frames", _COUNT, 100, "Random frames of full size, received twice each."), *_MANY)
+def screens(frames: int, **run: Any) -> None:
+    """Dark and ordinary pictures received with the screen searched, and with its corners handed over."""
+    from rxcli.lab.benchmark import screens as work
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
+
+    rows = work.rows(_random("screens", work.packets_of, frames, run))
+    click.echo(format_table(rows))
+    _say_written(write_outputs(run["out"], "screens", rows))
+
+
 def _check_sweeps(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
     from rxcli.lab.benchmark.sweeps import SWEEPS
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rxcli.errors import InputError, UsageError
 from rxcli.ingest import open_source
+from rxcli.link.collector import Collector
 from rxcli.options import ReceiverOptions, receiver_options
 from rxcli.receiver.pipeline import receive as receive_frames
 from rxcli.receiver.pipeline import receive_frame
@@ -37,7 +38,7 @@ class Receiver:
     """
 
     def __init__(self, **options: Any) -> None:
-        self.options = receiver_options(**options)
+        self.options = receiver_options(**{"soft_bits": True, **options})
 
     @classmethod
     def with_options(cls, options: ReceiverOptions) -> Self:
@@ -60,7 +61,8 @@ class Receiver:
             InputError: the file cannot be read.
             UsageError: the file is a clip, or the array is no picture.
         """
-        return receive_frame(_frame_of(picture), self.options)
+        (result,) = self._with_messages(iter([receive_frame(_frame_of(picture), self.options)]))
+        return result
 
     def receive(self, source: str | Path | Iterable[Picture]) -> Iterator[FrameResult]:
         """Receive a clip, a device, a photograph, or frames in order of time; one result a frame, in order.
@@ -77,7 +79,17 @@ class Receiver:
             UsageError: an array is no picture.
         """
         frames = open_source(source) if isinstance(source, (str, Path)) else _numbered(source)
-        return receive_frames(frames, self.options)
+        return self._with_messages(receive_frames(frames, self.options))
+
+    def _with_messages(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
+        """Results with the texts and files that they complete; the last one with what is left of others."""
+        collector, last = Collector(self.options.screens), None
+        for result in results:
+            if last is not None:
+                yield last
+            last = collector.add(result)
+        if last is not None:
+            yield collector.finish(last)
 
     def tap(self, picture: Picture) -> tuple[FrameResult, Taps | None]:
         """Receive one photograph and keep the arrays of every stage boundary; None where reception ended before.
@@ -88,7 +100,8 @@ class Receiver:
         """
         frame = _frame_of(picture)
         with TemporaryDirectory(prefix="vlc-rx-") as folder:
-            result = receive_frame(frame, replace(self.options, dump_dir=Path(folder)))
+            with_taps = replace(self.options, dump_dir=Path(folder))
+            (result,) = self._with_messages(iter([receive_frame(frame, with_taps)]))
             written = next(Path(folder).iterdir(), None)
             return result, None if written is None else read_taps(written)
 

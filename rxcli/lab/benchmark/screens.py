@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.lab.benchmark.journal import Journal, Record, Task, run_tasks
+from rxcli.lab.benchmark.journal import SEEDS_A_RUN, Record, Task
 from rxcli.lab.benchmark.outline import placed
 from rxcli.lab.benchmark.statistics import wilson
 from rxcli.lab.benchmark.tables import Row
@@ -21,7 +21,6 @@ from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
 from rxcli.lab.simulate.pictures import PHOTOS
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import CameraProfile, ScreenProfile, shipped_profiles
 from rxcli.receiver.pipeline import receive_frame
 from rxcli.types import FrameResult
 
@@ -68,17 +67,14 @@ def scene_of(seed: int, number: int) -> tuple[Scene, str]:
 
 def options_of(trial: Trial, corners: bool) -> ReceiverOptions:
     """What a user would tell: nothing but, perhaps, the corners."""
-    return ReceiverOptions(
-        screens=tuple(shipped_profiles(ScreenProfile)),
-        cameras=tuple(shipped_profiles(CameraProfile)),
-        corners=trial.corners if corners else None,
-    )
+    return ReceiverOptions(corners=trial.corners if corners else None)
 
 
-def measured(task: Task) -> Record:
+def packets_of(task: Task) -> Record:
     """Simulate one frame and receive it with the screen searched and with true corners."""
-    scene, kind = scene_of(task["seed"], task["number"])
-    trial = simulate_trial(scene, task["number"])
+    seed, number = divmod(task["seed"], SEEDS_A_RUN)
+    scene, kind = scene_of(seed, number)
+    trial = simulate_trial(scene, number)
     out: dict[str, Any] = {"kind": kind, "camera": scene.camera_name, "screen": scene.screen.name}
     for name, corners in (("searched", False), ("given", True)):
         result, score = score_result(receive_frame(trial.frame, options_of(trial, corners)), trial.truth)
@@ -110,12 +106,6 @@ def shift_of(result: FrameResult, trial: Trial) -> int:
                     votes[column.column - own] = votes.get(column.column - own, 0) + 1
     best = max(votes, key=lambda shift: votes[shift], default=0)
     return best if votes.get(best, 0) >= _SHIFTED and votes[best] > votes.get(0, 0) else 0
-
-
-def run(count: int, journal: Journal, *, seed: int = 0, jobs: int = 1, quiet: bool = False) -> list[Record]:
-    """Records of `count` random frames."""
-    tasks = [{"seed": seed, "number": number} for number in range(count)]
-    return run_tasks(tasks, measured, journal, jobs=jobs, label="screens", quiet=quiet)
 
 
 def rows(records: Sequence[Record]) -> list[Row]:
