@@ -52,6 +52,8 @@ _PACKETS_COUNT, _MOST_LOOKS = 0.08, 6
 _SAME_PACKETS, _LIKELY = 40.0, 0.5
 #: Columns that look less like packets than this have no light, nats.
 _NO_LIGHT = 25.0
+#: Packets that must show where nothing but the grid says that there is a screen, nats.
+_SOME_PACKETS = 40.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +69,8 @@ class Outline:
     #: Column of the screen that is the first; None where columns are counted from the left of what is seen.
     column_offset: int | None = 0
     log_odds: float = 0.0
+    #: Whether nothing but the grid says that there is a screen.
+    by_grid_alone: bool = False
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -88,7 +92,7 @@ def find_outline(frame: Frame, options: ReceiverOptions, timer: Timer) -> Outlin
         with timer("geometry"):
             return outside_the_picture(options.corners, frame) or Outline(options.corners)
     candidates, reason = possible_outlines(frame, options, timer)
-    if len(candidates) > 1:
+    if len(candidates) > 1 or (candidates and candidates[0].by_grid_alone):
         candidates = _by_packets(frame, candidates, options, timer)
     if candidates:
         return candidates[0]
@@ -138,10 +142,11 @@ def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: i
     by_sides = None if sides.corners is None else Outline(sides.corners, inferred=sides.inferred)
     if not numberings:
         return [by_sides] if by_sides else []
-    outlines = []
-    agreed = False
+    outlines, agreed, alone = [], False, by_sides is None
     for numbering in numberings:
-        own = Outline(numbering.corners, inferred=SIDE_NAMES, log_odds=_odds_of(numbering, numberings))
+        own = Outline(
+            numbering.corners, inferred=SIDE_NAMES, log_odds=_odds_of(numbering, numberings), by_grid_alone=alone
+        )
         if by_sides and _agree(by_sides.corners, numbering, n_columns):
             agreed = True
             bonus = _INFERRED if by_sides.inferred else _CONFIRMED
@@ -172,8 +177,10 @@ def _by_packets(frame: Frame, candidates: list[Outline], options: ReceiverOption
     """Candidates by what they were worth before and by how much their columns look like packets."""
     context = _context_of_any(frame, candidates, options, timer)
     if context is None:
-        return candidates
+        return [one for one in candidates if not one.by_grid_alone]
     packets = np.array([_packets(replace(context, corners=one.corners)) for one in candidates[:_MOST_LOOKS]])
+    if packets.max() < _SOME_PACKETS:
+        return [one for one in candidates if not one.by_grid_alone]
     # Without a column more or less the same packets are seen a little better or worse, by chance.
     lost = np.maximum(packets.max() - packets - _SAME_PACKETS, 0)
     # Those that nobody looked at may show as many.

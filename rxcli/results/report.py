@@ -41,7 +41,7 @@ def to_record(result: FrameResult) -> dict[str, Any]:
     }
     if result.message is not None:
         record["message"] = result.message
-    record["screen"] = {"profile": result.screen_profile, "corners": _corners(result)}
+    record["screen"] = {"profile": result.screen_profile, "corners": _corners(result), **_numbering(result)}
     record["camera"] = {
         "profile": result.camera_profile,
         "line_delay_s": _significant(result.line_delay_s),
@@ -158,6 +158,18 @@ def format_progress(progress: ObjectProgress) -> str:
     return f"incomplete: {share}, {math.ceil(progress.seconds_left)} more seconds of this clip would do"
 
 
+def _numbering(result: FrameResult) -> dict[str, Any]:
+    """What is not plain of the screen's place: sides that were inferred, and which column is which."""
+    out: dict[str, Any] = {}
+    if result.inferred_sides:
+        out["inferred_sides"] = list(result.inferred_sides)
+    if result.column_certainty < 1:
+        out["column_certainty"] = _rounded(result.column_certainty, 4)
+    if result.column_offset is None:
+        out["column_offset"] = None
+    return out
+
+
 def _corners(result: FrameResult) -> list[list[float | None]] | None:
     if result.corners is None:
         return None
@@ -244,6 +256,9 @@ def from_record(record: dict[str, Any]) -> FrameResult:
             message=_unless_none(_text, record.get("message")),
             screen_profile=_unless_none(_text, record["screen"]["profile"]),
             corners=None if corners is None else np.array(corners, dtype=np.float64).reshape(4, 2),
+            inferred_sides=tuple(str(side) for side in record["screen"].get("inferred_sides", ())),
+            column_certainty=float(record["screen"].get("column_certainty", 1.0)),
+            column_offset=record["screen"].get("column_offset", 0),
             camera_profile=_unless_none(_text, camera["profile"]),
             line_delay_s=_unless_none(_number, camera["line_delay_s"]),
             exposure_s=_unless_none(_number, camera["exposure_s"]),

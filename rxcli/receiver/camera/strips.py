@@ -139,7 +139,8 @@ def levelled(light: Float32Array, inside: Float32Array, window: int, noise: Nois
     """Light against mean and spread of the `window` rows around it; and the weight behind it, 0..1."""
     import cv2
 
-    size = (window | 1, 1)
+    # Periods of a row or two leave no window; the smallest one is no use, but no error.
+    size = (max(window, 1) | 1, 1)
     share = cv2.blur(inside, size) + np.float32(1e-3)
     mean = cv2.blur(light, size) / share
     random = noise.variance(mean) + np.float32(_LEAST_VARIANCE)

@@ -100,6 +100,8 @@ class _Clip:
         #: The first frames, until they have agreed on a clock; None when that is done, or not needed.
         self._first: list[Frame] | None = [] if "tracking" in options.skip else None
         self._outline: FirstOutline | None = None
+        #: Probability that the screen's columns are numbered right.
+        self._certainty = 1.0
         #: Whether a frame shows so little that it should find its clock with others.
         self._little = False
         self._start: Start | None = None
@@ -301,7 +303,7 @@ class _Clip:
         outline = found[1] if found and found[0] == frame.index else find_outline(frame, self._options, timer)
         if isinstance(outline, Failure):
             return outline
-        corners = outline.corners
+        corners, self._certainty = outline.corners, outline.certainty
         if self._scene_before is not None and self._scene_before.is_at(corners):
             corners = self._scene_before.corners
         self._corners = corners
@@ -525,6 +527,7 @@ class _Clip:
         closed = bursts.open.close(np.setdiff1d(waiting.numbers, going_on))
         ended = results.bursts_of(closed, int(waiting.numbers[0]), view)
         columns = results.columns_of(view, ended, bursts.confidence(going_on), self._options.min_confidence)
+        columns = assemble.with_doubt(columns, self._certainty, self._options.min_confidence)
         if self._options.dump_dir is not None:
             found = results.taps(waiting, view, ended)
             dump_stages(self._options.dump_dir, waiting.result.source, waiting.result.frame, found)

@@ -149,7 +149,7 @@ def _independent_rows(quiet: Float32Array, lit: Float32Array) -> float:
     strips, rows = quiet[:, :, bright], quiet.shape[1]
     power = float(np.mean(strips * strips)) + _TINY
     alike = [float(np.mean(strips[:, lag:] * strips[:, :-lag])) / power for lag in range(1, min(_LAGS, rows // 2))]
-    return float(rows / (1 + 2 * np.sum(np.square(alike))))
+    return float(rows / (1 + 2 * float(np.sum(np.square(alike)))))
 
 
 def _neighbours(scaled: Float32Array) -> Float32Array:

@@ -17,6 +17,8 @@ from rxcli.types import FloatArray, Lens
 
 #: Score of a comb below which there is none, and share of the best one's gain from which another one is a rival.
 _LEAST_SCORE, _RIVAL_GAIN, _RIVAL_NATS = 7.0, 0.75, 15.0
+#: How much better columns must explain the pairs than none, nats: pictures without data seldom reach it.
+_LEAST_GAIN = 5.0
 #: By how much less a grid's waveforms may explain that it is still a rival, nats.
 _RIVAL_EXPLAINED = 120.0
 #: Combs that are fitted: more where the best does not stand out.
@@ -87,7 +89,8 @@ def _grids(coherence: Coherence, sigma: float, lens: Lens | None) -> list[Grid]:
     least = min(_RIVAL_GAIN * distinct[0].gain, distinct[0].gain - _RIVAL_NATS)
     refined = [refine_by_waveforms(coherence, grid, sigma) for grid in distinct if grid.gain > least]
     refined.sort(key=lambda one: -one.explained)
-    return [grid for grid in refined if grid.explained > refined[0].explained - _RIVAL_EXPLAINED]
+    likely = [grid for grid in refined if grid.explained > refined[0].explained - _RIVAL_EXPLAINED]
+    return [grid for grid in likely if grid.gain > _LEAST_GAIN]
 
 
 def _same(one: Grid, other: Grid) -> bool:
