@@ -53,6 +53,8 @@ _LOST, _FRESH_ROUNDS = -0.3, 2
 #: Bursts are doubted where less than this share of the columns has packets of such a confidence, and where they are
 #: not so much likelier than others by how alike copies are, nats.
 _CLEAR_COLUMNS, _CLEAR, _PLAIN_BURSTS = 0.9, 0.9, 300.0
+#: Of two clocks the one whose slots are so much likelier packets on an initial pass, nats, is it.
+_PLAIN_CLOCK = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +87,10 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
         lock: the clock, perhaps another that it may be, and the row profiles.
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
     """
+    first = _first_pass(acquisition)
     if acquisition.rival is not None:
-        either = (replace(acquisition, clock=clock, rival=None) for clock in (acquisition.clock, acquisition.rival))
-        return max((decode_likeliest(one, skip) for one in either), key=packet_llr)
-    reception = decode(acquisition, skip)
+        return _likelier_clock(acquisition, first, skip)
+    reception = decode(acquisition, skip, first)
     confidence = np.where(_complete(reception), _confidence(reception), 0.0).max(axis=0)
     if not confidence.any() or (confidence > _CLEAR).mean() >= _CLEAR_COLUMNS:
         return reception
@@ -96,21 +98,35 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
     plain = len(possible) == 1 or possible[0][1] - possible[1][1] > _PLAIN_BURSTS
     if plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
         return reception
-    passes = [_first_pass(replace(acquisition, burst=clock.burst)) for clock, _ in possible]
-    likeliest = max(passes, key=packet_llr).clock.burst
-    if np.array_equal(likeliest, reception.clock.burst):
+    # How far rows are mixed does not depend on the bursts.
+    seen = replace(acquisition, clock=replace(acquisition.clock, exposure_slots=reception.clock.exposure_slots))
+    passes = [initial_pass(replace(seen, burst=clock.burst)) for clock, _ in possible]
+    likeliest = max(passes, key=packet_llr)
+    burst = likeliest.clock.burst
+    if np.array_equal(burst, reception.clock.burst):
         return reception
-    return max(reception, decode(replace(acquisition, burst=likeliest), skip), key=packet_llr)
+    return max(reception, decode(replace(seen, burst=burst), skip, likeliest), key=packet_llr)
 
 
-def decode(acquisition: Acquisition, skip: frozenset[str]) -> Reception:
+def _likelier_clock(acquisition: Acquisition, first: Reception, skip: frozenset[str]) -> Reception:
+    """What is decoded on the likelier of two clocks; on both where an initial pass does not tell them plainly."""
+    assert acquisition.rival is not None
+    either = [replace(acquisition, clock=clock, rival=None) for clock in (acquisition.clock, acquisition.rival)]
+    evidence = [packet_llr(first), packet_llr(_first_pass(either[1]))]
+    if abs(evidence[0] - evidence[1]) > _PLAIN_CLOCK:
+        return decode_likeliest(either[int(np.argmax(evidence))], skip)
+    return max((decode_likeliest(one, skip) for one in either), key=packet_llr)
+
+
+def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
     """A quick look first; where that leaves doubt, the light model in depth.
 
     Args:
         lock: the clock and the row profiles.
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
+        first: what the quick look showed, where there was one.
     """
-    reception = _first_pass(acquisition)
+    reception = first or _first_pass(acquisition)
     doubtful = _doubtful(reception, _CERTAIN) if "certain_columns" in skip else np.ones(reception.snr.shape[0], bool)
     if not doubtful.any():
         return replace(reception, skipped={"certain_columns": reception.snr.shape[0]})

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 
 from rxcli.protocol import slot_patterns
-from rxcli.receiver.channel.picture import by_slot
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray
 
 #: Log-likelihood ratio of a slot that the first guess sees at full contrast in all strips.
@@ -41,14 +40,25 @@ def by_pattern(taps: FloatArray, n: int, of_levels: Callable[[Float32Array], Flo
     """
     q, isi_memory = taps.shape[0], taps.shape[1] - 1
     lead = isi_memory * q // 2
-    sums = []
-    for levels in slot_patterns(isi_memory) @ taps.T:
+    # Many patterns have the same level in a sample, which need be asked but once: `chosen` numbers a sample's levels.
+    levels = slot_patterns(isi_memory) @ taps.T
+    distinct = [np.unique(in_sample, return_inverse=True) for in_sample in levels.T]
+    chosen = np.stack([number for _, number in distinct], axis=1)
+    tables = np.stack([np.resize(values, chosen.max() + 1) for values, _ in distinct], axis=1)
+    asked = []
+    for of_samples in tables:
         # Sample i belongs to metric (i + lead) // q.
-        values = of_levels(np.tile(np.roll(levels, -(lead % q)).astype(np.float32), -(-n // q))[:n])
+        values = of_levels(np.tile(np.roll(of_samples, -(lead % q)).astype(np.float32), -(-n // q))[:n])
         padded = np.zeros((values.shape[0], n + isi_memory * q), np.float32)
         padded[:, lead : lead + n] = values
-        sums.append(by_slot(padded, q))
-    return np.stack(sums, axis=2).astype(np.float64)
+        asked.append([padded[:, place::q] for place in range(q)])
+    out = np.empty((*asked[0][0].shape, levels.shape[0]))
+    for pattern, numbers in enumerate(chosen):
+        total = asked[numbers[0]][0].copy()
+        for place in range(1, q):
+            total += asked[numbers[place]][place]
+        out[..., pattern] = total
+    return out
 
 
 def metrics_of(llr: Float32Array, isi_memory: int) -> FloatArray:

@@ -41,6 +41,12 @@ class _Branches:
     features: NDArray[np.float32]
     #: (words, states) float32: 1 where the word ends in the state, else 0.
     into: NDArray[np.float32]
+    #: Patterns of header and dimming symbol, from the first slot whose predecessors are known.
+    preamble: NDArray[np.int64]
+    #: State that header and dimming symbol end in.
+    first_state: int
+    #: (states, memory) patterns of the next header's first slots after each state.
+    tail: NDArray[np.int64]
 
 
 def _pattern_index(slots: NDArray[np.integer], isi_memory: int) -> NDArray[np.int64]:
@@ -61,7 +67,16 @@ def _branches(w: int, isi_memory: int) -> _Branches:
     features = (index[..., None] == np.arange(1 << (isi_memory + 1))).reshape(n_states * n_words, -1)
     end = words[:, SLOTS_PER_SYMBOL - isi_memory :] @ (1 << np.arange(isi_memory - 1, -1, -1))
     into = (end[:, None] == np.arange(n_states)).astype(np.float32)
-    return _Branches(words, np.ascontiguousarray(features.T, np.float32), into)
+    preamble = np.concatenate([np.array(HEADER, np.int64), dimming_symbol(w)])
+    header = np.broadcast_to(np.array(HEADER[:isi_memory], np.int64), (n_states, isi_memory))
+    return _Branches(
+        words,
+        np.ascontiguousarray(features.T, np.float32),
+        into,
+        _pattern_index(preamble, isi_memory),
+        int(_pattern_index(preamble[PREAMBLE_SLOTS - isi_memory :], isi_memory - 1)[0]),
+        _pattern_index(np.concatenate([states, header], axis=1), isi_memory),
+    )
 
 
 def _log_sum(values: FloatArray, axis: int) -> FloatArray:
@@ -78,21 +93,29 @@ def _over_few(combine: np.ufunc, values: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class _Packets:
-    """Posterior of n packets of one weight."""
+class _Steps:
+    """n packets of one weight, as a trellis over their symbols."""
 
-    confidence_features: FloatArray  # (n,)
-    word: FloatArray  # (n, N, words) probability
+    branches: _Branches
+    #: (n,) log-likelihood that all words share.
+    common: FloatArray
+    #: (n, N, states, words) likelihood of each word after each state over that of the best, and the best's logarithm.
+    likelihood: Float32Array
+    top: Float32Array
+    #: (n, N, states, states) log-likelihood of going from state to state, over all words; the first's state, and what
+    #: the header that follows says of the last.
+    step: FloatArray
+    start: FloatArray
+    end: FloatArray
 
 
-def _forward_backward(metrics: FloatArray, w: int, isi_memory: int) -> _Packets:
-    """Posterior of n packets of weight `w` from their metrics (n, packet + memory, patterns)."""
+def _steps(metrics: FloatArray, w: int, isi_memory: int) -> _Steps:
+    """The trellis of n packets of weight `w` from their metrics (n, packet + memory, patterns)."""
     branches = _branches(w, isi_memory)
     n, length, _ = metrics.shape
     n_symbols = (length - isi_memory - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL
     n_states, n_words = 1 << isi_memory, len(branches.words)
-    preamble = np.concatenate([np.array(HEADER, np.int64), dimming_symbol(w)])
-    known = metrics[:, np.arange(isi_memory, PREAMBLE_SLOTS), _pattern_index(preamble, isi_memory)].sum(axis=1)
+    known = metrics[:, np.arange(isi_memory, PREAMBLE_SLOTS), branches.preamble].sum(axis=1)
     payload = metrics[:, PREAMBLE_SLOTS : length - isi_memory].reshape(n * n_symbols, -1)
     # Only differences matter; what is left fits float32 with room to spare.
     offset = payload.max(axis=1)
@@ -103,16 +126,32 @@ def _forward_backward(metrics: FloatArray, w: int, isi_memory: int) -> _Packets:
     likelihood = np.exp(branch, out=branch)
     step = np.log(np.maximum(likelihood @ branches.into, _TINY)) + top
     start = np.full((n, n_states), _NEVER)
-    start[:, _pattern_index(preamble[PREAMBLE_SLOTS - isi_memory :], isi_memory - 1)[0]] = 0.0
-    before, after = _recursions(step, start, _tail(metrics[:, length - isi_memory :], isi_memory))
-    joint = _scaled(before + top[..., 0])[:, :, None, :] @ likelihood
-    joint = joint[:, :, 0] * (_scaled(after) @ branches.into.T)
-    total = joint.sum(axis=2, keepdims=True)
-    last = _log_sum(before[:, -1, :, None] + step[:, -1], axis=1) + after[:, -1]
+    start[:, branches.first_state] = 0.0
     offset = SLOTS_PER_SYMBOL * offset.reshape(n, n_symbols).sum(axis=1)
-    confidence_features = known + offset + _log_sum(last, axis=1) - n_symbols * np.log(n_words)
-    uniform = np.full_like(joint, 1 / n_words)
-    return _Packets(confidence_features, np.divide(joint, total, out=uniform, where=total > 0))
+    common = known + offset - n_symbols * np.log(n_words)
+    tail = metrics[:, length - isi_memory :]
+    end = np.asarray(tail[:, np.arange(isi_memory), branches.tail].sum(axis=2))
+    return _Steps(branches, common, likelihood, top[..., 0], step, start, end)
+
+
+def _log_evidence(metrics: FloatArray, w: int, isi_memory: int) -> FloatArray:
+    """(n,) log evidence of packets of weight `w`, for which going forward is enough."""
+    trellis = _steps(metrics, w, isi_memory)
+    state = trellis.start
+    for symbol in range(trellis.step.shape[1]):
+        state = _log_sum(state[:, :, None] + trellis.step[:, symbol], axis=1)
+    return np.asarray(trellis.common + _log_sum(state + trellis.end, axis=1))
+
+
+def _word_posteriors(metrics: FloatArray, w: int, isi_memory: int) -> FloatArray:
+    """(n, N, words) probability of the words of n packets of weight `w`, by forward-backward."""
+    trellis = _steps(metrics, w, isi_memory)
+    before, after = _recursions(trellis.step, trellis.start, trellis.end)
+    joint = _scaled(before + trellis.top)[:, :, None, :] @ trellis.likelihood
+    joint = joint[:, :, 0] * (_scaled(after) @ trellis.branches.into.T)
+    total = joint.sum(axis=2, keepdims=True)
+    uniform = np.full_like(joint, 1 / joint.shape[2])
+    return np.divide(joint, total, out=uniform, where=total > 0)
 
 
 def _recursions(step: FloatArray, start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -131,14 +170,6 @@ def _recursions(step: FloatArray, start: FloatArray, end: FloatArray) -> tuple[F
 def _scaled(log_values: FloatArray) -> NDArray[np.float32]:
     """Exponentials, the largest of each last axis being 1."""
     return np.asarray(np.exp(log_values - log_values.max(axis=-1, keepdims=True)), np.float32)
-
-
-def _tail(metrics: FloatArray, isi_memory: int) -> FloatArray:
-    """(n, states) log-likelihood of the next header's first slots after each state; they tell of the last symbol."""
-    states = (np.arange(1 << isi_memory)[:, None] >> np.arange(isi_memory - 1, -1, -1)) & 1
-    header = np.broadcast_to(np.array(HEADER[:isi_memory], np.int64), (len(states), isi_memory))
-    index = _pattern_index(np.concatenate([states, header], axis=1), isi_memory)
-    return np.asarray(metrics[:, np.arange(isi_memory), index].sum(axis=2))
 
 
 def slot_llr(metrics: FloatArray) -> Float32Array:
@@ -259,9 +290,7 @@ def weight_log_evidence(metrics: FloatArray, candidates: NDArray[np.bool_]) -> F
         columns = np.flatnonzero(candidates[:, w - 1])
         if columns.size:
             chosen = metrics[:, columns].reshape(n_bursts * columns.size, *metrics.shape[2:])
-            out[columns, w - 1] = (
-                _forward_backward(chosen, w, isi_memory).confidence_features.reshape(n_bursts, -1).sum(axis=0)
-            )
+            out[columns, w - 1] = _log_evidence(chosen, w, isi_memory).reshape(n_bursts, -1).sum(axis=0)
     return out
 
 
@@ -393,7 +422,7 @@ def _posteriors(
     bit_llr = np.full((n_bursts, n_columns, n_symbols, 7), np.nan)
     for w, columns in _batches(weights, n_bursts):
         chosen = metrics[:, columns].reshape(n_bursts * columns.size, *metrics.shape[2:])
-        posterior = _forward_backward(chosen, w, isi_memory).word
+        posterior = _word_posteriors(chosen, w, isi_memory)
         if on_posteriors is not None:
             on_posteriors(w, columns, posterior)
         words = codebook(w)
