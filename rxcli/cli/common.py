@@ -165,6 +165,13 @@ def receiver_options(
     return options_of(screens or AUTO, cameras or AUTO, corners or None, **options)
 
 
+def camera_cache_folder() -> Path:
+    """Where estimated cameras are remembered: in the user's cache folder."""
+    from platformdirs import user_cache_path
+
+    return user_cache_path("vlc-rx") / "cameras"
+
+
 #: For every command that writes files which may be somebody's.
 force_argument = click.option(
     "--force", is_flag=True, help="Replace files that are there already and were not written by the same option."

@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
 import click
 
-from rxcli.cli.common import claim_outputs, complete_files, force_argument, receiver_arguments, receiver_options
+from rxcli.cli.common import (
+    camera_cache_folder,
+    claim_outputs,
+    complete_files,
+    force_argument,
+    receiver_arguments,
+    receiver_options,
+)
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
@@ -88,6 +95,12 @@ STDIN = "-"
 )
 @click.option("--out", type=_FOLDER, help="Write files that came whole into this folder, under their own names.")
 @click.option("--payloads", type=_FILE, help="Write one row a packet (CSV): where it is from, bits, hex, confidence.")
+@click.option(
+    "--no-camera-cache",
+    is_flag=True,
+    envvar="VLC_RX_NO_CAMERA_CACHE",
+    help="Estimate unknown cameras anew, and remember none (see vlc-rx profiles forget). [env: VLC_RX_NO_CAMERA_CACHE]",
+)
 @click.option("--quiet", is_flag=True, help="No table, no summary, no progress.")
 @force_argument
 def decode(paths: tuple[str, ...], **options: Any) -> int:
@@ -109,7 +122,8 @@ def decode(paths: tuple[str, ...], **options: Any) -> int:
     }
     from rxcli.runs.batch import standard_decoder
 
-    configured = receiver_options(**receiver, soft_bits=True)
+    cache = None if options["no_camera_cache"] else camera_cache_folder()
+    configured = receiver_options(**receiver, camera_cache=cache, soft_bits=True)
     tap = None
     if options["save_undistorted"]:
         from rxcli.results.undistort import UndistortedWriter

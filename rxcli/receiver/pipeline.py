@@ -10,6 +10,7 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
@@ -21,7 +22,14 @@ from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.outline import find_outline
 from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin, soft_bits
-from rxcli.receiver.unknown_camera import likely_camera, receive_unknown, without_estimate
+from rxcli.receiver.unknown_camera import (
+    fits,
+    likely_camera,
+    receive_unknown,
+    remember_estimate,
+    with_screen,
+    without_estimate,
+)
 from rxcli.results.dump import dump_stages
 from rxcli.types import FloatArray, Frame, FrameResult
 
@@ -58,7 +66,7 @@ def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
 def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     """Receive one frame as a photograph."""
     timer = Timer()
-    result = _receive_still(frame, options, timer)
+    result = _receive_still(frame, options, timer, options.camera_cache)
     return replace(result, message=_with_tried(result, options.screens), timing_ms=timer.total())
 
 
@@ -69,7 +77,10 @@ def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str 
     return f"{result.message}; only the screen {screens[0].name} was tried, --screen auto tries all"
 
 
-def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
+def _receive_still(
+    frame: Frame, options: ReceiverOptions, timer: Timer, remembering: Path | None = None
+) -> FrameResult:
+    """Receive one frame; what its camera is estimated to be is remembered in a folder."""
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
     # Screen: where the columns are.
     outline = find_outline(frame, options, timer)
@@ -85,14 +96,22 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
     sampler = sample_columns(context, context.n_columns, quick=True)
     acquisition = acquire(context, sampler)
     if isinstance(acquisition, Failure):
+        if context.camera.remembered:
+            return _receive_still(frame, replace(options, camera_cache=None), timer, remembering)
         return failed(replace(result, **context.camera.facts), acquisition)
     # Channel and decode, in turn: slot metrics to symbols, and what they say of the picture.
+    remembered = context.camera.remembered
+    if remembered:
+        context = with_screen(context, acquisition)
     if context.camera.blind_estimate is None:
         with timer("detect"):
             reception = decode_likeliest(acquisition, options.skip)
     else:
         received = receive_unknown(context, acquisition, options.skip)
+        remember_estimate(received, remembering)
         context, acquisition, reception = received.context, received.acquisition, received.reception
+    if remembered and not fits(reception):
+        return _receive_still(frame, replace(options, camera_cache=None), timer, remembering)
     with timer("detect"):
         no_header = headerless(reception)
     with timer("denoise"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -11,7 +12,8 @@ from rxcli.options import ReceiverOptions
 from rxcli.receiver import camera as blind
 from rxcli.receiver import channel
 from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
-from rxcli.receiver.cameras import find_cameras, linear_camera, refitted_camera
+from rxcli.receiver.camera_memory import recall, remember
+from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, refittable, refitted_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.still import Reception, decode_likeliest, initial_pass, packet_llr
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
@@ -28,6 +30,9 @@ _KEPT_EVIDENCE = 0.9
 _PACKETS_AT_LEAST = 80.0
 #: Packets that an estimate must show under which none is received, nats: wrong ones show less than 10, right ones 80.
 _PACKETS_IF_NONE_RECEIVED = 30.0
+#: Packets that a camera must show to be remembered, and to be kept when it was, nats. Relative standard deviation of
+#: the line delay of one that is remembered, and of one that no further picture need improve.
+_PACKETS_TO_REMEMBER, _TOLD, _PRECISE = 200.0, 2e-3, 4e-4
 #: Symbols' mean log probability counts so many times beside the headers: half a packet has headers, but no symbols.
 _SAY_OF_SYMBOLS = 40.0
 _NO_HEADERS = (
@@ -51,6 +56,9 @@ def likely_camera(frame: Frame, corners: FloatArray, options: ReceiverOptions, t
     Where several estimates are left, each has an initial pass: the one under which headers, packets and
     symbols show best is it, and without packets none, unless the first is beyond doubt.
     """
+    remembered = None if options.force_camera else recall(options.camera_cache, frame)
+    if remembered is not None and not has_profile(frame, options):
+        return FrameContext(frame, corners, remembered.camera(frame), options.screens, timer)
     found = find_cameras(frame, corners, options, timer)
     if found.first is not None and not found.rivals:
         return found.first
@@ -150,6 +158,31 @@ def _received_again(before: Received, receive: Callable[[Acquisition], Reception
         reception = receive(acquisition)
     kept = packet_llr(reception) >= _KEPT_EVIDENCE * packet_llr(before.reception)
     return Received(context, acquisition, reception) if kept else None
+
+
+def fits(reception: Reception) -> bool:
+    """Whether packets show with a remembered camera, of which nothing in the picture was asked."""
+    return packet_llr(reception) >= _PACKETS_TO_REMEMBER
+
+
+def with_screen(context: FrameContext, acquisition: Acquisition) -> FrameContext:
+    """A frame with a remembered camera once its screen is found; that camera is refitted where it is not precise."""
+    line_delay_s, sd = context.camera.estimated["line_delay_s"]
+    if sd > _PRECISE * line_delay_s:
+        return refittable(context, acquisition)
+    rows_per_slot = 1 / (line_delay_s * acquisition.screen.slot_rate_hz)
+    told = {"rows_per_slot": (rows_per_slot, rows_per_slot * sd / line_delay_s), **context.camera.estimated}
+    return replace(context, camera=replace(context.camera, estimated=told))
+
+
+def remember_estimate(received: Received, folder: Path | None) -> None:
+    """Keep an estimated camera for other pictures, where it is beyond doubt."""
+    camera = received.context.camera
+    if camera.blind_estimate is None or folder is None:
+        return
+    line_delay_s, sd = camera.estimated["line_delay_s"]
+    if sd < _TOLD * line_delay_s and packet_llr(received.reception) >= _PACKETS_TO_REMEMBER:
+        remember(folder, received.context.frame, camera)
 
 
 def without_estimate(result: FrameResult, camera: Camera, reception: Reception) -> FrameResult:

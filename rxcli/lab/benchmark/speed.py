@@ -24,7 +24,7 @@ from rxcli.errors import ReceiverError, UsageError
 from rxcli.ingest.sniff import HEAD_BYTES, read_bytes, sniff
 from rxcli.lab.benchmark.statistics import power_law
 from rxcli.lab.simulate.scenes import Scene, preset
-from rxcli.options import receiver_options
+from rxcli.options import AUTO, receiver_options
 from rxcli.profiles import ScreenProfile, dump_profile, load_profile
 from rxcli.protocol import payload_bits
 from rxcli.receiver.pipeline import receive
@@ -32,7 +32,7 @@ from rxcli.types import Frame, FrameResult
 
 _T = TypeVar("_T")
 #: What a whole reception may take of the bare one-thread decode, on two cores.
-TARGETS = {"jpeg-26mp": 1.6, "raw-26mp": 2.5}
+TARGETS = {"jpeg-26mp": 1.6, "raw-26mp": 2.5, "jpeg-26mp-hard": 4.0, "jpeg-12mp-unknown": 10.0}
 #: Megapixels and columns over which growth is measured.
 MEGAPIXELS = (2.0, 4.0, 8.0, 16.0, 26.0, 50.0)
 COLUMNS = (20, 50, 100, 200)
@@ -59,12 +59,22 @@ class Medium:
     bursts_a_frame: float | None = None
     bit_rate: int | None = None
     picture: str = "coffee"
+    #: Of the preset's.
+    light: float = 1.0
+    #: Whether the receiver is told neither camera nor screen.
+    unknown: bool = False
+
+    def receiver(self, path: Path) -> dict[str, Any]:
+        """Screen and camera, as the receiver of the file is told them."""
+        return {"screen": AUTO, "camera": []} if self.unknown else {"screen": self.screen, "camera": _camera_of(path)}
 
 
 MEDIA = (
     Medium("jpeg-26mp", "xs10-still", "paper-34k6", ".jpg"),
     Medium("raw-26mp", "xs10-still", "paper-34k6", ".dng"),
+    Medium("jpeg-26mp-hard", "xs10-still", "paper-34k6", ".jpg", light=0.3),
     Medium("jpeg-12mp", "phone-plain", "paper-17k3", ".jpg"),
+    Medium("jpeg-12mp-unknown", "phone-plain", "paper-17k3", ".jpg", unknown=True),
     Medium("video-4k", "video-4k", "paper-34k6", ".mp4", 16, 4, 1.5, 108_000_000, "rocket"),
     Medium("video-1080p", "video-1080p", "paper-17k3", ".mp4", 32, 6, 0.75, 28_000_000, "chelsea"),
 )
@@ -102,7 +112,8 @@ def make_medium(medium: Medium, folder: Path, seed: int = 0) -> Path:
     path = folder / f"{medium.name}{medium.suffix}"
     if path.exists() and _profile_path(path).exists():
         return path
-    scene = replace(preset(medium.camera, medium.screen), picture=medium.picture)
+    scene = preset(medium.camera, medium.screen)
+    scene = replace(scene, picture=medium.picture, light_e_per_s=scene.light_e_per_s * medium.light)
     if medium.bursts_a_frame is None:
         write_capture(scene, path, seed)
         return path
@@ -147,6 +158,10 @@ def repeat_clip(short: Path, out: Path, times: int) -> None:
 
 def _profile_path(path: Path) -> Path:
     return path.with_name(path.stem + ".camera.toml")
+
+
+def _camera_of(path: Path) -> str:
+    return str(_profile_path(path))
 
 
 def write_capture(scene: Scene, path: Path, seed: int, bit_rate: int | None = None) -> None:
@@ -220,7 +235,7 @@ def _frame_rate(path: Path) -> float | None:
 class _Reception:
     """One file, received again and again, every stage timed."""
 
-    def __init__(self, path: Path, screen: str, camera: str) -> None:
+    def __init__(self, path: Path, screen: str, camera: str | list[str]) -> None:
         self._path = path
         self._options = receiver_options(screen, camera)
         self._ingest_s = 0.0
@@ -356,19 +371,22 @@ def in_process(task: dict[str, Any]) -> dict[str, Any]:
 
 def time_medium(medium: Medium, path: Path, threads: int, repeats: int) -> Timing:
     """Time the reception of one of the media."""
-    return time_file(path, medium.screen, str(_profile_path(path)), threads, repeats, medium.name)
+    return _time(path, medium.receiver(path), threads, repeats, medium.name)
 
 
-def time_file(path: Path, screen: str, camera: str, threads: int, repeats: int, name: str = "") -> Timing:
+def time_file(path: Path, screen: str, camera: str, threads: int, repeats: int) -> Timing:
     """Time the reception of any photograph or clip, whose screen and camera are named."""
-    task = {"work": "timing", "path": str(path), "screen": screen, "camera": camera}
-    return Timing(name or path.name, threads, **in_process({**task, "threads": threads, "repeats": repeats}))
+    return _time(path, {"screen": screen, "camera": camera}, threads, repeats, path.name)
+
+
+def _time(path: Path, receiver: dict[str, Any], threads: int, repeats: int, name: str) -> Timing:
+    task = {"work": "timing", "path": str(path), "threads": threads, "repeats": repeats}
+    return Timing(name, threads, **in_process({**task, **receiver}))
 
 
 def memory_of(medium: Medium, path: Path) -> dict[str, float]:
     """Peak memory, MB: `idle_mb` after the imports, `peak_mb` after one reception."""
-    task = {"work": "memory", "path": str(path), "screen": medium.screen, "camera": str(_profile_path(path))}
-    return in_process({**task, "threads": 1})
+    return in_process({"work": "memory", "path": str(path), "threads": 1, **medium.receiver(path)})
 
 
 @dataclass(frozen=True)

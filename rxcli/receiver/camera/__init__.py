@@ -8,15 +8,13 @@ straight, and straight ones that the camera took it out (`Strips.correction`).
    the stripes. Where a camera has taken the distortion out of its picture, the sensor row of a point p is the y of
    K distort(K^-1 p); with any focal length in K the same map comes out for other coefficients, so that one width is
    taken and k1 k2 p1 p2 are what is sought.
-2. **Scan.** Light between its local extremes, averaged over columns, shows the header where a packet starts; a packet
-   sent again shows in every column's autocorrelation; and edges fall between slots, so that their power has a line at
-   the rate of the slots. All are looked up over a grid of rows per slot for each length of packet. The header read
-   backwards, 1100011100, is its own complement, so the sign tells the direction.
-3. **Trial.** The best hypotheses are sliced into slots; header, dimming symbol and the constant weight of all symbols
-   decide between them: a wrong one may show a header by chance, but never twenty columns of constant weight. Where that
-   decides little, slots are read first, knowing nothing of packets, and packets are sought among them (`reading`).
-4. **Slots.** Light of neighbouring slots overlaps through the exposure, and nobody told its levels: each column is read
-   at the levels that every weight would give, by forward-backward, and levels and slots then follow from one another.
+2. **Short list.** Edges fall between slots, so that their power has a line at the rate of the slots; and columns are
+   like themselves a packet later. The periods that stand out so, with the headers that show there, are the short list
+   (`scan`). The header read backwards, 1100011100, is its own complement, so the sign tells the direction.
+3. **Reading.** The best of them is read through an exposure, knowing nothing of packets, and packets of every length
+   and start are sought among its slots (`reading`). Where nothing reads surely, clocks of all periods are read.
+4. **Rounds.** Light of neighbouring slots overlaps through the exposure, and nobody told its levels: levels and slots
+   follow from one another, by forward-backward, one round of them for every step of the clock.
 5. **Refinement.** The slots, as probabilities seen through the exposure, predict the light of every strip on every row.
    What is missing is the derivative with respect to time: least squares over all strips gives row and period of the
    clock and the bend at once, with standard deviations from the spread between columns.
@@ -26,7 +24,15 @@ straight, and straight ones that the camera took it out (`Strips.correction`).
 """
 
 from rxcli.receiver.camera.advice import stripe_likeness, why_not
-from rxcli.receiver.camera.camera import camera_profile, curving_lens, in_time_order, lens_of, summary, summary_of_rows
+from rxcli.receiver.camera.camera import (
+    camera_profile,
+    curving_lens,
+    in_time_order,
+    lens_of,
+    lens_of_summary,
+    summary,
+    summary_of_rows,
+)
 from rxcli.receiver.camera.columns import likely_columns
 from rxcli.receiver.camera.curvature import curvature_terms, estimate_curvature, straightened
 from rxcli.receiver.camera.edges import by_edges
@@ -54,6 +60,7 @@ __all__ = [
     "in_time_order",
     "is_linear",
     "lens_of",
+    "lens_of_summary",
     "likely_columns",
     "refit",
     "side_curvature_of",

@@ -64,6 +64,19 @@ def summary(estimate: BlindEstimate, slot_rate_hz: float) -> dict[str, tuple[flo
     return out
 
 
+def lens_of_summary(estimated: dict[str, tuple[float, float]], width: int, height: int) -> Lens | None:
+    """The lens model of a picture from what was estimated, see `summary`; None where no lens was."""
+    if "k1" not in estimated:
+        return None
+    coefficients = np.array([*_coefficients(estimated), 0.0])
+    return Lens(_one_width(width, height), coefficients, corrected=bool(estimated["distortion_corrected"][0]))
+
+
+def _coefficients(estimated: dict[str, tuple[float, float]]) -> tuple[float, ...]:
+    """k1 k2 p1 p2 of what was estimated."""
+    return tuple(estimated.get(name, (0.0, 0.0))[0] for name in ("k1", "k2", "p1", "p2"))
+
+
 def summary_of_rows(estimate: BlindEstimate) -> dict[str, tuple[float, float]]:
     """What of it needs no screen's slot rate: name -> (value, standard deviation)."""
     out = {"rows_per_slot": (estimate.rows_per_slot, estimate.rows_per_slot_sd)}
@@ -97,7 +110,7 @@ def camera_profile(
     """
     lens = None
     if "k1" in estimated:
-        k = tuple(estimated.get(key, (0.0, 0.0))[0] for key in ("k1", "k2", "p1", "p2"))
+        k = _coefficients(estimated)
         top, middle, bottom = (tuple(row) for row in _one_width(width, height).tolist())
         lens = LensModel(
             width=width,

@@ -35,11 +35,12 @@ _BEND_GAINS = (5.0, 25.0)
 #: Readings that are refined, and the share of the best one's evidence that another needs.
 _REFINED, _CLOSE_EVIDENCE = 3, 0.3
 #: A reading of this evidence is of the right clock: right ones have 254 and more nearly always, wrong ones 68 at most.
-#: Below the second all periods are looked at, as a clock that is somewhat off reads at less.
-_READ_SURELY, _NOTHING_READ = 200.0, 150.0
+#: Below the second all periods are looked at, as a clock that is somewhat off reads at less; below the third not even
+#: its neighbours are.
+_READ_SURELY, _NOTHING_READ, _HOPELESS = 200.0, 150.0, 50.0
 #: Clocks of the short list, and of all periods, that are read; of how many of them the neighbours are read too, and by
 #: how many slots those are off by the end of the picture.
-_READ, _READ_OF_ALL, _READ_AROUND = 4, 16, 2
+_READ, _READ_OF_ALL, _READ_AROUND = 4, 12, 2
 _OFF_SLOTS = (-1.2, -0.6, 0.6, 1.2)
 #: What doubling the length of a packet costs, nats.
 _LONGER_PACKET = 3.0
@@ -109,7 +110,7 @@ def _readings(views: Views, curves: list[FloatArray], lengths: list[int]) -> lis
         outstanding = sorted(found, key=lambda pair: -pair[0].salience)
         either = [pair for both in zip(found, outstanding, strict=True) for pair in both]
         readings += _read_until_sure(views, distinct(either, on_one_curvature(same_slots), _READ_OF_ALL), lengths)
-    if _best(readings) < _READ_SURELY:
+    if _HOPELESS < _best(readings) < _READ_SURELY:
         readings += _read_around(views, sorted(readings, key=_by_evidence)[:_READ_AROUND], lengths)
     return sorted(readings, key=_by_evidence)
 

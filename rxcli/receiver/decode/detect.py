@@ -151,7 +151,7 @@ def _word_posteriors(metrics: FloatArray, w: int, isi_memory: int) -> FloatArray
     joint = joint[:, :, 0] * (_scaled(after) @ trellis.branches.into.T)
     total = joint.sum(axis=2, keepdims=True)
     uniform = np.full_like(joint, 1 / joint.shape[2])
-    return np.divide(joint, total, out=uniform, where=total > 0)
+    return np.asarray(np.divide(joint, total, out=uniform, where=total > 0))
 
 
 def _recursions(step: FloatArray, start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
