@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from rxcli.cli.benchmark import benchmark
 from rxcli.lab.benchmark.screens import rows, scene_of
 from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
 
@@ -37,11 +32,3 @@ def test_rows_count_packets_numbers_and_confidence() -> None:
     dark, every = rows(records)[-2:]
     assert (dark["searched"], dark["corners_given"], dark["shifted"]) == (18, 20, 1)
     assert every["share"] == pytest.approx(38 / 40)
-
-
-def test_the_command_writes_its_records(tmp_path: Path) -> None:
-    arguments = ["screens", "--frames", "1", "--seed", "3", "--out", str(tmp_path), "--quiet"]
-    result = CliRunner().invoke(benchmark, arguments)
-    assert result.exit_code == 0, result.output
-    (record,) = json.loads((tmp_path / "screens.json").read_text())["details"]
-    assert {"kind", "searched", "given"} <= record.keys()
