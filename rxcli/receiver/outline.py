@@ -111,20 +111,22 @@ def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> t
         sides = find_screen(frame.pixels, **levels)
         if sides.corners is None and (turned := turned_pixels(frame)):
             return [], turned
-        screen = min(options.screens, key=lambda one: one.columns)
-        layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
+        by_columns = {one.columns: ColumnLayout(one.columns, one.light_spread, one.aspect) for one in options.screens}
+        layout = by_columns[min(by_columns)]
         period, lens = int(levels.get("mosaic_period", 1)), known_lens(frame, options)
-        found = _by_sides(frame, sides, layout, period, lens)
+        found = _by_sides(frame, sides, [by_columns[n] for n in sorted(by_columns)], period, lens)
         if not found:
             columns = find_columns(frame.pixels, layout, mosaic_period=period, lens=lens, lines=sides.lines)
-            found = _joined(sides, columns.numberings, screen.columns)
+            found = _joined(sides, columns.numberings, layout.n_columns)
     orientation = frame.metadata.orientation
     return [
         replace(one, corners=geometry.viewer_order(one.corners, orientation)) for one in found
     ], f"{sides.reason}; {sides.advice}"
 
 
-def _by_sides(frame: Frame, sides: ScreenSearch, layout: ColumnLayout, period: int, lens: Lens | None) -> list[Outline]:
+def _by_sides(
+    frame: Frame, sides: ScreenSearch, layouts: list[ColumnLayout], period: int, lens: Lens | None
+) -> list[Outline]:
     """The outline by the sides, where the borders of the columns stand between them as they should."""
     from rxcli.receiver.screen.agreement import sides_agree
 
@@ -132,8 +134,9 @@ def _by_sides(frame: Frame, sides: ScreenSearch, layout: ColumnLayout, period: i
         return []
     # A part of the rows tells most of the time.
     for part in _PARTS:
-        if sides_agree(frame.pixels, sides.corners, layout, mosaic_period=period, lens=lens, part=part):
-            return [Outline(sides.corners, inferred=sides.inferred)]
+        for layout in layouts:
+            if sides_agree(frame.pixels, sides.corners, layout, mosaic_period=period, lens=lens, part=part):
+                return [Outline(sides.corners, inferred=sides.inferred)]
     return []
 
 
