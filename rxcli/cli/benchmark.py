@@ -177,6 +177,22 @@ def screens(frames: int, **run: Any) -> None:
     _say_written(write_outputs(run["out"], "screens", rows))
 
 
+@benchmark.command()
+@options(
+    ("--clips", _COUNT, 10, "Random scenes, each filmed at every speed, some minutes each."),
+    ("--frames", click.IntRange(2), 12, "Frames of a clip."),
+    *_MANY,
+)
+def motion(clips: int, frames: int, **run: Any) -> None:
+    """Clips from a hand by how fast it moves, against their frames one by one."""
+    from rxcli.lab.benchmark import motion as work
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
+
+    rows = work.rows(_random("motion", work.record_of, clips, run, n_frames=frames))
+    click.echo(format_table(rows))
+    _say_written(write_outputs(run["out"], "motion", rows))
+
+
 def _check_sweeps(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
     from rxcli.lab.benchmark.sweeps import SWEEPS
 

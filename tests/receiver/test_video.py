@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import copy
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -21,7 +19,6 @@ from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.receiver.channel.known_picture import KnownPicture, exposed
 from rxcli.receiver.decode.detect import detect
-from rxcli.receiver.outline import Outline
 from rxcli.receiver.pipeline import receive
 from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime
 from rxcli.results.truth import Score, Scorer, Truth
@@ -473,22 +470,3 @@ def test_dark_columns_are_left_out_and_counted() -> None:
     packets = [p for r in marked[0] for c in r.columns for p in c.packets]
     assert all(p.bit_errors == 0 for p in packets if p.confidence >= 0.9)
     assert all(not c.packets for r in marked[0][6:] for c in r.columns[12:])
-
-
-def test_the_screen_may_come_nearer(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many strips its columns would have now, the picture is known by those of the first frame."""
-    start = clip.options.corners
-    assert start is not None
-    passes = itertools.count(1)
-
-    def nearer(_pixels: object, stored: object, **_levels: object) -> SimpleNamespace:
-        return SimpleNamespace(corners=start + np.array([[-1, 0], [1, 0], [1, 0], [-1, 0]]) * 4.0 * next(passes))
-
-    numbers = itertools.count(2)
-    monkeypatch.setattr("rxcli.receiver.clip.scene._LOOK_EVERY", 3)
-    monkeypatch.setattr("rxcli.receiver.screen.find.track_screen", nearer)
-    monkeypatch.setattr("rxcli.receiver.clip.receiver.find_outline", lambda *_: Outline(start))
-    monkeypatch.setattr("rxcli.receiver.clip.scene.sampling.strips_per_column", lambda _px: next(numbers))
-    got = list(receive(clip.frames[:8], replace(clip.options, corners=None)))
-    assert [result.frame for result in got] == list(range(8))
-    assert next(passes) == 3  # every third after the first

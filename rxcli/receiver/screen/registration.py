@@ -62,6 +62,8 @@ _PARTS, _OUTLINE_SD = (20, 6), 0.002
 _MOST_SD, _LEAST_CORRELATION = 0.0012, 0.35
 #: Share of the last frame's motion that the next is expected to repeat.
 _PERSISTENCE = 0.7
+#: Frames from which the texture is learned one by one, and how often from then on.
+_FIRST_FRAMES, _LEARN_EVERY = 10, 4
 #: Weight of the frames before, at most, in frames, in what is known of the texture.
 _MOST_WEIGHT = 40.0
 #: Corners clockwise from the top-left: their u and v.
@@ -146,6 +148,9 @@ class ScreenTexture:
         self._v = np.linspace(-_MARGIN, 1 + _MARGIN, n_v)
         self._plane = self._undistorted(corners)
         self._before = self._plane
+        #: Frames so far, and what they taught of the texture; None where it has to be worked out anew.
+        self._n_frames = 0
+        self._known_so_far: tuple[_Known, _Known] | None = None
         self._read_last: tuple[Frame, _Texture] | None = None
         self._value: Float32Array = np.zeros((n_v, n_u), np.float32)
         self._weight: Float32Array = np.zeros((n_v, n_u), np.float32)
@@ -155,7 +160,9 @@ class ScreenTexture:
         """Where the screen is in the next frame."""
         texture = self._texture_of(frame)
         expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
-        coarse, fine = self._known()
+        if self._known_so_far is None:
+            self._known_so_far = self._known()
+        coarse, fine = self._known_so_far
         plane, _, _ = self._fit(_coarser(texture), coarse, (expected, expected), _COARSE_ITERATIONS)
         plane, covariance, correlation = self._fit(texture, fine, (plane, expected), _FINE_ITERATIONS)
         return Registration(self._lens_of(plane), covariance, correlation)
@@ -176,6 +183,10 @@ class ScreenTexture:
     def learn(self, frame: Frame, found: Registration) -> None:
         """Take the texture of a frame in which the screen was found."""
         self._before, self._plane = self._plane, self._undistorted(found.corners)
+        self._n_frames += 1
+        if self._n_frames > _FIRST_FRAMES and self._n_frames % _LEARN_EVERY:
+            return
+        self._known_so_far = None
         value, weight = self._read(self._texture_of(frame), self._plane, self._u, self._v)
         total = self._weight + weight
         self._value += (value - self._value) * (weight / np.maximum(total, np.float32(1e-6)))

@@ -1,0 +1,98 @@
+"""Where the screen is by the picture on it: shifts, skews, stripes that move on their own, flat pictures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen.registration import ScreenTexture
+from rxcli.types import FloatArray, Frame
+
+WIDTH, HEIGHT = 960, 540
+CORNERS = np.array([[110.0, 60.0], [850.0, 66.0], [846.0, 476.0], [104.0, 482.0]])
+
+
+def texture(seed: int = 1) -> NDArray[np.float32]:
+    import cv2
+
+    noise = np.random.default_rng(seed).normal(0, 1, (300, 520)).astype(np.float32)
+    return np.asarray(np.clip(0.5 + 0.6 * cv2.GaussianBlur(noise, (0, 0), 2.0), 0.05, 1.0))
+
+
+def picture_of(panel: NDArray[np.float32], corners: FloatArray, seed: int) -> Frame:
+    """A frame whose columns are lit at random, slot by slot of five rows."""
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    to_panel = np.diag([panel.shape[1], panel.shape[0], 1.0]) @ np.linalg.inv(geometry.homography(corners))
+    flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+    shown = cv2.warpPerspective(panel, to_panel, (WIDTH, HEIGHT), flags=flags)
+    slots = rng.integers(0, 2, (HEIGHT // 5 + 1, 20)).repeat(5, axis=0)[:HEIGHT]
+    bumps = np.exp(-0.5 * ((np.linspace(0, 20, WIDTH)[None] - np.arange(20)[:, None] - 0.5) / 0.45) ** 2)
+    light = shown * (slots @ bumps).clip(0, 1) + 0.01
+    coded = 220 * light ** (1 / 2.2) + rng.normal(0, 1, light.shape)
+    return Frame(np.clip(coded, 0, 255).astype(np.uint8), "frame", seed)
+
+
+def known_of(panel: NDArray[np.float32]) -> ScreenTexture:
+    """What five frames teach of a screen that stays where it is."""
+    known = ScreenTexture(picture_of(panel, CORNERS, 1), CORNERS, None)
+    for seed in range(2, 6):
+        frame = picture_of(panel, CORNERS, seed)
+        known.learn(frame, known.find(frame))
+    return known
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (6.0, -4.0), (-9.0, 7.0)])
+def test_a_shift_is_found(shift: tuple[float, float]) -> None:
+    panel = texture()
+    known = known_of(panel)
+    found = known.find(picture_of(panel, CORNERS + np.array(shift), 9))
+    assert found.certain
+    assert found.corners == pytest.approx(CORNERS + np.array(shift), abs=1.5)
+
+
+def test_many_frames_know_better_than_one() -> None:
+    panel = texture()
+    known = ScreenTexture(picture_of(panel, CORNERS, 1), CORNERS, None)
+    first = known.find(picture_of(panel, CORNERS, 2)).sd_px
+    for seed in range(2, 8):
+        frame = picture_of(panel, CORNERS, seed)
+        known.learn(frame, known.find(frame))
+    assert known.find(picture_of(panel, CORNERS, 9)).sd_px < first
+
+
+def test_a_skew_of_rows_is_a_motion_of_corners() -> None:
+    """Five pixels to the right from the first row to the last."""
+    panel = texture()
+    skewed = CORNERS + np.array([[-2.5, 0], [-2.5, 0], [2.5, 0], [2.5, 0]])
+    assert known_of(panel).find(picture_of(panel, skewed, 9)).corners == pytest.approx(skewed, abs=1.2)
+
+
+def test_stripes_are_not_followed() -> None:
+    """On a flat picture nothing moves but the stripes."""
+    flat = np.full((300, 520), 0.6, np.float32)
+    known = ScreenTexture(picture_of(flat, CORNERS, 1), CORNERS, None)
+    for seed in range(2, 8):
+        frame = picture_of(flat, CORNERS, seed)
+        found = known.with_outline(known.find(frame), CORNERS, 0.0005)
+        assert np.abs(found.corners - CORNERS).max() < 4
+        known.learn(frame, found)
+
+
+def test_another_picture_fits_worse() -> None:
+    known = known_of(texture(1))
+    same, other = (known.find(picture_of(texture(seed), CORNERS, 9)).correlation for seed in (1, 2))
+    assert same > other + 0.1
+
+
+def test_what_is_known_of_rest_counts() -> None:
+    """Between what the texture says and what an outline says, each by its precision."""
+    known = known_of(texture())
+    found = known.find(picture_of(texture(), CORNERS + np.array([5.0, 0.0]), 9))
+    firm = known.with_outline(found, CORNERS, 1e-6)
+    loose = known.with_outline(found, CORNERS, 1.0)
+    assert firm.corners == pytest.approx(CORNERS, abs=0.1)
+    assert loose.corners == pytest.approx(found.corners, abs=0.1)
