@@ -449,7 +449,7 @@ def test_copies_of_two_packets_taken_for_one_are_told_apart(monkeypatch: pytest.
     right = still.decode_likeliest(acquisition, options.skip)
     assert right.clock.burst.max() > 0
     repeats = acquisition.screen.repeats
-    for clock, _ in sync.possible_bursts(right.clock, detect.slot_llr(right.metrics), repeats)[1:]:
+    for clock, _ in sync.possible_bursts(right.clock, detect.slot_llr(right.metrics), (repeats,))[1:]:
         burst = clock.burst
         monkeypatch.setattr(sync, "assign_bursts", lambda clock, *_, burst=burst: replace(clock, burst=burst))
         assert np.array_equal(still.decode(acquisition, options.skip).clock.burst, burst)
