@@ -142,10 +142,12 @@ def test_a_cut_transport_stream_says_so(tmp_path: Path) -> None:
 
 
 def test_times_of_years_are_not_believed() -> None:
-    stream = SimpleNamespace(time_base=Fraction(1, 30))
-    progress = video._Progress(last_time_s=2.0)
-    times = [video._time_s(SimpleNamespace(pts=pts), stream, progress) for pts in (None, 90, 1 << 60, -(1 << 60))]
-    assert times == [2.0, 3.0, 2.0, 2.0]
+    codec = SimpleNamespace(framerate=Fraction(30))
+    stream = SimpleNamespace(time_base=Fraction(1, 30), codec_context=codec, guessed_rate=None, average_rate=None)
+    progress = video._Progress()
+    found = [video._time_s(SimpleNamespace(pts=pts), stream, progress) for pts in (60, 90, 1 << 60, -(1 << 60))]
+    assert [nominal for _, nominal in found] == [False, False, True, True]
+    assert [time_s for time_s, _ in found] == pytest.approx([2.0, 3.0, 3.0 + 1 / 30, 3.0 + 2 / 30])
 
 
 def test_libraries_keep_their_lines_to_themselves(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

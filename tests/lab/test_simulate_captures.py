@@ -222,7 +222,7 @@ def test_command_writes_clips_through_real_encoders(tmp_path: Path, name: str, c
         (["a.jpg", "--payload", "hex:0g"], "no hex"),
         (["a.jpg", "--payload", "none.bin"], "cannot be read"),
         (["a.jpg", "--exposure", "1/0"], "no time"),
-        (["a.jpg", "--exposure", "-1"], "exposure_s must be positive"),
+        (["a.jpg", "--exposure", "-1"], "is no time"),
         (["a.jpg", "--corners", "1,2,3"], "takes 8 numbers"),
         (["a.jpg", "--screen", "nope"], "no profile"),
         (["a.jpg", "--picture", "nope.png"], "no such picture"),

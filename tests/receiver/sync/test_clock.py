@@ -48,13 +48,13 @@ def received(
     )
     contrast = sync.contrast(samples.light, samples.valid, Q, model.sigma)
     metrics = channel.first_metrics(*contrast, model.taps)
-    clock_ = sync.assign_bursts(clock_, detect.slot_llr(metrics), REPEATS)
+    clock_ = sync.assign_bursts(clock_, detect.slot_llr(metrics), (REPEATS,))
     for _ in range(rounds):
         posteriors = detect.detect(channel.by_burst(metrics, clock_, memory))
         lit = channel.lit_on_grid(posteriors, clock_)
         found = channel.slot_likelihoods(samples, clock_, model, lit, np.arange(lit.shape[0]))
         metrics = found.metrics
-        clock_ = sync.corrected(sync.assign_bursts(clock_, detect.slot_llr(metrics), REPEATS), found.timing)
+        clock_ = sync.corrected(sync.assign_bursts(clock_, detect.slot_llr(metrics), (REPEATS,)), found.timing)
         samples = sync.sample_slots(profiles, clock_, Q)
     posteriors = detect.detect(channel.by_burst(metrics, clock_, memory))
     return clock_, posteriors, samples
@@ -207,15 +207,15 @@ def test_bursts_in_every_way_likeliest_first() -> None:
     clock_ = replace(clock_, first_slot=0, n_slots=350, burst=np.zeros(5, np.int64))
     sent = rng.choice([-4.0, 4.0], (2, 3, 70)).astype(np.float32)
     llr = np.concatenate([sent[0], sent[0], sent[1], sent[1], sent[1]], axis=1)
-    possible = sync.possible_bursts(clock_, llr, REPEATS)
+    possible = sync.possible_bursts(clock_, llr, (REPEATS,))
     assert possible[0][0].burst.tolist() == [0, 0, 1, 1, 1]
     assert sorted(one.burst.tolist() for one, _ in possible) == [[0, 0, 0, 1, 1], [0, 0, 1, 1, 1], [0, 1, 1, 1, 2]]
     scores = [score for _, score in possible]
     assert scores == sorted(scores, reverse=True)
     assert scores[0] - scores[1] > 100
-    assert sync.assign_bursts(clock_, llr, REPEATS).burst.tolist() == [0, 0, 1, 1, 1]
+    assert sync.assign_bursts(clock_, llr, (REPEATS,)).burst.tolist() == [0, 0, 1, 1, 1]
     alone = replace(clock_, n_slots=70, burst=np.zeros(1, np.int64))
-    assert len(sync.possible_bursts(alone, llr[:, :70], REPEATS)) == 1
+    assert len(sync.possible_bursts(alone, llr[:, :70], (REPEATS,))) == 1
 
 
 @pytest.mark.parametrize("n_rows", [1, 5, 30])
