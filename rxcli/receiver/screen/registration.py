@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -46,11 +47,11 @@ _TONE, _DARKEST = 2.2, 0.03
 _DARK_PERCENT = 8.0
 #: Cells of a coarse cell across and down, smoothing of the coarse texture in such cells, and iterations.
 _COARSE_CELLS, _COARSE_BLUR, _COARSE_ITERATIONS = (4, 2), 0.8, 4
-#: Iterations of the fine fit; and steps, in screen sizes, after which a fit ends.
-_FINE_ITERATIONS, _COARSE_CONVERGED, _CONVERGED = 3, 2e-4, 7e-5
-#: Every so manieth row of cells tells whether a screen stands still; pixels that it may seem to have moved; and the
-#: share of the textures' correlation that must be left.
-_FEW_ROWS, _STILL_PX, _STILL_CORRELATION = 4, 0.2, 0.9
+#: Iterations of the fine fit; and squared standard deviations of a step after which a fit ends.
+_FINE_ITERATIONS, _CONVERGED = 3, 0.5
+#: Every so manieth row of cells tells whether a screen stands still; how far, in screen sizes, it and its corners may
+#: seem to have moved; and the share of the textures' correlation that must be left.
+_FEW_ROWS, _STILL_SHIFT, _STILL_CORNERS, _STILL_CORRELATION = 4, 0.0003, 0.0008, 0.97
 #: Beyond how many standard deviations a cell is an outlier: a hand, a reflection.
 _OUTLIER = 2.5
 #: How far a frame may be from where it is expected, screen sizes: shift, affine modes, perspective modes.
@@ -217,8 +218,8 @@ class ScreenTexture:
         if still is not None:
             return still
         expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
-        plane, _, _ = self._fit(_coarser(texture), coarse, (expected, expected), _COARSE_ITERATIONS, _COARSE_CONVERGED)
-        plane, covariance, self._correlation = self._fit(texture, fine, (plane, expected), _FINE_ITERATIONS, _CONVERGED)
+        plane, _, _ = self._fit(_coarser(texture), coarse, (expected, expected), _COARSE_ITERATIONS)
+        plane, covariance, self._correlation = self._fit(texture, fine, (plane, expected), _FINE_ITERATIONS)
         return Registration(self._lens_of(plane), covariance, self._correlation)
 
     def _still(self, texture: _Texture, few: _Known) -> Registration | None:
@@ -228,10 +229,11 @@ class ScreenTexture:
         """
         if not np.array_equal(self._plane, self._before):
             return None
-        plane, covariance, correlation = self._fit(texture, few, (self._plane, self._plane), 1, 0.0)
+        plane, covariance, correlation = self._fit(texture, few, (self._plane, self._plane), 1)
         moved = plane - self._plane
         found = Registration(self._lens_of(self._plane), covariance, correlation)
-        near = max(np.abs(moved.mean(axis=0)).max(), np.sqrt(np.square(moved).mean()), found.sd_px) < _STILL_PX
+        shift, each, size = np.abs(moved.mean(axis=0)).max(), np.sqrt(np.square(moved).mean()), _size(plane)
+        near = shift < _STILL_SHIFT * size and each < _STILL_CORNERS * size
         alike = correlation > max(_STILL_CORRELATION * self._correlation, _LEAST_CORRELATION)
         return found if near and alike and found.tells else None
 
@@ -283,16 +285,13 @@ class ScreenTexture:
         known: _Known,
         poses: tuple[FloatArray, FloatArray],
         iterations: int,
-        converged: float,
     ) -> tuple[FloatArray, FloatArray, float]:
         """Corners (4, 2) on the undistorted picture, their covariance (8, 8), and the textures' correlation.
 
-        `poses` are where to begin, and where the corners are expected. Steps smaller than `converged` screen sizes are
-        the last.
+        `poses` are where to begin, and where the corners are expected.
         """
         plane, expected = poses
-        size = _size(plane)
-        prior = _information(size)
+        prior = _information(_size(plane))
         for _ in range(iterations):
             value, weight = self._read(texture, plane, known.places)
             weight *= known.trust
@@ -309,9 +308,10 @@ class ScreenTexture:
             # The prior counts against as much information as the parts' scatter leaves.
             scale = max(float(np.square(scores).sum() / max(np.trace(normal), 1e-12)), 1e-9)
             total = normal / scale + prior
-            step = np.linalg.solve(total, scores.sum(axis=0) / scale + prior @ (expected - plane).ravel())
+            slope = scores.sum(axis=0) / scale + prior @ (expected - plane).ravel()
+            step = np.linalg.solve(total, slope)
             plane = plane + step.reshape(4, 2)
-            if np.abs(step).max() < converged * size:
+            if step @ slope < _CONVERGED:
                 break
         of_known = weight * known.value
         power = float(np.vdot(of_known, known.value)) * float(np.vdot(weight * value, value))
@@ -502,8 +502,14 @@ def _size(corners: FloatArray) -> float:
 
 def _information(size: float) -> FloatArray:
     """(8, 8) information on how far the corners may be from where they are expected."""
+    return _information_of_one() / (size * size)
+
+
+@cache
+def _information_of_one() -> FloatArray:
+    """As `_information`, of a screen of size 1."""
     # Modes of four corners along one axis: all alike, right against left, bottom against top, and crosswise.
     modes = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [1, -1, 1, -1]]) / 4
     sds: Sequence[float] = (_SHIFT_SD, _AFFINE_SD, _AFFINE_SD, _PERSPECTIVE_SD)
-    along = (modes.T / np.square(np.array(sds) * size)) @ modes
+    along = (modes.T / np.square(np.array(sds))) @ modes
     return np.asarray(np.kron(along, np.eye(2)), np.float64)
