@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.profiles import LensModel
-from rxcli.types import BoolArray, FloatArray, IntArray, Lens, Outlines
+from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray, Lens, Outlines
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
@@ -176,9 +176,46 @@ def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:
 def _edges_at(points: FloatArray, v: FloatArray, knots: IntArray) -> tuple[FloatArray, FloatArray]:
     """x and v of every edge (n_edges, n_points, 2) on the rows `knots`; a screen upside down has y falling with v."""
     step = 1 if points[0, -1, 1] > points[0, 0, 1] else -1
-    x = np.stack([np.interp(knots, edge[::step, 1], edge[::step, 0]) for edge in points])
-    along = np.stack([np.interp(knots, edge[::step, 1], v[::step]) for edge in points])
+    edges = points[:, ::step]
+    along = np.broadcast_to(v[::step], edges.shape[:2])
+    x, along = _interpolated(np.broadcast_to(knots, (len(edges), knots.size)), edges[..., 1], edges[..., 0], along)
     return x, along
+
+
+def _interpolated(places: FloatArray | IntArray, known: FloatArray, *values: FloatArray) -> list[FloatArray]:
+    """`values` (n, P) each, at ascending `known` (n, P), linearly between at the `places` (n, K); the ends' beyond.
+
+    As `np.interp` has it, for all lines at once.
+    """
+    n_known = known.shape[1]
+    # One line after the other, far enough apart to be searched together.
+    apart = np.arange(len(known))[:, None]
+    distance = max(known.max(), places.max()) - min(known.min(), places.min()) + 1
+    found = np.searchsorted((known + apart * distance).ravel(), (places + apart * distance).ravel(), side="right")
+    right = np.clip(found.reshape(places.shape) - apart * n_known, 1, n_known - 1)
+    left = right - 1
+
+    def taken(of: FloatArray, index: IntArray) -> FloatArray:
+        return np.take_along_axis(of, index, axis=1)
+
+    before = taken(known, left)
+    part = np.clip((places - before) / np.maximum(taken(known, right) - before, 1e-12), 0, 1)
+    lows = [taken(of, left) for of in values]
+    return [low + (taken(of, right) - low) * part for low, of in zip(lows, values, strict=True)]
+
+
+def rows_elsewhere(rows: FloatArray, here: FloatArray, there: FloatArray) -> Float32Array:
+    """(C, R) row of what successive `rows` (R,) show, where points of columns at the rows `here` (C, n) are at `there`
+    (C, n); beyond the points as between the outermost."""
+    if here[0, -1] < here[0, 0]:
+        here, there = here[:, ::-1], there[:, ::-1]
+    knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
+    (inner,) = _interpolated(np.broadcast_to(knots, (len(here), knots.size)), here, there)
+    first, last = here[:, :1], here[:, -1:]
+    slope = (there[:, -1:] - there[:, :1]) / (last - first)
+    found = inner + slope * (np.minimum(knots - first, 0) + np.maximum(knots - last, 0))
+    # Rows of the picture need less than single precision.
+    return _between_knots(found.astype(np.float32), knots.astype(np.int64), rows.astype(np.int64))
 
 
 def _between_knots(values: NDArray[_Real], knots: IntArray, rows: IntArray) -> NDArray[_Real]:
@@ -197,8 +234,9 @@ def _between_knots(values: NDArray[_Real], knots: IntArray, rows: IntArray) -> N
 def _rows_between(values: FloatArray, knots: IntArray, rows: IntArray, low: float, high: float) -> BoolArray:
     """(n, rows) where values (n, knots), monotonic along the knots, lie strictly between `low` and `high`."""
     step = 1 if values[0, -1] > values[0, 0] else -1
-    beyond = (-np.inf * step, np.inf * step)
-    ends = np.array([np.interp([low, high], line[::step], knots[::step], *beyond) for line in values])
+    lines, limits = values[:, ::step], np.broadcast_to(np.array([low, high]), (len(values), 2))
+    (ends,) = _interpolated(limits, lines, np.broadcast_to(knots[::step].astype(np.float64), lines.shape))
+    ends = np.where(limits < lines[:, :1], -np.inf * step, np.where(limits > lines[:, -1:], np.inf * step, ends))
     return np.asarray((rows > ends.min(axis=1)[:, None]) & (rows < ends.max(axis=1)[:, None]))
 
 
