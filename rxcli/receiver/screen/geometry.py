@@ -95,13 +95,18 @@ def undistort(points: FloatArray, lens: Lens, iterations: int = 20) -> FloatArra
 
 def homography(corners: FloatArray) -> FloatArray:
     """(3, 3) map of screen points (u to the right, v down, both 0..1) to pixels, from the (4, 2) corners."""
-    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    rows = []
-    for (u, v), (x, y) in zip(square, corners, strict=True):
-        rows.append([u, v, 1, 0, 0, 0, -x * u, -x * v])
-        rows.append([0, 0, 0, u, v, 1, -y * u, -y * v])
-    solution = np.linalg.solve(np.array(rows), corners.ravel())
-    return np.append(solution, 1.0).reshape(3, 3)
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = np.asarray(corners, np.float64).tolist()
+    # What the corners lack of a parallelogram makes the perspective (Heckbert 1989).
+    bent_x, bent_y = x0 - x1 + x2 - x3, y0 - y1 + y2 - y3
+    right_x, right_y, left_x, left_y = x1 - x2, y1 - y2, x3 - x2, y3 - y2
+    determinant = right_x * left_y - left_x * right_y
+    if determinant == 0:
+        raise np.linalg.LinAlgError("three of the corners lie on one line")
+    g = (bent_x * left_y - left_x * bent_y) / determinant
+    h = (right_x * bent_y - bent_x * right_y) / determinant
+    return np.array(
+        [[x1 - x0 + g * x1, x3 - x0 + h * x3, x0], [y1 - y0 + g * y1, y3 - y0 + h * y3, y0], [g, h, 1.0]], np.float64
+    )
 
 
 def screen_to_picture(points: FloatArray, corners: FloatArray, lens: Lens | None) -> FloatArray:
