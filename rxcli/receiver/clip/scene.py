@@ -442,20 +442,6 @@ def _placement(
     n_columns = strips.inside.shape[0]
     before, after = (geometry.column_middles(c, n_columns, lens) for c in (first.corners, corners))
     first_row, row = first.map.first_row, strips.first_row
-    picture_row = _row_at(strips.rows, after, before) - first_row
-    frame_row = _row_at(first.rows, before, after) - row
-    return known_picture.Placement(picture_row.astype(np.float32), frame_row.astype(np.float32), strips.inside)
-
-
-def _row_at(rows: FloatArray, here: FloatArray, there: FloatArray) -> FloatArray:
-    """(C, R) row of what `rows` (R,) show, where points of columns at the rows `here` (C, n) are at `there` (C, n)."""
-    return np.stack([_extended(rows, *pair) for pair in zip(here, there, strict=True)])
-
-
-def _extended(rows: FloatArray, here: FloatArray, there: FloatArray) -> FloatArray:
-    """Linear interpolation, and beyond the ends as between them."""
-    order = slice(None, None, 1 if here[-1] > here[0] else -1)
-    here, there = here[order], there[order]
-    inner = np.interp(rows, here, there)
-    slope = (there[-1] - there[0]) / (here[-1] - here[0])
-    return np.asarray(inner + slope * (np.minimum(rows - here[0], 0) + np.maximum(rows - here[-1], 0)))
+    picture_row = geometry.rows_elsewhere(strips.rows, after, before) - np.float32(first_row)
+    frame_row = geometry.rows_elsewhere(first.rows, before, after) - np.float32(row)
+    return known_picture.Placement(picture_row, frame_row, strips.inside)

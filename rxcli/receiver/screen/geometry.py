@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.profiles import LensModel
-from rxcli.types import BoolArray, FloatArray, IntArray, Lens, Outlines
+from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray, Lens, Outlines
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
@@ -95,13 +95,18 @@ def undistort(points: FloatArray, lens: Lens, iterations: int = 20) -> FloatArra
 
 def homography(corners: FloatArray) -> FloatArray:
     """(3, 3) map of screen points (u to the right, v down, both 0..1) to pixels, from the (4, 2) corners."""
-    square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    rows = []
-    for (u, v), (x, y) in zip(square, corners, strict=True):
-        rows.append([u, v, 1, 0, 0, 0, -x * u, -x * v])
-        rows.append([0, 0, 0, u, v, 1, -y * u, -y * v])
-    solution = np.linalg.solve(np.array(rows), corners.ravel())
-    return np.append(solution, 1.0).reshape(3, 3)
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = np.asarray(corners, np.float64).tolist()
+    # What the corners lack of a parallelogram makes the perspective (Heckbert 1989).
+    bent_x, bent_y = x0 - x1 + x2 - x3, y0 - y1 + y2 - y3
+    right_x, right_y, left_x, left_y = x1 - x2, y1 - y2, x3 - x2, y3 - y2
+    determinant = right_x * left_y - left_x * right_y
+    if determinant == 0:
+        raise np.linalg.LinAlgError("three of the corners lie on one line")
+    g = (bent_x * left_y - left_x * bent_y) / determinant
+    h = (right_x * bent_y - bent_x * right_y) / determinant
+    return np.array(
+        [[x1 - x0 + g * x1, x3 - x0 + h * x3, x0], [y1 - y0 + g * y1, y3 - y0 + h * y3, y0], [g, h, 1.0]], np.float64
+    )
 
 
 def screen_to_picture(points: FloatArray, corners: FloatArray, lens: Lens | None) -> FloatArray:
@@ -176,9 +181,46 @@ def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:
 def _edges_at(points: FloatArray, v: FloatArray, knots: IntArray) -> tuple[FloatArray, FloatArray]:
     """x and v of every edge (n_edges, n_points, 2) on the rows `knots`; a screen upside down has y falling with v."""
     step = 1 if points[0, -1, 1] > points[0, 0, 1] else -1
-    x = np.stack([np.interp(knots, edge[::step, 1], edge[::step, 0]) for edge in points])
-    along = np.stack([np.interp(knots, edge[::step, 1], v[::step]) for edge in points])
+    edges = points[:, ::step]
+    along = np.broadcast_to(v[::step], edges.shape[:2])
+    x, along = _interpolated(np.broadcast_to(knots, (len(edges), knots.size)), edges[..., 1], edges[..., 0], along)
     return x, along
+
+
+def _interpolated(places: FloatArray | IntArray, known: FloatArray, *values: FloatArray) -> list[FloatArray]:
+    """`values` (n, P) each, at ascending `known` (n, P), linearly between at the `places` (n, K); the ends' beyond.
+
+    As `np.interp` has it, for all lines at once.
+    """
+    n_known = known.shape[1]
+    # One line after the other, far enough apart to be searched together.
+    apart = np.arange(len(known))[:, None]
+    distance = max(known.max(), places.max()) - min(known.min(), places.min()) + 1
+    found = np.searchsorted((known + apart * distance).ravel(), (places + apart * distance).ravel(), side="right")
+    right = np.clip(found.reshape(places.shape) - apart * n_known, 1, n_known - 1)
+    left = right - 1
+
+    def taken(of: FloatArray, index: IntArray) -> FloatArray:
+        return np.take_along_axis(of, index, axis=1)
+
+    before = taken(known, left)
+    part = np.clip((places - before) / np.maximum(taken(known, right) - before, 1e-12), 0, 1)
+    lows = [taken(of, left) for of in values]
+    return [low + (taken(of, right) - low) * part for low, of in zip(lows, values, strict=True)]
+
+
+def rows_elsewhere(rows: FloatArray, here: FloatArray, there: FloatArray) -> Float32Array:
+    """(C, R) row of what successive `rows` (R,) show, where points of columns at the rows `here` (C, n) are at `there`
+    (C, n); beyond the points as between the outermost."""
+    if here[0, -1] < here[0, 0]:
+        here, there = here[:, ::-1], there[:, ::-1]
+    knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
+    (inner,) = _interpolated(np.broadcast_to(knots, (len(here), knots.size)), here, there)
+    first, last = here[:, :1], here[:, -1:]
+    slope = (there[:, -1:] - there[:, :1]) / (last - first)
+    found = inner + slope * (np.minimum(knots - first, 0) + np.maximum(knots - last, 0))
+    # Rows of the picture need less than single precision.
+    return _between_knots(found.astype(np.float32), knots.astype(np.int64), rows.astype(np.int64))
 
 
 def _between_knots(values: NDArray[_Real], knots: IntArray, rows: IntArray) -> NDArray[_Real]:
@@ -197,8 +239,9 @@ def _between_knots(values: NDArray[_Real], knots: IntArray, rows: IntArray) -> N
 def _rows_between(values: FloatArray, knots: IntArray, rows: IntArray, low: float, high: float) -> BoolArray:
     """(n, rows) where values (n, knots), monotonic along the knots, lie strictly between `low` and `high`."""
     step = 1 if values[0, -1] > values[0, 0] else -1
-    beyond = (-np.inf * step, np.inf * step)
-    ends = np.array([np.interp([low, high], line[::step], knots[::step], *beyond) for line in values])
+    lines, limits = values[:, ::step], np.broadcast_to(np.array([low, high]), (len(values), 2))
+    (ends,) = _interpolated(limits, lines, np.broadcast_to(knots[::step].astype(np.float64), lines.shape))
+    ends = np.where(limits < lines[:, :1], -np.inf * step, np.where(limits > lines[:, -1:], np.inf * step, ends))
     return np.asarray((rows > ends.min(axis=1)[:, None]) & (rows < ends.max(axis=1)[:, None]))
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,11 @@ _TONE, _DARKEST = 2.2, 0.03
 _DARK_PERCENT = 8.0
 #: Cells of a coarse cell across and down, smoothing of the coarse texture in such cells, and iterations.
 _COARSE_CELLS, _COARSE_BLUR, _COARSE_ITERATIONS = (4, 2), 0.8, 4
-_FINE_ITERATIONS, _CONVERGED = 3, 3e-5
+#: Iterations of the fine fit; and squared standard deviations of a step after which a fit ends.
+_FINE_ITERATIONS, _CONVERGED = 3, 0.5
+#: Every so manieth row of cells tells whether a screen stands still; how far, in screen sizes, it and its corners may
+#: seem to have moved; and the share of the textures' correlation that must be left.
+_FEW_ROWS, _STILL_SHIFT, _STILL_CORNERS, _STILL_CORRELATION = 4, 0.0003, 0.0008, 0.97
 #: Beyond how many standard deviations a cell is an outlier: a hand, a reflection.
 _OUTLIER = 2.5
 #: How far a frame may be from where it is expected, screen sizes: shift, affine modes, perspective modes.
@@ -119,13 +124,55 @@ class _Known:
     """What is known of the texture at the places v x u, (V, U) each."""
 
     value: Float32Array
-    #: Its change along u and along v as far as it is more than noise.
-    along_u: Float32Array
-    along_v: Float32Array
+    #: (2, V, U) its change along u and along v as far as it is more than noise, and (3, V, U) the products of these.
+    along: Float32Array
+    products: Float32Array
     #: How well it is known, 0..1.
     trust: Float32Array
+    places: _Places
+
+    def every(self, step: int, places: _Places) -> _Known:
+        """Of every so manieth row alone, whose `places` these are."""
+        parts = (self.value, self.along, self.products, self.trust)
+        return _Known(*(np.ascontiguousarray(part[..., ::step, :]) for part in parts), places)
+
+
+@dataclass(frozen=True, slots=True)
+class _Places:
+    """Places v x u on the screen, and what is worked out of them once."""
+
     u: FloatArray
     v: FloatArray
+    #: (knots, 3) points through which the screen is projected, and what makes (V, U) of values there: (V, knots down)
+    #: and (knots across, U).
+    knots: FloatArray
+    down: Float32Array
+    across: Float32Array
+    #: (3, V) and (U, 3) products of two corners' shares, of a motion of which places take part in theirs.
+    pairs_v: Float32Array
+    pairs_u: Float32Array
+    #: (2 * parts down, V) and (U, 2 * parts across) shares of the corners in each part of the screen.
+    parts_v: Float32Array
+    parts_u: Float32Array
+
+    @classmethod
+    def of(cls, u: FloatArray, v: FloatArray) -> _Places:
+        """Of ascending u and v."""
+        knots_u, knots_v = np.linspace(u[0], u[-1], _KNOTS_U), np.linspace(v[0], v[-1], _KNOTS_V)
+        grid_u, grid_v = np.meshgrid(knots_u, knots_v)
+        knots = np.stack([grid_u, grid_v, np.ones_like(grid_u)], axis=-1).reshape(-1, 3)
+        share_u, share_v = _corner_weights(u), _corner_weights(v)
+        return cls(
+            u,
+            v,
+            knots,
+            _between(v, knots_v),
+            np.ascontiguousarray(_between(u, knots_u).T),
+            _pairs(share_v),
+            np.ascontiguousarray(_pairs(share_u).T),
+            _in_parts(share_v, _PARTS[1]),
+            np.ascontiguousarray(_in_parts(share_u, _PARTS[0]).T),
+        )
 
 
 class ScreenTexture:
@@ -150,7 +197,12 @@ class ScreenTexture:
         self._before = self._plane
         #: Frames so far, and what they taught of the texture; None where it has to be worked out anew.
         self._n_frames = 0
-        self._known_so_far: tuple[_Known, _Known] | None = None
+        self._known_so_far: tuple[_Known, _Known, _Known] | None = None
+        across, down = _COARSE_CELLS
+        self._coarse_places = _Places.of(_middles(self._u, across), _middles(self._v, down))
+        self._places, self._few_places = _Places.of(self._u, self._v), _Places.of(self._u, self._v[::_FEW_ROWS])
+        #: Correlation of the textures when the screen was found last, all of them looked at.
+        self._correlation = 1.0
         self._read_last: tuple[Frame, _Texture] | None = None
         self._value: Float32Array = np.zeros((n_v, n_u), np.float32)
         self._weight: Float32Array = np.zeros((n_v, n_u), np.float32)
@@ -159,13 +211,31 @@ class ScreenTexture:
     def find(self, frame: Frame) -> Registration:
         """Where the screen is in the next frame."""
         texture = self._texture_of(frame)
-        expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
         if self._known_so_far is None:
             self._known_so_far = self._known()
-        coarse, fine = self._known_so_far
+        coarse, fine, few = self._known_so_far
+        still = self._still(texture, few)
+        if still is not None:
+            return still
+        expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
         plane, _, _ = self._fit(_coarser(texture), coarse, (expected, expected), _COARSE_ITERATIONS)
-        plane, covariance, correlation = self._fit(texture, fine, (plane, expected), _FINE_ITERATIONS)
-        return Registration(self._lens_of(plane), covariance, correlation)
+        plane, covariance, self._correlation = self._fit(texture, fine, (plane, expected), _FINE_ITERATIONS)
+        return Registration(self._lens_of(plane), covariance, self._correlation)
+
+    def _still(self, texture: _Texture, few: _Known) -> Registration | None:
+        """Where the screen was, if it stood still before and a look at a few rows finds that it did not move.
+
+        A step of a fit tells of small motions only; after a large one the textures do not agree as they did.
+        """
+        if not np.array_equal(self._plane, self._before):
+            return None
+        plane, covariance, correlation = self._fit(texture, few, (self._plane, self._plane), 1)
+        moved = plane - self._plane
+        found = Registration(self._lens_of(self._plane), covariance, correlation)
+        shift, each, size = np.abs(moved.mean(axis=0)).max(), np.sqrt(np.square(moved).mean()), _size(plane)
+        near = shift < _STILL_SHIFT * size and each < _STILL_CORNERS * size
+        alike = correlation > max(_STILL_CORRELATION * self._correlation, _LEAST_CORRELATION)
+        return found if near and alike and found.tells else None
 
     def with_outline(self, found: Registration, outline: FloatArray, sd: float = _OUTLINE_SD) -> Registration:
         """What the texture says of a place, and what an outline (4, 2) says, together; `sd` in screen sizes."""
@@ -187,19 +257,19 @@ class ScreenTexture:
         if self._n_frames > _FIRST_FRAMES and self._n_frames % _LEARN_EVERY:
             return
         self._known_so_far = None
-        value, weight = self._read(self._texture_of(frame), self._plane, self._u, self._v)
+        value, weight = self._read(self._texture_of(frame), self._plane, self._places)
         total = self._weight + weight
         self._value += (value - self._value) * (weight / np.maximum(total, np.float32(1e-6)))
         self._weight = np.minimum(total, np.float32(_MOST_WEIGHT))
 
-    def _known(self) -> tuple[_Known, _Known]:
-        """The texture so far, coarse and fine."""
+    def _known(self) -> tuple[_Known, _Known, _Known]:
+        """The texture so far, coarse and fine, and fine on a few rows."""
         across, down = _COARSE_CELLS
-        fine = _Texture(self._value, self._weight, 1, 1)
-        places = _middles(self._u, across), _middles(self._v, down)
+        texture = _Texture(self._value, self._weight, 1, 1)
         # Blurred means of so many cells have so much less noise.
         fewer = across * down * (1 + 4 * np.pi * _COARSE_BLUR**2) / 2
-        return _known(_coarser(fine), fewer, places), _known(fine, 1.0, (self._u, self._v))
+        fine = _known(texture, 1.0, self._places)
+        return _known(_coarser(texture), fewer, self._coarse_places), fine, fine.every(_FEW_ROWS, self._few_places)
 
     def _texture_of(self, frame: Frame) -> _Texture:
         """The texture of a frame; of the one that was asked for last, without reading it again."""
@@ -221,54 +291,50 @@ class ScreenTexture:
         `poses` are where to begin, and where the corners are expected.
         """
         plane, expected = poses
-        corner_u, corner_v = _corner_weights(known.u), _corner_weights(known.v)
-        size = _size(plane)
-        prior = _information(size)
+        prior = _information(_size(plane))
         for _ in range(iterations):
-            value, weight = self._read(texture, plane, known.u, known.v)
+            value, weight = self._read(texture, plane, known.places)
             weight *= known.trust
             error = known.value - value
             squared = error * error
             variance = max(float(np.vdot(weight, squared)) / max(float(weight.sum()), 1e-6), 1e-6)
-            weight /= 1 + squared * np.float32(1 / (_OUTLIER**2 * variance))
-            along = _per_pixel(known, plane)
-            weighted = (weight * along[0], weight * along[1])
-            normal = _normal_matrix(along, weighted, corner_u, corner_v)
-            scores = _scores_of_parts((weighted[0] * error, weighted[1] * error), corner_u, corner_v)
+            squared *= np.float32(1 / (_OUTLIER**2 * variance))
+            squared += np.float32(1)
+            weight /= squared
+            per_pixel = _per_pixel(plane)
+            normal = _normal_matrix(known, weight, per_pixel)
+            error *= weight
+            scores = _scores_of_parts(known, error, per_pixel)
             # The prior counts against as much information as the parts' scatter leaves.
-            scale = max(float(np.trace(scores.T @ scores) / max(np.trace(normal), 1e-12)), 1e-9)
+            scale = max(float(np.square(scores).sum() / max(np.trace(normal), 1e-12)), 1e-9)
             total = normal / scale + prior
-            step = np.linalg.solve(total, scores.sum(axis=0) / scale + prior @ (expected - plane).ravel())
+            slope = scores.sum(axis=0) / scale + prior @ (expected - plane).ravel()
+            step = np.linalg.solve(total, slope)
             plane = plane + step.reshape(4, 2)
-            if np.abs(step).max() < _CONVERGED * size:
+            if step @ slope < _CONVERGED:
                 break
-        power = float(np.vdot(weight * known.value, known.value)) * float(np.vdot(weight * value, value))
-        correlation = float(np.vdot(weight * known.value, value)) / max(power, 1e-18) ** 0.5
+        of_known = weight * known.value
+        power = float(np.vdot(of_known, known.value)) * float(np.vdot(weight * value, value))
+        correlation = float(np.vdot(of_known, value)) / max(power, 1e-18) ** 0.5
         return plane, _sandwich(normal, scores, variance, prior), correlation
 
-    def _read(
-        self, texture: _Texture, plane: FloatArray, u: FloatArray, v: FloatArray
-    ) -> tuple[Float32Array, Float32Array]:
-        """Value and weight of a frame's texture at the screen places v x u, were the screen at `plane`."""
+    def _read(self, texture: _Texture, plane: FloatArray, places: _Places) -> tuple[Float32Array, Float32Array]:
+        """Value and weight of a frame's texture at screen places, were the screen at `plane`."""
         import cv2
 
-        x, y = self._project(plane, u, v)
-        x = (x + np.float32(0.5)) / np.float32(texture.cell_x) - np.float32(0.5)
-        y = (y + np.float32(0.5)) / np.float32(texture.cell_y) - np.float32(0.5)
+        x, y = self._project(plane, places, (texture.cell_x, texture.cell_y))
         value, weight = (
             np.asarray(cv2.remap(part, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
             for part in (texture.value, texture.weight)
         )
         return value, weight
 
-    def _project(self, plane: FloatArray, u: FloatArray, v: FloatArray) -> tuple[Float32Array, Float32Array]:
-        """Pixels (V, U) of screen places: exactly at some knots, and bilinearly between."""
-        knots_u, knots_v = np.linspace(u[0], u[-1], _KNOTS_U), np.linspace(v[0], v[-1], _KNOTS_V)
-        points = np.stack(np.meshgrid(knots_u, knots_v), axis=-1)
-        projected = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ geometry.homography(plane).T
-        pixels = self._lens_of(projected[..., :2] / projected[..., 2:])
-        across, down = _between(u, knots_u), _between(v, knots_v)
-        return tuple(down @ pixels[..., k].astype(np.float32) @ across.T for k in (0, 1))  # type: ignore[return-value]
+    def _project(self, plane: FloatArray, places: _Places, cell: tuple[int, int]) -> tuple[Float32Array, Float32Array]:
+        """Cells (V, U) of screen places: exactly at some knots, and bilinearly between."""
+        projected = places.knots @ geometry.homography(plane).T
+        pixels = self._lens_of(projected[:, :2] / projected[:, 2:])
+        cells = ((pixels + 0.5) / cell - 0.5).T.reshape(2, places.down.shape[1], -1).astype(np.float32)
+        return places.down @ (cells[0] @ places.across), places.down @ (cells[1] @ places.across)
 
     def _lens_of(self, points: FloatArray) -> FloatArray:
         return points if self._lens is None else geometry.distort(points, self._lens)
@@ -284,24 +350,36 @@ def _texture_of(frame: Frame, cell_x: int, cell_y: int) -> _Texture:
     n_y, n_x = frame.height // cell_y, frame.width // cell_x
     pixels: NDArray[Any] = frame.pixels[: n_y * cell_y, : n_x * cell_x]
     wide = np.uint16 if pixels.dtype == np.uint8 else np.uint32
-    rows = np.add.reduce(pixels.reshape(n_y, cell_y, -1), axis=1, dtype=wide).astype(np.float32)
-    cells = cv2.resize(rows, (n_x, n_y), interpolation=cv2.INTER_AREA)
+    cells = np.add.reduce(pixels.reshape(n_y, cell_y, -1), axis=1, dtype=wide)
+    if wide is np.uint32:
+        cells = cells.astype(np.float32)
+    cells = cv2.resize(cells, (n_x, n_y), interpolation=cv2.INTER_AREA).astype(np.float32)
     gain = 1 / (frame.white - frame.black)
-    coded = np.clip(cells * np.float32(gain / cell_y) - np.float32(frame.black * gain), 0, 1)
-    tone = np.float32(1.0 if frame.linear else _TONE)
-    light = coded**tone
+    cells *= np.float32(gain / cell_y)
+    cells -= np.float32(frame.black * gain)
+    coded = np.clip(cells, np.float32(0), np.float32(1), out=cells)
+    tone = 1.0 if frame.linear else _TONE
+    light = np.asarray(cv2.pow(coded, tone))
     mean = cv2.boxFilter(light, -1, (_NEIGHBOURS, 1), borderType=cv2.BORDER_REPLICATE)
     # A strip of the screen that is dark shows the room's light; its texture is nobody's.
-    lit = mean - np.float32(np.percentile(mean[_some_rows(n_y)], _DARK_PERCENT))
-    slope = tone * np.maximum(coded, np.float32(_DARKEST)) ** (tone - 1)
-    lit = np.maximum(lit, np.float32(1e-4))
-    noise = slope * np.float32(_CELL_NOISE / _STRIPE_NOISE) / lit
-    return _Texture(np.clip((light - mean) / lit, -1, 1), 1 / (1 + noise * noise), cell_x, cell_y)
+    lit = np.maximum(mean - _darkest(mean), np.float32(1e-4))
+    noise = np.asarray(cv2.pow(np.maximum(coded, np.float32(_DARKEST)), tone - 1))
+    noise *= np.float32(tone * _CELL_NOISE / _STRIPE_NOISE)
+    noise /= lit
+    noise *= noise
+    noise += np.float32(1)
+    light -= mean
+    light /= lit
+    value = np.clip(light, np.float32(-1), np.float32(1), out=light)
+    return _Texture(value, np.reciprocal(noise, out=noise), cell_x, cell_y)
 
 
-def _some_rows(n_rows: int) -> slice:
-    """The middle of a picture, where the screen is."""
-    return slice(n_rows // 4, n_rows - n_rows // 4)
+def _darkest(mean: Float32Array) -> np.float32:
+    """Light that few of the cells in the middle of a picture, where the screen is, fall short of."""
+    n_rows = len(mean)
+    some = mean[n_rows // 4 : n_rows - n_rows // 4 : 2, ::2].ravel()
+    place = int(some.size * _DARK_PERCENT / 100)
+    return np.float32(np.partition(some, place)[place])
 
 
 def _coarser(texture: _Texture) -> _Texture:
@@ -338,16 +416,29 @@ def _corner_weights(places: FloatArray) -> Float32Array:
     return np.stack([1 - places, places]).astype(np.float32)
 
 
-def _known(texture: _Texture, fewer: float, places: tuple[FloatArray, FloatArray]) -> _Known:
+def _pairs(shares: Float32Array) -> Float32Array:
+    """(3, n) products of two corners' shares (2, n): those of two along u times those along v are those of two."""
+    return np.stack([shares[0] * shares[0], shares[0] * shares[1], shares[1] * shares[1]])
+
+
+def _in_parts(shares: Float32Array, parts: int) -> Float32Array:
+    """(2 * parts, n) the corners' shares (2, n), in so many parts one after the other and none elsewhere."""
+    n = shares.shape[1]
+    part = np.searchsorted(np.arange(1, parts) * n // parts, np.arange(n), side="right")
+    return np.asarray((shares[:, None] * (part == np.arange(parts)[:, None])).reshape(-1, n), np.float32)
+
+
+def _known(texture: _Texture, fewer: float, places: _Places) -> _Known:
     """The texture at some places, its changes drawn to none where noise could make them; that is `fewer` times less."""
     import cv2
 
     def around(values: Float32Array) -> Float32Array:
         return np.asarray(cv2.boxFilter(values, -1, (_LOCAL_CELLS, _LOCAL_CELLS)))
 
-    u, v = places
+    u, v = places.u, places.v
     value, weight = texture.value, texture.weight
-    along_u, along_v = np.zeros_like(value), np.zeros_like(value)
+    along: Float32Array = np.zeros((2, *value.shape), np.float32)
+    along_u, along_v = along
     along_u[:, 1:-1] = (value[:, 2:] - value[:, :-2]) * np.float32(0.5)
     along_v[1:-1] = (value[2:] - value[:-2]) * np.float32(0.5)
     noise = np.float32(0.5 * _STRIPE_NOISE**2 / fewer)
@@ -358,46 +449,40 @@ def _known(texture: _Texture, fewer: float, places: tuple[FloatArray, FloatArray
         power = around(change * change * weight) / total
         least = np.float32(_ABOVE_NOISE) * (noise + more) / np.maximum(n, np.float32(1e-3))
         change *= np.maximum(1 - least / np.maximum(power, np.float32(1e-12)), 0) / np.float32(step)
-    return _Known(value, along_u, along_v, weight / (weight + np.float32(1.0)), u, v)
+    products = along[[0, 0, 1]] * along[[0, 1, 1]]
+    return _Known(value, along, products, weight / (weight + np.float32(1.0)), places)
 
 
-def _per_pixel(known: _Known, plane: FloatArray) -> tuple[Float32Array, Float32Array]:
-    """Change of the texture per pixel to the right and down, were the screen a parallelogram."""
+def _per_pixel(plane: FloatArray) -> FloatArray:
+    """(2, 2) changes to the right and down, per pixel, by those along u and v, were the screen a parallelogram."""
     side_u, side_v = (plane[1] - plane[0] + plane[2] - plane[3]) / 2, (plane[3] - plane[0] + plane[2] - plane[1]) / 2
-    (ux, uy), (vx, vy) = np.linalg.inv(np.stack([side_u, side_v], axis=1)).astype(np.float32)
-    return known.along_u * ux + known.along_v * vx, known.along_u * uy + known.along_v * vy
+    return np.asarray(np.linalg.inv(np.stack([side_u, side_v], axis=1)), np.float64)
 
 
-def _normal_matrix(
-    along: tuple[Float32Array, Float32Array],
-    weighted: tuple[Float32Array, Float32Array],
-    corner_u: Float32Array,
-    corner_v: Float32Array,
-) -> FloatArray:
+def _normal_matrix(known: _Known, weight: Float32Array, per_pixel: FloatArray) -> FloatArray:
     """(8, 8) normal matrix of the motion of the corners, x and y of each in turn."""
-    # Products of two corners' weights are products along u times products along v.
-    pairs_u, pairs_v = (np.stack([w[0] * w[0], w[0] * w[1], w[1] * w[1]]) for w in (corner_u, corner_v))
-    normal: FloatArray = np.zeros((8, 8))
-    for a, b in ((0, 0), (0, 1), (1, 1)):
-        moment = pairs_v @ (weighted[a] * along[b]) @ pairs_u.T
-        normal[a::2, b::2] = normal[b::2, a::2] = moment[_AT_V[:, None] + _AT_V, _AT_U[:, None] + _AT_U]
-    return normal
+    pairs_v, pairs_u = known.places.pairs_v, known.places.pairs_u
+    uu, uv, vv = (
+        (pairs_v @ (weight * product) @ pairs_u)[_AT_V[:, None] + _AT_V, _AT_U[:, None] + _AT_U]
+        for product in known.products
+    )
+    normal = np.array([[uu, uv], [uv, vv]], np.float64)
+    # From changes along u and v, of two corners each, to those per pixel.
+    normal = np.tensordot(per_pixel, np.tensordot(per_pixel, normal, (0, 1)), (0, 1))
+    return np.asarray(normal.transpose(2, 0, 3, 1).reshape(8, 8))
 
 
-def _scores_of_parts(
-    moments: tuple[Float32Array, Float32Array], corner_u: Float32Array, corner_v: Float32Array
-) -> FloatArray:
-    """(parts, 8) what every part of the screen says of the motion of the corners: its share of the normal equations."""
+def _scores_of_parts(known: _Known, weighted: Float32Array, per_pixel: FloatArray) -> FloatArray:
+    """(parts, 8) what every part of the screen says of the motion of the corners: its share of the normal equations.
+
+    `weighted` is the error of the texture times its weight.
+    """
     across, down = _PARTS
-    n_v, n_u = moments[0].shape
-    first_u, first_v = (np.arange(parts) * n // parts for parts, n in ((across, n_u), (down, n_v)))
-    scores = np.zeros((down * across, 8))
-    for axis, moment in enumerate(moments):
-        for k in range(4):
-            by_column = np.add.reduceat(moment * corner_u[_AT_U[k]], first_u, axis=1)
-            parts = np.add.reduceat(by_column * corner_v[_AT_V[k]][:, None], first_v, axis=0)
-            scores[:, 2 * k + axis] = parts.ravel()
-    return scores
+    scores = np.empty((2, 4, down * across))
+    for axis, along in enumerate(known.along):
+        moment = known.places.parts_v @ (weighted * along) @ known.places.parts_u
+        scores[axis] = moment.reshape(2, down, 2, across)[_AT_V, :, _AT_U].reshape(4, -1)
+    return np.asarray((scores.T @ per_pixel).reshape(-1, 8))
 
 
 def _sandwich(normal: FloatArray, scores: FloatArray, variance: float, prior: FloatArray) -> FloatArray:
@@ -417,8 +502,14 @@ def _size(corners: FloatArray) -> float:
 
 def _information(size: float) -> FloatArray:
     """(8, 8) information on how far the corners may be from where they are expected."""
+    return _information_of_one() / (size * size)
+
+
+@cache
+def _information_of_one() -> FloatArray:
+    """As `_information`, of a screen of size 1."""
     # Modes of four corners along one axis: all alike, right against left, bottom against top, and crosswise.
     modes = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [1, -1, 1, -1]]) / 4
     sds: Sequence[float] = (_SHIFT_SD, _AFFINE_SD, _AFFINE_SD, _PERSPECTIVE_SD)
-    along = (modes.T / np.square(np.array(sds) * size)) @ modes
+    along = (modes.T / np.square(np.array(sds))) @ modes
     return np.asarray(np.kron(along, np.eye(2)), np.float64)
