@@ -1,8 +1,8 @@
-"""From a frame's context to a clock: columns sampled, screen profile and header found. Part of the wiring."""
+"""Columns sampled, and what travels on once a screen and its clock were found. Part of the wiring."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,13 +11,10 @@ from numpy.typing import NDArray
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import camera as blind
 from rxcli.receiver import sampling, sync
-from rxcli.receiver.context import Failure, FrameContext
-from rxcli.receiver.corners import too_small
+from rxcli.receiver.context import FrameContext
 from rxcli.receiver.screen import geometry
 from rxcli.types import Clock, FloatArray, IntArray, RowProfiles
 
-#: A header peak less than this times the strongest rival is no clock.
-_MIN_PEAK_RATIO = 1.6
 #: Of so many strips a column an initial pass reads pairs; what tells screens by their columns needs some.
 _MANY_STRIPS = 4
 
@@ -123,89 +120,6 @@ def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False
     with context.timer("sampling"):
         profiles = read(slice(0, n_columns), None, n_strips // 2 if is_binned else n_strips, quick)
     return ColumnSampler(profiles, is_binned, read if quick else None)
-
-
-def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Failure:
-    """The screen profile and the clock that fit best, from the columns of `context.n_columns`.
-
-    Screens that differ in nothing but their columns share a clock: which of them it is, is asked last.
-    """
-    n_columns = context.n_columns
-    with context.timer("clock"):
-        pooled = sync.pooled_strips(sampler.binned())
-        different = told_apart_by_clock(context.screens)
-        rates = {(s.slot_rate_hz, s.packet_slots): s for s in different}
-        clocks = {rate: found for rate, screen in rates.items() if (found := _clocks_of(context, screen, pooled))}
-        clocks = {rate: found for rate, found in clocks.items() if found[0].header_peak_ratio >= _MIN_PEAK_RATIO}
-        if not clocks:
-            return Failure("no_signal", _why_no_signal(context))
-        rate = next(iter(clocks)) if len(clocks) == 1 else max(clocks, key=lambda r: _structure(pooled, clocks[r][0]))
-    alike = [screen for screen in different if (screen.slot_rate_hz, screen.packet_slots) == rate]
-    acquisitions = [_acquired(alike[0], sampler, clocks[rate])] if alike[0].columns == n_columns else []
-    for screen in alike[len(acquisitions) :]:
-        finer = sample_columns(context, screen.columns, quick=sampler.read is not None)
-        with context.timer("clock"):
-            found = _clocks_of(context, screen, sync.pooled_strips(finer.binned()))
-        if found:
-            acquisitions.append(_acquired(screen, finer, found))
-    if not acquisitions:
-        return Failure("no_signal", _why_no_signal(context))
-    likely = acquisitions[0] if len(acquisitions) == 1 else _with_likely_columns(acquisitions)
-    return replace(likely, variants=variants_of(likely.screen, context.screens))
-
-
-def _shape_of(screen: ScreenProfile) -> tuple[float, int, int]:
-    return screen.slot_rate_hz, screen.packet_slots, screen.columns
-
-
-def told_apart_by_clock(screens: Sequence[ScreenProfile]) -> list[ScreenProfile]:
-    """The screens without those that differ in nothing but how often a packet is sent: the one that does it most."""
-    by_shape: dict[tuple[float, int, int], ScreenProfile] = {}
-    for screen in screens:
-        known = by_shape.setdefault(_shape_of(screen), screen)
-        if screen.repeats > known.repeats:
-            by_shape[_shape_of(screen)] = screen
-    return list(by_shape.values())
-
-
-def variants_of(screen: ScreenProfile, screens: Sequence[ScreenProfile]) -> tuple[ScreenProfile, ...]:
-    """The screen, and others that differ in nothing but how often a packet is sent; the one that does it most first."""
-    others = {s.repeats: s for s in reversed(screens) if _shape_of(s) == _shape_of(screen)}
-    others[screen.repeats] = screen
-    return tuple(others[repeats] for repeats in sorted(others, reverse=True))
-
-
-def _acquired(screen: ScreenProfile, sampler: ColumnSampler, clocks: tuple[Clock, ...]) -> Acquisition:
-    return Acquisition(screen, sampler, clocks[0], rival=clocks[1] if len(clocks) > 1 else None)
-
-
-def _structure(profiles: RowProfiles, clock: Clock) -> float:
-    """How much the strips, each on its own, look like packets on this clock."""
-    samples = sync.sample_slots(profiles, clock, 1)
-    slots = samples.light.reshape(-1, clock.n_slots).astype(np.float64)
-    return blind.structure_llr(slots, clock.first_slot, clock.packet_slots)
-
-
-def _with_likely_columns(acquisitions: list[Acquisition]) -> Acquisition:
-    """Among screens of one clock, the one whose columns are as wide as seen."""
-    finest = max(
-        acquisitions, key=lambda acquisition: acquisition.profiles.light.shape[0] * acquisition.profiles.light.shape[1]
-    )
-    likely = blind.likely_columns(finest.profiles, finest.clock, [acquisition.screen for acquisition in acquisitions])
-    return next(acquisition for acquisition in acquisitions if acquisition.screen is likely)
-
-
-def _clocks_of(context: FrameContext, screen: ScreenProfile, profiles: RowProfiles) -> tuple[Clock, ...]:
-    rows_per_slot = 1 / (screen.slot_rate_hz * context.camera.line_delay_s)
-    exposure_slots = context.camera.exposure_s * screen.slot_rate_hz
-    return sync.find_clocks(profiles, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(profiles))
-
-
-def _why_no_signal(context: FrameContext) -> str:
-    shortest = min(context.screens, key=lambda screen: screen.packet_s)
-    return too_small(context, shortest) or (
-        "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
-    )
 
 
 def noise_of(profiles: RowProfiles) -> float:

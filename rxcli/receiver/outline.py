@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.acquisition import acquire, sample_columns
+from rxcli.receiver.acquisition import sample_columns
 from rxcli.receiver.cameras import known_lens
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.corners import (
@@ -25,6 +25,7 @@ from rxcli.receiver.corners import (
     whole_picture,
 )
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.still import column_llr, initial_pass
 from rxcli.receiver.unknown_camera import likely_camera
 from rxcli.types import FloatArray, Frame, Lens

@@ -16,11 +16,12 @@ from typing import Any
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import sync
-from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.outline import find_outline
+from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin, soft_bits
 from rxcli.receiver.unknown_camera import (
     fits,

@@ -11,10 +11,11 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import camera as blind
 from rxcli.receiver import channel
-from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.camera_memory import recall, remember
 from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, refittable, refitted_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
+from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.still import Reception, decode_likeliest, initial_pass, packet_llr
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
 

@@ -15,13 +15,14 @@ from rxcli.lab.simulate.capture import Capture, simulate_frame
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
 from rxcli.receiver import sampling, still, sync
-from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.context import FrameContext, Timer
 from rxcli.receiver.decode import detect
 from rxcli.receiver.outline import Outline, find_outline
 from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.receiver.screen_choice import acquire
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Frame, FrameResult, Metadata, Mosaic, PacketResult
 

@@ -21,10 +21,11 @@ from rxcli.lab.simulate.sensor import Sensor
 from rxcli.profiles import ScreenProfile, load_profile, parse_profile
 from rxcli.receiver import camera as blind
 from rxcli.receiver import unknown_camera
-from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.cameras import Cameras, find_cameras
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.still import decode
 from rxcli.types import Frame, FrameResult
 

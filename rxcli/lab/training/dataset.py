@@ -21,12 +21,13 @@ from rxcli.lab.simulate.scenes import Scene as SimulatedScene
 from rxcli.lab.training.fit import MOST_WORDS, UNKNOWN, Sample
 from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_scene
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
-from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.outline import find_outline
+from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.still import decode, doubtful_columns
 from rxcli.types import Clock, FloatArray
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import channel, sync
-from rxcli.receiver.acquisition import Acquisition, acquire, sample_columns
+from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.clip import results
 from rxcli.receiver.clip.bursts import BurstReader
@@ -25,6 +25,7 @@ from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.decode import assemble, detect
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
 from rxcli.receiver.outline import Outline, find_outline
+from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.still import Reception, apply_autoencoder, decode, doubtful_columns, initial_pass
 from rxcli.receiver.sync import tracking
 from rxcli.results.dump import dump_stages

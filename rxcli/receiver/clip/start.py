@@ -20,12 +20,11 @@ from rxcli.receiver.acquisition import (
     ColumnSampler,
     noise_of,
     sample_columns,
-    told_apart_by_clock,
-    variants_of,
 )
 from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.outline import find_outline
+from rxcli.receiver.screen_choice import told_apart_by_clock, variants_of
 from rxcli.receiver.sync.tracking import LinkTime
 from rxcli.types import Clock, FloatArray, Frame, RowProfiles
 
