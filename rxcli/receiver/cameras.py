@@ -107,6 +107,17 @@ def find_camera(frame: Frame, corners: FloatArray, options: ReceiverOptions, tim
     return found.first or Failure("no_signal", found.reason, found.estimated)
 
 
+def context_at(context: FrameContext, corners: FloatArray) -> FrameContext:
+    """A frame with its camera, the screen elsewhere: what the camera was estimated from is read there."""
+    camera = context.camera
+    if corners is context.corners or camera.blind_estimate is None:
+        return replace(context, corners=corners)
+    estimate, strips = camera.blind_estimate
+    with context.timer("sampling"):
+        there = _straightened_strips(context.frame, corners, strips.n_columns, strips.sides, camera.tone)
+    return replace(context, corners=corners, camera=replace(camera, blind_estimate=(estimate, there)))
+
+
 def _screens_of(estimate: blind.BlindEstimate, screens: tuple[ScreenProfile, ...]) -> tuple[ScreenProfile, ...]:
     """The screens that an estimated camera may show."""
     alike = [screen for screen in screens if screen.packet_slots == estimate.packet_slots]

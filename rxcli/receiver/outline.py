@@ -15,7 +15,7 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.acquisition import sample_columns
-from rxcli.receiver.cameras import known_lens
+from rxcli.receiver.cameras import context_at, known_lens
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.corners import (
     levels_of,
@@ -25,6 +25,7 @@ from rxcli.receiver.corners import (
     whole_picture,
 )
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen.sides import LEFT, RIGHT, SIDE_NAMES
 from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.still import column_llr, initial_pass
 from rxcli.receiver.unknown_camera import likely_camera
@@ -35,13 +36,18 @@ if TYPE_CHECKING:
     from rxcli.receiver.screen.find import ScreenSearch
     from rxcli.receiver.screen.numbering import Numbering
 
-SIDE_NAMES = ("top", "right", "bottom", "left")
 #: Shares of the rows, one of so many, by which sides are held against the columns' borders.
 _PARTS = (3, 1)
 #: Sides agree with a grid where columns differ less than this on average and anywhere, columns.
 _AGREE, _AGREE_ANYWHERE = 0.12, 0.45
+#: Support of left and right together from which these two tell that no column is missing between them.
+_BOTH_SHOW = 0.3
+#: Log-odds down to which another first column is a rival; and strips that a column needs to be asked for light.
+_RIVAL_SHIFT, _STRIPS_A_COLUMN = -7.0, 4.0
+#: Columns whose light must be seen: else they have other widths than was thought, and their light says nothing.
+_LIT_COLUMNS = 3
 #: Log-odds of an outline by sides that contradict the grid; what sides that agree with a numbering add to it; what
-#: sides add that were found for one side less.
+#: sides add that were found for top or bottom less. Where left or right is missing, the other one's line says all.
 _CONTRADICTED, _CONFIRMED, _INFERRED = -3.0, 4.0, 1.0
 #: What a grid's waveforms explain less counts so much: strips err together.
 _EXPLAINED_COUNTS = 0.05
@@ -72,6 +78,8 @@ class Outline:
     log_odds: float = 0.0
     #: Whether nothing but the grid says that there is a screen.
     by_grid_alone: bool = False
+    #: Outlines of one family are alike but for the first column.
+    family: int = 0
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -84,22 +92,38 @@ class Outline:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class Located:
+    """An outline, and the camera where it had to be asked to tell the outline."""
+
+    outline: Outline
+    #: None: nobody asked.
+    context: FrameContext | Failure | None = None
+
+
 def find_outline(frame: Frame, options: ReceiverOptions, timer: Timer) -> Outline | Failure:
     """The outline of the screen in a frame."""
+    located = locate(frame, options, timer)
+    return located if isinstance(located, Failure) else located.outline
+
+
+def locate(frame: Frame, options: ReceiverOptions, timer: Timer) -> Located | Failure:
+    """The outline of the screen in a frame, and what was learned of the camera on the way."""
     refused = unreadable_orientation(frame)
     if refused is not None:
         return refused
     if options.corners is not None:
         with timer("geometry"):
-            return outside_the_picture(options.corners, frame) or Outline(options.corners)
+            return outside_the_picture(options.corners, frame) or Located(Outline(options.corners))
     candidates, reason = possible_outlines(frame, options, timer)
+    located = Located(candidates[0]) if candidates else None
     if len(candidates) > 1 or (candidates and candidates[0].by_grid_alone):
-        candidates = _by_packets(frame, candidates, options, timer)
-    if candidates:
-        return candidates[0]
+        located = _by_packets(frame, candidates, options, timer)
+    if located:
+        return located
     if "no_screen" in options.skip:
         return Failure("no_screen", f"no screen found: {reason}")
-    return Outline(whole_picture(frame), inferred=SIDE_NAMES, column_offset=None)
+    return Located(Outline(whole_picture(frame), inferred=SIDE_NAMES, column_offset=None))
 
 
 def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> tuple[list[Outline], str]:
@@ -119,6 +143,8 @@ def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> t
         if not found:
             columns = find_columns(frame.pixels, layout, mosaic_period=period, lens=lens, lines=sides.lines)
             found = _joined(sides, columns.numberings, layout.n_columns)
+            if not columns.numberings:
+                found = _with_shifts(frame, found, sides, layout, period, lens)
     orientation = frame.metadata.orientation
     return [
         replace(one, corners=geometry.viewer_order(one.corners, orientation)) for one in found
@@ -137,8 +163,61 @@ def _by_sides(
     for part in _PARTS:
         for layout in layouts:
             if sides_agree(frame.pixels, sides.corners, layout, mosaic_period=period, lens=lens, part=part):
-                return [Outline(sides.corners, inferred=sides.inferred)]
+                own = Outline(sides.corners, inferred=sides.inferred)
+                return _with_shifts(frame, [own], sides, layout, period, lens)
     return []
+
+
+def _both_show(sides: ScreenSearch) -> bool:
+    """Whether left and right were seen both: then columns that fit between them are all there are."""
+    shown = sum(sides.lines[number].support for number in (LEFT, RIGHT))
+    return shown >= _BOTH_SHOW and not {"left", "right"} & set(sides.inferred)
+
+
+def _with_shifts(
+    frame: Frame, outlines: list[Outline], sides: ScreenSearch, layout: ColumnLayout, period: int, lens: Lens | None
+) -> list[Outline]:
+    """The outline by the sides, and where they leave it open those with another first column.
+
+    The borders of columns are where they are with each of them, and the packets are the same.
+    """
+    if not outlines or _both_show(sides):
+        return outlines
+    from rxcli.receiver.screen.coherence import measure_coherence
+    from rxcli.receiver.screen.grid import grid_between
+    from rxcli.receiver.screen.numbering import first_columns
+
+    own = outlines[0]
+    grid = grid_between(own.corners, layout.n_columns, (frame.width, frame.height), lens)
+    coherence = measure_coherence(frame.pixels, mosaic_period=period)
+    if grid.pitch_px < _STRIPS_A_COLUMN * coherence.strip_px:
+        return outlines
+    start = first_columns(coherence, grid, layout.n_columns, sides.lines)
+    if start.lit.sum() < _LIT_COLUMNS:
+        return outlines
+    shifted = [
+        _moved(own, int(first), float(odds), layout.n_columns, lens)
+        for first, odds in zip(start.first, start.log_odds, strict=True)
+        if odds > _RIVAL_SHIFT
+    ]
+    return _without_hopeless(shifted)
+
+
+def _moved(own: Outline, columns: int, log_odds: float, n_columns: int, lens: Lens | None) -> Outline:
+    """An outline some columns further to the right, of the same rows."""
+    if not columns:
+        return replace(own, log_odds=log_odds)
+    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) + np.array([columns / n_columns, 0.0])
+    corners = geometry.screen_to_picture(unit, own.corners, lens)
+    inferred = tuple(side for side in SIDE_NAMES if side in (*own.inferred, "left", "right"))
+    return replace(own, corners=corners, inferred=inferred, log_odds=log_odds)
+
+
+def _without_hopeless(outlines: list[Outline]) -> list[Outline]:
+    """Outlines, likeliest first; the first alone where it is beyond doubt."""
+    outlines = sorted(outlines, key=lambda one: -one.log_odds)
+    clear = len(outlines) == 1 or outlines[1].log_odds < outlines[0].log_odds - _CLEAR
+    return outlines[:1] if clear else outlines
 
 
 def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: int) -> list[Outline]:
@@ -147,20 +226,29 @@ def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: i
     if not numberings:
         return [by_sides] if by_sides else []
     outlines, agreed, alone = [], False, by_sides is None
+    families: dict[bytes, int] = {}
     for numbering in numberings:
         own = Outline(
-            numbering.corners, inferred=SIDE_NAMES, log_odds=_odds_of(numbering, numberings), by_grid_alone=alone
+            numbering.corners,
+            inferred=SIDE_NAMES,
+            log_odds=_odds_of(numbering, numberings),
+            by_grid_alone=alone,
+            family=families.setdefault(numbering.grid.numbers[1:].tobytes(), len(families)),
         )
         if by_sides and _agree(by_sides.corners, numbering, n_columns):
             agreed = True
-            bonus = _INFERRED if by_sides.inferred else _CONFIRMED
-            own = replace(by_sides, log_odds=own.log_odds + bonus)
+            own = replace(by_sides, log_odds=own.log_odds + _bonus(by_sides), family=own.family)
         outlines.append(own)
     if by_sides and not agreed:
-        outlines.append(replace(by_sides, log_odds=_CONTRADICTED))
-    outlines.sort(key=lambda one: -one.log_odds)
-    clear = len(outlines) == 1 or outlines[1].log_odds < outlines[0].log_odds - _CLEAR
-    return outlines[:1] if clear else outlines
+        outlines.append(replace(by_sides, log_odds=_CONTRADICTED, family=-1))
+    return _without_hopeless(outlines)
+
+
+def _bonus(by_sides: Outline) -> float:
+    """Log-odds that sides add to the numbering that they agree with."""
+    if {"left", "right"} & set(by_sides.inferred):
+        return 0.0
+    return _INFERRED if by_sides.inferred else _CONFIRMED
 
 
 def _odds_of(numbering: Numbering, numberings: tuple[Numbering, ...]) -> float:
@@ -177,37 +265,54 @@ def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:
     return bool(apart.mean() < _AGREE and apart.max() < _AGREE_ANYWHERE)
 
 
-def _by_packets(frame: Frame, candidates: list[Outline], options: ReceiverOptions, timer: Timer) -> list[Outline]:
-    """Candidates by what they were worth before and by how much their columns look like packets."""
-    context = _context_of_any(frame, candidates, options, timer)
-    if context is None:
-        return [one for one in candidates if not one.by_grid_alone]
+def _by_packets(frame: Frame, candidates: list[Outline], options: ReceiverOptions, timer: Timer) -> Located | None:
+    """The likeliest candidate by what they were worth before and by how much their columns look like packets."""
+    context, asked = _context_of_any(frame, candidates, options, timer)
+    if isinstance(context, Failure):
+        best = _likeliest([one for one in candidates if not one.by_grid_alone])
+        return Located(best, context if best.family in asked else None) if best else None
     packets = np.array([_packets(replace(context, corners=one.corners)) for one in candidates[:_MOST_LOOKS]])
+    if packets.max() < _SOME_PACKETS and context.camera.remembered:
+        return _by_packets(frame, candidates, replace(options, camera_cache=None), timer)
     if packets.max() < _SOME_PACKETS:
-        return [one for one in candidates if not one.by_grid_alone]
-    # Without a column more or less the same packets are seen a little better or worse, by chance.
-    lost = np.maximum(packets.max() - packets - _SAME_PACKETS, 0)
-    # Those that nobody looked at may show as many.
+        best = _likeliest([one for one in candidates if not one.by_grid_alone])
+    else:
+        # Without a column more or less the same packets are seen a little better or worse, by chance. Those that
+        # nobody looked at may show as many.
+        lost = np.zeros(len(candidates))
+        lost[: packets.size] = np.maximum(packets.max() - packets - _SAME_PACKETS, 0)
+        odds = [one.log_odds - _PACKETS_COUNT * less for one, less in zip(candidates, lost.tolist(), strict=True)]
+        best = _likeliest([replace(one, log_odds=score) for one, score in zip(candidates, odds, strict=True)])
+    return Located(best, context_at(context, best.corners)) if best else None
+
+
+def _likeliest(candidates: list[Outline]) -> Outline | None:
+    """The likeliest candidate, with what is left of doubt."""
+    if not candidates:
+        return None
     odds = np.array([one.log_odds for one in candidates])
-    odds[: lost.size] -= _PACKETS_COUNT * lost
     share = np.exp(odds - odds.max())
-    share /= share.sum()
-    judged = [
-        replace(one, log_odds=float(score), certainty=float(p), column_offset=0 if p >= _LIKELY else None)
-        for one, score, p in zip(candidates, odds, share, strict=True)
-    ]
-    return sorted(judged, key=lambda one: -one.certainty)
+    best, certainty = int(share.argmax()), float(1 / share.sum())
+    return replace(candidates[best], certainty=certainty, column_offset=0 if certainty >= _LIKELY else None)
 
 
 def _context_of_any(
     frame: Frame, candidates: list[Outline], options: ReceiverOptions, timer: Timer
-) -> FrameContext | None:
-    """The camera by the first candidate that shows one: it hardly depends on which columns are whose."""
+) -> tuple[FrameContext | Failure, set[int]]:
+    """The camera by the first candidate that shows one; and the families that were asked.
+
+    It hardly depends on which columns are whose, so one candidate of a family speaks for all.
+    """
+    found: FrameContext | Failure = Failure("no_signal", "")
+    asked: set[int] = set()
     for candidate in candidates:
-        context = likely_camera(frame, candidate.corners, options, timer)
-        if not isinstance(context, Failure):
-            return context
-    return None
+        if candidate.family in asked:
+            continue
+        asked.add(candidate.family)
+        found = likely_camera(frame, candidate.corners, options, timer)
+        if not isinstance(found, Failure):
+            break
+    return found, asked
 
 
 def _packets(context: FrameContext) -> float:

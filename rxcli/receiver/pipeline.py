@@ -20,7 +20,7 @@ from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.outline import find_outline
+from rxcli.receiver.outline import locate
 from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin, soft_bits
 from rxcli.receiver.unknown_camera import (
@@ -84,13 +84,13 @@ def _receive_still(
     """Receive one frame; what its camera is estimated to be is remembered in a folder."""
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
     # Screen: where the columns are.
-    outline = find_outline(frame, options, timer)
-    if isinstance(outline, Failure):
-        return failed(result, outline)
-    corners = outline.corners
+    located = locate(frame, options, timer)
+    if isinstance(located, Failure):
+        return failed(result, located)
+    outline, corners = located.outline, located.outline.corners
     result = replace(result, **outline.facts)
     # Camera: what a row is in time.
-    context = likely_camera(frame, corners, options, timer)
+    context = located.context or likely_camera(frame, corners, options, timer)
     if isinstance(context, Failure):
         return failed(result, context)
     # Sampling: pixels to row profiles; sync: row profiles to a clock.

@@ -79,6 +79,26 @@ class Grid:
         return replace(self, numbers=self.numbers - np.array([columns, 0, 0, 0, 0, 0]))
 
 
+def grid_between(corners: FloatArray, n_columns: int, size: tuple[int, int], lens: Lens | None) -> Grid:
+    """The grid of a screen's columns between its corners.
+
+    Args:
+        corners: (4, 2) pixels, clockwise from the top left.
+        n_columns: columns of the screen.
+        size: width and height of the picture, pixels.
+        lens: of the picture, where it is known.
+    """
+    from rxcli.receiver.screen import geometry
+
+    width, height = size
+    bent = lens is not None and not lens.corrected
+    seen = np.linalg.inv(geometry.homography(geometry.undistort(corners, lens) if bent and lens else corners))
+    matrix = seen @ np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1]])
+    across, below = n_columns * matrix[0] / matrix[2, 2], matrix[2] / matrix[2, 2]
+    u0, g, h = across[2], below[0], below[1]
+    return Grid(np.array([u0, across[0] - u0 * g, across[1] - u0 * h, g, h, 0.0]), width, height, lens)
+
+
 def _flat(points: FloatArray, width: int, height: int, lens: Lens | None) -> tuple[FloatArray, FloatArray]:
     """Pixels as offsets from the picture's middle in picture widths, a known lens taken off."""
     from rxcli.receiver.screen import geometry

@@ -59,6 +59,47 @@ def possible_numberings(
         lines: top, right, bottom, left, where stripes begin; none: nothing is known of them.
         least: log-odds against the likeliest down to which they are given.
     """
+    start = first_columns(coherence, grid, n_columns, lines)
+    likely: IntArray = np.flatnonzero(start.log_odds > least)
+    chosen = likely[np.argsort(-start.log_odds[likely], kind="stable")]
+    first, odds, k, there, light = start.first, start.log_odds, start.columns, start.in_picture, start.light
+    best = int(first[chosen[0]])
+    mine = (k >= best) & (k < best + n_columns)
+    # All have their rows in common, so that packets can tell them apart.
+    rows = find_rows(
+        coherence, grid.shifted(best), n_columns, aspect, _middle_row(coherence, light, mine), tuple(lines[::2])
+    )
+    out = []
+    for i in chosen:
+        number = int(first[i])
+        column = k[(there > _MOSTLY) & (k >= number) & (k < number + n_columns)] - number
+        visible = (int(column.min()), int(column.max()) + 1) if column.size else (0, 0)
+        out.append(Numbering(grid.shifted(number), rows.corners(number - best), float(odds[i]), visible))
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class FirstColumns:
+    """What a picture says of the columns that may be the screen's first."""
+
+    #: (F,) such columns of the grid, and the natural logarithm of their odds against the likeliest.
+    first: IntArray
+    log_odds: FloatArray
+    #: (K,) columns of the grid in the picture, and the share of each that lies in it.
+    columns: IntArray
+    in_picture: FloatArray
+    #: (K,) whether light was seen there.
+    lit: BoolArray
+    light: LightMap
+
+
+def first_columns(coherence: Coherence, grid: Grid, n_columns: int, lines: Sequence[Side] = ()) -> FirstColumns:
+    """How likely each column of a grid is the screen's first.
+
+    Numberings that differ by a shift have all columns in common but the outermost, so these decide: light outside the
+    screen, columns outside the picture and a line where stripes begin tell. Where columns are dark at both ends the
+    numberings stay alike.
+    """
     light = light_map(coherence, grid)
     evidence = _column_evidence(light)
     there = _share_in_picture(coherence, grid, light)
@@ -73,22 +114,7 @@ def possible_numberings(
         score = float(evidence[inside].sum()) + _OUTSIDE * max(hidden - 0.3, 0.0)
         off = (middle - start - n_columns / 2) / _LIGHT_SD
         scores.append(score - 0.5 * off * off + _by_lines(grid, lines, start, n_columns))
-    odds = np.array(scores) - max(scores)
-    likely: IntArray = np.flatnonzero(odds > least)
-    chosen = likely[np.argsort(-odds[likely], kind="stable")]
-    best = int(first[chosen[0]])
-    mine = (k >= best) & (k < best + n_columns)
-    # All have their rows in common, so that packets can tell them apart.
-    rows = find_rows(
-        coherence, grid.shifted(best), n_columns, aspect, _middle_row(coherence, light, mine), tuple(lines[::2])
-    )
-    out = []
-    for i in chosen:
-        start = int(first[i])
-        column = k[(there > _MOSTLY) & (k >= start) & (k < start + n_columns)] - start
-        visible = (int(column.min()), int(column.max()) + 1) if column.size else (0, 0)
-        out.append(Numbering(grid.shifted(start), rows.corners(start - best), float(odds[i]), visible))
-    return out
+    return FirstColumns(first, np.array(scores) - max(scores), k, there, evidence > 0, light)
 
 
 def _by_lines(grid: Grid, lines: Sequence[Side], first: int, n_columns: int) -> float:
