@@ -47,8 +47,10 @@ _TONE, _DARKEST = 2.2, 0.03
 _DARK_PERCENT = 8.0
 #: Cells of a coarse cell across and down, smoothing of the coarse texture in such cells, and iterations.
 _COARSE_CELLS, _COARSE_BLUR, _COARSE_ITERATIONS = (4, 2), 0.8, 4
-#: Iterations of the fine fit; and squared standard deviations of a step after which a fit ends.
+#: Iterations of the fine fit, and squared standard deviations of a step after which a fit ends; and the same of a
+#: screen whose texture is known from few frames: what is learned in a wrong place stays.
 _FINE_ITERATIONS, _CONVERGED = 3, 0.5
+_FIRST_ITERATIONS, _FIRST_CONVERGED = 7, 0.001
 #: Every so manieth row of cells tells whether a screen stands still; how far, in screen sizes, it and its corners may
 #: seem to have moved; and the share of the textures' correlation that must be left.
 _FEW_ROWS, _STILL_SHIFT, _STILL_CORNERS, _STILL_CORRELATION = 4, 0.0003, 0.0008, 0.97
@@ -219,7 +221,8 @@ class ScreenTexture:
             return still
         expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
         plane, _, _ = self._fit(_coarser(texture), coarse, (expected, expected), _COARSE_ITERATIONS)
-        plane, covariance, self._correlation = self._fit(texture, fine, (plane, expected), _FINE_ITERATIONS)
+        iterations = _FIRST_ITERATIONS if self._n_frames <= _FIRST_FRAMES else _FINE_ITERATIONS
+        plane, covariance, self._correlation = self._fit(texture, fine, (plane, expected), iterations)
         return Registration(self._lens_of(plane), covariance, self._correlation)
 
     def _still(self, texture: _Texture, few: _Known) -> Registration | None:
@@ -292,6 +295,7 @@ class ScreenTexture:
         """
         plane, expected = poses
         prior = _information(_size(plane))
+        converged = _FIRST_CONVERGED if self._n_frames <= _FIRST_FRAMES else _CONVERGED
         for _ in range(iterations):
             value, weight = self._read(texture, plane, known.places)
             weight *= known.trust
@@ -311,7 +315,7 @@ class ScreenTexture:
             slope = scores.sum(axis=0) / scale + prior @ (expected - plane).ravel()
             step = np.linalg.solve(total, slope)
             plane = plane + step.reshape(4, 2)
-            if step @ slope < _CONVERGED:
+            if step @ slope < converged:
                 break
         of_known = weight * known.value
         power = float(np.vdot(of_known, known.value)) * float(np.vdot(weight * value, value))
