@@ -135,8 +135,9 @@ class _Known:
 
     def every(self, step: int, places: _Places) -> _Known:
         """Of every so manieth row alone, whose `places` these are."""
-        parts = (self.value, self.along, self.products, self.trust)
-        return _Known(*(np.ascontiguousarray(part[..., ::step, :]) for part in parts), places)
+        all_rows = (self.value, self.along, self.products, self.trust)
+        value, along, products, trust = (np.ascontiguousarray(part[..., ::step, :]) for part in all_rows)
+        return _Known(value, along, products, trust, places)
 
 
 @dataclass(frozen=True, slots=True)
