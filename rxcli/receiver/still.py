@@ -17,6 +17,7 @@ from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import assemble, detect
 from rxcli.receiver.decode.soft_bits import of_observed, still_soft_bits
+from rxcli.receiver.decode.steady import is_steady
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, SlotSamples
 
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
@@ -389,11 +390,22 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
     """(C,) columns that show no packets: no header where it should be, and not so many words of the codebook.
 
     With few rows a slot or at the screen's edge light is not as the model has it, and headers are the first to tell.
+    None has any where all the light is a steady periodic waveform.
     """
     out = assemble.without_header(reception.posteriors)
+    if not out.all() and _is_steady(reception):
+        return np.ones_like(out)
     if out.any():
         out[out] = _packets_over_any(reception, np.flatnonzero(out)) < _PACKETS_WITHOUT_HEADER
     return out
+
+
+def _is_steady(reception: Reception) -> bool:
+    """Whether the light is that of a lamp or of a screen that is dimmed by switching."""
+    samples, clock = reception.samples, reception.clock
+    contrast = sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.sigma)
+    lit = channel.lit_on_grid(reception.posteriors, clock)
+    return is_steady(*contrast, lit, clock.packet_slots)
 
 
 def doubtful_columns(reception: Reception) -> NDArray[np.int64]:

@@ -1,0 +1,67 @@
+"""Light that a lamp or a dimmed screen switches on and off steadily: it looks like packets, but says nothing.
+
+A waveform of any period far below a packet's has few free parameters. Where it explains the light, and does so better
+than the slots that were decided, the slots are no evidence of packets. Headers and dimming symbols break every such
+period, so that packets whose payload repeats one symbol are not refused.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rxcli.types import Float32Array, FloatArray
+
+#: Lines of a waveform that are added up, and the longest period, packets: a packet sent again has lines of its own.
+_LINES, _LONGEST = 24, 0.5
+#: Share of the light's variance from which on it may be a steady waveform: packets reach 0.5, by repeating.
+_STEADY = 0.6
+#: Samples by which the exposure may move or spread a slot, slots.
+_REACH_SLOTS = 2
+#: Spectra are computed on a grid so many times finer than the light's length resolves.
+_FINER = 4
+
+
+def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, packet_slots: int) -> bool:
+    """Whether light is a steady periodic waveform rather than packets.
+
+    Args:
+        value: (C, N * Q) light of every column between its extremes, Q samples a slot.
+        weight: (C, N * Q) the weight behind it; 0 where nothing is seen.
+        lit: (C, N) slots as decided, 0..1.
+        packet_slots: slots of a packet.
+    """
+    samples_per_slot = value.shape[1] // lit.shape[1]
+    observed = weight > 0
+    level = value * observed
+    level = (level - level.sum(axis=1, keepdims=True) / np.maximum(observed.sum(axis=1, keepdims=True), 1)) * observed
+    if not level.any():
+        return False
+    steady = periodic_share(level, packet_slots * samples_per_slot)
+    return steady > _STEADY and steady > _share_of_slots(level, observed, lit, samples_per_slot)
+
+
+def periodic_share(level: FloatArray | Float32Array, packet_samples: int) -> float:
+    """Share of the variance of columns (C, n) that one period explains, whatever the waveform of each column."""
+    n = level.shape[1]
+    size = 1 << int(np.ceil(np.log2(_FINER * n)))
+    power = (np.abs(np.fft.rfft(level, size, axis=1)) ** 2).sum(axis=0) * (2 / (n * float((level**2).sum())))
+    # The grid may miss a line by half a step.
+    near = np.maximum(power, np.maximum(np.roll(power, 1), np.roll(power, -1)))
+    fundamental = np.arange(int(np.ceil(size / (_LONGEST * packet_samples))), size // 2)
+    share = np.zeros(fundamental.size)
+    for line in range(1, _LINES + 1):
+        inside = line * fundamental <= size // 2
+        share[inside] += near[line * fundamental[inside]]
+    return float(share.max(initial=0.0))
+
+
+def _share_of_slots(level: FloatArray, observed: FloatArray, lit: Float32Array, samples_per_slot: int) -> float:
+    """Share of the variance that the decided slots explain through any exposure; each column has its own."""
+    slots = np.repeat(lit, samples_per_slot, axis=1)
+    reach = _REACH_SLOTS * samples_per_slot
+    left = 0.0
+    for light, shown, column in zip(level, observed, slots, strict=True):
+        moved = np.stack([np.ones(column.size), *(np.roll(column, s) for s in range(-reach, reach + 1))], axis=1)[shown]
+        fit, *_ = np.linalg.lstsq(moved, light[shown], rcond=None)
+        left += float(((light[shown] - moved @ fit) ** 2).sum())
+    return 1 - left / float((level**2).sum())
