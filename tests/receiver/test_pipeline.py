@@ -14,7 +14,7 @@ from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.capture import Capture, simulate_frame
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
-from rxcli.receiver import sampling, still, sync
+from rxcli.receiver import sampling, screen_choice, still, sync
 from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.channel import denoise
@@ -467,3 +467,48 @@ def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_no
     assert not still.headerless(replace(reception, posteriors=unseen)).any()
     moved = replace(reception, posteriors=unseen, metrics=np.roll(reception.metrics, 3, axis=1))
     assert still.headerless(moved).all()
+
+
+def screen_chosen(taken: Capture) -> str:
+    options = replace(options_for(taken), screens=tuple(shipped_profiles(ScreenProfile)))
+    context = context_of(frame_of(taken), options)
+    acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
+    assert isinstance(acquisition, Acquisition)
+    return acquisition.screen.name
+
+
+@pytest.mark.parametrize("screen", ["paper-8k65", "paper-17k3", "paper-34k6"])
+def test_where_clocks_leave_doubt_packets_tell_the_screen(screen: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures with strong texture hide all structure of a clock's slots: here it speaks for the wrong screens."""
+    taken = capture(screen, "phone-plain", "sky", 30.0, 1)
+    right = load_profile(screen, ScreenProfile)
+    assert screen_chosen(taken) == screen
+    monkeypatch.setattr(screen_choice, "_MIN_PEAK_RATIO", 0.0)
+    misled = lambda _, clock: -20.0 if clock.packet_slots == right.packet_slots else -3.0  # noqa: E731
+    monkeypatch.setattr(screen_choice, "_structure", misled)
+    assert screen_chosen(taken) == screen
+
+
+@pytest.mark.parametrize(("structure", "plain"), [([5.0], True), ([300.0, 2.0], True), ([300.0, 280.0], False)])
+def test_only_a_clear_lead_spares_an_initial_pass(structure: list[float], plain: bool) -> None:
+    assert screen_choice._is_plain(structure) == plain
+
+
+@pytest.mark.parametrize(("period_rows", "duty"), [(19.3, 0.4), (14.2, 0.15), (27.9, 0.12), (32.1, 0.53), (25.7, 0.38)])
+def test_a_screen_dimmed_by_switching_gives_no_packet(period_rows: float, duty: float) -> None:
+    """Whatever clock a profile's line delay makes of its stripes."""
+    rng = np.random.default_rng(round(1000 * period_rows * duty))
+    fine, exposure = 8, max(round(4 * 0.5 * period_rows * duty), 1)
+    on = (np.arange(540 * fine + exposure) / fine) % period_rows < duty * period_rows
+    total = np.cumsum(np.concatenate([[0.0], on]))
+    rows = ((total[exposure:] - total[:-exposure]) / exposure)[::fine][:540]
+    pixels = 30 + 400 * np.repeat(rows[:, None], 960, axis=1)
+    pixels = np.clip(pixels + rng.normal(0, 4, pixels.shape), 0, 1023).astype(np.uint16)
+    frame = replace(frame_of(clean()), pixels=pixels, black=0.0, white=1023.0, mosaic=None, linear=True)
+    corners = np.array([[0.5, 0.5], [958.5, 0.5], [958.5, 538.5], [0.5, 538.5]])
+    for rows_per_slot in (1.9, 2.6, 3.4):
+        mode = {"name": "s", "width": 960, "height": 540, "line_delay_s": 1 / (rows_per_slot * 17300)}
+        mode |= {"exposure_s": 0.7 / 17300}
+        camera = check_profile({"format": 1, "kind": "camera", "name": "c", "modes": [mode]}, CameraProfile, "test")
+        (result,) = receive([frame], ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners))
+        assert [p for c in result.columns for p in c.packets] == []
