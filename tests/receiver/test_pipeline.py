@@ -512,3 +512,15 @@ def test_a_screen_dimmed_by_switching_gives_no_packet(period_rows: float, duty: 
         camera = check_profile({"format": 1, "kind": "camera", "name": "c", "modes": [mode]}, CameraProfile, "test")
         (result,) = receive([frame], ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners))
         assert [p for c in result.columns for p in c.packets] == []
+
+
+@pytest.mark.parametrize("period_rows", [4, 5, 6])
+def test_stripes_of_few_rows_are_no_error(period_rows: int) -> None:
+    """Their slots are of a row or two, which leaves no rows to level them by."""
+    rng = np.random.default_rng(period_rows)
+    on = (np.arange(540) % period_rows < 0.3 * period_rows).astype(float)
+    pixels = np.clip(30 + 180 * np.repeat(on[:, None], 960, axis=1) + rng.normal(0, 3, (540, 960)), 0, 255)
+    frame = Frame(pixels.astype(np.uint8), "memory")
+    corners = np.array([[0.5, 0.5], [958.5, 0.5], [958.5, 538.5], [0.5, 538.5]])
+    (result,) = receive([frame], ReceiverOptions(cameras=(), corners=corners))
+    assert all(packet.confidence < 0.5 for column in result.columns for packet in column.packets)
