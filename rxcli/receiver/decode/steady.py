@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rxcli.types import Float32Array, FloatArray
+from rxcli.types import BoolArray, Float32Array, FloatArray
 
 #: Lines of a waveform that are added up, and the longest period, packets: a packet sent again has lines of its own.
 _LINES, _LONGEST = 24, 0.5
@@ -55,7 +55,7 @@ def periodic_share(level: FloatArray | Float32Array, packet_samples: int) -> flo
     return float(share.max(initial=0.0))
 
 
-def _share_of_slots(level: FloatArray, observed: FloatArray, lit: Float32Array, samples_per_slot: int) -> float:
+def _share_of_slots(level: FloatArray, observed: BoolArray, lit: Float32Array, samples_per_slot: int) -> float:
     """Share of the variance that the decided slots explain through any exposure; each column has its own."""
     slots = np.repeat(lit, samples_per_slot, axis=1)
     reach = _REACH_SLOTS * samples_per_slot
