@@ -143,8 +143,14 @@ def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> t
         if not found:
             columns = find_columns(frame.pixels, layout, mosaic_period=period, lens=lens, lines=sides.lines)
             found = _joined(sides, columns.numberings, layout.n_columns)
-            if not columns.numberings:
-                found = _with_shifts(frame, found, sides, layout, period, lens)
+            # Sides that no grid bears out may be a column off like any others.
+            unsure = [replace(one, log_odds=0.0) for one in found if not columns.numberings or one.family < 0]
+            if unsure:
+                shifted = _with_shifts(frame, unsure, sides, layout, period, lens)
+                less = _CONTRADICTED if columns.numberings else 0.0
+                rest = [one for one in found if one.family >= 0] if columns.numberings else []
+                found = rest + [replace(one, log_odds=one.log_odds + less) for one in shifted]
+                found.sort(key=lambda one: -one.log_odds)
     orientation = frame.metadata.orientation
     return [
         replace(one, corners=geometry.viewer_order(one.corners, orientation)) for one in found
@@ -278,9 +284,12 @@ def _by_packets(frame: Frame, candidates: list[Outline], options: ReceiverOption
         best = _likeliest([one for one in candidates if not one.by_grid_alone])
     else:
         # Without a column more or less the same packets are seen a little better or worse, by chance. Those that
-        # nobody looked at may show as many.
+        # nobody looked at may show as many as the others of their family.
         lost = np.zeros(len(candidates))
         lost[: packets.size] = np.maximum(packets.max() - packets - _SAME_PACKETS, 0)
+        for number in range(packets.size, len(candidates)):
+            alike = [lost[i] for i in range(packets.size) if candidates[i].family == candidates[number].family]
+            lost[number] = min(alike, default=0.0)
         odds = [one.log_odds - _PACKETS_COUNT * less for one, less in zip(candidates, lost.tolist(), strict=True)]
         best = _likeliest([replace(one, log_odds=score) for one, score in zip(candidates, odds, strict=True)])
     return Located(best, context_at(context, best.corners)) if best else None

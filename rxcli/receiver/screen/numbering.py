@@ -15,14 +15,14 @@ from rxcli.types import BoolArray, FloatArray, IntArray
 
 #: Share of a screen's columns that are dark, and significance of columns that have light, about. Off the screen it is
 #: spread by this scale, more than by chance: what row noise leaves.
-_DARK_COLUMNS, _LIT_SCALE, _OFF_SCALE = 0.12, 30.0, 2.0
+_DARK_COLUMNS, _LIT_SCALE, _OFF_SCALE = 0.3, 30.0, 2.0
 #: Log-odds of a screen that goes on outside the picture, for every column that is there.
 _OUTSIDE = -2.0
 #: The light's middle is the screen's, but for this, columns.
 _LIGHT_SD = 3.0
 #: Support from which a line where stripes begin counts, how near it lies to a border then, columns, and the log-odds
 #: that it adds there.
-_LINE_SHOWS, _NEAR_BORDER, _ON_BORDER = 0.3, 0.1, 1.6
+_LINE_SHOWS, _NEAR_BORDER, _ON_BORDER = 0.2, 0.1, 2.3
 #: A column of which this share lies in the picture is in view.
 _MOSTLY = 0.5
 

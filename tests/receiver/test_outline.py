@@ -1,0 +1,144 @@
+"""Which column is the first: shifted outlines compared on the same rows; and the camera asked once for all of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.options import ReceiverOptions
+from rxcli.profiles import ScreenProfile, load_profile
+from rxcli.receiver import outline as outlines
+from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
+from rxcli.receiver.outline import Located, Outline, locate, possible_outlines
+from rxcli.receiver.screen import find, geometry
+from rxcli.receiver.screen.coherence import measure_coherence
+from rxcli.receiver.screen.find import ScreenSearch
+from rxcli.receiver.screen.grid import grid_between
+from rxcli.receiver.screen.numbering import first_columns
+from rxcli.receiver.screen.sides import Side
+from rxcli.types import FloatArray, Frame
+
+HEIGHT, WIDTH, ROWS_PER_SLOT, COLUMNS = 1600, 1200, 10.0, 20
+CORNERS = np.array([[150.0, 320.0], [1105.0, 290.0], [1130.0, 880.0], [120.0, 850.0]])
+OPTIONS = ReceiverOptions(screens=(load_profile("paper-17k3", ScreenProfile),))
+
+
+def drawn(first: int, last: int) -> NDArray[np.uint8]:
+    """Luma of a screen that shows light in the columns from one to before another."""
+    rng = np.random.default_rng(3)
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
+    at = np.linalg.inv(geometry.homography(CORNERS)) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    u, v = (at[:2] / at[2]).reshape(2, HEIGHT, WIDTH)
+    sent = rng.integers(0, 2, (int(HEIGHT / ROWS_PER_SLOT) + 2, COLUMNS))
+    now = sent[(np.arange(HEIGHT) / ROWS_PER_SLOT).astype(int)]
+    light = sum(np.exp(-((COLUMNS * u - k - 0.5) ** 2) / (2 * 0.45**2)) * now[:, k, None] for k in range(COLUMNS))
+    light = light * ((COLUMNS * u > first) & (COLUMNS * u < last) & (v > 0) & (v < 1))
+    luma = 150 * light + 12 + rng.normal(0, 4, u.shape) + rng.normal(0, 0.5, (HEIGHT, 1))
+    return np.clip(luma, 0, 255).astype(np.uint8)
+
+
+def moved(columns: float) -> FloatArray:
+    """The true corners, moved along the screen."""
+    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]) + np.array([columns / COLUMNS, 0.0])
+    return geometry.screen_to_picture(unit, CORNERS, None)
+
+
+def shift_of(outline: Outline) -> int:
+    """Columns by which an outline is numbered wrong."""
+    return round(float(grid_between(CORNERS, COLUMNS, (WIDTH, HEIGHT), None).columns_at(outline.corners)[0]))
+
+
+def found_as(monkeypatch: pytest.MonkeyPatch, corners: FloatArray, inferred: tuple[str, ...], support: float) -> None:
+    """Let the search for sides find these."""
+    lines = tuple(Side(np.array([0.0, 0.0]), 600.0, 300.0, support if name not in inferred else 0.0) for name in SIDES)
+    monkeypatch.setattr(
+        find, "find_screen", lambda *_, **__: ScreenSearch(corners, 0.8, inferred=inferred, lines=lines)
+    )
+
+
+SIDES = ("top", "right", "bottom", "left")
+
+
+def test_the_grid_between_corners_has_its_columns_there() -> None:
+    grid = grid_between(CORNERS, COLUMNS, (WIDTH, HEIGHT), None)
+    u, v = np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 4))
+    points = geometry.screen_to_picture(np.stack([u, v], axis=-1), CORNERS, None)
+    np.testing.assert_allclose(grid.columns_at(points), COLUMNS * u, atol=1e-6)
+
+
+def test_light_at_both_ends_leaves_one_first_column() -> None:
+    start = first_columns(measure_coherence(drawn(0, 20)), grid_between(CORNERS, COLUMNS, (WIDTH, HEIGHT), None), 20)
+    assert start.first[np.argsort(start.log_odds)[-1]] == 0
+    assert 1 / np.exp(start.log_odds).sum() > 0.9
+
+
+def test_dark_columns_at_both_ends_leave_as_many_first_columns() -> None:
+    start = first_columns(measure_coherence(drawn(3, 17)), grid_between(CORNERS, COLUMNS, (WIDTH, HEIGHT), None), 20)
+    share = np.exp(start.log_odds) / np.exp(start.log_odds).sum()
+    assert share.max() < 0.4
+    assert set(start.first[start.log_odds > -3]) >= {-2, -1, 0, 1, 2}
+
+
+@pytest.mark.parametrize("columns", [-1, 1, 2])
+def test_sides_of_which_one_is_inferred_are_moved_to_where_no_light_is_left_out(
+    columns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found_as(monkeypatch, moved(columns), ("right",), 0.1)
+    candidates, _ = possible_outlines(Frame(drawn(0, 20), "drawn"), OPTIONS, Timer())
+    assert shift_of(candidates[0]) == 0
+    np.testing.assert_allclose(candidates[0].corners, CORNERS, atol=1.0)
+
+
+def test_where_both_ends_are_dark_a_side_that_is_inferred_leaves_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
+    found_as(monkeypatch, moved(1), ("right",), 0.1)
+    candidates, _ = possible_outlines(Frame(drawn(3, 17), "drawn"), OPTIONS, Timer())
+    assert {shift_of(one) for one in candidates} >= {-1, 0, 1, 2}
+    best = outlines._likeliest(candidates)
+    assert best is not None
+    assert best.certainty < 0.5
+    assert best.column_offset is None
+
+
+def test_left_and_right_that_both_show_need_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    found_as(monkeypatch, CORNERS, (), 0.5)
+    candidates, _ = possible_outlines(Frame(drawn(3, 17), "drawn"), OPTIONS, Timer())
+    assert [shift_of(one) for one in candidates] == [0]
+
+
+def camera_of(frame: Frame, corners: FloatArray) -> FrameContext:
+    return FrameContext(frame, corners, Camera(None, 1e-5, 1e-4, None, "srgb"), OPTIONS.screens, Timer())
+
+
+@pytest.mark.parametrize("packets", [0.0, 500.0])
+def test_the_camera_is_asked_once_and_handed_on(packets: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, asked = Frame(np.zeros((200, 300), np.uint8), "drawn"), []
+
+    def likely(frame: Frame, corners: FloatArray, *_: object) -> FrameContext:
+        asked.append(corners)
+        return camera_of(frame, corners)
+
+    candidates = [Outline(moved(k), log_odds=-float(k)) for k in range(4)]
+    monkeypatch.setattr(outlines, "possible_outlines", lambda *_: (candidates, ""))
+    monkeypatch.setattr(outlines, "likely_camera", likely)
+    monkeypatch.setattr(outlines, "_packets", lambda _: packets)
+    located = locate(frame, OPTIONS, Timer())
+    assert isinstance(located, Located)
+    assert len(asked) == 1
+    assert isinstance(located.context, FrameContext)
+    assert located.context.corners is located.outline.corners
+    # What the packets do not tell stays in doubt, with packets or without.
+    assert located.outline.certainty == pytest.approx(1 / np.exp(-np.arange(4.0)).sum())
+
+
+def test_a_camera_that_shows_under_no_first_column_is_not_asked_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    candidates = [replace(Outline(moved(k)), log_odds=-float(k), family=k // 3) for k in range(6)]
+    monkeypatch.setattr(outlines, "possible_outlines", lambda *_: (candidates, ""))
+    monkeypatch.setattr(outlines, "likely_camera", lambda *_: (asked.append(1), Failure("no_signal", "no camera"))[1])
+    located = locate(Frame(np.zeros((200, 300), np.uint8), "drawn"), OPTIONS, Timer())
+    assert isinstance(located, Located)
+    assert isinstance(located.context, Failure)
+    assert len(asked) == 2
