@@ -14,7 +14,12 @@ from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.profiles import CameraProfile
+from rxcli.receiver.acquisition import Acquisition, sample_columns
+from rxcli.receiver.cameras import find_camera
+from rxcli.receiver.context import Failure, Timer
+from rxcli.receiver.outline import find_outline
 from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.receiver.screen_choice import acquire
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import FloatArray, Frame, FrameResult, Metadata, Mosaic
 
@@ -128,3 +133,14 @@ def mosaic_of(scene: Scene) -> Mosaic:
         black=(float(sensor.black_level),) * 3,
         white=float(sensor.white_level),
     )
+
+
+def acquired(trial: Trial, *, quick: bool = True) -> Acquisition | None:
+    """Screen and clock of a trial's first frame; None where they are not found. For `quick` see `sample_columns`."""
+    options, timer = trial.options(), Timer()
+    outline = find_outline(trial.frame, options, timer)
+    context = outline if isinstance(outline, Failure) else find_camera(trial.frame, outline.corners, options, timer)
+    if isinstance(context, Failure):
+        return None
+    found = acquire(context, sample_columns(context, context.n_columns, quick=quick))
+    return None if isinstance(found, Failure) else found

@@ -15,19 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from rxcli.lab.benchmark.trial import Trial, simulate_trial
+from rxcli.lab.benchmark.trial import acquired, simulate_trial
 from rxcli.lab.simulate.camera import Exposure
 from rxcli.lab.simulate.scenes import Scene as SimulatedScene
 from rxcli.lab.training.fit import MOST_WORDS, UNKNOWN, Sample
 from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_scene
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
-from rxcli.receiver.acquisition import Acquisition, sample_columns
-from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
-from rxcli.receiver.context import Failure, Timer
-from rxcli.receiver.outline import find_outline
-from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.still import decode, doubtful_columns
 from rxcli.types import Clock, FloatArray
 
@@ -100,17 +95,6 @@ def _read(path: Path) -> list[Sample] | None:
             ]
     except (OSError, ValueError, KeyError, BadZipFile, EOFError):
         return None
-
-
-def acquired(trial: Trial, *, quick: bool = True) -> Acquisition | None:
-    """Screen and clock of a trial's first frame; None where they are not found. For `quick` see `sample_columns`."""
-    options, timer = trial.options(), Timer()
-    outline = find_outline(trial.frame, options, timer)
-    context = outline if isinstance(outline, Failure) else find_camera(trial.frame, outline.corners, options, timer)
-    if isinstance(context, Failure):
-        return None
-    found = acquire(context, sample_columns(context, context.n_columns, quick=quick))
-    return None if isinstance(found, Failure) else found
 
 
 def _simulated(simulated: SimulatedScene, seed: int) -> list[Sample]:

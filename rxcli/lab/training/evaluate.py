@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tqdm import tqdm
 
-from rxcli.lab.benchmark.trial import Trial, simulate_trial
-from rxcli.lab.training.dataset import acquired
+from rxcli.lab.benchmark.trial import Trial, acquired, simulate_trial
 from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
 from rxcli.protocol import indices_to_bits
 from rxcli.receiver.still import apply_autoencoder, decode
