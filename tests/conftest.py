@@ -7,7 +7,11 @@ import signal
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
+#: A busy machine fails no test: how long examples take to make says nothing of the code.
+settings.register_profile("any machine", suppress_health_check=[HealthCheck.too_slow], deadline=None)
+settings.load_profile("any machine")
 _SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 
 
