@@ -34,3 +34,9 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     command = ["benchmark", "stability", "--readers", "3", "--seed", "2", "--out", str(tmp_path)]
     assert run(command) == 0
     assert "3 cases with seeds from 2000000 on" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("seed", [77000206, 77000377])
+def test_a_clock_that_runs_away_is_no_clock(seed: int, tmp_path: Path) -> None:
+    """Least squares on damaged pictures went to negative periods, or out of the picture, and ended in an error."""
+    assert readers.Cases(tmp_path, lambda arguments: int(run(arguments))).run(seed)["problems"] == []

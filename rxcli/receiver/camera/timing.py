@@ -187,7 +187,7 @@ def _descend(
     """
     strips, terms = view.strips, view.terms
     exposure, exposure_sd = exposure_slots, 0.0
-    change, factor = np.zeros(6), 1.0
+    change, factor, period = np.zeros(6), 1.0, float(values[1])
     for step in range(_REFINE_STEPS):
         time = slot_time(strips, terms, values)
         waves = column_waves(view, time)
@@ -202,8 +202,11 @@ def _descend(
             gauss_newton(strips, terms, values, time, observed, free),
         )
         factor = _extrapolation(before, change, covariance)
-        values = values + factor * change
-        moved = float(np.abs(slot_time(strips, terms, values)[:, ::BLOCK_ROWS] - time[:, ::BLOCK_ROWS]).max())
+        following = values + factor * change
+        moved = float(np.abs(slot_time(strips, terms, following)[:, ::BLOCK_ROWS] - time[:, ::BLOCK_ROWS]).max())
+        if not (0.5 < following[1] / period < 2.0 and moved < grid.packet_slots):
+            break  # no step of a clock that was read: nothing here looks like slots
+        values = following
         if moved < _CONVERGED and step >= _LEAST_STEPS - 1:
             break
     return _Timing(values, covariance, exposure, exposure_sd, explained, slots, waves)
@@ -249,7 +252,7 @@ def gauss_newton(
     """
     wave, slope = observed
     pitch = float(strips.rows[1] - strips.rows[0])
-    window = round(local_slots * values[1] / pitch)
+    window = max(round(local_slots * values[1] / pitch), 1)
     inside = strips.inside
     near = local_moments(strips.light, wave, inside, window)
     gain = near.gain
