@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import UsageError
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import bits_per_symbol, encode_packet, hex_to_bits
 from rxcli.receiver import camera as blind
 from rxcli.receiver.decode import assemble
 from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, PacketResult, RowProfiles
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 def in_time_order(
@@ -76,16 +71,3 @@ def packet_slots_of(packet: PacketResult, w: int, screen: ScreenProfile) -> NDAr
     if packet.payload_bits != bits_per_symbol(w) * screen.payload_symbols:
         return None
     return encode_packet(hex_to_bits(packet.payload, packet.payload_bits), w)
-
-
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure that belongs to nobody else.
-
-    Raises:
-        UsageError: matplotlib is not installed.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise UsageError("pictures need the package matplotlib", "pip install 'vlc-rx[plot]'") from None
-    return Figure(figsize=(width_in, height_in), layout="constrained")
