@@ -179,6 +179,25 @@ def screens(frames: int, **run: Any) -> None:
 
 @benchmark.command()
 @options(
+    ("--room", str, "receiver", "Folder or module whose numbers are moved, like receiver/screen."),
+    ("--pictures", _COUNT, 8, "Random pictures, half of them dark, received for each move: about a second each."),
+    *_MANY,
+)
+def sensitivity(room: str, pictures: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
+    """What hangs on each of the receiver's numbers: moved by 0.7 and by 1.4, on the same pictures."""
+    from rxcli.lab.benchmark import sensitivity as work
+    from rxcli.lab.benchmark.tables import format_table, write_outputs
+
+    journal = _journal(out, "sensitivity", fresh)
+    rows = work.run(room, pictures, journal, seed=seed, jobs=jobs, quiet=quiet)
+    still = sum(row["changed"] == 0 for row in rows)
+    click.echo(format_table(rows))
+    click.echo(f"{still} of {len(rows)} numbers change no packet of {pictures} pictures")
+    _say_written(write_outputs(out, "sensitivity", rows))
+
+
+@benchmark.command()
+@options(
     ("--clips", _COUNT, 10, "Random scenes, each filmed at every speed, some minutes each."),
     ("--frames", click.IntRange(2), 12, "Frames of a clip."),
     *_MANY,

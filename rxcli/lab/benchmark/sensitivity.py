@@ -1,0 +1,204 @@
+"""What hangs on the receiver's numbers: each is moved by 0.7 and by 1.4, and the same pictures are received again.
+
+A number that changes no packet can be round, or go; one that changes many is a place where a model is missing.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import rxcli
+from rxcli.errors import UsageError
+from rxcli.lab.benchmark import screens
+from rxcli.lab.benchmark.journal import Journal, Record, Task, run_tasks
+from rxcli.lab.benchmark.tables import Row
+from rxcli.lab.benchmark.trial import Trial, score_result, simulate_trial
+from rxcli.options import ReceiverOptions
+from rxcli.receiver.pipeline import receive_frame
+
+FACTORS = (0.7, 1.4)
+_ROOT = Path(rxcli.__file__).parent
+Value = float | tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A numeric constant of a module: a scalar, or a tuple that is scaled as a whole."""
+
+    module: str
+    name: str
+    line: int
+    value: Value
+
+    @property
+    def place(self) -> str:
+        """`receiver/still.py:25 _MAX_ITERATIONS`, without the package's name."""
+        return f"{self.module.removeprefix('rxcli.').replace('.', '/')}.py:{self.line} {self.name}"
+
+    def times(self, factor: float) -> Value:
+        """The value moved; whole numbers stay whole and move by one at least."""
+        if isinstance(self.value, tuple):
+            return tuple(_moved(item, factor) for item in self.value)
+        return _moved(self.value, factor)
+
+
+def _moved(value: float, factor: float) -> float:
+    if not isinstance(value, int):
+        return value * factor
+    up = factor > 1
+    return max(value + 1, round(value * factor)) if up else min(value - 1, round(value * factor))
+
+
+def numbers(room: str = "receiver") -> list[Number]:
+    """The numeric constants of all modules below the folder `room` of the package, in the order of the files.
+
+    Args:
+        room: a folder or a module without its ending, relative to the package: `receiver/screen`, `receiver/still`.
+
+    Raises:
+        UsageError: there is no such room, or it has no numbers.
+    """
+    place = _ROOT / room
+    paths = sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
+    if not paths[0].is_file():
+        raise UsageError(f"no room {room!r} in the package", "name a folder or module, like receiver/screen")
+    found = [number for path in paths for number in _numbers_of(path)]
+    if not found:
+        raise UsageError(f"{room} has no numbers at the top of its modules", "name another room")
+    return found
+
+
+def _numbers_of(path: Path) -> Iterator[Number]:
+    module = ".".join(("rxcli", *path.relative_to(_ROOT).with_suffix("").parts)).removesuffix(".__init__")
+    for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+        target, value = _assigned(statement)
+        literal = _literal(value)
+        if target is not None and literal is not None:
+            yield Number(module, target, statement.lineno, literal)
+
+
+def _assigned(statement: ast.stmt) -> tuple[str | None, ast.expr | None]:
+    if isinstance(statement, ast.Assign) and len(statement.targets) == 1:
+        target: ast.expr = statement.targets[0]
+    elif isinstance(statement, ast.AnnAssign):
+        target = statement.target
+    else:
+        return None, None
+    return (target.id if isinstance(target, ast.Name) else None), statement.value
+
+
+def _literal(expression: ast.expr | None) -> Value | None:
+    try:
+        value = ast.literal_eval(expression) if expression is not None else None
+    except ValueError:
+        return None
+    items = value if isinstance(value, tuple) else (value,)
+    if not items or any(isinstance(item, bool) or not isinstance(item, int | float) for item in items):
+        return None
+    return value
+
+
+@contextmanager
+def moved(number: Number, factor: float) -> Iterator[None]:
+    """The number moved for a while, in its own module and in those that import it by name."""
+    own = importlib.import_module(number.module)
+    before = getattr(own, number.name)
+    holders = [
+        module
+        for name, module in list(sys.modules.items())
+        if name.startswith("rxcli.") and module is not None and module.__dict__.get(number.name) is before
+    ]
+    try:
+        for module in holders:
+            setattr(module, number.name, number.times(factor))
+        yield
+    finally:
+        for module in holders:
+            setattr(module, number.name, before)
+
+
+@lru_cache(maxsize=1)
+def _pictures(seed: int, count: int) -> list[Trial]:
+    return [simulate_trial(screens.scene_of(seed, number)[0], number) for number in range(count)]
+
+
+def received(task: Task) -> Record:
+    """Receive the task's pictures with one number moved; what came out of each.
+
+    A receiver that a number breaks (a division by zero, a shape that does not fit) counts as nothing received.
+    """
+    options = ReceiverOptions()
+    out: list[Any] = []
+    with moved(Number(**{**task["number"], "value": _tuple(task["number"]["value"])}), task["factor"]):
+        start = time.process_time()
+        for trial in _pictures(task["seed"], task["pictures"]):
+            try:
+                result, _ = score_result(receive_frame(trial.frame, options), trial.truth)
+            except Exception as error:
+                out.append({"broke": repr(error), "right": 0, "surely_wrong": 0})
+                continue
+            packets = [packet for column in result.columns for packet in column.packets]
+            right = sum(packet.bit_errors == 0 for packet in packets)
+            sure = sum(p.bit_errors != 0 and p.confidence >= screens.CONFIDENT for p in packets)
+            out.append({"right": right, "surely_wrong": sure})
+        cpu_s = time.process_time() - start
+    return {"frames": out, "cpu_s": cpu_s}
+
+
+def _tuple(value: Any) -> Value:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def run(room: str, pictures: int, journal: Journal, *, seed: int, jobs: int = 1, quiet: bool = False) -> list[Row]:
+    """A row for every number of `room`, those on which most hangs first.
+
+    Args:
+        room: see `numbers`.
+        pictures: random pictures of `screens.scene_of`, half of them dark.
+        journal: what is done already.
+        seed: of the pictures.
+        jobs: processes; each simulates the pictures once.
+        quiet: show no progress bar.
+    """
+    found = numbers(room)
+    shared = {"run": "sensitivity", "seed": seed, "pictures": pictures}
+    moves = [(number, factor) for number in found for factor in FACTORS]
+    # The first number times one is the receiver as it is.
+    tasks = [{**shared, "number": _told(number), "factor": factor} for number, factor in [(found[0], 1.0), *moves]]
+    unmoved, *records = run_tasks(tasks, received, journal, jobs=jobs, label="sensitivity", quiet=quiet)
+    rows = [_row(number, unmoved, records[2 * at : 2 * at + 2]) for at, number in enumerate(found)]
+    return sorted(rows, key=lambda row: -row["changed"])
+
+
+def _told(number: Number) -> Record:
+    value = list(number.value) if isinstance(number.value, tuple) else number.value
+    return {"module": number.module, "name": number.name, "line": number.line, "value": value}
+
+
+def _row(number: Number, unmoved: Record, records: Sequence[Record]) -> Row:
+    def change(record: Record, what: str) -> int:
+        after, before = (sum(int(frame[what]) for frame in each["frames"]) for each in (record, unmoved))
+        return after - before
+
+    row: Row = {"number": number.place, "value": str(number.value)[:24]}
+    for factor, record in zip(FACTORS, records, strict=True):
+        row[f"right_{factor:g}"] = change(record, "right")
+        row[f"surely_wrong_{factor:g}"] = change(record, "surely_wrong")
+        row[f"cpu_{factor:g}"] = record["cpu_s"] / unmoved["cpu_s"]
+    row["broke"] = sum("broke" in frame for record in records for frame in record["frames"])
+    # Pictures of which another number of packets, right or surely wrong, came out.
+    row["changed"] = sum(
+        (frame["right"], frame["surely_wrong"]) != (before["right"], before["surely_wrong"])
+        for record in records
+        for frame, before in zip(record["frames"], unmoved["frames"], strict=True)
+    )
+    return row
