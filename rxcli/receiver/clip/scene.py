@@ -15,9 +15,9 @@ from rxcli.receiver.clip.views import Pose, View
 from rxcli.receiver.context import Camera, FrameContext, Timer
 from rxcli.receiver.sampling import tracked
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.registration import ScreenTexture
+from rxcli.receiver.screen.registration import Registration, ScreenTexture
 from rxcli.receiver.sync import tracking
-from rxcli.types import Clock, Float32Array, FloatArray, Frame, IntArray, Lens, RowProfiles
+from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, Lens, RowProfiles
 
 #: Strips of a column, at most: more tell no more of a picture that is known, and take time.
 _STRIPS = 4
@@ -25,13 +25,19 @@ _STRIPS = 4
 _MANY_VIEWS = 12
 #: Movement that is none: pixels, or standard deviations of what was found.
 _STILL_PX, _STILL_SDS = 0.3, 2.5
-#: Where texture tells little: how well rest is known in screen sizes, and standard deviations of what may be rest.
-_REST_SD, _REST_SDS = 0.0005, 4.0
+#: Where texture tells little: how well rest is known in screen sizes, and standard deviations of what may be rest;
+#: and how well the place of one that does not rest is known.
+_REST_SD, _REST_SDS, _MOVING_SD = 0.0005, 4.0, 0.003
+#: Share of its motion between two looks that a screen is expected to repeat.
+_DRIFT = 0.7
+#: Rows at the screen's ends that are not counted on where a screen moves: least, most, and in standard deviations of
+#: the corners. A row beyond the end is dark, whatever the known picture expects there.
+_LEAST_END, _MOST_END, _END_SDS = 1.0, 14.0, 1.0
 #: How often a still outline is looked for where the picture does not tell, and looks that make it still.
 _LOOK_EVERY, _STILL_LOOKS = 8, 3
-#: In screen widths: how far an outline may be from where the screen was to be there still; from where it objects to
-#: what the picture says; and how far it may move from one frame to the next to be found.
-_STILL_OUTLINE, _OBJECTION, _OUTLINE_REACH = 0.004, 0.008, 0.02
+#: In screen widths: how far an outline may be from where the screen was to be there still; how far from the first that
+#: was; and how far it may move from one frame to the next to be found.
+_STILL_OUTLINE, _SAME_OUTLINE, _OUTLINE_REACH = 0.004, 0.006, 0.02
 #: A screen found anew whose corners are closer than this to where they were, in screen widths, is where it was.
 _NEAR = 0.06
 #: Frames from which the picture is learned one by one, and how often from then on.
@@ -73,8 +79,12 @@ class TrackedScreen:
         self.last: View | None = None
         self._lens, self._named = lens, named
         self._texture = ScreenTexture(frame, pose.corners, lens)
-        #: Frames whose picture did not tell where the screen is, and outlines in a row that were where it was.
+        #: Frames whose picture did not tell where the screen is, and outlines in a row that were where the first was.
         self._n_untold = self._n_still = 0
+        self._still_outline: FloatArray | None = None
+        #: Where its outline was when looked at last, and how far it moves from frame to frame since.
+        self._looked: FloatArray | None = None
+        self._drift: FloatArray = np.zeros(2)
         self._begun_with = acquisition, black_level
         self._n_updates = 0
         self._picture = self._new_picture(black_level)
@@ -135,22 +145,37 @@ class TrackedScreen:
         found = self._texture.find(frame)
         confirmed = found.fits
         if not found.tells:
-            # What the texture leaves open does not matter to it: it stays, unless the outline objects.
             outline = self._outline_near(frame, found.corners)
             confirmed = confirmed or outline is not None or self._named
-            at_rest = self._texture.with_outline(found, self.corners, _REST_SD)
-            if _is_possible(self.corners - found.corners, found.covariance):
-                at_rest = replace(at_rest, corners=self.corners)
-            moved = outline is not None and np.abs(outline - at_rest.corners).max() > _OBJECTION * self._width
-            found = self._texture.with_outline(found, outline) if outline is not None and moved else at_rest
+            found = self._untold(found, outline)
         if not confirmed:
             return False
-        if _is_still(found.corners - self.corners, found.sd_px):
+        at_rest = found.tells or self._named or self._n_still >= _STILL_LOOKS
+        if at_rest and _is_still(found.corners - self.corners, found.sd_px):
             found = replace(found, corners=self.corners)
         else:
-            self._move(frame, found.corners)
+            self._move(frame, found)
         self._texture.learn(frame, found)
         return True
+
+    def _untold(self, found: Registration, outline: FloatArray | None) -> Registration:
+        """Where the screen is that has too little texture to tell: it rests, unless its outline says that it moves."""
+        rests = self._named or self._n_still >= _STILL_LOOKS
+        expected = self.corners if rests else self.corners + self._drift
+        at_rest = self._texture.with_outline(found, expected, _REST_SD)
+        if _is_possible(expected - found.corners, found.covariance):
+            at_rest = replace(at_rest, corners=expected)
+        if rests:
+            return at_rest
+        # It may have moved since the last look as far as the outline errs.
+        corners = at_rest.corners
+        if outline is not None:
+            far = np.abs(outline - corners).max() > _SAME_OUTLINE * self._width
+            corners = outline if far else (corners + outline) / 2
+            if self._looked is not None:
+                self._drift = (corners - self._looked).mean(axis=0) * (_DRIFT / 2)
+            self._looked = corners
+        return replace(at_rest, corners=corners, covariance=np.eye(8) * (_MOVING_SD * self._width) ** 2)
 
     def _outline_near(self, frame: Frame, corners: FloatArray) -> FloatArray | None:
         """Corners (4, 2) of the screen by its outline, where the picture on it does not tell; None where it shows none.
@@ -169,8 +194,10 @@ class TrackedScreen:
         outline = found.corners[order]
         if np.abs(outline - corners).max() > 2 * _OUTLINE_REACH * self._width:
             return None
-        still = np.abs(outline - self.corners).max() < _OBJECTION * self._width
-        self._n_still = self._n_still + 1 if still else 0
+        before = self._still_outline
+        if before is None or np.abs(outline - before).max() > _SAME_OUTLINE * self._width:
+            self._n_still, self._still_outline = 0, outline
+        self._n_still += 1
         return outline
 
     @property
@@ -181,9 +208,12 @@ class TrackedScreen:
         """Expect the screen near the corners (4, 2) next."""
         self._texture.seek(corners)
 
-    def _move(self, frame: Frame, corners: FloatArray) -> None:
+    def _move(self, frame: Frame, found: Registration) -> None:
         n_columns, n_strips, _ = self._first_pose.map.inside.shape
+        corners = found.corners
         outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, self._lens)
+        sd = float(np.sqrt(np.diag(found.covariance)[1::2].max()))
+        outlines = replace(outlines, inside=_less_ends(outlines.inside, _LEAST_END + _END_SDS * sd))
         strips = tracked.moved_map(self._first_pose.map, outlines)
         placement = _placement(self._first_pose, corners, strips, self._lens)
         self.pose = Pose(corners, strips, placement)
@@ -377,6 +407,14 @@ class TrackedScreen:
             view.flat, clock, _, metrics = refined
             view.snr = _snr(view.flat, clock)
             view.bursts = replace(view.bursts, clock=replace(clock, burst=burst), metrics=metrics, tracked=True)
+
+
+def _less_ends(inside: BoolArray, rows: float) -> BoolArray:
+    """(C, S, R) strips on the screen, without so many rows at its ends."""
+    n = int(np.ceil(min(rows, _MOST_END)))
+    left = np.zeros_like(inside)
+    left[..., n:-n] = inside[..., 2 * n :] & inside[..., : -2 * n]
+    return left
 
 
 def _map(

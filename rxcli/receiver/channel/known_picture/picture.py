@@ -20,6 +20,9 @@ _DOUBT = 1.4
 _AROUND_ROWS = 4
 #: Relative error of a picture taken from the rows around, and of one that was looked at well.
 _AROUND_ERROR, _LEAST_ERROR = 0.3, 0.02
+#: Rows in each direction, all strips of a column together, from which the picture is taken where those around were not
+#: lit either; its weight against theirs, and its relative error, which neighbouring rows have in common.
+_WIDE_ROWS, _WIDE, _WIDE_ERROR = 60, 0.1, 2.0
 #: A slot's light is at 0.5 with this precision before anything is seen.
 PRIOR = 4.0
 #: Rows of a slot err alike; their log-likelihoods count this much.
@@ -264,11 +267,23 @@ class KnownPicture:
 
     def picture(self) -> tuple[Float32Array, Float32Array]:
         """The picture and its relative variance, (C, S, R) each."""
-        around = box_sums(self._light, _AROUND_ROWS) / (box_sums(self._observed, _AROUND_ROWS) + np.float32(1e-3))
+        near = box_sums(self._observed, _AROUND_ROWS) + np.float32(_WIDE)
+        around = (box_sums(self._light, _AROUND_ROWS) + np.float32(_WIDE) * self._wide()[:, None]) / near
         total = self._observed + np.float32(_SMOOTH)
         picture = np.maximum(self._light + np.float32(_SMOOTH) * around, 0) / total
-        unseen = np.float32(_SMOOTH * _AROUND_ERROR) / total
-        return picture, unseen * unseen + np.float32(_LEAST_ERROR**2)
+        # Light that neighbours spill is no look at a picture: it may be any number of times what was made of it.
+        unknown = np.float32(_WIDE) / near
+        error = np.float32(_AROUND_ERROR**2) + np.float32(_WIDE_ERROR**2) * unknown * unknown
+        error *= np.square(np.float32(_SMOOTH) / total)
+        error += np.float32(_LEAST_ERROR**2)
+        return picture, error
+
+    def _wide(self) -> Float32Array:
+        """(C, R) mean of the picture over a column's strips and many rows."""
+        light, observed = (values.sum(axis=1) for values in (self._light, self._observed))
+        usual = light.sum() / max(float(observed.sum()), 1e-6)
+        some = np.float32(_WIDE)
+        return (box_sums(light, _WIDE_ROWS) + some * usual) / (box_sums(observed, _WIDE_ROWS) + some)
 
     def _factor(self, measured: Float32Array | None = None) -> _System:
         """Normal equations A m = b of every row, A symmetric with two bands: A = L D L', and the diagonal of A^-1."""
