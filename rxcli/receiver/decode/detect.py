@@ -9,7 +9,7 @@ known once `w` is, so both ends of the trellis are fixed, and the sum over all p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from math import comb
@@ -17,30 +17,48 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, bits_per_symbol, codebook, dimming_symbol
+from rxcli.protocol import (
+    HEADER,
+    PREAMBLE_SLOTS,
+    SLOTS_PER_SYMBOL,
+    WEIGHTS,
+    bits_per_symbol,
+    codebook,
+    dimming_symbol,
+    slot_patterns,
+)
 from rxcli.types import BurstPosteriors, Float32Array, FloatArray
 
 #: Longest memory of the trellis; five slots cover an exposure of four.
 MAX_MEMORY = 5
-_NEVER = -1e9
+#: Likelihoods, over that of the likeliest state, are taken to be at least this, so that their logarithm exists.
+_LEAST = 1e-300
 #: Slots are taken to be at most this sure when weights are compared: one bad slot must not decide.
 _SURE_LLR = 12.0
 #: Probabilities below this are not told apart.
 _TINY = 1e-30
-#: Packets that are detected together: more leave the processor's cache, fewer take more calls.
-_AT_ONCE = 256
+#: Metrics that are worked on together: more leave the processor's cache, fewer take more calls.
+_AT_ONCE = 250_000
 
 
 @dataclass(frozen=True, slots=True)
 class _Branches:
-    """Branches of one symbol of weight w: every codeword from every state."""
+    """Branches of one symbol of weight w: every codeword from every state.
+
+    The first slots of a word share metrics with the state it comes from, the others are the word's alone. So what is
+    said of words and what is said of states and words' beginnings are worked out apart.
+    """
 
     #: (words, 10) uint8.
     words: NDArray[np.uint8]
-    #: (10 * 2**(memory+1), states * words) float32: which metrics a branch adds up.
-    features: NDArray[np.float32]
-    #: (words, states) float32: 1 where the word ends in the state, else 0.
-    into: NDArray[np.float32]
+    #: ((10 - memory) * patterns, words): which metrics a word adds up from the first slot that no state reaches.
+    features: FloatArray
+    #: (words,) the word's first slots, and its last ones, as states.
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    #: (words, states): 1 where a word begins, or ends, so.
+    begins: FloatArray
+    ends: FloatArray
     #: Patterns of header and dimming symbol, from the first slot whose predecessors are known.
     preamble: NDArray[np.int64]
     #: State that header and dimming symbol end in.
@@ -55,27 +73,41 @@ def _pattern_index(slots: NDArray[np.integer], isi_memory: int) -> NDArray[np.in
     return windows @ (1 << np.arange(isi_memory, -1, -1))
 
 
+def _states(isi_memory: int) -> NDArray[np.int64]:
+    """(states, memory) the slots that each state stands for."""
+    states: NDArray[np.int64] = (np.arange(1 << isi_memory)[:, None] >> np.arange(isi_memory - 1, -1, -1)) & 1
+    return states
+
+
+@lru_cache(maxsize=8)
+def _meeting_patterns(isi_memory: int) -> NDArray[np.int64]:
+    """(memory, states * beginnings) pattern at each of a word's first slots, by the state before and these slots."""
+    states = _states(isi_memory)
+    either = np.concatenate([np.repeat(states, len(states), axis=0), np.tile(states, (len(states), 1))], axis=1)
+    return np.ascontiguousarray(_pattern_index(either, isi_memory).T)
+
+
 @lru_cache(maxsize=64)
 def _branches(w: int, isi_memory: int) -> _Branches:
     words = codebook(w)
-    n_states, n_words = 1 << isi_memory, len(words)
-    states = (np.arange(n_states)[:, None] >> np.arange(isi_memory - 1, -1, -1)) & 1
-    slots = np.concatenate(
-        [np.repeat(states[:, None], n_words, axis=1), np.repeat(words[None], n_states, axis=0)], axis=2
-    )
-    index = _pattern_index(slots, isi_memory)
-    features = (index[..., None] == np.arange(1 << (isi_memory + 1))).reshape(n_states * n_words, -1)
-    end = words[:, SLOTS_PER_SYMBOL - isi_memory :] @ (1 << np.arange(isi_memory - 1, -1, -1))
-    into = (end[:, None] == np.arange(n_states)).astype(np.float32)
+    n_states = 1 << isi_memory
+    index = _pattern_index(words, isi_memory)
+    features = (index[..., None] == np.arange(2 * n_states)).reshape(len(words), -1)
+    place = 1 << np.arange(isi_memory - 1, -1, -1)
+    first, last = words[:, :isi_memory] @ place, words[:, SLOTS_PER_SYMBOL - isi_memory :] @ place
+    begins, ends = ((slots[:, None] == np.arange(n_states)).astype(np.float64) for slots in (first, last))
     preamble = np.concatenate([np.array(HEADER, np.int64), dimming_symbol(w)])
     header = np.broadcast_to(np.array(HEADER[:isi_memory], np.int64), (n_states, isi_memory))
     return _Branches(
         words,
-        np.ascontiguousarray(features.T, np.float32),
-        into,
+        np.ascontiguousarray(features.T, np.float64),
+        first,
+        last,
+        begins,
+        ends,
         _pattern_index(preamble, isi_memory),
         int(_pattern_index(preamble[PREAMBLE_SLOTS - isi_memory :], isi_memory - 1)[0]),
-        _pattern_index(np.concatenate([states, header], axis=1), isi_memory),
+        _pattern_index(np.concatenate([_states(isi_memory), header], axis=1), isi_memory),
     )
 
 
@@ -93,83 +125,128 @@ def _over_few(combine: np.ufunc, values: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class _Steps:
-    """n packets of one weight, as a trellis over their symbols."""
+class _Payload:
+    """What n packets' metrics say of the N symbols of their payload, whatever their weight."""
+
+    #: (n, packet + memory, patterns).
+    metrics: FloatArray
+    #: (N, n, states, beginnings) likelihood of each beginning of a word after each state over that of the likeliest,
+    #: and (n,) the logarithm of that, added up.
+    meeting: FloatArray
+    log_scale: FloatArray
+
+    @property
+    def isi_memory(self) -> int:
+        return _isi_memory_of(self.metrics)
+
+    @property
+    def n_symbols(self) -> int:
+        return len(self.meeting)
+
+    def of_packets(self, packets: NDArray[np.int64]) -> _Payload:
+        return _Payload(self.metrics[packets], self.meeting[:, packets], self.log_scale[packets])
+
+
+def _payload_of(metrics: FloatArray) -> _Payload:
+    """The payload of packets from their metrics (n, packet + memory, patterns)."""
+    isi_memory = _isi_memory_of(metrics)
+    n, length, n_patterns = metrics.shape
+    slots = metrics[:, PREAMBLE_SLOTS : length - isi_memory].reshape(n, -1, SLOTS_PER_SYMBOL, n_patterns)
+    slots = slots.swapaxes(0, 1).reshape(-1, SLOTS_PER_SYMBOL, n_patterns)
+    patterns = _meeting_patterns(isi_memory)
+    meeting = slots[:, 0].take(patterns[0], axis=1)
+    for slot in range(1, isi_memory):
+        meeting += slots[:, slot].take(patterns[slot], axis=1)
+    meeting, top = _over_likeliest(meeting)
+    n_states = 1 << isi_memory
+    return _Payload(metrics, meeting.reshape(-1, n, n_states, n_states), top.reshape(-1, n).sum(axis=0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Trellis:
+    """n packets of one weight as a trellis over their symbols, in likelihoods over those of the likeliest."""
 
     branches: _Branches
-    #: (n,) log-likelihood that all words share.
+    #: (n,) logarithm of what all words share, and of what the others are scaled by.
     common: FloatArray
-    #: (n, N, states, words) likelihood of each word after each state over that of the best, and the best's logarithm.
-    likelihood: Float32Array
-    top: Float32Array
-    #: (n, N, states, states) log-likelihood of going from state to state, over all words; the first's state, and what
-    #: the header that follows says of the last.
-    step: FloatArray
+    #: (N, n, states, beginnings) as in `_Payload`.
+    meeting: FloatArray
+    #: (N, n, words) likelihood of each word's slots from the first that no state before it reaches.
+    rest: FloatArray
+    #: (n, states) before the first symbol, and what the header that follows says of the last.
     start: FloatArray
     end: FloatArray
 
+    def forward(self) -> tuple[list[FloatArray], FloatArray, FloatArray]:
+        """Likelihood (n, words) of what leads to each word and of the word, by symbol, each scaled; that of the last
+        states, and the logarithm of its scale."""
+        by_symbol, state, log_scale = [], self.start, np.zeros(len(self.start))
+        for meeting, rest in zip(self.meeting, self.rest, strict=True):
+            words = np.matmul(state[:, None], meeting)[:, 0].take(self.branches.first, axis=1)
+            words *= rest
+            by_symbol.append(words)
+            state, log_scale = _scaled(words @ self.branches.ends, log_scale)
+        return by_symbol, state, log_scale
 
-def _steps(metrics: FloatArray, w: int, isi_memory: int) -> _Steps:
-    """The trellis of n packets of weight `w` from their metrics (n, packet + memory, patterns)."""
+    def backward(self) -> FloatArray:
+        """(N, n, states) likelihood of what follows each symbol, by the state that it ends in, scaled."""
+        out, state = [self.end], self.end
+        for meeting, rest in zip(self.meeting[:0:-1], self.rest[:0:-1], strict=True):
+            words = state.take(self.branches.last, axis=1)
+            words *= rest
+            state, _ = _scaled(np.matmul(meeting, (words @ self.branches.begins)[..., None])[..., 0])
+            out.append(state)
+        return np.stack(out[::-1])
+
+
+def _scaled(state: FloatArray, log_scale: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """States (n, S), the likeliest being 1; and the logarithm of what was taken off added to that of before."""
+    top = np.maximum(state.max(axis=1), _LEAST)
+    return state / top[:, None], np.asarray(log_scale + np.log(top))
+
+
+def _trellis(payload: _Payload, w: int) -> _Trellis:
+    """The trellis of n packets as ones of weight `w`."""
+    metrics, isi_memory, n_symbols = payload.metrics, payload.isi_memory, payload.n_symbols
     branches = _branches(w, isi_memory)
-    n, length, _ = metrics.shape
-    n_symbols = (length - isi_memory - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL
-    n_states, n_words = 1 << isi_memory, len(branches.words)
+    n, length, n_patterns = metrics.shape
     known = metrics[:, np.arange(isi_memory, PREAMBLE_SLOTS), branches.preamble].sum(axis=1)
-    payload = metrics[:, PREAMBLE_SLOTS : length - isi_memory].reshape(n * n_symbols, -1)
-    # Only differences matter; what is left fits float32 with room to spare.
-    offset = payload.max(axis=1)
-    payload = (payload - offset[:, None]).astype(np.float32)
-    branch = (payload @ branches.features).reshape(n, n_symbols, n_states, n_words)
-    top = branch.max(axis=3, keepdims=True)
-    branch -= top
-    likelihood = np.exp(branch, out=branch)
-    step = np.log(np.maximum(likelihood @ branches.into, _TINY)) + top
-    start = np.full((n, n_states), _NEVER)
-    start[:, branches.first_state] = 0.0
-    offset = SLOTS_PER_SYMBOL * offset.reshape(n, n_symbols).sum(axis=1)
-    common = known + offset - n_symbols * np.log(n_words)
-    tail = metrics[:, length - isi_memory :]
-    end = np.asarray(tail[:, np.arange(isi_memory), branches.tail].sum(axis=2))
-    return _Steps(branches, common, likelihood, top[..., 0], step, start, end)
+    slots = metrics[:, PREAMBLE_SLOTS : length - isi_memory].reshape(n * n_symbols, -1)
+    rest, top = _over_likeliest(slots[:, isi_memory * n_patterns :] @ branches.features)
+    end, top_end = _over_likeliest(metrics[:, length - isi_memory + np.arange(isi_memory), branches.tail].sum(axis=2))
+    start = np.zeros((n, 1 << isi_memory))
+    start[:, branches.first_state] = 1.0
+    scale = payload.log_scale + top.reshape(n, -1).sum(axis=1) + top_end[:, 0]
+    return _Trellis(
+        branches,
+        known + scale - n_symbols * np.log(rest.shape[1]),
+        payload.meeting,
+        rest.reshape(n, n_symbols, -1).swapaxes(0, 1),
+        start,
+        end,
+    )
 
 
-def _log_evidence(metrics: FloatArray, w: int, isi_memory: int) -> FloatArray:
-    """(n,) log evidence of packets of weight `w`, for which going forward is enough."""
-    trellis = _steps(metrics, w, isi_memory)
-    state = trellis.start
-    for symbol in range(trellis.step.shape[1]):
-        state = _log_sum(state[:, :, None] + trellis.step[:, symbol], axis=1)
-    return np.asarray(trellis.common + _log_sum(state + trellis.end, axis=1))
+def _over_likeliest(log_values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Exponentials of the last axis over the largest there, and the largest itself, (..., 1)."""
+    top = log_values.max(axis=-1, keepdims=True)
+    return np.exp(log_values - top), top
 
 
-def _word_posteriors(metrics: FloatArray, w: int, isi_memory: int) -> FloatArray:
-    """(n, N, words) probability of the words of n packets of weight `w`, by forward-backward."""
-    trellis = _steps(metrics, w, isi_memory)
-    before, after = _recursions(trellis.step, trellis.start, trellis.end)
-    joint = _scaled(before + trellis.top)[:, :, None, :] @ trellis.likelihood
-    joint = joint[:, :, 0] * (_scaled(after) @ trellis.branches.into.T)
+def _log_evidence(trellis: _Trellis) -> FloatArray:
+    """(n,) log evidence of packets, for which going forward is enough."""
+    _, state, log_scale = trellis.forward()
+    return np.asarray(trellis.common + log_scale + np.log(np.maximum((state * trellis.end).sum(axis=1), _LEAST)))
+
+
+def _word_posteriors(trellis: _Trellis) -> FloatArray:
+    """(n, N, words) probability of the words of n packets, by forward-backward."""
+    by_symbol, _, _ = trellis.forward()
+    joint = np.stack(by_symbol)
+    joint *= trellis.backward().take(trellis.branches.last, axis=2)
     total = joint.sum(axis=2, keepdims=True)
     uniform = np.full_like(joint, 1 / joint.shape[2])
-    return np.asarray(np.divide(joint, total, out=uniform, where=total > 0))
-
-
-def _recursions(step: FloatArray, start: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Log-likelihood of each state before and after every symbol, (n, N, states), from the steps between states.
-
-    Both recursions take as many steps and run side by side: what counts is the number of calls.
-    """
-    steps = np.concatenate([step[:, :-1], step[:, :0:-1].swapaxes(2, 3)])
-    states = [np.concatenate([start, end])]
-    for symbol in range(steps.shape[1]):
-        states.append(_log_sum(states[-1][:, :, None] + steps[:, symbol], axis=1))
-    before, after = np.split(np.stack(states, axis=1), 2)
-    return before, after[:, ::-1]
-
-
-def _scaled(log_values: FloatArray) -> NDArray[np.float32]:
-    """Exponentials, the largest of each last axis being 1."""
-    return np.asarray(np.exp(log_values - log_values.max(axis=-1, keepdims=True)), np.float32)
+    return np.divide(joint, total, out=uniform, where=total > 0).swapaxes(0, 1)
 
 
 def slot_llr(metrics: FloatArray) -> Float32Array:
@@ -185,14 +262,17 @@ def slot_llr(metrics: FloatArray) -> Float32Array:
     """
     isi_memory = _isi_memory_of(metrics)
     n_slots = metrics.shape[-2] - isi_memory
-    total = np.zeros((*metrics.shape[:-2], n_slots))
     likelihood = np.exp(metrics - _over_few(np.maximum, metrics)[..., None])
-    for age in range(isi_memory + 1):
-        # Bit `age` of the pattern's number is the slot `age` slots ago.
-        split = likelihood[..., age : age + n_slots, :].reshape(*total.shape, -1, 2, 1 << age)
-        dark, lit = (_over_few(np.add, split[..., state, :].reshape(*total.shape, -1)) for state in (0, 1))
-        total += np.log((lit + _TINY) / (dark + _TINY))
-    return total.astype(np.float32)
+    sums = np.log(likelihood @ _lit_and_dark(isi_memory) + _TINY)
+    odds = sums[..., : isi_memory + 1] - sums[..., isi_memory + 1 :]
+    return np.asarray(sum(odds[..., age : age + n_slots, age] for age in range(isi_memory + 1)), np.float32)
+
+
+@lru_cache(maxsize=8)
+def _lit_and_dark(isi_memory: int) -> FloatArray:
+    """(patterns, 2 * (memory + 1)): 1 where the slot `age` slots ago is lit, by age; and where it is dark."""
+    lit = slot_patterns(isi_memory)[:, ::-1].astype(np.float64)
+    return np.concatenate([lit, 1 - lit], axis=1)
 
 
 def slot_margin(metrics: FloatArray, decided: NDArray[np.bool_]) -> Float32Array:
@@ -283,14 +363,26 @@ def weight_log_evidence(metrics: FloatArray, candidates: NDArray[np.bool_]) -> F
         metrics: (B, C, packet + memory, patterns) log-likelihoods of B bursts.
         candidates: (C, 9) which weights to try for each column.
     """
-    n_bursts, n_columns = metrics.shape[:2]
-    isi_memory = _isi_memory_of(metrics)
-    out = np.full((n_columns, len(WEIGHTS)), -np.inf)
+    out = np.full(candidates.shape, -np.inf)
+    for columns in _batches(metrics):
+        out[columns] = _of_weights(_payload_of(_packets(metrics, columns)), candidates[columns])
+    return out
+
+
+def _packets(metrics: FloatArray, columns: NDArray[np.int64]) -> FloatArray:
+    """(B * columns, packet + memory, patterns) the packets of some columns, burst by burst."""
+    return metrics[:, columns].reshape(-1, *metrics.shape[2:])
+
+
+def _of_weights(payload: _Payload, candidates: NDArray[np.bool_]) -> FloatArray:
+    """Log evidence (C, 9) of the weights that may be, from the packets of C columns."""
+    out = np.full(candidates.shape, -np.inf)
+    packets = np.arange(len(payload.metrics)).reshape(-1, len(candidates))
     for w in WEIGHTS:
         columns = np.flatnonzero(candidates[:, w - 1])
         if columns.size:
-            chosen = metrics[:, columns].reshape(n_bursts * columns.size, *metrics.shape[2:])
-            out[columns, w - 1] = _log_evidence(chosen, w, isi_memory).reshape(n_bursts, -1).sum(axis=0)
+            trellis = _trellis(payload.of_packets(packets[:, columns].ravel()), w)
+            out[columns, w - 1] = _log_evidence(trellis).reshape(-1, columns.size).sum(axis=0)
     return out
 
 
@@ -334,7 +426,7 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
     _check(metrics)
     if candidates is None:
         candidates = np.ones((metrics.shape[1], len(WEIGHTS)), bool)
-    return _posteriors(metrics, _weights(metrics, candidates))
+    return _posteriors(metrics, candidates)
 
 
 def _check(metrics: FloatArray) -> None:
@@ -377,10 +469,9 @@ def detect_with_words(
     found: list[DoubtfulWords] = []
 
     def on_posteriors(w: int, columns: NDArray[np.int64], word: FloatArray) -> None:
-        by_burst = word.reshape(len(metrics), columns.size, *word.shape[1:])
-        found.append(_in_doubt(by_burst, w, columns, certain, most))
+        found.append(_in_doubt(word, w, columns, certain, most))
 
-    posteriors = _posteriors(metrics, _weights(metrics, candidates), on_posteriors)
+    posteriors = _posteriors(metrics, candidates, on_posteriors)
     return posteriors, DoubtfulWords(
         np.concatenate([f.places for f in found]),
         np.concatenate([f.words for f in found]),
@@ -397,52 +488,55 @@ def _in_doubt(word: FloatArray, w: int, columns: NDArray[np.int64], certain: flo
     return DoubtfulWords(places, codebook(w)[order], np.log(np.take_along_axis(doubtful, order, axis=1) + _TINY))
 
 
-def _weights(metrics: FloatArray, candidates: NDArray[np.bool_]) -> FloatArray:
+def _weights(payload: _Payload, candidates: NDArray[np.bool_]) -> FloatArray:
     """(C, 9) log probability of every weight; no evidence is needed where one candidate is left."""
     log_prob = np.where(candidates, 0.0, -np.inf)
-    open_columns = np.flatnonzero(candidates.sum(axis=1) > 1)
-    if open_columns.size:
-        log_prob[open_columns] = weight_log_evidence(metrics[:, open_columns], candidates[open_columns])
+    open_columns = candidates.sum(axis=1) > 1
+    if open_columns.any():
+        log_prob[open_columns] = _of_weights(payload, candidates & open_columns[:, None])[open_columns]
     return np.asarray(log_prob - _log_sum(log_prob, 1)[:, None])
 
 
 def _posteriors(
     metrics: FloatArray,
-    w_log_prob: FloatArray,
+    candidates: NDArray[np.bool_],
     on_posteriors: Callable[[int, NDArray[np.int64], FloatArray], None] | None = None,
 ) -> BurstPosteriors:
-    """Posteriors given the weights; `on_posteriors` gets weight, columns, (B * C, N, words) probabilities."""
+    """Posteriors of the weights that may be; `on_posteriors` gets weight, columns, (B, C, N, words) probabilities."""
     n_bursts, n_columns, length, _ = metrics.shape
     isi_memory = _isi_memory_of(metrics)
     n_symbols = (length - isi_memory - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL
-    weights = w_log_prob.argmax(axis=1) + 1
+    w_log_prob = np.empty((n_columns, len(WEIGHTS)))
     lit = np.empty((n_bursts, n_columns, length - isi_memory), np.float32)
     index = np.empty((n_bursts, n_columns, n_symbols), np.int64)
     log_prob = np.empty((n_bursts, n_columns, n_symbols))
     bit_llr = np.full((n_bursts, n_columns, n_symbols, 7), np.nan)
-    for w, columns in _batches(weights, n_bursts):
-        chosen = metrics[:, columns].reshape(n_bursts * columns.size, *metrics.shape[2:])
-        posterior = _word_posteriors(chosen, w, isi_memory)
-        if on_posteriors is not None:
-            on_posteriors(w, columns, posterior)
-        words = codebook(w)
-        preamble = np.concatenate([np.array(HEADER), dimming_symbol(w)])
-        lit[:, columns, :PREAMBLE_SLOTS] = preamble
-        lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ words).reshape(n_bursts, columns.size, -1)
-        best = posterior.argmax(axis=2)
-        index[:, columns] = best.reshape(n_bursts, columns.size, n_symbols)
-        log_prob[:, columns] = _log_of_best(posterior, best).reshape(n_bursts, columns.size, n_symbols)
-        k = bits_per_symbol(w)
-        bit_llr[:, columns, :, :k] = _bit_llr(posterior, k).reshape(n_bursts, columns.size, n_symbols, k)
+    for batch in _batches(metrics):
+        payload = _payload_of(_packets(metrics, batch))
+        packets = np.arange(len(payload.metrics)).reshape(n_bursts, batch.size)
+        w_log_prob[batch] = _weights(payload, candidates[batch])
+        weights = w_log_prob[batch].argmax(axis=1) + 1
+        for w in np.unique(weights).tolist():
+            alike = np.flatnonzero(weights == w)
+            columns, words = batch[alike], codebook(w)
+            posterior = _word_posteriors(_trellis(payload.of_packets(packets[:, alike].ravel()), w))
+            posterior = posterior.reshape(n_bursts, columns.size, n_symbols, -1)
+            if on_posteriors is not None:
+                on_posteriors(w, columns, posterior)
+            lit[:, columns, :PREAMBLE_SLOTS] = np.concatenate([np.array(HEADER), dimming_symbol(w)])
+            lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ words).reshape(n_bursts, columns.size, -1)
+            index[:, columns] = best = posterior.argmax(axis=3)
+            log_prob[:, columns] = _log_of_best(posterior, best)
+            bit_llr[:, columns, :, : bits_per_symbol(w)] = _bit_llr(posterior, bits_per_symbol(w))
+    weights = w_log_prob.argmax(axis=1) + 1
     return BurstPosteriors(weights, w_log_prob, lit, index, log_prob, bit_llr, _header_llr(metrics))
 
 
-def _batches(weights: NDArray[np.int64], n_bursts: int) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Each weight with columns that have it; as many at a time as are quick to detect."""
-    for w in np.unique(weights):
-        columns = np.flatnonzero(weights == w)
-        for batch in np.array_split(columns, min(-(-columns.size * n_bursts // _AT_ONCE), columns.size)):
-            yield int(w), batch
+def _batches(metrics: FloatArray) -> list[NDArray[np.int64]]:
+    """Columns of metrics (B, C, packet + memory, patterns), as many at a time as fit the cache."""
+    n_bursts, n_columns, length, n_patterns = metrics.shape
+    numbers = n_bursts * length * n_patterns
+    return np.array_split(np.arange(n_columns), max(min(-(-n_columns * numbers // _AT_ONCE), n_columns), 1))
 
 
 def _header_llr(metrics: FloatArray) -> FloatArray:
@@ -456,13 +550,13 @@ def _header_llr(metrics: FloatArray) -> FloatArray:
 
 def _log_of_best(posterior: FloatArray, best: NDArray[np.int64]) -> FloatArray:
     """Log of the largest probability, from the sum of the others so that 1 - 1e-12 is told from 1."""
-    rest = posterior.astype(np.float64)
-    np.put_along_axis(rest, best[..., None], 0.0, 2)
-    return np.asarray(np.log1p(-np.minimum(rest.sum(axis=2), 1 - 1 / posterior.shape[2])))
+    rest = posterior.copy()
+    np.put_along_axis(rest, best[..., None], 0.0, -1)
+    return np.asarray(np.log1p(-np.minimum(rest.sum(axis=-1), 1 - 1 / posterior.shape[-1])))
 
 
 def _bit_llr(posterior: FloatArray, k: int) -> FloatArray:
-    """(n, N, k) ln p(1)/p(0) from (n, N, 2**k) probabilities of the codebook indices."""
+    """(..., k) ln p(1)/p(0) from (..., 2**k) probabilities of the codebook indices."""
     bits = (np.arange(1 << k)[:, None] >> np.arange(k - 1, -1, -1)) & 1
     one, zero = posterior @ bits, posterior @ (1 - bits)
     return np.asarray(np.log(np.maximum(one, _TINY)) - np.log(np.maximum(zero, _TINY)))
