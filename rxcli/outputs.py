@@ -8,6 +8,7 @@ complete, so that a kill or a full disk leaves the old file. Journals, which gro
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import stat
@@ -16,14 +17,20 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import mkstemp
 from typing import TYPE_CHECKING
 
-from rxcli.errors import OutputError, UsageError
+from rxcli.errors import ExitCode, OutputError, ReceiverError, UsageError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+#: What another name would mend, and what it would not.
+_NAMED_WRONG = frozenset(
+    {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP}
+)
+_DISK_FAILS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO})
 #: So much of a file's start and of its end tells whose it is.
 _LOOK_BYTES = 1 << 16
 #: Signature and IHDR of a PNG (ISO 15948, section 5).
@@ -82,7 +89,7 @@ def claim(
     profiles: Iterable[str | Path] = (),
     force: bool = False,
 ) -> None:
-    """Refuse outputs that would destroy something; nothing is opened for writing.
+    """Refuse outputs that would destroy something or cannot be written; what is there is not touched.
 
     Args:
         outputs: all files that the run will write.
@@ -91,8 +98,9 @@ def claim(
         force: replace files that others wrote, though never an input or a profile of this run.
 
     Raises:
-        UsageError: two outputs are one file; or an output is an input, a profile, a folder, in no folder, or a file
-            that does not look like an earlier output of the same sort.
+        UsageError: two outputs are one file; or an output is an input, a profile, a folder, in no folder, in one that
+            cannot be written, or a file that does not look like an earlier output of the same sort.
+        OutputError: the disk is full.
     """
     taken: dict[object, str] = {}
     for kind, paths in (("an input", inputs), ("a profile that is read", profiles)):
@@ -110,18 +118,46 @@ def claim(
         taken[identity] = f"written by {output.option}"
         if not force:
             _check_ours(output)
+        _check_writable(output)
 
 
 def claim_folder(option: str, folder: Path) -> None:
     """Make a folder that a run writes into.
 
     Raises:
-        UsageError: it is a file, or cannot be made.
+        UsageError: it is a file, or cannot be made or written.
+        OutputError: the disk is full.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        _try_to_write(folder)
     except (OSError, ValueError) as error:
-        raise UsageError(f"{option} {folder}: {_reason(error)}", "name another folder") from None
+        raise _refusal(f"{option} {folder}", error, "name another folder") from None
+
+
+def _check_writable(output: Output) -> None:
+    """Refuse an output whose folder takes no file, or that is there and may not be changed."""
+    try:
+        path = output.path.resolve()
+        if path.exists():
+            path.open("r+b").close()
+        _try_to_write(next(folder for folder in path.parents if folder.exists()))
+    except (OSError, RuntimeError) as error:
+        raise _refusal(str(output), error, "name a file in a folder that can be written") from None
+
+
+def _try_to_write(folder: Path) -> None:
+    """Make a file in a folder and remove it: permissions alone do not tell of file systems that are read only."""
+    handle, name = mkstemp(prefix=".vlc-rx-", suffix=".part", dir=folder)
+    os.close(handle)
+    Path(name).unlink(missing_ok=True)
+
+
+def _refusal(what: str, error: BaseException, step: str) -> ReceiverError:
+    """A usage error, or an output error where the names are right and the disk is not."""
+    if getattr(error, "errno", None) in _DISK_FAILS:
+        return OutputError(f"{what}: cannot be written ({_reason(error)})", "make room, or name another disk")
+    return UsageError(f"{what}: cannot be written ({_reason(error)})", step)
 
 
 def _identity(path: Path) -> object | None:
@@ -221,12 +257,17 @@ def check_replaceable(path: Path, ours: re.Pattern[bytes], option: str) -> None:
     try:
         _check_ours(Output(option, path, ours))
     except UsageError as error:
-        raise OutputError(error.message, "name another folder") from None
+        told = OutputError(error.message, "name another folder")
+        told.exit_code = error.exit_code
+        raise told from None
 
 
 def unwritable(path: Path, error: BaseException) -> OutputError:
-    """The error that says that `path` could not be written, and why."""
-    return OutputError(f"{path}: cannot be written ({_reason(error)})", "name a file in a folder that can be written")
+    """The error that says that `path` could not be written, and why; wrong usage unless the disk is to blame."""
+    told = OutputError(f"{path}: cannot be written ({_reason(error)})", "name a file in a folder that can be written")
+    if isinstance(error, OSError) and error.errno in _NAMED_WRONG:
+        told.exit_code = ExitCode.USAGE
+    return told
 
 
 def _reason(error: BaseException) -> str:

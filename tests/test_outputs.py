@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from pathlib import Path
@@ -200,6 +201,57 @@ def test_taps_of_files_with_one_name_stand_in_their_folders(tmp_path: Path, name
     assert len(set(lights)) == 4
 
 
+@pytest.mark.parametrize(
+    "option", ["--json", "--junit", "--summary", "--payloads", "--save-camera", "--dump-dir", "--save-undistorted"]
+)
+def test_what_cannot_be_written_is_wrong_usage_before_any_work(
+    option: str, tmp_path: Path, names: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """/proc takes no file, whoever asks; a file is no folder."""
+    name = "o.csv" if option == "--summary" else "o"
+    for target in (f"/proc/{name}", str(tmp_path / "in" / "a.png" / name)):
+        assert run(["decode", str(tmp_path / "in" / "a.png"), option, target, *names]) == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.startswith(f"vlc-rx: {option} {target}: ")
+        assert captured.err.count("\n") == 1
+
+
+def test_other_commands_try_their_outputs_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = tmp_path / "a.png"
+    picture.write_bytes(b"")
+    for arguments in (
+        ["inspect", str(picture), "--out", "/proc/o"],
+        ["simulate", "/proc/o.png"],
+        ["encode", "--text", "a", "--screen", "data-17k3", "--out", "/proc/o.npy"],
+        ["calibrate", "shutter", str(picture), "--frequency", "1000", "--save", "/proc/o.toml"],
+    ):
+        assert run(arguments) == 2
+        assert "cannot be written (No such file or directory)" in capsys.readouterr().err
+
+
+def test_a_file_that_may_not_be_changed_is_no_output(tmp_path: Path) -> None:
+    path = tmp_path / "o"
+    path.write_bytes(b"")
+    path.chmod(0o400)
+    if os.access(path, os.W_OK):
+        pytest.skip("permissions do not bind this user")
+    with pytest.raises(UsageError, match="Permission denied"):
+        claim([Output("--json", path, outputs.ANYTHING)])
+
+
+def test_a_failing_disk_is_no_wrong_usage() -> None:
+    full = outputs.unwritable(Path("a"), OSError(errno.ENOSPC, "No space left on device"))
+    readonly = outputs.unwritable(Path("a"), OSError(errno.EROFS, "Read-only file system"))
+    assert (full.exit_code, readonly.exit_code) == (3, 2)
+
+
+def test_claiming_leaves_no_trace(tmp_path: Path) -> None:
+    claim([Output("--json", tmp_path / "o", outputs.ANYTHING), Output("--junit", tmp_path / "p", outputs.JUNIT)])
+    outputs.claim_folder("--out", tmp_path / "folder")
+    assert [path.name for path in tmp_path.rglob("*")] == ["folder"]
+
+
 def test_taps_do_not_replace_a_file_of_somebody_else(
     tmp_path: Path, names: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -207,7 +259,7 @@ def test_taps_do_not_replace_a_file_of_somebody_else(
     assert run(["decode", str(picture), "--dump-dir", str(taps), *names]) == 0
     assert run(["decode", str(picture), "--dump-dir", str(taps), *names]) == 0
     (taps / "a.png-000000.npz").write_text("mine")
-    assert run(["decode", str(picture), "--dump-dir", str(taps), *names]) == 3
+    assert run(["decode", str(picture), "--dump-dir", str(taps), *names]) == 2
     assert "no earlier output" in capsys.readouterr().err
     assert (taps / "a.png-000000.npz").read_text() == "mine"
 

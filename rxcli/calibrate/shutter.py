@@ -2,7 +2,8 @@
 
 One lamp lights all its rows at once, so wherever it shines the stripes have one period and one phase. The picture is
 cut into cells; the clearest stripes give a template, every cell that follows it belongs to that lamp, and the search
-goes on among the rest. Each lamp's region is then summed to one profile and fitted (`rxcli.calibrate.periodic`).
+goes on among the rest. Lamps that are small spots in a dark picture are looked for each in its own part
+(`rxcli.calibrate.spots`). Each lamp's region is then summed to one profile and fitted (`rxcli.calibrate.periodic`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from rxcli.calibrate.periodic import (
     search_many,
     significant,
 )
+from rxcli.calibrate.spots import find_spots
 from rxcli.errors import ReceiverError, UsageError
 from rxcli.types import BoolArray, FloatArray
 
@@ -38,6 +40,8 @@ _STRIPS = 32
 #: Shortest side of a picture that is looked at, pixels.
 _MIN_SIDE = 24
 _MAX_LAMPS = 8
+#: Logarithm of the ratio of two line delays that may still be one.
+_SAME_LINE_DELAY = 0.02
 #: Smallest region of a lamp, as a share of the picture, by its number of periods.
 _MIN_AREA = ((2.0, 4.0, 6.0, 12.0), (0.15, 0.05, 0.015, 0.003))
 _HINT = (
@@ -156,10 +160,53 @@ def find_stripes(picture: Picture, axis: Axis | None = None) -> tuple[Axis, list
     Returns:
         The axis and one region a lamp, clearest first; none where there are no stripes.
     """
+    spots = find_spots(picture)
     if axis is not None:
-        return axis, _find_along(picture if axis == "rows" else picture.T, axis)
-    by_rows, by_columns = _find_along(picture, "rows"), _find_along(picture.T, "columns")
+        return axis, _regions(picture, spots, axis)
+    by_rows, by_columns = _regions(picture, spots, "rows"), _regions(picture, spots, "columns")
     return ("columns", by_columns) if _evidence(by_columns) > _evidence(by_rows) else ("rows", by_rows)
+
+
+def _regions(picture: Picture, spots: Sequence[tuple[int, int, int, int]], axis: Axis) -> list[Stripes]:
+    """Lamps of the whole picture, and of its spots where it shows none."""
+    found = _find_along(picture if axis == "rows" else picture.T, axis)
+    for spot in spots:
+        if any(_holds_most(spot, other.bounds) for other in found):
+            continue
+        for lamp in _lamps_of_spot(picture, spot, axis):
+            if not any(_overlap(lamp.bounds, other.bounds) for other in found):
+                found.append(lamp)
+    return found
+
+
+def _holds_most(spot: tuple[int, int, int, int], region: tuple[int, int, int, int]) -> bool:
+    """Whether a lamp's region is a spot, more or less."""
+    return _common_area(spot, region) >= _area_of(spot) / 2
+
+
+def _area_of(box: tuple[int, int, int, int]) -> int:
+    return (box[2] - box[0]) * (box[3] - box[1])
+
+
+def _common_area(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -> int:
+    across = min(one[2], other[2]) - max(one[0], other[0])
+    down = min(one[3], other[3]) - max(one[1], other[1])
+    return max(across, 0) * max(down, 0)
+
+
+def _overlap(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -> bool:
+    """Whether two boxes share a fifth of the smaller one or more."""
+    return 5 * _common_area(one, other) >= min(_area_of(one), _area_of(other))
+
+
+def _lamps_of_spot(picture: Picture, spot: tuple[int, int, int, int], axis: Axis) -> list[Stripes]:
+    """Lamps in a spot with enough periods to be sure."""
+    left, top, right, bottom = spot
+    part = picture[top:bottom, left:right]
+    if min(part.shape) < _MIN_SIDE:
+        return []
+    lamps = _find_along(part if axis == "rows" else part.T, axis)
+    return [_placed(lamp, left, top) for lamp in lamps if lamp.periods >= FEW_PERIODS]
 
 
 def _evidence(found: list[Stripes]) -> float:
@@ -168,8 +215,7 @@ def _evidence(found: list[Stripes]) -> float:
 
 
 def _area(stripes: Stripes) -> int:
-    x0, y0, x1, y1 = stripes.bounds
-    return (x1 - x0) * (y1 - y0)
+    return _area_of(stripes.bounds)
 
 
 def _find_along(picture: Picture, axis: Axis) -> list[Stripes]:
@@ -361,11 +407,13 @@ def _found_in(
             "give it in stored pixels",
         )
     axis, regions = find_stripes(part, axis)
-    return axis, [replace(s, bounds=_shifted(s.bounds, x, y)) for s in regions]
+    return axis, [_placed(s, x, y) for s in regions]
 
 
-def _shifted(bounds: tuple[int, int, int, int], x: int, y: int) -> tuple[int, int, int, int]:
-    return bounds[0] + x, bounds[1] + y, bounds[2] + x, bounds[3] + y
+def _placed(stripes: Stripes, x: int, y: int) -> Stripes:
+    """The region of a part of a picture, in the whole, whose pixel (x, y) is the part's first."""
+    left, top, right, bottom = stripes.bounds
+    return replace(stripes, bounds=(left + x, top + y, right + x, bottom + y))
 
 
 def _pictures(n: int) -> str:
@@ -390,20 +438,32 @@ def _common_line_delay(seen: list[Stripes], frequencies_hz: Sequence[float]) -> 
 
     Every pairing of a region with a frequency proposes one; a proposal is worth the regions that agree with it, and,
     so that several lamps are told apart, the number of given frequencies that it accounts for.
+
+    Raises:
+        ReceiverError: several frequencies are given, and the regions fit them in more than one way.
     """
-    best, chosen = (-1, -1.0), 0.0
+    proposals = []
     for proposer in seen:
         for proposed in frequencies_hz:
             line_delay = 1 / (proposed * proposer.period_px)
-            used, weight = set(), 0.0
-            for stripes in seen:
-                match = _match(stripes, frequencies_hz, line_delay)
-                if match is not None:
-                    used.add(match)
-                    weight += _area(stripes) * stripes.explained
-            if (len(used), weight) > best:
-                best, chosen = (len(used), weight), line_delay
+            matches = [(s, _match(s, frequencies_hz, line_delay)) for s in seen]
+            weight = sum(_area(s) * s.explained for s, match in matches if match is not None)
+            used = {match for _, match in matches} - {None}
+            proposals.append((len(used), weight, line_delay))
+    n_used, weight, chosen = max(proposals)
+    far = [p for p in proposals if abs(np.log(p[2] / chosen)) > _SAME_LINE_DELAY]
+    if len(set(frequencies_hz)) > 1 and any(n == n_used and w > weight / 2 for n, w, _ in far):
+        rival = max(p for p in far if p[0] == n_used)[2]
+        raise ReceiverError(
+            f"the lamps that were found (periods of {_periods(seen)} px) fit the frequencies given in more than one "
+            f"way: {chosen * 1e6:.4g} or {rival * 1e6:.4g} us a row",
+            "give the frequencies of these lamps alone, or let all of the lamps show",
+        )
     return chosen
+
+
+def _periods(seen: list[Stripes]) -> str:
+    return ", ".join(f"{period:.4g}" for period in sorted(s.period_px for s in seen))
 
 
 def _match(stripes: Stripes, frequencies_hz: Sequence[float], line_delay: float) -> float | None:

@@ -96,8 +96,8 @@ STDIN = "-"
 @click.option("--out", type=_FOLDER, help="Write files that came whole into this folder, under their own names.")
 @click.option("--payloads", type=_FILE, help="Write one row a packet (CSV): where it is from, bits, hex, confidence.")
 @click.option(
-    "--no-camera-cache",
-    is_flag=True,
+    "--no-camera-cache/--camera-cache",
+    default=False,
     envvar="VLC_RX_NO_CAMERA_CACHE",
     help="Estimate unknown cameras anew, and remember none (see vlc-rx profiles forget). [env: VLC_RX_NO_CAMERA_CACHE]",
 )
@@ -124,16 +124,17 @@ def decode(paths: tuple[str, ...], **options: Any) -> int:
 
     cache = None if options["no_camera_cache"] else camera_cache_folder()
     configured = receiver_options(**receiver, camera_cache=cache, soft_bits=True)
-    tap = None
+    tap, after = None, None
     if options["save_undistorted"]:
         from rxcli.results.undistort import UndistortedWriter
 
         folder = Path(options["save_undistorted"]).absolute()
         tap = UndistortedWriter(folder, configured.cameras, configured.force_camera)
+        after = tap.finish
     sources = _sources(paths)
     _claim(options, sources)
     with _stdin_as_file(sources) as sources:
-        return _Run(standard_decoder(configured, tap), options).run(sources)
+        return _Run(standard_decoder(configured, tap, after), options).run(sources)
 
 
 def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rxcli.cli.common import claim_outputs, complete_files, force_argument, receiver_arguments, receiver_options
-from rxcli.errors import ExitCode, InputError, OutputError
+from rxcli.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
     from rxcli.options import ReceiverOptions
@@ -38,7 +38,7 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
 
     Of a clip, the first frames are received, and one is shown in full.
     """
-    from rxcli.outputs import Output, write_whole
+    from rxcli.outputs import Output, unwritable, write_whole
     from rxcli.results.overlay import camera_of
     from rxcli.results.page import MARK, inspection_page
 
@@ -56,7 +56,7 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
         folder.mkdir(parents=True, exist_ok=True)
         (folder / _MARKER).touch()
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be written ({error.strerror})", "name another folder with --out") from None
+        raise unwritable(folder, error) from None
     write_whole(page, text)
     click.echo(page)
     received = any(column.packets for result in results for column in result.columns)

@@ -56,6 +56,9 @@ def train(
     for package in ("torch", "onnx", "matplotlib"):
         if find_spec(package) is None:
             raise UsageError(f"training needs {package}, which is not installed", "run: pip install 'vlc-rx[train]'")
+    from rxcli.outputs import claim_folder
+
+    claim_folder("OUT", out)
     from rxcli.lab.training import dataset, export, fit
     from rxcli.lab.training.network import Shape, n_parameters
 

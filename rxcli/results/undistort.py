@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from rxcli.outputs import PICTURE, check_replaceable, encode_png, unwritable, write_whole
 from rxcli.profiles import CameraProfile, match_camera
 from rxcli.receiver.screen.geometry import lens_for
-from rxcli.types import Frame, Lens
+from rxcli.types import Frame, FrameResult, Lens
 
 log = logging.getLogger(__name__)
+
+#: Frames that may wait for their result: a clip's come some frames later.
+_MOST_WAITING = 48
 
 
 def undistorted(frame: Frame, lens: Lens) -> NDArray[np.uint8]:
@@ -60,25 +63,51 @@ def _mosaic_grey(frame: Frame) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, slots=True)
 class UndistortedWriter:
-    """Writes every frame it is given into a folder, undistorted, as PNG; picklable."""
+    """Writes every frame it is given into a folder, undistorted, as PNG; picklable.
+
+    A frame whose lens no profile tells waits for its result, which may hold an estimated lens.
+    """
 
     folder: Path
     cameras: tuple[CameraProfile, ...]
     #: Take the first camera whatever the file says of itself.
     force_camera: bool = False
+    #: Frames that wait, by source and index.
+    _waiting: dict[tuple[str, int], Frame] = field(default_factory=dict, compare=False)
 
     def __call__(self, frame: Frame, subfolder: str = "") -> None:
-        """Write `frame` into a subfolder; one whose lens is not known is passed over with a warning.
+        """Write `frame` into a subfolder, or keep it until its result comes.
 
         Raises:
             OutputError: the file cannot be written, or is there and none of ours.
         """
         lens = self._lens(frame)
-        if lens is None:
-            log.warning(
-                "%s: no camera profile with a lens fits; not undistorted (name one with --camera)", frame.source
-            )
+        if lens is not None:
+            self._write(frame, lens, subfolder)
             return
+        self._waiting[frame.source, frame.index] = frame
+        while len(self._waiting) > _MOST_WAITING:
+            self._give_up(self._waiting.pop(next(iter(self._waiting))))
+
+    def finish(self, result: FrameResult, subfolder: str = "") -> None:
+        """Write the frame that a result is of, if it has waited; one without a lens is passed over with a warning.
+
+        Raises:
+            OutputError: the file cannot be written, or is there and none of ours.
+        """
+        from rxcli.results.overlay import camera_of
+
+        frame = self._waiting.pop((result.source, result.frame), None)
+        if frame is None:
+            return
+        camera = camera_of(frame, result, self.cameras)
+        lens = lens_for(camera.lens, frame.width, frame.height) if camera and camera.lens else None
+        if lens is None:
+            self._give_up(frame)
+        else:
+            self._write(frame, lens, subfolder)
+
+    def _write(self, frame: Frame, lens: Lens, subfolder: str) -> None:
         path = self.folder / subfolder / f"{Path(frame.source).name}.{frame.index:05d}.png"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -86,6 +115,14 @@ class UndistortedWriter:
             raise unwritable(path, error) from None
         check_replaceable(path, PICTURE, "--save-undistorted")
         write_whole(path, encode_png(undistorted(frame, lens)))
+
+    @staticmethod
+    def _give_up(frame: Frame) -> None:
+        log.warning(
+            "%s: no camera profile with a lens fits, and none could be estimated; not undistorted (name one with "
+            "--camera)",
+            frame.source,
+        )
 
     def _lens(self, frame: Frame) -> Lens | None:
         meta = frame.metadata

@@ -130,6 +130,8 @@ class Decoder:
     receive: Receive
     #: Sees every frame before it is received, and the subfolder of its source.
     tap: Callable[[Frame, str], None] | None = None
+    #: Sees every result, and the subfolder of its source.
+    after: Callable[[FrameResult, str], None] | None = None
     #: Screens whose messages and files are looked for; empty: none are.
     link_screens: tuple[ScreenProfile, ...] = ()
 
@@ -147,7 +149,10 @@ class Decoder:
             if source.problem:
                 raise InputError(source.problem)
             for result in self.linked(self.receive(failure.guard(self._frames(source)), self._options_of(source))):
-                yield replace(result, source=source.name)
+                result = replace(result, source=source.name)
+                if self.after is not None:
+                    self.after(result, source.subfolder)
+                yield result
                 count += 1
         except (UsageError, ProfileError, OutputError):
             raise
@@ -231,12 +236,16 @@ def unreadable(source: Source, frame: int, message: str) -> FrameResult:
     return FrameResult(source=source.name, frame=frame, time_s=0.0, status="unreadable", message=message)
 
 
-def standard_decoder(options: ReceiverOptions, tap: Callable[[Frame, str], None] | None = None) -> Decoder:
+def standard_decoder(
+    options: ReceiverOptions,
+    tap: Callable[[Frame, str], None] | None = None,
+    after: Callable[[FrameResult, str], None] | None = None,
+) -> Decoder:
     """The decoder that reads files and receives them."""
     from rxcli.ingest import open_source
     from rxcli.receiver.pipeline import receive
 
-    return Decoder(options, open_source, receive, tap, options.screens if options.soft_bits else ())
+    return Decoder(options, open_source, receive, tap, after, options.screens if options.soft_bits else ())
 
 
 def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded]:

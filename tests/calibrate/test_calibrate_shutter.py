@@ -14,6 +14,7 @@ from rxcli.calibrate.frames import light_of
 from rxcli.calibrate.periodic import explained_share, fit_fundamental, fit_periodic, longest_block, noise_spectrum
 from rxcli.calibrate.saving import profile_to_extend, with_mode, write_profile
 from rxcli.calibrate.shutter import calibrate_shutter, find_stripes
+from rxcli.calibrate.spots import find_spots
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode, ProfileError, ReceiverError, UsageError
 from rxcli.profiles import CameraProfile, ReadoutMode, load_profile
@@ -117,6 +118,67 @@ def test_a_lamp_that_was_not_named_is_told() -> None:
     result = calibrate_shutter([exposed(big + small, np.random.default_rng(6))], [1000])
     assert result.line_delay_s == pytest.approx(LINE_DELAY_S, rel=2e-3)
     assert any("1900" in warning or "190" in warning for warning in result.warnings)
+
+
+LAMPS_HZ = [2000, 2500, 3000, 3500, 4000]
+
+
+def dark_photo(seed: int, radius: float, steady: bool = False) -> tuple[Any, list[tuple[float, int, int]]]:
+    """A dark picture of five spots of different lamps, one of them faint, with halos; frequency and centre of each."""
+    rng = np.random.default_rng(seed)
+    height, width = 1080, 1920
+    light = np.zeros((height, width))
+    placed = []
+    for x, frequency in zip(rng.permutation(np.linspace(0.12, 0.88, 5)) * width, LAMPS_HZ, strict=True):
+        y, size = height * rng.uniform(0.3, 0.7), radius * rng.uniform(0.8, 1.25)
+        brightness = 0.15 if frequency == 3000 else 1.5
+        shape = spot(height, width, x, y, size) + 0.03 * spot(height, width, x, y, 3 * size)
+        light += brightness * lamp(frequency, height, 1 / 8000, 0.5, rng.random())[:, None] * shape
+        placed.append((frequency, int(x), int(y)))
+    if steady:
+        light += spot(height, width, width / 2, 0.9 * height, radius)
+    return exposed(light, rng, 0.03, 1.0), placed
+
+
+@pytest.mark.parametrize(("seed", "radius", "steady"), [(1, 40, False), (2, 75, True), (3, 60, False)])
+def test_five_spots_in_a_dark_picture_are_five_regions_and_one_readout(seed: int, radius: float, steady: bool) -> None:
+    picture, placed = dark_photo(seed, radius, steady)
+    result = calibrate_shutter([picture], LAMPS_HZ)
+    assert result.axis == "rows"
+    assert result.line_delay_s == pytest.approx(LINE_DELAY_S, rel=1e-3)
+    low, high = result.line_delay_interval_s
+    assert low - np.ptp([low, high]) < LINE_DELAY_S < high + np.ptp([low, high])
+    regions = {reading.frequency_hz: reading.stripes.bounds for reading in result.lamps}
+    assert set(regions) == set(LAMPS_HZ)
+    assert result.warnings == ()
+    for frequency, x, y in placed:
+        left, top, right, bottom = regions[frequency]
+        assert left <= x <= right
+        assert top <= y <= bottom
+
+
+def test_lamps_that_fit_in_two_ways_are_refused() -> None:
+    """One lamp may be either of two; two lamps an octave apart may be any two of four."""
+    alone = lamp(1000, 800, 1e-4)[:, None] * spot(800, 640, 320, 400, 150)
+    with pytest.raises(ReceiverError, match=r"fit the frequencies given in more than one way: (20|27\.4) or"):
+        calibrate_shutter([exposed(alone, np.random.default_rng(20))], [1000, 1370])
+    left = lamp(1000, 800, 1e-4)[:, None] * spot(800, 640, 150, 400, 130)
+    right = lamp(2000, 800, 1e-4)[:, None] * spot(800, 640, 490, 380, 130)
+    picture = exposed(left + right, np.random.default_rng(21))
+    with pytest.raises(ReceiverError, match="more than one way"):
+        calibrate_shutter([picture], [500, 1000, 2000, 4000])
+    assert calibrate_shutter([picture], [1000, 2000]).line_delay_s == pytest.approx(LINE_DELAY_S, rel=1e-3)
+
+
+def test_spots_are_found_in_dark_pictures_only() -> None:
+    picture, placed = dark_photo(4, 75)
+    boxes = find_spots(picture)
+    assert len(boxes) == 5
+    assert all(any(a <= x <= c and b <= y <= d for a, b, c, d in boxes) for _, x, y in placed)
+    assert find_spots(textured(np.random.default_rng(22))) == []
+    assert find_spots(np.zeros((300, 400))) == []
+    noise = np.random.default_rng(23).standard_normal((300, 400))
+    assert find_spots(0.01 + 0.001 * noise) == []
 
 
 def textured(rng: np.random.Generator) -> Any:
@@ -342,6 +404,18 @@ def test_rotated_pictures_give_no_mode(tmp_path: Path, capsys: pytest.CaptureFix
     capsys.readouterr()
     assert run([*arguments, "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["axis"] == "columns"
+
+
+def test_a_photo_of_five_leds(shared_real: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A dark phone photo of five spots of 2 to 4 kHz, 47.54 thousand rows a second."""
+    found = sorted(path for path in (shared_real / "shutter").iterdir() if "led" in path.name.casefold())
+    if not found:
+        pytest.skip(f"needs a photo of five LEDs in {shared_real / 'shutter'}")
+    lamps = [word for frequency in LAMPS_HZ for word in ("--frequency", str(frequency))]
+    assert run(["calibrate", "shutter", str(found[0]), *lamps, "--json", "-"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert 1 / record["line_delay_s"] == pytest.approx(47_540, rel=2e-3)
+    assert {lamp["frequency_hz"] for lamp in record["lamps"]} >= set(LAMPS_HZ)
 
 
 def test_nikon_led(shared_real: Path, capsys: pytest.CaptureFixture[str]) -> None:

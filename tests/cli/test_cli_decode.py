@@ -22,6 +22,8 @@ import pytest
 from small_frames import N_COLUMNS, W, write_frame, write_profiles
 
 from rxcli.cli.main import run
+from rxcli.results.undistort import UndistortedWriter
+from rxcli.types import Frame, FrameResult
 
 Decode = Callable[..., tuple[int, str, str]]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
@@ -241,6 +243,37 @@ def test_undistorted_pictures_need_a_lens(tmp_path: Path, decode: Decode) -> Non
     [straight] = (tmp_path / "straight").iterdir()
     assert straight.name == "a.png.00000.png"
     assert straight.read_bytes() != (tmp_path / "a.png").read_bytes()
+
+
+def test_a_frame_without_a_profile_waits_for_the_lens_that_is_estimated(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A line that the lens has bent comes out straight; where nothing is estimated, a warning says so."""
+    width, height, k1 = 640, 480, -0.3
+    y, x = np.mgrid[0:height, 0:width].astype(np.float64)
+    matrix = np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1]], np.float64)
+    points = np.stack([x, y], -1).reshape(-1, 1, 2)
+    coefficients = np.array([k1, -k1, 0, 0, 0])
+    ideal_y = cv2.undistortPoints(points, matrix, coefficients, P=matrix)[:, 0, 1].reshape(height, width)
+    bent = np.where(ideal_y < 60, 30, 220).astype(np.uint8)
+    estimated = {"line_delay_s": (1e-5, 1e-9), "k1": (k1, 0.0), "k2": (-k1, 0.0), "distortion_corrected": (0.0, 0.0)}
+    writer = UndistortedWriter(tmp_path, ())
+    frames = [Frame(bent, "a.png", index=index) for index in range(2)]
+    for frame in frames:
+        writer(frame)
+    assert list(tmp_path.iterdir()) == []
+    writer.finish(FrameResult("a.png", 0, 0.0, "ok", estimated=estimated))
+    writer.finish(FrameResult("a.png", 1, 0.0, "no_screen"))
+    [path] = tmp_path.iterdir()
+    assert path.name == "a.png.00000.png"
+    assert "none could be estimated" in caplog.text
+
+    def border(picture: Any) -> Any:
+        return np.argmax(picture > 125, axis=0)
+
+    straight = border(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    assert np.ptp(border(bent)) >= 6
+    assert np.ptp(straight) <= 1
 
 
 def test_worker_processes_change_nothing_but_the_time(tmp_path: Path, decode: Decode) -> None:
