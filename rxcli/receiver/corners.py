@@ -56,6 +56,11 @@ def outside_the_picture(corners: FloatArray, frame: Frame) -> Failure | None:
     return None
 
 
+def may_fill(frame: Frame) -> bool:
+    """Whether a part of a screen that fills the picture could be received at all."""
+    return min(frame.width, frame.height) >= _LEAST_ROWS
+
+
 def whole_picture(frame: Frame) -> FloatArray:
     """(4, 2) the picture's own corners, the viewer's top left first: it may show nothing but a part of the screen."""
     right, bottom = frame.width - 1.0, frame.height - 1.0

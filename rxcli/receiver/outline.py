@@ -19,6 +19,7 @@ from rxcli.receiver.cameras import context_at, known_lens
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.corners import (
     levels_of,
+    may_fill,
     outside_the_picture,
     turned_pixels,
     unreadable_orientation,
@@ -121,7 +122,7 @@ def locate(frame: Frame, options: ReceiverOptions, timer: Timer) -> Located | Fa
         located = _by_packets(frame, candidates, options, timer)
     if located:
         return located
-    if "no_screen" in options.skip:
+    if "no_screen" in options.skip or not may_fill(frame):
         return Failure("no_screen", f"no screen found: {reason}")
     return Located(Outline(whole_picture(frame), inferred=SIDE_NAMES, column_offset=None))
 

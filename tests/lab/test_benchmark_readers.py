@@ -5,10 +5,17 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from rxcli.cli.main import run
 from rxcli.lab.benchmark import readers
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory: pytest.TempPathFactory) -> readers.Cases:
+    return readers.Cases(tmp_path_factory.mktemp("cases"), lambda arguments: int(run(arguments)))
 
 
 def test_the_same_seed_makes_the_same_case() -> None:
@@ -18,8 +25,30 @@ def test_the_same_seed_makes_the_same_case() -> None:
     assert sum(case != data for case in cases) > 45
 
 
-def test_what_goes_wrong_is_a_problem_with_its_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cases = readers.Cases(tmp_path, lambda arguments: int(run(arguments)))
+def test_unharmed_samples_are_received(cases: readers.Cases, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is mutated must be good at first, or nothing is tried beyond the first check."""
+    path = cases.folder / "sample.png"
+    path.write_bytes(cases.samples["known/a.png"])
+    assert run(["decode", str(path), *cases.pictures["known"].options]) == 0
+    assert "6 packets in 6 of 6 columns" in capsys.readouterr().out
+    rng = random.Random(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(readers, "_mutated_text", lambda data, _rng: data)
+        for kind in ("screen", "camera", "truth", "journal", "baseline", "config", "gyroflow"):
+            assert run(getattr(cases, f"_{kind}")(rng)) == 0, kind
+
+
+def test_damaged_pngs_can_have_right_checksums(cases: readers.Cases) -> None:
+    data = cases.samples["thumb/a.png"]
+    assert readers.with_checksums(data) == data
+    damaged = data[:-20] + b"\x55\x55" + data[-18:]
+    assert damaged != data
+    repaired = readers.with_checksums(damaged)
+    assert repaired not in (data, damaged)
+    assert readers.with_checksums(repaired) == repaired
+
+
+def test_what_goes_wrong_is_a_problem_with_its_seed(cases: readers.Cases, monkeypatch: pytest.MonkeyPatch) -> None:
     assert cases.run(1)["problems"] == []
     monkeypatch.setattr(readers, "_call", lambda *_: (1, "vlc-rx: internal error (IndexError: 5)"))
     record = cases.run(7)
@@ -36,7 +65,45 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "3 cases with seeds from 2000000 on" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("seed", [77000206, 77000377])
-def test_a_clock_that_runs_away_is_no_clock(seed: int, tmp_path: Path) -> None:
+# What mutated files have found, as small as it gets.
+
+
+def _outcome(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    assert run(["decode", *arguments, "--no-camera-cache"]) in (1, 3)
+    said = capsys.readouterr()
+    assert "internal error" not in said.out + said.err
+    return said.out
+
+
+@pytest.mark.parametrize(
+    ("seed", "name", "options"),
+    [(77000206, "a.ts", ["--no-skip", "no_screen"]), (77000377, "a.webp", [])],
+    ids=["a.ts", "a.webp"],
+)
+def test_a_clock_that_runs_away_is_no_clock(
+    seed: int,
+    name: str,
+    options: list[str],
+    cases: readers.Cases,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Least squares on damaged pictures went to negative periods, or out of the picture, and ended in an error."""
-    assert readers.Cases(tmp_path, lambda arguments: int(run(arguments))).run(seed)["problems"] == []
+    rng, data = random.Random(seed), cases.samples[f"blind/{name}"]
+    rng.random()  # the kind of the case, and the sample: what was drawn first
+    rng.choice(range(17))
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        data = rng.choice(readers.MUTATIONS)(data, rng)
+    path = tmp_path / name
+    path.write_bytes(data)
+    _outcome([str(path), *options], capsys)
+
+
+@pytest.mark.parametrize("height", [1, 2, 24, 47, 66])
+def test_few_rows_are_no_reason_for_an_error(height: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The search for curved stripes compared more rows than there were."""
+    rows = np.repeat(np.random.default_rng(height).integers(0, 2, -(-height // 3)) * 180 + 30, 3)[:height]
+    flat = np.repeat(rows[:, None], 300, axis=1).astype(np.uint8)
+    for name, picture in (("flat.png", flat), ("narrow.png", np.ascontiguousarray(flat.T))):
+        assert cv2.imwrite(str(tmp_path / name), picture)
+        _outcome([str(tmp_path / name), "--no-skip", "no_screen"], capsys)

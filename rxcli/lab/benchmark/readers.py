@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -28,6 +29,10 @@ from queue import Empty, Queue
 from threading import Thread
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.protocol import bits_to_hex, encode_packet, payload_bits
 from rxcli.resources import data_dir
 
 #: What one process may take: resident memory, and time for one case on a machine of its own.
@@ -39,16 +44,41 @@ _ENOUGH = 77
 #: Bytes that decide much: ends of ranges, and what formats count with.
 _TELLING = (b"\0", b"\xff", b"\x7f", b"\x80", b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\0\0\0\0", b"\x01\0\0\0")
 _NUMBERS = ("nan", "inf", "-inf", "-1", "0", "1e999", "1e-999", "9" * 5000, "x", "", "1,2", "0x10", "٣")
+_PLAUSIBLE = ("0", "1", "2", "7", "19", "64", "1000", "0.5", "1.5", "-1", "1e-6", "1e6", "1e300", "4294967296", "0.0")
+_WORDS = ("true", "null", "[]", "{}", '"x"', "[" * 50_000, "1e308", "-5", "4294967296")
 _OPTIONS = (
-    "--min-confidence",
-    "--max-ber",
-    "--min-packets",
-    "--workers",
-    "--cae",
-    "--corners",
-    "--no-skip",
-    "--camera",
+    *("--min-confidence", "--max-ber", "--min-packets", "--workers", "--cae", "--corners", "--no-skip", "--camera"),
+    *("--screen", "--truth", "--baseline", "--slower", "--min-packet-confidence", "--cluster"),
 )
+#: What is mutated, and how often of a hundred.
+_KINDS = {
+    "file": 60,
+    "screen": 7,
+    "camera": 7,
+    "truth": 6,
+    "journal": 6,
+    "option": 6,
+    "config": 3,
+    "gyroflow": 3,
+    "baseline": 2,
+}
+#: The drawn screen: height and width of its picture, and what it sends.
+_SIZE, _BORDER, _COLUMN_PX, _ROWS_PER_SLOT = (256, 140), 10, 20, 3
+_COLUMNS, _SYMBOLS, _LIT = 6, 3, 5
+_BLIND_PX = 256
+_GYROFLOW = {
+    "camera_brand": "Maker",
+    "camera_model": "M 1",
+    "lens_model": "15 mm",
+    "calib_dimension": {"w": 3840, "h": 2160},
+    "frame_readout_time": 14.5,
+    "fps": 30.0,
+    "input_horizontal_stretch": 1.0,
+    "fisheye_params": {
+        "camera_matrix": [[2600.0, 0, 1910.0], [0, 2610.0, 1085.0], [0, 0, 1]],
+        "distortion_coeffs": [0.3, 0.1, -0.2, 0.1],
+    },
+}
 
 Mutate = Callable[[bytes, random.Random], bytes]
 Program = Callable[[list[str]], int]
@@ -56,12 +86,12 @@ Program = Callable[[list[str]], int]
 _START = "from rxcli.cli.main import run; from rxcli.lab.benchmark.readers import serve; serve(run)"
 
 
-def _change_bytes(data: bytes, rng: random.Random) -> bytes:
+def _change_bytes(data: bytes, rng: random.Random, most: int = 64) -> bytes:
     changed = bytearray(data)
     # Headers decide most, and are small: half of the changes go there.
-    for _ in range(rng.choice((1, 2, 4, 16, 64))):
-        most = len(changed) if rng.random() < 0.5 else min(len(changed), 512)
-        changed[rng.randrange(most)] = rng.randrange(256)
+    for _ in range(rng.choice([n for n in (1, 2, 4, 16, 64) if n <= most])):
+        stop = len(changed) if rng.random() < 0.5 else min(len(changed), 512)
+        changed[rng.randrange(stop)] = rng.randrange(256)
     return bytes(changed)
 
 
@@ -90,30 +120,110 @@ def _swap(data: bytes, rng: random.Random) -> bytes:
     return data[b:] + data[a:b] + data[:a]
 
 
-_MUTATIONS: tuple[Mutate, ...] = (_change_bytes, _change_bytes, _put_telling, _put_telling, _cut, _repeat, _drop, _swap)
+MUTATIONS: tuple[Mutate, ...] = (_change_bytes, _change_bytes, _put_telling, _put_telling, _cut, _repeat, _drop, _swap)
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
-    """`data` with one to three things done to it."""
+    """`data` with one to three things done to it; often with little, which gets beyond the first checks."""
+    if rng.random() < 0.35:
+        return _change_bytes(data, rng, most=3)
     for _ in range(rng.choice((1, 1, 2, 3))):
-        data = rng.choice(_MUTATIONS)(data, rng) or b"\0"
+        data = rng.choice(MUTATIONS)(data, rng) or b"\0"
     return data
 
 
-def make_samples(folder: Path) -> dict[str, bytes]:
-    """A small valid file of every format, by name; a frame of a shipped sample where it is a picture."""
-    import av
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """One sort of picture, which is written in every format."""
+
+    #: (height, width, 3) uint8, RGB.
+    picture: NDArray[np.uint8]
+    #: How often it is taken, of all.
+    weight: int
+    #: Options that go with it.
+    options: tuple[str, ...] = ()
+
+
+def _pictures(folder: Path) -> dict[str, _Kind]:
+    """The pictures: what is refused at a glance costs little, and what is decoded goes through the whole receiver.
+
+    Args:
+        folder: where the profiles of the drawn screen are written.
+    """
     import cv2
-    import numpy as np
+
+    source = cv2.imread(str(data_dir("sample_frames") / "phone_chelsea_17k3.jpg"))
+    assert source is not None
+    names = write_profiles(folder)
+    kinds = {"known": _Kind(np.repeat(drawn_screen()[..., None], 3, axis=2), 3, tuple(names))}
+    for name, width, weight in (("blind", _BLIND_PX, 1), ("small", 144, 2), ("thumb", 64, 2)):
+        picture = cv2.resize(source, (width, width * 3 // 4), interpolation=cv2.INTER_AREA)[..., ::-1]
+        kinds[name] = _Kind(np.ascontiguousarray(picture, np.uint8), weight)
+    return kinds
+
+
+def drawn_screen(seed: int = 1) -> NDArray[np.uint8]:
+    """(256, 140) a screen of six columns that fills a picture but for its border; it decodes in no time."""
+    payloads = _payloads(seed)
+    burst = np.stack([np.tile(encode_packet(payload, _LIT), 3) for payload in payloads])
+    light = np.repeat(burst, _ROWS_PER_SLOT, axis=1)[:, : _SIZE[0] - 2 * _BORDER].T
+    picture = np.full(_SIZE, 8, np.uint8)
+    picture[_BORDER:-_BORDER, _BORDER:-_BORDER] = 20 + 180 * np.repeat(light, _COLUMN_PX, axis=1)
+    return picture
+
+
+def _payloads(seed: int) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(seed)
+    return rng.integers(0, 2, (_COLUMNS, payload_bits(_LIT, _SYMBOLS)), dtype=np.uint8)
+
+
+def _truth_of(seed: int) -> dict[str, Any]:
+    payloads = _payloads(seed)
+    return {
+        "capture": "drawn",
+        "columns": _COLUMNS,
+        "payload_symbols": _SYMBOLS,
+        "w": [_LIT] * _COLUMNS,
+        "payload_bits": [payloads.shape[1]] * _COLUMNS,
+        "frames": [{"frame": 0, "bursts": [{"burst": 0, "visible_slots": 80.0}]}],
+        "payload": {"0": [bits_to_hex(payload) for payload in payloads]},
+    }
+
+
+def write_profiles(folder: Path) -> list[str]:
+    """Write the drawn screen's profile and its camera's; returns the options that name them, and its corners."""
+    (height, width), folder_of = _SIZE, folder.joinpath
+    folder_of("screen.toml").write_text(
+        f'format = 1\nkind = "screen"\nname = "drawn"\ncolumns = {_COLUMNS}\nslot_rate_hz = 10000.0\n'
+        f"payload_symbols = {_SYMBOLS}\nlight_spread = 0.45\n"
+    )
+    folder_of("camera.toml").write_text(
+        f'format = 1\nkind = "camera"\nname = "drawn"\ntone = "linear"\n\n[[modes]]\nname = "still"\n'
+        f"width = {width}\nheight = {height}\nline_delay_s = {1e-4 / _ROWS_PER_SLOT}\nexposure_s = 1e-5\n\n"
+        f"[lens]\nwidth = {width}\nheight = {height}\ncamera_matrix = [[200.0, 0.0, 70.0], [0.0, 200.0, 128.0], "
+        "[0.0, 0.0, 1.0]]\ndist_coeffs = [0.0, 0.0, 0.0, 0.0, 0.0]\n"
+    )
+    left, top, right, bottom = _BORDER, _BORDER, width - _BORDER - 1, height - _BORDER - 1
+    corners = [f"{x},{y}" for x, y in ((left, top), (right, top), (right, bottom), (left, bottom))]
+    names = ["--screen", str(folder_of("screen.toml")), "--camera", str(folder_of("camera.toml"))]
+    return [*names, "--corners", *corners]
+
+
+def make_samples(folder: Path, picture: NDArray[np.uint8]) -> dict[str, bytes]:
+    """A small valid file of every format that shows `picture`, by name."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_stills(folder, picture)
+    _write_clips(folder, picture)
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
+
+
+def _write_stills(folder: Path, picture: NDArray[np.uint8]) -> None:
+    import cv2
     import tifffile
     from PIL import Image
 
-    folder.mkdir(parents=True, exist_ok=True)
-    source = cv2.imread(str(data_dir("sample_frames") / "phone_chelsea_17k3.jpg"))
-    assert source is not None
-    picture = np.ascontiguousarray(cv2.resize(source, (256, 192), interpolation=cv2.INTER_AREA)[..., ::-1])
     image, exif = Image.fromarray(picture), Image.Exif()
-    exif[0x010F], exif[0x0110], exif.get_ifd(0x8769)[0x829A] = "Example", "Camera", 1 / 8000
+    exif[0x010F], exif[0x0110], exif.get_ifd(0x8769)[0x829A] = "Example", "Camera", 1e-5
     image.save(folder / "a.jpg", exif=exif)
     image.save(folder / "progressive.jpg", progressive=True)
     image.save(folder / "a.png", exif=exif)
@@ -138,17 +248,25 @@ def make_samples(folder: Path) -> dict[str, bytes]:
     ]
     mosaic = picture[..., 1].astype(np.uint16) * 16
     tifffile.imwrite(folder / "a.dng", mosaic, photometric=32803, extratags=tags, metadata=None)
+
+
+def _write_clips(folder: Path, picture: NDArray[np.uint8]) -> None:
+    import av
+    import cv2
+
+    height, width = picture.shape[:2]
+    if width == _BLIND_PX:  # every frame of it is looked at for long
+        width, height = 160, 120
+    frame_rgb = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
     for name, codec in (("a.mp4", "libx264"), ("a.avi", "mjpeg"), ("a.mkv", "mjpeg"), ("a.ts", "libx264")):
         with av.open(str(folder / name), "w") as container:
             stream = container.add_stream(codec, rate=30)
-            stream.width, stream.height = 160, 120
+            stream.width, stream.height = width, height
             stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-            small = cv2.resize(picture, (160, 120), interpolation=cv2.INTER_AREA)
             for _ in range(4):
-                frame = av.VideoFrame.from_ndarray(small, "rgb24").reformat(format=stream.pix_fmt)
+                frame = av.VideoFrame.from_ndarray(frame_rgb, "rgb24").reformat(format=stream.pix_fmt)
                 container.mux(stream.encode(frame))
             container.mux(stream.encode())
-    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
 
 
 @dataclass
@@ -186,22 +304,39 @@ class Cases:
 
     def __init__(self, folder: Path, program: Program) -> None:
         self._program = program
-        self._samples = make_samples(folder / "samples")
-        self._work = folder / f"work-{os.getpid()}"
-        self._work.mkdir(exist_ok=True)
-        shipped = data_dir("calibration")
-        self._texts = {
-            "screen": (shipped / "screens" / "paper-17k3.toml").read_bytes(),
-            "camera": (data_dir("sample_frames") / "phone12.toml").read_bytes(),
-            "truth": (data_dir("sample_frames") / "phone_chelsea_17k3.truth.json").read_bytes(),
+        #: Scratch files of this process.
+        self.folder = folder / f"work-{os.getpid()}"
+        self._home = self.folder / "home"
+        self._home.mkdir(parents=True, exist_ok=True)
+        self.pictures = _pictures(self.folder)
+        self.samples = {
+            f"{kind}/{name}": data
+            for kind, of in self.pictures.items()
+            for name, data in make_samples(folder / "samples" / kind, of.picture).items()
         }
+        self._known = list(self.pictures["known"].options)
+        self._texts = {
+            "screen": (self.folder / "screen.toml").read_bytes(),
+            "camera": (self.folder / "camera.toml").read_bytes(),
+            "shipped": (data_dir("calibration") / "screens" / "paper-17k3.toml").read_bytes(),
+            "truth": json.dumps(_truth_of(1)).encode(),
+            "config": b'screen = ["paper-17k3"]\ncamera = "phone12"\nworkers = 1\n',
+            "gyroflow": json.dumps(_GYROFLOW).encode(),
+        }
+        for number in (1, 2):
+            self._write_good(number)
         self._whole: bytes | None = None
 
     def run(self, seed: int) -> dict[str, Any]:
         """Run one case; what came of it."""
         rng = random.Random(seed)
-        kind = rng.choices(("file", "screen", "camera", "truth", "journal", "option"), (60, 8, 8, 8, 8, 8))[0]
-        name, arguments = self._file(rng) if kind == "file" else (kind, getattr(self, f"_{kind}")(rng))
+        kind = rng.choices(list(_KINDS), list(_KINDS.values()))[0]
+        with _environment(VLC_RX_HOME=str(self._home), XDG_CACHE_HOME=str(self.folder / "cache")):
+            (self._home / "config.toml").unlink(missing_ok=True)
+            name, arguments = self._file(rng) if kind == "file" else (kind, getattr(self, f"_{kind}")(rng))
+            return self._outcome(seed, name, arguments)
+
+    def _outcome(self, seed: int, name: str, arguments: list[str]) -> dict[str, Any]:
         began, cpu = time.monotonic(), time.process_time()
         code, text = _call(self._program, arguments)
         problems = [f"{name}: {line}" for line in text.splitlines() if "internal error" in line or "Traceback" in line]
@@ -212,63 +347,126 @@ class Cases:
             problems.append(f"{name}: {mb:.0f} MB")
         if min(cpu_s, time.monotonic() - began) > MOST_S:
             problems.append(f"{name}: {cpu_s:.0f} s")
-        problems = [problem[:300].replace(str(self._work), "") for problem in problems]
-        return {"seed": seed, "kind": name, "code": code, "s": round(cpu_s, 2), "mb": round(mb), "problems": problems}
+        problems = [problem[:300].replace(str(self.folder), "") for problem in problems]
+        kind = name.rpartition("/")[2]
+        return {"seed": seed, "kind": kind, "code": code, "s": round(cpu_s, 2), "mb": round(mb), "problems": problems}
 
     def _write(self, name: str, data: bytes) -> str:
-        path = self._work / name
+        path = self.folder / name
         path.write_bytes(data)
         return str(path)
 
+    def _write_good(self, number: int) -> None:
+        import cv2
+
+        cv2.imwrite(str(self.folder / f"good{number}.png"), drawn_screen(number))
+
+    def _good(self, number: int = 1) -> str:
+        return str(self.folder / f"good{number}.png")
+
     def _file(self, rng: random.Random) -> tuple[str, list[str]]:
-        name = rng.choice(list(self._samples))
-        path = self._write(f"mutated{Path(name).suffix}", mutated(self._samples[name], rng))
-        more = rng.choice(([], [], ["--no-skip", "no_screen"], ["--json", "-"], ["--screen", "paper-17k3"]))
-        return name, ["decode", path, *more]
+        weights = {kind: of.weight for kind, of in self.pictures.items()}
+        kind = rng.choices(list(weights), list(weights.values()))[0]
+        name = rng.choice([name for name in self.samples if name.startswith(f"{kind}/")])
+        data = mutated(self.samples[name], rng)
+        if name.endswith(".png") and rng.random() < 0.7:
+            data = with_checksums(data)
+        path = self._write(f"mutated{Path(name).suffix}", data)
+        taps = ["--dump-dir", str(self.folder / "taps"), "--save-undistorted", str(self.folder / "taps")]
+        more = rng.choice(([], [], ["--no-skip", "no_screen"], ["--json", "-"], ["--screen", "paper-17k3"], taps))
+        return name, ["decode", path, *self.pictures[kind].options, *more]
 
     def _screen(self, rng: random.Random) -> list[str]:
-        path = self._write("screen.toml", _mutated_text(self._texts["screen"], rng))
-        return rng.choice((["profiles", "validate", path], ["decode", self._good(), "--screen", path]))
+        path = self._write("changed.toml", _mutated_text(self._texts[rng.choice(("screen", "shipped"))], rng))
+        decode = ["decode", self._good(), *self._known, "--screen", path]
+        return rng.choice((["profiles", "validate", path], decode, decode))
 
     def _camera(self, rng: random.Random) -> list[str]:
-        path = self._write("camera.toml", _mutated_text(self._texts["camera"], rng))
-        return rng.choice((["profiles", "validate", path], ["decode", self._good(), "--camera", path]))
+        path = self._write("changed.toml", _mutated_text(self._texts["camera"], rng))
+        decode = ["decode", self._good(), *self._known[:2], *self._known[4:], "--camera", path]
+        return rng.choice((["profiles", "validate", path], decode, decode))
 
     def _truth(self, rng: random.Random) -> list[str]:
         path = self._write("truth.json", _mutated_text(self._texts["truth"], rng))
-        return ["decode", self._good(), "--truth", path, "--max-ber", "0.1"]
+        return ["decode", self._good(), *self._known, "--truth", path, "--max-ber", "0.1"]
+
+    def _config(self, rng: random.Random) -> list[str]:
+        (self._home / "config.toml").write_bytes(_mutated_text(self._texts["config"], rng))
+        return rng.choice((["profiles", "list"], ["decode", self._good(), *self._known]))
+
+    def _gyroflow(self, rng: random.Random) -> list[str]:
+        path = self._write("lens.json", _mutated_text(self._texts["gyroflow"], rng))
+        return ["calibrate", "gyroflow", path, "--json", "-"]
 
     def _option(self, rng: random.Random) -> list[str]:
-        option = rng.choice(_OPTIONS)
-        values = [rng.choice(_NUMBERS) for _ in range(4 if option == "--corners" else 1)]
-        if option == "--corners" and rng.random() < 0.7:
-            values = [f"{rng.uniform(-900, 900):.1f},{rng.uniform(-900, 900):.1f}" for _ in range(4)]
-        return ["decode", self._good(), option, *values, "--truth", "auto"]
+        arguments = ["decode", self._good(), *self._known, "--truth", "auto"]
+        for option in rng.sample(_OPTIONS, rng.choice((1, 1, 2))):
+            values = [rng.choice(_NUMBERS) for _ in range(4 if option == "--corners" else 1)]
+            if option == "--corners" and rng.random() < 0.7:
+                values = [f"{rng.uniform(-900, 900):.1f},{rng.uniform(-900, 900):.1f}" for _ in range(4)]
+            arguments += [option, *values]
+        return arguments
 
     def _journal(self, rng: random.Random) -> list[str]:
-        picture = self._good()
-        if self._whole is None:
-            out = self._work / "whole.jsonl"
-            _call(self._program, ["decode", picture, "--json", str(out), "--force"])
-            self._whole = out.read_bytes()
-        path = self._write("journal.jsonl", _mutated_text(self._whole, rng))
-        return ["decode", picture, "--json", path, "--resume"]
+        path = self._write("journal.jsonl", _mutated_text(self._results(), rng))
+        summary = ["--summary", str(self.folder / "summary.csv"), "--junit", str(self.folder / "junit.xml")]
+        return ["decode", *self._both(), "--json", path, "--resume", *rng.choice(([], summary))]
 
-    def _good(self) -> str:
-        path = self._work / "good.png"
-        if not path.exists():
-            path.write_bytes(self._samples["a.png"])
-        return str(path)
+    def _baseline(self, rng: random.Random) -> list[str]:
+        path = self._write("baseline.jsonl", _mutated_text(self._results(), rng))
+        return ["decode", *self._both(), "--baseline", path]
+
+    def _both(self) -> list[str]:
+        return [self._good(1), self._good(2), *self._known]
+
+    def _results(self) -> bytes:
+        """What a run over both pictures writes."""
+        if self._whole is None:
+            out = self.folder / "whole.jsonl"
+            _call(self._program, ["decode", *self._both(), "--json", str(out), "--force"])
+            self._whole = out.read_bytes()
+        return self._whole
+
+
+@contextlib.contextmanager
+def _environment(**values: str) -> Iterator[None]:
+    """The environment with these values: nobody's own profiles, settings and remembered cameras."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def with_checksums(data: bytes) -> bytes:
+    """A damaged PNG whose chunks have the checksums of what they hold: damage that goes beyond the first check."""
+    out, place = bytearray(data), 8
+    while place + 12 <= len(out):
+        end = place + 8 + int.from_bytes(out[place : place + 4], "big")
+        if end + 4 > len(out):
+            break
+        out[end : end + 4] = zlib.crc32(out[place + 4 : end]).to_bytes(4, "big")
+        place = end + 4
+    return bytes(out)
 
 
 def _mutated_text(data: bytes, rng: random.Random) -> bytes:
     """Text with numbers or words replaced, or bytes mutated."""
-    if rng.random() < 0.4:
+    way = rng.random()
+    if way < 0.35:
         return mutated(data, rng)
     words = re.findall(rb"[-0-9.e+]+|[A-Za-z_]+|[^\w]", data)
-    for _ in range(rng.choice((1, 2, 5))):
-        value = rng.choice((*_NUMBERS, "true", "null", "[]", "{}", '"x"', "[" * 50_000, "1e308", "-5", "4294967296"))
-        words[rng.randrange(len(words))] = value.encode()
+    numbers = [place for place, word in enumerate(words) if word[:1].isdigit()]
+    for _ in range(1 if way < 0.7 else rng.choice((1, 2, 5))):
+        if numbers and (way < 0.7 or rng.random() < 0.5):  # what may pass the first checks
+            words[rng.choice(numbers)] = rng.choice(_PLAUSIBLE).encode()
+        else:
+            words[rng.randrange(len(words))] = rng.choice((*_NUMBERS, *_WORDS)).encode()
     return b"".join(words)
 
 

@@ -69,7 +69,10 @@ def estimate_curvature(strips: Strips) -> tuple[FloatArray, float]:
 def strip_distances(strips: Strips) -> list[int]:
     per_column = strips.light.shape[0] // strips.n_columns
     steps = {max(1, round(distance * per_column)) for distance in _BEND_DISTANCES}
-    return sorted(step for step in steps if step < strips.light.shape[0])
+    n_strips, n_rows = strips.light.shape
+    if n_rows < 2 * _BEND_LAGS + _BEND_WINDOWS:
+        return []
+    return sorted(step for step in steps if step < n_strips)
 
 
 def _lag_correlations(strips: Strips, distance: int) -> tuple[Float32Array, FloatArray]:
