@@ -212,6 +212,29 @@ def motion(clips: int, frames: int, **run: Any) -> None:
     _say_written(write_outputs(run["out"], "motion", rows))
 
 
+@benchmark.command()
+@options(
+    ("--count", _COUNT, 100, "Pictures, every other one striped."),
+    ("--camera", ("unknown", "known"), "unknown", "What the receiver is told of the camera."),
+    ("--frames", _COUNT, 1, "Frames of each: clips in place of pictures."),
+    *_MANY,
+)
+def nodata(count: int, camera: str, frames: int, **run: Any) -> int:
+    """Pictures without data: dimmed screens, lamps, blinds, photographs, noise. Nothing may be reported of them.
+
+    Exit code 1 where a packet was reported.
+    """
+    from rxcli.errors import ExitCode
+    from rxcli.lab.benchmark import nodata as work
+    from rxcli.lab.benchmark.tables import titled, write_outputs
+
+    records = _random("nodata", work.packets_of, count, run, camera=camera, n_frames=frames)
+    rows, offenders = work.rows(records), work.offenders(records)
+    click.echo(titled([("pictures without data", rows), ("pictures that gave packets", offenders)]))
+    _say_written(write_outputs(run["out"], "nodata", rows, offenders))
+    return ExitCode.NOT_RECEIVED if offenders else ExitCode.OK
+
+
 def _check_sweeps(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
     from rxcli.lab.benchmark.sweeps import SWEEPS
 
