@@ -51,6 +51,8 @@ _COARSE_CELLS, _COARSE_BLUR, _COARSE_ITERATIONS = (4, 2), 0.8, 4
 #: screen whose texture is known from few frames: what is learned in a wrong place stays.
 _FINE_ITERATIONS, _CONVERGED = 3, 0.5
 _FIRST_ITERATIONS, _FIRST_CONVERGED = 7, 0.001
+#: Every so manieth row of cells is enough of a texture that is known well.
+_SOME_ROWS = 2
 #: Every so manieth row of cells tells whether a screen stands still; how far, in screen sizes, it and its corners may
 #: seem to have moved; and the share of the textures' correlation that must be left.
 _FEW_ROWS, _STILL_SHIFT, _STILL_CORNERS, _STILL_CORRELATION = 4, 0.0003, 0.0008, 0.97
@@ -141,6 +143,16 @@ class _Known:
 
 
 @dataclass(frozen=True, slots=True)
+class _AllKnown:
+    """What is known of the texture: of coarse cells, of fine ones, of these on some rows, and on a few."""
+
+    coarse: _Known
+    fine: _Known
+    some: _Known
+    few: _Known
+
+
+@dataclass(frozen=True, slots=True)
 class _Places:
     """Places v x u on the screen, and what is worked out of them once."""
 
@@ -200,10 +212,11 @@ class ScreenTexture:
         self._before = self._plane
         #: Frames so far, and what they taught of the texture; None where it has to be worked out anew.
         self._n_frames = 0
-        self._known_so_far: tuple[_Known, _Known, _Known] | None = None
+        self._known_so_far: _AllKnown | None = None
         across, down = _COARSE_CELLS
         self._coarse_places = _Places.of(_middles(self._u, across), _middles(self._v, down))
-        self._places, self._few_places = _Places.of(self._u, self._v), _Places.of(self._u, self._v[::_FEW_ROWS])
+        self._places = _Places.of(self._u, self._v)
+        self._some_places, self._few_places = (_Places.of(self._u, self._v[::n]) for n in (_SOME_ROWS, _FEW_ROWS))
         #: Correlation of the textures when the screen was found last, all of them looked at.
         self._correlation = 1.0
         self._read_last: tuple[Frame, _Texture] | None = None
@@ -216,14 +229,23 @@ class ScreenTexture:
         texture = self._texture_of(frame)
         if self._known_so_far is None:
             self._known_so_far = self._known()
-        coarse, fine, few = self._known_so_far
-        still = self._still(texture, few)
+        known = self._known_so_far
+        still = self._still(texture, known.few)
         if still is not None:
             return still
         expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
-        plane, _, _ = self._fit(_coarser(texture), coarse, (expected, expected), _COARSE_ITERATIONS)
-        iterations = _FIRST_ITERATIONS if self._n_frames <= _FIRST_FRAMES else _FINE_ITERATIONS
-        plane, covariance, self._correlation = self._fit(texture, fine, (plane, expected), iterations)
+        plane, _, _ = self._fit(_coarser(texture), known.coarse, (expected, expected), _COARSE_ITERATIONS)
+        if self._n_frames > _FIRST_FRAMES:
+            found = self._found(texture, known.some, (plane, expected), _FINE_ITERATIONS)
+            if found.tells:
+                return found
+            return self._found(texture, known.fine, (plane, expected), _FINE_ITERATIONS)
+        return self._found(texture, known.fine, (plane, expected), _FIRST_ITERATIONS)
+
+    def _found(
+        self, texture: _Texture, known: _Known, poses: tuple[FloatArray, FloatArray], iterations: int
+    ) -> Registration:
+        plane, covariance, self._correlation = self._fit(texture, known, poses, iterations)
         return Registration(self._lens_of(plane), covariance, self._correlation)
 
     def _still(self, texture: _Texture, few: _Known) -> Registration | None:
@@ -266,14 +288,16 @@ class ScreenTexture:
         self._value += (value - self._value) * (weight / np.maximum(total, np.float32(1e-6)))
         self._weight = np.minimum(total, np.float32(_MOST_WEIGHT))
 
-    def _known(self) -> tuple[_Known, _Known, _Known]:
-        """The texture so far, coarse and fine, and fine on a few rows."""
+    def _known(self) -> _AllKnown:
+        """The texture so far."""
         across, down = _COARSE_CELLS
         texture = _Texture(self._value, self._weight, 1, 1)
         # Blurred means of so many cells have so much less noise.
         fewer = across * down * (1 + 4 * np.pi * _COARSE_BLUR**2) / 2
         fine = _known(texture, 1.0, self._places)
-        return _known(_coarser(texture), fewer, self._coarse_places), fine, fine.every(_FEW_ROWS, self._few_places)
+        coarse = _known(_coarser(texture), fewer, self._coarse_places)
+        some, few = fine.every(_SOME_ROWS, self._some_places), fine.every(_FEW_ROWS, self._few_places)
+        return _AllKnown(coarse, fine, some, few)
 
     def _texture_of(self, frame: Frame) -> _Texture:
         """The texture of a frame; of the one that was asked for last, without reading it again."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.numerics import box_sums
-from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
+from rxcli.types import BoolArray, Float32Array, FloatArray
 
 #: Share of its weight that a frame keeps with every frame after it.
 MEMORY = 0.95
@@ -98,7 +98,8 @@ class KnownPicture:
         self._observed: Float32Array = np.zeros(inside.shape, np.float32)
         self._system: _System | None = None
         self._of_one: Float32Array | None = None
-        self._picture = self._error = self._light
+        #: The picture and its relative variance as they were made of what is known; None where that changed since.
+        self._made: tuple[Float32Array, Float32Array] | None = None
         #: (C,) variance of the columns' light over what was foreseen.
         self._excess = np.ones(inside.shape[0], np.float32)
 
@@ -110,9 +111,8 @@ class KnownPicture:
         if placement is None:
             return self
         other = copy(self)
-        other._light, other._observed = (
-            _resampled(values, placement.picture_row, beyond=False) for values in (self._light, self._observed)
-        )
+        picture, error = (_resampled(values, placement.picture_row, beyond=False) for values in self.picture())
+        other._made = picture, error
         other._inside = placement.inside.astype(np.float32)
         other._system = other._of_one = None
         return other
@@ -137,7 +137,7 @@ class KnownPicture:
         lit, observed = self._update_of(light, slots, trust, placement)
         self._light = self._light * np.float32(keep) + lit
         self._observed = self._observed * np.float32(keep) + observed
-        self._system = None
+        self._system = self._made = None
 
     def without(
         self, light: Float32Array, slots: Float32Array, trust: Float32Array, placement: Placement | None = None
@@ -155,7 +155,7 @@ class KnownPicture:
         lit, observed = self._update_of(light, slots, trust, placement)
         other = copy(self)
         other._light, other._observed = self._light - lit, np.maximum(self._observed - observed, 0)
-        other._system, other._excess = None, self._excess.copy()
+        other._system, other._made, other._excess = None, None, self._excess.copy()
         return other
 
     def _update_of(
@@ -196,8 +196,7 @@ class KnownPicture:
             expected: (C, R) light that the slots decided so far give.
             rows_per_slot: rows per slot.
         """
-        self._settled()
-        predicted = self._picture * (self._crosstalk @ _with_neighbours(expected))
+        predicted = self.picture()[0] * (self._crosstalk @ _with_neighbours(expected))
         error = light - self._black_level - predicted
         error *= error
         error *= self._inside
@@ -240,25 +239,6 @@ class KnownPicture:
         better = ColumnLight(observed.value, observed.precision / np.maximum(ratio, 0.5)[:, None], observed.shrunk)
         return better, float(np.median(ratio))
 
-    def moved(self, row_of: FloatArray, inside: BoolArray) -> None:
-        """Follow the screen to another place.
-
-        Args:
-            row_of: (C, R) index of the row, before, of what each row shows now.
-            inside: (C, S, R) as for the class, now.
-        """
-        n_before = self._light.shape[-1]
-        place = np.clip(row_of, 0, n_before - 1.001)[:, None]
-        left: IntArray = place.astype(np.int64)
-        part = (place - left).astype(np.float32)
-        for name in ("_light", "_observed"):
-            values = getattr(self, name)
-            before = np.take_along_axis(values, left, 2)
-            after = np.take_along_axis(values, left + 1, 2)
-            setattr(self, name, before + (after - before) * part)
-        self._inside = inside.astype(np.float32)
-        self._system = self._of_one = None
-
     def _tempered(self, value: Float32Array, precision: Float32Array) -> Float32Array:
         variance = self._excess[:, None] / np.maximum(precision, np.float32(1e-6)) + np.float32(_COMMON_ERROR**2)
         beyond = np.maximum(np.abs(value - np.float32(0.5)) - np.float32(0.5 + _BEYOND), 0)
@@ -267,6 +247,11 @@ class KnownPicture:
 
     def picture(self) -> tuple[Float32Array, Float32Array]:
         """The picture and its relative variance, (C, S, R) each."""
+        if self._made is None:
+            self._made = self._make()
+        return self._made
+
+    def _make(self) -> tuple[Float32Array, Float32Array]:
         near = box_sums(self._observed, _AROUND_ROWS) + np.float32(_WIDE)
         around = (box_sums(self._light, _AROUND_ROWS) + np.float32(_WIDE) * self._wide()[:, None]) / near
         total = self._observed + np.float32(_SMOOTH)
@@ -287,11 +272,9 @@ class KnownPicture:
 
     def _factor(self, measured: Float32Array | None = None) -> _System:
         """Normal equations A m = b of every row, A symmetric with two bands: A = L D L', and the diagonal of A^-1."""
-        if self._system is None:
-            self._picture, self._error = self.picture()
-        picture = self._picture
+        picture, error = self.picture()
         half = np.float32(0.5) * picture
-        variance = self._variance + half * (self._shot_gain + half * self._error)
+        variance = self._variance + half * (self._shot_gain + half * error)
         if measured is not None:
             variance += measured
         gain = picture * self._inside / variance

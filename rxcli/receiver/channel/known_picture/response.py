@@ -18,7 +18,7 @@ _GROUPS, _GAIN = 8, (0.15, 1.3)
 _TABLE = 256
 #: Rows of columns, about, from which a response is measured, more would tell no more; and the golden ratio, whose
 #: multiples fall evenly between whole numbers.
-_SAMPLES_OF_RESPONSE, _GOLDEN = 9000, 0.6180339887
+_SAMPLES_OF_RESPONSE, _GOLDEN = 5000, 0.6180339887
 #: Largest correction of the clock at a time, slots.
 _MAX_LATE = 0.4
 
