@@ -43,10 +43,17 @@ _QUICK_DOUBT = 0.5
 _SAME_STEP, _SAME_CONTRAST, _SAME_SHARE = 7, 3.0, 0.25
 _SAME = "it shows the frame before once more, so that its time is not that of its rows; it was left out"
 _NOMINAL_TIME = "the clip's time stamps do not advance here; its nominal frame rate was taken"
+_SLOW_MOTION = "slow motion: time stamps are {:g} times as long as the link's time, which was taken"
+_RETIMED = (
+    "the clip's time stamps do not fit the link's time, as after a change of its speed: each frame is received alone; "
+    "give the clip as the camera recorded it"
+)
 #: Frames in a row that may be received like photographs before the picture is learned anew.
 _MOST_UNKNOWN = 3
 #: Frames that find their clock together where each shows little.
 _TOGETHER = 8
+#: Copies between two frames that have none in common.
+_FAR_APART = 1 << 12
 #: Frames that may wait until it is clear which copies begin a burst.
 _MAX_WAITING = 8
 
@@ -88,6 +95,8 @@ class _Link:
     #: Number of burst 0 of this time in the clip.
     offset: int = 0
     last_time_s: float = 0.0
+    #: Whether it was looked whether time stamps are the time.
+    judged: bool = False
 
 
 class _Clip:
@@ -107,6 +116,8 @@ class _Clip:
         self._little = False
         self._start: Start | None = None
         self._next_number = 0
+        #: How much longer time stamps are than the time was; None where that cannot be told, and frames stand alone.
+        self._stretch: float | None = 1.0
         #: Counts the times that the link's time was begun anew: burst numbers of different ones cannot be compared.
         self._epoch = 0
         #: A frame with the camera and the screens that remain, and what they were found for.
@@ -170,7 +181,7 @@ class _Clip:
 
     def _take(self, frame: Frame) -> list[FrameResult]:
         timer = Timer()
-        message = _NOMINAL_TIME if frame.nominal_time else None
+        message = _NOMINAL_TIME if frame.nominal_time else self._about_time()
         waiting = Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok", message=message))
         if self._shows_the_same(frame):
             waiting.result = replace(waiting.result, message=_SAME)
@@ -382,7 +393,8 @@ class _Clip:
         view = waiting.view
         assert view is not None
         done: list[FrameResult] = []
-        first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock) if self._link else None
+        known = self._link if self._stretch is not None else None
+        first_copy = known.time.take(frame.index, frame.time_s, view.bursts.clock) if known else None
         if first_copy is None:
             done = self._finish_scene_before() if self._link is not None else []
             self._begin_link(view, frame)
@@ -397,6 +409,8 @@ class _Clip:
             if not self._link.phase.settled:
                 self._compare(view)
             n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)
+            if self._n_held and self._link.time.judged and not self._link.judged:
+                self._judge_stamps()
             if self._link.phase.settled or n_unsettled > _MAX_WAITING:
                 self._settle_bursts()
                 if self._n_held and len(self._waiting) >= self._n_held:
@@ -406,12 +420,57 @@ class _Clip:
     def _begin_link(self, view: View, frame: Frame) -> None:
         screen = view.acquisition.screen
         offset = self._next_number
+        stretch = self._stretch or 1.0
         if self._link is not None and offset:
-            offset += int((frame.time_s - self._link.last_time_s) / (screen.packet_s * self._link.phase.repeats))
-        time = self._start.time if self._start else tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz)
+            passed_s = (frame.time_s - self._link.last_time_s) / stretch
+            offset += int(passed_s / (screen.packet_s * self._link.phase.repeats))
+        time = tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
+        time = self._start.time if self._start else time
         self._link = _Link(time, tracking.BurstPhase(view.acquisition.repeats), offset)
         self._epoch += 1
         self._bursts.begin()
+
+    # -- time stamps that are not the time -------------------------------------------------------------------------
+
+    def _about_time(self) -> str | None:
+        """What there is to say of the clip's time stamps."""
+        if self._stretch is None:
+            return _RETIMED
+        return _SLOW_MOTION.format(self._stretch) if self._stretch != 1 else None
+
+    def _judge_stamps(self) -> None:
+        """Whether the stamps of the first frames are the time; where they are not, those frames are entered anew."""
+        link, waiting = self._link, [w for w in self._waiting if w.view is not None]
+        assert link is not None
+        link.judged = True
+        first = waiting[0].view
+        assert first is not None
+        shown = np.ptp(np.flatnonzero(first.acquisition.profiles.inside.any(axis=(0, 1))))
+        rate_hz = first.acquisition.screen.slot_rate_hz
+        self._stretch = link.time.stretch_of_stamps(float(shown) / first.bursts.clock.rows_per_slot / rate_hz)
+        if self._stretch == link.time.stretch:
+            return
+        link.time = tracking.LinkTime(link.time.packet_slots, rate_hz, self._stretch or 1.0)
+        link.phase = tracking.BurstPhase(first.acquisition.repeats)
+        link.judged = True
+        self._bursts.begin()
+        for each in waiting:
+            self._enter_anew(each)
+
+    def _enter_anew(self, waiting: Waiting) -> None:
+        view, link = waiting.view, self._link
+        assert view is not None
+        assert link is not None
+        clock = view.bursts.clock
+        first_copy = link.time.take(waiting.result.frame, waiting.result.time_s, clock)
+        if first_copy is None or self._stretch is None:
+            # Frames that stand alone: no copy of one is near any of another.
+            first_copy = waiting.result.frame * _FAR_APART
+        clock = replace(clock, burst=np.arange(clock.n_copies))
+        view.bursts = replace(view.bursts, first_copy=first_copy, clock=clock)
+        waiting.numbers = None
+        waiting.result = replace(waiting.result, message=self._about_time())
+        self._compare(view)
 
     def _compare(self, view: View) -> None:
         """What the frame says of the phase of the bursts."""

@@ -9,7 +9,7 @@ clip, and with the phase of the bursts (`BurstPhase`) every burst too, those in 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,6 +25,10 @@ _PERIOD_SHARE = 0.2
 _SETTLED = 12.0
 #: Closed bursts of which it is remembered whether they were certain.
 _REMEMBERED = 4
+#: Locks by which time stamps are judged; how often slow motion stretches them; what of the slots from frame to frame
+#: a clock may be off by: a share, slots, and the error of stamps, seconds, where they are not even.
+_JUDGED_LOCKS, _STRETCHES = 5, (2, 4, 8, 16, 32, 5, 10, 20, 3, 6)
+_RATE_SHARE, _RATE_SLOTS, _UNEVEN_S, _STEADY_SLOTS = 0.004, 0.4, 2e-3, 1.0
 #: Log-odds that a slot seen once is taken to be at most sure of: copies are compared with what may be wrong.
 _SURE = 3.0
 
@@ -35,6 +39,10 @@ class LinkTime:
 
     packet_slots: int
     slot_rate_hz: float
+    #: How much longer the clip's time stamps are than the time was, as those of slow motion.
+    stretch: float = 1.0
+    #: The first locks: frame number, stamp, slot of sensor row 0.
+    _first: list[tuple[int, float, float]] = field(default_factory=list)
     #: Frame number, time, and slot of sensor row 0 at the last lock.
     _last: tuple[int, float, float] | None = None
     #: Slots from frame to frame, as measured, and its spread.
@@ -64,13 +72,17 @@ class LinkTime:
         """Slot of sensor row 0 in a frame, from the locks before; None before the first."""
         if self._last is None:
             return None
+        time_s /= self.stretch
         number, at_s, slot = self._last
         if self._period is not None:
             return slot + self._period * self._frames_since(number, frame, time_s - at_s)
         return slot + (time_s - at_s) * self.slot_rate_hz
 
     def take(self, frame: int, time_s: float, clock: Clock) -> int | None:
-        """Enter a locked clock; returns the number of its copy 0, None where it is not of the time told so far."""
+        """Enter a locked clock; returns the number of its copy 0, None where it is not of the time told so far.
+
+        `time_s` is the frame's stamp, here as everywhere.
+        """
         inside = clock.first_slot - clock.row0 / clock.rows_per_slot
         predicted = self.predict(frame, time_s)
         if predicted is None:
@@ -80,9 +92,39 @@ class LinkTime:
             slot = inside + first_copy * self.packet_slots
             if self._period is not None and abs(slot - predicted) > _MAX_JUMP_SLOTS:
                 return None
-            self._measure(frame, time_s, slot)
-        self._last = (frame, time_s, slot)
+            self._measure(frame, time_s / self.stretch, slot)
+        self._last = (frame, time_s / self.stretch, slot)
+        if len(self._first) < _JUDGED_LOCKS:
+            self._first.append((frame, time_s, slot))
         return first_copy
+
+    @property
+    def judged(self) -> bool:
+        """Whether as many frames were locked as time stamps are judged by."""
+        return len(self._first) >= _JUDGED_LOCKS
+
+    def stretch_of_stamps(self, least_frame_s: float) -> float | None:
+        """How much longer the stamps of the first locks are than the time was; None where no factor explains them.
+
+        The link's own clock shows in the headers, whole packets aside. Stamps that are not even are not judged.
+
+        Args:
+            least_frame_s: time that passes from frame to frame at least.
+        """
+        frames, stamps, slots = np.array(self._first).T
+        if len(frames) < 3 or np.ptp(frames) == 0:
+            return self.stretch
+        period, slots_off = _line(frames, slots)
+        stamp_s, stamps_off = _line(frames, stamps)
+        if slots_off > _STEADY_SLOTS or stamps_off > _UNEVEN_S or stamp_s <= 0:
+            return self.stretch
+        uneven = 2 * stamps_off / np.ptp(frames) * self.slot_rate_hz + _RATE_SLOTS
+        for stretch in (1, *_STRETCHES):
+            expected = stamp_s / stretch * self.slot_rate_hz
+            off = abs((period - expected + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2)
+            if off <= uneven / stretch + _RATE_SHARE * expected and stamp_s / stretch > least_frame_s:
+                return float(stretch)
+        return None
 
     def agrees(self, frame: int, time_s: float, clock: Clock) -> bool:
         """Whether a frame's clock is of the time told so far, whole packets aside."""
@@ -129,6 +171,12 @@ class LinkTime:
             self._frame_s = min(self._frame_s, time_s - at_s)
         period = (slot - before) / max(self._frames_since(number, frame, time_s - at_s), 1)
         self._period = period if self._period is None else self._period + _PERIOD_SHARE * (period - self._period)
+
+
+def _line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Slope of a line through points, and how far they are from it at most."""
+    slope, offset = np.polyfit(x - x[0], y, 1)
+    return float(slope), float(np.abs(y - offset - slope * (x - x[0])).max())
 
 
 class BurstPhase:
