@@ -114,7 +114,9 @@ def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False
         outlines = geometry.column_outlines(
             context.corners, n_columns, n_strips, frame.width, frame.height, camera.lens, columns
         )
-        profiles = sampling.sample_rows(frame, outlines, camera.tone, quick=quick, noise=noise)
+        profiles = context.timer.rows.sample(
+            frame, outlines, camera.tone, quick=quick, noise=noise, first_column=columns.start
+        )
         return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
 
     with context.timer("sampling"):

@@ -23,7 +23,7 @@ from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
 _MATTERS_SLOTS = 0.05
 _MOST_INITIAL_REFITS = 3
 #: Slots, as probabilities, that differ by no more than this on average tell the same camera.
-_SLOTS_ALIKE = 0.01
+_SLOTS_ALIKE = 0.02
 #: What is received with a refitted camera shows packets as well as before from this share of the evidence on.
 _KEPT_EVIDENCE = 0.9
 #: Headers and packets, all columns together, that an estimate with rivals must show, nats: wrong ones have next to none
