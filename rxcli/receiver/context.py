@@ -93,6 +93,8 @@ class FrameContext:
     #: Screens that it may be, at least one.
     screens: tuple[ScreenProfile, ...]
     timer: Timer
+    #: What was worked out of it already, see `screen_choice.quick_look`; another context begins anew.
+    kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def n_columns(self) -> int:

@@ -78,7 +78,7 @@ class Reception:
     skipped: dict[str, int] = field(default_factory=dict)
 
 
-def decode_likeliest(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
+def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Reception:
     """What is decoded on the clock, and with the bursts, by which slots are packets most.
 
     Bursts are told apart by how alike copies are. Where symbols stay in doubt that may be why: copies of two packets,
@@ -88,9 +88,8 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str], first: Rece
     Args:
         acquisition: the clock, perhaps another that it may be, and the row profiles.
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
-        first: the `first_pass` on the clock, where there was one.
     """
-    first = first or first_pass(acquisition)
+    first = first_pass(acquisition)
     if acquisition.rival is not None:
         return _likelier_clock(acquisition, first, skip)
     weighed = [first]
@@ -150,12 +149,11 @@ def _likelier_clock(acquisition: Acquisition, first: Reception, skip: frozenset[
     """What is decoded on the likelier of two clocks; on both where an initial pass does not tell them plainly."""
     assert acquisition.rival is not None
     either = [replace(acquisition, clock=clock, rival=None) for clock in (acquisition.clock, acquisition.rival)]
-    passes = [first, first_pass(either[1])]
-    evidence = [packet_llr(one) for one in passes]
+    either[0].kept.update(acquisition.kept)
+    evidence = [packet_llr(first), packet_llr(first_pass(either[1]))]
     if abs(evidence[0] - evidence[1]) > _PLAIN_CLOCK:
-        best = int(np.argmax(evidence))
-        return decode_likeliest(either[best], skip, passes[best])
-    return max((decode_likeliest(*one) for one in zip(either, (skip, skip), passes, strict=True)), key=packet_llr)
+        return decode_likeliest(either[int(np.argmax(evidence))], skip)
+    return max((decode_likeliest(one, skip) for one in either), key=packet_llr)
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
@@ -176,16 +174,25 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
     return remove_row_noise(acquisition, reception, columns) if columns.size else reception
 
 
-def first_pass(acquisition: Acquisition, initial: Reception | None = None) -> Reception:
-    """The initial pass, the one that was made if any; with few rows a slot that with the likeliest mix of rows."""
-    if acquisition.clock.rows_per_slot < _FEW_ROWS:
-        return _likeliest_row_mix(acquisition)
-    return initial or initial_pass(acquisition)
+def first_pass(acquisition: Acquisition) -> Reception:
+    """The initial pass; with few rows a slot that with the likeliest mix of rows."""
+    if acquisition.clock.rows_per_slot >= _FEW_ROWS:
+        return initial_pass(acquisition)
+    if "first" not in acquisition.kept:
+        acquisition.kept["first"] = _likeliest_row_mix(acquisition)
+    kept: Reception = acquisition.kept["first"]
+    return kept
 
 
 def initial_pass(acquisition: Acquisition) -> Reception:
-    """One pass over the strips pooled in pairs, from the first guess."""
-    acquisition = acquisition.binned()
+    """One pass over the strips pooled in pairs, from the first guess; made once for an acquisition."""
+    if "initial" not in acquisition.kept:
+        acquisition.kept["initial"] = _initial_pass(acquisition.binned())
+    kept: Reception = acquisition.kept["initial"]
+    return kept
+
+
+def _initial_pass(acquisition: Acquisition) -> Reception:
     clock = acquisition.clock
     samples = sync.sample_slots(acquisition.profiles, clock, _COARSE)
     model = _light_model(acquisition, samples)

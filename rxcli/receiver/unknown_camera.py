@@ -11,11 +11,11 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import camera as blind
 from rxcli.receiver import channel
-from rxcli.receiver.acquisition import Acquisition, sample_columns
+from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera_memory import recall, remember
 from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, refittable, refitted_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
-from rxcli.receiver.screen_choice import acquire
+from rxcli.receiver.screen_choice import quick_look
 from rxcli.receiver.still import Reception, decode_likeliest, initial_pass, packet_llr
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
 
@@ -73,7 +73,7 @@ def likely_camera(frame: Frame, corners: FloatArray, options: ReceiverOptions, t
 
 def _initial_evidence(context: FrameContext) -> tuple[float, float]:
     """What an initial pass says of a camera: evidence of headers and packets, and how sure symbols are; nats."""
-    acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
+    acquisition = quick_look(context)
     if isinstance(acquisition, Failure):
         return -np.inf, 0.0
     with context.timer("detect"):
@@ -152,7 +152,7 @@ def _with_camera(received: Received, camera: Camera) -> Received:
 def _received_again(before: Received, receive: Callable[[Acquisition], Reception]) -> Received | None:
     """What is received with a refitted camera; None where packets show less than in what was received before."""
     context = before.context
-    acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
+    acquisition = quick_look(context)
     if isinstance(acquisition, Failure):
         return None
     with context.timer("detect"):
