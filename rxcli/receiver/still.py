@@ -233,7 +233,7 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
             tried[number] = float(_evidence(reception.metrics, reception.clock).sum()), reception
         return tried[number][0]
 
-    best = _USUAL_MIX
+    best = min(_USUAL_MIX, len(_MIXED_ROWS) - 1)
     step = 1 if likelihood(best + 1) > likelihood(best) else -1
     while likelihood(best + step) > likelihood(best):
         best += step

@@ -29,6 +29,9 @@ _KEPT_EVIDENCE = 0.9
 #: Headers and packets, all columns together, that an estimate with rivals must show, nats: wrong ones have next to none
 #: of one or of the other.
 _PACKETS_AT_LEAST = 80.0
+#: From so many on it is right but for the length of its packets: wrong ones reach 103. Periods this close are one, as
+#: far as an initial pass goes.
+_PLAIN_PACKETS, _SAME_PERIOD = 200.0, 5e-3
 #: Packets that an estimate must show under which none is received, nats: wrong ones show less than 10, right ones 80.
 _PACKETS_IF_NONE_RECEIVED = 30.0
 #: Packets that a camera must show to be remembered, and to be kept when it was, nats. Relative standard deviation of
@@ -54,8 +57,8 @@ class Received:
 def likely_camera(frame: Frame, corners: FloatArray, options: ReceiverOptions, timer: Timer) -> FrameContext | Failure:
     """The frame with its camera, known or estimated, and the screens that remain.
 
-    Where several estimates are left, each has an initial pass: the one under which headers, packets and
-    symbols show best is it, and without packets none, unless the first is beyond doubt.
+    Where several estimates are left, they have initial passes by turns until one shows packets plainly: the one under
+    which headers, packets and symbols show best is it, and without packets none, unless the first is beyond doubt.
     """
     remembered = None if options.force_camera else recall(options.camera_cache, frame)
     if remembered is not None and not has_profile(frame, options):
@@ -64,11 +67,43 @@ def likely_camera(frame: Frame, corners: FloatArray, options: ReceiverOptions, t
     if found.first is not None and not found.rivals:
         return found.first
     best, most = found.first if found.sure else None, -np.inf
-    for candidate in ([found.first] if found.first else []) + list(found.rivals):
+    plain: FrameContext | None = None
+    for candidate in _of_different_clocks([*([found.first] if found.first else []), *found.rivals]):
+        if plain is not None and not _may_be_of_shorter_packets(candidate, plain):
+            continue
         packets, symbols = _initial_evidence(candidate)
         if packets > _PACKETS_AT_LEAST and packets + symbols > most:
             best, most = candidate, packets + symbols
+        if packets > _PLAIN_PACKETS and plain is None:
+            plain = candidate
     return best or Failure("no_signal", found.reason or _NO_HEADERS, found.estimated)
+
+
+def _of_different_clocks(candidates: list[FrameContext]) -> list[FrameContext]:
+    """The candidates without those whose clock is that of one before: a refit moves them to the same one."""
+    chosen: list[FrameContext] = []
+    for candidate in candidates:
+        if not any(_same_clock(candidate, one) and _length(candidate) == _length(one) for one in chosen):
+            chosen.append(candidate)
+    return chosen
+
+
+def _same_clock(one: FrameContext, other: FrameContext) -> bool:
+    delays = [_line_delay_slots(context) for context in (one, other)]
+    return abs(np.log(delays[0] / delays[1])) < _SAME_PERIOD and one.camera.reversed == other.camera.reversed
+
+
+def _line_delay_slots(context: FrameContext) -> float:
+    return context.camera.line_delay_s * context.screens[0].slot_rate_hz
+
+
+def _length(context: FrameContext) -> int:
+    return context.screens[0].packet_slots
+
+
+def _may_be_of_shorter_packets(candidate: FrameContext, plain: FrameContext) -> bool:
+    """Whether packets that show plainly may be pairs of a candidate's: where headers are, every other one has them."""
+    return _same_clock(candidate, plain) and _length(plain) % _length(candidate) == 0
 
 
 def _initial_evidence(context: FrameContext) -> tuple[float, float]:
@@ -101,10 +136,12 @@ def _with_settled_clock(received: Received) -> Received:
         received = _with_camera(received, camera)
         if moved_slots < _MATTERS_SLOTS:
             break
-        again = _received_again(received, initial_pass)
+        before, again = received, _received_again(received, initial_pass)
         if again is None:
             break
         received = again
+        if not _slots_changed(before, again):
+            break
     return received
 
 
