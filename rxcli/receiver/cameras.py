@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -70,8 +71,22 @@ class Cameras:
     sure: bool = False
 
 
-def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, timer: Timer) -> Cameras:
-    """The camera that a profile tells, or those that may be, estimated from the frame."""
+def find_cameras(
+    frame: Frame,
+    corners: FloatArray,
+    options: ReceiverOptions,
+    timer: Timer,
+    shows_packets: Callable[[FrameContext], bool] = lambda _: False,
+) -> Cameras:
+    """The camera that a profile tells, or those that may be, estimated from the frame.
+
+    Args:
+        frame: the picture.
+        corners: (4, 2) of the screen.
+        options: screens and cameras.
+        timer: of the frame.
+        shows_packets: whether packets show with a camera beyond doubt; asked before the search is widened.
+    """
     known = _camera_of(frame, options)
     if isinstance(known, Failure):
         return Cameras(None, reason=known.message)
@@ -86,14 +101,19 @@ def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, ti
         # Lenses that are left in a picture do not bend stripes: what looked like its sides are others.
         with timer("sampling"):
             strips = _straightened_strips(frame, corners, n_columns, None, timer)
-    with timer("blind"):
-        found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
+    contexts: dict[int, FrameContext] = {}
 
     def with_camera(estimate: blind.BlindEstimate) -> FrameContext:
-        screens = _screens_of(estimate, options.screens)
-        camera = _estimated_camera(estimate, strips, screens[0].slot_rate_hz)
-        return FrameContext(frame, corners, camera, screens, timer)
+        if id(estimate) not in contexts:
+            screens = _screens_of(estimate, options.screens)
+            camera = _estimated_camera(estimate, strips, screens[0].slot_rate_hz)
+            contexts[id(estimate)] = FrameContext(frame, corners, camera, screens, timer)
+        return contexts[id(estimate)]
 
+    with timer("blind"):
+        found = blind.estimate_camera(
+            strips, options.screens, frame.metadata.exposure_s, lambda estimate: shows_packets(with_camera(estimate))
+        )
     first = with_camera(found.estimate) if found.estimate else None
     rivals = tuple(with_camera(rival) for rival in found.rivals)
     by_edges = blind.summary_of_rows(found.by_edges) if found.by_edges else {}

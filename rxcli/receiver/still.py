@@ -105,6 +105,16 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
     return max(reception, decode(_in_bursts_of(acquisition, likeliest), skip, likeliest), key=packet_llr)
 
 
+def decode_alike(acquisition: Acquisition, skip: frozenset[str], before: Reception) -> Reception:
+    """What is decoded on a clock next to the one before: with columns spread in time as there, and with its bursts."""
+    clocks = [clock for clock in (acquisition.clock, acquisition.rival) if clock is not None]
+    alike = [clock for clock in clocks if clock.delay_slots.any() == before.clock.delay_slots.any()]
+    clock = (alike or clocks)[0]
+    if clock.n_copies != before.clock.n_copies or clock.packet_slots != before.clock.packet_slots:
+        return decode_likeliest(acquisition, skip)
+    return decode(replace(acquisition, clock=clock, rival=None, burst=before.clock.burst), skip)
+
+
 def _with_likeliest_bursts(acquisition: Acquisition, reception: Reception, weighed: list[Reception]) -> Reception:
     """Of initial passes with the bursts that there may be, that of the likeliest; where there is no doubt, `reception`.
 
@@ -146,14 +156,20 @@ def _same_bursts(one: Reception, other: Reception) -> bool:
 
 
 def _likelier_clock(acquisition: Acquisition, first: Reception, skip: frozenset[str]) -> Reception:
-    """What is decoded on the likelier of two clocks; on both where an initial pass does not tell them plainly."""
+    """What is decoded on the likelier of two clocks; a further look tells where an initial pass does not plainly."""
     assert acquisition.rival is not None
     either = [replace(acquisition, clock=clock, rival=None) for clock in (acquisition.clock, acquisition.rival)]
     either[0].kept.update(acquisition.kept)
     evidence = [packet_llr(first), packet_llr(first_pass(either[1]))]
-    if abs(evidence[0] - evidence[1]) > _PLAIN_CLOCK:
-        return decode_likeliest(either[int(np.argmax(evidence))], skip)
-    return max((decode_likeliest(one, skip) for one in either), key=packet_llr)
+    if abs(evidence[0] - evidence[1]) < _PLAIN_CLOCK:
+        evidence = [packet_llr(_refined_once(one)) for one in either]
+    return decode_likeliest(either[int(np.argmax(evidence))], skip)
+
+
+def _refined_once(acquisition: Acquisition) -> Reception:
+    """The first pass and a look at all scales of every column that has light."""
+    first = first_pass(acquisition)
+    return _refine_columns(acquisition, first, np.flatnonzero(~_dark(first.snr)), _COARSE)[0]
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:

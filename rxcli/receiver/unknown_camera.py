@@ -16,7 +16,7 @@ from rxcli.receiver.camera_memory import recall, remember
 from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, refittable, refitted_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.screen_choice import quick_look
-from rxcli.receiver.still import Reception, decode_likeliest, initial_pass, packet_llr
+from rxcli.receiver.still import Reception, decode_alike, decode_likeliest, initial_pass, packet_llr
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
 
 #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
@@ -63,7 +63,7 @@ def likely_camera(frame: Frame, corners: FloatArray, options: ReceiverOptions, t
     remembered = None if options.force_camera else recall(options.camera_cache, frame)
     if remembered is not None and not has_profile(frame, options):
         return FrameContext(frame, corners, remembered.camera(frame), options.screens, timer)
-    found = find_cameras(frame, corners, options, timer)
+    found = find_cameras(frame, corners, options, timer, shows_packets)
     if found.first is not None and not found.rivals:
         return found.first
     best, most = found.first if found.sure else None, -np.inf
@@ -108,13 +108,24 @@ def _may_be_of_shorter_packets(candidate: FrameContext, plain: FrameContext) -> 
 
 def _initial_evidence(context: FrameContext) -> tuple[float, float]:
     """What an initial pass says of a camera: evidence of headers and packets, and how sure symbols are; nats."""
-    acquisition = quick_look(context)
+    if "evidence" not in context.kept:
+        context.kept["evidence"] = _evidence_of(quick_look(context), context.timer)
+    kept: tuple[float, float] = context.kept["evidence"]
+    return kept
+
+
+def _evidence_of(acquisition: Acquisition | Failure, timer: Timer) -> tuple[float, float]:
     if isinstance(acquisition, Failure):
         return -np.inf, 0.0
-    with context.timer("detect"):
+    with timer("detect"):
         reception = initial_pass(acquisition)
         packets = float(reception.posteriors.header_llr.sum()) + packet_llr(reception)
     return packets, _SAY_OF_SYMBOLS * float(reception.posteriors.log_prob.mean())
+
+
+def shows_packets(context: FrameContext) -> bool:
+    """Whether packets show with a camera beyond doubt."""
+    return _initial_evidence(context)[0] > _PLAIN_PACKETS
 
 
 def receive_unknown(context: FrameContext, acquisition: Acquisition, skip: frozenset[str]) -> Received:
@@ -158,7 +169,7 @@ def with_refitted_camera(received: Received, skip: frozenset[str], slots_changed
     """
 
     def decoded(acquisition: Acquisition) -> Reception:
-        return decode_likeliest(acquisition, skip)
+        return decode_alike(acquisition, skip, received.reception)
 
     if slots_changed:
         with received.context.timer("blind"):
