@@ -102,8 +102,8 @@ def _length(context: FrameContext) -> int:
 
 
 def _may_be_of_shorter_packets(candidate: FrameContext, plain: FrameContext) -> bool:
-    """Whether packets that show plainly may be pairs of a candidate's: where headers are, every other one has them."""
-    return _same_clock(candidate, plain) and _length(plain) % _length(candidate) == 0
+    """Whether a candidate has shorter packets on the same clock: a second header may stand among longer ones' words."""
+    return _same_clock(candidate, plain) and _length(candidate) < _length(plain)
 
 
 def _initial_evidence(context: FrameContext) -> tuple[float, float]:
