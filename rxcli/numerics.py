@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.types import Float32Array
+from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
+from rxcli.types import Float32Array, FloatArray
+
+#: Change of a header's slots, lit 1 and dark -1, at its borders.
+_HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
 
 
 def box_sums(values: Float32Array, half: int) -> Float32Array:
@@ -35,3 +39,21 @@ def log_alike(
         share: of lit slots among all, 0..1 exclusive.
     """
     return np.asarray(np.log(first * second / share + (1 - first) * (1 - second) / (1 - share)))
+
+
+def header_correlation(total: FloatArray, samples_per_slot: int) -> FloatArray:
+    """Mean over the slots of a header that starts at each sample, dark ones counting negative.
+
+    Args:
+        total: (..., n + 1) running sums at the borders of samples.
+        samples_per_slot: samples a slot.
+
+    Returns:
+        (..., n + 1 - samples of a header), in the samples' unit.
+    """
+    length = SLOTS_PER_SYMBOL * samples_per_slot
+    n = total.shape[-1] - length
+    out = np.zeros((*total.shape[:-1], n))
+    for slot in np.flatnonzero(_HEADER_STEPS):
+        out -= _HEADER_STEPS[slot] * total[..., slot * samples_per_slot :][..., :n]
+    return out / length

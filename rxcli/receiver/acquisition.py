@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +69,8 @@ class Acquisition:
     variants: tuple[ScreenProfile, ...] = ()
     #: (n_copies,) burst of every copy; None where the light is to tell.
     burst: IntArray | None = None
+    #: What was worked out of it already, see `still.initial_pass`; another acquisition begins anew.
+    kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def profiles(self) -> RowProfiles:
@@ -114,7 +117,9 @@ def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False
         outlines = geometry.column_outlines(
             context.corners, n_columns, n_strips, frame.width, frame.height, camera.lens, columns
         )
-        profiles = sampling.sample_rows(frame, outlines, camera.tone, quick=quick, noise=noise)
+        profiles = context.timer.rows.sample(
+            frame, outlines, camera.tone, quick=quick, noise=noise, first_column=columns.start
+        )
         return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
 
     with context.timer("sampling"):

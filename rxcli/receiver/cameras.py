@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,7 +10,6 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ReadoutMode, ScreenProfile, match_camera
 from rxcli.receiver import camera as blind
-from rxcli.receiver import sampling
 from rxcli.receiver.acquisition import Acquisition, n_strips_of
 from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure, FrameContext, Timer
 from rxcli.receiver.corners import levels_of
@@ -71,8 +71,22 @@ class Cameras:
     sure: bool = False
 
 
-def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, timer: Timer) -> Cameras:
-    """The camera that a profile tells, or those that may be, estimated from the frame."""
+def find_cameras(
+    frame: Frame,
+    corners: FloatArray,
+    options: ReceiverOptions,
+    timer: Timer,
+    shows_packets: Callable[[FrameContext], bool] = lambda _: False,
+) -> Cameras:
+    """The camera that a profile tells, or those that may be, estimated from the frame.
+
+    Args:
+        frame: the picture.
+        corners: (4, 2) of the screen.
+        options: screens and cameras.
+        timer: of the frame.
+        shows_packets: whether packets show with a camera beyond doubt; asked before the search is widened.
+    """
     known = _camera_of(frame, options)
     if isinstance(known, Failure):
         return Cameras(None, reason=known.message)
@@ -80,21 +94,26 @@ def find_cameras(frame: Frame, corners: FloatArray, options: ReceiverOptions, ti
         return Cameras(FrameContext(frame, corners, known, options.screens, timer))
     n_columns = min(screen.columns for screen in options.screens)
     with timer("sampling"):
-        strips = _straightened_strips(frame, corners, n_columns, _sides_of(frame, corners))
+        strips = _straightened_strips(frame, corners, n_columns, _sides_of(frame, corners), timer)
     with timer("blind"):
         contradicted = strips.side_curvature is not None and blind.stripes_are_curved(strips)
     if contradicted:
         # Lenses that are left in a picture do not bend stripes: what looked like its sides are others.
         with timer("sampling"):
-            strips = _straightened_strips(frame, corners, n_columns, None)
-    with timer("blind"):
-        found = blind.estimate_camera(strips, options.screens, frame.metadata.exposure_s)
+            strips = _straightened_strips(frame, corners, n_columns, None, timer)
+    contexts: dict[int, FrameContext] = {}
 
     def with_camera(estimate: blind.BlindEstimate) -> FrameContext:
-        screens = _screens_of(estimate, options.screens)
-        camera = _estimated_camera(estimate, strips, screens[0].slot_rate_hz)
-        return FrameContext(frame, corners, camera, screens, timer)
+        if id(estimate) not in contexts:
+            screens = _screens_of(estimate, options.screens)
+            camera = _estimated_camera(estimate, strips, screens[0].slot_rate_hz)
+            contexts[id(estimate)] = FrameContext(frame, corners, camera, screens, timer)
+        return contexts[id(estimate)]
 
+    with timer("blind"):
+        found = blind.estimate_camera(
+            strips, options.screens, frame.metadata.exposure_s, lambda estimate: shows_packets(with_camera(estimate))
+        )
     first = with_camera(found.estimate) if found.estimate else None
     rivals = tuple(with_camera(rival) for rival in found.rivals)
     by_edges = blind.summary_of_rows(found.by_edges) if found.by_edges else {}
@@ -114,7 +133,7 @@ def context_at(context: FrameContext, corners: FloatArray) -> FrameContext:
         return replace(context, corners=corners)
     estimate, strips = camera.blind_estimate
     with context.timer("sampling"):
-        there = _straightened_strips(context.frame, corners, strips.n_columns, strips.sides, camera.tone)
+        there = _straightened_strips(context.frame, corners, strips.n_columns, strips.sides, context.timer, camera.tone)
     return replace(context, corners=corners, camera=replace(camera, blind_estimate=(estimate, there)))
 
 
@@ -132,14 +151,19 @@ def _sides_of(frame: Frame, corners: FloatArray) -> tuple[float, float] | None:
 
 
 def _straightened_strips(
-    frame: Frame, corners: FloatArray, n_columns: int, sides: tuple[float, float] | None, tone: str = DEFAULT_TONE
+    frame: Frame,
+    corners: FloatArray,
+    n_columns: int,
+    sides: tuple[float, float] | None,
+    timer: Timer,
+    tone: str = DEFAULT_TONE,
 ) -> blind.Strips:
     """Strips of a picture whose camera is not known, along sides that show some distortion."""
     lens = blind.curving_lens(blind.side_curvature_of(sides), frame.width, frame.height)
     n_strips = n_strips_of(corners, n_columns)
     outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
     centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
-    profiles = sampling.sample_rows(frame, outlines, tone)
+    profiles = timer.rows.sample(frame, outlines, tone)
     mosaic = frame.mosaic is not None
     undone = None if mosaic or frame.linear else tone
     return blind.strips_of(profiles, centre_x, frame.width, frame.height, sides, mosaic, undone)
@@ -164,7 +188,7 @@ def refittable(context: FrameContext, acquisition: Acquisition) -> FrameContext:
     told = camera.estimated
     corrected = bool(told.get("distortion_corrected", (0.0, 0.0))[0])
     sides = _STRAIGHT_SIDES if corrected else told.get("k1")
-    strips = _straightened_strips(context.frame, context.corners, screen.columns, sides, camera.tone)
+    strips = _straightened_strips(context.frame, context.corners, screen.columns, sides, context.timer, camera.tone)
     line_delay_s, sd = told["line_delay_s"]
     rows_per_slot = 1 / (line_delay_s * screen.slot_rate_hz)
     curvature = np.array([told.get(name, (0.0, 0.0)) for name in ("k1", "k2", "p1", "p2")]) * corrected
@@ -196,7 +220,9 @@ def refitted_camera(
         return camera, 0.0
     estimate, strips = camera.blind_estimate
     if strips.n_columns != n_columns:
-        strips = _straightened_strips(context.frame, context.corners, n_columns, strips.sides, camera.tone)
+        strips = _straightened_strips(
+            context.frame, context.corners, n_columns, strips.sides, context.timer, camera.tone
+        )
     found, moved_slots = blind.refit(strips, estimate, clock, lit)
     return _estimated_camera(found, strips, acquisition.screen.slot_rate_hz), moved_slots
 
@@ -212,7 +238,9 @@ def linear_camera(context: FrameContext, acquisition: Acquisition, clock: Clock,
     estimate, strips = camera.blind_estimate
     if not blind.is_linear(estimate.tone):
         return camera
-    as_stored = _straightened_strips(context.frame, context.corners, screen.columns, strips.sides, "linear")
+    as_stored = _straightened_strips(
+        context.frame, context.corners, screen.columns, strips.sides, context.timer, "linear"
+    )
     found, _ = blind.refit(as_stored, estimate, clock, lit)
     if blind.is_linear(found.tone):
         return _estimated_camera(found, as_stored, screen.slot_rate_hz)

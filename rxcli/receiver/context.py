@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import camera as blind
+from rxcli.receiver.sampling import RowStore
 from rxcli.types import FloatArray, Frame, Lens
 
 DEFAULT_TONE = "srgb"
@@ -26,10 +27,11 @@ class Failure:
 
 
 class Timer:
-    """Wall time by stage."""
+    """Wall time by stage; and what was read of the frame's pixels meanwhile."""
 
     def __init__(self) -> None:
         self.timing_ms: dict[str, float] = {}
+        self.rows = RowStore()
         self._start = time.perf_counter()
 
     @contextmanager
@@ -91,6 +93,8 @@ class FrameContext:
     #: Screens that it may be, at least one.
     screens: tuple[ScreenProfile, ...]
     timer: Timer
+    #: What was worked out of it already, see `screen_choice.quick_look`; another context begins anew.
+    kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def n_columns(self) -> int:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.acquisition import sample_columns
 from rxcli.receiver.cameras import context_at, known_lens
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.corners import (
@@ -27,7 +26,7 @@ from rxcli.receiver.corners import (
 )
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.sides import LEFT, RIGHT, SIDE_NAMES
-from rxcli.receiver.screen_choice import acquire
+from rxcli.receiver.screen_choice import quick_look
 from rxcli.receiver.still import column_llr, initial_pass
 from rxcli.receiver.unknown_camera import likely_camera
 from rxcli.types import FloatArray, Frame, Lens
@@ -327,7 +326,7 @@ def _context_of_any(
 
 def _packets(context: FrameContext) -> float:
     """How much the columns of an outline look like packets, nats."""
-    acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
+    acquisition = quick_look(context)
     if isinstance(acquisition, Failure):
         return 0.0
     with context.timer("detect"):

@@ -16,12 +16,12 @@ from typing import Any
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import sync
-from rxcli.receiver.acquisition import Acquisition, sample_columns
+from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.outline import locate
-from rxcli.receiver.screen_choice import acquire
+from rxcli.receiver.screen_choice import quick_look
 from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin, soft_bits
 from rxcli.receiver.unknown_camera import (
     fits,
@@ -94,8 +94,7 @@ def _receive_still(
     if isinstance(context, Failure):
         return failed(result, context)
     # Sampling: pixels to row profiles; sync: row profiles to a clock.
-    sampler = sample_columns(context, context.n_columns, quick=True)
-    acquisition = acquire(context, sampler)
+    acquisition = quick_look(context)
     if isinstance(acquisition, Failure):
         if context.camera.remembered:
             return _receive_still(frame, replace(options, camera_cache=None), timer, remembering)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,8 +17,18 @@ from rxcli.types import Clock, RowProfiles
 
 #: A header peak less than this times the strongest rival is no clock.
 _MIN_PEAK_RATIO = 1.6
+#: Columns that show so much evidence of packets, nats, are the screen's: wider ones mix the slots of several.
+_PLAIN_COLUMNS = 100.0
 #: A clock whose slots look so much like packets, and so much more than on any other, nats, needs no further look.
 _PLAIN_STRUCTURE = 60.0
+
+
+def quick_look(context: FrameContext) -> Acquisition | Failure:
+    """The screen and the clock by a quick look at the columns; taken once for a context."""
+    if "quick" not in context.kept:
+        context.kept["quick"] = acquire(context, sample_columns(context, context.n_columns, quick=True))
+    kept: Acquisition | Failure = context.kept["quick"]
+    return kept
 
 
 def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Failure:
@@ -31,30 +40,36 @@ def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Fail
     with context.timer("clock"):
         pooled = sync.pooled_strips(sampler.binned())
         different = told_apart_by_clock(context.screens)
-        rates = {(s.slot_rate_hz, s.packet_slots): s for s in different}
+        rates = {(s.slot_rate_hz, s.packet_slots): s for s in reversed(different)}
         clocks = {rate: found for rate, screen in rates.items() if (found := _clocks_of(context, screen, pooled))}
         clocks = {rate: found for rate, found in clocks.items() if found[0].header_peak_ratio >= _MIN_PEAK_RATIO}
         if not clocks:
             return Failure("no_signal", _why_no_signal(context))
         structure = {rate: _structure(pooled, found[0]) for rate, found in clocks.items()} if len(clocks) > 1 else {}
+    first: dict[tuple[float, int], Acquisition] = {}
     if _is_plain(list(structure.values())):
         rate = max(clocks, key=lambda rate: structure.get(rate, 0.0))
     else:
         # Each has an initial pass; where none shows packets, the clocks' structure is all there is.
-        first = {rate: _acquired(screen, sampler, clocks[rate]) for rate, screen in rates.items() if rate in clocks}
+        first = {
+            rate: _acquired(context, screen, sampler, clocks[rate]) for rate, screen in rates.items() if rate in clocks
+        }
         rate = max(clocks, key=lambda rate: (_packets(context, first[rate]), structure[rate]))
     alike = [screen for screen in different if (screen.slot_rate_hz, screen.packet_slots) == rate]
-    acquisitions = [_acquired(alike[0], sampler, clocks[rate])] if alike[0].columns == n_columns else []
+    coarse = first.get(rate) or _acquired(context, alike[0], sampler, clocks[rate])
+    coarse = coarse if coarse.screen.columns == n_columns else None
+    if coarse is not None and (len(alike) == 1 or _packets(context, coarse) > _PLAIN_COLUMNS):
+        return coarse
+    acquisitions = [coarse] if coarse else []
     for screen in alike[len(acquisitions) :]:
         finer = sample_columns(context, screen.columns, quick=sampler.read is not None)
         with context.timer("clock"):
             found = _clocks_of(context, screen, sync.pooled_strips(finer.binned()))
         if found:
-            acquisitions.append(_acquired(screen, finer, found))
+            acquisitions.append(_acquired(context, screen, finer, found))
     if not acquisitions:
         return Failure("no_signal", _why_no_signal(context))
-    likely = acquisitions[0] if len(acquisitions) == 1 else _with_likely_columns(acquisitions)
-    return replace(likely, variants=variants_of(likely.screen, context.screens))
+    return acquisitions[0] if len(acquisitions) == 1 else _with_likely_columns(acquisitions)
 
 
 def _shape_of(screen: ScreenProfile) -> tuple[float, int, int]:
@@ -78,8 +93,11 @@ def variants_of(screen: ScreenProfile, screens: Sequence[ScreenProfile]) -> tupl
     return tuple(others[repeats] for repeats in sorted(others, reverse=True))
 
 
-def _acquired(screen: ScreenProfile, sampler: ColumnSampler, clocks: tuple[Clock, ...]) -> Acquisition:
-    return Acquisition(screen, sampler, clocks[0], rival=clocks[1] if len(clocks) > 1 else None)
+def _acquired(
+    context: FrameContext, screen: ScreenProfile, sampler: ColumnSampler, clocks: tuple[Clock, ...]
+) -> Acquisition:
+    rival = clocks[1] if len(clocks) > 1 else None
+    return Acquisition(screen, sampler, clocks[0], rival, variants_of(screen, context.screens))
 
 
 def _structure(profiles: RowProfiles, clock: Clock) -> float:

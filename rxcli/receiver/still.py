@@ -25,7 +25,7 @@ _COARSE, _FINE = 2, 4
 _MAX_ITERATIONS = 3
 #: Below so many rows a slot it shows that developing mixes rows; as how wide a box of rows, is tried.
 _FEW_ROWS = 4.0
-_MIXED_ROWS = (0.0, 1.0, 1.7, 2.4, 3.0)
+_MIXED_ROWS, _USUAL_MIX = (0.0, 1.0, 1.7, 2.4, 3.0), 1
 #: A column whose packets have at least this confidence, or whose symbols this log probability whatever slots say,
 #: is not looked at again. Of 2699 packets of simulated frames a quick look leaves 1322 so, two of them wrong.
 _CERTAIN, _BEYOND_DOUBT = 0.99, -1e-3
@@ -82,16 +82,44 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
     """What is decoded on the clock, and with the bursts, by which slots are packets most.
 
     Bursts are told apart by how alike copies are. Where symbols stay in doubt that may be why: copies of two packets,
-    taken for one, decode to neither.
+    taken for one, decode to neither. So they are weighed on the initial pass, and once more by what was decoded, which
+    tells copies better.
 
     Args:
-        lock: the clock, perhaps another that it may be, and the row profiles.
+        acquisition: the clock, perhaps another that it may be, and the row profiles.
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
     """
-    first = _first_pass(acquisition)
+    first = first_pass(acquisition)
     if acquisition.rival is not None:
         return _likelier_clock(acquisition, first, skip)
-    reception = decode(acquisition, skip, first)
+    weighed = [first]
+    likeliest = _with_likeliest_bursts(acquisition, first, weighed)
+    reception = decode(
+        _in_bursts_of(acquisition, likeliest) if likeliest is not first else acquisition, skip, likeliest
+    )
+    if len(weighed) > 1 and _same_bursts(reception, likeliest):
+        return reception
+    likeliest = _with_likeliest_bursts(acquisition, reception, weighed)
+    if _same_bursts(likeliest, reception):
+        return reception
+    return max(reception, decode(_in_bursts_of(acquisition, likeliest), skip, likeliest), key=packet_llr)
+
+
+def decode_alike(acquisition: Acquisition, skip: frozenset[str], before: Reception) -> Reception:
+    """What is decoded on a clock next to the one before: with columns spread in time as there, and with its bursts."""
+    clocks = [clock for clock in (acquisition.clock, acquisition.rival) if clock is not None]
+    alike = [clock for clock in clocks if clock.delay_slots.any() == before.clock.delay_slots.any()]
+    clock = (alike or clocks)[0]
+    if clock.n_copies != before.clock.n_copies or clock.packet_slots != before.clock.packet_slots:
+        return decode_likeliest(acquisition, skip)
+    return decode(replace(acquisition, clock=clock, rival=None, burst=before.clock.burst), skip)
+
+
+def _with_likeliest_bursts(acquisition: Acquisition, reception: Reception, weighed: list[Reception]) -> Reception:
+    """Of initial passes with the bursts that there may be, that of the likeliest; where there is no doubt, `reception`.
+
+    Passes that were `weighed` before are not made again; new ones are added there.
+    """
     confidence = np.where(_complete(reception), _confidence(reception), 0.0).max(axis=0)
     if not confidence.any() or (confidence > _CLEAR).mean() >= _CLEAR_COLUMNS:
         return reception
@@ -100,23 +128,48 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
     if plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
         return reception
     # How far rows are mixed does not depend on the bursts.
-    seen = replace(acquisition, clock=replace(acquisition.clock, exposure_slots=reception.clock.exposure_slots))
-    passes = [initial_pass(replace(seen, burst=clock.burst)) for clock, _ in possible]
-    likeliest = max(passes, key=packet_llr)
-    burst = likeliest.clock.burst
-    if np.array_equal(burst, reception.clock.burst):
-        return reception
-    return max(reception, decode(replace(seen, burst=burst), skip, likeliest), key=packet_llr)
+    clocks = [replace(clock, exposure_slots=reception.clock.exposure_slots) for clock, _ in possible]
+    passes = []
+    for clock in clocks:
+        known = next((one for one in weighed if np.array_equal(one.clock.burst, clock.burst)), None)
+        if known is None:
+            known = initial_pass(
+                replace(
+                    acquisition,
+                    clock=replace(acquisition.clock, exposure_slots=clock.exposure_slots),
+                    burst=clock.burst,
+                )
+            )
+            weighed.append(known)
+        passes.append(known)
+    return max(passes, key=packet_llr)
+
+
+def _in_bursts_of(acquisition: Acquisition, reception: Reception) -> Acquisition:
+    """The acquisition with the bursts, and the exposure, of what was received."""
+    clock = replace(acquisition.clock, exposure_slots=reception.clock.exposure_slots)
+    return replace(acquisition, clock=clock, burst=reception.clock.burst)
+
+
+def _same_bursts(one: Reception, other: Reception) -> bool:
+    return np.array_equal(one.clock.burst, other.clock.burst)
 
 
 def _likelier_clock(acquisition: Acquisition, first: Reception, skip: frozenset[str]) -> Reception:
-    """What is decoded on the likelier of two clocks; on both where an initial pass does not tell them plainly."""
+    """What is decoded on the likelier of two clocks; a further look tells where an initial pass does not plainly."""
     assert acquisition.rival is not None
     either = [replace(acquisition, clock=clock, rival=None) for clock in (acquisition.clock, acquisition.rival)]
-    evidence = [packet_llr(first), packet_llr(_first_pass(either[1]))]
-    if abs(evidence[0] - evidence[1]) > _PLAIN_CLOCK:
-        return decode_likeliest(either[int(np.argmax(evidence))], skip)
-    return max((decode_likeliest(one, skip) for one in either), key=packet_llr)
+    either[0].kept.update(acquisition.kept)
+    evidence = [packet_llr(first), packet_llr(first_pass(either[1]))]
+    if abs(evidence[0] - evidence[1]) < _PLAIN_CLOCK:
+        evidence = [packet_llr(_refined_once(one)) for one in either]
+    return decode_likeliest(either[int(np.argmax(evidence))], skip)
+
+
+def _refined_once(acquisition: Acquisition) -> Reception:
+    """The first pass and a look at all scales of every column that has light."""
+    first = first_pass(acquisition)
+    return _refine_columns(acquisition, first, np.flatnonzero(~_dark(first.snr)), _COARSE)[0]
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
@@ -127,7 +180,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
         first: what the quick look showed, where there was one.
     """
-    reception = first or _first_pass(acquisition)
+    reception = first or first_pass(acquisition)
     doubtful = _doubtful(reception, _CERTAIN) if "certain_columns" in skip else np.ones(reception.snr.shape[0], bool)
     if not doubtful.any():
         return replace(reception, skipped={"certain_columns": reception.snr.shape[0]})
@@ -137,15 +190,25 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
     return remove_row_noise(acquisition, reception, columns) if columns.size else reception
 
 
-def _first_pass(acquisition: Acquisition) -> Reception:
-    return (
-        initial_pass(acquisition) if acquisition.clock.rows_per_slot >= _FEW_ROWS else _likeliest_row_mix(acquisition)
-    )
+def first_pass(acquisition: Acquisition) -> Reception:
+    """The initial pass; with few rows a slot that with the likeliest mix of rows."""
+    if acquisition.clock.rows_per_slot >= _FEW_ROWS:
+        return initial_pass(acquisition)
+    if "first" not in acquisition.kept:
+        acquisition.kept["first"] = _likeliest_row_mix(acquisition)
+    kept: Reception = acquisition.kept["first"]
+    return kept
 
 
 def initial_pass(acquisition: Acquisition) -> Reception:
-    """One pass over the strips pooled in pairs, from the first guess."""
-    acquisition = acquisition.binned()
+    """One pass over the strips pooled in pairs, from the first guess; made once for an acquisition."""
+    if "initial" not in acquisition.kept:
+        acquisition.kept["initial"] = _initial_pass(acquisition.binned())
+    kept: Reception = acquisition.kept["initial"]
+    return kept
+
+
+def _initial_pass(acquisition: Acquisition) -> Reception:
     clock = acquisition.clock
     samples = sync.sample_slots(acquisition.profiles, clock, _COARSE)
     model = _light_model(acquisition, samples)
@@ -171,12 +234,26 @@ def _first_decision(metrics: FloatArray, isi_memory: int) -> Float32Array:
 def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
     """The quick look with the exposure widened by the rows that demosaicing and denoising mixed, as the light has it.
 
-    They tell on a slot of few rows: one of 1.5 rows that is exposed for 0.4 slots is seen as if for 1.2 and more.
+    They tell on a slot of few rows: one of 1.5 rows that is exposed for 0.4 slots is seen as if for 1.2 and more. From
+    the usual mix on, the next ones are tried for as long as they are likelier.
     """
     acquisition, clock = acquisition.binned(), acquisition.clock
-    widths = (np.hypot(clock.exposure_slots, mixed / clock.rows_per_slot) for mixed in _MIXED_ROWS)
-    passes = [initial_pass(replace(acquisition, clock=replace(clock, exposure_slots=float(width)))) for width in widths]
-    return max(passes, key=lambda reception: float(_evidence(reception.metrics, reception.clock).sum()))
+    tried: dict[int, tuple[float, Reception]] = {}
+
+    def likelihood(number: int) -> float:
+        if not 0 <= number < len(_MIXED_ROWS):
+            return -np.inf
+        if number not in tried:
+            width = float(np.hypot(clock.exposure_slots, _MIXED_ROWS[number] / clock.rows_per_slot))
+            reception = initial_pass(replace(acquisition, clock=replace(clock, exposure_slots=width)))
+            tried[number] = float(_evidence(reception.metrics, reception.clock).sum()), reception
+        return tried[number][0]
+
+    best = min(_USUAL_MIX, len(_MIXED_ROWS) - 1)
+    step = 1 if likelihood(best + 1) > likelihood(best) else -1
+    while likelihood(best + step) > likelihood(best):
+        best += step
+    return tried[best][1]
 
 
 def iterate(

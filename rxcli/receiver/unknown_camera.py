@@ -11,24 +11,27 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import camera as blind
 from rxcli.receiver import channel
-from rxcli.receiver.acquisition import Acquisition, sample_columns
+from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera_memory import recall, remember
 from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, refittable, refitted_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
-from rxcli.receiver.screen_choice import acquire
-from rxcli.receiver.still import Reception, decode_likeliest, initial_pass, packet_llr
+from rxcli.receiver.screen_choice import quick_look
+from rxcli.receiver.still import Reception, decode_alike, decode_likeliest, initial_pass, packet_llr
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
 
 #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
 _MATTERS_SLOTS = 0.05
 _MOST_INITIAL_REFITS = 3
 #: Slots, as probabilities, that differ by no more than this on average tell the same camera.
-_SLOTS_ALIKE = 0.01
+_SLOTS_ALIKE = 0.02
 #: What is received with a refitted camera shows packets as well as before from this share of the evidence on.
 _KEPT_EVIDENCE = 0.9
 #: Headers and packets, all columns together, that an estimate with rivals must show, nats: wrong ones have next to none
 #: of one or of the other.
 _PACKETS_AT_LEAST = 80.0
+#: From so many on it is right but for the length of its packets: wrong ones reach 103. Periods this close are one, as
+#: far as an initial pass goes.
+_PLAIN_PACKETS, _SAME_PERIOD = 200.0, 5e-3
 #: Packets that an estimate must show under which none is received, nats: wrong ones show less than 10, right ones 80.
 _PACKETS_IF_NONE_RECEIVED = 30.0
 #: Packets that a camera must show to be remembered, and to be kept when it was, nats. Relative standard deviation of
@@ -54,32 +57,75 @@ class Received:
 def likely_camera(frame: Frame, corners: FloatArray, options: ReceiverOptions, timer: Timer) -> FrameContext | Failure:
     """The frame with its camera, known or estimated, and the screens that remain.
 
-    Where several estimates are left, each has an initial pass: the one under which headers, packets and
-    symbols show best is it, and without packets none, unless the first is beyond doubt.
+    Where several estimates are left, they have initial passes by turns until one shows packets plainly: the one under
+    which headers, packets and symbols show best is it, and without packets none, unless the first is beyond doubt.
     """
     remembered = None if options.force_camera else recall(options.camera_cache, frame)
     if remembered is not None and not has_profile(frame, options):
         return FrameContext(frame, corners, remembered.camera(frame), options.screens, timer)
-    found = find_cameras(frame, corners, options, timer)
+    found = find_cameras(frame, corners, options, timer, shows_packets)
     if found.first is not None and not found.rivals:
         return found.first
     best, most = found.first if found.sure else None, -np.inf
-    for candidate in ([found.first] if found.first else []) + list(found.rivals):
+    plain: FrameContext | None = None
+    for candidate in _of_different_clocks([*([found.first] if found.first else []), *found.rivals]):
+        if plain is not None and not _may_be_of_shorter_packets(candidate, plain):
+            continue
         packets, symbols = _initial_evidence(candidate)
         if packets > _PACKETS_AT_LEAST and packets + symbols > most:
             best, most = candidate, packets + symbols
+        if packets > _PLAIN_PACKETS and plain is None:
+            plain = candidate
     return best or Failure("no_signal", found.reason or _NO_HEADERS, found.estimated)
+
+
+def _of_different_clocks(candidates: list[FrameContext]) -> list[FrameContext]:
+    """The candidates without those whose clock is that of one before: a refit moves them to the same one."""
+    chosen: list[FrameContext] = []
+    for candidate in candidates:
+        if not any(_same_clock(candidate, one) and _length(candidate) == _length(one) for one in chosen):
+            chosen.append(candidate)
+    return chosen
+
+
+def _same_clock(one: FrameContext, other: FrameContext) -> bool:
+    delays = [_line_delay_slots(context) for context in (one, other)]
+    return abs(np.log(delays[0] / delays[1])) < _SAME_PERIOD and one.camera.reversed == other.camera.reversed
+
+
+def _line_delay_slots(context: FrameContext) -> float:
+    return context.camera.line_delay_s * context.screens[0].slot_rate_hz
+
+
+def _length(context: FrameContext) -> int:
+    return context.screens[0].packet_slots
+
+
+def _may_be_of_shorter_packets(candidate: FrameContext, plain: FrameContext) -> bool:
+    """Whether a candidate has shorter packets on the same clock: a second header may stand among longer ones' words."""
+    return _same_clock(candidate, plain) and _length(candidate) < _length(plain)
 
 
 def _initial_evidence(context: FrameContext) -> tuple[float, float]:
     """What an initial pass says of a camera: evidence of headers and packets, and how sure symbols are; nats."""
-    acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
+    if "evidence" not in context.kept:
+        context.kept["evidence"] = _evidence_of(quick_look(context), context.timer)
+    kept: tuple[float, float] = context.kept["evidence"]
+    return kept
+
+
+def _evidence_of(acquisition: Acquisition | Failure, timer: Timer) -> tuple[float, float]:
     if isinstance(acquisition, Failure):
         return -np.inf, 0.0
-    with context.timer("detect"):
+    with timer("detect"):
         reception = initial_pass(acquisition)
         packets = float(reception.posteriors.header_llr.sum()) + packet_llr(reception)
     return packets, _SAY_OF_SYMBOLS * float(reception.posteriors.log_prob.mean())
+
+
+def shows_packets(context: FrameContext) -> bool:
+    """Whether packets show with a camera beyond doubt."""
+    return _initial_evidence(context)[0] > _PLAIN_PACKETS
 
 
 def receive_unknown(context: FrameContext, acquisition: Acquisition, skip: frozenset[str]) -> Received:
@@ -101,10 +147,12 @@ def _with_settled_clock(received: Received) -> Received:
         received = _with_camera(received, camera)
         if moved_slots < _MATTERS_SLOTS:
             break
-        again = _received_again(received, initial_pass)
+        before, again = received, _received_again(received, initial_pass)
         if again is None:
             break
         received = again
+        if not _slots_changed(before, again):
+            break
     return received
 
 
@@ -121,7 +169,7 @@ def with_refitted_camera(received: Received, skip: frozenset[str], slots_changed
     """
 
     def decoded(acquisition: Acquisition) -> Reception:
-        return decode_likeliest(acquisition, skip)
+        return decode_alike(acquisition, skip, received.reception)
 
     if slots_changed:
         with received.context.timer("blind"):
@@ -152,7 +200,7 @@ def _with_camera(received: Received, camera: Camera) -> Received:
 def _received_again(before: Received, receive: Callable[[Acquisition], Reception]) -> Received | None:
     """What is received with a refitted camera; None where packets show less than in what was received before."""
     context = before.context
-    acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
+    acquisition = quick_look(context)
     if isinstance(acquisition, Failure):
         return None
     with context.timer("detect"):

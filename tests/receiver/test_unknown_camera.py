@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.cameras import Cameras, find_cameras
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.pipeline import ReceiverOptions, receive
-from rxcli.receiver.screen_choice import acquire
+from rxcli.receiver.screen_choice import acquire, quick_look
 from rxcli.receiver.still import decode
 from rxcli.types import Frame, FrameResult
 
@@ -94,7 +93,7 @@ def test_an_estimate_without_a_lock_is_none_where_it_has_rivals(
 ) -> None:
     frame, _ = _frame(tmp_path)
     right, wrong = _with_camera(frame, ROWS_PER_SLOT), _with_camera(frame, 1.13 * ROWS_PER_SLOT)
-    monkeypatch.setattr(unknown_camera, "acquire", lambda *_: Failure("no_signal", "nothing there"))
+    monkeypatch.setattr(unknown_camera, "quick_look", lambda *_: Failure("no_signal", "nothing there"))
     assert _chosen(frame, Cameras(right), monkeypatch) is right
     assert "no packet header" in _why_none(frame, Cameras(right, (wrong,)), monkeypatch)
 
@@ -171,11 +170,11 @@ def test_a_picture_whose_values_follow_light_is_read_as_one(tone: Tone, monkeypa
     options = ReceiverOptions(cameras=(), corners=trial.corners, cae="never")
     read: list[str] = []
 
-    def noting_the_tone(context: FrameContext, *rest: Any) -> Acquisition | Failure:
+    def noting_the_tone(context: FrameContext) -> Acquisition | Failure:
         read.append(context.camera.tone)
-        return acquire(context, *rest)
+        return quick_look(context)
 
-    monkeypatch.setattr(unknown_camera, "acquire", noting_the_tone)
+    monkeypatch.setattr(unknown_camera, "quick_look", noting_the_tone)
     result = next(receive([frame], options))
     exponent, sd = result.estimated["tone_exponent"]
     assert abs(exponent - (1.0 if tone == "linear" else 2.2)) < 2 * sd

@@ -49,9 +49,11 @@ class RowModel:
             values: start and rows per slot of the clock, and more.
             lit: (C, N) probability that each slot is lit.
         """
-        light, slope = _parts(strips, time, values, lit, self.shutter_slots)
-        kernel = self.kernel.astype(np.float32)
-        return np.tensordot(kernel, light, 1), np.tensordot(kernel, slope, 1)
+        rows = _SensorRows.of(strips, time, values)
+        light, slope = (
+            rows.read(_mixed(table, self.kernel)) for table in rows.seen(strips, values, lit, self.shutter_slots)
+        )
+        return light, slope
 
 
 def fit_rows(
@@ -75,9 +77,10 @@ def fit_rows(
         shutter_slots: exposure that the file tells, 0 where it does not.
     """
     tried = (shutter_slots,) if shutter_slots else [share * exposure_slots for share in _SHUTTERS]
-    fits = []
+    rows, fits = _SensorRows.of(strips, time, values), []
     for shutter in tried:
-        light, _ = _parts(strips, time, values, lit, shutter)
+        table, _ = rows.seen(strips, values, lit, shutter)
+        light = np.stack([rows.read(_mixed(table, part)) for part in np.eye(_KERNEL.size)])
         kernel = _KERNEL
         for _ in range(_KERNEL_ROUNDS):
             kernel, misfit = _fit_kernel(strips, light, kernel, window)
@@ -85,26 +88,50 @@ def fit_rows(
     return min(fits, key=lambda fit: fit[0])[1]
 
 
-def _parts(
-    strips: Strips, time: Float32Array, values: FloatArray, lit: Float32Array, shutter_slots: float
-) -> tuple[Float32Array, Float32Array]:
-    """(3, M, R) light of sensor rows at, next to and two from every strip's row; and its change per slot."""
-    start, rows_per_slot = values[:2]
-    join = max(round(float(strips.rows[1] - strips.rows[0])), 1)
-    place: FloatArray = time.astype(np.float64) * rows_per_slot + start - (join - 1) / 2
-    reach = _KERNEL.size - 1
-    first = int(np.floor(place.min())) - reach
-    n = int(np.ceil(place.max())) + 2 + reach - first
-    sensor_time = (first + np.arange(n + join - 1) - start) / rows_per_slot
-    columns = np.arange(lit.shape[0])
-    observed = seen_through(lit, np.broadcast_to(sensor_time, (columns.size, sensor_time.size)), columns, shutter_slots)
-    shares = column_shares(strips).astype(np.float32)
-    place -= first
-    low: IntArray = place.astype(np.int64)
-    fraction = (place - low).astype(np.float32)
-    low += (np.arange(low.shape[0]) * n)[:, None]
-    light, slope = (_mixed(shares @ _joined(table, join), low, fraction) for table in observed)
-    return light, slope
+@dataclass(frozen=True, slots=True)
+class _SensorRows:
+    """Where every strip's rows lie among successive sensor rows."""
+
+    #: Number of the first of the sensor rows, and how many there are; so many rows were averaged to one of a strip.
+    first: int
+    n: int
+    join: int
+    #: (M, R) sensor row below, counted through a table (M, n), and how far above it.
+    low: IntArray
+    fraction: Float32Array
+
+    @staticmethod
+    def of(strips: Strips, time: Float32Array, values: FloatArray) -> _SensorRows:
+        """The sensor rows of strips whose rows stand at slot positions (M, R) of a clock."""
+        start, rows_per_slot = values[:2]
+        join = max(round(float(strips.rows[1] - strips.rows[0])), 1)
+        place: FloatArray = time.astype(np.float64) * rows_per_slot + start - (join - 1) / 2
+        reach = _KERNEL.size - 1
+        first = int(np.floor(place.min())) - reach
+        n = int(np.ceil(place.max())) + 2 + reach - first
+        place -= first
+        low: IntArray = place.astype(np.int64)
+        fraction = (place - low).astype(np.float32)
+        low += (np.arange(low.shape[0]) * n)[:, None]
+        return _SensorRows(first, n, join, low, fraction)
+
+    def seen(
+        self, strips: Strips, values: FloatArray, lit: Float32Array, shutter_slots: float
+    ) -> tuple[Float32Array, Float32Array]:
+        """(M, n) light of the sensor rows in every strip; and its change per slot."""
+        start, rows_per_slot = values[:2]
+        time = (self.first + np.arange(self.n + self.join - 1) - start) / rows_per_slot
+        columns = np.arange(lit.shape[0])
+        tables = seen_through(lit, np.broadcast_to(time, (columns.size, time.size)), columns, shutter_slots)
+        shares = column_shares(strips).astype(np.float32)
+        light, slope = (shares @ _joined(table, self.join) for table in tables)
+        return light, slope
+
+    def read(self, table: Float32Array) -> Float32Array:
+        """(M, R) values of a table (M, n) between two sensor rows."""
+        flat = table.ravel()
+        below = flat.take(self.low)
+        return np.asarray(below + (flat.take(self.low + 1) - below) * self.fraction, np.float32)
 
 
 def _joined(table: Float32Array, join: int) -> Float32Array:
@@ -113,18 +140,15 @@ def _joined(table: Float32Array, join: int) -> Float32Array:
     return np.asarray(sum(table[:, k : k + n] for k in range(join)), np.float32) / np.float32(join)
 
 
-def _mixed(table: Float32Array, low: IntArray, fraction: Float32Array) -> Float32Array:
-    """(3, M, R) values of a table (M, n) between two rows, and of the rows on either side."""
-    out = np.empty((_KERNEL.size, *low.shape), np.float32)
-    for reach in range(_KERNEL.size):
-        either = table
-        if reach:
+def _mixed(table: Float32Array, kernel: FloatArray) -> Float32Array:
+    """(M, n) every row of a table mixed with the rows on either side."""
+    weights = kernel.astype(np.float32)
+    out = weights[0] * table
+    for reach, weight in enumerate(weights[1:], 1):
+        if weight:
             padded = np.pad(table, ((0, 0), (reach, reach)), mode="edge")
-            either = np.asarray((padded[:, : -2 * reach] + padded[:, 2 * reach :]) / 2, np.float32)
-        flat = either.ravel()
-        below = flat.take(low)
-        out[reach] = below + (flat.take(low + 1) - below) * fraction
-    return out
+            out += (weight / 2) * (padded[:, : -2 * reach] + padded[:, 2 * reach :])
+    return np.asarray(out, np.float32)
 
 
 def _fit_kernel(strips: Strips, parts: Float32Array, kernel: FloatArray, window: int) -> tuple[FloatArray, float]:

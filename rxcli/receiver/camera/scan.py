@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.numerics import header_correlation
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.edges import edge_power
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis, distinct
 from rxcli.receiver.camera.strips import SAMPLES, Noise, Strips, levelled
@@ -43,9 +44,6 @@ _TRIALS = 24
 #: The same of the short list; lines and peaks that an octave has on it, those of every length of packet; and slots over
 #: the picture by which a period is off.
 _SHORT_TRIALS, _LINES, _PEAKS, _OFF_SLOTS = 5, 4, 3, (-1.0, 0.0, 1.0)
-
-#: Steps of the header, dark before and after.
-_HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,10 +171,7 @@ def _header_response(total: FloatArray, rows_per_slot: float) -> FloatArray:
     starts = int((total.size - 1) / rows_per_slot * SAMPLES) + lead
     grid = np.arange(-lead, starts + 1) * (rows_per_slot / SAMPLES)
     summed = np.interp(grid, np.arange(total.size), total)
-    out = np.zeros(starts)
-    for edge in np.flatnonzero(_HEADER_STEPS):
-        out -= _HEADER_STEPS[edge] * summed[edge * SAMPLES : edge * SAMPLES + starts]
-    out /= SLOTS_PER_SYMBOL * rows_per_slot
+    out = header_correlation(summed, SAMPLES)[:starts] * (SAMPLES / rows_per_slot)
     return np.stack([out, -out])
 
 

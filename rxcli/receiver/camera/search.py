@@ -64,13 +64,19 @@ class BlindSearch:
         return self.estimate is not None and self.estimate.log_evidence > _BEYOND_DOUBT
 
 
-def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None) -> BlindSearch:
+def estimate_camera(
+    strips: Strips,
+    screens: Sequence[ScreenProfile],
+    exposure_s: float | None = None,
+    shows_packets: Callable[[BlindEstimate], bool] = lambda _: False,
+) -> BlindSearch:
     """Estimate the camera from one picture of a sending screen.
 
     Args:
         strips: see `strips_of`.
         screens: screens that it may be.
         exposure_s: exposure, None where the file does not tell it.
+        shows_packets: whether packets show with an estimate beyond doubt; asked before the search is widened.
 
     Raises:
         ValueError: no screens.
@@ -83,14 +89,27 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     sure = gain > _BEND_GAINS[1]
     curves = [curvature] if sure else [np.zeros(4), curvature] if gain > _BEND_GAINS[0] else [np.zeros(4)]
     views = Views(strips)
-    readings = _readings(views, curves, lengths)
+    straight = [straightened(strips, curvature) for curvature in curves]
+
+    def refined(reading: Reading) -> list[BlindEstimate]:
+        return refine(views, reading, lengths, lambda length: (exposure_s or 0.0) * rates[length], sure)
+
+    readings = sorted(
+        _read_until_sure(views, _clocks(short_list, straight, curves, lengths)[:_READ], lengths), key=_by_evidence
+    )
     estimates: list[BlindEstimate] = []
-    for reading in _worth_refining(readings):
-        estimates += refine(views, reading, lengths, lambda length: (exposure_s or 0.0) * rates[length], sure)
+    if _HOPELESS < _best(readings) < _READ_SURELY:
+        estimates = refined(readings[0])
+        best = max(estimates, key=lambda one: _plausibility(one, strips, one.rows_per_slot))
+        if _is_plausible(best) and shows_packets(best):
+            return BlindSearch(best, rivals=_worth_reading([one for one in estimates if one is not best]))
+    asked = readings[:1] if estimates else []
+    for reading in _worth_refining(_more_readings(views, straight, curves, lengths, readings)):
+        estimates += [] if any(reading is one for one in asked) else refined(reading)
     rows_per_slot = estimates[0].rows_per_slot if estimates else 1.0
     estimates.sort(key=lambda estimate: -_plausibility(estimate, strips, rows_per_slot))
     best = estimates[0] if estimates else None
-    if best is None or best.log_evidence < MIN_EVIDENCE or best.explained < _LEAST_EXPLAINED:
+    if best is None or not _is_plausible(best):
         return BlindSearch(None, why_not(strips), _worth_reading(estimates), by_edges(strips, estimates))
     rivals = _worth_reading(estimates[1:])
     if best.log_evidence > _BEYOND_DOUBT:
@@ -100,18 +119,23 @@ def estimate_camera(strips: Strips, screens: Sequence[ScreenProfile], exposure_s
     return BlindSearch(best, rivals=rivals)
 
 
-def _readings(views: Views, curves: list[FloatArray], lengths: list[int]) -> list[Reading]:
-    """Slots read on the clocks that the picture may show, best first; no more of them than it takes to be sure."""
-    straight = [straightened(views.strips, curvature) for curvature in curves]
-    found = _clocks(short_list, straight, curves, lengths)
-    readings = _read_until_sure(views, found[:_READ], lengths)
+def _is_plausible(estimate: BlindEstimate) -> bool:
+    return estimate.log_evidence >= MIN_EVIDENCE and estimate.explained >= _LEAST_EXPLAINED
+
+
+def _more_readings(
+    views: Views, straight: list[Strips], curves: list[FloatArray], lengths: list[int], readings: list[Reading]
+) -> list[Reading]:
+    """The readings, best first, with those of further clocks where they are not of the right one for sure."""
     if _best(readings) < _NOTHING_READ:
         found = _clocks(every_clock, straight, curves, lengths)
         outstanding = sorted(found, key=lambda pair: -pair[0].salience)
         either = [pair for both in zip(found, outstanding, strict=True) for pair in both]
-        readings += _read_until_sure(views, distinct(either, on_one_curvature(same_slots), _READ_OF_ALL), lengths)
+        readings = readings + _read_until_sure(
+            views, distinct(either, on_one_curvature(same_slots), _READ_OF_ALL), lengths
+        )
     if _HOPELESS < _best(readings) < _READ_SURELY:
-        readings += _read_around(views, sorted(readings, key=_by_evidence)[:_READ_AROUND], lengths)
+        readings = readings + _read_around(views, sorted(readings, key=_by_evidence)[:_READ_AROUND], lengths)
     return sorted(readings, key=_by_evidence)
 
 

@@ -84,36 +84,42 @@ def _have_sides(corners: FloatArray, picture: Picture) -> bool:
     )
 
 
-def _arcs(picture: Picture, corners: FloatArray, k1: float) -> list[Side]:
-    """The sides between corners that a lens of this coefficient has moved to where they are."""
+def _arcs(picture: Picture, corners: FloatArray, k1: FloatArray) -> list[list[Side]]:
+    """The sides between corners that a lens of each coefficient has moved to where they are."""
     middle = np.array([(picture.width - 1) / 2, (picture.height - 1) / 2])
+    k1 = np.asarray(k1, np.float64)[:, None, None]
 
     def moved(points: FloatArray) -> FloatArray:
         square = (points**2).sum(axis=-1, keepdims=True)
-        return np.asarray(1 + k1 * square * (1 - square))
+        return np.asarray(1 + k1.reshape(-1, *[1] * (points.ndim - 1)) * square * (1 - square))
 
     observed = (corners - middle) / picture.width
-    ideal = observed
+    ideal = np.broadcast_to(observed, (k1.size, 4, 2))
     for _ in range(8):
         ideal = observed / moved(ideal)
-    sides = []
-    for side in range(4):
-        straight = ideal[side] + _ALONG[:, None] * (ideal[(side + 1) % 4] - ideal[side])
-        points = straight * moved(straight) * picture.width + middle
-        t, place = (points if across(side) else points[:, ::-1]).T
-        centre, half = (t[0] + t[-1]) / 2, abs(t[-1] - t[0]) / 2
-        sides.append(Side(np.polyfit((t - centre) / half, place, _DEGREE), float(centre), float(half), 1.0))
-    return sides
+    straight = ideal[:, :, None] + _ALONG[:, None] * (np.roll(ideal, -1, axis=1) - ideal)[:, :, None]
+    points = straight * moved(straight) * picture.width + middle
+    upright = [side for side in range(4) if not across(side)]
+    points[:, upright] = points[:, upright, :, ::-1]
+    t, place = points[..., 0], points[..., 1]
+    centre, half = (t[..., 0] + t[..., -1]) / 2, np.abs(t[..., -1] - t[..., 0]) / 2
+    powers = ((t - centre[..., None]) / half[..., None])[..., None] ** np.arange(_DEGREE, -1, -1)
+    turned = powers.swapaxes(-1, -2)
+    coefficients = np.linalg.solve(turned @ powers, turned @ place[..., None])[..., 0]
+    return [
+        [Side(*one, 1.0) for one in zip(*sides, strict=True)]
+        for sides in zip(coefficients, centre.tolist(), half.tolist(), strict=True)
+    ]
 
 
 def _best_around(
     picture: Picture, corners: FloatArray, initial: float, size: float
 ) -> tuple[float, float, list[Steps]]:
     """The support of the best coefficient near a guess, that coefficient, and the steps found along the guess."""
-    arcs = _arcs(picture, corners, initial)
-    steps = [steps_of(picture, arcs, side, size) for side in range(4)]
-    supports = [(_support(steps, _arcs(picture, corners, k1)), k1) for k1 in (initial + _TRIED).tolist()]
-    return *max(supports), steps
+    tried = np.append(initial, initial + _TRIED)
+    own, *others = _arcs(picture, corners, tried)
+    steps = [steps_of(picture, own, side, size) for side in range(4)]
+    return *max((_support(steps, arcs), k1) for arcs, k1 in zip(others, tried[1:].tolist(), strict=True)), steps
 
 
 def _support(steps: list[Steps], arcs: list[Side]) -> float:
@@ -134,7 +140,7 @@ def _by_least_squares(
     edge of a picture's black part, or of what the correction of a lens left of it.
     """
     for _ in range(_ROUNDS):
-        now, next_one = _arcs(picture, corners, k1), _arcs(picture, corners, k1 + _STEP)
+        now, next_one = _arcs(picture, corners, np.array([k1, k1 + _STEP]))
         said = [_said_by(*one, size) for one in zip(steps, now, next_one, strict=True)]
         precision, pull = np.array([one for one in said if one]).reshape(-1, 2).T
         if precision.size < _LEAST_SIDES:

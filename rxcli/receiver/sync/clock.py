@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import log_alike
+from rxcli.numerics import header_correlation, log_alike
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
@@ -189,10 +189,15 @@ def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot
     A start may lie up to a header before the first sample's end; what is not seen counts as nothing.
     """
     share = weight / (weight + 1.0)
-    mean = (pooled * share).sum(axis=0) / max(pooled.shape[0], 1)
-    template = np.repeat(2.0 * np.array(HEADER) - 1, samples_per_slot) / (SLOTS_PER_SYMBOL * samples_per_slot)
-    padded = np.concatenate([np.asarray(mean, np.float64), np.zeros(template.size - 1)])
-    return np.correlate(padded, template, "valid")
+    return _header_correlation((pooled * share).sum(axis=0)[None] / max(pooled.shape[0], 1), samples_per_slot)[0]
+
+
+def _header_correlation(values: NDArray[np.floating], samples_per_slot: int) -> FloatArray:
+    """(n, samples) mean of the slots of a header that starts at each sample, dark ones negative; nothing beyond."""
+    total = np.cumsum(values, axis=1, dtype=np.float64)
+    padded = np.pad(total, ((0, 0), (1, 0)))
+    length = SLOTS_PER_SYMBOL * samples_per_slot
+    return header_correlation(np.pad(padded, ((0, 0), (0, length - 1)), mode="edge"), samples_per_slot)
 
 
 def find_clock(
@@ -299,21 +304,23 @@ def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> 
 
     Each column's own header correlation is folded; the start is where most columns have a peak within reach.
     """
+    import cv2
+
     n_columns = pooled.shape[0]
     length = SLOTS_PER_SYMBOL * _SEARCH_SAMPLES
     share = np.pad(weight / (weight + 1.0), ((0, 0), (0, length - 1)))
     total = np.cumsum(np.pad(share, ((0, 0), (1, 0))), axis=1)
     support = (total[:, length:] - total[:, :-length]) / length
-    responses = [header_response(pooled[c : c + 1], weight[c : c + 1], _SEARCH_SAMPLES) for c in range(n_columns)]
+    responses = _header_correlation(pooled * (weight / (weight + 1.0)), _SEARCH_SAMPLES)
     # Twice a correlation less its bound: the log-likelihood ratio, up to a factor, of a header against random slots.
     folded = np.zeros((n_columns, -(-pooled.shape[1] // period) * period))
-    folded[:, : pooled.shape[1]] = 2 * np.array(responses) - support
+    folded[:, : pooled.shape[1]] = 2 * responses - support
     folded = folded.reshape(n_columns, -1, period).sum(axis=1)
     reach = int(_MAX_DELAY_SLOTS * _SEARCH_SAMPLES)
     wide = reach + _SEARCH_SAMPLES
     wrapped = np.pad(folded, ((0, 0), (wide, wide)), mode="wrap")
-    near = np.lib.stride_tricks.sliding_window_view(wrapped, 2 * reach + 1, axis=1)[:, wide - reach :][:, :period]
-    score = np.maximum(near.max(axis=2), 0).sum(axis=0)
+    near = cv2.dilate(wrapped, np.ones((1, 2 * reach + 1), np.uint8))[:, wide : wide + period]
+    score = np.maximum(near, 0).sum(axis=0)
     start = int(score.argmax())
     header_peak_ratio = score[start] / max(float(score[_away(period, start, 2 * reach)].max(initial=0.0)), 1e-12)
     around = wrapped[:, start : start + 2 * wide + 1]
