@@ -67,7 +67,7 @@ def live(device: Path, **options: Any) -> int:
     if options["list_only"]:
         return _show_modes(device)
     names = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
-    configured = receiver_options(**{name: options[name] for name in names}, soft_bits=True)
+    configured = replace(receiver_options(**{name: options[name] for name in names}, soft_bits=True), prompt=True)
     _claim(device, options)
     from rxcli.ingest.v4l2 import LiveSource
     from rxcli.link.collector import Collector
