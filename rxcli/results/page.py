@@ -6,6 +6,7 @@ import base64
 import html
 import math
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -109,14 +110,13 @@ def _svg(height: float, body: str, told: str, width: float = _WIDTH, kind: str =
 
 def _path(x: FloatArray, y: FloatArray) -> str:
     """Points as a path that breaks where they are NaN."""
-    parts, pen = [], "M"
-    for px, py in zip(x, y, strict=True):
-        if not (math.isfinite(px) and math.isfinite(py)):
-            pen = "M"
-            continue
-        parts.append(f"{pen}{px:.1f} {py:.1f}")
-        pen = "L"
-    return "".join(parts)
+    known = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if not known.size:
+        return ""
+    points = list(zip(x[known].round(1).tolist(), y[known].round(1).tolist(), strict=True))
+    breaks = np.flatnonzero(np.diff(known) > 1) + 1
+    edges = [0, *breaks.tolist(), known.size]
+    return "".join("M" + "L".join(f"{px} {py}" for px, py in points[a:b]) for a, b in pairwise(edges))
 
 
 # -- what came of it ---------------------------------------------------------------------------------------------------
