@@ -34,7 +34,7 @@ _STYLE = Path(__file__).parents[1] / "web" / "page" / "app.css"
 _WIDTH, _POINTS, _FEW_POINTS = 1000, 1200, 500
 _MANY_COLUMNS = 24
 _MORE_STYLE = """
-main { max-width: 75rem; }
+header, main { max-width: 75rem; } td.mono { min-width: 8rem; }
 svg { display: block; width: 100%; height: auto; background: var(--card); }
 svg.small { max-width: 34rem; }
 svg text { fill: var(--soft); stroke: none; font-size: 12px; display: inline; }
@@ -265,21 +265,23 @@ def _timeline(results: Sequence[FrameResult]) -> str:
 
 
 def _packets(result: FrameResult) -> str:
+    packets = [(column.column, packet) for column in result.columns for packet in column.packets]
+    scored = any(packet.bit_errors is not None for _, packet in packets)  # only where the truth is known
     rows = []
-    for column in result.columns:
-        for packet in column.packets:
-            wrong = "" if packet.bit_errors is None else str(packet.bit_errors)
-            kind = "weak" if packet.confidence < 0.5 else "ok"
-            sure = math.floor(packet.confidence * 1000) / 10
-            rows.append(
-                f'<tr><td class="number">{column.column}</td><td class="number {kind}">{sure:.1f} %</td>'
-                f'<td class="number">{packet.copies:.2f}</td><td class="number">{wrong}</td>'
-                f'<td class="mono">{html.escape(packet.payload)}</td></tr>'
-            )
+    for column, packet in packets:
+        wrong = "" if packet.bit_errors is None else str(packet.bit_errors)
+        kind = "weak" if packet.confidence < 0.5 else "ok"
+        sure = math.floor(packet.confidence * 1000) / 10
+        rows.append(
+            f'<tr><td class="number">{column}</td><td class="number {kind}">{sure:.1f} %</td>'
+            f'<td class="number">{packet.copies:.2f}</td>'
+            + (f'<td class="number">{wrong}</td>' if scored else "")
+            + f'<td class="mono">{html.escape(packet.payload)}</td></tr>'
+        )
     reasons: dict[str, list[int]] = {}
-    for column in result.columns:
-        if column.message and not column.packets:
-            reasons.setdefault(column.message, []).append(column.column)
+    for silent in result.columns:
+        if silent.message and not silent.packets:
+            reasons.setdefault(silent.message, []).append(silent.column)
     lines = "".join(
         f"<li>Column {', '.join(map(str, which))}: {html.escape(why)}</li>" for why, which in reasons.items()
     )
@@ -287,8 +289,9 @@ def _packets(result: FrameResult) -> str:
     if rows:
         body += (
             '<div class="scroll" tabindex="0"><table><thead><tr><th scope="col" class="number">Column</th>'
-            '<th scope="col" class="number">Sure</th><th scope="col" class="number">Seen</th><th scope="col" '
-            f'class="number">Wrong bits</th><th scope="col">Payload</th></tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+            '<th scope="col" class="number">Sure</th><th scope="col" class="number">Seen</th>'
+            + ('<th scope="col" class="number">Wrong bits</th>' if scored else "")
+            + f'<th scope="col">Payload</th></tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
         )
     if lines:
         body += f"<h3>Columns without a packet</h3><ul>{lines}</ul>"
@@ -296,8 +299,8 @@ def _packets(result: FrameResult) -> str:
         _section(
             "Packets",
             body,
-            "Sure: probability that every bit is right. Seen: how often the packet is in view. "
-            "Wrong bits: where the truth is known.",
+            "Sure: probability that every bit is right. Seen: how often the packet is in view."
+            + (" Wrong bits: against the truth." if scored else ""),
         )
         if body
         else ""
