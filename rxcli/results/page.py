@@ -283,7 +283,8 @@ def _packets(result: FrameResult) -> str:
         if silent.message and not silent.packets:
             reasons.setdefault(silent.message, []).append(silent.column)
     lines = "".join(
-        f"<li>Column {', '.join(map(str, which))}: {html.escape(why)}</li>" for why, which in reasons.items()
+        f"<li>Column{'s' if len(which) > 1 else ''} {', '.join(map(str, which))}: {html.escape(why)}</li>"
+        for why, which in reasons.items()
     )
     body = ""
     if rows:
@@ -518,7 +519,7 @@ def _encoder(result: FrameResult) -> str:
         for key, value in result.denoiser.items()
     )
     kept = (
-        f"Its corrections were kept in column {', '.join(map(str, changed))}."
+        f"Its corrections were kept in column{'s' if len(changed) > 1 else ''} {', '.join(map(str, changed))}."
         if changed
         else "None of its corrections were kept."
     )

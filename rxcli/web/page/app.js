@@ -134,8 +134,8 @@
     if (reasons.length) {
       const list = make("ul");
       for (const reason of reasons.slice(0, 6)) {
-        const which = columns.filter((column) => column.message === reason).map((column) => column.column).join(", ");
-        list.append(make("li", `Column ${which}: ${reason}`));
+        const which = columns.filter((column) => column.message === reason).map((column) => column.column);
+        list.append(make("li", `Column${which.length > 1 ? "s" : ""} ${which.join(", ")}: ${reason}`));
       }
       $("payloads").append(make("h3", "Columns without a packet"), list);
     }
