@@ -43,6 +43,9 @@ class ReceiverOptions:
     skip: frozenset[str] = field(default_factory=lambda: frozenset(SKIPS))
     #: Pass over frames of a clip all of whose bursts are certain already.
     stop_when_certain: bool = False
+    #: Give the results of a clip's first frames after some frames even where more would leave less doubt: for cameras
+    #: that somebody aims.
+    prompt: bool = False
     #: In place of the shipped auto-encoder; see `rxcli.receiver.channel.denoise.Denoiser`.
     denoiser: Denoiser | None = None
     #: Folder for the arrays of every stage boundary; None: none are written.

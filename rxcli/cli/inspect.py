@@ -36,11 +36,14 @@ _MARKER = ".vlc-rx-output"
 def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, force: bool, **options: Any) -> int:
     """Write a page that shows how PATH was received, stage by stage, or why not; prints the page's path.
 
+    Texts and files that came are named on stderr.
+
     Of a clip, the first frames are received, and one is shown in full.
     """
     from rxcli.outputs import Output, unwritable, write_whole
     from rxcli.results.overlay import camera_of
     from rxcli.results.page import MARK, inspection_page
+    from rxcli.results.report import format_link
 
     folder = out if out is not None else Path(f"inspect-{_stem(path)}")
     page = folder / "index.html"
@@ -58,6 +61,9 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
     except OSError as error:
         raise unwritable(folder, error) from None
     write_whole(page, text)
+    for result in results:
+        for line in format_link(result):
+            click.echo(line, err=True)
     click.echo(page)
     received = any(column.packets for result in results for column in result.columns)
     return ExitCode.OK if received else ExitCode.NOT_RECEIVED

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -67,7 +69,7 @@ def live(device: Path, **options: Any) -> int:
     if options["list_only"]:
         return _show_modes(device)
     names = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
-    configured = receiver_options(**{name: options[name] for name in names}, soft_bits=True)
+    configured = replace(receiver_options(**{name: options[name] for name in names}, soft_bits=True), prompt=True)
     _claim(device, options)
     from rxcli.ingest.v4l2 import LiveSource
     from rxcli.link.collector import Collector
@@ -264,13 +266,13 @@ class Status:
             return
         from tqdm import tqdm
 
-        if not self._bars:
-            form = {"bar_format": "{desc}", "dynamic_ncols": True, "leave": True, "file": sys.stderr}
-            self._bars = [tqdm(position=place, **form) for place in range(len(lines))]
-        for place, (bar, line) in enumerate(zip(self._bars, lines, strict=True)):
-            bar.set_description_str(
-                _coloured(line, self.state is not None and self.state.locked) if place == 0 else line
-            )
+        lines = fit_lines(lines, shutil.get_terminal_size().columns - 1)
+        form = {"bar_format": "{desc}", "dynamic_ncols": True, "leave": True, "file": sys.stderr}
+        while len(self._bars) < len(lines):
+            self._bars.append(tqdm(position=len(self._bars), **form))
+        lines[0] = _coloured(lines[0], self.state is not None and self.state.locked)
+        for bar, line in zip_longest(self._bars, lines, fillvalue=""):
+            bar.set_description_str(line)
 
 
 def format_status(state: AimState | None, counts: CameraCounts) -> list[str]:
@@ -297,6 +299,13 @@ def format_status(state: AimState | None, counts: CameraCounts) -> list[str]:
     if state.height_share is not None:
         seen.append(f"screen fills {100 * state.height_share:.0f} % of the height")
     return [" | ".join(rates), " | ".join(seen + lost), " ".join(filter(None, (state.reason, state.advice)))]
+
+
+def fit_lines(lines: Sequence[str], width: int) -> list[str]:
+    """The lines, broken between words where they are longer than `width`, so that nothing of them is cut off."""
+    from textwrap import wrap
+
+    return [part for line in lines for part in wrap(line, max(width, 20), subsequent_indent="  ") or [""]]
 
 
 def format_file(progress: ObjectProgress) -> str:

@@ -41,7 +41,7 @@ class Preview:
 def preview(frame: Frame, width_px: int = 1000) -> Preview:
     """A copy of `frame` at most about `width_px` wide: every so many pixels, so that stripes stay stripes."""
     step = max(1, math.ceil(max(frame.width, frame.height) / width_px))
-    return Preview(grey_levels(frame)[::step, ::step], step)
+    return Preview(grey_levels(frame, step), step)
 
 
 def camera_of(frame: Frame, result: FrameResult, cameras: tuple[CameraProfile, ...]) -> CameraProfile | None:

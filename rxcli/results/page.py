@@ -6,6 +6,7 @@ import base64
 import html
 import math
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ _STYLE = Path(__file__).parents[1] / "web" / "page" / "app.css"
 _WIDTH, _POINTS, _FEW_POINTS = 1000, 1200, 500
 _MANY_COLUMNS = 24
 _MORE_STYLE = """
-main { max-width: 75rem; }
+header, main { max-width: 75rem; } td.mono { min-width: 8rem; }
 svg { display: block; width: 100%; height: auto; background: var(--card); }
 svg.small { max-width: 34rem; }
 svg text { fill: var(--soft); stroke: none; font-size: 12px; display: inline; }
@@ -109,14 +110,13 @@ def _svg(height: float, body: str, told: str, width: float = _WIDTH, kind: str =
 
 def _path(x: FloatArray, y: FloatArray) -> str:
     """Points as a path that breaks where they are NaN."""
-    parts, pen = [], "M"
-    for px, py in zip(x, y, strict=True):
-        if not (math.isfinite(px) and math.isfinite(py)):
-            pen = "M"
-            continue
-        parts.append(f"{pen}{px:.1f} {py:.1f}")
-        pen = "L"
-    return "".join(parts)
+    known = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if not known.size:
+        return ""
+    points = list(zip(x[known].round(1).tolist(), y[known].round(1).tolist(), strict=True))
+    breaks = np.flatnonzero(np.diff(known) > 1) + 1
+    edges = [0, *breaks.tolist(), known.size]
+    return "".join("M" + "L".join(f"{px} {py}" for px, py in points[a:b]) for a, b in pairwise(edges))
 
 
 # -- what came of it ---------------------------------------------------------------------------------------------------
@@ -265,30 +265,34 @@ def _timeline(results: Sequence[FrameResult]) -> str:
 
 
 def _packets(result: FrameResult) -> str:
+    packets = [(column.column, packet) for column in result.columns for packet in column.packets]
+    scored = any(packet.bit_errors is not None for _, packet in packets)  # only where the truth is known
     rows = []
-    for column in result.columns:
-        for packet in column.packets:
-            wrong = "" if packet.bit_errors is None else str(packet.bit_errors)
-            kind = "weak" if packet.confidence < 0.5 else "ok"
-            sure = math.floor(packet.confidence * 1000) / 10
-            rows.append(
-                f'<tr><td class="number">{column.column}</td><td class="number {kind}">{sure:.1f} %</td>'
-                f'<td class="number">{packet.copies:.2f}</td><td class="number">{wrong}</td>'
-                f'<td class="mono">{html.escape(packet.payload)}</td></tr>'
-            )
+    for column, packet in packets:
+        wrong = "" if packet.bit_errors is None else str(packet.bit_errors)
+        kind = "weak" if packet.confidence < 0.5 else "ok"
+        sure = math.floor(packet.confidence * 1000) / 10
+        rows.append(
+            f'<tr><td class="number">{column}</td><td class="number {kind}">{sure:.1f} %</td>'
+            f'<td class="number">{packet.copies:.2f}</td>'
+            + (f'<td class="number">{wrong}</td>' if scored else "")
+            + f'<td class="mono">{html.escape(packet.payload)}</td></tr>'
+        )
     reasons: dict[str, list[int]] = {}
-    for column in result.columns:
-        if column.message and not column.packets:
-            reasons.setdefault(column.message, []).append(column.column)
+    for silent in result.columns:
+        if silent.message and not silent.packets:
+            reasons.setdefault(silent.message, []).append(silent.column)
     lines = "".join(
-        f"<li>Column {', '.join(map(str, which))}: {html.escape(why)}</li>" for why, which in reasons.items()
+        f"<li>Column{'s' if len(which) > 1 else ''} {', '.join(map(str, which))}: {html.escape(why)}</li>"
+        for why, which in reasons.items()
     )
     body = ""
     if rows:
         body += (
             '<div class="scroll" tabindex="0"><table><thead><tr><th scope="col" class="number">Column</th>'
-            '<th scope="col" class="number">Sure</th><th scope="col" class="number">Seen</th><th scope="col" '
-            f'class="number">Wrong bits</th><th scope="col">Payload</th></tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
+            '<th scope="col" class="number">Sure</th><th scope="col" class="number">Seen</th>'
+            + ('<th scope="col" class="number">Wrong bits</th>' if scored else "")
+            + f'<th scope="col">Payload</th></tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
         )
     if lines:
         body += f"<h3>Columns without a packet</h3><ul>{lines}</ul>"
@@ -296,8 +300,8 @@ def _packets(result: FrameResult) -> str:
         _section(
             "Packets",
             body,
-            "Sure: probability that every bit is right. Seen: how often the packet is in view. "
-            "Wrong bits: where the truth is known.",
+            "Sure: probability that every bit is right. Seen: how often the packet is in view."
+            + (" Wrong bits: against the truth." if scored else ""),
         )
         if body
         else ""
@@ -515,7 +519,7 @@ def _encoder(result: FrameResult) -> str:
         for key, value in result.denoiser.items()
     )
     kept = (
-        f"Its corrections were kept in column {', '.join(map(str, changed))}."
+        f"Its corrections were kept in column{'s' if len(changed) > 1 else ''} {', '.join(map(str, changed))}."
         if changed
         else "None of its corrections were kept."
     )

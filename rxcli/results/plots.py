@@ -60,8 +60,10 @@ def decided_slots(
         slots = packet_slots_of(packet, column.w, screen)
         if slots is None:
             continue
-        longest = screen.repeats * slots.size
-        n_slots = min(math.ceil((end - packet.first_row) / rows_per_slot), longest)
+        # Behind the copies that were counted, another burst may begin of which too little is seen.
+        hidden = max(float(rows.min()) - packet.first_row, 0.0) / rows_per_slot
+        longest = min(hidden + packet.copies * slots.size, screen.repeats * slots.size)
+        n_slots = math.ceil(min((end - packet.first_row) / rows_per_slot, longest))
         if n_slots > 0:
             yield packet.first_row, np.resize(slots, n_slots)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from rxcli.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable
     from multiprocessing.connection import Connection
     from multiprocessing.process import BaseProcess
 
@@ -27,6 +27,8 @@ MAX_PIXELS = 64_000_000
 #: Clips are read until they have cost so much time of the processor; then what was received till then is shown.
 _CLIP_S = 12.0
 _MAX_PACKETS = 2000
+#: What was received of a clip so far is told after so many seconds at the earliest.
+_PARTIAL_S = 0.4
 _POLL_S = 0.05
 #: Address space of the process: far more than it uses, far less than would hurt the machine.
 _ADDRESS_SPACE = 6 << 30
@@ -80,12 +82,13 @@ class DecodingProcess:
         """Number of the process, None where there is none."""
         return self._process.pid if self._process is not None else None
 
-    def decode(self, path: Path, name: str) -> dict[str, Any]:
+    def decode(self, path: Path, name: str, tell: Callable[[dict[str, Any]], None] | None = None) -> dict[str, Any]:
         """What became of the file at `path`, as plain data for the page; a failure is an answer like any other.
 
         Args:
             path: the file.
             name: what messages call it.
+            tell: given, from time to time, the answer so far of a clip that is still being read.
         """
         if self._process is None or not self._process.is_alive():
             self.close()
@@ -93,7 +96,7 @@ class DecodingProcess:
         assert self._connection is not None
         try:
             self._connection.send((str(path), name))
-            return self._answer()
+            return self._answer(tell)
         except _EndedError as ended:
             reason, step = ended.args
         except (EOFError, OSError):
@@ -102,16 +105,20 @@ class DecodingProcess:
         self.close()
         return refusal(reason, step)
 
-    def _answer(self) -> dict[str, Any]:
+    def _answer(self, tell: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
         assert self._connection is not None
         end_s = time.monotonic() + self._limits.time_s
-        while not self._connection.poll(_POLL_S):
-            if time.monotonic() > end_s:
-                raise _EndedError(f"it took more than {self._limits.time_s:.0f} s", "try a smaller picture")
-            if resident_bytes(self.pid) > self._limits.memory:
-                raise _EndedError("it takes too much memory", "try a smaller picture")
-        answer: dict[str, Any] = self._connection.recv()
-        return answer
+        while True:
+            while not self._connection.poll(_POLL_S):
+                if time.monotonic() > end_s:
+                    raise _EndedError(f"it took more than {self._limits.time_s:.0f} s", "try a smaller picture")
+                if resident_bytes(self.pid) > self._limits.memory:
+                    raise _EndedError("it takes too much memory", "try a smaller picture")
+            answer: dict[str, Any] = self._connection.recv()
+            if not answer.get("partial"):
+                return answer
+            if tell is not None:
+                tell(answer)
 
 
 class _EndedError(Exception):
@@ -141,11 +148,11 @@ def _work(connection: Connection, options: ReceiverOptions) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides what an interrupt means
     _confine()
-    _warm_up()
+    _warm_up(options)
     try:
         while True:
             path, name = connection.recv()
-            connection.send(answer_for(Path(path), name, options))
+            connection.send(answer_for(Path(path), name, options, connection.send))
     except (EOFError, OSError):
         return
 
@@ -162,16 +169,25 @@ def _confine() -> None:
     os.dup2(nowhere, 2)
 
 
-def _warm_up() -> None:
-    """Import what the first picture would otherwise wait for."""
-    from rxcli.ingest import image, raw, video  # noqa: F401
-    from rxcli.receiver import clip, pipeline  # noqa: F401
+def _warm_up(options: ReceiverOptions) -> None:
+    """Import and load what the first picture would otherwise wait for, by decoding a sample."""
+    from rxcli.ingest import video  # noqa: F401
+    from rxcli.receiver import clip  # noqa: F401
+    from rxcli.resources import data_dir
     from rxcli.runs.batch import use_one_thread
 
     use_one_thread()
+    sample = data_dir("sample_frames") / "phone_chelsea_17k3.jpg"
+    if sample.is_file():
+        try:
+            answer_for(sample, "sample", options)
+        except Exception as error:  # whatever it is, pictures that come will tell
+            log.debug("the sample was not decoded: %s", error)
 
 
-def answer_for(path: Path, name: str, options: ReceiverOptions) -> dict[str, Any]:
+def answer_for(
+    path: Path, name: str, options: ReceiverOptions, tell: Callable[[dict[str, Any]], None] | None = None
+) -> dict[str, Any]:
     """The answer for one file; see `DecodingProcess.decode`."""
     from rxcli.runs.batch import Source, standard_decoder
 
@@ -182,9 +198,14 @@ def answer_for(path: Path, name: str, options: ReceiverOptions) -> dict[str, Any
     except InputError as error:
         return refusal(error.message, error.hint)
     decoder = standard_decoder(options, frames.tap)
-    results = (_without(result, path) for result in decoder.results(Source(name, str(path))))
+    gathered, told_s = _Gathered(frames, options), started_s
     try:
-        answer = _gathered(results, frames, options)
+        for result in decoder.results(Source(name, str(path))):
+            gathered.add(_without(result, path))
+            if tell is not None and gathered.has_news and time.monotonic() - told_s > _PARTIAL_S:
+                tell(gathered.answer() | {"name": name, "partial": True})
+                told_s = time.monotonic()
+        answer = gathered.answer()
     except MemoryError:
         return refusal("it takes too much memory", "try a smaller picture")
     return answer | {"name": name, "seconds": round(time.monotonic() - started_s, 2)}
@@ -236,44 +257,57 @@ class _Frames:
         return self._kept.get(index)
 
 
-def _gathered(results: Iterator[FrameResult], frames: _Frames, options: ReceiverOptions) -> dict[str, Any]:
+class _Gathered:
     """All results of a source as one answer, shown with the frame that gave most."""
-    best: tuple[int, FrameResult, dict[str, Any]] | None = None
-    packets: list[dict[str, Any]] = []
-    texts: list[dict[str, Any]] = []
-    n_frames = 0
-    for result in results:
-        if frames.cut_short and result.status == "unreadable":
-            continue
-        n_frames += 1
-        texts += texts_of(result)
-        found = packets_of(result)
-        packets += found[: _MAX_PACKETS - len(packets)]
-        if best is None or len(found) > best[0]:
-            best = len(found), result, _picture(result, frames.take(result.frame), options)
-    if best is None:
-        return refusal("it holds no picture", "send another file")
-    from rxcli.results.aim import split_message
-    from rxcli.results.report import to_record
 
-    _, result, picture = best
-    reason, advice = ("", "") if packets else split_message(result)
-    return {
-        "status": result.status if not packets or result.status != "unreadable" else "partial",
-        "reason": reason,
-        "advice": advice,
-        "texts": texts,
-        "packets": packets,
-        "n_frames": n_frames,
-        "cut_short": frames.cut_short,
-        "screen": result.screen_profile,
-        "camera": result.camera_profile,
-        "columns": [
-            {"column": column.column, "status": column.status, "message": column.message} for column in result.columns
-        ],
-        "record": to_record(result),
-        **picture,
-    }
+    def __init__(self, frames: _Frames, options: ReceiverOptions) -> None:
+        self._frames, self._options = frames, options
+        self._best: tuple[int, FrameResult, dict[str, Any]] | None = None
+        self._packets: list[dict[str, Any]] = []
+        self._texts: list[dict[str, Any]] = []
+        self._n_frames = 0
+        #: Whether packets or texts came in a frame that is not the first since the last answer.
+        self.has_news = False
+
+    def add(self, result: FrameResult) -> None:
+        """Take the next result."""
+        if self._frames.cut_short and result.status == "unreadable":
+            return
+        self._n_frames += 1
+        texts, found = texts_of(result), packets_of(result)
+        self._texts += texts
+        self._packets += found[: _MAX_PACKETS - len(self._packets)]
+        self.has_news = result.frame > 0 and (self.has_news or bool(texts or found))
+        if self._best is None or len(found) > self._best[0]:
+            picture = _picture(result, self._frames.take(result.frame), self._options)
+            self._best = len(found), result, picture
+
+    def answer(self) -> dict[str, Any]:
+        """What is known so far."""
+        self.has_news = False
+        if self._best is None:
+            return refusal("it holds no picture", "send another file")
+        from rxcli.results.aim import split_message
+        from rxcli.results.report import to_record
+
+        _, result, picture = self._best
+        packets = self._packets
+        reason, advice = ("", "") if packets else split_message(result)
+        columns = [{"column": c.column, "status": c.status, "message": c.message} for c in result.columns]
+        return {
+            "status": result.status if not packets or result.status != "unreadable" else "partial",
+            "reason": reason,
+            "advice": advice,
+            "texts": list(self._texts),
+            "packets": list(packets),
+            "n_frames": self._n_frames,
+            "cut_short": self._frames.cut_short,
+            "screen": result.screen_profile,
+            "camera": result.camera_profile,
+            "columns": columns,
+            "record": to_record(result),
+            **picture,
+        }
 
 
 def texts_of(result: FrameResult) -> list[dict[str, Any]]:

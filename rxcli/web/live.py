@@ -127,7 +127,8 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
     from rxcli.web.decoding import packets_of, texts_of
 
     watched, aim = _Watched(), Aim()
-    decoder = replace(standard_decoder(options, watched.tap), open_source=lambda path: frames)
+    prompt = replace(options, prompt=True)
+    decoder = replace(standard_decoder(prompt, watched.tap), open_source=lambda path: frames)
     packets: deque[dict[str, Any]] = deque(maxlen=_HISTORY)
     texts: list[dict[str, Any]] = []
     last_s = 0.0

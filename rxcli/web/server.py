@@ -17,7 +17,7 @@ import tempfile
 import time
 import uuid
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,6 +44,8 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",  # the address may hold the token
     "Cache-Control": "no-store",
 }
+#: A line of JSON for every answer: what is known so far, and at last the whole.
+_LINES = "application/x-ndjson"
 _LOCAL = ("127.0.0.1", "localhost", "::1", "[::1]")
 _CHUNK = 1 << 16
 _SWEEP_S = 2.0
@@ -260,9 +262,9 @@ class Server:
                 size = await self._save(request, path)
             if size is None:
                 return _answer(self._too_large(), 413, close=True)
-            loop = asyncio.get_running_loop()
-            answer = await loop.run_in_executor(self._thread, self._decoder.decode, path, "the picture")
-            self._keep(path, answer)
+            if _LINES in request.headers.get("Accept", ""):
+                return await self._answer_by_and_by(request, path)
+            answer = await self._decoded(path, None)
             return _answer(answer, 200)
         except TimeoutError:
             slow = refusal(
@@ -275,6 +277,33 @@ class Server:
         finally:
             path.unlink(missing_ok=True)
             self._n_uploads -= 1
+
+    async def _decoded(self, path: Path, tell: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
+        loop = asyncio.get_running_loop()
+        answer = await loop.run_in_executor(self._thread, self._decoder.decode, path, "the picture", tell)
+        self._keep(path, answer)
+        return answer
+
+    async def _answer_by_and_by(self, request: web.Request, path: Path) -> web.StreamResponse:
+        """A line of JSON for what is known of a clip so far, from time to time, and one for the whole answer."""
+        response = web.StreamResponse(headers={**_HEADERS, "Content-Type": _LINES})
+        await response.prepare(request)
+        loop = asyncio.get_running_loop()
+        lines: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+
+        def tell(answer: dict[str, Any]) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(lines.put_nowait, answer)
+
+        decoding = asyncio.create_task(self._decoded(path, tell))
+        decoding.add_done_callback(lambda _: lines.put_nowait({}))
+        with contextlib.suppress(ConnectionError):  # the upload stays until it is decoded, whoever still listens
+            while answer := await lines.get():
+                await response.write(json.dumps(answer).encode() + b"\n")
+        whole = await decoding
+        with contextlib.suppress(ConnectionError):
+            await response.write(json.dumps(whole).encode() + b"\n")
+        return response
 
     async def _save(self, request: web.Request, path: Path) -> int | None:
         """Write the body to `path`; its size, None where it is too large."""

@@ -12,13 +12,24 @@ from small_frames import BOTTOM, N_COLUMNS, ROWS_PER_SLOT, TOP, W, write_frame, 
 from rxcli.cli.common import receiver_options
 from rxcli.cli.main import run
 from rxcli.ingest import open_source
+from rxcli.profiles import ScreenProfile, load_profile
+from rxcli.protocol import bits_per_symbol
 from rxcli.receiver.pipeline import receive
 from rxcli.results.inspection import inspect_frame
 from rxcli.results.overlay import camera_of
 from rxcli.results.plots import column_light, decided_slots
 from rxcli.runs.batch import collect_sources
+from rxcli.types import ColumnResult, PacketResult
 
 SAMPLE = Path(__file__).parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
+
+
+def test_a_text_that_came_is_said(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert run(["inspect", str(SAMPLE.parents[1] / "docs" / "hello.jpg"), "--out", str(tmp_path / "page")]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == f"{tmp_path / 'page' / 'index.html'}\n"
+    assert captured.err == "text: Hello! This text came as light.\n"
+    assert "<blockquote>Hello! This text came as light.</blockquote>" in (tmp_path / "page" / "index.html").read_text()
 
 
 def test_a_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -158,6 +169,20 @@ def test_the_shaded_slots_are_where_the_light_is(tmp_path: Path) -> None:
         shown = (number >= 0) & (number < slots.size)
         assert shown.mean() > 0.6
         assert np.corrcoef(light[shown], slots[number[shown]])[0, 1] > 0.8
+
+
+def test_slots_are_told_for_the_copies_in_view_and_not_for_what_follows() -> None:
+    """Behind them a burst may begin of which too little is seen to say anything."""
+    screen = load_profile("paper-17k3", ScreenProfile)
+    n_slots = 20 + 10 * screen.payload_symbols
+    bits = bits_per_symbol(5) * screen.payload_symbols
+    payload = "00" * ((bits + 7) // 8)
+    rows = np.arange(100.0, 4000.0)
+    for first_row, copies, expected in ((100.0, 1.5, 1.5 * n_slots), (50.0, 1.5, 1.5 * n_slots + 10)):
+        packet = PacketResult(first_row, copies, bits, payload, 0.9, 0.01)
+        [(start, slots)] = decided_slots(ColumnResult(0, "ok", w=5, packets=(packet,)), screen, 5.0, rows)
+        assert start == first_row
+        assert slots.size == pytest.approx(expected, abs=1)
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -21,12 +21,13 @@ import pytest
 import simplejpeg
 from numpy.typing import NDArray
 
-from rxcli.cli.live import Status, format_status
+from rxcli.cli.live import Status, fit_lines, format_status
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode, InputError
 from rxcli.ingest import open_source
 from rxcli.ingest.v4l2 import Camera, CameraCounts, CameraLost, CameraSettings, LiveSource
 from rxcli.profiles import ScreenProfile, dump_profile, load_profile
+from rxcli.results.aim import Aim
 from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
 
 FAKE = Path(__file__).parents[1] / "fake_v4l2"
@@ -361,3 +362,14 @@ class TestStatus:
         assert text.count("payload\r\n") == 4
         assert text.count("LOCKED | columns 15/20") >= 4
         assert "\x1b[A" in text  # goes back up instead of writing on
+
+
+@pytest.mark.parametrize("width", [30, 59, 99])
+def test_nothing_of_the_status_is_cut_off_by_a_narrow_terminal(width: int) -> None:
+    reason = "no screen found: no area with stripes was found; use the electronic shutter and a short exposure"
+    result = FrameResult("camera", 0, 0.0, "no_screen", reason)
+    lines = format_status(Aim().update(result, 0.0, 1000), CameraCounts())
+    fitted = fit_lines(lines, width)
+    assert max(map(len, fitted)) <= width
+    assert " ".join(fitted).split() == " ".join(lines).split()
+    assert fit_lines(["", "a"], width) == ["", "a"]

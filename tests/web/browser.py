@@ -33,7 +33,7 @@ class Browser:
         self._answers: dict[int, asyncio.Future[Any]] = {}
 
     async def __aenter__(self) -> Browser:
-        self._home = tempfile.TemporaryDirectory(prefix="chromium-")
+        self._home = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
         assert CHROMIUM is not None
         flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"]
         flags += [

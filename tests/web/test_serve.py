@@ -102,6 +102,48 @@ def test_a_bad_file_gives_a_reason_without_a_path(options: ReceiverOptions) -> N
     serving(Site(options, port=0), work)
 
 
+def test_a_clip_is_answered_by_and_by() -> None:
+    """What was received so far comes while the rest is read; at last the whole comes, as it does without."""
+
+    async def work(server: Server, client: Any) -> None:
+        data = (SAMPLES / "video1080_chelsea_17k3.mp4").read_bytes()
+        headers = {"Accept": "application/x-ndjson"}
+        async with client.post(server.address + "photo", data=io.BytesIO(data), headers=headers) as answer:
+            assert answer.content_type == "application/x-ndjson"
+            *before, whole = [json.loads(line) async for line in answer.content]
+        assert before
+        assert all(part["partial"] and part["packets"] for part in before)
+        assert before[0]["picture"]["outlines"]
+        assert "partial" not in whole
+        assert len(before[0]["packets"]) < len(whole["packets"]) == 360
+        assert whole["packets"][: len(before[0]["packets"])] == before[0]["packets"]
+        _, plain = await post(server, client, data)
+        assert plain["packets"] == whole["packets"]
+
+    serving(Site(receiver_options(cameras=(str(SAMPLES / "video1080.toml"),)), port=0), work)
+
+
+def test_who_goes_away_while_a_clip_is_read_leaves_nothing(options: ReceiverOptions) -> None:
+    before = leftovers()
+
+    async def work(server: Server, client: Any) -> None:
+        data = (SAMPLES / "video1080_chelsea_17k3.mp4").read_bytes()
+        call = client.post(server.address + "photo", data=io.BytesIO(data), headers={"Accept": "application/x-ndjson"})
+        async with call as answer:
+            answer.close()
+        status, answer = await post(server, client, b"hello")  # is read after the clip
+        assert (status, answer["status"]) == (200, "unreadable")
+        [folder] = set(leftovers()) - set(before)
+        for _ in range(50):
+            if not os.listdir(Path(tempfile.gettempdir()) / folder):
+                break
+            await asyncio.sleep(0.1)
+        assert not os.listdir(Path(tempfile.gettempdir()) / folder)
+
+    serving(Site(options, port=0), work)
+    assert leftovers() == before
+
+
 def test_uploads_are_kept_where_that_is_asked_for(tmp_path: Path, options: ReceiverOptions) -> None:
     write_frame(tmp_path / "a.png", 3)
     data = (tmp_path / "a.png").read_bytes()
@@ -406,7 +448,9 @@ def test_a_phone_sends_the_samples_and_a_bad_file(dark: bool, tmp_path: Path) ->
             for path, (title, n_outlines) in expected.items():
                 await browser.choose("#file", path)
                 await browser.until("document.getElementById('progress').textContent !== ''")
-                await browser.until("!document.getElementById('result').hidden")
+                first_s = await browser.until("!document.getElementById('result').hidden")
+                whole_s = await browser.until("document.getElementById('progress').textContent === ''")
+                print(f"{path.name}: first answer after {first_s:.2f} s, whole {whole_s:.2f} s later")
                 assert await browser.run("document.getElementById('result-title').textContent") == title
                 assert await browser.run("document.activeElement.id") == "result-title"
                 assert (

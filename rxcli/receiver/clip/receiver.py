@@ -519,12 +519,12 @@ class _Clip:
     def _receive_first_again(self, at_last: bool) -> None:
         """The first frames once more: by then it is known better what is on the screen.
 
-        Where that leaves doubt, more frames are waited for, unless it is `at_last`.
+        Where that leaves doubt, more frames are waited for, unless it is `at_last` or results are wanted promptly.
         """
         held = [
             w for w in self._waiting if w.view is not None and w.numbers is not None and self._can_receive_again(w.view)
         ]
-        may_wait = self._n_held < _HELD_LONG and not at_last
+        may_wait = self._n_held < _HELD_LONG and not at_last and not self._options.prompt
         if len(held) > 1 and not (may_wait and self._doubt(held) > _TOO_MUCH_DOUBT):
             self._measure_again(held)
             self._detect_again()

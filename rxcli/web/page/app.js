@@ -106,6 +106,7 @@
 
   function headline(answer) {
     const n = answer.packets ? answer.packets.length : 0;
+    if (n && answer.partial) return `Received so far: ${count(n, "packet")}`;
     if (n) {
       const columns = new Set(answer.packets.map((packet) => packet.column)).size;
       const of = answer.columns.length ? ` of ${answer.columns.length}` : "";
@@ -133,8 +134,8 @@
     if (reasons.length) {
       const list = make("ul");
       for (const reason of reasons.slice(0, 6)) {
-        const which = columns.filter((column) => column.message === reason).map((column) => column.column).join(", ");
-        list.append(make("li", `Column ${which}: ${reason}`));
+        const which = columns.filter((column) => column.message === reason).map((column) => column.column);
+        list.append(make("li", `Column${which.length > 1 ? "s" : ""} ${which.join(", ")}: ${reason}`));
       }
       $("payloads").append(make("h3", "Columns without a packet"), list);
     }
@@ -144,9 +145,32 @@
       saved = URL.createObjectURL(new Blob([JSON.stringify({ packets: answer.packets, frame: answer.record }, null, 1)], { type: "application/json" }));
       $("save").href = saved;
     }
+    const first = $("result").hidden;
     $("result").hidden = false;
+    if (!first) return; // what is added to a clip's answer moves nobody who reads it
     $("result-title").focus();
     $("result").scrollIntoView({ block: "start" });
+  }
+
+  // A line of JSON for what is known of a clip so far, now and then, and one for the whole answer.
+  async function showLines(response) {
+    const reader = response.body.getReader();
+    const decoder = new TextDecoder();
+    let text = "", whole = null;
+    for (;;) {
+      const { done, value } = await reader.read();
+      text += done ? decoder.decode() : decoder.decode(value, { stream: true });
+      const lines = text.split("\n");
+      text = lines.pop();
+      if (lines.length) {
+        const answer = JSON.parse(lines.pop());
+        show(answer);
+        if (answer.partial) $("progress").textContent = "Reading the rest of the clip …";
+        whole = answer;
+      }
+      if (done) break;
+    }
+    if (!whole || whole.partial) throw new Error("the answer broke off");
   }
 
   async function send(file) {
@@ -159,8 +183,10 @@
     progress.classList.add("busy");
     $("result").hidden = true;
     try {
-      const answer = await fetch("photo", { method: "POST", body: file, headers: { "Content-Type": "application/octet-stream" } });
-      show(await answer.json());
+      const headers = { "Content-Type": "application/octet-stream", "Accept": "application/x-ndjson, application/json" };
+      const answer = await fetch("photo", { method: "POST", body: file, headers });
+      if (answer.headers.get("Content-Type").startsWith("application/x-ndjson")) await showLines(answer);
+      else show(await answer.json());
     } catch (error) {
       show({ status: "unreadable", reason: "The picture did not arrive.", advice: "Check that this phone is still in the same network, and try again." });
     } finally {
