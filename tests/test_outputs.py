@@ -220,10 +220,12 @@ def test_cells_that_a_spreadsheet_would_compute_are_quoted(tmp_path: Path, names
     before = Path.cwd()
     os.chdir(folder)
     try:
-        run(
-            ["decode", "--summary", "s.csv", *names, "--quiet", "--", "=1+1.png", "+a.png", "@b.png", "-c.png", "d.png"]
-        )
+        odd = ["=1+1.png", "+a.png", "@b.png", "-c.png", "d.png"]
+        run(["decode", "--summary", "s.csv", *names, "--quiet", "--", *odd])
+        write_frame(folder / "=1+1.png", 1)
+        run(["decode", "--payloads", "p.csv", *names, "--quiet", "--", "=1+1.png"])
     finally:
         os.chdir(before)
     sources = [line.split(",")[0] for line in (folder / "s.csv").read_text().splitlines()[1:]]
     assert sources == ["'=1+1.png", "'+a.png", "'@b.png", "'-c.png", "d.png"]
+    assert {line.split(",")[0] for line in (folder / "p.csv").read_text().splitlines()[1:]} == {"'=1+1.png"}

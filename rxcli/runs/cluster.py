@@ -154,7 +154,7 @@ def _await(source: Source, future: Any, address: str) -> list[FrameResult]:
         return results
     except KilledWorker:
         message = f"{source.name}: every worker that decoded it died; try it by itself"
-        return [unreadable(source, 0, message)]
+        return [replace(unreadable(source, 0, message), retry=True)]
     except (OSError, _cancelled()) as error:
         raise InputError(
             f"the scheduler at {address!r} went away ({type(error).__name__})", "start it again and use --resume"

@@ -127,6 +127,48 @@ def test_resuming_with_other_inputs_keeps_what_is_there(tmp_path: Path, folder: 
     assert [record["source"] for record in records(out)] == [str(folder / f"{n}.png") for n in range(3)]
 
 
+def without_run(record: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in record.items() if name != "run"}
+
+
+def test_a_file_whose_decoder_was_killed_is_tried_again(tmp_path: Path, folder: Path, decode: Decode) -> None:
+    out = tmp_path / "o.jsonl"
+    assert decode(folder, "--json", out)[0] == 0
+    whole = records(out)
+    for number in range(3):
+        killed = [json.loads(line) for line in out.read_text().splitlines()]
+        killed[number] |= {"status": "unreadable", "message": "two processes that decoded it died", "retry": True}
+        killed[number]["columns"] = []
+        cut = tmp_path / f"{number}.jsonl"
+        cut.write_text("".join(json.dumps(record) + "\n" for record in killed))
+        table = tmp_path / "s.csv"
+        assert decode(folder, "--json", cut, "--resume", "--summary", table) == (0, "")
+        found = records(cut)
+        assert found[0].pop("run") == whole[0]["run"]
+        others = [place for place in range(3) if place != number]
+        assert found == [without_run(whole[place]) for place in (*others, number)]
+        assert [row["packets"] for row in csv.DictReader(table.read_text().splitlines())] == ["10"] * 3
+        assert decode(folder, "--json", cut, "--resume")[0] == 0  # nothing is left to do, and the file is whole
+
+
+def test_the_packets_of_a_killed_run_stand_once(tmp_path: Path, folder: Path, decode: Decode) -> None:
+    out, table = tmp_path / "o.jsonl", tmp_path / "p.csv"
+    assert decode(folder, "--json", out, "--payloads", table)[0] == 0
+    whole = table.read_bytes()
+    assert whole.count(b"\n") == 31
+    out.write_bytes(b"".join(out.read_bytes().splitlines(keepends=True)[:2]) + b'{"source": "half')
+    for rows in (12, 21, 25):  # some were lost, or are of the file that is decoded again
+        table.write_bytes(b"".join(whole.splitlines(keepends=True)[:rows]))
+        assert decode(folder, "--json", out, "--resume", "--payloads", table)[0] == 0
+        assert table.read_bytes() == whole
+
+
+def test_packets_that_cannot_be_written_are_told_of(folder: Path, decode: Decode) -> None:
+    code, said = decode(folder, "--payloads", "/dev/full")
+    assert code == 3
+    assert "/dev/full: cannot be written (No space left on device)" in said
+
+
 def test_a_resumed_file_is_that_of_an_undisturbed_run(tmp_path: Path, folder: Path, decode: Decode) -> None:
     whole, cut = tmp_path / "whole.jsonl", tmp_path / "cut.jsonl"
     assert decode(folder, "--json", whole)[0] == 0
