@@ -181,10 +181,11 @@ class Decoder:
             yield replace(before, soft_bits=None if before.messages or before.objects else alone)
 
     def _frames(self, source: Source) -> Iterator[Frame]:
+        told = False
         for frame in self.open_source(source.path):
             frame = replace(frame, source=source.name)  # as the user named it, wherever it is opened
-            if frame.index == 0 and frame.metadata.not_believed:
-                claims = ", ".join(frame.metadata.not_believed)
+            if frame.metadata.not_believed and not told:
+                claims, told = ", ".join(frame.metadata.not_believed), True
                 log.warning("%s: not believed, and taken as unknown: %s", source.name, claims)
             if self.tap is not None:
                 self.tap(frame, source.subfolder)
