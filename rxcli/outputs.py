@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+#: A folder with a file of this name holds what a command has written, and nothing to decode.
+OUTPUT_MARKER = ".vlc-rx-output"
 #: So much of a file's start and of its end tells whose it is.
 _LOOK_BYTES = 1 << 16
 #: Signature and IHDR of a PNG (ISO 15948, section 5).
@@ -121,6 +123,32 @@ def claim_folder(option: str, folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
+        raise UsageError(f"{option} {folder}: {_reason(error)}", "name another folder") from None
+
+
+def claim_own_folder(option: str, folder: Path, known: Iterable[str] = (), force: bool = False) -> None:
+    """Make a folder for nothing but what a command writes, and mark it, so that runs over folders pass over it.
+
+    Args:
+        option: that names it.
+        folder: new, empty, or written by the same command before.
+        known: patterns of names that tell a folder which an earlier version has written, without a mark.
+        force: write into somebody else's folder, which gets no mark.
+
+    Raises:
+        UsageError: it is a file, cannot be made, or holds other files.
+    """
+    claim_folder(option, folder)
+    mark = folder / OUTPUT_MARKER
+    try:
+        if mark.exists() or any(any(folder.glob(name)) for name in known):
+            return
+        if not any(folder.iterdir()):
+            mark.touch()
+        elif not force:
+            reason = f"{option} {folder}: the folder holds files that this command did not write"
+            raise UsageError(reason, "name a new folder, or an empty one")
+    except OSError as error:
         raise UsageError(f"{option} {folder}: {_reason(error)}", "name another folder") from None
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
+from rxcli.outputs import OUTPUT_MARKER
 from rxcli.runs.journal import Journal as Journal
 from rxcli.runs.journal import recover as recover
 from rxcli.types import Frame, FrameResult, FrameSoftBits
@@ -36,8 +37,6 @@ Decoded = tuple["Source", Iterator[FrameResult]]
 
 #: What these signals mean is decided by the first process; they often come to all at once.
 _FIRST_DECIDES = (signal.SIGINT, signal.SIGTERM)
-#: A folder with a file of this name holds what a command has written, and nothing to decode.
-OUTPUT_MARKER = ".vlc-rx-output"
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
 _AHEAD = 32
 _THREAD_VARIABLES = (
