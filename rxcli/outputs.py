@@ -31,6 +31,8 @@ _NAMED_WRONG = frozenset(
     {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP}
 )
 _DISK_FAILS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO})
+#: A folder with a file of this name holds what a command has written, and nothing to decode.
+OUTPUT_MARKER = ".vlc-rx-output"
 #: So much of a file's start and of its end tells whose it is.
 _LOOK_BYTES = 1 << 16
 #: Signature and IHDR of a PNG (ISO 15948, section 5).
@@ -158,6 +160,32 @@ def _refusal(what: str, error: BaseException, step: str) -> ReceiverError:
     if getattr(error, "errno", None) in _DISK_FAILS:
         return OutputError(f"{what}: cannot be written ({_reason(error)})", "make room, or name another disk")
     return UsageError(f"{what}: cannot be written ({_reason(error)})", step)
+
+
+def claim_own_folder(option: str, folder: Path, known: Iterable[str] = (), force: bool = False) -> None:
+    """Make a folder for nothing but what a command writes, and mark it, so that runs over folders pass over it.
+
+    Args:
+        option: that names it.
+        folder: new, empty, or written by the same command before.
+        known: patterns of names that tell a folder which an earlier version has written, without a mark.
+        force: write into somebody else's folder, which gets no mark.
+
+    Raises:
+        UsageError: it is a file, cannot be made, or holds other files.
+    """
+    claim_folder(option, folder)
+    mark = folder / OUTPUT_MARKER
+    try:
+        if mark.exists() or any(any(folder.glob(name)) for name in known):
+            return
+        if not any(folder.iterdir()):
+            mark.touch()
+        elif not force:
+            reason = f"{option} {folder}: the folder holds files that this command did not write"
+            raise UsageError(reason, "name a new folder, or an empty one")
+    except OSError as error:
+        raise UsageError(f"{option} {folder}: {_reason(error)}", "name another folder") from None
 
 
 def _identity(path: Path) -> object | None:

@@ -123,6 +123,8 @@ class CameraProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return model.strip().casefold() in {name.casefold() for name in self.models}
 
 
+#: Distortion coefficients that any calibration may give, and focal lengths and centres in sizes of the picture.
+_LARGEST_COEFFICIENT, _FARTHEST = 1e3, 1e3
 _Profile = TypeVar("_Profile", ScreenProfile, CameraProfile)
 _KINDS: dict[type[Any], str] = {ScreenProfile: "screens", CameraProfile: "cameras"}
 
@@ -164,15 +166,23 @@ def check_profile(raw: dict[str, Any], kind: type[_Profile], source: str) -> _Pr
 def _check_lens(lens: LensModel | None, source: str) -> None:
     if lens is None:
         return
-    (fx, _, _), (_, fy, _), last = lens.camera_matrix
+    (fx, skew, cx), (lower, fy, cy), last = lens.camera_matrix
     if not all(map(isfinite, (*lens.dist_coeffs, *chain.from_iterable(lens.camera_matrix)))):
         raise ProfileError(f"{source}: lens: camera_matrix and dist_coeffs must be finite numbers", "correct the file")
-    if fx <= 0 or fy <= 0 or last != (0.0, 0.0, 1.0):
+    if fx <= 0 or fy <= 0 or (skew, lower) != (0.0, 0.0) or last != (0.0, 0.0, 1.0):
         raise ProfileError(
             f"{source}: lens.camera_matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy "
             f"(got {[list(row) for row in lens.camera_matrix]})",
             "correct the file",
         )
+    largest, size = max(map(abs, lens.dist_coeffs)), max(lens.width, lens.height)
+    if largest > _LARGEST_COEFFICIENT:
+        reason = f"no lens has distortion coefficients beyond {_LARGEST_COEFFICIENT:g} (got {largest:g})"
+        raise ProfileError(f"{source}: lens: {reason}", "correct the file, or calibrate again")
+    if max(fx, fy, abs(cx), abs(cy)) > _FARTHEST * size or min(fx, fy) < size / _FARTHEST:
+        reason = f"camera_matrix does not fit a picture of {lens.width} x {lens.height} pixels"
+        matrix = [list(row) for row in lens.camera_matrix]
+        raise ProfileError(f"{source}: lens: {reason} (got {matrix})", "correct the file, or calibrate again")
 
 
 def _explain(message: str, raw: dict[str, Any]) -> str:

@@ -371,3 +371,5 @@ class FrameResult:
     #: In the last result of a source: files under way, and sentences about what was refused.
     progress: tuple[ObjectProgress, ...] = ()
     link_notes: tuple[str, ...] = ()
+    #: The process that decoded the source was ended from outside: a run that is resumed tries the source again.
+    retry: bool = False

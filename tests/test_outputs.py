@@ -272,10 +272,66 @@ def test_cells_that_a_spreadsheet_would_compute_are_quoted(tmp_path: Path, names
     before = Path.cwd()
     os.chdir(folder)
     try:
-        run(
-            ["decode", "--summary", "s.csv", *names, "--quiet", "--", "=1+1.png", "+a.png", "@b.png", "-c.png", "d.png"]
-        )
+        odd = ["=1+1.png", "+a.png", "@b.png", "-c.png", "d.png"]
+        run(["decode", "--summary", "s.csv", *names, "--quiet", "--", *odd])
+        write_frame(folder / "=1+1.png", 1)
+        run(["decode", "--payloads", "p.csv", *names, "--quiet", "--", "=1+1.png"])
     finally:
         os.chdir(before)
     sources = [line.split(",")[0] for line in (folder / "s.csv").read_text().splitlines()[1:]]
     assert sources == ["'=1+1.png", "'+a.png", "'@b.png", "'-c.png", "d.png"]
+    assert {line.split(",")[0] for line in (folder / "p.csv").read_text().splitlines()[1:]} == {"'=1+1.png"}
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["benchmark", "stability", "--readers", "1"],
+        ["benchmark", "confidence", "--frames", "1"],
+        ["benchmark", "memory", "--frames", "100"],
+        ["benchmark", "speed", "--medium", "jpeg-26mp", "--fresh"],
+        ["benchmark", "compare", "."],
+        ["benchmark", "goodput"],
+        ["benchmark", "--quick"],
+        ["inspect", "a.png"],
+        ["train"],
+    ],
+    ids=lambda command: " ".join(command[:2]),
+)
+def test_folders_of_results_are_no_folders_of_photos(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder that holds other files is neither written to nor marked as one that runs pass over."""
+    monkeypatch.chdir(tmp_path)
+    write_frame(tmp_path / "a.png", 1)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "a.jpg").write_bytes(b"photo")
+    (photos / "notes.csv").write_text("mine")
+    for name in ("torch", "onnx", "matplotlib") if command == ["train"] else ():
+        pytest.importorskip(name)
+    if command[1:2] == ["compare"]:
+        monkeypatch.setattr("rxcli.lab.benchmark.compare.check_checkout", lambda path: path)
+        monkeypatch.setattr("rxcli.lab.benchmark.compare.shared_screens", lambda path: ())
+    assert run([*command, *(["--out"] if command != ["train"] else []), "photos"]) == 2
+    said = capsys.readouterr().err
+    assert "photos: the folder holds files that this command did not write; name a new folder" in said
+    assert sorted(path.name for path in photos.iterdir()) == ["a.jpg", "notes.csv"]
+
+
+def test_a_folder_of_results_is_new_empty_or_the_commands_own(tmp_path: Path) -> None:
+    new, old, other = tmp_path / "a" / "new", tmp_path / "old", tmp_path / "other"
+    for _ in range(2):
+        outputs.claim_own_folder("--out", new, ("*.journal.jsonl",))
+        (new / "confidence.csv").write_text("x")
+    assert (new / outputs.OUTPUT_MARKER).exists()
+    for folder, name in ((old, "confidence.journal.jsonl"), (other, "a.jpg")):
+        folder.mkdir()
+        (folder / name).touch()
+    outputs.claim_own_folder("--out", old, ("*.journal.jsonl",))
+    outputs.claim_own_folder("--out", other, (), force=True)
+    with pytest.raises(UsageError, match="the folder holds files"):
+        outputs.claim_own_folder("--out", other, ("*.journal.jsonl",))
+    with pytest.raises(UsageError, match=r"a\.jpg: File exists"):
+        outputs.claim_own_folder("--out", other / "a.jpg")
+    assert not any((folder / outputs.OUTPUT_MARKER).exists() for folder in (old, other))

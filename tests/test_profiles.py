@@ -152,6 +152,11 @@ def test_a_wrong_screen_names_file_key_and_value(path: str, value: Any, words: l
         ("lens.dist_coeffs", [0.1], ["dist_coeffs"]),
         ("lens.camera_matrix.0.0", -500.0, ["camera_matrix", "-500.0"]),
         ("lens.camera_matrix.2.2", 2.0, ["camera_matrix", "2.0"]),
+        ("lens.camera_matrix.0.1", 1e300, ["camera_matrix", "1e+300"]),
+        ("lens.camera_matrix.0.0", 1e300, ["camera_matrix", "does not fit a picture of"]),
+        ("lens.camera_matrix.1.2", -1e9, ["camera_matrix", "does not fit a picture of"]),
+        ("lens.camera_matrix.1.1", 1e-300, ["camera_matrix", "does not fit a picture of"]),
+        ("lens.dist_coeffs", [0.0, 1e300, 0.0, 0.0, 0.0], ["no lens has distortion coefficients", "1e+300"]),
         ("tone", "film", ["tone", "film"]),
     ],
 )

@@ -36,9 +36,21 @@ _RUN = (_RESULTS, _SEED, _FRESH, _QUIET)
 _MANY = (_JOBS, *_RUN)
 
 
+#: Commands that keep no journal.
+_WITHOUT_JOURNAL = ("speed", "readers", "compare", "memory", "goodput")
+
+
+def _claim(out: Path) -> None:
+    """Refuse a folder of results that is somebody else's."""
+    from rxcli.outputs import claim_own_folder
+
+    claim_own_folder("--out", out, ("*.journal.jsonl", *(f"{name}.json" for name in _WITHOUT_JOURNAL)))
+
+
 def _journal(out: Path, name: str, fresh: bool) -> Journal:
     from rxcli.lab.benchmark.journal import Journal
 
+    _claim(out)
     path = out / f"{name}.journal.jsonl"
     if fresh:
         path.unlink(missing_ok=True)
@@ -81,7 +93,8 @@ def benchmark(context: click.Context, quick: bool, jobs: int, out: Path, seed: i
     from rxcli.lab.benchmark import quick as work
     from rxcli.lab.benchmark.tables import titled, write_text
 
-    headline = work.run(out / "media", _journal(out, "quick", fresh), seed=seed, jobs=jobs, quiet=quiet)
+    journal = _journal(out, "quick", fresh)
+    headline = work.run(out / "media", journal, seed=seed, jobs=jobs, quiet=quiet)
     text = titled(headline.sections)
     click.echo(text)
     _say_written([write_text(out / "quick.txt", text + "\n")])
@@ -305,6 +318,7 @@ def speed(repeats: int, only: tuple[str, ...], growth: bool, out: Path, quiet: b
     media = [medium for medium in work.MEDIA if not only or medium.name in only]
     if not media:
         raise click.BadParameter(f"no medium of that name; choose from: {', '.join(m.name for m in work.MEDIA)}")
+    _claim(out)
     if given["fresh"]:
         for medium in media:
             (out / "media" / f"{medium.name}{medium.suffix}").unlink(missing_ok=True)
@@ -352,6 +366,7 @@ def _mutated_readers(n: int, seconds: float | None, out: Path, seed: int) -> int
     from rxcli.lab.benchmark import readers as work
     from rxcli.lab.benchmark.tables import format_table, write_outputs
 
+    _claim(out)
     first = 1_000_000 * seed
     verdict = work.run(n, first, out / "readers", seconds)
     table = work.rows(verdict)
@@ -418,6 +433,7 @@ def compare(checkout: Path, out: Path, **given: Any) -> int:
     from rxcli.resources import data_dir
 
     other, seed = work.check_checkout(checkout), given["seed"]
+    _claim(out)
     screens = work.shared_screens(other)
     jobs = work.captures((given["captures"] or data_dir("sample_frames")).resolve(), screens)
     jobs += work.random_scenes(out / "compare", given["scenes"], seed)
@@ -437,6 +453,7 @@ def memory(frames: int, out: Path) -> None:
     from rxcli.lab.benchmark import long_clip as work
     from rxcli.lab.benchmark.tables import format_table, write_outputs
 
+    _claim(out)
     clip = work.make_clip(out / "media", frames)
     places = tuple(sorted({max(round(frames * share), 1) for share in (0.1, 0.2, 0.5, 1.0)}))
     found = work.measure(clip, places, out / "media" / "long.jsonl")
@@ -474,6 +491,7 @@ def goodput(
     from rxcli.lab.benchmark import goodput as work
     from rxcli.lab.benchmark.tables import format_table, write_outputs
 
+    _claim(out)
     chosen = [_camera_of(text) for text in cameras] or work.CAMERAS
     grid = [replace(point, mother=mother) for point in work.points(screens, pictures, chosen, sizes)]
     bar = tqdm(grid, unit="point", leave=False, disable=None)

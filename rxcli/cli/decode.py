@@ -259,9 +259,11 @@ class _Run:
         self._paths = {source.name: source.path for source in sources}
         with ExitStack() as stack:
             journal = self._journal(stack)
-            done = self._recover() if self._options["resume"] else set()
-            writer = self._writer(journal, begun=bool(done))
             self._write_payloads = self._payloads(stack)
+            done = self._recover() if self._options["resume"] else set()
+            if journal is not None:
+                journal.follow()
+            writer = self._writer(journal, begun=bool(done))
             try:
                 self._decode([source for source in sources if source.name not in done], writer, len(sources))
             except BaseException:
@@ -279,6 +281,7 @@ class _Run:
             summary, scorer = self._begin(name)
             for result in results:
                 summary.add(scorer.add(result) if scorer else result)
+                self._write_payloads(result)
             self._end(summary, scorer)
             done.add(name)
         return done
@@ -321,7 +324,7 @@ class _Run:
             return lambda result: None
         from rxcli.results.payloads import PayloadWriter
 
-        return stack.enter_context(PayloadWriter(self._options["payloads"], self._options["resume"])).write
+        return stack.enter_context(PayloadWriter(self._options["payloads"])).write
 
     def _decode(self, sources: list[Source], writer: _Writer, n_total: int) -> None:
         from rxcli.results.report import plural, result_in_words

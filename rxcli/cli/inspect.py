@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 #: Frames of a clip that its timeline shows.
 _MOST_FRAMES = 240
-#: A folder with a file of this name is passed over by runs over folders.
-_MARKER = ".vlc-rx-output"
 
 
 @click.command()
@@ -40,7 +38,7 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
 
     Of a clip, the first frames are received, and one is shown in full.
     """
-    from rxcli.outputs import Output, unwritable, write_whole
+    from rxcli.outputs import Output, claim_own_folder, write_whole
     from rxcli.results.overlay import camera_of
     from rxcli.results.page import MARK, inspection_page
     from rxcli.results.report import format_link
@@ -49,17 +47,15 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
     page = folder / "index.html"
     own = re.compile(re.escape(MARK.encode()))
     claim_outputs([Output("--out", page, own, makes_folder=True)], (path,), (), force)
+    if folder.exists():  # a new one is made when there is something to put into it
+        claim_own_folder("--out", folder, (page.name,), force)
     configured = receiver_options(**options, soft_bits=True)
     results, picture = _received(path, frame, configured, truth)
     shown = next(result for result in results if result.frame == picture.index)
     screen = next((s for s in configured.screens if s.name == shown.screen_profile), None)
     timeline = results if len(results) > 1 else []
     text = inspection_page(picture, shown, screen, camera_of(picture, shown, configured.cameras), timeline)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / _MARKER).touch()
-    except OSError as error:
-        raise unwritable(folder, error) from None
+    claim_own_folder("--out", folder, (page.name,), force)
     write_whole(page, text)
     for result in results:
         for line in format_link(result):

@@ -61,8 +61,11 @@ def train(
     claim_folder("OUT", out)
     from rxcli.lab.training import dataset, export, fit
     from rxcli.lab.training.network import Shape, n_parameters
+    from rxcli.outputs import claim_own_folder
 
     data, progress = cache or out / "data", not quiet
+    claim_own_folder("OUT", out, (fit.CHECKPOINT, "model.toml"))
+    claim_own_folder("--cache", data, ("frames-*", "validation"))
     recipe = fit.Recipe(shape=Shape(strip_width=strip_width, column_width=column_width), steps=steps, seed=seed)
     samples = dataset.frame_samples(frames, seed, data, progress=progress)
     held = dataset.validation_samples(held_out, data, progress=progress)

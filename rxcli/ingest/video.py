@@ -54,6 +54,8 @@ class _Progress:
     n_damaged: int = 0
     #: Whether the file ends within a packet.
     cut: bool = False
+    #: What a frame's time claims to be, where that is not believed.
+    doubt: str | None = None
 
     def damage(self) -> None:
         self.n_damaged += 1
@@ -107,6 +109,8 @@ def _frames(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
     decode = _decode_mjpeg if stream.codec_context.name == "mjpeg" else _decode
     for index, picture in enumerate(decode(path, container, stream, progress)):
         progress.last_time_s = picture.time_s
+        if progress.doubt and not metadata.not_believed:
+            metadata = replace(metadata, not_believed=(progress.doubt,))
         yield Frame(
             pixels=picture.pixels,
             source=str(path),
@@ -182,6 +186,7 @@ def _time_s(stamped: Any, stream: Any, progress: _Progress) -> tuple[float, bool
     """
     own = float(stamped.pts * stream.time_base) if stamped.pts is not None and stream.time_base else None
     if own is not None and abs(own) >= _MOST_S:
+        progress.doubt = progress.doubt or f"a frame's time of {own:.6g} s"
         own = None
     before = progress.stamp_s
     nominal = before is not None and (own is None or own <= before)
@@ -254,7 +259,7 @@ def _ends_early(path: Path, container: Any, stream: Any, progress: _Progress) ->
     if "mp4" in container.format.name:
         return _boxes_end(path) > container.size or any(entry.pos + entry.size > container.size for entry in entries)
     frame_s = 1 / float(stream.average_rate or 30)
-    return progress.last_time_s + _END_TOLERANCE * frame_s < _stated_end_s(container, stream)
+    return progress.last_time_s + _END_TOLERANCE * frame_s < _stated_end_s(container, stream) < _MOST_S
 
 
 def _ends_within_packet(path: Path) -> bool:

@@ -3,36 +3,39 @@
 from __future__ import annotations
 
 import csv
+import io
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TextIO
+from typing import BinaryIO
 
-from rxcli.errors import InputError
-from rxcli.results.report import printable
+from rxcli.outputs import unwritable
+from rxcli.results.report import csv_cell, printable
 from rxcli.types import FrameResult
 
 _NAMES = ("source", "frame", "column", "burst", "bits", "hex", "confidence")
 
 
 class PayloadWriter:
-    """A file with one row a packet; a context manager.
+    """A file with one row a packet, that grows with the run; a context manager.
 
     Args:
         path: the file.
-        resume: go on behind what is there.
 
     Raises:
-        InputError: it cannot be written.
+        OutputError: it cannot be written.
     """
 
-    def __init__(self, path: Path, resume: bool = False) -> None:
-        go_on = resume and path.is_file() and path.stat().st_size > 0
+    def __init__(self, path: Path) -> None:
+        self._path = path
         try:
-            self._file: TextIO = path.open("a" if go_on else "w", newline="", encoding="utf-8")
+            self._file: BinaryIO = path.open("wb", buffering=0)
         except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror})", "name another file") from None
-        self._rows = csv.writer(self._file)
-        if not go_on:
-            self._rows.writerow(_NAMES)
+            raise unwritable(path, error) from None
+        try:
+            self._write([_NAMES])
+        except BaseException:
+            self._file.close()
+            raise
 
     def __enter__(self) -> PayloadWriter:
         return self
@@ -42,17 +45,28 @@ class PayloadWriter:
 
     def write(self, result: FrameResult) -> None:
         """Write the packets of a frame."""
-        for column in result.columns:
-            for packet in column.packets:
-                burst = "" if packet.burst is None else packet.burst
-                self._rows.writerow(
-                    (
-                        printable(result.source),
-                        result.frame,
-                        column.column,
-                        burst,
-                        packet.payload_bits,
-                        packet.payload,
-                        f"{packet.confidence:.6f}",
-                    )
-                )
+        self._write(
+            (
+                csv_cell(printable(result.source)),
+                result.frame,
+                column.column,
+                "" if packet.burst is None else packet.burst,
+                packet.payload_bits,
+                packet.payload,
+                f"{packet.confidence:.6f}",
+            )
+            for column in result.columns
+            for packet in column.packets
+        )
+
+    def _write(self, rows: Iterable[tuple[object, ...]]) -> None:
+        text = io.StringIO(newline="")
+        csv.writer(text).writerows(rows)
+        rest = memoryview(text.getvalue().encode())
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise unwritable(self._path, error) from None

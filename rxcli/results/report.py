@@ -71,6 +71,8 @@ def _details(result: FrameResult) -> dict[str, Any]:
         details["objects_incomplete"] = [_progress_record(progress) for progress in result.progress]
     if result.link_notes:
         details["link_notes"] = list(result.link_notes)
+    if result.retry:
+        details["retry"] = True
     return details
 
 
@@ -271,6 +273,7 @@ def from_record(record: dict[str, Any]) -> FrameResult:
             objects=_objects_from(record),
             progress=_progress_from(record),
             link_notes=tuple(str(note) for note in record.get("link_notes", ())),
+            retry=record.get("retry") is True,
         )
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         shown = f"{error!r:.200}"
@@ -339,12 +342,19 @@ def _unless_none(convert: Callable[[Any], _T], value: Any) -> _T | None:
     return None if value is None else convert(value)
 
 
+def csv_cell(value: Any) -> Any:
+    """`value` so that a spreadsheet takes it for text, not for a formula (OWASP, CSV injection)."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA_STARTS) else value
+
+
 def printable(text: str) -> str:
     """`text` as any terminal takes it: bytes of a file name that are no UTF-8, and line ends, become marks."""
     text = text.encode(errors="surrogateescape").decode(errors="replace")
     return "".join(character if character.isprintable() else "�" for character in text)
 
 
+#: What makes a spreadsheet compute a cell.
+_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 _HEADER = "    col  status     w  snr dB  confidence  copies  errors  payload"
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from rxcli.errors import ExitCode, UsageError, worst
 from rxcli.outputs import replacing, write_whole
-from rxcli.results.report import format_progress, format_table, plural, printable
+from rxcli.results.report import csv_cell, format_progress, format_table, plural, printable
 from rxcli.results.truth import Score
 from rxcli.types import FrameResult
 
@@ -242,12 +242,7 @@ def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, _COLUMNS)
         writer.writeheader()
-        writer.writerows({name: _cell(value) for name, value in row.items()} for row in rows)
-
-
-def _cell(value: Any) -> Any:
-    """`value` so that a spreadsheet takes it for text, not for a formula (OWASP, CSV injection)."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA_STARTS) else value
+        writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
 
 
 def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -261,8 +256,6 @@ def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
 
 
 _COLUMNS = tuple(SourceSummary("").row(Limits()))
-#: What makes a spreadsheet compute a cell.
-_FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 
 def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) -> None:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
+from rxcli.outputs import OUTPUT_MARKER
 from rxcli.runs.journal import Journal as Journal
 from rxcli.runs.journal import recover as recover
 from rxcli.types import Frame, FrameResult, FrameSoftBits
@@ -36,8 +37,6 @@ Decoded = tuple["Source", Iterator[FrameResult]]
 
 #: What these signals mean is decided by the first process; they often come to all at once.
 _FIRST_DECIDES = (signal.SIGINT, signal.SIGTERM)
-#: A folder with a file of this name holds what a command has written, and nothing to decode.
-OUTPUT_MARKER = ".vlc-rx-output"
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
 _AHEAD = 32
 _THREAD_VARIABLES = (
@@ -186,10 +185,11 @@ class Decoder:
             yield replace(before, soft_bits=None if before.messages or before.objects else alone)
 
     def _frames(self, source: Source) -> Iterator[Frame]:
+        told = False
         for frame in self.open_source(source.path):
             frame = replace(frame, source=source.name)  # as the user named it, wherever it is opened
-            if frame.index == 0 and frame.metadata.not_believed:
-                claims = ", ".join(frame.metadata.not_believed)
+            if frame.metadata.not_believed and not told:
+                claims, told = ", ".join(frame.metadata.not_believed), True
                 log.warning("%s: not believed, and taken as unknown: %s", source.name, claims)
             if self.tap is not None:
                 self.tap(frame, source.subfolder)
@@ -257,7 +257,8 @@ def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded
 def decode_in_processes(sources: Sequence[Source], decoder: Decoder, workers: int) -> Iterator[Decoded]:
     """Decode sources in worker processes; results as from `decode_here`, in the same order.
 
-    A worker that dies costs the source it had in hand, which ends as unreadable; another worker takes its place.
+    The source that a worker had in hand when it died is decoded again, by another worker while all others rest (what
+    ended it may have been the want of memory). A source that ends two workers is unreadable.
 
     Args:
         sources: what to decode.
@@ -275,8 +276,10 @@ class _Worker:
     connection: Connection
     #: Index of the source in hand, None while idle.
     index: int | None = None
-    #: Results it has given of that source.
-    count: int = 0
+    #: Results of that source that another worker has given, and are still to come again.
+    skip: int = 0
+    #: Whether the others rest meanwhile.
+    alone: bool = False
 
 
 class _Finished:
@@ -288,7 +291,11 @@ class _Buffer:
     """Results of one source that have come and were not taken yet."""
 
     results: deque[FrameResult] = field(default_factory=deque)
+    #: Results that have come at all.
+    count: int = 0
     complete: bool = False
+    #: Workers that died with the source in hand.
+    deaths: int = 0
 
 
 class _Pool:
@@ -304,6 +311,8 @@ class _Pool:
         self._buffers: dict[int, _Buffer] = {}
         self._next = 0
         self._taking = 0
+        #: Sources whose worker died.
+        self._again: deque[int] = deque()
 
     def __enter__(self) -> _Pool:
         self._fill()
@@ -330,29 +339,36 @@ class _Pool:
 
     def _fill(self) -> None:
         """Give every idle worker a source, and start workers where some are missing."""
+        if self._again:
+            if all(worker.index is None for worker in self._workers):
+                self._assign(self._workers[0] if self._workers else self._started(), self._again.popleft())
+            return
+        if any(worker.alone for worker in self._workers):
+            return
         while len(self._workers) < self._n_workers and self._may_assign():
-            self._workers.append(self._start())
+            self._started()
         for worker in self._workers:
             if worker.index is None and self._may_assign():
-                self._assign(worker)
+                self._assign(worker, self._next)
+                self._next += 1
 
     def _may_assign(self) -> bool:
         return self._next < min(len(self._sources), self._taking + _AHEAD * self._n_workers)
 
-    def _start(self) -> _Worker:
+    def _started(self) -> _Worker:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_work, args=(theirs, self._decoder, log_level()), daemon=True)
         with _one_thread_environment(), _signals_held():
             process.start()
         theirs.close()
-        return _Worker(process, ours)
+        self._workers.append(_Worker(process, ours))
+        return self._workers[-1]
 
-    def _assign(self, worker: _Worker) -> None:
-        worker.index, worker.count = self._next, 0
-        self._buffers.setdefault(self._next, _Buffer())
-        self._next += 1
+    def _assign(self, worker: _Worker, index: int) -> None:
+        buffer = self._buffers.setdefault(index, _Buffer())
+        worker.index, worker.skip, worker.alone = index, buffer.count, buffer.deaths > 0
         try:
-            worker.connection.send(self._sources[worker.index])
+            worker.connection.send(self._sources[index])
         except OSError:
             log.debug("worker %s is gone", worker.process.pid)  # the next wait finds its connection closed
 
@@ -374,22 +390,30 @@ class _Pool:
             raise message
         assert worker.index is not None
         buffer = self._buffers[worker.index]
-        if isinstance(message, FrameResult):
-            buffer.results.append(message)
-            worker.count += 1
-        else:
+        if not isinstance(message, FrameResult):
             buffer.complete = True
-            worker.index = None
+            worker.index, worker.alone = None, False
+        elif worker.skip:
+            worker.skip -= 1
+        else:
+            buffer.results.append(message)
+            buffer.count += 1
 
     def _bury(self, worker: _Worker) -> None:
-        """Put a dead worker's source down as unreadable."""
+        """Take a dead worker's source up again, or put it down as unreadable where it is the second to die of it."""
         worker.connection.close()
         worker.process.join()
         self._workers.remove(worker)
         assert worker.index is not None
         source, buffer = self._sources[worker.index], self._buffers[worker.index]
-        message = f"{source.name}: the process that decoded it {_ending(worker.process.exitcode)}; try it by itself"
-        buffer.results.append(unreadable(source, worker.count, message))
+        ending = _ending(worker.process.exitcode)
+        buffer.deaths += 1
+        if buffer.deaths == 1:
+            log.warning("%s: the process that decoded it %s; it is tried again", source.name, ending)
+            self._again.append(worker.index)
+            return
+        message = f"{source.name}: two processes that decoded it died, the last one {ending}; try it by itself"
+        buffer.results.append(replace(unreadable(source, buffer.count, message), retry=True))
         buffer.complete = True
 
 

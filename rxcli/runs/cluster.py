@@ -5,16 +5,20 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import time
 import warnings
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from rxcli.errors import InputError, ReceiverError, UsageError
+from rxcli.errors import InputError, OutputError, ReceiverError, UsageError
+from rxcli.outputs import PICTURE, TAPS, check_replaceable, unwritable, write_whole
 from rxcli.runs.batch import Decoded, Decoder, Source, unreadable
 from rxcli.types import FrameResult
 
@@ -27,6 +31,11 @@ log = logging.getLogger(__name__)
 _RETRIES = 3
 #: Tasks in the scheduler's hands at a time: enough for a large cluster, few enough that results do not pile up.
 _IN_FLIGHT = 1024
+#: Bytes of one source's taps: results wait in the memory of the cluster.
+_MOST_TAPPED = 512 << 20
+#: A tapped file: the option that asks for it, its path below that option's folder, its bytes.
+_Tap = tuple[str, str, bytes]
+_Outcome = tuple[list[FrameResult], list[_Tap]]
 _START_ONE = "start one with `dask scheduler` and name its address, such as tcp://host:8786"
 
 
@@ -41,7 +50,7 @@ def decode_on_cluster(
         sources: what to decode.
         decoder: how; must be picklable.
         address: the scheduler's, such as `tcp://host:8786`.
-        connect_s: how long to wait for the scheduler, seconds.
+        connect_s: how long to wait for the scheduler in all, seconds.
 
     Raises:
         UsageError: the extra is missing, the address is none, or no scheduler answers there.
@@ -52,7 +61,9 @@ def decode_on_cluster(
         flying = deque((source, _submit(client, decoder, source)) for source in islice(waiting, _IN_FLIGHT))
         while flying:
             source, future = flying.popleft()
-            yield source, iter(_await(source, future, address))
+            results, taps = _await(source, future, address)
+            _write(taps, decoder)
+            yield source, iter(results)
             flying.extend((following, _submit(client, decoder, following)) for following in islice(waiting, 1))
 
 
@@ -61,12 +72,13 @@ def _connect(address: str, connect_s: float) -> Client:
         from distributed import Client
     except ImportError:
         raise UsageError("--cluster needs the package distributed", "pip install 'vlc-rx[cluster]'") from None
+    end_s = time.monotonic() + connect_s
     problem = _problem_at(address, connect_s)
     if problem is not None:
         raise UsageError(f"--cluster: no Dask scheduler answers at {address!r} ({problem})", _START_ONE)
     try:
         with _silent():
-            client = Client(address, timeout=connect_s, set_as_default=False)
+            client = Client(address, timeout=max(end_s - time.monotonic(), 0.1), set_as_default=False)
     except (OSError, ValueError) as error:
         raise UsageError(
             f"--cluster: no Dask scheduler answers at {address!r} ({type(error).__name__})", _START_ONE
@@ -83,7 +95,7 @@ def _problem_at(address: str, connect_s: float) -> str | None:
     asker = Thread(target=lambda: outcome.append(_asked(address, connect_s)), daemon=True)
     with _silent():
         asker.start()
-        asker.join(1.5 * connect_s)
+        asker.join(connect_s)
     return outcome[0] if outcome else f"nothing within {connect_s:g} s"
 
 
@@ -142,19 +154,79 @@ def _submit(client: Client, decoder: Decoder, source: Source) -> Any:
     return client.submit(_decode, decoder, task, pure=False, retries=_RETRIES)
 
 
-def _decode(decoder: Decoder, source: Source) -> list[FrameResult]:
-    return list(decoder.results(source))
+def _decode(decoder: Decoder, source: Source) -> _Outcome:
+    """Decode a source on a worker; what is tapped comes back with the results, for the disk may be another one."""
+    if not _folders(decoder):
+        return list(decoder.results(source)), []
+    with TemporaryDirectory(prefix="vlc-rx-") as scratch:
+        results = list(_tapping_into(decoder, Path(scratch)).results(source))
+        return results, _collect(Path(scratch), source)
 
 
-def _await(source: Source, future: Any, address: str) -> list[FrameResult]:
+def _folders(decoder: Decoder) -> dict[str, Path]:
+    """Where taps go, by the option that names it."""
+    folders = {
+        "--dump-dir": getattr(decoder.options, "dump_dir", None),
+        "--save-undistorted": getattr(decoder.tap, "folder", None),
+    }
+    return {option: folder for option, folder in folders.items() if folder is not None}
+
+
+def _tapping_into(decoder: Decoder, scratch: Path) -> Decoder:
+    """The decoder with its taps in folders of `scratch`, called as the options are."""
+    there = {option: scratch / option for option in _folders(decoder)}
+    if "--dump-dir" in there:
+        decoder = replace(decoder, options=replace(decoder.options, dump_dir=there["--dump-dir"]))
+    if "--save-undistorted" in there:
+        tap: Any = decoder.tap
+        decoder = replace(decoder, tap=replace(tap, folder=there["--save-undistorted"]))
+    return decoder
+
+
+def _collect(scratch: Path, source: Source) -> list[_Tap]:
+    """The files below `scratch`."""
+    paths = sorted(path for path in scratch.rglob("*") if path.is_file())
+    size = sum(path.stat().st_size for path in paths)
+    if size > _MOST_TAPPED:
+        reason = f"{source.name}: its taps take {size >> 20} MB, {_MOST_TAPPED >> 20} are the most that a cluster sends"
+        raise OutputError(reason, "decode this file without --cluster")
+    found = []
+    for path in paths:
+        option, *below = path.relative_to(scratch).parts
+        found.append((option, "/".join(below), path.read_bytes()))
+    return found
+
+
+def _write(taps: list[_Tap], decoder: Decoder) -> None:
+    """Write what was tapped where the options say.
+
+    Raises:
+        OutputError: it cannot be written, or somebody else's file is there.
+    """
+    folders = _folders(decoder)
+    looks = {"--dump-dir": TAPS, "--save-undistorted": PICTURE}
+    for option, below, data in taps:
+        folder = folders[option]
+        path = folder / below
+        if not path.resolve().is_relative_to(folder.resolve()):
+            raise OutputError(f"{path}: a worker names a file outside {option}", "look at who joins the cluster")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise unwritable(path, error) from None
+        check_replaceable(path, looks[option], option)
+        write_whole(path, data)
+
+
+def _await(source: Source, future: Any, address: str) -> _Outcome:
     from distributed import KilledWorker
 
     try:
-        results: list[FrameResult] = future.result()
-        return results
+        decoded: _Outcome = future.result()
+        return decoded
     except KilledWorker:
         message = f"{source.name}: every worker that decoded it died; try it by itself"
-        return [unreadable(source, 0, message)]
+        return [replace(unreadable(source, 0, message), retry=True)], []
     except (OSError, _cancelled()) as error:
         raise InputError(
             f"the scheduler at {address!r} went away ({type(error).__name__})", "start it again and use --resume"

@@ -1,9 +1,10 @@
 """The file of JSON lines as its own journal: what it holds whenever the process ends, and going on from there.
 
 Every line is written whole, at once, and sources follow one another, so that after a kill at most the last source is
-incomplete; `recover` drops it and the run goes on behind the rest. The first line says under `run` which version wrote
-the file with which options; the first line of every source says under `file` how long the file was and when it was
-written; its last line says `last`. Other options or changed files would make results that do not go together.
+incomplete; `recover` drops it, and sources whose decoder was killed, and the run goes on behind the rest. The first
+line says under `run` which version wrote the file with which options; the first line of every source says under `file`
+how long the file was and when it was written; its last line says `last`. Other options or changed files would make
+results that do not go together.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from rxcli.errors import InputError, UsageError
-from rxcli.outputs import unwritable
+from rxcli.outputs import replacing, unwritable
 from rxcli.results.report import from_record, to_record
 from rxcli.types import FrameResult
 
@@ -29,6 +30,7 @@ except ImportError:  # no such locks on this system
 #: What every line of results starts with, so that half of one is told from a foreign file.
 _LINE_START = b'{"source": "'
 _ANOTHER = "name the file that --json wrote before"
+_PIECE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,18 +125,33 @@ class Journal:
 
     def __init__(self, path: Path, resume: bool = False) -> None:
         self._path = path
+        #: A file that was replaced, whose lock is kept.
+        self._replaced: BinaryIO | None = None
+        self._open()
+        if self._regular and not resume:
+            self._file.truncate(0)
+
+    def _open(self) -> None:
         try:
-            self._file: BinaryIO = path.open("ab", buffering=0)
+            self._file: BinaryIO = self._path.open("ab", buffering=0)
             self._regular = stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
         except (OSError, ValueError) as error:
-            raise unwritable(path, error) from None
+            raise unwritable(self._path, error) from None
         try:
             self._lock()
-            if self._regular and not resume:
-                self._file.truncate(0)
         except BaseException:
-            self.close()
+            self._file.close()
             raise
+
+    def follow(self) -> None:
+        """Go on in the file that has taken the place of the one that was opened, if `recover` has put one there."""
+        try:
+            if not self._regular or os.path.samestat(os.fstat(self._file.fileno()), self._path.stat()):
+                return
+        except OSError as error:
+            raise unwritable(self._path, error) from None
+        self._replaced = self._file
+        self._open()
 
     def _lock(self) -> None:
         if fcntl is None or not self._regular:
@@ -173,14 +190,17 @@ class Journal:
     def close(self) -> None:
         """Close the file, which unlocks it."""
         self._file.close()
+        if self._replaced is not None:
+            self._replaced.close()
 
 
 def recover(
     path: Path, head: Head | None = None, paths: Mapping[str, str] | None = None
 ) -> Iterator[tuple[str, list[FrameResult]]]:
-    """Give the complete sources of an earlier run's JSON lines, then cut off the last one if it may be incomplete.
+    """Give the complete sources of an earlier run's JSON lines, then leave only them in the file.
 
-    Exhaust it before the file is written to.
+    The last source may be incomplete, and is cut off. Sources that say `retry` are left out wherever they stand, by
+    a new file in the place of the old one (see `Journal.follow`). Exhaust it before the file is written to.
 
     Args:
         path: the file.
@@ -195,8 +215,11 @@ def recover(
     try:
         _check_same(path, head, paths or {})
         with path.open("rb+") as file:
-            end = yield from _complete_sources(file, path)
-            file.truncate(end)
+            kept = yield from _complete_sources(file, path)
+            if len(kept) > 1 or (kept and kept[0][0] > 0):
+                _leave_only(kept, file, path)
+            else:
+                file.truncate(kept[0][1] if kept else 0)
     except FileNotFoundError:
         return
     except OSError as error:
@@ -241,10 +264,23 @@ def _changes(source: str, facts: object, paths: Mapping[str, str]) -> list[str]:
     return [f"{source} has changed ({name.removesuffix('_s')} was {facts.get(name)!r}, is {now.get(name)} {unit})"]
 
 
-def _complete_sources(file: BinaryIO, path: Path) -> Generator[tuple[str, list[FrameResult]], None, int]:
-    """Give every complete source; returns where they end."""
-    end = offset = 0
+def _complete_sources(
+    file: BinaryIO, path: Path
+) -> Generator[tuple[str, list[FrameResult]], None, list[tuple[int, int]]]:
+    """Give every complete source; returns from where to where they stand, in pieces."""
+    kept: list[tuple[int, int]] = []
+    begin = offset = 0
     results: list[FrameResult] = []
+
+    def complete() -> Iterator[tuple[str, list[FrameResult]]]:
+        if any(result.retry for result in results):
+            return
+        if kept and kept[-1][1] == begin:
+            kept[-1] = (kept[-1][0], offset)
+        else:
+            kept.append((begin, offset))
+        yield results[0].source, results
+
     for number, line in enumerate(file, start=1):
         if _is_cut(line):
             break
@@ -252,14 +288,30 @@ def _complete_sources(file: BinaryIO, path: Path) -> Generator[tuple[str, list[F
         record = _parse(line, place)
         result = _result(record, place)
         if results and result.source != results[0].source:  # a version that did not say which line is the last
-            yield results[0].source, results
-            results, end = [], offset
+            yield from complete()
+            results, begin = [], offset
         results.append(result)
         offset += len(line)
         if record.get("last") is True:
-            yield result.source, results
-            results, end = [], offset
-    return end
+            yield from complete()
+            results, begin = [], offset
+    return kept
+
+
+def _leave_only(kept: list[tuple[int, int]], file: BinaryIO, path: Path) -> None:
+    """Replace a journal by pieces of it; what its first line says of the run stands in the first that is left."""
+    file.seek(0)
+    run = _parse(file.readline(), f"{path} line 1").get("run")
+    with replacing(path) as hidden, hidden.open("wb") as out:
+        for begin, end in kept:
+            file.seek(begin)
+            if out.tell() == 0 and begin > 0:
+                record = _parse(file.readline(), str(path))
+                at = list(record).index("file") if "file" in record else len(record)
+                items = list(record.items())
+                out.write(json.dumps(dict([*items[:at], ("run", run), *items[at:]])).encode() + b"\n")
+            while piece := file.read(min(end - file.tell(), _PIECE_BYTES)):
+                out.write(piece)
 
 
 def _is_cut(line: bytes) -> bool:

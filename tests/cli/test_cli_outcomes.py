@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import resource
 import shutil
 import signal
 import socket
@@ -19,6 +20,7 @@ import pytest
 from small_frames import write_frame, write_profiles
 
 from rxcli.cli.main import run
+from rxcli.runs.journal import Journal
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 COMMAND = [sys.executable, "-m", "rxcli.cli.main"]
@@ -125,6 +127,77 @@ def test_resuming_with_other_inputs_keeps_what_is_there(tmp_path: Path, folder: 
     assert decode(folder / "2.png", "--json", out, "--resume")[0] == 0
     assert out.read_bytes().startswith(before)
     assert [record["source"] for record in records(out)] == [str(folder / f"{n}.png") for n in range(3)]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs Linux's /proc")
+def test_many_files_in_one_process_leave_nothing_behind(
+    tmp_path: Path, decode: Decode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Memory and handles after 240 files of three sorts are those after 80."""
+    folder = tmp_path / "many"
+    folder.mkdir()
+    write_frame(tmp_path / "good.png", 1)
+    good = (tmp_path / "good.png").read_bytes()
+    for number in range(80):
+        (folder / f"{number:03}-a.png").write_bytes(good)
+        (folder / f"{number:03}-b.jpg").write_bytes(b"\xff\xd8\xff cut")
+        (folder / f"{number:03}-c.dng").write_bytes(b"II*\0\x08\0\0\0" + bytes(64))
+    seen = []
+    append = Journal.append
+
+    def appended(journal: Journal, line: str) -> None:
+        append(journal, line)
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        seen.append((len(os.listdir("/proc/self/fd")), pages * resource.getpagesize() / 2**20))
+
+    monkeypatch.setattr(Journal, "append", appended)
+    assert decode(folder, "--json", tmp_path / "o.jsonl", "--quiet")[0] == 3
+    assert len(seen) == 240
+    (before, before_mb), (after, after_mb) = seen[79], seen[-1]
+    assert after == before
+    assert after_mb < before_mb + 8
+
+
+def without_run(record: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in record.items() if name != "run"}
+
+
+def test_a_file_whose_decoder_was_killed_is_tried_again(tmp_path: Path, folder: Path, decode: Decode) -> None:
+    out = tmp_path / "o.jsonl"
+    assert decode(folder, "--json", out)[0] == 0
+    whole = records(out)
+    for number in range(3):
+        killed = [json.loads(line) for line in out.read_text().splitlines()]
+        killed[number] |= {"status": "unreadable", "message": "two processes that decoded it died", "retry": True}
+        killed[number]["columns"] = []
+        cut = tmp_path / f"{number}.jsonl"
+        cut.write_text("".join(json.dumps(record) + "\n" for record in killed))
+        table = tmp_path / "s.csv"
+        assert decode(folder, "--json", cut, "--resume", "--summary", table) == (0, "")
+        found = records(cut)
+        assert found[0].pop("run") == whole[0]["run"]
+        others = [place for place in range(3) if place != number]
+        assert found == [without_run(whole[place]) for place in (*others, number)]
+        assert [row["packets"] for row in csv.DictReader(table.read_text().splitlines())] == ["10"] * 3
+        assert decode(folder, "--json", cut, "--resume")[0] == 0  # nothing is left to do, and the file is whole
+
+
+def test_the_packets_of_a_killed_run_stand_once(tmp_path: Path, folder: Path, decode: Decode) -> None:
+    out, table = tmp_path / "o.jsonl", tmp_path / "p.csv"
+    assert decode(folder, "--json", out, "--payloads", table)[0] == 0
+    whole = table.read_bytes()
+    assert whole.count(b"\n") == 31
+    out.write_bytes(b"".join(out.read_bytes().splitlines(keepends=True)[:2]) + b'{"source": "half')
+    for rows in (12, 21, 25):  # some were lost, or are of the file that is decoded again
+        table.write_bytes(b"".join(whole.splitlines(keepends=True)[:rows]))
+        assert decode(folder, "--json", out, "--resume", "--payloads", table)[0] == 0
+        assert table.read_bytes() == whole
+
+
+def test_packets_that_cannot_be_written_are_told_of(folder: Path, decode: Decode) -> None:
+    code, said = decode(folder, "--payloads", "/dev/full")
+    assert code == 3
+    assert "/dev/full: cannot be written (No space left on device)" in said
 
 
 def test_a_resumed_file_is_that_of_an_undisturbed_run(tmp_path: Path, folder: Path, decode: Decode) -> None:

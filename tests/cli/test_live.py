@@ -229,6 +229,20 @@ class TestCommand:
         done = bench.vlc_rx("live", "/dev/video0", "--duration", "0.3", "--quiet")
         assert (done.returncode, done.stderr) == (ExitCode.NOT_RECEIVED, "")
 
+    @pytest.mark.parametrize("faults", [{"busy_s": 100}, {"stall_after": 0}, {"damage_every": 1}], ids=str)
+    def test_duration_counts_from_the_start_whatever_comes(self, bench: Bench, faults: dict[str, int]) -> None:
+        """A camera that is busy, sends nothing, or nothing whole: without a duration it would be waited for."""
+        done = bench.vlc_rx("live", "/dev/video0", "--wait", "--duration", "0.5", "--json", "-", faults=faults)
+        assert done.returncode == ExitCode.NOT_RECEIVED, done.stderr
+        assert done.stdout == ""
+
+    def test_damaged_frames_alone_have_a_status_line(self, bench: Bench) -> None:
+        done = bench.vlc_rx("live", "/dev/video0", "--duration", "0.5", faults={"damage_every": 1})
+        assert done.returncode == ExitCode.NOT_RECEIVED
+        last = done.stderr.splitlines()[-1]
+        assert last.startswith("no whole frame yet | dropped ")
+        assert int(last.rpartition(" ")[2]) > 0
+
     def test_interrupt(self, bench: Bench) -> None:
         command = bench.command(*VLC_RX, "live", "/dev/video0")
         process = subprocess.Popen(

@@ -10,6 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -148,6 +149,29 @@ def test_times_of_years_are_not_believed() -> None:
     found = [video._time_s(SimpleNamespace(pts=pts), stream, progress) for pts in (60, 90, 1 << 60, -(1 << 60))]
     assert [nominal for _, nominal in found] == [False, False, True, True]
     assert [time_s for time_s, _ in found] == pytest.approx([2.0, 3.0, 3.0 + 1 / 30, 3.0 + 2 / 30])
+
+
+@pytest.mark.parametrize("first_s", [0, 2_000_000], ids=["later", "at once"])
+def test_a_clip_with_times_of_years_says_so(first_s: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("mjpeg", rate=1000)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuvj420p"
+        for number, time_s in enumerate((first_s, first_s + 1, 3_000_000)):
+            frame = av.VideoFrame.from_ndarray(np.full((64, 96), 9 * number, np.uint8), "gray").reformat(
+                format="yuvj420p"
+            )
+            frame.pts, frame.time_base = 1000 * time_s, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    frames, error = read_all(tmp_path / "a.mkv")
+    assert error is None
+    assert max(frame.time_s for frame in frames) < 10
+    from rxcli.cli.main import run
+
+    run(["decode", str(tmp_path / "a.mkv"), "--quiet"])
+    claimed = 2_000_000 if first_s else 3_000_000
+    said = capsys.readouterr().err
+    assert said.count(f"a.mkv: not believed, and taken as unknown: a frame's time of {claimed:.6g} s") == 1
 
 
 def test_libraries_keep_their_lines_to_themselves(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

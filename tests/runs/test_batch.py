@@ -18,6 +18,7 @@ from fake_receiver import fake_decoder
 from rxcli.errors import InputError, UsageError
 from rxcli.results.report import from_record, to_json_line
 from rxcli.runs.batch import Journal, Source, collect_sources, decode_here, decode_in_processes, recover, unreadable
+from rxcli.runs.journal import Head, Lines
 from rxcli.types import FrameResult
 
 SUFFIXES = frozenset({".jpg", ".mp4"})
@@ -98,13 +99,26 @@ def test_worker_processes_give_what_one_gives_in_the_same_order(tmp_path: Path) 
     assert lines(decode_in_processes(sources, fake_decoder(), 3)) == alone
 
 
-def test_a_worker_that_dies_costs_the_source_in_its_hands_only(tmp_path: Path) -> None:
+@pytest.mark.parametrize("n_workers", [2, 3])
+def test_a_worker_that_dies_costs_nothing(tmp_path: Path, n_workers: int) -> None:
     sources = mixed(tmp_path)
-    deadly = write_order(tmp_path, "deadly.mp4", frames=3, kill_at=1)
+    for place, (name, order) in enumerate((("a.mp4", {"frames": 4, "kill_at": 2}), ("b.jpg", {"kill_at": 0}))):
+        sources.insert(2 * place, write_order(tmp_path, f"deadly-{name}", kills=1, **order))
+    found = lines(decode_in_processes(sources, fake_decoder(), n_workers))
+    assert len(list(tmp_path.glob("*.kills"))) == 2
+    assert found == lines(decode_here(sources, fake_decoder()))
+
+
+def test_a_source_that_ends_two_workers_costs_itself_only(tmp_path: Path) -> None:
+    sources = mixed(tmp_path)
+    deadly = write_order(tmp_path, "deadly.mp4", frames=3, kill_at=2)
     sources.insert(3, deadly)
     results = [result for _, found in decode_in_processes(sources, fake_decoder(), 2) for result in found]
-    [last] = [result for result in results if result.source == deadly.name and result.status == "unreadable"]
-    assert "was ended by SIGKILL" in str(last.message)
+    of_it = [result for result in results if result.source == deadly.name]
+    # One frame late, as the fake receiver is, and none of them twice.
+    assert [(result.frame, result.status) for result in of_it] == [(0, "ok"), (1, "unreadable")]
+    assert "two processes that decoded it died, the last one was ended by SIGKILL" in str(of_it[-1].message)
+    assert [result.retry for result in of_it] == [False, True]
     others = [to_json_line(result) for result in results if result.source != deadly.name]
     assert others == lines(decode_here([source for source in sources if source != deadly], fake_decoder()))
 
@@ -136,6 +150,28 @@ def test_recover_drops_a_half_line_and_the_source_it_belongs_to(tmp_path: Path, 
     path.write_bytes(whole[: len(whole) - cut])
     assert [(name, len(found)) for name, found in recover(path)] == [("a", 2), ("b", 1)]
     assert path.read_bytes() == b"".join(line for line in whole.splitlines(True)[:3])
+
+
+@pytest.mark.parametrize("names", ["aabccc", "baac", "aacb", "b", "abc"])
+def test_recover_leaves_out_sources_whose_decoder_was_killed(tmp_path: Path, names: str) -> None:
+    """`b` is to be tried again; the others stay as they are, behind what the first line says of the run."""
+    path = tmp_path / "out.jsonl"
+    journal, made = Journal(path), Lines(Head("1", {"cae": "auto"}), {})
+    found = results_of(names)
+    for result, following in zip(found, [*found[1:], None], strict=True):
+        made.begin(result.source)
+        last = following is None or following.source != result.source
+        journal.append(made.line(replace(result, retry=result.source == "b"), last))
+    kept = [name for name in dict.fromkeys(names) if name != "b"]
+    assert [name for name, _ in recover(path)] == kept
+    records = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [record["source"] for record in records] == [name for name in names if name != "b"]
+    assert ["run" in record for record in records] == [place == 0 for place in range(len(records))]
+    journal.follow()
+    journal.append("more")
+    journal.close()
+    assert path.read_text().endswith("more\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["out.jsonl"]
 
 
 def test_recover_of_a_file_that_is_not_there_starts_afresh(tmp_path: Path) -> None:

@@ -10,13 +10,18 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fake_receiver import fake_decoder
+from small_frames import write_frame, write_profiles
 
-from rxcli.errors import UsageError
+from rxcli.cli.main import run
+from rxcli.errors import OutputError, UsageError
 from rxcli.results.report import to_json_line
+from rxcli.runs import cluster
 from rxcli.runs.batch import Source, decode_here
 from rxcli.runs.cluster import decode_on_cluster
 
@@ -84,6 +89,62 @@ def test_a_run_is_complete_and_in_order_though_a_worker_is_killed(tmp_path: Path
             assert first.wait() == -signal.SIGKILL
             assert second.poll() is None
     assert lines == alone
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_taps_land_where_the_user_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Workers write nothing but scratch files of their own; the command writes what comes back."""
+    (tmp_path / "profiles").mkdir()
+    names = write_profiles(tmp_path / "profiles")
+    with (tmp_path / "profiles" / "camera.toml").open("a") as file:
+        file.write("[lens]\nwidth = 340\nheight = 620\n")
+        file.write(
+            "camera_matrix = [[300.0, 0, 169.5], [0, 300.0, 309.5], [0, 0, 1]]\ndist_coeffs = [0.01, 0, 0, 0, 0]\n"
+        )
+    for name in ("a", "b"):
+        (tmp_path / "in" / name).mkdir(parents=True)
+        write_frame(tmp_path / "in" / name / "x.png", 1)
+    monkeypatch.chdir(tmp_path)
+    command = ["decode", "in", *names, "--quiet"]
+    assert run([*command, "--dump-dir", "here/taps", "--save-undistorted", "here/straight"]) == 0
+    written = []
+    monkeypatch.setattr("rxcli.runs.cluster.write_whole", lambda path, data: written.append(path))
+    scheduler_options = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+    with process("distributed.cli.dask_scheduler", *scheduler_options) as scheduler:
+        address = wait_for(scheduler, r"Scheduler at:\s*(tcp://[0-9.:]+)").group(1)
+        with worker(address, tmp_path, "only"):
+            options = ["--dump-dir", "there/taps", "--save-undistorted", "there/straight", "--cluster", address]
+            assert run([*command, *options]) == 0, capsys.readouterr().err
+            assert contents(tmp_path / "there") == {}
+            assert len(written) == 4
+            monkeypatch.undo()
+            monkeypatch.chdir(tmp_path)
+            assert run([*command, *options]) == 0, capsys.readouterr().err
+    here, there = contents(tmp_path / "here"), contents(tmp_path / "there")
+    assert sorted(there) == sorted(here) == [f"{kind}/{n}/x.png{end}" for kind, end in KINDS for n in "ab"]
+    assert all(there[name] == data for name, data in here.items() if name.endswith(".png"))
+
+
+KINDS = (("straight", ".00000.png"), ("taps", "-000000.npz"))
+
+
+def test_a_worker_names_no_file_elsewhere(tmp_path: Path) -> None:
+    decoder = replace(fake_decoder(), options=SimpleNamespace(dump_dir=tmp_path / "taps"))
+    with pytest.raises(OutputError, match="a worker names a file outside --dump-dir"):
+        cluster._write([("--dump-dir", "../other.npz", b"")], decoder)
+    assert not list(tmp_path.iterdir())
+
+
+def test_taps_that_are_too_large_to_send(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "_MOST_TAPPED", 1 << 20)
+    (tmp_path / "a.npz").write_bytes(bytes(3 << 20))
+    with pytest.raises(OutputError, match=r"x\.mp4: its taps take 3 MB, 1 are the most"):
+        cluster._collect(tmp_path, Source("x.mp4", "x.mp4"))
 
 
 def test_a_scheduler_that_is_not_there(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rxcli.errors import UsageError
+from rxcli.outputs import unwritable, write_whole
 
 Row = dict[str, Any]
 
@@ -85,13 +85,13 @@ def write_text(path: Path, text: str) -> Path:
     """Write a file and the folder it lies in.
 
     Raises:
-        UsageError: it cannot be written.
+        OutputError: it cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise UsageError(f"{path}: cannot be written ({error.strerror})", "name another folder with --out") from None
+        raise unwritable(path, error) from None
+    write_whole(path, text)
     return path
 
 
