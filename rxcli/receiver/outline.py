@@ -43,24 +43,26 @@ _AGREE, _AGREE_ANYWHERE = 0.12, 0.45
 #: Support of left and right together from which these two tell that no column is missing between them.
 _BOTH_SHOW = 0.3
 #: Log-odds down to which another first column is a rival; and strips that a column needs to be asked for light.
-_RIVAL_SHIFT, _STRIPS_A_COLUMN = -7.0, 4.0
-#: Columns whose light must be seen: else they have other widths than was thought, and their light says nothing.
-_LIT_COLUMNS = 3
+_RIVAL_SHIFT, _STRIPS_A_COLUMN = -7.0, 6.0
 #: Log-odds of an outline by sides that contradict the grid; what sides that agree with a numbering add to it; what
 #: sides add that were found for top or bottom less. Where left or right is missing, the other one's line says all.
 _CONTRADICTED, _CONFIRMED, _INFERRED = -3.0, 4.0, 1.0
-#: What a grid's waveforms explain less counts so much: strips err together.
-_EXPLAINED_COUNTS = 0.05
+#: What tells a grid from others counts so much: strips err together.
+_LIKELIHOOD_COUNTS = 0.01
 #: Log-odds by which an outline must lead so that packets are not asked.
 _CLEAR = 6.0
 #: What packets say counts so much: the light model is surer than it should be. At most so many outlines are received.
 _PACKETS_COUNT, _MOST_LOOKS = 0.08, 6
 #: Outlines whose packets differ by less than this, nats, show the same; and the certainty from which one is likely.
 _SAME_PACKETS, _LIKELY = 40.0, 0.5
+#: Packets by which other rows must show more, nats.
+_BETTER_ROWS = 10.0
 #: Columns that look less like packets than this have no light, nats.
 _NO_LIGHT = 25.0
-#: Packets that must show where nothing but the grid says that there is a screen, nats.
-_SOME_PACKETS = 40.0
+#: Headers without symbols count so much.
+_HEADERS_ALONE = 0.1
+#: Packets that must show at a first look where nothing but the grid says that there is a screen, nats.
+_SOME_PACKETS = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +82,8 @@ class Outline:
     by_grid_alone: bool = False
     #: Outlines of one family are alike but for the first column.
     family: int = 0
+    #: Corners that it has with other rows, likeliest first.
+    other_rows: tuple[FloatArray, ...] = ()
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -151,10 +155,13 @@ def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> t
                 rest = [one for one in found if one.family >= 0] if columns.numberings else []
                 found = rest + [replace(one, log_odds=one.log_odds + less) for one in shifted]
                 found.sort(key=lambda one: -one.log_odds)
-    orientation = frame.metadata.orientation
-    return [
-        replace(one, corners=geometry.viewer_order(one.corners, orientation)) for one in found
-    ], f"{sides.reason}; {sides.advice}"
+    return [_as_viewed(one, frame.metadata.orientation) for one in found], f"{sides.reason}; {sides.advice}"
+
+
+def _as_viewed(outline: Outline, orientation: int) -> Outline:
+    """An outline with its corners in the viewer's order."""
+    corners, *others = (geometry.viewer_order(one, orientation) for one in (outline.corners, *outline.other_rows))
+    return replace(outline, corners=corners, other_rows=tuple(others))
 
 
 def _by_sides(
@@ -189,18 +196,17 @@ def _with_shifts(
     """
     if not outlines or _both_show(sides):
         return outlines
-    from rxcli.receiver.screen.coherence import measure_coherence
+    from rxcli.receiver.screen.coherence import N_STRIPS, measure_coherence
     from rxcli.receiver.screen.grid import grid_between
-    from rxcli.receiver.screen.numbering import first_columns
+    from rxcli.receiver.screen.numbering import first_columns, light_profile
+    from rxcli.receiver.screen.waveforms import StripLight
 
     own = outlines[0]
     grid = grid_between(own.corners, layout.n_columns, (frame.width, frame.height), lens)
-    coherence = measure_coherence(frame.pixels, mosaic_period=period)
-    if grid.pitch_px < _STRIPS_A_COLUMN * coherence.strip_px:
-        return outlines
-    start = first_columns(coherence, grid, layout.n_columns, sides.lines)
-    if start.lit.sum() < _LIT_COLUMNS:
-        return outlines
+    n_strips = max(N_STRIPS, round(_STRIPS_A_COLUMN * frame.width / grid.pitch_px))
+    coherence = measure_coherence(frame.pixels, mosaic_period=period, n_strips=n_strips)
+    strips = StripLight.of(coherence, layout.sigma, lens)
+    start = first_columns(light_profile(strips, grid), grid, layout.n_columns, sides.lines)
     shifted = [
         _moved(own, int(first), float(odds), layout.n_columns, lens)
         for first, odds in zip(start.first, start.log_odds, strict=True)
@@ -235,8 +241,9 @@ def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: i
     families: dict[bytes, int] = {}
     for numbering in numberings:
         own = Outline(
-            numbering.corners,
+            numbering.corners[0],
             inferred=SIDE_NAMES,
+            other_rows=numbering.corners[1:],
             log_odds=_odds_of(numbering, numberings),
             by_grid_alone=alone,
             family=families.setdefault(numbering.grid.numbers[1:].tobytes(), len(families)),
@@ -259,8 +266,8 @@ def _bonus(by_sides: Outline) -> float:
 
 def _odds_of(numbering: Numbering, numberings: tuple[Numbering, ...]) -> float:
     """Log-odds of a numbering, grids that explain less counting less."""
-    best = max(one.grid.explained for one in numberings)
-    return numbering.log_odds - _EXPLAINED_COUNTS * (best - numbering.grid.explained)
+    best = max(one.grid.likelihood for one in numberings)
+    return numbering.log_odds - _LIKELIHOOD_COUNTS * (best - numbering.grid.likelihood)
 
 
 def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:
@@ -277,22 +284,40 @@ def _by_packets(frame: Frame, candidates: list[Outline], options: ReceiverOption
     if isinstance(context, Failure):
         best = _likeliest([one for one in candidates if not one.by_grid_alone])
         return Located(best, context if best.family in asked else None) if best else None
-    packets = np.array([_packets(replace(context, corners=one.corners)) for one in candidates[:_MOST_LOOKS]])
-    if packets.max() < _SOME_PACKETS and context.camera.remembered:
-        return _by_packets(frame, candidates, replace(options, camera_cache=None), timer)
-    if packets.max() < _SOME_PACKETS:
+    candidates, packets = _with_likely_rows(context, candidates)
+    if max(packets.values()) < _SOME_PACKETS:
+        if context.camera.remembered:
+            return _by_packets(frame, candidates, replace(options, camera_cache=None), timer)
         best = _likeliest([one for one in candidates if not one.by_grid_alone])
     else:
-        # Without a column more or less the same packets are seen a little better or worse, by chance. Those that
-        # nobody looked at may show as many as the others of their family.
-        lost = np.zeros(len(candidates))
-        lost[: packets.size] = np.maximum(packets.max() - packets - _SAME_PACKETS, 0)
-        for number in range(packets.size, len(candidates)):
-            alike = [lost[i] for i in range(packets.size) if candidates[i].family == candidates[number].family]
-            lost[number] = min(alike, default=0.0)
-        odds = [one.log_odds - _PACKETS_COUNT * less for one, less in zip(candidates, lost.tolist(), strict=True)]
+        # Without a column more or less the same packets are seen: those of a family have theirs in common.
+        lost = {family: max(max(packets.values()) - own - _SAME_PACKETS, 0) for family, own in packets.items()}
+        least = max(lost.values())
+        odds = [one.log_odds - _PACKETS_COUNT * lost.get(one.family, least) for one in candidates]
         best = _likeliest([replace(one, log_odds=score) for one, score in zip(candidates, odds, strict=True)])
     return Located(best, context_at(context, best.corners)) if best else None
+
+
+def _with_likely_rows(context: FrameContext, candidates: list[Outline]) -> tuple[list[Outline], dict[int, float]]:
+    """The candidates, each family with the rows under which most packets show; and how many these are, nats."""
+    families: dict[int, Outline] = {}
+    for one in candidates:
+        families.setdefault(one.family, one)
+    corners = {family: (one.corners, *one.other_rows) for family, one in families.items()}
+    # Every family has a first look, then the likeliest ones with other rows.
+    looks = [(family, rows) for rows in range(_MOST_LOOKS) for family in families if rows < len(corners[family])]
+    looks.sort(key=lambda look: look[1] > 0)
+    packets: dict[int, float] = {}
+    rows_of: dict[int, int] = {}
+    for family, rows in looks[:_MOST_LOOKS]:
+        shown = _packets(replace(context, corners=corners[family][rows]))
+        if shown > packets.get(family, -1.0) + (_BETTER_ROWS if rows else 0):
+            packets[family], rows_of[family] = shown, rows
+    moved = [
+        replace(one, corners=(one.corners, *one.other_rows)[rows_of.get(one.family, 0)], other_rows=())
+        for one in candidates
+    ]
+    return moved, packets
 
 
 def _likeliest(candidates: list[Outline]) -> Outline | None:
@@ -332,5 +357,7 @@ def _packets(context: FrameContext) -> float:
     with context.timer("detect"):
         reception = initial_pass(acquisition)
         # Columns without light say next to nothing, but not the same of every outline.
-        by_column = column_llr(reception) + np.maximum(reception.posteriors.header_llr.sum(axis=0), 0)
-    return float(np.maximum(by_column - _NO_LIGHT, 0).sum())
+        headers = reception.posteriors.header_llr.sum(axis=0)
+        by_column = column_llr(reception) + np.maximum(headers, 0)
+    # Where light is weak or a frame shows little more than a packet, headers come through before symbols do.
+    return float(np.maximum(by_column - _NO_LIGHT, 0).sum() + _HEADERS_ALONE * max(headers.sum(), 0.0))

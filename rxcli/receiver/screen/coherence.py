@@ -18,7 +18,7 @@ from rxcli.types import Float32Array, FloatArray
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 #: Strips that a picture is cut into, about, and windows of rows.
-_STRIPS, _WINDOWS = 250, 16
+N_STRIPS, _WINDOWS = 250, 16
 #: Rows over which light is averaged, and over which its mean is taken off. Slots have 3 to 20 rows.
 _SHORT_ROWS, _LONG_ROWS = 6, 49
 #: The same below so many rows of a picture, whose slots have fewer rows.
@@ -65,7 +65,7 @@ class Coherence:
 
 
 def measure_coherence(
-    pixels: Pixels, *, mosaic_period: int = 1, n_strips: int = _STRIPS, reach: float = 0.2
+    pixels: Pixels, *, mosaic_period: int = 1, n_strips: int = N_STRIPS, reach: float = 0.2
 ) -> Coherence:
     """Coherence of the strips of a picture.
 
@@ -86,7 +86,7 @@ def measure_coherence(
 
 
 def strip_changes(
-    pixels: Pixels, *, mosaic_period: int = 1, n_strips: int = _STRIPS, part: int = 1
+    pixels: Pixels, *, mosaic_period: int = 1, n_strips: int = N_STRIPS, part: int = 1
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
     """Changes of the strips of a picture from row to row.
 

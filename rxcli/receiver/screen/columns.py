@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rxcli.receiver.screen.coherence import Coherence, Pixels, measure_coherence
 from rxcli.receiver.screen.comb import find_combs
-from rxcli.receiver.screen.grid import Grid, fit_grid
+from rxcli.receiver.screen.grid import Grid
 from rxcli.receiver.screen.numbering import Numbering, possible_numberings
 from rxcli.receiver.screen.sides import Side
-from rxcli.receiver.screen.waveforms import refine_by_waveforms
+from rxcli.receiver.screen.waveforms import StripLight, refine_by_waveforms, with_light
 from rxcli.types import FloatArray, Lens
 
-#: Score of a comb below which there is none, and share of the best one's gain from which another one is a rival.
-_LEAST_SCORE, _RIVAL_GAIN, _RIVAL_NATS = 7.0, 0.75, 15.0
-#: How much better columns must explain the pairs than none, nats: pictures without data seldom reach it.
-_LEAST_GAIN = 5.0
-#: By how much less a grid's waveforms may explain that it is still a rival, nats.
-_RIVAL_EXPLAINED = 120.0
-#: Combs that are fitted: more where the best does not stand out.
-_FITTED, _CLEAR = 4, 0.7
-#: Grids that differ less than this over the picture, columns, are one.
-_SAME = 0.25
+#: Combs that are looked at, by one of so many windows, and the best that are refined, unless they explain less than
+#: this share of the first one.
+_COMBS, _EVERY, _FITTED, _HOPELESS = 12, 2, 4, 0.8
+#: By how much less a grid may explain, a share, that it is still a rival.
+_RIVAL = 0.05
+#: Contrast of a grid, a share of what it explains, from which there may be columns, for one independent row: by chance
+#: it is the smaller, the more rows there are.
+_LEAST_CONTRAST = 0.95
+#: How much more a lens that nobody knows must explain, a share.
+_BENT_GAIN = 0.01
+#: Grids that differ less than this over the picture, columns, are one; combs that differ less from a grid lead to it.
+_SAME, _WITHIN_REACH = 0.25, 0.4
 _MIN_SIZE = 96
 
 
@@ -69,37 +71,49 @@ def find_columns(
     if min(pixels.shape) < _MIN_SIZE:
         return ColumnSearch(None, ())
     coherence = measure_coherence(pixels, mosaic_period=mosaic_period)
+    strips = StripLight.of(coherence, layout.sigma, lens)
     found = []
-    for grid in _grids(coherence, layout.sigma, lens):
-        found += possible_numberings(coherence, grid, layout.n_columns, layout.aspect, lines=lines)
+    for grid in _grids(coherence, strips, lens):
+        found += possible_numberings(coherence, strips, grid, layout.n_columns, layout.aspect, lines=lines)
     return ColumnSearch(coherence, tuple(found))
 
 
-def _grids(coherence: Coherence, sigma: float, lens: Lens | None) -> list[Grid]:
-    """The grids that explain the coherence best, and rivals that come near."""
-    combs = [comb for comb in find_combs(coherence, sigma, _FITTED) if comb.score > _LEAST_SCORE]
-    if not combs:
-        return []
-    clear = len(combs) == 1 or combs[1].score < _CLEAR * combs[0].score
-    fitted = [fit_grid(coherence, comb, sigma, lens) for comb in combs[: 1 if clear else _FITTED]]
+def _grids(coherence: Coherence, strips: StripLight, lens: Lens | None) -> list[Grid]:
+    """The grids that explain the strips' light best, and rivals that come near, likeliest first."""
+    thinned = strips.thinned(_EVERY)
+    combs = [Grid.of_comb(comb, coherence, lens) for comb in find_combs(coherence, strips.sigma, _COMBS)]
+    combs = sorted((with_light(thinned, grid) for grid in combs), key=lambda one: -one.likelihood)
+    refined: list[Grid] = []
+    for grid in combs:
+        hopeless = refined and _EVERY * grid.likelihood < _HOPELESS * refined[0].likelihood
+        if hopeless or len(refined) == _FITTED:
+            break
+        if not any(_apart(grid, known) < _WITHIN_REACH for known in refined):
+            refined.append(refine_by_waveforms(strips, grid))
+    refined.sort(key=lambda one: -one.likelihood)
+    least = _LEAST_CONTRAST / np.sqrt(coherence.n_rows * coherence.y.size)
     distinct: list[Grid] = []
-    for grid in sorted(fitted, key=lambda one: -one.gain):
-        if not any(_same(grid, other) for other in distinct):
+    for grid in refined:
+        near = grid.likelihood > (1 - _RIVAL) * refined[0].likelihood
+        new = not any(_apart(grid, known) < _SAME for known in distinct)
+        if near and new and grid.contrast > least * grid.explained:
             distinct.append(grid)
-    least = min(_RIVAL_GAIN * distinct[0].gain, distinct[0].gain - _RIVAL_NATS)
-    refined = [refine_by_waveforms(coherence, grid, sigma) for grid in distinct if grid.gain > least]
-    refined.sort(key=lambda one: -one.explained)
-    likely = [grid for grid in refined if grid.explained > refined[0].explained - _RIVAL_EXPLAINED]
-    return [grid for grid in likely if grid.gain > _LEAST_GAIN]
+    return [_bent(strips, grid) for grid in distinct] if lens is None else distinct
 
 
-def _same(one: Grid, other: Grid) -> bool:
-    """Whether two grids differ next to nowhere but in their first column."""
+def _bent(strips: StripLight, grid: Grid) -> Grid:
+    """The grid with an unknown lens, where that explains much more: such lenses are rare."""
+    bent = refine_by_waveforms(strips, replace(grid, bent=True))
+    return bent if bent.likelihood > (1 + _BENT_GAIN) * grid.likelihood else grid
+
+
+def _apart(one: Grid, other: Grid) -> float:
+    """How far two grids differ but in their first column, columns on average."""
     x = np.linspace(0.1, 0.9, 7) * one.width
     y = np.linspace(0.2, 0.8, 5) * one.height
     apart = one.columns_at(_points(x, y)) - other.columns_at(_points(x, y))
     apart -= np.round(np.median(apart))
-    return bool(np.abs(apart).mean() < _SAME)
+    return float(np.abs(apart).mean())
 
 
 def _points(x: FloatArray, y: FloatArray) -> FloatArray:

@@ -34,22 +34,12 @@ _OVERLAP = 1.5
 
 @dataclass(frozen=True)
 class Likeness:
-    """How alike two places of the screen are, by their middle and their distance, both in columns."""
+    """How alike two places of the screen are at a distance, columns, over all places of their middle."""
 
-    #: (phases, distances): cosine, and its slopes with the middle and with the distance.
-    cosine: Float32Array
-    by_middle: Float32Array
-    by_distance: Float32Array
     #: (distances,) mean and first harmonic over the phase, which is 0 at a border.
     mean: Float32Array
     harmonic: Float32Array
     furthest: float
-
-    def place(self, middle: FloatArray, distance: FloatArray) -> NDArray[np.int64]:
-        """Place in the flat tables of pairs."""
-        phases, distances = self.cosine.shape
-        phase = np.mod(middle * phases + 0.5, phases).astype(np.int64)
-        return np.asarray(phase * distances + np.minimum(self.step(distance), distances - 1), np.int64)
 
     def step(self, distance: FloatArray) -> NDArray[np.int64]:
         """Place in the tables over distances."""
@@ -69,14 +59,9 @@ def likeness(sigma: float, phases: int = 128, distances: int = 161, furthest: fl
         return np.asarray((one * other).sum(-1) / np.sqrt((one**2).sum(-1) * (other**2).sum(-1)))
 
     mid, apart = np.meshgrid(middle, distance, indexing="ij")
-    table, eps = cosine(mid, apart), 1e-4
-    by_middle = (cosine(mid + eps, apart) - cosine(mid - eps, apart)) / (2 * eps)
-    by_distance = (cosine(mid, apart + eps) - cosine(mid, apart - eps)) / (2 * eps)
+    table = cosine(mid, apart)
     harmonic = 2 * (table * np.cos(2 * np.pi * middle)[:, None]).mean(axis=0)
     return Likeness(
-        cosine=table.astype(np.float32),
-        by_middle=by_middle.astype(np.float32),
-        by_distance=by_distance.astype(np.float32),
         mean=table.mean(axis=0).astype(np.float32),
         harmonic=harmonic.astype(np.float32),
         furthest=furthest,

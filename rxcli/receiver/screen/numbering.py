@@ -1,4 +1,8 @@
-"""Which column of a grid is the screen's first: no light may lie outside, little of the screen outside the picture."""
+"""Which column of a grid is the screen's first: no light may lie outside, little of the screen outside the picture.
+
+Numberings that differ by a shift have all columns in common but the outermost, so these decide. Light is looked for in
+eighths of a column: the edge of a screen lies on a border of its columns, the edge of a picture on it by chance only.
+"""
 
 from __future__ import annotations
 
@@ -8,23 +12,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.receiver.screen.coherence import Coherence
-from rxcli.receiver.screen.grid import Grid, LightMap, light_map
+from rxcli.receiver.screen.grid import Grid, columns_at
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.sides import LEFT, RIGHT, Side
+from rxcli.receiver.screen.waveforms import StripLight, predicted_light
 from rxcli.types import BoolArray, FloatArray, IntArray
 
-#: Share of a screen's columns that are dark, and significance of columns that have light, about. Off the screen it is
-#: spread by this scale, more than by chance: what row noise leaves.
-_DARK_COLUMNS, _LIT_SCALE, _OFF_SCALE = 0.3, 30.0, 2.0
+#: Parts of a column that are asked for light.
+_PARTS = 8
+#: Significance of light off the screen and on it, as scales of exponential distributions; the log-odds that a part
+#: without light is off the screen; and how much each counts, neighbouring parts being dark together.
+_OFF_SCALE, _LIT_SCALE, _DARK_PART, _PART_COUNTS = 1.2, 6.0, 0.25, 0.5
+#: Log-odds that parts of a column must have so that light ends no earlier.
+_ENDS = 0.05
 #: Log-odds of a screen that goes on outside the picture, for every column that is there.
-_OUTSIDE = -2.0
+_OUTSIDE = -4.0
 #: The light's middle is the screen's, but for this, columns.
-_LIGHT_SD = 3.0
+_LIGHT_SD = 3.5
+#: Films with bars have it there to this, columns, and take these shares of the screen's width: log-odds that this adds.
+_IN_MIDDLE, _BARS, _FILM = 0.2, (0.53, 0.95), 2.0
 #: Support from which a line where stripes begin counts, how near it lies to a border then, columns, and the log-odds
-#: that it adds there.
-_LINE_SHOWS, _NEAR_BORDER, _ON_BORDER = 0.2, 0.1, 2.3
-#: A column of which this share lies in the picture is in view.
-_MOSTLY = 0.5
+#: that it, or light that begins on a border, adds there.
+_LINE_SHOWS, _NEAR_BORDER, _ON_BORDER = 0.2, 0.1, 2.0
+#: Light on one side of a border, log-odds, from which it begins there, and the share of it that may lie beyond.
+_BEGINS, _BEYOND = 2.0, 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,16 +44,16 @@ class Numbering:
 
     #: Its columns count from the screen's first.
     grid: Grid
-    #: (4, 2) the screen's corners in pixels of the stored picture, clockwise from its top left.
-    corners: FloatArray
+    #: (4, 2) the screen's corners in pixels of the stored picture, clockwise from its top left: with the likeliest rows
+    #: first, then with others.
+    corners: tuple[FloatArray, ...]
     #: Natural logarithm of its odds against the other numberings of the same grid.
     log_odds: float
-    #: Columns that lie in the picture with most of their width: first, and last + 1.
-    visible: tuple[int, int]
 
 
 def possible_numberings(
     coherence: Coherence,
+    strips: StripLight,
     grid: Grid,
     n_columns: int,
     aspect: float,
@@ -53,29 +64,71 @@ def possible_numberings(
 
     Args:
         coherence: of the picture.
+        strips: its strips' light.
         grid: columns of it.
         n_columns: columns of the screen.
         aspect: width over height of the screen.
         lines: top, right, bottom, left, where stripes begin; none: nothing is known of them.
         least: log-odds against the likeliest down to which they are given.
     """
-    start = first_columns(coherence, grid, n_columns, lines)
+    light = light_profile(strips, grid)
+    start = first_columns(light, grid, n_columns, lines)
     likely: IntArray = np.flatnonzero(start.log_odds > least)
     chosen = likely[np.argsort(-start.log_odds[likely], kind="stable")]
-    first, odds, k, there, light = start.first, start.log_odds, start.columns, start.in_picture, start.light
-    best = int(first[chosen[0]])
-    mine = (k >= best) & (k < best + n_columns)
+    best = int(start.first[chosen[0]])
     # All have their rows in common, so that packets can tell them apart.
-    rows = find_rows(
-        coherence, grid.shifted(best), n_columns, aspect, _middle_row(coherence, light, mine), tuple(lines[::2])
-    )
+    middle = float((light.by_window * coherence.y).sum() / max(light.by_window.sum(), 1e-9))
+    rows = find_rows(strips, grid.shifted(best), n_columns, aspect, middle, tuple(lines[::2]))
     out = []
     for i in chosen:
-        number = int(first[i])
-        column = k[(there > _MOSTLY) & (k >= number) & (k < number + n_columns)] - number
-        visible = (int(column.min()), int(column.max()) + 1) if column.size else (0, 0)
-        out.append(Numbering(grid.shifted(number), rows.corners(number - best), float(odds[i]), visible))
+        number = int(start.first[i])
+        corners = tuple(one.corners(number - best) for one in rows)
+        out.append(Numbering(grid.shifted(number), corners, float(start.log_odds[i])))
     return out
+
+
+@dataclass(frozen=True, slots=True)
+class LightProfile:
+    """Where across the columns of a grid there is light."""
+
+    #: (P,) middles of the parts of columns, and whether the picture shows them.
+    place: FloatArray
+    in_picture: BoolArray
+    #: (P,) light in standard deviations, and the log-odds that it is the screen's over being off it.
+    significance: FloatArray
+    log_odds: FloatArray
+    #: (W,) light of every window of rows.
+    by_window: FloatArray
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Columns at which the light begins and ends."""
+        gain = np.concatenate([[0.0], np.cumsum(self.log_odds - _ENDS)])
+        end = int((gain - np.minimum.accumulate(gain)).argmax())
+        start = int(gain[: end + 1].argmin())
+        left = float(self.place[0]) - 0.5 / _PARTS
+        return left + start / _PARTS, left + end / _PARTS
+
+
+def light_profile(strips: StripLight, grid: Grid) -> LightProfile:
+    """The light across the columns of a grid: how alike strips are to what their neighbours' waveforms predict."""
+    u = columns_at(grid.numbers, strips.x, strips.y)
+    alike = predicted_light(strips, u)
+    first = int(np.floor(u.min())) - 1
+    n = (int(np.ceil(u.max())) + 1 - first) * _PARTS
+    part = ((u - first) * _PARTS).astype(np.int64).ravel()
+    count = np.bincount(part, minlength=n)
+    total = np.bincount(part, alike.sum(axis=2).ravel(), n)
+    power = np.bincount(part, (alike * alike).sum(axis=2).ravel(), n)
+    share = total / np.sqrt(np.maximum(power * count * alike.shape[2], 1e-9))
+    shown = count > 0
+    light = np.maximum(share, 0.0) * np.sqrt(count * strips.n_rows)
+    off = np.exp(-light / _OFF_SCALE) / _OFF_SCALE + 1e-12
+    lit = np.exp(-light / _LIT_SCALE) / _LIT_SCALE
+    odds = _PART_COUNTS * np.log(np.exp(-_DARK_PART) + (1 - np.exp(-_DARK_PART)) * lit / off)
+    by_window = np.maximum(alike.mean(axis=(1, 2)), 0.0)
+    place = first + (np.arange(n) + 0.5) / _PARTS
+    return LightProfile(place, shown, light, np.where(shown, odds, 0.0), np.asarray(by_window, np.float64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,72 +138,52 @@ class FirstColumns:
     #: (F,) such columns of the grid, and the natural logarithm of their odds against the likeliest.
     first: IntArray
     log_odds: FloatArray
-    #: (K,) columns of the grid in the picture, and the share of each that lies in it.
-    columns: IntArray
-    in_picture: FloatArray
-    #: (K,) whether light was seen there.
-    lit: BoolArray
-    light: LightMap
 
 
-def first_columns(coherence: Coherence, grid: Grid, n_columns: int, lines: Sequence[Side] = ()) -> FirstColumns:
+def first_columns(light: LightProfile, grid: Grid, n_columns: int, lines: Sequence[Side] = ()) -> FirstColumns:
     """How likely each column of a grid is the screen's first.
 
-    Numberings that differ by a shift have all columns in common but the outermost, so these decide: light outside the
-    screen, columns outside the picture and a line where stripes begin tell. Where columns are dark at both ends the
-    numberings stay alike.
+    Light outside the screen, columns outside the picture, light that begins on a border and a line where stripes begin
+    tell. Where columns are dark at both ends the numberings stay alike.
     """
-    light = light_map(coherence, grid)
-    evidence = _column_evidence(light)
-    there = _share_in_picture(coherence, grid, light)
-    k = light.first + np.arange(evidence.size)
-    first = np.arange(light.first - n_columns + 3, light.first + evidence.size - 2)
-    lit = np.flatnonzero(evidence > 0)
-    middle = float(k[lit].mean()) + 0.5 if lit.size else light.first + evidence.size / 2
+    shown = light.place[light.in_picture]
+    left, right = float(shown.min()), float(shown.max())
+    first = np.arange(int(left) - n_columns + 3, int(right) - 2)
+    begin, end_of_light = light.ends
+    may_have_bars = _BARS[0] < (end_of_light - begin) / n_columns < _BARS[1]
     scores = []
     for start in first.tolist():
-        inside = (k >= start) & (k < start + n_columns)
-        hidden = n_columns - float(there[inside].sum())
-        score = float(evidence[inside].sum()) + _OUTSIDE * max(hidden - 0.3, 0.0)
-        off = (middle - start - n_columns / 2) / _LIGHT_SD
-        scores.append(score - 0.5 * off * off + _by_lines(grid, lines, start, n_columns))
-    return FirstColumns(first, np.array(scores) - max(scores), k, there, evidence > 0, light)
+        end = start + n_columns
+        hidden = max(left - start, 0.0) + max(end - right, 0.0)
+        off = (begin + end_of_light) / 2 - start - n_columns / 2
+        score = _light_within(light, start, end) + _OUTSIDE * max(hidden - 0.3, 0.0) - 0.5 * (off / _LIGHT_SD) ** 2
+        score += _FILM if may_have_bars and abs(off) < _IN_MIDDLE else 0.0
+        for border, side, number in ((start, 1, LEFT), (end, -1, RIGHT)):
+            if _begins(light, border, side) or _line_on(grid, lines, number, border):
+                score += _ON_BORDER
+        scores.append(score)
+    return FirstColumns(first, np.array(scores) - max(scores))
 
 
-def _by_lines(grid: Grid, lines: Sequence[Side], first: int, n_columns: int) -> float:
-    """Log-odds that the lines where stripes begin at left and right add to a first column.
-
-    A screen's side lies on a border of its columns; the edge of a picture on it lies there by chance only.
-    """
-    total = 0.0
-    for number, border in ((RIGHT, first + n_columns), (LEFT, first)):
-        if not lines or lines[number].support < _LINE_SHOWS:
-            continue
-        line = lines[number]
-        y = line.middle + line.half * np.linspace(-0.8, 0.8, 5)
-        off = np.abs(grid.columns_at(np.stack([line.at(y), y], axis=-1)) - border)
-        total += _ON_BORDER if np.median(off) < _NEAR_BORDER else 0.0
-    return total
+def _light_within(light: LightProfile, start: int, end: int) -> float:
+    """Log-odds that the screen lies between two borders; what lies next to them is the screen's if it has light."""
+    near = np.minimum(np.abs(light.place - start), np.abs(light.place - end)) < 1 / _PARTS
+    inside = (light.place > start) & (light.place < end) & ~near
+    return float(light.log_odds[inside].sum() + np.maximum(light.log_odds[near], 0.0).sum())
 
 
-def _column_evidence(light: LightMap) -> FloatArray:
-    """(K,) log-likelihood ratio of each column being the screen's over being off it."""
-    seen = np.maximum(light.significance, 0.0)
-    off = np.exp(-seen / _OFF_SCALE) / _OFF_SCALE + 1e-12
-    lit = np.exp(-seen / (2 * _LIT_SCALE)) / (2 * _LIT_SCALE)
-    return np.asarray(np.log(_DARK_COLUMNS + (1 - _DARK_COLUMNS) * lit / off))
+def _begins(light: LightProfile, border: int, side: int) -> bool:
+    """Whether light begins on a border, to its right (1) or left (-1)."""
+    off = side * (light.place - border)
+    inside, outside = (light.log_odds[(s * off > 1 / _PARTS) & (s * off < 0.5)].sum() for s in (1, -1))
+    return bool(inside > _BEGINS and outside < _BEYOND * inside)
 
 
-def _share_in_picture(coherence: Coherence, grid: Grid, light: LightMap) -> FloatArray:
-    """(K,) share of each column of the light map that lies in the picture."""
-    points = np.stack(np.meshgrid(coherence.x, coherence.y), axis=-1)
-    column = np.floor(grid.columns_at(points)).astype(np.int64) - light.first
-    strips = np.bincount(column.ravel(), minlength=light.light.shape[1]) / coherence.y.size
-    return np.asarray(np.minimum(strips * coherence.strip_px / grid.pitch_px, 1.0))
-
-
-def _middle_row(coherence: Coherence, light: LightMap, columns: BoolArray) -> float:
-    """The row in the middle of the light under some columns."""
-    precision = light.precision[:, columns]
-    total = np.maximum((light.light[:, columns] * precision).sum(axis=1), 0.0)
-    return float((total * coherence.y).sum() / max(total.sum(), 1e-9)) if total.any() else coherence.height / 2
+def _line_on(grid: Grid, lines: Sequence[Side], number: int, border: int) -> bool:
+    """Whether the line where stripes begin on a side lies on a border of the columns."""
+    if not lines or lines[number].support < _LINE_SHOWS:
+        return False
+    line = lines[number]
+    y = line.middle + line.half * np.linspace(-0.8, 0.8, 5)
+    off = np.abs(grid.columns_at(np.stack([line.at(y), y], axis=-1)) - border)
+    return bool(np.median(off) < _NEAR_BORDER)

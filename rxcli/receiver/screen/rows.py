@@ -1,8 +1,8 @@
 """On which rows a screen's columns have light, and where its corners lie then.
 
 Across the columns a grid says all. Along them the screen's lines stand at right angles to the columns' at its middle,
-its height follows from its aspect, and its place from where light begins and ends: there the two halves of a column
-change alike, and halves on either side of a border do not.
+its height follows from its aspect, and its place from where light begins and ends: there strips are what the waveforms
+of their columns predict.
 """
 
 from __future__ import annotations
@@ -12,20 +12,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.receiver.screen.coherence import Coherence
-from rxcli.receiver.screen.grid import Grid
+from rxcli.receiver.screen.grid import Grid, columns_at
 from rxcli.receiver.screen.sides import Side
-from rxcli.types import Float32Array, FloatArray, IntArray
+from rxcli.receiver.screen.waveforms import StripLight, predicted_light
+from rxcli.types import FloatArray
 
 #: Places along the screen at which light is asked for, and how far beyond its ends, screen heights.
 _BINS, _BEYOND = 320, 0.6
-#: Strips nearer than this to a column's border, or to its middle, are left out, columns.
-_MARGIN, _GAP = 0.05, 0.1
+#: Share of the strips, the least alike, that are taken to be without light.
+_DARK_SHARE = 0.1
 #: Light counts from this share of what the lit rows have.
-_LIT_SHARE = 0.2
-#: By how many standard deviations rows must lack light to be left out, and how many at most; so many more are kept,
-#: screen heights.
-_CLEARLY, _BARS, _MORE = 2.0, 0.45, 0.015
+_LIT_SHARE = 0.12
+#: Bars take no more than this, screen heights; and so many more rows are kept than have light.
+_BARS, _MORE = 0.45, 0.03
 #: Sides are no further apart than the screen's height and this share of it.
 _WHOLE = 0.035
 #: Support from which top and bottom show well; how far they may be slanted against the columns, and the least distance
@@ -57,10 +56,16 @@ class Plane:
 
     def along(self, points: FloatArray) -> FloatArray:
         """(...) v of (..., 2) pixels."""
-        x, y = self.grid.flat(points)
-        return np.asarray(
-            (self.v0 + self.c * x + self.d * y) / (1 + self.grid.numbers[3] * x + self.grid.numbers[4] * y)
-        )
+        return self._along(*self.grid.flat(points))
+
+    def along_flat(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """(...) v of places that `strip_places` gives."""
+        scale = 1 + self.grid.numbers[5] * (x * x + y * y)
+        return self._along(x * scale, y * scale)
+
+    def _along(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        _, _, _, g, h, _ = self.grid.numbers
+        return np.asarray((self.v0 + self.c * x + self.d * y) / (1 + g * x + h * y))
 
     def pixels(self, points: FloatArray) -> FloatArray:
         """(n, 2) pixels of (n, 2) columns and v."""
@@ -100,12 +105,12 @@ class Rows:
 
 
 def find_rows(
-    coherence: Coherence, grid: Grid, n_columns: int, aspect: float, row: float, sides: Sequence[Side] = ()
-) -> Rows:
-    """Where the light under the columns of a grid begins and ends.
+    strips: StripLight, grid: Grid, n_columns: int, aspect: float, row: float, sides: Sequence[Side] = ()
+) -> tuple[Rows, ...]:
+    """Where the screen may begin and end along the columns of a grid, likeliest first.
 
     Args:
-        coherence: of the picture.
+        strips: of the picture.
         grid: counted from the screen's first column.
         n_columns: columns of the screen.
         aspect: width over height of the screen.
@@ -113,31 +118,49 @@ def find_rows(
         sides: top and bottom, where stripes begin and end, taken where they show well; none: nothing is known of them.
     """
     plane = Plane.through(grid, n_columns, aspect, row)
-    top, bottom = lit_range(*light_along(coherence, plane, n_columns))
-    for _ in range(_ROUNDS - 1):
+    for _ in range(_ROUNDS):
+        top, bottom = lit_range(*light_along(strips, plane, n_columns))
         middle = plane.pixels(np.array([[n_columns / 2, (top + bottom) / 2]]))[0, 1]
         plane = Plane.through(grid, n_columns, aspect, float(middle))
-        top, bottom = lit_range(*light_along(coherence, plane, n_columns))
-    return Rows(plane, _by_sides(plane, n_columns, sides, top, bottom), n_columns)
+    top, bottom = lit_range(*light_along(strips, plane, n_columns))
+    by_sides = _by_sides(plane, n_columns, sides, top, bottom)
+    if by_sides is not None:
+        return (Rows(plane, by_sides, n_columns),)
+    ends = _possible_ends(top, bottom)
+    return tuple(Rows(plane, np.array([[top, top], [bottom, bottom]]), n_columns) for top, bottom in ends)
 
 
-def _by_sides(plane: Plane, n_columns: int, sides: Sequence[Side], top: float, bottom: float) -> FloatArray:
-    """(2, 2) v at the left and right end of top and bottom: by the sides where they show well, else by the light."""
+def _possible_ends(top: float, bottom: float) -> list[tuple[float, float]]:
+    """Ends of a screen that has light between two places: the light lies in its middle, at its end, or it is all."""
+    less = 1 - (bottom - top)
+    if less < _WHOLE:
+        middle = (top + bottom) / 2
+        return [(middle - 0.5, middle + 0.5)]
+    ends = [(top - less / 2, bottom + less / 2)]
+    if less > 2 * _WHOLE:
+        more = min(_MORE, less / 2)
+        ends += [(top - more, bottom + more), (top - more, top - more + 1), (bottom + more - 1, bottom + more)]
+    return ends if less < _BARS else ends[:1] + ends[2:] + ends[1:2]
+
+
+def _by_sides(plane: Plane, n_columns: int, sides: Sequence[Side], top: float, bottom: float) -> FloatArray | None:
+    """(2, 2) v at the left and right end of top and bottom by the sides; None where they do not show well."""
     light = np.array([[top, top], [bottom, bottom]])
     if not sides:
-        return light
+        return None
     ends = np.array([[_meets(plane, side, u) for u in (0.0, float(n_columns))] for side in sides])
     shows = np.array([side.support >= _SHOWS for side in sides]) & (np.abs(np.diff(ends, axis=1)[:, 0]) < _SLANTED)
     height = float(np.diff(ends.mean(axis=1))[0])
     if shows.all() and _LEAST_HEIGHT < height < 1 + _WHOLE and bottom - top < height + _LEFT_OUT:
         middle = ends.mean(axis=1)
-        return ends if middle[0] < (top + bottom) / 2 < middle[1] else light
+        return ends if middle[0] < (top + bottom) / 2 < middle[1] else None
     off = np.abs(ends.mean(axis=1) - light[:, 0])
     near = np.flatnonzero(shows & (off < _LEFT_OUT))
     if not near.size:
-        return light
+        return None
     light[near] = ends[near]
-    if near.size == 1 and float(np.diff(light.mean(axis=1))[0]) > 1 + _WHOLE:
+    if near.size == 1:
+        # Where one side shows, the other one is a screen's height away: rows too many cost next to nothing.
         other = 1 - int(near[0])
         light[other] = light[1 - other] + (1 if other else -1)
     return light
@@ -154,72 +177,36 @@ def _meets(plane: Plane, side: Side, u: float) -> float:
 
 
 def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:
-    """From where to where the screen has light.
-
-    No more than its height, 1, can have light. Less is taken where it is clear and no more than bars: a few lamps in
-    the dark say little of where else there may be some.
-    """
+    """From where to where there is light, no more than a screen's height, 1."""
     step = float(v[1] - v[0])
-    noise = 1.48 * float(np.median(np.abs(np.diff(light)))) / np.sqrt(2) + 1e-9
     gain = np.concatenate([[0.0], np.cumsum(light - _LIT_SHARE * max(float(np.percentile(light, 85)), 1e-6))])
     n = min(round(1 / step), light.size)
-    whole = gain[n:] - gain[:-n]
     end = int((gain - np.minimum.accumulate(gain)).argmax())
     start = int(gain[: end + 1].argmin())
-    less = n - (end - start)
-    clear = gain[end] - gain[start] - whole.max() > _CLEARLY * noise * np.sqrt(max(less, 1))
-    if clear and _WHOLE * n < less < _BARS * n:
-        more = round(_MORE * n)
-        start, end = max(start - more, 0), min(end + more, light.size)
-    else:
-        # Many places of the screen's height may hold all of the light: it lies in the middle of it.
-        start = round((start + end - n) / 2) if 0 < less < n else int(whole.argmax())
+    if end - start > n:
+        start = int((gain[n:] - gain[:-n]).argmax())
         end = start + n
     return float(v[0] + (start - 0.5) * step), float(v[0] + (end - 0.5) * step)
 
 
-def light_along(coherence: Coherence, plane: Plane, n_columns: int) -> tuple[FloatArray, FloatArray]:
+def light_along(strips: StripLight, plane: Plane, n_columns: int) -> tuple[FloatArray, FloatArray]:
     """How much light the columns have along the screen.
 
     Returns:
-        (n,) v, and how much more alike the two halves of a column are there than halves on either side of a border.
+        (n,) v, and how alike the strips of the screen are to what their neighbours predict there, beyond what strips
+        without light are.
     """
+    u = columns_at(plane.grid.numbers, strips.x, strips.y)
+    alike, inside = predicted_light(strips, u), (u > 0) & (u < n_columns)
+    mean = alike.mean(axis=(0, 2))
+    dark = np.sort(mean)[: max(round(_DARK_SHARE * mean.size), 1)].mean()
+    # A strip's rows of one window lie evenly along the screen.
+    ends = np.stack([plane.along_flat(strips.x, strips.y + side * strips.half_height) for side in (-1, 1)], axis=-1)
+    share = (np.arange(alike.shape[2]) + 0.5) / alike.shape[2]
+    v = (ends[..., :1] + np.diff(ends) * share)[inside]
     edges = np.linspace(-_BEYOND, 1 + _BEYOND, _BINS + 1)
-    total, count = np.zeros(_BINS), np.zeros(_BINS)
-    for window, rows in zip(coherence.changes, coherence.rows, strict=True):
-        half, middle = _halves(coherence, plane.grid, float(rows.mean()), n_columns)
-        light = _alike(window, half, n_columns)
-        there = np.isfinite(light[:, 0]) & np.isfinite(middle)
-        points = np.stack(np.broadcast_arrays(middle[there, None], rows), axis=-1)
-        place = np.floor((plane.along(points) - edges[0]) / (edges[1] - edges[0]))
-        good = (place >= 0) & (place < _BINS)
-        total += np.bincount(place[good].astype(np.int64), light[there][good], _BINS)
-        count += np.bincount(place[good].astype(np.int64), minlength=_BINS)
+    place = np.floor((v.ravel() - edges[0]) / (edges[1] - edges[0])).astype(np.int64)
+    good = (place >= 0) & (place < _BINS)
+    light = (alike[inside].ravel() - np.float32(max(dark, 0.0)))[good]
+    total, count = np.bincount(place[good], light, _BINS), np.bincount(place[good], minlength=_BINS)
     return (edges[1:] + edges[:-1]) / 2, np.asarray(total / np.maximum(count, 1.0))
-
-
-def _halves(coherence: Coherence, grid: Grid, row: float, n_columns: int) -> tuple[IntArray, FloatArray]:
-    """(S,) half of a column that each strip lies in on a row, -1 for none; and (C,) middle of the columns, pixels."""
-    u = grid.columns_at(np.stack([coherence.x, np.full(coherence.x.size, row)], axis=-1))
-    column = np.floor(u).astype(np.int64)
-    off = u - column
-    use = (np.abs(off - 0.5) < 0.5 - _MARGIN) & (np.abs(off - 0.5) > _GAP) & (column >= 0) & (column < n_columns)
-    middle = np.interp(np.arange(n_columns) + 0.5, u, coherence.x, np.nan, np.nan)
-    return np.where(use, 2 * column + (off > 0.5), -1), middle
-
-
-def _alike(window: Float32Array, half: IntArray, n_columns: int) -> FloatArray:
-    """(C, rows) products of the halves of a column, less those with the nearer halves of its neighbours; NaN: none.
-
-    What is alike over a distance for other reasons, as bent row noise is, drops out.
-    """
-    member = (half[:, None] == np.arange(2 * n_columns)).astype(np.float32)
-    n = member.sum(axis=0)
-    mean = ((window @ member) / np.where(n > 0, n, np.nan)).T
-    left, right = mean[::2], mean[1::2]
-    across = np.full((n_columns + 1, mean.shape[1]), np.nan)
-    across[1:-1] = right[:-1] * left[1:]
-    beside = np.stack([across[:-1], across[1:]])
-    known = np.isfinite(beside)
-    apart = np.where(known, beside, 0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
-    return np.asarray(left * right - apart)

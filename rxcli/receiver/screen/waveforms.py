@@ -1,123 +1,173 @@
-"""A grid refined by what its columns send: each strip's light is a mix of the waveforms of the columns beside it.
+"""A grid by what its columns send: each strip's light is a mix of the waveforms of the columns beside it.
 
 The coherence of pairs takes columns for independent of one another, which some ten slots in a window of rows are not.
-Here the waveforms themselves are estimated from one half of the strips, and tell of the other half's mixes, and the
-other way round; how a mix changes with the place is known, so that all strips together correct the grid.
+Here the waveforms themselves are estimated from one half of the strips, and predict the other half, and the other way
+round. How a mix changes with the place is known, so that all strips together correct the grid; and how much of the
+strips' light the right grid explains, and how much less with its borders half a column further, tells it from others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rxcli.receiver.screen.coherence import Coherence
-from rxcli.receiver.screen.grid import Grid, columns_of_strips, gain_of, grid_prior, grid_slopes
-from rxcli.types import Float32Array, FloatArray
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_prior, grid_slopes, strip_places
+from rxcli.types import Float32Array, FloatArray, Lens
 
-_ROUNDS = 16
-#: Waveforms have noise in them, so that steps come out too short.
-_LONGER = 1.5
+#: Waveforms follow the grid that they are estimated with and have noise in them, so that steps come out too short.
+_ROUNDS, _LONGER = 10, 2.5
+#: Movement of the strips, columns on average, below which nothing more is to be expected.
+_SETTLED = 0.0015
 #: Weight against waveforms of columns that hardly show, strips.
 _RIDGE = 0.5
 #: Strips whose mixes are further off than so many standard deviations count less.
 _ROBUST = 2.0
 _LARGEST = np.array([0.1, 0.3, 0.3, 0.04, 0.04, 0.02])
+#: Places of the borders at which light is explained, columns.
+_PHASES = 4
+_TINY = np.float32(1e-6)
 
 
-def refine_by_waveforms(coherence: Coherence, grid: Grid, sigma: float) -> Grid:
-    """The grid that explains the strips' light best as mixes of their columns' waveforms.
+@dataclass(frozen=True, slots=True)
+class StripLight:
+    """The light of a picture's strips, W windows by S strips, laid out for mixing; see `Coherence`."""
 
-    Args:
-        coherence: of the picture.
-        grid: right to some tenths of a column.
-        sigma: light spread of the screen, column pitches.
-    """
-    numbers = grid.numbers
-    for _ in range(_ROUNDS):
-        u = columns_of_strips(coherence, replace(grid, numbers=numbers))
-        slopes = grid_slopes(coherence, replace(grid, numbers=numbers))
-        off, precision = _off(coherence, u, sigma)
-        limit = _ROBUST / np.sqrt(np.maximum(precision, 1e-9))
-        weight = precision / np.maximum(np.abs(off) / limit, 1.0)
-        flat = slopes.reshape(slopes.shape[0], -1)
-        prior = grid_prior(grid.bent)
-        normal = (flat * weight.ravel()) @ flat.T + np.diag(prior)
-        gradient = flat @ (weight * off).ravel() - prior * numbers
-        step = np.linalg.solve(normal + 1e-3 * np.diag(np.diag(normal)), gradient)
-        numbers = numbers + np.clip(_LONGER * step, -_LARGEST, _LARGEST)
-        if np.abs(step[:3]).max() < 2e-3:
-            break
-    refined = replace(grid, numbers=numbers)
-    before, after = explained(coherence, grid, sigma), explained(coherence, refined, sigma)
-    if after < before:
-        return replace(grid, explained=before)
-    return replace(refined, gain=gain_of(coherence, refined, sigma), explained=after)
+    #: (W, S / 2, rows) changes of the even and of the odd strips, and (W, S / 2, 1) roots of what is light in them.
+    halves: tuple[Float32Array, Float32Array]
+    weights: tuple[Float32Array, Float32Array]
+    #: (W, S) offsets of the strips from the picture's middle, a known lens taken off, see `grid`.
+    x: FloatArray
+    y: FloatArray
+    #: Light spread of the screen, column pitches.
+    sigma: float
+    #: Independent rows of one window, and half of its height as a share of the picture's width.
+    n_rows: float
+    half_height: float
 
+    @classmethod
+    def of(cls, coherence: Coherence, sigma: float, lens: Lens | None) -> StripLight:
+        """The light of the strips of a picture that was taken through a known lens, or through none."""
+        changes, weight = coherence.changes.transpose(0, 2, 1), np.sqrt(coherence.lit)[..., None]
+        even, odd = (np.ascontiguousarray(changes[:, half::2]) for half in (0, 1))
+        x, y = strip_places(coherence, lens)
+        half_height = float(np.ptp(coherence.rows[0])) / 2 / coherence.width
+        return cls((even, odd), (weight[:, ::2], weight[:, 1::2]), x, y, sigma, coherence.n_rows, half_height)
 
-def _off(coherence: Coherence, u: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """(W, S) how far each strip lies from where the grid has it, columns, and the precision of that."""
-    off, precision = np.zeros(u.shape), np.zeros(u.shape)
-    for window, half, strips, mix, turned in _by_halves(coherence, u, sigma):
-        told, asked = slice(half, None, 2), slice(1 - half, None, 2)
-        waves = _waveforms(strips[:, told], mix[told], np.sqrt(coherence.lit[window, told]))
-        off[window, asked], precision[window, asked] = _asked(
-            strips[:, asked], waves @ mix[asked].T, waves @ turned[asked].T
+    def thinned(self, every: int) -> StripLight:
+        """One of so many windows."""
+        (even, odd), (more, less) = self.halves, self.weights
+        return replace(
+            self,
+            halves=(even[::every], odd[::every]),
+            weights=(more[::every], less[::every]),
+            x=self.x[::every],
+            y=self.y[::every],
         )
-    return off, precision / coherence_rows(coherence)
 
 
-def _by_halves(
-    coherence: Coherence, u: FloatArray, sigma: float
-) -> Iterator[tuple[int, int, Float32Array, Float32Array, Float32Array]]:
-    """Every window twice: its number, which half of the strips tells, its changes, mixes and their slopes (S, K)."""
+def _mixes(u: FloatArray, sigma: float) -> tuple[Float32Array, Float32Array]:
+    """(W, S, K) shares of the columns in every strip's light, and how far off its middle each column lies."""
     centres = np.arange(int(np.floor(u.min())), int(np.ceil(u.max())) + 1) + 0.5
-    for window, (own, strips) in enumerate(zip(u, coherence.changes, strict=True)):
-        apart = own[:, None] - centres
-        spread = np.exp(-(apart**2) / (2 * sigma**2))
-        norm = np.sqrt((spread**2).sum(axis=1, keepdims=True))
-        mix = spread / norm
-        slope = -spread * apart / sigma**2
-        turned = (slope - mix * (slope * mix).sum(axis=1, keepdims=True)) / norm
-        for half in (0, 1):
-            yield window, half, strips, mix.astype(np.float32), turned.astype(np.float32)
+    apart = u.astype(np.float32)[..., None] - centres.astype(np.float32)
+    spread = np.exp(apart * apart * np.float32(-0.5 / sigma**2))
+    return spread / np.sqrt(np.einsum("wsk,wsk->ws", spread, spread))[..., None], apart
 
 
-def explained(coherence: Coherence, grid: Grid, sigma: float) -> float:
-    """How much of the strips' light the other strips' waveforms explain, nats."""
-    u = columns_of_strips(coherence, grid)
+def _slopes(share: Float32Array, apart: Float32Array, sigma: float) -> Float32Array:
+    """(W, S, K) slopes of the shares with the strips' places, columns."""
+    slope = share * apart * np.float32(-1 / sigma**2)
+    return np.asarray(slope - share * np.einsum("wsk,wsk->ws", slope, share)[..., None], np.float32)
+
+
+def _waveforms(strips: Float32Array, share: Float32Array, weight: Float32Array) -> Float32Array:
+    """(W, K, rows) waveforms of the columns from some of the strips."""
+    weighted = share * weight
+    turned = weighted.transpose(0, 2, 1)
+    normal = np.matmul(turned, weighted) + np.float32(_RIDGE) * np.eye(share.shape[2], dtype=np.float32)
+    return np.asarray(np.matmul(np.linalg.inv(normal), np.matmul(turned, strips)), np.float32)
+
+
+def explained_light(strips: StripLight, u: FloatArray) -> float:
+    """How much of the strips' light the other strips' waveforms explain, nats, with (W, S) columns of the strips."""
+    share, _ = _mixes(u, strips.sigma)
     total = 0.0
-    for window, half, strips, mix, _ in _by_halves(coherence, u, sigma):
-        told, asked = slice(half, None, 2), slice(1 - half, None, 2)
-        model = _waveforms(strips[:, told], mix[told], np.sqrt(coherence.lit[window, told])) @ mix[asked].T
-        own = strips[:, asked]
-        power = (model * model).sum(axis=0) + 1e-6
-        shared = np.maximum((model * own).sum(axis=0), 0) ** 2 / power / np.maximum((own * own).sum(axis=0), 1e-6)
-        total -= 0.5 * coherence.n_rows * float(np.log1p(-np.minimum(shared, 0.999)).sum())
+    for known, asked in ((0, 1), (1, 0)):
+        waves = _waveforms(strips.halves[known], share[:, known::2], strips.weights[known])
+        model, own = np.matmul(share[:, asked::2], waves), strips.halves[asked]
+        power = np.einsum("wsr,wsr->ws", model, model) * np.einsum("wsr,wsr->ws", own, own) + _TINY
+        alike = np.maximum(np.einsum("wsr,wsr->ws", model, own), 0) ** 2 / power
+        total -= 0.5 * strips.n_rows * float(np.log1p(-np.minimum(alike, np.float32(0.999))).sum())
     return total
 
 
-def coherence_rows(coherence: Coherence) -> float:
-    """Rows of a window for each independent one."""
-    return float(coherence.changes.shape[1]) / coherence.n_rows
+def predicted_light(strips: StripLight, u: FloatArray) -> Float32Array:
+    """(W, S, rows) products of every strip's changes with what the other strips' waveforms predict."""
+    share, _ = _mixes(u, strips.sigma)
+    out = np.empty((*u.shape, strips.halves[0].shape[2]), np.float32)
+    for known, asked in ((0, 1), (1, 0)):
+        waves = _waveforms(strips.halves[known], share[:, known::2], strips.weights[known])
+        out[:, asked::2] = np.matmul(share[:, asked::2], waves) * strips.halves[asked]
+    return out
 
 
-def _waveforms(strips: Float32Array, mix: Float32Array, lit: Float32Array) -> Float32Array:
-    """(rows, K) waveforms of the columns from some of the strips."""
-    weighted = mix * lit[:, None]
-    normal = weighted.T @ weighted + _RIDGE * np.eye(mix.shape[1], dtype=np.float32)
-    return np.asarray(np.linalg.solve(normal, (strips @ weighted).T).T, np.float32)
+def with_light(strips: StripLight, grid: Grid) -> Grid:
+    """A grid, its borders moved to where they explain most of the light, with how much that is; see `Grid`."""
+    u = columns_at(grid.numbers, strips.x, strips.y)
+    places = np.arange(_PHASES) / _PHASES
+    light = np.array([explained_light(strips, u + place) for place in places.tolist()])
+    wave = complex((light * np.exp(-2j * np.pi * places)).sum()) * 2 / _PHASES
+    moved = grid.shifted(float(np.angle(wave)) / (2 * np.pi))
+    return replace(moved, explained=float(light.mean()) + abs(wave), contrast=2 * abs(wave))
+
+
+def refine_by_waveforms(strips: StripLight, grid: Grid) -> Grid:
+    """The grid that explains the strips' light best as mixes of their columns' waveforms.
+
+    Args:
+        strips: of the picture.
+        grid: right to some tenths of a column.
+    """
+    best, prior = with_light(strips, grid), grid_prior(grid.bent)
+    numbers = best.numbers
+    for _ in range(_ROUNDS):
+        off, precision = _off(strips, columns_at(numbers, strips.x, strips.y))
+        limit = _ROBUST / np.sqrt(np.maximum(precision, 1e-9))
+        weight = (precision / np.maximum(np.abs(off) / limit, 1.0)).ravel()
+        flat = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
+        normal = (flat * weight) @ flat.T
+        gradient = flat @ (weight * off.ravel()) - prior * numbers
+        damped = normal + np.diag(prior + 1e-3 * np.diag(normal))
+        step = np.clip(_LONGER * np.linalg.solve(damped, gradient), -_LARGEST, _LARGEST)
+        numbers = numbers + step
+        if step @ normal @ step < _SETTLED**2 * weight.sum():
+            break
+    refined = with_light(strips, replace(best, numbers=numbers))
+    return refined if refined.likelihood > best.likelihood else best
+
+
+def _off(strips: StripLight, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(W, S) how far each strip lies from where the grid has it, columns, and the precision of that."""
+    off, precision = np.zeros(u.shape), np.zeros(u.shape)
+    share, apart = _mixes(u, strips.sigma)
+    turned = _slopes(share, apart, strips.sigma)
+    for known, asked in ((0, 1), (1, 0)):
+        waves = _waveforms(strips.halves[known], share[:, known::2], strips.weights[known])
+        model, slope = np.matmul(share[:, asked::2], waves), np.matmul(turned[:, asked::2], waves)
+        off[:, asked::2], precision[:, asked::2] = _asked(strips.halves[asked], model, slope)
+    return off, precision * (strips.n_rows / strips.halves[0].shape[2])
 
 
 def _asked(strips: Float32Array, model: Float32Array, slope: Float32Array) -> tuple[FloatArray, FloatArray]:
-    """How far some strips lie off, and the precision of that: by light and its slope, its strength left open."""
-    power = (model * model).sum(axis=0) + 1e-6
-    gain = (model * strips).sum(axis=0) / power
-    slope = slope - model * ((model * slope).sum(axis=0) / power)
-    left = strips - gain * model
-    told = (slope * slope).sum(axis=0)
-    noise = (left * left).mean(axis=0) + 1e-6
+    """How far strips (W, S, rows) lie off, and the precision of that: by light and its slope, of whatever strength."""
+    product = "wsr,wsr->ws"
+    power = np.einsum(product, model, model) + _TINY
+    gain = np.einsum(product, model, strips) / power
+    shared = np.einsum(product, model, slope) / power
+    told = np.maximum(np.einsum(product, slope, slope) - shared * shared * power, _TINY)
+    left = np.einsum(product, slope, strips) - shared * gain * power
+    noise = np.maximum(np.einsum(product, strips, strips) - gain * gain * power, 0) / strips.shape[2] + _TINY
     lit = np.maximum(gain, 0.0)
-    off = (slope * left).sum(axis=0) / (np.maximum(lit, 0.05) * told + 1e-6)
+    off = left / (np.maximum(lit, 0.05) * told)
     return np.asarray(off, np.float64), np.asarray(lit * lit * told / noise, np.float64)

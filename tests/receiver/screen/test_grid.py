@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import cv2
@@ -14,8 +15,10 @@ from rxcli.receiver.screen.agreement import sides_agree
 from rxcli.receiver.screen.coherence import measure_coherence
 from rxcli.receiver.screen.columns import ColumnLayout, ColumnSearch, find_columns
 from rxcli.receiver.screen.comb import find_combs, likeness
-from rxcli.receiver.screen.grid import light_map
+from rxcli.receiver.screen.grid import grid_between
+from rxcli.receiver.screen.numbering import first_columns, light_profile
 from rxcli.receiver.screen.rows import lit_range
+from rxcli.receiver.screen.waveforms import StripLight, refine_by_waveforms, with_light
 from rxcli.types import FloatArray
 
 LAYOUT = ColumnLayout()
@@ -54,8 +57,9 @@ def shown(
         return ((v > 0.13) & (v < 0.87)).astype(np.float32)
     if picture == "round":
         return (np.hypot((u - 0.5) * 16 / 9, v - 0.5) < 0.88).astype(np.float32)
-    if picture == "window":
-        return np.where((u > 0.07) & (u < 0.8) & (v > 0.2) & (v < 0.7), 0.9, 0.06).astype(np.float32)
+    if "window" in picture:
+        ground = 0.0 if picture == "window on black" else 0.06
+        return np.where((u > 0.07) & (u < 0.8) & (v > 0.2) & (v < 0.7), 0.9, ground).astype(np.float32)
     return (0.15 + 0.85 * (np.sin(23 * u + 9 * v) * np.sin(17 * v - 5 * u) > 0)).astype(np.float32)
 
 
@@ -79,7 +83,7 @@ def test_the_grid_is_found_whatever_the_picture(picture: str) -> None:
     assert any(round(float(np.median(apart(search, n)))) == 0 for n in range(len(search.numberings)))
 
 
-@pytest.mark.parametrize("picture", ["white", "letterbox", "blobs"])
+@pytest.mark.parametrize("picture", ["white", "letterbox", "blobs", "window"])
 def test_where_all_columns_have_light_the_first_is_plain(picture: str) -> None:
     search = found(picture)
     assert np.abs(apart(search)).mean() < 0.1
@@ -87,26 +91,52 @@ def test_where_all_columns_have_light_the_first_is_plain(picture: str) -> None:
 
 
 def test_where_the_outer_columns_are_dark_others_are_handed_on() -> None:
-    search = found("window")
+    search = found("window on black")
     assert len(search.numberings) > 1
     assert search.numberings[1].log_odds > -5
 
 
 def test_corners_follow_from_the_columns_and_the_light() -> None:
-    corners = found("white").numberings[0].corners
+    corners = found("white").numberings[0].corners[0]
     assert np.abs(corners[:, 0] - CORNERS[:, 0]).max() < 0.2 * 50
     assert np.abs(corners[:, 1] - CORNERS[:, 1]).max() < 0.05 * 590
 
 
-def test_columns_without_light_are_told_from_those_with() -> None:
-    search = found("window")
+def test_where_bars_are_other_rows_are_handed_on() -> None:
+    tall = [corners[2:, 1].mean() - corners[:2, 1].mean() for corners in found("letterbox").numberings[0].corners]
+    true = CORNERS[2:, 1].mean() - CORNERS[:2, 1].mean()
+    assert tall[0] == pytest.approx(true, rel=0.05)
+    assert min(tall) < 0.9 * true
+
+
+def strips_of(picture: str) -> StripLight:
+    search = found(picture)
     assert search.coherence is not None
-    light = light_map(search.coherence, search.numberings[0].grid)
-    shift = round(float(np.median(apart(search))))
-    number = light.first + np.arange(light.significance.size) - shift
-    assert light.significance[(number >= 3) & (number < 14)].min() > 3 * light.significance[number < -1].max(
-        initial=1.0
-    )
+    return StripLight.of(search.coherence, LAYOUT.sigma, None)
+
+
+def test_columns_without_light_are_told_from_those_with() -> None:
+    light = light_profile(strips_of("window"), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None))
+    inside, outside = (light.place > 3) & (light.place < 14), (light.place < -0.2) | (light.place > 20.2)
+    assert light.significance[inside].min() > 2 * light.significance[outside].max()
+
+
+def test_the_first_column_is_where_light_begins_on_a_border() -> None:
+    grid = grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    start = first_columns(light_profile(strips_of("letterbox"), grid), grid, 20)
+    assert start.first[start.log_odds.argmax()] == 0
+    assert np.sort(start.log_odds)[-2] < -3
+
+
+def test_the_true_grid_explains_more_than_others_and_is_reached_from_near() -> None:
+    strips, true = strips_of("blobs"), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    own = with_light(strips, true)
+    for factor in (0.8, 0.95, 1.05, 1.3):
+        wide = true.shifted(0.0).numbers * np.array([factor, factor, factor, 1, 1, 1])
+        assert with_light(strips, replace(true, numbers=wide)).likelihood < own.likelihood
+    near = replace(true, numbers=true.numbers * np.array([1, 1.015, 1, 1, 1, 1]) + np.array([0.1, 0, 0.2, 0, 0, 0]))
+    off = refine_by_waveforms(strips, near).numbers[:3] - true.numbers[:3]
+    assert np.abs(off - np.array([round(off[0]), 0, 0])).max() < 0.3
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -116,7 +146,7 @@ def test_a_picture_without_data_has_no_comb(seed: int) -> None:
     still = 100 + 1500 * cv2.GaussianBlur(rng.normal(0, 1, (HEIGHT, WIDTH)), (0, 0), 12)
     luma = still + (rows if seed else 0) + rng.normal(0, 4, still.shape) + rng.normal(0, 1, (HEIGHT, 1))
     found = find_columns(np.clip(luma, 0, 255).astype(np.uint8), LAYOUT)
-    assert not [numbering for numbering in found.numberings if numbering.grid.gain > 30]
+    assert not found.numberings
 
 
 def test_the_true_sides_agree_with_the_columns_and_others_do_not() -> None:
@@ -128,22 +158,29 @@ def test_the_true_sides_agree_with_the_columns_and_others_do_not() -> None:
     assert not sides_agree(luma, CORNERS + np.array([25.0, 0.0]), LAYOUT)
 
 
-def test_rows_are_left_out_where_bars_are() -> None:
+def test_light_ends_where_bars_begin_and_takes_no_more_than_a_screen() -> None:
     v = (np.arange(320) + 0.5) / 320 * 2.2 - 0.6
     rng = np.random.default_rng(1)
     for low, high in ((0.0, 1.0), (0.15, 0.85)):
         top, bottom = lit_range(v, 0.5 * ((v > low) & (v < high)) + rng.normal(0, 0.03, v.size))
         assert abs(top - low) < 0.04
         assert abs(bottom - high) < 0.04
+    top, bottom = lit_range(v, np.full(v.size, 0.5))
+    assert bottom - top == pytest.approx(1, abs=0.02)
 
 
-def test_likeness_is_the_cosine_of_two_places_light() -> None:
+def test_likeness_is_the_mean_cosine_of_two_places_light() -> None:
     tables, k = likeness(0.45), np.arange(-8, 9) + 0.5
-    for u, distance in ((0.0, 0.5), (0.3, 0.72), (0.5, 1.2)):
-        one, other = (np.exp(-((u + side * distance / 2 - k) ** 2) / (2 * 0.45**2)) for side in (-1, 1))
-        want = one @ other / np.sqrt((one @ one) * (other @ other))
-        got = tables.cosine.ravel()[int(tables.place(np.array(u), np.array(distance)))]
-        assert got == pytest.approx(want, abs=0.03)
+    for distance in (0.5, 0.72, 1.2):
+        cosines = []
+        for u in np.arange(0, 1, 0.05):
+            one, other = (np.exp(-((u + side * distance / 2 - k) ** 2) / (2 * 0.45**2)) for side in (-1, 1))
+            cosines.append(one @ other / np.sqrt((one @ one) * (other @ other)))
+        step = int(tables.step(np.array(distance)))
+        assert tables.mean[step] == pytest.approx(np.mean(cosines), abs=0.01)
+        assert tables.harmonic[step] == pytest.approx(
+            2 * np.mean(cosines * np.cos(2 * np.pi * np.arange(0, 1, 0.05))), abs=0.02
+        )
 
 
 def test_coherence_of_independent_strips_is_chance() -> None:
