@@ -22,6 +22,7 @@ from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.outline import locate
 from rxcli.receiver.screen_choice import acquire
+from rxcli.receiver.single_light import with_data
 from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin, soft_bits
 from rxcli.receiver.unknown_camera import (
     fits,
@@ -95,7 +96,7 @@ def _receive_still(
         return failed(result, context)
     # Sampling: pixels to row profiles; sync: row profiles to a clock.
     sampler = sample_columns(context, context.n_columns, quick=True)
-    acquisition = acquire(context, sampler)
+    acquisition = with_data(context, sampler, acquire(context, sampler))
     if isinstance(acquisition, Failure):
         if context.camera.remembered:
             return _receive_still(frame, replace(options, camera_cache=None), timer, remembering)
