@@ -127,6 +127,8 @@ def confidence(frames: int, clips: int | None, cae: str, journals: tuple[Path, .
     rows = work.rows(result)
     click.echo(format_table(rows))
     click.echo("\n".join(_calibration_notes(result)))
+    if clips is not None:
+        click.echo(format_table(clip_confidence.rows(records)))
     paths = write_outputs(run["out"], "confidence", rows, work.details(result))
     if plots.available():
         paths.append(run["out"] / "confidence.png")

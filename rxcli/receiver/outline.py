@@ -105,14 +105,25 @@ class Located:
     context: FrameContext | Failure | None = None
 
 
-def find_outline(frame: Frame, options: ReceiverOptions, timer: Timer) -> Outline | Failure:
-    """The outline of the screen in a frame."""
-    located = locate(frame, options, timer)
+def find_outline(
+    frame: Frame, options: ReceiverOptions, timer: Timer, known: FrameContext | None = None
+) -> Outline | Failure:
+    """The outline of the screen in a frame; for `known` see `locate`."""
+    located = locate(frame, options, timer, known)
     return located if isinstance(located, Failure) else located.outline
 
 
-def locate(frame: Frame, options: ReceiverOptions, timer: Timer) -> Located | Failure:
-    """The outline of the screen in a frame, and what was learned of the camera on the way."""
+def locate(
+    frame: Frame, options: ReceiverOptions, timer: Timer, known: FrameContext | None = None
+) -> Located | Failure:
+    """The outline of the screen in a frame, and what was learned of the camera on the way.
+
+    Args:
+        frame: to be searched.
+        options: of the receiver.
+        timer: time is counted there.
+        known: another frame of the same camera, which need not be asked again.
+    """
     refused = unreadable_orientation(frame)
     if refused is not None:
         return refused
@@ -122,7 +133,7 @@ def locate(frame: Frame, options: ReceiverOptions, timer: Timer) -> Located | Fa
     candidates, reason = possible_outlines(frame, options, timer)
     located = Located(candidates[0]) if candidates else None
     if len(candidates) > 1 or (candidates and candidates[0].by_grid_alone):
-        located = _by_packets(frame, candidates, options, timer)
+        located = _by_packets(frame, candidates, options, timer, known)
     if located:
         return located
     if "no_screen" in options.skip or not may_fill(frame):
@@ -278,9 +289,19 @@ def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:
     return bool(apart.mean() < _AGREE and apart.max() < _AGREE_ANYWHERE)
 
 
-def _by_packets(frame: Frame, candidates: list[Outline], options: ReceiverOptions, timer: Timer) -> Located | None:
+def _by_packets(
+    frame: Frame,
+    candidates: list[Outline],
+    options: ReceiverOptions,
+    timer: Timer,
+    known: FrameContext | None = None,
+) -> Located | None:
     """The likeliest candidate by what they were worth before and by how much their columns look like packets."""
-    context, asked = _context_of_any(frame, candidates, options, timer)
+    context: FrameContext | Failure
+    if known is not None:
+        context, asked = replace(known, frame=frame, timer=timer), {one.family for one in candidates}
+    else:
+        context, asked = _context_of_any(frame, candidates, options, timer)
     if isinstance(context, Failure):
         best = _likeliest([one for one in candidates if not one.by_grid_alone])
         return Located(best, context if best.family in asked else None) if best else None

@@ -21,7 +21,8 @@ from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.outline import locate
-from rxcli.receiver.screen_choice import quick_look
+from rxcli.receiver.screen_choice import quick_look, quick_sampler
+from rxcli.receiver.single_light import with_data
 from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin, soft_bits
 from rxcli.receiver.unknown_camera import (
     fits,
@@ -94,7 +95,7 @@ def _receive_still(
     if isinstance(context, Failure):
         return failed(result, context)
     # Sampling: pixels to row profiles; sync: row profiles to a clock.
-    acquisition = quick_look(context)
+    acquisition = with_data(context, quick_sampler(context), quick_look(context))
     if isinstance(acquisition, Failure):
         if context.camera.remembered:
             return _receive_still(frame, replace(options, camera_cache=None), timer, remembering)

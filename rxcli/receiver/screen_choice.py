@@ -26,8 +26,16 @@ _PLAIN_STRUCTURE = 60.0
 def quick_look(context: FrameContext) -> Acquisition | Failure:
     """The screen and the clock by a quick look at the columns; taken once for a context."""
     if "quick" not in context.kept:
-        context.kept["quick"] = acquire(context, sample_columns(context, context.n_columns, quick=True))
+        context.kept["quick"] = acquire(context, quick_sampler(context))
     kept: Acquisition | Failure = context.kept["quick"]
+    return kept
+
+
+def quick_sampler(context: FrameContext) -> ColumnSampler:
+    """What a quick look samples of the columns; sampled once for a context."""
+    if "sampler" not in context.kept:
+        context.kept["sampler"] = sample_columns(context, context.n_columns, quick=True)
+    kept: ColumnSampler = context.kept["sampler"]
     return kept
 
 

@@ -469,15 +469,15 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
     With few rows a slot or at the screen's edge light is not as the model has it, and headers are the first to tell.
     None has any where all the light is a steady periodic waveform.
     """
-    out = assemble.without_header(reception.posteriors)
-    if not out.all() and _is_steady(reception):
+    out = assemble.without_header(reception.posteriors.header_llr)
+    if not out.all() and shows_steady_light(reception):
         return np.ones_like(out)
     if out.any():
         out[out] = _packets_over_any(reception, np.flatnonzero(out)) < _PACKETS_WITHOUT_HEADER
     return out
 
 
-def _is_steady(reception: Reception) -> bool:
+def shows_steady_light(reception: Reception) -> bool:
     """Whether the light is that of a lamp or of a screen that is dimmed by switching."""
     samples, clock = reception.samples, reception.clock
     contrast = sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.sigma)

@@ -1,8 +1,13 @@
-"""The question of `rxcli.lab.benchmark.confidence` of clips: through real encoders, from ample bits to starved ones."""
+"""The question of `rxcli.lab.benchmark.confidence` of clips: whole frames through real encoders, the screen searched.
+
+A scene is filmed once and compressed several times, as phones and cameras do: bit rates from scarce to ample, codecs
+and presets of any kind. Half of the pictures are dark, some clips are taken from a hand. Each clip is received with the
+screen searched and, for comparison, with its corners handed over.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +19,10 @@ import numpy as np
 from rxcli.ingest import open_source
 from rxcli.lab.benchmark.confidence import reported_packets
 from rxcli.lab.benchmark.journal import Record, Task
+from rxcli.lab.benchmark.statistics import wilson
+from rxcli.lab.benchmark.tables import Row
 from rxcli.lab.simulate.capture import Take, prepare
+from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
 from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.lab.simulate.truth import build_camera_profile
@@ -22,94 +30,180 @@ from rxcli.lab.simulate.video import write_video
 from rxcli.receiver.pipeline import CaeMode, ReceiverOptions, receive
 from rxcli.results.truth import Scorer, Truth
 
-#: Camera and screen; the fastest link has too few rows per slot in 1080p.
-_KINDS = (("video-1080p", "paper-8k65"), ("video-1080p", "paper-17k3"), ("video-4k", "paper-34k6"))
-#: Widths in pixels: few, because many clips are wanted; the rows stay as many as they are.
-_WIDTH_PX = (360, 720)
-_FRAMES = (2, 14)
-#: Bits per pixel and frame, from starved to ample.
-_BITS_PER_PIXEL = (0.03, 1.5)
-_CODECS = ("h264", "h264", "hevc")
+#: Camera, screen, how often they are drawn, frames, and bits per second. The fastest link has too few rows per slot in
+#: 1080p.
+_KINDS = (
+    ("video-1080p", "paper-8k65", 0.42, (4, 9), (6e6, 25e6)),
+    ("video-1080p", "paper-17k3", 0.42, (4, 9), (6e6, 25e6)),
+    ("video-4k", "paper-17k3", 0.08, (3, 5), (20e6, 80e6)),
+    ("video-4k", "paper-34k6", 0.08, (3, 5), (20e6, 80e6)),
+)
+_CODECS, _PRESETS = ("h264", "h264", "hevc"), ("ultrafast", "veryfast", "veryfast", "medium")
+#: Times that a scene is compressed.
+_ENCODINGS = 3
+#: Shares of dark pictures, of clips from a hand, and of cameras that nobody told of; pixels that a hand moves a frame.
+_DARK, _MOVING, _UNTOLD, _HAND_PX = 0.5, 0.35, 0.3, (0.5, 6.0)
+#: Confidence from which a packet counts as confident.
+CONFIDENT = 0.99
 
 
 @dataclass(frozen=True)
-class ClipScene:
-    """A scene and how its clip is compressed."""
+class Encoding:
+    """How a clip is compressed."""
 
-    scene: Scene
     codec: str
+    preset: str
     #: Bits per second.
     bit_rate: int
 
 
+@dataclass(frozen=True)
+class ClipScene:
+    """A scene, what it shows, how its clips are compressed, and whether the receiver is told the camera."""
+
+    scene: Scene
+    kind: str
+    encodings: tuple[Encoding, ...]
+    camera_told: bool
+
+
 def scene_of(seed: int) -> ClipScene:
-    """A short, narrow clip of random quality: from clean to hopeless."""
+    """A short clip of random quality."""
     rng = np.random.default_rng([seed, 17])
-    base = preset(*_KINDS[rng.integers(len(_KINDS))])
-    # Encoders want even numbers of pixels.
-    base = base.scaled(2 * int(rng.integers(*_WIDTH_PX) / 2) / base.sensor.width, 1.0)
+    name, screen, _, frames, bits = _KINDS[rng.choice(len(_KINDS), p=[kind[2] for kind in _KINDS])]
+    base = preset(name, screen)
+    kind = str(rng.choice(DARK_KINDS)) if rng.random() < _DARK else "photo"
+    names = [*PHOTOS, *(name for name in GENERATED if name != "black")]
+    size = base.screen.width_px, base.screen.height_px
+    picture = str(rng.choice(names)) if kind == "photo" else draw_dark_picture(kind, rng, *size)
     exposure_slots = rng.choice([0.5, 1.0, 1.5]) * rng.uniform(0.8, 1.2)
     exposure_s = max(float(exposure_slots) / base.screen.slot_rate_hz, 1 / 32000)
+    pose = replace(
+        base.pose,
+        fill=rng.uniform(0.75, 0.93),
+        roll_deg=rng.normal(0, 0.8),
+        yaw_deg=rng.normal(0, 2),
+        pitch_deg=rng.normal(0, 2),
+    )
     scene = replace(
         base,
-        picture=str(rng.choice([*PHOTOS, *(name for name in GENERATED if name != "black")])),
+        picture=picture,
         w="dimming" if rng.random() < 0.3 else int(rng.integers(2, 9)),
-        pose=replace(base.pose, fill=rng.uniform(0.8, 0.97), roll_deg=rng.normal(0, 0.5), yaw_deg=rng.normal(0, 2)),
+        pose=pose,
         exposure_s=exposure_s,
-        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(-1.0, 0.3),
-        slot_rate_error_ppm=rng.uniform(-100, 100),
-        shake_px=base.shake_px * rng.uniform(0, 0.5),
-        n_frames=int(rng.integers(*_FRAMES, endpoint=True)),
+        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(-0.7, 0.3),
+        slot_rate_error_ppm=rng.uniform(-50, 50),
+        shake_px=0.0,
+        hand_px=rng.uniform(*_HAND_PX) if rng.random() < _MOVING else 0.0,
+        n_frames=int(rng.integers(*frames, endpoint=True)),
     )
-    pixels = scene.sensor.width * scene.sensor.height * scene.frame_rate_hz
-    bits = np.exp(rng.uniform(*np.log(_BITS_PER_PIXEL)))
-    return ClipScene(scene, str(rng.choice(_CODECS)), int(bits * pixels))
+    encodings = tuple(_encoding(rng, bits) for _ in range(_ENCODINGS))
+    return ClipScene(scene, kind, encodings, bool(rng.random() >= _UNTOLD))
+
+
+def _encoding(rng: np.random.Generator, bits: tuple[float, float]) -> Encoding:
+    bit_rate = int(np.exp(rng.uniform(*np.log(bits))))
+    return Encoding(str(rng.choice(_CODECS)), str(rng.choice(_PRESETS)), bit_rate)
 
 
 @contextmanager
-def clip_of(seed: int, folder: Path | None = None) -> Iterator[tuple[Path, Take]]:
-    """The clip as a file, in a folder that goes away afterwards where none is given."""
+def clips_of(seed: int, folder: Path | None = None) -> Iterator[tuple[list[Path], Take]]:
+    """A scene's clips as files, in a folder that goes away afterwards where none is given."""
     clip = scene_of(seed)
     take = prepare(clip.scene, seed)
+    pictures = [take.frame(n, threads=1).rgb for n in range(clip.scene.n_frames)]
     with TemporaryDirectory() as temporary:
-        path = (folder or Path(temporary)) / f"{seed}.mp4"
-        frames = (take.frame(n, threads=1).rgb for n in range(clip.scene.n_frames))
-        write_video(frames, path, clip.codec, clip.scene.frame_rate_hz, clip.bit_rate)
-        yield path, take
+        paths = [(folder or Path(temporary)) / f"{seed}-{number}.mp4" for number in range(len(clip.encodings))]
+        for path, how in zip(paths, clip.encodings, strict=True):
+            write_video(pictures, path, how.codec, clip.scene.frame_rate_hz, how.bit_rate, how.preset)
+        yield paths, take
 
 
-def options_for(take: Take, *, cae: CaeMode = "auto") -> ReceiverOptions:
-    """Screen, camera and outline named: how well they are found is not the question here."""
+def options_for(clip: ClipScene, take: Take, *, corners: bool, cae: CaeMode = "auto") -> ReceiverOptions:
+    """What a user would tell: the camera, perhaps, and for comparison the corners."""
     exposure = take.exposure()
     return ReceiverOptions(
-        screens=(take.scene.screen,),
-        cameras=(build_camera_profile(take.scene, exposure),),
-        force_camera=True,
-        corners=exposure.view.corners,
+        cameras=(build_camera_profile(take.scene, exposure),) if clip.camera_told else (),
+        force_camera=clip.camera_told,
+        corners=exposure.corners if corners else None,
         cae=cae,
     )
 
 
 def packets_of(task: Task) -> Record:
-    """Simulate, compress and receive one clip; returns what was reported of every packet."""
-    with clip_of(task["seed"]) as (path, take):
-        told = take.truth(path.name)
+    """Film a scene, compress and receive it; returns what was reported of every packet, screen searched."""
+    seed = task["seed"]
+    clip = scene_of(seed)
+    with clips_of(seed) as (paths, take):
+        told = take.truth("clip")
         truth = msgspec.convert({**told, "payload": {int(k): v for k, v in told["payload"].items()}}, Truth)
-        scorer = Scorer(truth)
-        results = [scorer.add(result) for result in receive(open_source(path), options_for(take, cae=task["cae"]))]
-    clip, score = scene_of(task["seed"]), scorer.score()
-    packets = [packet for result in results for packet in reported_packets(result, truth.w)]
+        clips = []
+        for path, how in zip(paths, clip.encodings, strict=True):
+            ways = {
+                name: _received(path, truth, options_for(clip, take, corners=corners, cae=task["cae"]))
+                for name, corners in (("searched", False), ("given", True))
+            }
+            clips.append({**msgspec.to_builtins(how), "bytes": path.stat().st_size, **ways})
+    scene = clip.scene
     return {
-        "screen": clip.scene.screen.name,
-        "picture": clip.scene.picture,
-        "codec": clip.codec,
-        "bit_rate": clip.bit_rate,
-        "n_frames": clip.scene.n_frames,
-        "exposure_slots": clip.scene.exposure_s * clip.scene.screen.slot_rate_hz,
+        "screen": scene.screen.name,
+        "camera": scene.camera_name,
+        "camera_told": clip.camera_told,
+        "kind": clip.kind,
+        "picture": scene.picture if isinstance(scene.picture, str) else clip.kind,
+        "hand_px": scene.hand_px,
+        "n_frames": scene.n_frames,
+        "exposure_slots": scene.exposure_s * scene.screen.slot_rate_hz,
+        "clips": clips,
+        "packets": [packet for one in clips for packet in one["searched"]["packets"]],
+    }
+
+
+def _received(path: Path, truth: Truth, options: ReceiverOptions) -> Record:
+    scorer = Scorer(truth)
+    results = [scorer.add(result) for result in receive(open_source(path), options)]
+    packets = [packet for result in results for packet in reported_packets(result, truth.w)]
+    score = scorer.score()
+    return {
         "status": [result.status for result in results],
         "expected": score.expected,
         "error_free": score.error_free,
-        "lost": score.lost,
         "false": score.false,
         "packets": packets,
+    }
+
+
+def rows(records: Sequence[Record]) -> list[Row]:
+    """Packets with the screen searched and given, and wrong ones that were confident, of clips of several sorts."""
+    every = [(record, clip) for record in records for clip in record["clips"]]
+    sorts: list[tuple[str, list[tuple[Record, Record]]]] = [
+        ("1080p", [(r, c) for r, c in every if r["camera"] == "video1080"]),
+        ("4K", [(r, c) for r, c in every if r["camera"] != "video1080"]),
+        ("photographs", [(r, c) for r, c in every if r["kind"] == "photo"]),
+        ("dark pictures", [(r, c) for r, c in every if r["kind"] != "photo"]),
+        ("from a tripod", [(r, c) for r, c in every if not r["hand_px"]]),
+        ("from a hand", [(r, c) for r, c in every if r["hand_px"]]),
+        ("camera told", [(r, c) for r, c in every if r["camera_told"]]),
+        ("camera unknown", [(r, c) for r, c in every if not r["camera_told"]]),
+        *((codec, [(r, c) for r, c in every if c["codec"] == codec]) for codec in sorted(set(_CODECS))),
+        ("all", every),
+    ]
+    return [_row(name, [clip for _, clip in some]) for name, some in sorts if some]
+
+
+def _row(name: str, clips: Sequence[Record]) -> Row:
+    packets = [packet for clip in clips for packet in clip["searched"]["packets"]]
+    confident = [packet for packet in packets if packet["confidence"] >= CONFIDENT]
+    wrong = sum(packet["bit_errors"] != 0 for packet in confident)
+    searched, given = (sum(clip[way]["error_free"] for clip in clips) for way in ("searched", "given"))
+    return {
+        "clips": name,
+        "n": len(clips),
+        "expected": sum(clip["searched"]["expected"] for clip in clips),
+        "searched": searched,
+        "corners_given": given,
+        "share": searched / given if given else None,
+        f"confident_{CONFIDENT:g}": len(confident),
+        "wrong": wrong,
+        "wrong_at_most": wilson(wrong, len(confident))[1] if confident else None,
     }

@@ -18,8 +18,9 @@ from rxcli.types import Frame
 
 #: Confidences from which packets are counted.
 LEVELS = (0.0, 0.5, 0.9, 0.99)
-#: Line delay and exposure of a camera that is told: such as are, whatever the picture shows.
-_LINE_DELAY_S, _EXPOSURE_ROWS = (3e-6, 30e-6), (0.5, 12.0)
+#: Time that a camera that is told takes to read a picture out, and rows that it exposes: such as are, whatever the
+#: picture shows.
+_READOUT_S, _EXPOSURE_ROWS = (10e-3, 40e-3), (0.5, 12.0)
 SOURCE = "no data"
 
 
@@ -44,7 +45,7 @@ def draw(seed: int, number: int, camera: str = "unknown", n_frames: int = 1) -> 
     rng = np.random.default_rng([seed, number, 23])
     made = draw_no_data(draw_kind(rng, number % 2 == 0), rng, n_frames)
     height, width = made.frames[0].shape
-    line_delay_s = float(np.exp(rng.uniform(*np.log(_LINE_DELAY_S))))
+    line_delay_s = float(np.exp(rng.uniform(*np.log(_READOUT_S)))) / height
     step_s = made.frame_rows * line_delay_s
     frames = tuple(Frame(pixels, SOURCE, index, index * step_s) for index, pixels in enumerate(made.frames))
     if camera == "unknown":

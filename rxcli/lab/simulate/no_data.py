@@ -175,7 +175,7 @@ def _picture(rng: np.random.Generator, width: int, height: int) -> Float32Array:
     names = [*PHOTOS, *(name for name in GENERATED if name != "black")]
     rgb = load_picture(str(rng.choice(names)), width, height)
     grey = np.asarray(rgb, np.float32).mean(axis=2) / 255
-    return np.ascontiguousarray(grey[:, :: rng.choice([-1, 1])]) ** 2.2
+    return np.asarray(grey[:, :: rng.choice([-1, 1])] ** np.float32(2.2), np.float32)
 
 
 def _on_screen(rng: np.random.Generator, picture: Float32Array, width: int, height: int) -> _Scene:
@@ -253,7 +253,7 @@ def _blinds(rng: np.random.Generator, width: int, height: int) -> _Scene:
         return np.asarray((t / period % 1.0 < share) * gains[slat % gains.size] + 0.05)
 
     scene.waveform, scene.still = waveform, True
-    scene.late = rng.normal(0, 0.01) * np.arange(width)
+    scene.late = np.asarray(rng.normal(0, 0.01) * np.arange(width), np.float64)
     scene.exposure_rows = rng.uniform(1, 4)
     scene.about = {"period_rows": period, "duty": share}
     return scene
@@ -271,9 +271,9 @@ def _keyboard(rng: np.random.Generator, width: int, height: int) -> _Scene:
             face, letter = int(tone * rng.uniform(0.85, 1.0)), chr(int(rng.integers(65, 91)))
             cv2.rectangle(keys, (left + gap, top + gap), (left + across - gap, top + down - gap), face, -1)
             cv2.putText(keys, letter, (left + gap + 6, top + down - gap - 6), 0, 0.6, tone // 5, 2, cv2.LINE_AA)
-    light = keys.astype(np.float32) / 255
+    light = (keys / 255).astype(np.float32)
     if rng.random() < 0.5:
-        light = np.float32(rng.uniform(0.8, 1.0)) - light
+        light = (rng.uniform(0.8, 1.0) - light).astype(np.float32)
     return _on_screen(rng, light, width, height)
 
 

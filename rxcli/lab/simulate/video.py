@@ -41,7 +41,12 @@ _BT709, _MPEG_RANGE, _JPEG_RANGE = 1, 1, 2
 
 
 def write_video(
-    frames: Iterable[NDArray[np.generic]], path: Path, codec: str, frame_rate_hz: float, bit_rate: int | None = None
+    frames: Iterable[NDArray[np.generic]],
+    path: Path,
+    codec: str,
+    frame_rate_hz: float,
+    bit_rate: int | None = None,
+    preset: str = "veryfast",
 ) -> None:
     """Compress developed pictures into a clip.
 
@@ -51,6 +56,7 @@ def write_video(
         codec: one of `CODECS`.
         frame_rate_hz: of the clip.
         bit_rate: bits per second; None for the encoder's constant quality.
+        preset: how much work the encoder does; see x264 and x265.
 
     Raises:
         UsageError: unknown codec, or one that this machine's FFmpeg lacks.
@@ -65,7 +71,7 @@ def write_video(
         stream = None
         for number, rgb in enumerate(frames):
             if stream is None:
-                stream = _add_stream(container, settings, rate, rgb.shape, bit_rate)
+                stream = _add_stream(container, settings, rate, rgb.shape, bit_rate, preset)
             frame = av.VideoFrame.from_ndarray(
                 np.ascontiguousarray(rgb), "rgb24" if rgb.dtype == np.uint8 else "rgb48le"
             )
@@ -82,7 +88,9 @@ def write_video(
             container.mux(stream.encode(None))
 
 
-def _add_stream(container: Any, settings: Codec, rate: Fraction, shape: tuple[int, ...], bit_rate: int | None) -> Any:
+def _add_stream(
+    container: Any, settings: Codec, rate: Fraction, shape: tuple[int, ...], bit_rate: int | None, preset: str
+) -> Any:
     import av
 
     try:
@@ -99,7 +107,7 @@ def _add_stream(container: Any, settings: Codec, rate: Fraction, shape: tuple[in
     if bit_rate is not None:
         stream.bit_rate = bit_rate
     if settings.encoder != "mjpeg":
-        stream.options = {"preset": "veryfast"} | ({} if bit_rate else {"crf": "23"})
+        stream.options = {"preset": preset} | ({} if bit_rate else {"crf": "23"})
         if settings.encoder == "libx265":
             # Reordered frames of a clip shorter than the encoder's delay get times that no container takes; and the
             # encoders in cameras do not reorder either.

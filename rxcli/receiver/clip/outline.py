@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.context import Failure, Timer
+from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.outline import find_outline
 from rxcli.receiver.screen.registration import ScreenTexture
 from rxcli.types import FloatArray, Frame
@@ -26,10 +26,13 @@ class FirstOutline:
         frame: the first.
         corners: (4, 2) of the screen as found there.
         options: where they name the corners, there is nothing to find.
+        known: that frame with its camera, where it is known already.
     """
 
-    def __init__(self, frame: Frame, corners: FloatArray, options: ReceiverOptions) -> None:
-        self._options = options
+    def __init__(
+        self, frame: Frame, corners: FloatArray, options: ReceiverOptions, known: FrameContext | None = None
+    ) -> None:
+        self._options, self._known = options, known
         self._first = corners
         self._width = float(np.linalg.norm(corners[1] - corners[0]))
         self._differences = [np.zeros_like(corners)]
@@ -54,7 +57,7 @@ class FirstOutline:
         moved = self._texture.find(frame)
         if not moved.tells:
             moved = self._texture.with_outline(moved, self._first)
-        found = find_outline(frame, self._options, Timer())
+        found = find_outline(frame, self._options, Timer(), self._known)
         if isinstance(found, Failure) or not moved.fits or self._is_far(found.corners - moved.corners):
             # Nothing to compare with: what was found so far must do.
             self._texture = None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import channel, sync
 from rxcli.receiver.acquisition import Acquisition, sample_columns
-from rxcli.receiver.cameras import find_camera
+from rxcli.receiver.cameras import context_at
 from rxcli.receiver.clip import results
 from rxcli.receiver.clip.bursts import BurstReader
 from rxcli.receiver.clip.outline import FirstOutline
@@ -24,12 +24,29 @@ from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.decode import assemble, detect
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
-from rxcli.receiver.outline import Outline, find_outline
+from rxcli.receiver.outline import Located, locate
 from rxcli.receiver.screen_choice import acquire
-from rxcli.receiver.still import Reception, apply_autoencoder, decode, doubtful_columns, initial_pass
+from rxcli.receiver.single_light import STEADY_LIGHT, with_data
+from rxcli.receiver.still import (
+    Reception,
+    apply_autoencoder,
+    decode,
+    decode_likeliest,
+    doubtful_columns,
+    initial_pass,
+    shows_steady_light,
+)
 from rxcli.receiver.sync import tracking
+from rxcli.receiver.unknown_camera import (
+    Received,
+    fits,
+    likely_camera,
+    receive_unknown,
+    remember_estimate,
+    with_screen,
+)
 from rxcli.results.dump import dump_stages
-from rxcli.types import FloatArray, Frame, FrameResult, FrameSoftBits, IntArray
+from rxcli.types import BoolArray, FloatArray, Frame, FrameResult, FrameSoftBits, IntArray
 
 #: Frames at the start of a scene that are looked at once more when the picture is known better; how many are waited for
 #: where compression has taken much; and the share of the well lit packets that are then in doubt.
@@ -54,6 +71,8 @@ _MOST_UNKNOWN = 3
 _TOGETHER = 8
 #: Copies between two frames that have none in common.
 _FAR_APART = 1 << 12
+#: What the header of one burst may say of a column, nats.
+_MOST_HEADER = 12.0
 #: Frames that may wait until it is clear which copies begin a burst.
 _MAX_WAITING = 8
 
@@ -97,6 +116,26 @@ class _Link:
     last_time_s: float = 0.0
     #: Whether it was looked whether time stamps are the time.
     judged: bool = False
+    #: (1, C) log-likelihood of the headers of all bursts so far; None before any.
+    header_llr: FloatArray | None = None
+
+    def headerless(self, closed: Sequence[tracking.ClosedBurst], n_columns: int) -> BoolArray:
+        """(C,) columns that show no headers, in all bursts up to some that are closed."""
+        header_llr = np.zeros((1, n_columns)) if self.header_llr is None else self.header_llr
+        for burst in closed:
+            header_llr = header_llr + np.clip(burst.posteriors.header_llr, -_MOST_HEADER, _MOST_HEADER)
+        self.header_llr = header_llr
+        return assemble.without_header(header_llr) if closed else np.zeros(n_columns, bool)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Settled:
+    """A frame whose clock and camera are known."""
+
+    context: FrameContext
+    acquisition: Acquisition
+    #: What was received to know its camera; None where that was known.
+    reception: Reception | None = None
 
 
 class _Clip:
@@ -126,8 +165,8 @@ class _Clip:
         self._corners: FloatArray | None = None
         #: Some pixels of the last frame.
         self._some: NDArray[np.float32] | None = None
-        #: Number of a frame that is yet to be received, and its corners.
-        self._found: tuple[int, Outline] | None = None
+        #: Number of a frame that is yet to be received, and where its screen is.
+        self._found: tuple[int, Located] | None = None
         #: None where nothing is known, or frames cannot be tracked; and the one before the last search.
         self._scene: TrackedScreen | None = None
         self._scene_before: TrackedScreen | None = None
@@ -162,21 +201,26 @@ class _Clip:
 
     def _opens(self, frame: Frame) -> bool:
         """Whether a first frame shows a screen; its outline, and perhaps its clock, is then found with others."""
-        outline = find_outline(frame, self._options, Timer())
-        if isinstance(outline, Failure):
+        located = locate(frame, self._options, Timer())
+        if isinstance(located, Failure):
             return False
-        self._found = frame.index, outline
-        self._outline = FirstOutline(frame, outline.corners, self._options)
-        self._little = shows_little(frame, outline.corners, self._options)
+        outline = located.outline
+        context = located.context or likely_camera(frame, outline.corners, self._options, Timer())
+        self._found = frame.index, replace(located, context=context)
+        known = None if isinstance(context, Failure) else context
+        self._outline = FirstOutline(frame, outline.corners, self._options, known)
+        self._little = known is not None and shows_little(known)
         return True
 
     def _begin(self) -> list[FrameResult]:
         """The first frames, once they have agreed on an outline and, where each shows little, on a clock."""
         frames, self._first = self._first or [], None
         if self._outline is not None and self._found is not None:
-            index, outline = self._found
-            self._found = index, replace(outline, corners=self._outline.corners)
-        self._start = agree(frames, self._options) if self._little and len(frames) > 1 else None
+            index, located = self._found
+            self._found = index, _moved_to(located, self._outline.corners)
+            context = self._found[1].context
+            if self._little and len(frames) > 1 and isinstance(context, FrameContext):
+                self._start = agree(frames, context)
         return [result for frame in frames for result in self._take(frame)]
 
     def _take(self, frame: Frame) -> list[FrameResult]:
@@ -282,11 +326,15 @@ class _Clip:
         context = self._context_of(frame, timer)
         if isinstance(context, Failure):
             return context, None
-        acquisition = self._predicted(context) or acquire(context, sample_columns(context, context.n_columns))
-        if isinstance(acquisition, Failure):
-            return acquisition, None
+        received = self._with_settled_camera(context)
+        if isinstance(received, Failure):
+            return received, None
+        context, acquisition = received.context, received.acquisition
         can_track = self._can_track(context, acquisition)
-        reception, denoised, report = self._decoded(acquisition, can_track and self._n_held == _HELD, timer)
+        again = can_track and self._n_held == _HELD
+        reception, denoised, report = self._decoded(acquisition, received.reception, again, timer)
+        if self._start is None and shows_steady_light(reception):
+            return Failure("no_signal", STEADY_LIGHT), None
         if assemble.all_dark(reception.snr):
             message = "no light of the screen's columns is seen; something may be in front of it"
             return Failure("no_signal", message), None
@@ -311,20 +359,62 @@ class _Clip:
 
     def _context_of(self, frame: Frame, timer: Timer) -> FrameContext | Failure:
         """Where the screen is in a frame, and the camera, known from the frames before where nothing changed."""
+        if self._taken_with != _taken_with(frame) or "tracking" not in self._options.skip:
+            self._context = None
         found, self._found = self._found, None
-        outline = found[1] if found and found[0] == frame.index else find_outline(frame, self._options, timer)
-        if isinstance(outline, Failure):
-            return outline
-        corners, self._certainty = outline.corners, outline.certainty
+        known = found is not None and found[0] == frame.index
+        located = found[1] if found and known else locate(frame, self._options, timer, self._context)
+        if isinstance(located, Failure):
+            return located
+        corners, self._certainty = located.outline.corners, located.outline.certainty
         if self._scene_before is not None and self._scene_before.is_at(corners):
             corners = self._scene_before.corners
         self._corners = corners
-        if self._context is None or self._taken_with != _taken_with(frame) or "tracking" not in self._options.skip:
-            context = find_camera(frame, corners, self._options, timer)
+        if self._context is None:
+            context = located.context or likely_camera(frame, corners, self._options, timer)
             if isinstance(context, Failure):
                 return context
             self._context, self._taken_with = context, _taken_with(frame)
         return replace(self._context, frame=frame, corners=corners, timer=timer)
+
+    def _with_settled_camera(self, context: FrameContext) -> _Settled | Failure:
+        """The frame's clock; and where its camera was estimated, the camera that its slots tell, from then on."""
+        sampler = sample_columns(context, context.n_columns)
+        acquisition = with_data(context, sampler, self._predicted(context) or acquire(context, sampler))
+        camera, cache = context.camera, self._options.camera_cache
+        if camera.remembered:
+            return self._with_remembered_camera(context, acquisition)
+        if isinstance(acquisition, Failure):
+            return acquisition
+        if camera.blind_estimate is None or self._start is not None:
+            return _Settled(context, acquisition)
+        received = receive_unknown(context, acquisition, self._options.skip)
+        remember_estimate(received, cache)
+        return self._settled(received)
+
+    def _with_remembered_camera(self, context: FrameContext, acquisition: Acquisition | Failure) -> _Settled | Failure:
+        """With a camera known from other files; without what they said where it does not fit this one."""
+        timer, skip = context.timer, self._options.skip
+        if not isinstance(acquisition, Failure):
+            context = with_screen(context, acquisition)
+            if context.camera.blind_estimate is not None:
+                received = receive_unknown(context, acquisition, skip)
+            else:
+                with timer("detect"):
+                    received = Received(context, acquisition, decode_likeliest(acquisition, skip))
+            if fits(received.reception):
+                remember_estimate(received, self._options.camera_cache)
+                return self._settled(received)
+        anew = replace(self._options, camera_cache=None)
+        found = likely_camera(context.frame, context.corners, anew, timer)
+        return found if isinstance(found, Failure) else self._with_settled_camera(found)
+
+    def _settled(self, received: Received) -> _Settled:
+        """What was received, its camera being known from now on."""
+        camera = replace(received.context.camera, blind_estimate=None, remembered=False)
+        context = replace(received.context, camera=camera)
+        self._context = context
+        return _Settled(context, received.acquisition, received.reception)
 
     def _go_on(self, view: View, frame: Frame) -> None:
         """After a frame received like a photograph: with the scene before, as long as such frames are few.
@@ -345,19 +435,21 @@ class _Clip:
             self._scene, view.light, view.pose = before, None, None
 
     def _decoded(
-        self, acquisition: Acquisition, again: bool, timer: Timer
+        self, acquisition: Acquisition, reception: Reception | None, again: bool, timer: Timer
     ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
         """What is received at a lock, columns that the auto-encoder changed, and its report.
 
         A quick look that leaves little doubt is enough of a frame that is looked at `again` when the picture is known.
+        A reception that there is already needs no other.
         """
-        if again and self._options.cae != "always":
+        if reception is None and again and self._options.cae != "always":
             with timer("detect"):
                 reception = initial_pass(acquisition)
                 if doubtful_columns(reception).size <= _QUICK_DOUBT * reception.snr.shape[0]:
                     return reception, frozenset(), None
-        with timer("detect"):
-            reception = decode(acquisition, self._options.skip)
+        if reception is None:
+            with timer("detect"):
+                reception = decode(acquisition, self._options.skip)
         with timer("denoise"):
             return apply_autoencoder(acquisition, reception, self._options)
 
@@ -588,6 +680,8 @@ class _Clip:
         ended = results.bursts_of(closed, int(waiting.numbers[0]), view)
         columns = results.columns_of(view, ended, bursts.confidence(going_on), self._options.min_confidence)
         columns = assemble.with_doubt(columns, self._certainty, self._options.min_confidence)
+        if self._link is not None:
+            columns = assemble.without_packets(columns, self._link.headerless(closed, len(columns)))
         if self._options.dump_dir is not None:
             found = results.taps(waiting, view, ended)
             dump_stages(self._options.dump_dir, waiting.result.source, waiting.result.frame, found)
@@ -603,6 +697,13 @@ class _Clip:
         if soft is None:
             return None
         return replace(soft, source=result.source, frame=result.frame, time_s=result.time_s)
+
+
+def _moved_to(located: Located, corners: FloatArray) -> Located:
+    """The same with the corners elsewhere."""
+    context = located.context
+    moved = context_at(context, corners) if isinstance(context, FrameContext) else context
+    return Located(replace(located.outline, corners=corners), moved)
 
 
 def _taken_with(frame: Frame) -> tuple[object, ...]:

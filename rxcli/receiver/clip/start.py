@@ -11,19 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver import sync
-from rxcli.receiver.acquisition import (
-    Acquisition,
-    ColumnSampler,
-    noise_of,
-    sample_columns,
-)
-from rxcli.receiver.cameras import find_camera
-from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
-from rxcli.receiver.outline import find_outline
+from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sample_columns
+from rxcli.receiver.context import Camera, FrameContext
 from rxcli.receiver.screen_choice import told_apart_by_clock, variants_of
 from rxcli.receiver.sync.tracking import LinkTime
 from rxcli.types import Clock, FloatArray, Frame, RowProfiles
@@ -47,23 +39,15 @@ class Start:
     time: LinkTime
 
 
-def shows_little(frame: Frame, corners: FloatArray, options: ReceiverOptions) -> bool:
-    """Whether a frame with the screen at the corners (4, 2) shows too few packets to find its clock alone."""
-    context = find_camera(frame, corners, options, Timer())
-    if isinstance(context, Failure):
-        return False
-    shown = min(float(corners[:, 1].max()), frame.height - 1.0) - max(float(corners[:, 1].min()), 0.0)
+def shows_little(context: FrameContext) -> bool:
+    """Whether a frame shows too few packets to find its clock alone."""
+    corners, height = context.corners, context.frame.height
+    shown = min(float(corners[:, 1].max()), height - 1.0) - max(float(corners[:, 1].min()), 0.0)
     return shown * context.camera.line_delay_s < _FEW_PACKETS * min(screen.packet_s for screen in context.screens)
 
 
-def agree(frames: Sequence[Frame], options: ReceiverOptions) -> Start | None:
-    """The clock that the headers of several frames agree on, None where they do not."""
-    outline = find_outline(frames[0], options, Timer())
-    if isinstance(outline, Failure):
-        return None
-    context = find_camera(frames[0], outline.corners, options, Timer())
-    if isinstance(context, Failure):
-        return None
+def agree(frames: Sequence[Frame], context: FrameContext) -> Start | None:
+    """The clock that the headers of several frames agree on, None where they do not; `context` is of the first."""
     best: tuple[float, Start] | None = None
     for n_columns in sorted({screen.columns for screen in context.screens}):
         profiles_of = [sample_columns(replace(context, frame=frame), n_columns).profiles for frame in frames]

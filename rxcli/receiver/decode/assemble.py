@@ -325,12 +325,25 @@ def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolA
     return np.asarray(two & beside)
 
 
-def without_header(posteriors: BurstPosteriors) -> BoolArray:
-    """(C,) columns whose header does not show; all where the columns together show none: no light, no packet."""
+def without_header(header_llr: FloatArray) -> BoolArray:
+    """(C,) columns whose header does not show; all where the columns together show none: no light, no packet.
+
+    Args:
+        header_llr: (B, C) of bursts, see `BurstPosteriors`.
+    """
     # A glare may spoil one header altogether: a good one elsewhere outweighs it.
-    by_column = np.maximum(posteriors.header_llr, -_GOOD_HEADER).sum(axis=0)
+    by_column = np.maximum(header_llr, -_GOOD_HEADER).sum(axis=0)
     together = np.maximum(by_column, -_GOOD_HEADER).sum() > _HEADERS_AT_LEAST
-    return np.asarray(by_column < (_CONTRADICTED if together else np.inf))
+    return np.asarray(by_column < (_CONTRADICTED if together else np.inf), bool)
+
+
+def without_packets(columns: tuple[ColumnResult, ...], headerless: BoolArray) -> tuple[ColumnResult, ...]:
+    """Columns of a clip, without the packets of those (C,) of which headers say that there are none."""
+    message = _HEADERLESS + _OTHER_SCREEN
+    return tuple(
+        replace(column, packets=(), w=None, status="no_packet", message=message) if out and column.packets else column
+        for column, out in zip(columns, headerless, strict=True)
+    )
 
 
 def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:
@@ -373,7 +386,8 @@ class _Doubts:
 
 def _doubts(posteriors: BurstPosteriors, confidence_features: FloatArray) -> _Doubts:
     unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of few bits are filled up with NaN
-    return _Doubts(confidence(confidence_features), np.nanmean(unsure, axis=(2, 3)), confidence_features)
+    still = confidence_features[..., : len(_CALIBRATION)]
+    return _Doubts(confidence(still), np.nanmean(unsure, axis=(2, 3)), confidence_features)
 
 
 def _clip_doubts(burst: BurstInClip) -> _Doubts:
@@ -382,9 +396,10 @@ def _clip_doubts(burst: BurstInClip) -> _Doubts:
     Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
     What slots say against the codeword that was decided shows it.
     """
-    doubts = _doubts(burst.posteriors, burst.confidence_features[None])
     if burst.against is None:
-        return doubts
+        return _doubts(burst.posteriors, burst.confidence_features[None])
+    features = clip_features(burst)
+    doubts = _doubts(burst.posteriors, features[None])
     log_odds = clip_log_odds(burst)
     n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
     at_evens = np.maximum(WRONG_AT_EVENS / n_bits, BER_AT_EVENS)
@@ -396,9 +411,33 @@ def clip_log_odds(burst: BurstInClip) -> FloatArray:
     """(1, C) calibrated log-odds of the packets of a burst of a clip being error-free."""
     if burst.against is None:
         return confidence_log_odds(burst.confidence_features[None])
-    offset, slope, slope_against = _CLIP_CALIBRATION
-    log_odds = _log_odds(burst.posteriors.log_prob.sum(axis=2))
-    return np.asarray(offset + slope * log_odds + slope_against * np.log(burst.against + _AGAINST_AT_LEAST))
+    return np.asarray(clip_features(burst)[None, :, :3] @ np.array(_CLIP_CALIBRATION))
+
+
+def clip_features(burst: BurstInClip) -> FloatArray:
+    """(C, k) what the confidence of a burst's packets is made of, in the order of `_CLIP_CALIBRATION`."""
+    assert burst.against is not None
+    log_odds = _log_odds(burst.posteriors.log_prob.sum(axis=2))[0]
+    capped = np.clip(log_odds, -8, 8)
+    n = log_odds.size
+    others = (capped.sum() - capped) / max(n - 1, 1)
+    beside = np.stack([np.r_[capped[:1], capped[:-1]], np.r_[capped[1:], capped[-1:]]]).min(axis=0)
+    return np.stack(
+        [
+            np.ones(n),
+            log_odds,
+            np.log(burst.against + _AGAINST_AT_LEAST),
+            others,
+            beside,
+            np.minimum(burst.posteriors.header_llr[0], 20),
+            _log_odds(burst.posteriors.log_prob.min(axis=2))[0],
+            np.full(n, np.log(len(burst.frames))),
+            burst.n_observed.sum(axis=1) / burst.n_observed.shape[1],
+            *burst.confidence_features[:, 1:].T,
+            _log_odds(burst.posteriors.w_log_prob.max(axis=1)),
+        ],
+        axis=1,
+    )
 
 
 def _packet(

@@ -1,8 +1,11 @@
-"""Light that a lamp or a dimmed screen switches on and off steadily: it looks like packets, but says nothing.
+"""Light that is switched but says nothing: of lamps, and of screens that are dimmed by switching.
 
 A waveform of any period far below a packet's has few free parameters. Where it explains the light, and does so better
 than the slots that were decided, the slots are no evidence of packets. Headers and dimming symbols break every such
 period, so that packets whose payload repeats one symbol are not refused.
+
+Columns are independent transmitters. Where all show the same light, it is that of one lamp, and what twenty columns
+say of it counts once.
 """
 
 from __future__ import annotations
@@ -19,6 +22,9 @@ _STEADY = 0.6
 _REACH_SLOTS = 2
 #: Spectra are computed on a grid so many times finer than the light's length resolves.
 _FINER = 4
+#: Columns this far apart, of all, and by number, share no light; correlation from which they show the same. Packets,
+#: which have headers in common, reach 0.5, and light that is the same everywhere 0.7 and more. Pairs that are compared.
+_APART_SHARE, _APART, _ALIKE, _MOST_PAIRS = 1 / 6, 3, 0.65, 300
 
 
 def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, packet_slots: int) -> bool:
@@ -32,12 +38,31 @@ def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, pack
     """
     samples_per_slot = value.shape[1] // lit.shape[1]
     observed = weight > 0
-    level = value * observed
-    level = (level - level.sum(axis=1, keepdims=True) / np.maximum(observed.sum(axis=1, keepdims=True), 1)) * observed
+    level = (value - _mean(value, observed)) * observed
     if not level.any():
         return False
     steady = periodic_share(level, packet_slots * samples_per_slot)
     return steady > _STEADY and steady > _share_of_slots(level, observed, lit, samples_per_slot)
+
+
+def is_alike(value: Float32Array, weight: Float32Array, reach: int = 0) -> bool:
+    """Whether columns far apart show the same light, up to `reach` samples later or earlier; see `is_steady`."""
+    n_columns, n = value.shape
+    first, second = np.triu_indices(n_columns, max(_APART, int(_APART_SHARE * n_columns)))
+    if first.size == 0:
+        return False
+    some = np.linspace(0, first.size - 1, min(first.size, _MOST_PAIRS)).astype(np.int64)
+    observed = weight > 0
+    level = (value - _mean(value, observed)) * observed
+    level = level / np.maximum(np.sqrt(np.square(level).sum(axis=1, keepdims=True)), 1e-9)
+    spectrum = np.fft.rfft(level, n + reach, axis=1)
+    moved = np.fft.irfft(spectrum[first[some]] * np.conj(spectrum[second[some]]), n + reach, axis=1)
+    likeness = np.concatenate([moved[:, : reach + 1], moved[:, moved.shape[1] - reach :]], axis=1).max(axis=1)
+    return bool(np.median(likeness) > _ALIKE)
+
+
+def _mean(value: Float32Array, observed: BoolArray) -> FloatArray:
+    return np.asarray((value * observed).sum(axis=1, keepdims=True) / np.maximum(observed.sum(1, keepdims=True), 1))
 
 
 def periodic_share(level: FloatArray | Float32Array, packet_samples: int) -> float:

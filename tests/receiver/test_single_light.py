@@ -1,0 +1,80 @@
+"""Light that is the same everywhere: lamps and dimmed screens give no packets, a screen that says one thing does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.lab.benchmark.trial import simulate_trial
+from rxcli.lab.simulate.no_data import draw_no_data
+from rxcli.lab.simulate.scenes import preset
+from rxcli.profiles import CameraProfile, ReadoutMode
+from rxcli.receiver.decode.steady import is_alike
+from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.types import Frame
+
+#: Seeds whose pictures are large and striped enough to be taken for a screen.
+PWM, CODE = 0, 1
+
+
+def clip_of(kind: str, seed: int, n_frames: int) -> tuple[list[Frame], ReceiverOptions]:
+    """Frames without data, and a camera that reads them out in 20 ms."""
+    made = draw_no_data(kind, np.random.default_rng([999, seed, 23]), n_frames)
+    height, width = made.frames[0].shape
+    mode = ReadoutMode(name="whole", width=width, height=height, line_delay_s=20e-3 / height, exposure_s=40e-6)
+    camera = CameraProfile(name="said", modes=(mode,))
+    step_s = made.frame_rows * mode.line_delay_s
+    frames = [Frame(pixels, "drawn", number, number * step_s) for number, pixels in enumerate(made.frames)]
+    return frames, ReceiverOptions(cameras=(camera,), force_camera=True)
+
+
+@pytest.mark.parametrize("n_frames", [1, 3])
+@pytest.mark.parametrize(("kind", "says"), [("pwm", "steadily"), ("codes", "same light")])
+def test_one_lamp_gives_no_packets_and_is_named(kind: str, says: str, n_frames: int) -> None:
+    """Photographs and clips alike; what is seen is named in one of a few pictures at least."""
+    messages = []
+    for seed in range(4 if n_frames == 1 else 2):
+        results = list(receive(*clip_of(kind, seed, n_frames)))
+        assert len(results) == n_frames
+        assert not any(column.packets for result in results for column in result.columns)
+        messages += [result.message or "" for result in results]
+    assert any(says in message for message in messages)
+
+
+@dataclass(frozen=True)
+class Alike:
+    """The same random labels in all columns."""
+
+    def labels(self, bursts: NDArray[np.int64], columns: int, payload_symbols: int) -> NDArray[np.uint8]:
+        """See `LabelSource`."""
+        rng = np.random.default_rng(bursts)
+        return np.repeat(rng.integers(0, 128, (bursts.size, payload_symbols, 1), np.uint8), columns, axis=2)
+
+
+@pytest.mark.parametrize("screen", ["paper-8k65", "paper-17k3"])
+def test_a_screen_that_says_the_same_in_all_columns_is_received(screen: str) -> None:
+    scene = preset("phone-plain", screen).scaled(0.3, 0.5, keep_readout=True)
+    trial = simulate_trial(replace(scene, labels=Alike(), picture="coffee"), 3)
+    result, score = trial.receive(trial.options())
+    assert result.status == "ok"
+    assert score.error_free >= 18
+    assert len({column.packets[0].payload for column in result.columns}) <= 2
+
+
+def test_columns_are_alike_that_show_one_light() -> None:
+    """With noise, and a little later from column to column; packets of one clock are not alike."""
+    rng = np.random.default_rng(1)
+    light = np.sign(rng.normal(size=400))
+    slanted = np.stack([light[k : k + 300] for k in range(20)]).astype(np.float32)
+    noisy = slanted + rng.normal(0, 0.5, slanted.shape).astype(np.float32)
+    weight = np.ones_like(noisy)
+    assert is_alike(noisy, weight, 20)
+    assert not is_alike(noisy, weight)
+    different = rng.normal(size=(20, 300)).astype(np.float32)
+    different[:, ::4] = light[:75]
+    assert not is_alike(different, weight, 20)
+    assert not is_alike(different[:2], weight[:2])
+    assert not is_alike(np.zeros_like(weight), np.zeros_like(weight), 20)
