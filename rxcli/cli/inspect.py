@@ -39,7 +39,7 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
     Of a clip, the first frames are received, and one is shown in full.
     """
     from rxcli.outputs import Output, claim_own_folder, write_whole
-    from rxcli.results.overlay import camera_of
+    from rxcli.results.cameras import camera_of
     from rxcli.results.page import MARK, inspection_page
     from rxcli.results.report import format_link
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.profiles import CameraProfile, ScreenProfile
-from rxcli.receiver.camera import camera_profile
 from rxcli.receiver.screen import geometry
 from rxcli.results.undistort import grey_levels
 from rxcli.types import FloatArray, Frame, FrameResult, Outlines
@@ -42,14 +41,6 @@ def preview(frame: Frame, width_px: int = 1000) -> Preview:
     """A copy of `frame` at most about `width_px` wide: every so many pixels, so that stripes stay stripes."""
     step = max(1, math.ceil(max(frame.width, frame.height) / width_px))
     return Preview(grey_levels(frame, step), step)
-
-
-def camera_of(frame: Frame, result: FrameResult, cameras: tuple[CameraProfile, ...]) -> CameraProfile | None:
-    """The camera that a frame was received with: the profile that is named, or the one that was estimated."""
-    named = next((camera for camera in cameras if camera.name == result.camera_profile), None)
-    if named is not None or "line_delay_s" not in result.estimated:
-        return named
-    return camera_profile(result.estimated, "estimated", None, None, frame.width, frame.height)
 
 
 def outlines_of(

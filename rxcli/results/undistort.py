@@ -128,8 +128,6 @@ class UndistortedWriter:
         Raises:
             OutputError: the file cannot be written, or is there and none of ours.
         """
-        from rxcli.results.overlay import camera_of
-
         frame = self._waiting.pop((result.source, result.frame), None)
         if frame is None:
             return

@@ -339,7 +339,8 @@ def _picture(result: FrameResult, frame: Frame | None, options: ReceiverOptions)
     """The picture as JPEG, and outlines in its pixels; empty where there is no frame."""
     if frame is None:
         return {}
-    from rxcli.results.overlay import camera_of, column_polygons, preview
+    from rxcli.results.cameras import camera_of
+    from rxcli.results.overlay import column_polygons, preview
 
     small = preview(frame)
     screen = next((screen for screen in options.screens if screen.name == result.screen_profile), None)

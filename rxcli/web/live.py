@@ -180,7 +180,8 @@ class _Watched:
 
     def picture(self, result: FrameResult, options: ReceiverOptions) -> dict[str, Any] | None:
         """The picture of a result with its outlines, in its pixels."""
-        from rxcli.results.overlay import camera_of, column_polygons
+        from rxcli.results.cameras import camera_of
+        from rxcli.results.overlay import column_polygons
 
         small = self._previews.get(result.frame)
         if small is None or self._frame is None:

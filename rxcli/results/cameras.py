@@ -1,0 +1,15 @@
+"""With which camera a frame was received."""
+
+from __future__ import annotations
+
+from rxcli.profiles import CameraProfile
+from rxcli.receiver.camera import camera_profile
+from rxcli.types import Frame, FrameResult
+
+
+def camera_of(frame: Frame, result: FrameResult, cameras: tuple[CameraProfile, ...]) -> CameraProfile | None:
+    """The camera that a frame was received with: the profile that is named, or the one that was estimated."""
+    named = next((camera for camera in cameras if camera.name == result.camera_profile), None)
+    if named is not None or "line_delay_s" not in result.estimated:
+        return named
+    return camera_profile(result.estimated, "estimated", None, None, frame.width, frame.height)
