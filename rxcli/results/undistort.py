@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rxcli.outputs import PICTURE, check_replaceable, encode_png, unwritable, write_whole
 from rxcli.profiles import CameraProfile, match_camera
 from rxcli.receiver.screen.geometry import lens_for
+from rxcli.results.cameras import camera_of
 from rxcli.types import Float32Array, Frame, FrameResult, Lens
 
 log = logging.getLogger(__name__)
