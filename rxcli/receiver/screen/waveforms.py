@@ -135,6 +135,8 @@ def refine_by_waveforms(strips: StripLight, grid: Grid) -> Grid:
         off, precision = _off(strips, columns_at(numbers, strips.x, strips.y))
         limit = _ROBUST / np.sqrt(np.maximum(precision, 1e-9))
         weight = (precision / np.maximum(np.abs(off) / limit, 1.0)).ravel()
+        if not weight.any():
+            break  # A black picture: nothing says where the borders are.
         flat = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
         normal = (flat * weight) @ flat.T
         gradient = flat @ (weight * off.ravel()) - prior * numbers
