@@ -215,10 +215,13 @@ modes = st.builds(
 )
 lenses = st.builds(
     lambda f, c, d, w, h: LensModel(
-        width=w, height=h, camera_matrix=((f, 0.0, c), (0.0, f, c), (0.0, 0.0, 1.0)), dist_coeffs=tuple(d)
+        width=w,
+        height=h,
+        camera_matrix=((f * max(w, h), 0.0, c * w), (0.0, f * max(w, h), c * h), (0.0, 0.0, 1.0)),
+        dist_coeffs=tuple(d),
     ),
-    st.floats(1, 1e5),
-    numbers,
+    st.floats(0.01, 100),
+    st.floats(-100, 100),
     st.lists(numbers, min_size=4, max_size=14),
     sizes,
     sizes,
