@@ -185,7 +185,7 @@ def claim_own_folder(option: str, folder: Path, known: Iterable[str] = (), force
             reason = f"{option} {folder}: the folder holds files that this command did not write"
             raise UsageError(reason, "name a new folder, or an empty one")
     except OSError as error:
-        raise UsageError(f"{option} {folder}: {_reason(error)}", "name another folder") from None
+        raise _refusal(f"{option} {folder}", error, "name another folder") from None
 
 
 def _identity(path: Path) -> object | None:

@@ -332,6 +332,6 @@ def test_a_folder_of_results_is_new_empty_or_the_commands_own(tmp_path: Path) ->
     outputs.claim_own_folder("--out", other, (), force=True)
     with pytest.raises(UsageError, match="the folder holds files"):
         outputs.claim_own_folder("--out", other, ("*.journal.jsonl",))
-    with pytest.raises(UsageError, match=r"a\.jpg: File exists"):
+    with pytest.raises(UsageError, match="File exists"):
         outputs.claim_own_folder("--out", other / "a.jpg")
     assert not any((folder / outputs.OUTPUT_MARKER).exists() for folder in (old, other))
