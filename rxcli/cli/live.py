@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
-from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -271,8 +270,8 @@ class Status:
         while len(self._bars) < len(lines):
             self._bars.append(tqdm(position=len(self._bars), **form))
         lines[0] = _coloured(lines[0], self.state is not None and self.state.locked)
-        for bar, line in zip_longest(self._bars, lines, fillvalue=""):
-            bar.set_description_str(line)
+        for place, bar in enumerate(self._bars):
+            bar.set_description_str(lines[place] if place < len(lines) else "")
 
 
 def format_status(state: AimState | None, counts: CameraCounts) -> list[str]:

@@ -249,7 +249,7 @@ class Server:
         body = (_PAGE / request.match_info["name"]).read_bytes()
         return web.Response(body=body, content_type=kind, charset="utf-8")
 
-    async def _photo(self, request: web.Request) -> web.Response:
+    async def _photo(self, request: web.Request) -> web.StreamResponse:
         bounds = self._site.bounds
         if self._n_uploads >= bounds.uploads:
             return _answer(refusal("other pictures are being read just now", "try again in a few seconds"), 503)
