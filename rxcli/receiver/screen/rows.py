@@ -21,8 +21,10 @@ from rxcli.types import FloatArray
 _BINS, _BEYOND = 320, 0.6
 #: Share of the strips, the least alike, that are taken to be without light.
 _DARK_SHARE = 0.1
+#: Places with less than this share of the strips that others have count in proportion.
+_FEW_STRIPS = 0.5
 #: Light counts from this share of what the lit rows have.
-_LIT_SHARE = 0.12
+_LIT_SHARE = 0.18
 #: Bars take no more than this, screen heights; and so many more rows are kept than have light.
 _BARS, _MORE = 0.45, 0.03
 #: Sides are no further apart than the screen's height and this share of it.
@@ -123,47 +125,49 @@ def find_rows(
         middle = plane.pixels(np.array([[n_columns / 2, (top + bottom) / 2]]))[0, 1]
         plane = Plane.through(grid, n_columns, aspect, float(middle))
     top, bottom = lit_range(*light_along(strips, plane, n_columns))
-    by_sides = _by_sides(plane, n_columns, sides, top, bottom)
-    if by_sides is not None:
-        return (Rows(plane, by_sides, n_columns),)
-    ends = _possible_ends(top, bottom)
-    return tuple(Rows(plane, np.array([[top, top], [bottom, bottom]]), n_columns) for top, bottom in ends)
-
-
-def _possible_ends(top: float, bottom: float) -> list[tuple[float, float]]:
-    """Ends of a screen that has light between two places: the light lies in its middle, at its end, or it is all."""
-    less = 1 - (bottom - top)
-    if less < _WHOLE:
-        middle = (top + bottom) / 2
-        return [(middle - 0.5, middle + 0.5)]
-    ends = [(top - less / 2, bottom + less / 2)]
-    if less > 2 * _WHOLE:
-        more = min(_MORE, less / 2)
-        ends += [(top - more, bottom + more), (top - more, top - more + 1), (bottom + more - 1, bottom + more)]
-    return ends if less < _BARS else ends[:1] + ends[2:] + ends[1:2]
-
-
-def _by_sides(plane: Plane, n_columns: int, sides: Sequence[Side], top: float, bottom: float) -> FloatArray | None:
-    """(2, 2) v at the left and right end of top and bottom by the sides; None where they do not show well."""
     light = np.array([[top, top], [bottom, bottom]])
+    shown = _shown_sides(plane, n_columns, sides, light)
+    return tuple(Rows(plane, ends, n_columns) for ends in _possible_ends(light, shown))
+
+
+def _possible_ends(light: FloatArray, shown: FloatArray) -> list[FloatArray]:
+    """(2, 2) ends that the screen may have, likeliest first: what has light, or more of it on either side.
+
+    Args:
+        light: (2, 2) where the light begins and ends, at the left and the right end.
+        shown: (2, 2) the same by the sides; NaN for one that does not show.
+    """
+    sees = np.isfinite(shown).all(axis=1)
+    less = 1 - float(np.diff(light.mean(axis=1))[0])
+    more = float(np.clip(less / 2, 0, _MORE)) * np.array([[-1.0], [1.0]])
+    tight = np.where(np.isfinite(shown), shown, light + more)
+    if sees.all():
+        return [tight]
+    if not sees.any() and less < _WHOLE:
+        return [light + less / 2 * np.array([[-1.0], [1.0]])]
+    anchored = [tight[0] + np.array([[0.0], [1.0]]), tight[1] + np.array([[-1.0], [0.0]])]
+    if sees.any():
+        return [tight, anchored[int(sees.argmax())]]
+    whole = [light + less / 2 * np.array([[-1.0], [1.0]])]
+    if less < 2 * _WHOLE:
+        return whole
+    return [*whole, tight, *anchored] if less < _BARS else [*whole, *anchored, tight]
+
+
+def _shown_sides(plane: Plane, n_columns: int, sides: Sequence[Side], light: FloatArray) -> FloatArray:
+    """(2, 2) v at the left and right end of top and bottom, NaN for sides that do not show well or lie in the light."""
+    ends = np.full((2, 2), np.nan)
     if not sides:
-        return None
-    ends = np.array([[_meets(plane, side, u) for u in (0.0, float(n_columns))] for side in sides])
-    shows = np.array([side.support >= _SHOWS for side in sides]) & (np.abs(np.diff(ends, axis=1)[:, 0]) < _SLANTED)
-    height = float(np.diff(ends.mean(axis=1))[0])
-    if shows.all() and _LEAST_HEIGHT < height < 1 + _WHOLE and bottom - top < height + _LEFT_OUT:
-        middle = ends.mean(axis=1)
-        return ends if middle[0] < (top + bottom) / 2 < middle[1] else None
-    off = np.abs(ends.mean(axis=1) - light[:, 0])
-    near = np.flatnonzero(shows & (off < _LEFT_OUT))
-    if not near.size:
-        return None
-    light[near] = ends[near]
-    if near.size == 1:
-        # Where one side shows, the other one is a screen's height away: rows too many cost next to nothing.
-        other = 1 - int(near[0])
-        light[other] = light[1 - other] + (1 if other else -1)
-    return light
+        return ends
+    meets = np.array([[_meets(plane, side, u) for u in (0.0, float(n_columns))] for side in sides])
+    shows = np.array([side.support >= _SHOWS for side in sides]) & (np.abs(np.diff(meets, axis=1)[:, 0]) < _SLANTED)
+    middle, lit = meets.mean(axis=1), light.mean(axis=1)
+    both = shows.all() and _LEAST_HEIGHT < middle[1] - middle[0] < 1 + _WHOLE
+    if both and lit[1] - lit[0] < middle[1] - middle[0] + _LEFT_OUT and middle[0] < lit.mean() < middle[1]:
+        return meets
+    near = shows & (np.abs(middle - lit) < _LEFT_OUT)
+    ends[near] = meets[near]
+    return ends
 
 
 def _meets(plane: Plane, side: Side, u: float) -> float:
@@ -179,7 +183,8 @@ def _meets(plane: Plane, side: Side, u: float) -> float:
 def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:
     """From where to where there is light, no more than a screen's height, 1."""
     step = float(v[1] - v[0])
-    gain = np.concatenate([[0.0], np.cumsum(light - _LIT_SHARE * max(float(np.percentile(light, 85)), 1e-6))])
+    full = max(float(np.percentile(light[light != 0], 75)), 1e-6) if light.any() else 1e-6
+    gain = np.concatenate([[0.0], np.cumsum(np.minimum(light, full) - _LIT_SHARE * full)])
     n = min(round(1 / step), light.size)
     end = int((gain - np.minimum.accumulate(gain)).argmax())
     start = int(gain[: end + 1].argmin())
@@ -209,4 +214,6 @@ def light_along(strips: StripLight, plane: Plane, n_columns: int) -> tuple[Float
     good = (place >= 0) & (place < _BINS)
     light = (alike[inside].ravel() - np.float32(max(dark, 0.0)))[good]
     total, count = np.bincount(place[good], light, _BINS), np.bincount(place[good], minlength=_BINS)
-    return (edges[1:] + edges[:-1]) / 2, np.asarray(total / np.maximum(count, 1.0))
+    # At the ends of the picture a few strips alone say little.
+    enough = _FEW_STRIPS * float(np.median(count[count > 0])) if count.any() else 1.0
+    return (edges[1:] + edges[:-1]) / 2, np.asarray(total / np.maximum(count, enough))
