@@ -55,6 +55,9 @@ _CLEAR = 6.0
 _PACKETS_COUNT, _MOST_LOOKS = 0.08, 6
 #: Outlines whose packets differ by less than this, nats, show the same; and the certainty from which one is likely.
 _SAME_PACKETS, _LIKELY = 40.0, 0.5
+#: Where no numbering is likely, columns are counted from the left of what is seen, if that is less likely than the
+#: likeliest by no more than this, log-odds.
+_MAY_BE = 3.0
 #: Packets by which other rows must show more, nats.
 _BETTER_ROWS = 10.0
 #: Columns that look less like packets than this have no light, nats.
@@ -82,8 +85,15 @@ class Outline:
     by_grid_alone: bool = False
     #: Outlines of one family are alike but for the first column.
     family: int = 0
+    #: Whether light reaches to both ends of the picture.
+    fills: bool = False
     #: Corners that it has with other rows, likeliest first.
     other_rows: tuple[FloatArray, ...] = ()
+
+    @property
+    def is_counted_from_left(self) -> bool:
+        """Whether no side is in view that tells which column is the first."""
+        return self.fills and self.column_offset is None
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -219,7 +229,7 @@ def _with_shifts(
     strips = StripLight.of(coherence, layout.sigma, lens)
     start = first_columns(light_profile(strips, grid), grid, layout.n_columns, sides.lines)
     shifted = [
-        _moved(own, int(first), float(odds), layout.n_columns, lens)
+        _moved(replace(own, fills=start.fills), int(first), float(odds), layout.n_columns, lens)
         for first, odds in zip(start.first, start.log_odds, strict=True)
         if odds > _RIVAL_SHIFT
     ]
@@ -256,6 +266,7 @@ def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: i
             inferred=SIDE_NAMES,
             other_rows=numbering.corners[1:],
             log_odds=_odds_of(numbering, numberings),
+            fills=numbering.fills,
             by_grid_alone=alone,
             family=families.setdefault(numbering.grid.numbers[1:].tobytes(), len(families)),
         )
@@ -347,8 +358,19 @@ def _likeliest(candidates: list[Outline]) -> Outline | None:
         return None
     odds = np.array([one.log_odds for one in candidates])
     share = np.exp(odds - odds.max())
-    best, certainty = int(share.argmax()), float(1 / share.sum())
-    return replace(candidates[best], certainty=certainty, column_offset=0 if certainty >= _LIKELY else None)
+    best, certainty = candidates[int(share.argmax())], float(1 / share.sum())
+    if certainty >= _LIKELY:
+        return replace(best, certainty=certainty)
+    if best.fills:
+        alike = [one for one in candidates if one.family == best.family and one.log_odds > best.log_odds - _MAY_BE]
+        best = max(alike, key=_leftmost)
+    return replace(best, certainty=certainty, column_offset=None)
+
+
+def _leftmost(outline: Outline) -> float:
+    """How far right, for a viewer, an outline begins: of those that leave no light out the furthest begins in view."""
+    along = outline.corners[1] - outline.corners[0]
+    return float(outline.corners[0] @ along / np.linalg.norm(along))
 
 
 def _context_of_any(

@@ -38,6 +38,12 @@ from rxcli.types import FloatArray, Frame, FrameResult
 __all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "failed", "receive", "receive_frame"]
 
 
+_COUNTED_FROM_LEFT = (
+    "no side of the screen is in view: columns are counted from the left of what is seen; take one side into view to "
+    "have the screen's numbers"
+)
+
+
 def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
     """Receive the frames of one source, in order; one result a frame, in order.
 
@@ -145,7 +151,7 @@ def _receive_still(
     if options.soft_bits:
         result = replace(result, soft_bits=soft_bits(frame, reception, no_header, denoised))
     if result.status != "no_signal":
-        return result
+        return replace(result, message=_COUNTED_FROM_LEFT) if outline.is_counted_from_left else result
     message = too_small(context, acquisition.screen) or assemble.why_no_packet(columns)
     return without_estimate(replace(result, message=message), context.camera, reception)
 

@@ -26,9 +26,10 @@ def test_scenes_are_dark_half_of_the_time_and_stand_in_the_picture() -> None:
 
 
 def test_rows_count_packets_numbers_and_confidence() -> None:
-    one = {"status": "ok", "error_free": 18, "confident": 10, "confident_wrong": 1, "shift": 1}
+    one = {"status": "ok", "error_free": 18, "confident": 10, "confident_wrong": 1, "shift": 1, "numbered": True}
     other = {**one, "error_free": 20, "shift": 0}
     records = [{"kind": "night", "searched": one, "given": other}, {"kind": "photo", "searched": other, "given": other}]
     dark, every = rows(records)[-2:]
-    assert (dark["searched"], dark["corners_given"], dark["shifted"]) == (18, 20, 1)
+    assert (dark["searched"], dark["corners_given"], dark["shifted"], dark["numbered_wrong"]) == (18, 20, 1, 1)
+    assert (dark["not_found"], dark["of"]) == (0, 1)
     assert every["share"] == pytest.approx(38 / 40)

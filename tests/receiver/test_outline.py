@@ -27,11 +27,11 @@ CORNERS = np.array([[150.0, 320.0], [1105.0, 290.0], [1130.0, 880.0], [120.0, 85
 OPTIONS = ReceiverOptions(screens=(load_profile("paper-17k3", ScreenProfile),))
 
 
-def drawn(first: int, last: int) -> NDArray[np.uint8]:
+def drawn(first: int, last: int, corners: FloatArray = CORNERS) -> NDArray[np.uint8]:
     """Luma of a screen that shows light in the columns from one to before another."""
     rng = np.random.default_rng(3)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
-    at = np.linalg.inv(geometry.homography(CORNERS)) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    at = np.linalg.inv(geometry.homography(corners)) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
     u, v = (at[:2] / at[2]).reshape(2, HEIGHT, WIDTH)
     sent = rng.integers(0, 2, (int(HEIGHT / ROWS_PER_SLOT) + 2, COLUMNS))
     now = sent[(np.arange(HEIGHT) / ROWS_PER_SLOT).astype(int)]
@@ -86,6 +86,31 @@ def test_dark_columns_at_both_ends_leave_as_many_first_columns() -> None:
     share = np.exp(start.log_odds) / np.exp(start.log_odds).sum()
     assert share.max() < 0.5
     assert set(start.first[start.log_odds > -3]) >= {-1, 0, 1, 2}
+
+
+LARGE = np.array([[-160.0, 300.0], [1380.0, 280.0], [1400.0, 1170.0], [-180.0, 1140.0]])
+
+
+def test_a_screen_larger_than_the_picture_has_its_columns_counted_from_the_left_of_what_is_seen() -> None:
+    candidates, _ = possible_outlines(Frame(drawn(0, 20, LARGE), "drawn"), OPTIONS, Timer())
+    best = outlines._likeliest(candidates)
+    assert best is not None
+    assert best.column_offset is None
+    assert best.is_counted_from_left
+    assert -60 < best.corners[0, 0] < 20
+    # Borders of columns lie where they are, by whatever number.
+    grid = grid_between(LARGE, COLUMNS, (WIDTH, HEIGHT), None)
+    u = grid.columns_at(geometry.screen_to_picture(np.array([[0.1, 0.5], [0.5, 0.5], [0.7, 0.5]]), best.corners, None))
+    assert np.abs(u - np.round(u)).max() < 0.1
+
+
+def test_a_side_in_view_tells_the_columns_of_a_screen_that_goes_on_outside_the_picture() -> None:
+    corners = LARGE + np.array([300.0, 0.0])
+    candidates, _ = possible_outlines(Frame(drawn(0, 20, corners), "drawn"), OPTIONS, Timer())
+    best = outlines._likeliest(candidates)
+    assert best is not None
+    assert best.column_offset == 0
+    assert abs(float(grid_between(corners, COLUMNS, (WIDTH, HEIGHT), None).columns_at(best.corners)[0])) < 0.3
 
 
 def test_light_in_the_middle_as_bars_of_films_leave_it_speaks_for_it() -> None:

@@ -32,6 +32,8 @@ _PRESETS = ("xs10-still", "phone-corrected", "phone-plain")
 _LEAST_PACKETS = 1.25
 #: A wrong packet is right under a neighbouring number when so many columns of the frame say the same shift.
 _SHIFTED = 2
+#: A screen can be found where the true corners give so many packets.
+_SHOWN = 5
 
 
 def scene_of(seed: int, number: int) -> tuple[Scene, str]:
@@ -85,6 +87,7 @@ def packets_of(task: Task) -> Record:
             "confident": len(confident),
             "confident_wrong": sum(p.bit_errors != 0 for p in confident),
             "shift": shift_of(result, trial),
+            "numbered": result.column_offset is not None,
             "ms": result.timing_ms.get("total", 0.0),
         }
     return {**task, **out}
@@ -120,6 +123,7 @@ def _row(name: str, records: Sequence[Record]) -> Row:
         return sum(int(record[which][what]) for record in records)
 
     given = total("given", "error_free")
+    shown = [r for r in records if r["given"]["error_free"] >= _SHOWN]
     confident, wrong = total("searched", "confident"), total("searched", "confident_wrong")
     return {
         "pictures": name,
@@ -127,7 +131,10 @@ def _row(name: str, records: Sequence[Record]) -> Row:
         "searched": total("searched", "error_free"),
         "corners_given": given,
         "share": total("searched", "error_free") / given if given else None,
-        "not_found": sum(r["searched"]["status"] == "no_screen" and r["given"]["error_free"] > 4 for r in records),
+        "not_found": sum(r["searched"]["status"] == "no_screen" for r in shown),
+        "of": len(shown),
+        # Columns that are said to be counted from elsewhere are not numbered wrong.
+        "numbered_wrong": sum(r["searched"]["shift"] != 0 and r["searched"]["numbered"] for r in records),
         "shifted": sum(r["searched"]["shift"] != 0 for r in records),
         f"confident_{CONFIDENT:g}": confident,
         "wrong": wrong,

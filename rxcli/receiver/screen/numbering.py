@@ -25,15 +25,18 @@ _PARTS = 8
 _OFF_SCALE, _LIT_SCALE, _DARK_PART, _PART_COUNTS = 1.2, 6.0, 0.25, 0.5
 #: Log-odds that parts of a column must have so that light ends no earlier.
 _ENDS = 0.05
-#: Log-odds of a screen that goes on outside the picture, for every column that is there.
-_OUTSIDE = -4.0
+#: Log-odds of a screen that goes on outside the picture, for every column that is there; and by however much, where
+#: light reaches to that end of the picture.
+_OUTSIDE, _LARGER = -4.0, -3.0
 #: The light's middle is the screen's, but for this, columns.
 _LIGHT_SD = 3.5
 #: Films with bars have it there to this, columns, and take these shares of the screen's width: log-odds that this adds.
 _IN_MIDDLE, _BARS, _FILM = 0.2, (0.53, 0.95), 2.0
+#: So much of the picture, columns, must lie beyond light that ends in it.
+_IN_VIEW = 0.4
 #: Support from which a line where stripes begin counts, how near it lies to a border then, columns, and the log-odds
-#: that it, or light that begins on a border, adds there.
-_LINE_SHOWS, _NEAR_BORDER, _ON_BORDER = 0.2, 0.1, 2.0
+#: that it, or light that begins on a border, adds there; and what both add.
+_LINE_SHOWS, _NEAR_BORDER, _ON_BORDER, _BOTH_SIGNS = 0.2, 0.1, 2.0, 1.0
 #: Light on one side of a border, log-odds, from which it begins there, and the share of it that may lie beyond.
 _BEGINS, _BEYOND = 2.0, 0.3
 
@@ -49,6 +52,8 @@ class Numbering:
     corners: tuple[FloatArray, ...]
     #: Natural logarithm of its odds against the other numberings of the same grid.
     log_odds: float
+    #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
+    fills: bool
 
 
 def possible_numberings(
@@ -83,7 +88,7 @@ def possible_numberings(
     for i in chosen:
         number = int(start.first[i])
         corners = tuple(one.corners(number - best) for one in rows)
-        out.append(Numbering(grid.shifted(number), corners, float(start.log_odds[i])))
+        out.append(Numbering(grid.shifted(number), corners, float(start.log_odds[i]), start.fills))
     return out
 
 
@@ -138,6 +143,8 @@ class FirstColumns:
     #: (F,) such columns of the grid, and the natural logarithm of their odds against the likeliest.
     first: IntArray
     log_odds: FloatArray
+    #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
+    fills: bool = False
 
 
 def first_columns(light: LightProfile, grid: Grid, n_columns: int, lines: Sequence[Side] = ()) -> FirstColumns:
@@ -150,19 +157,29 @@ def first_columns(light: LightProfile, grid: Grid, n_columns: int, lines: Sequen
     left, right = float(shown.min()), float(shown.max())
     first = np.arange(int(left) - n_columns + 3, int(right) - 2)
     begin, end_of_light = light.ends
-    may_have_bars = _BARS[0] < (end_of_light - begin) / n_columns < _BARS[1]
+    reaches = (begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW)
+    # Light that goes on to where the picture ends has no bars beside it.
+    may_have_bars = not any(reaches) and _BARS[0] < (end_of_light - begin) / n_columns < _BARS[1]
     scores = []
     for start in first.tolist():
         end = start + n_columns
-        hidden = max(left - start, 0.0) + max(end - right, 0.0)
+        hidden = max(left - start, 0.0), max(end - right, 0.0)
         off = (begin + end_of_light) / 2 - start - n_columns / 2
-        score = _light_within(light, start, end) + _OUTSIDE * max(hidden - 0.3, 0.0) - 0.5 * (off / _LIGHT_SD) ** 2
+        score = _light_within(light, start, end) + _hidden(hidden, reaches) - 0.5 * (off / _LIGHT_SD) ** 2
         score += _FILM if may_have_bars and abs(off) < _IN_MIDDLE else 0.0
         for border, side, number in ((start, 1, LEFT), (end, -1, RIGHT)):
-            if _begins(light, border, side) or _line_on(grid, lines, number, border):
-                score += _ON_BORDER
+            signs = (_begins(light, border, side), _line_on(grid, lines, number, border))
+            score += _ON_BORDER * any(signs) + _BOTH_SIGNS * all(signs)
         scores.append(score)
-    return FirstColumns(first, np.array(scores) - max(scores))
+    return FirstColumns(first, np.array(scores) - max(scores), all(reaches))
+
+
+def _hidden(columns: tuple[float, float], reaches: tuple[bool, bool]) -> float:
+    """Log-odds of columns left and right of the picture, by whether light reaches to its ends."""
+    if all(reaches):
+        return max(_OUTSIDE * max(sum(columns) - 0.3, 0.0), _LARGER)
+    odds = [_OUTSIDE * max(count - 0.3, 0.0) for count in columns]
+    return sum(max(one, _LARGER) if to_the_end else one for one, to_the_end in zip(odds, reaches, strict=True))
 
 
 def _light_within(light: LightProfile, start: int, end: int) -> float:
@@ -175,8 +192,10 @@ def _light_within(light: LightProfile, start: int, end: int) -> float:
 def _begins(light: LightProfile, border: int, side: int) -> bool:
     """Whether light begins on a border, to its right (1) or left (-1)."""
     off = side * (light.place - border)
-    inside, outside = (light.log_odds[(s * off > 1 / _PARTS) & (s * off < 0.5)].sum() for s in (1, -1))
-    return bool(inside > _BEGINS and outside < _BEYOND * inside)
+    beyond = (off < -1 / _PARTS) & (off > -0.5)
+    inside, outside = light.log_odds[(off > 1 / _PARTS) & (off < 0.5)].sum(), light.log_odds[beyond].sum()
+    seen = light.in_picture[beyond].all()
+    return bool(seen and inside > _BEGINS and outside < _BEYOND * inside)
 
 
 def _line_on(grid: Grid, lines: Sequence[Side], number: int, border: int) -> bool:
