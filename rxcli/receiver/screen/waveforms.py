@@ -25,6 +25,8 @@ _RIDGE = 0.5
 #: Strips whose mixes are further off than so many standard deviations count less.
 _ROBUST = 2.0
 _LARGEST = np.array([0.1, 0.3, 0.3, 0.04, 0.04, 0.02])
+#: Columns on either side of the middle beyond which strips are not told apart: a plane seen nearly edge-on counts any.
+_REACH = 100.0
 #: Places of the borders at which light is explained, columns.
 _PHASES = 4
 _TINY = np.float32(1e-6)
@@ -69,6 +71,8 @@ class StripLight:
 
 def _mixes(u: FloatArray, sigma: float) -> tuple[Float32Array, Float32Array]:
     """(W, S, K) shares of the columns in every strip's light, and how far off its middle each column lies."""
+    middle = float(np.median(u))
+    u = np.clip(u, middle - _REACH, middle + _REACH)
     centres = np.arange(int(np.floor(u.min())), int(np.ceil(u.max())) + 1) + 0.5
     apart = u.astype(np.float32)[..., None] - centres.astype(np.float32)
     spread = np.exp(apart * apart * np.float32(-0.5 / sigma**2))
