@@ -17,8 +17,6 @@ from rxcli.types import Clock, RowProfiles
 
 #: A header peak less than this times the strongest rival is no clock.
 _MIN_PEAK_RATIO = 1.6
-#: Columns that show so much evidence of packets, nats, are the screen's: wider ones mix the slots of several.
-_PLAIN_COLUMNS = 100.0
 #: A clock whose slots look so much like packets, and so much more than on any other, nats, needs no further look.
 _PLAIN_STRUCTURE = 60.0
 
@@ -66,7 +64,7 @@ def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Fail
     alike = [screen for screen in different if (screen.slot_rate_hz, screen.packet_slots) == rate]
     coarse = first.get(rate) or _acquired(context, alike[0], sampler, clocks[rate])
     coarse = coarse if coarse.screen.columns == n_columns else None
-    if coarse is not None and (len(alike) == 1 or _packets(context, coarse) > _PLAIN_COLUMNS):
+    if coarse is not None and (len(alike) == 1 or _has_few_columns(coarse, alike)):
         return coarse
     acquisitions = [coarse] if coarse else []
     for screen in alike[len(acquisitions) :]:
@@ -125,6 +123,12 @@ def _packets(context: FrameContext, acquisition: Acquisition) -> float:
     """Log-likelihood ratio of packets on an initial pass."""
     with context.timer("detect"):
         return packet_llr(initial_pass(acquisition))
+
+
+def _has_few_columns(coarse: Acquisition, screens: Sequence[ScreenProfile]) -> bool:
+    """Whether strips of the coarsest screen's columns tell already that it has no more columns than these."""
+    likely = blind.likely_columns(coarse.sampler.binned(), coarse.clock, screens)
+    return likely.columns == coarse.screen.columns
 
 
 def _with_likely_columns(acquisitions: list[Acquisition]) -> Acquisition:

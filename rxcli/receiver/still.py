@@ -411,28 +411,42 @@ def remove_row_noise(acquisition: Acquisition, reception: Reception, columns: ND
     likelihoods = channel.slot_likelihoods(asked, reception.clock, model, scene.lit, columns)
     metrics, snr = reception.metrics.copy(), reception.snr.copy()
     metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
-    lost = np.flatnonzero(reception.posteriors.log_prob[:, columns].mean(axis=(0, 2)) < _LOST)
+    posteriors = _detect(metrics[columns], reception.clock)
+    lost = np.flatnonzero(posteriors.log_prob.mean(axis=(0, 2)) < _LOST)
+    if lost.size:
+        light = replace(asked, light=asked.light[lost], valid=asked.valid[lost])
+        other, lit = _of_other_weight(reception.clock, light, model, scene.lit, columns[lost], posteriors.w[lost])
+        lost, light = lost[other], replace(light, light=light.light[other], valid=light.valid[other])
     if lost.size:
         there = columns[lost]
-        light = replace(asked, light=asked.light[lost], valid=asked.valid[lost])
-        fresh = _from_nothing(reception.clock, light, model, scene.lit, there)
+        fresh = channel.slot_likelihoods(light, reception.clock, model, lit, there)
         better = _evidence(fresh.metrics, reception.clock) > _evidence(metrics[there], reception.clock)
         metrics[there[better]], snr[there[better]] = fresh.metrics[better], fresh.snr[better]
-    posteriors = reception.posteriors.with_columns(columns, _detect(metrics[columns], reception.clock))
-    cleaned = replace(reception, metrics=metrics, snr=snr, posteriors=posteriors)
+        again = _detect(metrics[there], reception.clock)
+        posteriors = posteriors.with_columns(lost, again)
+    cleaned = replace(
+        reception, metrics=metrics, snr=snr, posteriors=reception.posteriors.with_columns(columns, posteriors)
+    )
     return replace(cleaned, scene=_scene_of(cleaned, scene.samples, model))
 
 
-def _from_nothing(
-    clock: Clock, samples: SlotSamples, model: channel.LightModel, lit: Float32Array, columns: NDArray[np.int64]
-) -> channel.SlotLikelihoods:
-    """The light model of some columns once more, without what was believed of them: it may have explained itself."""
+def _of_other_weight(
+    clock: Clock,
+    samples: SlotSamples,
+    model: channel.LightModel,
+    lit: Float32Array,
+    columns: NDArray[np.int64],
+    w: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], Float32Array]:
+    """Columns that seem to have another weight than `w` to a light model that knows nothing of them, which may have
+    explained itself: their places in `columns`; and the slots (C, N) of all as it has them."""
     lit = lit.copy()
     lit[columns] = 0.5
     for _ in range(_FRESH_ROUNDS):
         quick = channel.slot_likelihoods(samples, clock, model, lit, columns, thorough=False)
-        lit[columns] = channel.lit_on_grid(_detect(quick.metrics, clock), clock)
-    return channel.slot_likelihoods(samples, clock, model, lit, columns)
+        found = _detect(quick.metrics, clock)
+        lit[columns] = channel.lit_on_grid(found, clock)
+    return np.flatnonzero(found.w != w), lit
 
 
 def _evidence(metrics: FloatArray, clock: Clock) -> FloatArray:
