@@ -62,11 +62,12 @@ def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Fail
         }
         rate = max(clocks, key=lambda rate: (_packets(context, first[rate]), structure[rate]))
     alike = [screen for screen in different if (screen.slot_rate_hz, screen.packet_slots) == rate]
-    coarse = first.get(rate) or _acquired(context, alike[0], sampler, clocks[rate])
-    coarse = coarse if coarse.screen.columns == n_columns else None
-    if coarse is not None and (len(alike) == 1 or _has_few_columns(coarse, alike)):
-        return coarse
-    acquisitions = [coarse] if coarse else []
+    acquisitions = []
+    if alike[0].columns == n_columns:
+        coarse = first.get(rate) or _acquired(context, alike[0], sampler, clocks[rate])
+        if len(alike) == 1 or _has_few_columns(coarse, alike):
+            return coarse
+        acquisitions = [coarse]
     for screen in alike[len(acquisitions) :]:
         finer = sample_columns(context, screen.columns, quick=sampler.read is not None)
         with context.timer("clock"):
