@@ -12,7 +12,8 @@ from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sample_columns
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.corners import too_small
-from rxcli.receiver.still import initial_pass, packet_llr
+from rxcli.receiver.reception import packet_llr
+from rxcli.receiver.still import initial_pass
 from rxcli.types import Clock, RowProfiles
 
 #: A header peak less than this times the strongest rival is no clock.
