@@ -56,6 +56,8 @@ _LOST, _FRESH_ROUNDS = -0.3, 2
 #: Bursts are doubted where less than this share of the columns has packets of such a confidence, and where they are
 #: not so much likelier than others by how alike copies are, nats.
 _CLEAR_COLUMNS, _CLEAR, _PLAIN_BURSTS = 0.9, 0.9, 300.0
+#: How alike copies are is half told by the packets' evidence.
+_SAY_OF_COPIES = 0.5
 #: Of two clocks the one whose slots are so much likelier packets on an initial pass, nats, is it.
 _PLAIN_CLOCK = 60.0
 
@@ -75,7 +77,7 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
     if acquisition.rival is not None:
         return _likelier_clock(acquisition, first, skip)
     weighed = [first]
-    likeliest = _with_likeliest_bursts(acquisition, first, weighed)
+    likeliest = _with_likeliest_bursts(acquisition, first, weighed, _SAY_OF_COPIES)
     reception = decode(
         _in_bursts_of(acquisition, likeliest) if likeliest is not first else acquisition, skip, likeliest
     )
@@ -97,10 +99,13 @@ def decode_alike(acquisition: Acquisition, skip: frozenset[str], before: Recepti
     return decode(replace(acquisition, clock=clock, rival=None, burst=before.clock.burst), skip)
 
 
-def _with_likeliest_bursts(acquisition: Acquisition, reception: Reception, weighed: list[Reception]) -> Reception:
+def _with_likeliest_bursts(
+    acquisition: Acquisition, reception: Reception, weighed: list[Reception], say_of_copies: float = 0.0
+) -> Reception:
     """Of initial passes with the bursts that there may be, that of the likeliest; where there is no doubt, `reception`.
 
-    Passes that were `weighed` before are not made again; new ones are added there.
+    Passes that were `weighed` before are not made again; new ones are added there. How alike copies are, by themselves,
+    counts as said: where they were decoded as copies of one another they say nothing new.
     """
     confidence = np.where(complete_packets(reception), packet_confidence(reception), 0.0).max(axis=0)
     if not confidence.any() or (confidence > _CLEAR).mean() >= _CLEAR_COLUMNS:
@@ -111,20 +116,16 @@ def _with_likeliest_bursts(acquisition: Acquisition, reception: Reception, weigh
         return reception
     # How far rows are mixed does not depend on the bursts.
     clocks = [replace(clock, exposure_slots=reception.clock.exposure_slots) for clock, _ in possible]
-    passes = []
-    for clock in clocks:
+    passes, scores = [], []
+    for clock, (_, likeness) in zip(clocks, possible, strict=True):
         known = next((one for one in weighed if np.array_equal(one.clock.burst, clock.burst)), None)
         if known is None:
-            known = initial_pass(
-                replace(
-                    acquisition,
-                    clock=replace(acquisition.clock, exposure_slots=clock.exposure_slots),
-                    burst=clock.burst,
-                )
-            )
+            exposed = replace(acquisition.clock, exposure_slots=clock.exposure_slots)
+            known = initial_pass(replace(acquisition, clock=exposed, burst=clock.burst))
             weighed.append(known)
         passes.append(known)
-    return max(passes, key=packet_llr)
+        scores.append(packet_llr(known) + say_of_copies * likeness)
+    return passes[int(np.argmax(scores))]
 
 
 def _in_bursts_of(acquisition: Acquisition, reception: Reception) -> Acquisition:
