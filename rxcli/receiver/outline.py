@@ -24,10 +24,11 @@ from rxcli.receiver.corners import (
     unreadable_orientation,
     whole_picture,
 )
+from rxcli.receiver.reception import column_llr
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.sides import LEFT, RIGHT, SIDE_NAMES
 from rxcli.receiver.screen_choice import quick_look
-from rxcli.receiver.still import column_llr, initial_pass
+from rxcli.receiver.still import initial_pass
 from rxcli.receiver.unknown_camera import likely_camera
 from rxcli.types import FloatArray, Frame, Lens
 

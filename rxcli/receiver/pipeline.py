@@ -21,9 +21,10 @@ from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.outline import locate
+from rxcli.receiver.reception import Reception, headerless, slot_margin, soft_bits
 from rxcli.receiver.screen_choice import quick_look, quick_sampler
 from rxcli.receiver.single_light import with_data
-from rxcli.receiver.still import Reception, apply_autoencoder, decode_likeliest, headerless, slot_margin, soft_bits
+from rxcli.receiver.still import apply_autoencoder, decode_likeliest
 from rxcli.receiver.unknown_camera import (
     fits,
     likely_camera,

@@ -12,13 +12,12 @@ from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sample_columns
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.corners import too_small
-from rxcli.receiver.still import initial_pass, packet_llr
+from rxcli.receiver.reception import packet_llr
+from rxcli.receiver.still import initial_pass
 from rxcli.types import Clock, RowProfiles
 
 #: A header peak less than this times the strongest rival is no clock.
 _MIN_PEAK_RATIO = 1.6
-#: Columns that show so much evidence of packets, nats, are the screen's: wider ones mix the slots of several.
-_PLAIN_COLUMNS = 100.0
 #: A clock whose slots look so much like packets, and so much more than on any other, nats, needs no further look.
 _PLAIN_STRUCTURE = 60.0
 
@@ -64,11 +63,12 @@ def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Fail
         }
         rate = max(clocks, key=lambda rate: (_packets(context, first[rate]), structure[rate]))
     alike = [screen for screen in different if (screen.slot_rate_hz, screen.packet_slots) == rate]
-    coarse = first.get(rate) or _acquired(context, alike[0], sampler, clocks[rate])
-    coarse = coarse if coarse.screen.columns == n_columns else None
-    if coarse is not None and (len(alike) == 1 or _packets(context, coarse) > _PLAIN_COLUMNS):
-        return coarse
-    acquisitions = [coarse] if coarse else []
+    acquisitions = []
+    if alike[0].columns == n_columns:
+        coarse = first.get(rate) or _acquired(context, alike[0], sampler, clocks[rate])
+        if len(alike) == 1 or _has_few_columns(coarse, alike):
+            return coarse
+        acquisitions = [coarse]
     for screen in alike[len(acquisitions) :]:
         finer = sample_columns(context, screen.columns, quick=sampler.read is not None)
         with context.timer("clock"):
@@ -125,6 +125,12 @@ def _packets(context: FrameContext, acquisition: Acquisition) -> float:
     """Log-likelihood ratio of packets on an initial pass."""
     with context.timer("detect"):
         return packet_llr(initial_pass(acquisition))
+
+
+def _has_few_columns(coarse: Acquisition, screens: Sequence[ScreenProfile]) -> bool:
+    """Whether strips of the coarsest screen's columns tell already that it has no more columns than these."""
+    likely = blind.likely_columns(coarse.sampler.binned(), coarse.clock, screens)
+    return likely.columns == coarse.screen.columns
 
 
 def _with_likely_columns(acquisitions: list[Acquisition]) -> Acquisition:

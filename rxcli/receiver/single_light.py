@@ -11,7 +11,8 @@ from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.steady import is_alike, periodic_share
-from rxcli.receiver.still import column_llr, initial_pass, shows_steady_light
+from rxcli.receiver.reception import column_llr, shows_steady_light
+from rxcli.receiver.still import initial_pass
 from rxcli.types import BoolArray, RowProfiles
 
 #: Samples a slot on which columns are compared, and by how many slots they may be apart: slats may slant.

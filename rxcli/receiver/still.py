@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -11,14 +11,23 @@ from numpy.typing import NDArray
 
 from rxcli.errors import ReceiverError
 from rxcli.options import ReceiverOptions
-from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel, sync
 from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.channel import denoise
-from rxcli.receiver.decode import assemble, detect
-from rxcli.receiver.decode.soft_bits import of_observed, still_soft_bits
-from rxcli.receiver.decode.steady import is_steady
-from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, SlotSamples
+from rxcli.receiver.decode import detect
+from rxcli.receiver.reception import (
+    HOPELESS_WEIGHT,
+    Reception,
+    best_packet,
+    complete_packets,
+    dark_columns,
+    in_doubt,
+    metrics_by_burst,
+    packet_confidence,
+    packet_evidence,
+    packet_llr,
+)
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
 _COARSE, _FINE = 2, 4
@@ -28,11 +37,7 @@ _FEW_ROWS = 4.0
 _MIXED_ROWS, _USUAL_MIX = (0.0, 1.0, 1.7, 2.4, 3.0), 1
 #: A column whose packets have at least this confidence, or whose symbols this log probability whatever slots say,
 #: is not looked at again. Of 2699 packets of simulated frames a quick look leaves 1322 so, two of them wrong.
-_CERTAIN, _BEYOND_DOUBT = 0.99, -1e-3
-#: A column whose slots stand out less than this has no light to speak of.
-_DARK_SNR_DB = -3.0
-#: Weights that a quick look finds this much less likely than the best are dropped, nats.
-HOPELESS_WEIGHT = 20.0
+_CERTAIN = 0.99
 #: A column with a packet of less confidence is looked at without the rows' own light, and gets a second opinion, in
 #: which symbols of less than this log probability are weighed. Where the gate comes from: docs/auto_encoder.md.
 _DOUBTFUL, _DOUBTFUL_WORD = 0.985, -1e-2
@@ -45,37 +50,16 @@ _WORDS, _WORD_MARGIN, _HOPELESS_WORD = 4, 5.0, -1.4
 #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least sure,
 #: have their words weighed alone.
 _MOST_SHOWN = 58_000
-#: A column whose slots are so much likelier packets than any slots, nats, has packets whether its header shows or not:
-#: on wrong clocks columns show 74 at most.
-_PACKETS_WITHOUT_HEADER = 100.0
 #: A column whose symbols have a mean log probability below this may have settled on a wrong weight: it starts again,
 #: after so many quick rounds.
 _LOST, _FRESH_ROUNDS = -0.3, 2
 #: Bursts are doubted where less than this share of the columns has packets of such a confidence, and where they are
 #: not so much likelier than others by how alike copies are, nats.
 _CLEAR_COLUMNS, _CLEAR, _PLAIN_BURSTS = 0.9, 0.9, 300.0
+#: How alike copies are is half told by the packets' evidence.
+_SAY_OF_COPIES = 0.5
 #: Of two clocks the one whose slots are so much likelier packets on an initial pass, nats, is it.
 _PLAIN_CLOCK = 60.0
-
-
-@dataclass(frozen=True, slots=True)
-class Reception:
-    """What was received of a frame."""
-
-    clock: Clock
-    #: Of the quick look: strips pooled in pairs.
-    samples: SlotSamples
-    posteriors: BurstPosteriors
-    #: (C, N): squared contrast over variance of every slot.
-    snr: Float32Array
-    #: For the samples.
-    model: channel.LightModel
-    #: (C, N + memory, patterns).
-    metrics: FloatArray
-    #: What the auto-encoder may be shown: the fine grid without the rows' own light; None where nothing was in doubt.
-    scene: denoise.DenoiserInput | None = None
-    #: What was skipped: name -> columns.
-    skipped: dict[str, int] = field(default_factory=dict)
 
 
 def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Reception:
@@ -93,7 +77,7 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
     if acquisition.rival is not None:
         return _likelier_clock(acquisition, first, skip)
     weighed = [first]
-    likeliest = _with_likeliest_bursts(acquisition, first, weighed)
+    likeliest = _with_likeliest_bursts(acquisition, first, weighed, _SAY_OF_COPIES)
     reception = decode(
         _in_bursts_of(acquisition, likeliest) if likeliest is not first else acquisition, skip, likeliest
     )
@@ -115,12 +99,15 @@ def decode_alike(acquisition: Acquisition, skip: frozenset[str], before: Recepti
     return decode(replace(acquisition, clock=clock, rival=None, burst=before.clock.burst), skip)
 
 
-def _with_likeliest_bursts(acquisition: Acquisition, reception: Reception, weighed: list[Reception]) -> Reception:
+def _with_likeliest_bursts(
+    acquisition: Acquisition, reception: Reception, weighed: list[Reception], say_of_copies: float = 0.0
+) -> Reception:
     """Of initial passes with the bursts that there may be, that of the likeliest; where there is no doubt, `reception`.
 
-    Passes that were `weighed` before are not made again; new ones are added there.
+    Passes that were `weighed` before are not made again; new ones are added there. How alike copies are, by themselves,
+    counts as said: where they were decoded as copies of one another they say nothing new.
     """
-    confidence = np.where(_complete(reception), _confidence(reception), 0.0).max(axis=0)
+    confidence = np.where(complete_packets(reception), packet_confidence(reception), 0.0).max(axis=0)
     if not confidence.any() or (confidence > _CLEAR).mean() >= _CLEAR_COLUMNS:
         return reception
     possible = sync.possible_bursts(reception.clock, detect.slot_llr(reception.metrics), acquisition.repeats)
@@ -129,20 +116,16 @@ def _with_likeliest_bursts(acquisition: Acquisition, reception: Reception, weigh
         return reception
     # How far rows are mixed does not depend on the bursts.
     clocks = [replace(clock, exposure_slots=reception.clock.exposure_slots) for clock, _ in possible]
-    passes = []
-    for clock in clocks:
+    passes, scores = [], []
+    for clock, (_, likeness) in zip(clocks, possible, strict=True):
         known = next((one for one in weighed if np.array_equal(one.clock.burst, clock.burst)), None)
         if known is None:
-            known = initial_pass(
-                replace(
-                    acquisition,
-                    clock=replace(acquisition.clock, exposure_slots=clock.exposure_slots),
-                    burst=clock.burst,
-                )
-            )
+            exposed = replace(acquisition.clock, exposure_slots=clock.exposure_slots)
+            known = initial_pass(replace(acquisition, clock=exposed, burst=clock.burst))
             weighed.append(known)
         passes.append(known)
-    return max(passes, key=packet_llr)
+        scores.append(packet_llr(known) + say_of_copies * likeness)
+    return passes[int(np.argmax(scores))]
 
 
 def _in_bursts_of(acquisition: Acquisition, reception: Reception) -> Acquisition:
@@ -169,7 +152,7 @@ def _likelier_clock(acquisition: Acquisition, first: Reception, skip: frozenset[
 def _refined_once(acquisition: Acquisition) -> Reception:
     """The first pass and a look at all scales of every column that has light."""
     first = first_pass(acquisition)
-    return _refine_columns(acquisition, first, np.flatnonzero(~_dark(first.snr)), _COARSE)[0]
+    return _refine_columns(acquisition, first, np.flatnonzero(~dark_columns(first.snr)), _COARSE)[0]
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
@@ -181,7 +164,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
         first: what the quick look showed, where there was one.
     """
     reception = first or first_pass(acquisition)
-    doubtful = _doubtful(reception, _CERTAIN) if "certain_columns" in skip else np.ones(reception.snr.shape[0], bool)
+    doubtful = in_doubt(reception, _CERTAIN) if "certain_columns" in skip else np.ones(reception.snr.shape[0], bool)
     if not doubtful.any():
         return replace(reception, skipped={"certain_columns": reception.snr.shape[0]})
     acquisition = acquisition.in_depth(np.flatnonzero(doubtful))
@@ -215,7 +198,7 @@ def _initial_pass(acquisition: Acquisition) -> Reception:
     contrast = sync.contrast(samples.light, samples.valid, _COARSE, model.sigma)
     first = channel.first_metrics(*contrast, model.taps)
     clock = _in_bursts(acquisition, clock, detect.slot_llr(first))
-    lit = channel.on_grid(_first_decision(_by_burst(first, clock), model.isi_memory), clock)
+    lit = channel.on_grid(_first_decision(metrics_by_burst(first, clock), model.isi_memory), clock)
     columns = np.arange(samples.light.shape[0])
     likelihoods = channel.slot_likelihoods(samples, clock, model, lit, columns, thorough=False)
     clock = _in_bursts(acquisition, clock, detect.slot_llr(likelihoods.metrics))
@@ -246,7 +229,7 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
         if number not in tried:
             width = float(np.hypot(clock.exposure_slots, _MIXED_ROWS[number] / clock.rows_per_slot))
             reception = initial_pass(replace(acquisition, clock=replace(clock, exposure_slots=width)))
-            tried[number] = float(_evidence(reception.metrics, reception.clock).sum()), reception
+            tried[number] = float(packet_evidence(reception.metrics, reception.clock).sum()), reception
         return tried[number][0]
 
     best = min(_USUAL_MIX, len(_MIXED_ROWS) - 1)
@@ -264,7 +247,7 @@ def iterate(
     Columns in doubt, (C,), are looked at on the coarse grid once, and those that still are on the fine one.
     """
     every = np.ones(reception.snr.shape[0], bool)
-    wanted = ~_dark(reception.snr) if "dark_columns" in skip else every
+    wanted = ~dark_columns(reception.snr) if "dark_columns" in skip else every
     skipped = {"dark_columns": int((~wanted).sum()), "certain_columns": 0}
     for iteration in range(_MAX_ITERATIONS):
         columns = np.flatnonzero(wanted & doubtful)
@@ -313,19 +296,13 @@ def _view(
     return samples, model
 
 
-def _dark(snr: Float32Array) -> NDArray[np.bool_]:
-    """(C,) whether a column has too little light for the light model to make anything of it."""
-    n_observed, n_lit = ((snr > least).sum(axis=1) for least in (0.0, 10 ** (_DARK_SNR_DB / 10)))
-    return np.asarray((2 * n_lit < n_observed) | (n_observed == 0))
-
-
 def _unsettled(
     reception: Reception, before: NDArray[np.int64], iteration: int, skip: frozenset[str]
 ) -> NDArray[np.bool_]:
     """(C,) which columns are worth another iteration."""
     if "certain_columns" not in skip:
         return np.ones(reception.snr.shape[0], bool)
-    doubtful = _doubtful(reception, _CERTAIN)
+    doubtful = in_doubt(reception, _CERTAIN)
     index = reception.posteriors.index
     if iteration and before.shape == index.shape:
         # What does not change any more will not do so later.
@@ -348,7 +325,7 @@ def apply_autoencoder(
         reception = remove_row_noise(acquisition.in_depth(columns), reception, columns)
     else:
         columns = doubtful_columns(reception)
-        columns = columns[_best_packet(reception)[columns] > _BEYOND_REPAIR]
+        columns = columns[best_packet(reception)[columns] > _BEYOND_REPAIR]
     if columns.size == 0 or reception.scene is None:
         return reception, frozenset(), None
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
@@ -380,7 +357,7 @@ def _worth_showing(reception: Reception, scene: denoise.DenoiserInput, columns: 
     """Places in `columns` of those that the network is shown: the surest, and no more than its time allows."""
     _, n_strips, _ = scene.samples.light.shape
     most = max(_MOST_SHOWN // (n_strips * reception.clock.n_slots), 1)
-    return np.sort(np.argsort(-_best_packet(reception)[columns], kind="stable")[:most])
+    return np.sort(np.argsort(-best_packet(reception)[columns], kind="stable")[:most])
 
 
 def _words_weighed(
@@ -388,7 +365,7 @@ def _words_weighed(
 ) -> FloatArray:
     """Metrics of some columns with the likeliest words of every symbol in doubt weighed as a whole."""
     clock = reception.clock
-    bursts = _by_burst(metrics, clock)
+    bursts = metrics_by_burst(metrics, clock)
     candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
     posteriors, doubtful = detect.detect_with_words(bursts, candidates, _DOUBTFUL_WORD, _WORDS)
     asked = doubtful.log_prob[:, 0] > _HOPELESS_WORD
@@ -411,124 +388,47 @@ def remove_row_noise(acquisition: Acquisition, reception: Reception, columns: ND
     likelihoods = channel.slot_likelihoods(asked, reception.clock, model, scene.lit, columns)
     metrics, snr = reception.metrics.copy(), reception.snr.copy()
     metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
-    lost = np.flatnonzero(reception.posteriors.log_prob[:, columns].mean(axis=(0, 2)) < _LOST)
+    posteriors = _detect(metrics[columns], reception.clock)
+    lost = np.flatnonzero(posteriors.log_prob.mean(axis=(0, 2)) < _LOST)
+    if lost.size:
+        light = replace(asked, light=asked.light[lost], valid=asked.valid[lost])
+        other, lit = _of_other_weight(reception.clock, light, model, scene.lit, columns[lost], posteriors.w[lost])
+        lost, light = lost[other], replace(light, light=light.light[other], valid=light.valid[other])
     if lost.size:
         there = columns[lost]
-        light = replace(asked, light=asked.light[lost], valid=asked.valid[lost])
-        fresh = _from_nothing(reception.clock, light, model, scene.lit, there)
-        better = _evidence(fresh.metrics, reception.clock) > _evidence(metrics[there], reception.clock)
+        fresh = channel.slot_likelihoods(light, reception.clock, model, lit, there)
+        better = packet_evidence(fresh.metrics, reception.clock) > packet_evidence(metrics[there], reception.clock)
         metrics[there[better]], snr[there[better]] = fresh.metrics[better], fresh.snr[better]
-    posteriors = reception.posteriors.with_columns(columns, _detect(metrics[columns], reception.clock))
-    cleaned = replace(reception, metrics=metrics, snr=snr, posteriors=posteriors)
+        again = _detect(metrics[there], reception.clock)
+        posteriors = posteriors.with_columns(lost, again)
+    cleaned = replace(
+        reception, metrics=metrics, snr=snr, posteriors=reception.posteriors.with_columns(columns, posteriors)
+    )
     return replace(cleaned, scene=_scene_of(cleaned, scene.samples, model))
 
 
-def _from_nothing(
-    clock: Clock, samples: SlotSamples, model: channel.LightModel, lit: Float32Array, columns: NDArray[np.int64]
-) -> channel.SlotLikelihoods:
-    """The light model of some columns once more, without what was believed of them: it may have explained itself."""
+def _of_other_weight(
+    clock: Clock,
+    samples: SlotSamples,
+    model: channel.LightModel,
+    lit: Float32Array,
+    columns: NDArray[np.int64],
+    w: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], Float32Array]:
+    """Columns that seem to have another weight than `w` to a light model that knows nothing of them, which may have
+    explained itself: their places in `columns`; and the slots (C, N) of all as it has them."""
     lit = lit.copy()
     lit[columns] = 0.5
     for _ in range(_FRESH_ROUNDS):
         quick = channel.slot_likelihoods(samples, clock, model, lit, columns, thorough=False)
-        lit[columns] = channel.lit_on_grid(_detect(quick.metrics, clock), clock)
-    return channel.slot_likelihoods(samples, clock, model, lit, columns)
-
-
-def _evidence(metrics: FloatArray, clock: Clock) -> FloatArray:
-    """(C,) log evidence of columns, over all weights."""
-    bursts = _by_burst(metrics, clock)
-    candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
-    return np.asarray(np.logaddexp.reduce(detect.weight_log_evidence(bursts, candidates), axis=1))
-
-
-def packet_llr(reception: Reception) -> float:
-    """Log-likelihood ratio of all columns' slots being packets, on the clock they were received with, over any slots.
-
-    Copies that differ and words that are not in the codebook speak against it, headers or not.
-    """
-    # The light model is surer than it should be: a column that fits poorly, or is dark, says nothing.
-    return float(np.logaddexp(column_llr(reception), 0.0).sum())
-
-
-def column_llr(reception: Reception) -> FloatArray:
-    """(C,) log-likelihood ratio of each column's slots being packets, over slots that are anything."""
-    return _packets_over_any(reception, np.arange(reception.snr.shape[0]))
-
-
-def _packets_over_any(reception: Reception, columns: NDArray[np.int64]) -> FloatArray:
-    """Log-likelihood ratio of each column's slots being packets, over slots that are anything."""
-    metrics = reception.metrics[columns]
-    packets = _evidence(metrics, reception.clock) - np.log(len(WEIGHTS))
-    return np.asarray(packets - detect.free_log_evidence(metrics, reception.posteriors.w[columns] / SLOTS_PER_SYMBOL))
-
-
-def headerless(reception: Reception) -> NDArray[np.bool_]:
-    """(C,) columns that show no packets: no header where it should be, and not so many words of the codebook.
-
-    With few rows a slot or at the screen's edge light is not as the model has it, and headers are the first to tell.
-    None has any where all the light is a steady periodic waveform.
-    """
-    out = assemble.without_header(reception.posteriors.header_llr)
-    if not out.all() and shows_steady_light(reception):
-        return np.ones_like(out)
-    if out.any():
-        out[out] = _packets_over_any(reception, np.flatnonzero(out)) < _PACKETS_WITHOUT_HEADER
-    return out
-
-
-def shows_steady_light(reception: Reception) -> bool:
-    """Whether the light is that of a lamp or of a screen that is dimmed by switching."""
-    samples, clock = reception.samples, reception.clock
-    contrast = sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.sigma)
-    lit = channel.lit_on_grid(reception.posteriors, clock)
-    return is_steady(*contrast, lit, clock.packet_slots)
+        found = _detect(quick.metrics, clock)
+        lit[columns] = channel.lit_on_grid(found, clock)
+    return np.flatnonzero(found.w != w), lit
 
 
 def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
     """Columns that get a second opinion."""
-    return np.flatnonzero(_doubtful(reception, _DOUBTFUL))
-
-
-def slot_margin(reception: Reception) -> Float32Array:
-    """(C, N) what the light says for every slot as decided, nats."""
-    return detect.slot_margin(reception.metrics, channel.lit_on_grid(reception.posteriors, reception.clock) > 0.5)
-
-
-def soft_bits(
-    frame: Frame, reception: Reception, no_header: NDArray[np.bool_], denoised: frozenset[int] = frozenset()
-) -> FrameSoftBits:
-    """What a photograph says of the payload's bits, cut packets included."""
-    n_observed = assemble.slots_observed(reception.samples, reception.clock)
-    n_columns, n_strips = reception.samples.light.shape[:2]
-    features = assemble.confidence_features(
-        of_observed(reception.posteriors, n_observed),
-        assemble.slot_margin_by_burst(slot_margin(reception), reception.clock),
-        np.isin(np.arange(n_columns), list(denoised)),
-        n_strips,
-    )
-    snr_db = assemble.snr_db_of_columns(reception.snr)
-    soft = still_soft_bits(reception.posteriors, n_observed, features, snr_db, no_header)
-    return replace(soft, source=frame.source, frame=frame.index, time_s=frame.time_s)
-
-
-def _best_packet(reception: Reception) -> FloatArray:
-    """(C,) mean log probability of the symbols of each column's surest packet that could be reported."""
-    return np.asarray(np.where(_complete(reception), reception.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0))
-
-
-def _complete(reception: Reception) -> NDArray[np.bool_]:
-    """(B, C) packets that could be reported."""
-    return assemble.complete(assemble.slots_observed(reception.samples, reception.clock))
-
-
-def _confidence(reception: Reception) -> FloatArray:
-    """(B, C) confidence of packets, the auto-encoder not yet asked."""
-    by_burst = assemble.slot_margin_by_burst(slot_margin(reception), reception.clock)
-    n_columns, n_strips = reception.samples.light.shape[:2]
-    return assemble.confidence(
-        assemble.confidence_features(reception.posteriors, by_burst, np.zeros(n_columns, bool), n_strips)
-    )
+    return np.flatnonzero(in_doubt(reception, _DOUBTFUL))
 
 
 @lru_cache(maxsize=1)
@@ -564,19 +464,9 @@ def _with_bursts_of(acquisition: Acquisition, reception: Reception, log_odds: Fl
     return replace(reception, clock=clock, posteriors=_detect(reception.metrics, clock))
 
 
-def _doubtful(reception: Reception, certain: float) -> NDArray[np.bool_]:
-    """(C,) whether a packet that could be reported has less than the confidence `certain`."""
-    doubtful = (_confidence(reception) < certain) & (reception.posteriors.log_prob.min(axis=2) < _BEYOND_DOUBT)
-    return np.asarray((doubtful & _complete(reception)).any(axis=0))
-
-
 def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:
-    bursts = _by_burst(metrics, clock)
+    bursts = metrics_by_burst(metrics, clock)
     return detect.detect(bursts, detect.plausible_weights(bursts, HOPELESS_WEIGHT))
-
-
-def _by_burst(metrics: FloatArray, clock: Clock) -> FloatArray:
-    return channel.by_burst(metrics, clock, isi_memory=metrics.shape[1] - clock.n_slots)
 
 
 def _light_model(acquisition: Acquisition, samples: SlotSamples) -> channel.LightModel:

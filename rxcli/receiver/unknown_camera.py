@@ -15,8 +15,9 @@ from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera_memory import recall, remember
 from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, refittable, refitted_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
+from rxcli.receiver.reception import Reception, packet_llr
 from rxcli.receiver.screen_choice import quick_look
-from rxcli.receiver.still import Reception, decode_alike, decode_likeliest, initial_pass, packet_llr
+from rxcli.receiver.still import decode_alike, decode_likeliest, initial_pass
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
 
 #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.

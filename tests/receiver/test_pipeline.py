@@ -22,6 +22,7 @@ from rxcli.receiver.context import FrameContext, Timer
 from rxcli.receiver.decode import detect
 from rxcli.receiver.outline import Outline, find_outline
 from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.receiver.reception import headerless
 from rxcli.receiver.screen_choice import acquire
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Frame, FrameResult, Metadata, Mosaic, PacketResult
@@ -463,11 +464,11 @@ def test_copies_of_two_packets_taken_for_one_are_told_apart(monkeypatch: pytest.
 def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:
     acquisition, options = acquired(clean())
     reception = still.decode(acquisition, options.skip)
-    assert not still.headerless(reception).any()
+    assert not headerless(reception).any()
     unseen = replace(reception.posteriors, header_llr=np.full_like(reception.posteriors.header_llr, -30.0))
-    assert not still.headerless(replace(reception, posteriors=unseen)).any()
+    assert not headerless(replace(reception, posteriors=unseen)).any()
     moved = replace(reception, posteriors=unseen, metrics=np.roll(reception.metrics, 3, axis=1))
-    assert still.headerless(moved).all()
+    assert headerless(moved).all()
 
 
 def screen_chosen(taken: Capture) -> str:

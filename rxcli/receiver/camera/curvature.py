@@ -61,7 +61,9 @@ def estimate_curvature(strips: Strips) -> tuple[FloatArray, float]:
     weight = 4000.0 / total
     k1, share = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.4, 0.4, 25), [0.0, 0.8, 1.8]))
     guesses = np.stack([k1, -share * k1, 0 * k1, 0 * k1], axis=1)
-    scores = [_likeness(guess, lags[-1:], weight) for guess in guesses]
+    correlation, terms = lags[-1]
+    along = _at_lag(correlation, np.tensordot(guesses, terms, 1))[0].sum(axis=(1, 2))
+    scores = weight * along - 0.5 * ((guesses @ BEND_PRECISION) * guesses).sum(axis=1)
     found = _climb(guesses[int(np.argmax(scores))], lags, weight)
     return found, _likeness(found, lags, weight) - _likeness(np.zeros(4), lags, weight)
 
@@ -97,11 +99,17 @@ def _lag_correlations(strips: Strips, distance: int) -> tuple[Float32Array, Floa
 
 
 def _at_lag(correlation: Float32Array, lag: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Correlation at fractional lags with first and second derivative, by a Catmull-Rom cubic."""
+    """Correlation (lags, strips, windows) at fractional lags (..., strips, windows) with first and second derivative.
+
+    By a Catmull-Rom cubic.
+    """
     place = np.clip(lag + (correlation.shape[0] - 1) / 2, 1, correlation.shape[0] - 2.001)
     low = place.astype(np.int64)
     f = place - low
-    a, b, c, d = (np.take_along_axis(correlation, (low + k)[None], 0)[0].astype(np.float64) for k in (-1, 0, 1, 2))
+    size = correlation[0].size
+    index = low * size + np.arange(size).reshape(correlation.shape[1:])
+    flat = correlation.ravel()
+    a, b, c, d = (flat.take(index + k * size).astype(np.float64) for k in (-1, 0, 1, 2))
     linear, square, cubic = (c - a) / 2, a - 2.5 * b + 2 * c - 0.5 * d, 1.5 * (b - c) + 0.5 * (d - a)
     value = b + f * (linear + f * (square + f * cubic))
     return value, linear + f * (2 * square + 3 * f * cubic), a - 2 * b + c

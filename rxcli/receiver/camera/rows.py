@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.numerics import local_mean
+from rxcli.numerics import SlotLight, local_mean
 from rxcli.receiver.camera.strips import Strips
-from rxcli.receiver.camera.waves import column_shares, local_moments, residual_of, seen_through
+from rxcli.receiver.camera.waves import column_shares, local_moments, residual_of
 from rxcli.types import Float32Array, FloatArray, IntArray
 
 #: Weights of a row, of its two neighbours together, and of the two next to those: of developed pictures in general, and
@@ -121,8 +121,7 @@ class _SensorRows:
         """(M, n) light of the sensor rows in every strip; and its change per slot."""
         start, rows_per_slot = values[:2]
         time = (self.first + np.arange(self.n + self.join - 1) - start) / rows_per_slot
-        columns = np.arange(lit.shape[0])
-        tables = seen_through(lit, np.broadcast_to(time, (columns.size, time.size)), columns, shutter_slots)
+        tables = SlotLight(lit, 0.0).seen_with_slope(time[None], shutter_slots)
         shares = column_shares(strips).astype(np.float32)
         light, slope = (shares @ _joined(table, self.join) for table in tables)
         return light, slope

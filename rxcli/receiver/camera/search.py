@@ -100,9 +100,9 @@ def estimate_camera(
     estimates: list[BlindEstimate] = []
     if _HOPELESS < _best(readings) < _READ_SURELY:
         estimates = refined(readings[0])
-        best = max(estimates, key=lambda one: _plausibility(one, strips, one.rows_per_slot))
-        if _is_plausible(best) and shows_packets(best):
-            return BlindSearch(best, rivals=_worth_reading([one for one in estimates if one is not best]))
+        likely = max(estimates, key=lambda one: _plausibility(one, strips, one.rows_per_slot))
+        if _is_plausible(likely) and shows_packets(likely):
+            return BlindSearch(likely, rivals=_worth_reading([one for one in estimates if one is not likely]))
     asked = readings[:1] if estimates else []
     for reading in _worth_refining(_more_readings(views, straight, curves, lengths, readings)):
         estimates += [] if any(reading is one for one in asked) else refined(reading)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import local_mean
+from rxcli.numerics import SlotLight, local_mean
 from rxcli.receiver.camera.curvature import BEND_PRECISION, BEND_SCALE
 from rxcli.receiver.camera.estimates import BlindEstimate
 from rxcli.receiver.camera.reading import Packets, Reading, read_slots
@@ -28,7 +28,6 @@ from rxcli.receiver.camera.waves import (
     local_moments,
     packet_llr,
     residual_of,
-    seen_through,
 )
 from rxcli.types import Float32Array, FloatArray
 
@@ -225,7 +224,7 @@ def seen_by_strips(
 ) -> tuple[Float32Array, Float32Array]:
     """(M, R) light 0..1 of slots (C, N) in every strip at slot positions; and its change per slot."""
     mixed = np.asarray(column_shares(strips) @ lit, np.float32)
-    return seen_through(mixed, time, np.arange(mixed.shape[0]), exposure_slots)
+    return SlotLight(mixed, 0.0).seen_with_slope(time, exposure_slots)
 
 
 def gauss_newton(

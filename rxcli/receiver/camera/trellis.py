@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from rxcli.numerics import exposure_shares
+from rxcli.protocol import slot_patterns
 from rxcli.types import Float32Array, FloatArray
 
 #: Slots that are walked together, and those before them from which their first state is told.
@@ -21,14 +23,9 @@ def pattern_light(exposure_slots: float, samples: int) -> FloatArray:
         (2**n, samples), n = 3 or 5; the earliest slot is the most significant bit.
     """
     reach = 1 if exposure_slots <= 2 else 2
-    n = 2 * reach + 1
     middle = (np.arange(samples) + 0.5) / samples
-    slot = np.arange(-reach, reach + 1)[:, None]
-    begin = np.maximum(middle - exposure_slots / 2, slot)
-    end = np.minimum(middle + exposure_slots / 2, slot + 1)
-    share = np.maximum(end - begin, 0) / exposure_slots
-    patterns = (np.arange(1 << n)[:, None] >> np.arange(n - 1, -1, -1)) & 1
-    return np.asarray(patterns @ share)
+    share = exposure_shares(middle, np.arange(-reach, reach + 1)[:, None], exposure_slots)
+    return np.asarray(slot_patterns(2 * reach) @ share)
 
 
 def lit_probability(

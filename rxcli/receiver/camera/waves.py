@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import local_mean
+from rxcli.numerics import SlotLight, local_mean
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook
 from rxcli.receiver.camera.strips import SAMPLES, Strips
 from rxcli.receiver.camera.trellis import lit_probability, pattern_light
@@ -244,10 +244,9 @@ def _pattern_metric(
 
 def _levels(waves: Waves, lit: Float32Array, exposure_slots: float) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Of every sample: gain and offset of lit slots thereabouts, and the square that is expected to be left."""
-    centres = np.broadcast_to((np.arange(waves.value.shape[1]) + 0.5) / SAMPLES, waves.value.shape)
-    column = np.arange(lit.shape[0])
-    wave, _ = seen_through(lit, centres, column, exposure_slots)
-    unsure, _ = seen_through(lit * (1 - lit), centres, column, exposure_slots)
+    centres = (np.arange(waves.value.shape[1])[None] + 0.5) / SAMPLES
+    wave = SlotLight(lit, 0.0).seen(centres, exposure_slots)
+    unsure = SlotLight(lit * (1 - lit), 0.0).seen(centres, exposure_slots)
     unsure /= np.float32(max(exposure_slots, 1.0))
     weight = waves.weight
     near = local_moments(waves.value, wave, weight, _LEVEL_SLOTS * SAMPLES, unsure)
@@ -257,32 +256,6 @@ def _levels(waves: Waves, lit: Float32Array, exposure_slots: float) -> tuple[Flo
     gain = (np.maximum(both, 0) + _GAIN_PRIOR * np.maximum(overall, 0)) / (np.maximum(power, 0) + _GAIN_PRIOR)
     offset = near.value - gain * near.wave
     return gain, offset, (waves.value - offset - gain * wave) ** 2 + gain * gain * unsure
-
-
-def seen_through(
-    lit: Float32Array, time: FloatArray | Float32Array, column: NDArray[np.int64], exposure_slots: float
-) -> tuple[Float32Array, Float32Array]:
-    """Light 0..1 of slots through the exposure at slot positions (n, m) of columns (n,); and its change per slot."""
-    n = lit.shape[1]
-    total = np.zeros((lit.shape[0], n + 2), np.float32)
-    np.cumsum(lit, axis=1, out=total[:, 1 : n + 1])
-    total[:, n + 1] = total[:, n]
-    flat, base = total.ravel(), (column * (n + 2))[:, None]
-    late, late_slope = _running(flat, base, time + np.float32(exposure_slots / 2), n)
-    early, early_slope = _running(flat, base, time - np.float32(exposure_slots / 2), n)
-    scale = np.float32(1 / exposure_slots)
-    return (late - early) * scale, (late_slope - early_slope) * scale
-
-
-def _running(
-    flat: Float32Array, base: NDArray[np.int64], time: FloatArray | Float32Array, n: int
-) -> tuple[Float32Array, Float32Array]:
-    place: FloatArray = np.clip(np.asarray(time, np.float64), 0, n + 0.999)
-    low = place.astype(np.int64)
-    index = low + base
-    below: Float32Array = np.asarray(flat.take(index), np.float32)
-    step: Float32Array = np.asarray(flat.take(index + 1), np.float32) - below
-    return np.asarray(below + step * (place - low), np.float32), step
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,8 +317,8 @@ def _least(tried: FloatArray, errors: FloatArray, waves: Waves) -> tuple[float, 
 
 def _misfit(waves: Waves, exposure_slots: float, lit: Float32Array) -> float:
     """Weighted square of what the slots through this exposure leave of the waves, as a share."""
-    centres = np.broadcast_to((np.arange(waves.value.shape[1]) + 0.5) / SAMPLES, waves.value.shape)
-    wave, _ = seen_through(lit, centres, np.arange(lit.shape[0]), exposure_slots)
+    centres = (np.arange(waves.value.shape[1])[None] + 0.5) / SAMPLES
+    wave = SlotLight(lit, 0.0).seen(centres, exposure_slots)
     weight = waves.weight
     near = local_moments(waves.value, wave, weight, LOCAL_SLOTS * SAMPLES)
     residual = waves.value - near.value - near.gain * (wave - near.wave)

@@ -29,7 +29,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from rxcli.errors import ProfileError
-from rxcli.numerics import box_sums
+from rxcli.numerics import SlotLight, box_sums
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, slot_patterns
 from rxcli.resources import data_dir
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
@@ -59,6 +59,8 @@ _TINY = 1e-30
 #: Strips and samples err alike: about so much of their summed information is left.
 _ALIKE = 0.16
 _MAX_MODEL_BYTES = 2_000_000
+#: Slots that an exposure is taken to last at least.
+_LEAST_EXPOSURE = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,9 +333,9 @@ def _exposures(scene: DenoiserInput, columns: NDArray[np.int64], ahead: FloatArr
     """(B, N * Q) mean of the believed slots of columns over every sample's exposure, read `ahead` slots later."""
     n = scene.samples.light.shape[-1]
     centres = (np.arange(n) + 0.5) / scene.samples.samples_per_slot
-    exposure = scene.clock.exposure_slots
-    rows = [_exposed(scene.lit[c], centres + late, exposure) for c, late in zip(columns, ahead, strict=True)]
-    return np.asarray(rows, np.float32).reshape(columns.size, n)
+    exposure = max(scene.clock.exposure_slots, _LEAST_EXPOSURE)
+    positions = centres + ahead[:, None] if ahead.any() else centres[None]
+    return SlotLight(scene.lit[columns]).seen(positions, exposure)
 
 
 def _against_middle(crosstalk: FloatArray) -> FloatArray:
@@ -347,18 +349,6 @@ def _against_middle(crosstalk: FloatArray) -> FloatArray:
     rise = (log[:, 2] - log[:, 0]) / 2
     own = np.exp(-np.square(rise) / (2 * bend))
     return np.asarray(crosstalk / crosstalk[:, 1:2] * own[:, None])
-
-
-def _exposed(lit: Float32Array, centres: FloatArray, exposure_slots: float) -> FloatArray:
-    """Mean of slots over exposures centred at `centres` (in slots); slots beyond the grid are half lit."""
-    margin = int(np.ceil(exposure_slots)) + 4
-    padded = np.pad(lit.astype(np.float64), margin, constant_values=0.5)
-    integral = np.concatenate([[0.0], np.cumsum(padded)])
-    knots = np.arange(integral.size) - margin
-    half = max(exposure_slots, 0.25) / 2
-    return np.asarray(
-        (np.interp(centres + half, knots, integral) - np.interp(centres - half, knots, integral)) / (2 * half)
-    )
 
 
 def payload_observed(scene: DenoiserInput) -> Float32Array:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rxcli.numerics import exposure_shares
 from rxcli.types import Clock, FloatArray, SlotSamples
 
 #: Positions in the packet of the header's middle dark slot, where only the floor is seen.
@@ -57,10 +58,7 @@ def exposure_taps(exposure_slots: float, blur_slots: float, isi_memory: int, sam
     centres = -isi_memory / 2 + (np.arange(samples_per_slot) + 0.5) / samples_per_slot
     slots = np.arange(-isi_memory, 1)
     fine = (centres[:, None] + offsets)[:, None, :]
-    exposure = max(exposure_slots, 1e-3)
-    low = np.maximum(fine - exposure / 2, slots[:, None])
-    high = np.minimum(fine + exposure / 2, slots[:, None] + 1)
-    return np.asarray(np.maximum(high - low, 0).mean(axis=2) / exposure)
+    return np.asarray(exposure_shares(fine, slots[:, None], max(exposure_slots, 1e-3)).mean(axis=2))
 
 
 def crosstalk_matrix(n_strips: int, light_spread: float) -> FloatArray:

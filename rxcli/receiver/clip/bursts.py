@@ -11,7 +11,7 @@ from rxcli.protocol import WEIGHTS
 from rxcli.receiver import channel, sync
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble, detect
-from rxcli.receiver.still import HOPELESS_WEIGHT
+from rxcli.receiver.reception import HOPELESS_WEIGHT
 from rxcli.receiver.sync.tracking import Bursts
 from rxcli.types import Float32Array, FloatArray, IntArray
 

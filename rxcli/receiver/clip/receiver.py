@@ -25,17 +25,10 @@ from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.decode import assemble, detect
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
 from rxcli.receiver.outline import Located, locate
+from rxcli.receiver.reception import Reception, shows_steady_light
 from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.single_light import STEADY_LIGHT, with_data
-from rxcli.receiver.still import (
-    Reception,
-    apply_autoencoder,
-    decode,
-    decode_likeliest,
-    doubtful_columns,
-    initial_pass,
-    shows_steady_light,
-)
+from rxcli.receiver.still import apply_autoencoder, decode, decode_likeliest, doubtful_columns, initial_pass
 from rxcli.receiver.sync import tracking
 from rxcli.receiver.unknown_camera import (
     Received,

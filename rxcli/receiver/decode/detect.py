@@ -151,8 +151,8 @@ def _payload_of(metrics: FloatArray) -> _Payload:
     """The payload of packets from their metrics (n, packet + memory, patterns)."""
     isi_memory = _isi_memory_of(metrics)
     n, length, n_patterns = metrics.shape
-    slots = metrics[:, PREAMBLE_SLOTS : length - isi_memory].reshape(n, -1, SLOTS_PER_SYMBOL, n_patterns)
-    slots = slots.swapaxes(0, 1).reshape(-1, SLOTS_PER_SYMBOL, n_patterns)
+    by_packet = metrics[:, PREAMBLE_SLOTS : length - isi_memory].reshape(n, -1, SLOTS_PER_SYMBOL, n_patterns)
+    slots = by_packet.swapaxes(0, 1).reshape(-1, SLOTS_PER_SYMBOL, n_patterns)
     patterns = _meeting_patterns(isi_memory)
     meeting = slots[:, 0].take(patterns[0], axis=1)
     for slot in range(1, isi_memory):
@@ -246,7 +246,7 @@ def _word_posteriors(trellis: _Trellis) -> FloatArray:
     joint *= trellis.backward().take(trellis.branches.last, axis=2)
     total = joint.sum(axis=2, keepdims=True)
     uniform = np.full_like(joint, 1 / joint.shape[2])
-    return np.divide(joint, total, out=uniform, where=total > 0).swapaxes(0, 1)
+    return np.asarray(np.divide(joint, total, out=uniform, where=total > 0)).swapaxes(0, 1)
 
 
 def slot_llr(metrics: FloatArray) -> Float32Array:

@@ -189,7 +189,8 @@ def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot
     A start may lie up to a header before the first sample's end; what is not seen counts as nothing.
     """
     share = weight / (weight + 1.0)
-    return _header_correlation((pooled * share).sum(axis=0)[None] / max(pooled.shape[0], 1), samples_per_slot)[0]
+    mean = (pooled * share).sum(axis=0) / max(pooled.shape[0], 1)
+    return np.asarray(_header_correlation(mean[None], samples_per_slot)[0])
 
 
 def _header_correlation(values: NDArray[np.floating], samples_per_slot: int) -> FloatArray:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rxcli.numerics import SlotLight, exposure_shares, taken
 from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 #: Slots to each side that a blur reaches.
@@ -26,7 +25,7 @@ def exposed(slots: Float32Array, positions: FloatArray, exposure_slots: float) -
         positions: (C, R) or (1, R) exposure's centre in slots.
         exposure_slots: exposure in slots.
     """
-    return _Light(slots).between(positions, exposure_slots / 2) / np.float32(exposure_slots)
+    return SlotLight(slots).seen(positions, exposure_slots)
 
 
 def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
@@ -42,46 +41,12 @@ def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> 
     return np.asarray(trust[each], np.float32)
 
 
-class _Light:
-    """Slots (C, N), half lit beyond, and what they add up to.
-
-    Args:
-        slots: (C, N) values.
-    """
-
-    def __init__(self, slots: Float32Array) -> None:
-        n_columns, n = slots.shape
-        self._slots = np.full((n_columns, n + 2 * _BEYOND_SLOTS + 1), 0.5, np.float32)
-        self._slots[:, _BEYOND_SLOTS : _BEYOND_SLOTS + n] = slots
-        self._total = np.zeros_like(self._slots)
-        np.cumsum(self._slots[:, :-1], axis=1, out=self._total[:, 1:])
-
-    def between(self, positions: FloatArray, half: float) -> Float32Array:
-        """(C, R) light from `half` a slot before to as much after the positions, (C, R) or (1, R)."""
-        upper = self._until(positions + half)
-        upper -= self._until(positions - half)
-        return upper
-
-    def _until(self, positions: FloatArray) -> Float32Array:
-        place = np.clip(positions + _BEYOND_SLOTS, 0, self._total.shape[1] - 1.001)
-        left = place.astype(np.intp)
-        out = _taken(self._slots, left)
-        out *= (place - left).astype(np.float32)
-        out += _taken(self._total, left)
-        return out
-
-
-def _taken(values: NDArray[Any], index: IntArray) -> NDArray[Any]:
-    """`values` (C, n) at the places (C, R) or (1, R)."""
-    return values.take(index[0], axis=1) if index.shape[0] == 1 else np.take_along_axis(values, index, 1)
-
-
 def read_between(values: FloatArray, place: FloatArray) -> FloatArray:
     """`values` (C, n) at the places (C, R) or (1, R), linearly between."""
     place = np.clip(place, 0, values.shape[1] - 1.001)
     left = place.astype(np.intp)
-    low = _taken(values, left)
-    return np.asarray(low + (_taken(values, left + 1) - low) * (place - left))
+    low = taken(values, left)
+    return np.asarray(low + (taken(values, left + 1) - low) * (place - left))
 
 
 def row_positions(rows: FloatArray, clock: Clock) -> FloatArray:
@@ -129,15 +94,8 @@ def alike_columns(positions: FloatArray) -> list[slice]:
 
 def shares_of_slots(centre: FloatArray, slots: IntArray, exposure_slots: float, response: Response) -> Float32Array:
     """(R, n) share of each of the `slots` (R, n) in what a row at `centre` (R,) sees."""
-    share = response.centre * _overlap(centre, slots, exposure_slots)
+    share = response.centre * exposure_shares(centre[:, None], slots, exposure_slots)
     if response.side:
-        share += response.side * _overlap(centre - SIDE, slots, exposure_slots)
-        share += response.side * _overlap(centre + SIDE, slots, exposure_slots)
+        share += response.side * exposure_shares((centre - SIDE)[:, None], slots, exposure_slots)
+        share += response.side * exposure_shares((centre + SIDE)[:, None], slots, exposure_slots)
     return np.asarray(share, np.float32)
-
-
-def _overlap(centre: FloatArray, slots: IntArray, exposure_slots: float) -> FloatArray:
-    """Share of an exposure around `centre` (R,) that falls into each of its `slots` (R, n)."""
-    half = exposure_slots / 2
-    reach = np.minimum((centre + half)[:, None], slots + 1) - np.maximum((centre - half)[:, None], slots)
-    return np.asarray(np.maximum(reach, 0) / exposure_slots)

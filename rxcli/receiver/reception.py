@@ -1,0 +1,155 @@
+"""What was received of a frame on a clock, and what it says of itself: packets, doubt, darkness. Part of the wiring."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS
+from rxcli.receiver import channel, sync
+from rxcli.receiver.channel import denoise
+from rxcli.receiver.decode import assemble, detect
+from rxcli.receiver.decode.soft_bits import of_observed, still_soft_bits
+from rxcli.receiver.decode.steady import is_steady
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, SlotSamples
+
+#: A column whose symbols have this log probability whatever slots say is not looked at again.
+_BEYOND_DOUBT = -1e-3
+#: A column whose slots stand out less than this has no light to speak of.
+_DARK_SNR_DB = -3.0
+#: Weights that a quick look finds this much less likely than the best are dropped, nats.
+HOPELESS_WEIGHT = 20.0
+#: A column whose slots are so much likelier packets than any slots, nats, has packets whether its header shows or not:
+#: on wrong clocks columns show 74 at most.
+_PACKETS_WITHOUT_HEADER = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class Reception:
+    """What was received of a frame."""
+
+    clock: Clock
+    #: Of the quick look: strips pooled in pairs.
+    samples: SlotSamples
+    posteriors: BurstPosteriors
+    #: (C, N): squared contrast over variance of every slot.
+    snr: Float32Array
+    #: For the samples.
+    model: channel.LightModel
+    #: (C, N + memory, patterns).
+    metrics: FloatArray
+    #: What the auto-encoder may be shown: the fine grid without the rows' own light; None where nothing was in doubt.
+    scene: denoise.DenoiserInput | None = None
+    #: What was skipped: name -> columns.
+    skipped: dict[str, int] = field(default_factory=dict)
+
+
+def metrics_by_burst(metrics: FloatArray, clock: Clock) -> FloatArray:
+    return channel.by_burst(metrics, clock, isi_memory=metrics.shape[1] - clock.n_slots)
+
+
+def packet_evidence(metrics: FloatArray, clock: Clock) -> FloatArray:
+    """(C,) log evidence of columns, over all weights."""
+    bursts = metrics_by_burst(metrics, clock)
+    candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
+    return np.asarray(np.logaddexp.reduce(detect.weight_log_evidence(bursts, candidates), axis=1))
+
+
+def packet_llr(reception: Reception) -> float:
+    """Log-likelihood ratio of all columns' slots being packets, on the clock they were received with, over any slots.
+
+    Copies that differ and words that are not in the codebook speak against it, headers or not.
+    """
+    # The light model is surer than it should be: a column that fits poorly, or is dark, says nothing.
+    return float(np.logaddexp(column_llr(reception), 0.0).sum())
+
+
+def column_llr(reception: Reception) -> FloatArray:
+    """(C,) log-likelihood ratio of each column's slots being packets, over slots that are anything."""
+    return _packets_over_any(reception, np.arange(reception.snr.shape[0]))
+
+
+def _packets_over_any(reception: Reception, columns: NDArray[np.int64]) -> FloatArray:
+    """Log-likelihood ratio of each column's slots being packets, over slots that are anything."""
+    metrics = reception.metrics[columns]
+    packets = packet_evidence(metrics, reception.clock) - np.log(len(WEIGHTS))
+    return np.asarray(packets - detect.free_log_evidence(metrics, reception.posteriors.w[columns] / SLOTS_PER_SYMBOL))
+
+
+def headerless(reception: Reception) -> NDArray[np.bool_]:
+    """(C,) columns that show no packets: no header where it should be, and not so many words of the codebook.
+
+    With few rows a slot or at the screen's edge light is not as the model has it, and headers are the first to tell.
+    None has any where all the light is a steady periodic waveform.
+    """
+    out = assemble.without_header(reception.posteriors.header_llr)
+    if not out.all() and shows_steady_light(reception):
+        return np.ones_like(out)
+    if out.any():
+        out[out] = _packets_over_any(reception, np.flatnonzero(out)) < _PACKETS_WITHOUT_HEADER
+    return out
+
+
+def shows_steady_light(reception: Reception) -> bool:
+    """Whether the light is that of a lamp or of a screen that is dimmed by switching."""
+    samples, clock = reception.samples, reception.clock
+    contrast = sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.sigma)
+    lit = channel.lit_on_grid(reception.posteriors, clock)
+    return is_steady(*contrast, lit, clock.packet_slots)
+
+
+def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
+    """(C,) whether a column has too little light for the light model to make anything of it."""
+    n_observed, n_lit = ((snr > least).sum(axis=1) for least in (0.0, 10 ** (_DARK_SNR_DB / 10)))
+    return np.asarray((2 * n_lit < n_observed) | (n_observed == 0))
+
+
+def in_doubt(reception: Reception, certain: float) -> NDArray[np.bool_]:
+    """(C,) whether a packet that could be reported has less than the confidence `certain`."""
+    doubtful = (packet_confidence(reception) < certain) & (reception.posteriors.log_prob.min(axis=2) < _BEYOND_DOUBT)
+    return np.asarray((doubtful & complete_packets(reception)).any(axis=0))
+
+
+def complete_packets(reception: Reception) -> NDArray[np.bool_]:
+    """(B, C) packets that could be reported."""
+    return assemble.complete(assemble.slots_observed(reception.samples, reception.clock))
+
+
+def packet_confidence(reception: Reception) -> FloatArray:
+    """(B, C) confidence of packets, the auto-encoder not yet asked."""
+    by_burst = assemble.slot_margin_by_burst(slot_margin(reception), reception.clock)
+    n_columns, n_strips = reception.samples.light.shape[:2]
+    return assemble.confidence(
+        assemble.confidence_features(reception.posteriors, by_burst, np.zeros(n_columns, bool), n_strips)
+    )
+
+
+def best_packet(reception: Reception) -> FloatArray:
+    """(C,) mean log probability of the symbols of each column's surest packet that could be reported."""
+    return np.asarray(
+        np.where(complete_packets(reception), reception.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0)
+    )
+
+
+def slot_margin(reception: Reception) -> Float32Array:
+    """(C, N) what the light says for every slot as decided, nats."""
+    return detect.slot_margin(reception.metrics, channel.lit_on_grid(reception.posteriors, reception.clock) > 0.5)
+
+
+def soft_bits(
+    frame: Frame, reception: Reception, no_header: NDArray[np.bool_], denoised: frozenset[int] = frozenset()
+) -> FrameSoftBits:
+    """What a photograph says of the payload's bits, cut packets included."""
+    n_observed = assemble.slots_observed(reception.samples, reception.clock)
+    n_columns, n_strips = reception.samples.light.shape[:2]
+    features = assemble.confidence_features(
+        of_observed(reception.posteriors, n_observed),
+        assemble.slot_margin_by_burst(slot_margin(reception), reception.clock),
+        np.isin(np.arange(n_columns), list(denoised)),
+        n_strips,
+    )
+    snr_db = assemble.snr_db_of_columns(reception.snr)
+    soft = still_soft_bits(reception.posteriors, n_observed, features, snr_db, no_header)
+    return replace(soft, source=frame.source, frame=frame.index, time_s=frame.time_s)
