@@ -14,6 +14,7 @@ import numpy as np
 
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.results.aim import height_share, light_of, split_message
+from rxcli.results.grids import rival_grids
 from rxcli.results.inspection import BINS, EYE_TIMES, RANGE, Inspection, Trace, inspect_frame
 from rxcli.results.overlay import column_polygons, preview
 from rxcli.results.report import plural, printable
@@ -203,7 +204,7 @@ def _photo(frame: Frame, result: FrameResult, screen: ScreenProfile | None, came
         f'<figure><div class="view"><img src="data:image/jpeg;base64,{data}" width="{width}" height="{height}" '
         f'alt="The picture. {html.escape(told)}"><svg viewBox="0 0 {width} {height}" aria-hidden="true">'
         f"{''.join(shapes)}</svg></div><figcaption>{html.escape(told)}</figcaption></figure>"
-        f'<ul class="legend">{legend}</ul>{_coherence(frame)}'
+        f'<ul class="legend">{legend}</ul>{_coherence(frame)}{rival_grids(frame)}'
     )
     caption = "White: the outline of the screen that was found. Colours: what became of each column of its backlight."
     return _section("The picture", body, caption if polygons else "")

@@ -23,6 +23,8 @@ _RIVAL = 0.05
 #: Contrast of a grid, a share of what it explains, from which there may be columns, for one independent row: by chance
 #: it is the smaller, the more rows there are.
 _LEAST_CONTRAST = 0.95
+#: The same for every strip of a window, nats: in noise it is a third of this.
+_LEAST_IN_STRIP = 0.05
 #: How much more a lens that nobody knows must explain, a share.
 _BENT_GAIN = 0.01
 #: Grids that differ less than this over the picture, columns, are one; combs that differ less from a grid lead to it.
@@ -73,12 +75,12 @@ def find_columns(
     coherence = measure_coherence(pixels, mosaic_period=mosaic_period)
     strips = StripLight.of(coherence, layout.sigma, lens)
     found = []
-    for grid in _grids(coherence, strips, lens):
+    for grid in likely_grids(coherence, strips, lens):
         found += possible_numberings(coherence, strips, grid, layout.n_columns, layout.aspect, lines=lines)
     return ColumnSearch(coherence, tuple(found))
 
 
-def _grids(coherence: Coherence, strips: StripLight, lens: Lens | None) -> list[Grid]:
+def likely_grids(coherence: Coherence, strips: StripLight, lens: Lens | None) -> list[Grid]:
     """The grids that explain the strips' light best, and rivals that come near, likeliest first."""
     thinned = strips.thinned(_EVERY)
     combs = [Grid.of_comb(comb, coherence, lens) for comb in find_combs(coherence, strips.sigma, _COMBS)]
@@ -96,7 +98,7 @@ def _grids(coherence: Coherence, strips: StripLight, lens: Lens | None) -> list[
     for grid in refined:
         near = grid.likelihood > (1 - _RIVAL) * refined[0].likelihood
         new = not any(_apart(grid, known) < _SAME for known in distinct)
-        if near and new and grid.contrast > least * grid.explained:
+        if near and new and grid.contrast > max(least * grid.explained, _LEAST_IN_STRIP * strips.x.size):
             distinct.append(grid)
     return [_bent(strips, grid) for grid in distinct] if lens is None else distinct
 
