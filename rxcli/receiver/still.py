@@ -152,7 +152,8 @@ def _likelier_clock(acquisition: Acquisition, first: Reception, skip: frozenset[
 def _refined_once(acquisition: Acquisition) -> Reception:
     """The first pass and a look at all scales of every column that has light."""
     first = first_pass(acquisition)
-    return _refine_columns(acquisition, first, np.flatnonzero(~dark_columns(first.snr)), _COARSE)[0]
+    lit = np.flatnonzero(~dark_columns(first.snr))
+    return _refine_columns(acquisition, first, lit, _COARSE)[0] if lit.size else first
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
