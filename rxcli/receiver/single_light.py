@@ -9,6 +9,7 @@ import numpy as np
 from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of
 from rxcli.receiver.context import Failure, FrameContext
+from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.steady import is_alike, periodic_share
 from rxcli.receiver.reception import column_llr, shows_steady_light
@@ -34,6 +35,8 @@ def with_data(
     context: FrameContext, sampler: ColumnSampler, acquisition: Acquisition | Failure
 ) -> Acquisition | Failure:
     """A screen whose clock was found, unless its light carries no data; and why no clock was found."""
+    if all(too_small(context, screen) for screen in context.screens):
+        return acquisition  # No packet fits; and light of few rows repeats itself under some period.
     with context.timer("detect"):
         if not isinstance(acquisition, Failure):
             return _without_data(acquisition) or acquisition
