@@ -12,7 +12,7 @@ from rxcli.receiver.sampling.rows import sample_rows
 from rxcli.types import Frame, Outlines, RowProfiles
 
 #: Readings of one frame that are kept: of few and of many columns, quick and in depth, and some for outlines in doubt.
-_MOST_KEPT = 8
+_MOST_KEPT = 4
 #: Edges that are this near, pixels, enclose the same light.
 _SAME_EDGES_PX = 0.02
 
