@@ -61,10 +61,11 @@ class RowStore:
                     return replace(known, sensor_row=outlines.sensor_row, noise_floor=floor, noise_slope=slope)
         profiles = sample_rows(frame, outlines, tone, quick=quick, noise=noise)
         if noise is None:
-            self._readings = [
-                *self._readings[-_MOST_KEPT + 1 :],
-                _Reading(frame.pixels, tone, quick, outlines, profiles),
-            ]
+            # Sensor rows are asked anew: they are what a lens changes.
+            reading = _Reading(
+                frame.pixels, tone, quick, replace(outlines, sensor_row=None), replace(profiles, sensor_row=None)
+            )
+            self._readings = [*self._readings[-_MOST_KEPT + 1 :], reading]
         return profiles
 
 
