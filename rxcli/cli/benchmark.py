@@ -148,8 +148,8 @@ def _calibration_notes(result: Calibration) -> list[str]:
             f"likeliest scaling: logistic({result.scaling.offset:+.3f} {result.scaling.slope:+.3f} * "
             f"logit(confidence)), Brier score {format_value(result.brier_scaled)}"
         )
-    if result.weights:
-        lines.append("likeliest weights of the evidence: " + " ".join(f"{weight:+.3f}" for weight in result.weights))
+    for weights in result.weights.values():
+        lines.append("likeliest weights of the evidence: " + " ".join(f"{weight:+.3f}" for weight in weights))
     return lines
 
 
