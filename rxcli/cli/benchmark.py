@@ -148,9 +148,8 @@ def _calibration_notes(result: Calibration) -> list[str]:
             f"likeliest scaling: logistic({result.scaling.offset:+.3f} {result.scaling.slope:+.3f} * "
             f"logit(confidence)), Brier score {format_value(result.brier_scaled)}"
         )
-    if result.weights:
-        lines.append("likeliest weights of the evidence: " + " ".join(f"{weight:+.3f}" for weight in result.weights))
-    return lines
+    fitted = (" ".join(f"{weight:+.3f}" for weight in weights) for weights in result.weights.values())
+    return lines + [f"likeliest weights of the evidence: {weights}" for weights in fitted]
 
 
 @benchmark.command()

@@ -27,6 +27,8 @@ _FEW_ROWS_SHARE, _FEW_ROWS, _FEW_ROWS_WIDTH_PX = 0.4, (1.5, 5.0), (100.0, 900.0)
 #: Powers of ten of the light against that of the preset: clean at one end, hopeless at the other, most about where
 #: packets begin to fail.
 _LIGHT = (-1.4, 0.1)
+#: Terms of what confidences are made of: of photographs, and of clips whose picture is known.
+TERMS = (8, 3)
 #: Confidences are kept this far from 0 and 1 where their logarithm is taken.
 _EDGE = 1e-6
 
@@ -80,8 +82,9 @@ class Calibration:
     error: float
     #: None where all packets have the same outcome.
     scaling: Scaling | None
-    #: Weights of what the confidences are made of that fit these packets best; None where not all packets tell it.
-    weights: tuple[float, ...] | None
+    #: Weights of what the confidences are made of that fit these packets best, by how many terms that is: packets of
+    #: photographs and those of clips whose picture is known have their own.
+    weights: dict[int, tuple[float, ...]]
 
 
 def scene_of(seed: int) -> Scene:
@@ -172,11 +175,16 @@ def calibration(records: Sequence[Record], n_bins: int = N_BINS) -> Calibration:
     )
 
 
-def _fitted_weights(packets: Sequence[Record], right: NDArray[np.bool_]) -> tuple[float, ...] | None:
-    terms = {len(packet.get("evidence", ())) for packet in packets}
-    if right.all() or not right.any() or len(terms) > 1 or 0 in terms:
-        return None
-    return tuple(logistic_regression(np.array([packet["evidence"] for packet in packets]), right).tolist())
+def _fitted_weights(packets: Sequence[Record], right: NDArray[np.bool_]) -> dict[int, tuple[float, ...]]:
+    """Weights by number of terms, of packets that all tell theirs; none where the outcomes do not tell them."""
+    n_terms = np.array([len(packet.get("evidence", ())) for packet in packets])
+    fitted = {}
+    for n in np.unique(n_terms).tolist():
+        mine = n_terms == n
+        if n in TERMS and 0 < right[mine].sum() < mine.sum():
+            terms = np.array([packet["evidence"] for packet, own in zip(packets, mine, strict=True) if own])
+            fitted[n] = tuple(logistic_regression(terms, right[mine]).tolist())
+    return fitted
 
 
 def bin_outcomes(confidence: FloatArray, right: NDArray[np.bool_], n_bins: int = N_BINS) -> tuple[Bin, ...]:

@@ -104,6 +104,8 @@ class _Link:
 
     time: tracking.LinkTime
     phase: tracking.BurstPhase
+    #: Columns and slots of a packet.
+    shape: tuple[int, int]
     #: Number of burst 0 of this time in the clip.
     offset: int = 0
     last_time_s: float = 0.0
@@ -478,8 +480,9 @@ class _Clip:
         view = waiting.view
         assert view is not None
         done: list[FrameResult] = []
-        known = self._link if self._stretch is not None else None
-        first_copy = known.time.take(frame.index, frame.time_s, view.bursts.clock) if known else None
+        known, first_copy = self._link if self._stretch is not None else None, None
+        if known is not None and known.shape == _shape(view):
+            first_copy = known.time.take(frame.index, frame.time_s, view.bursts.clock)
         if first_copy is None:
             done = self._finish_scene_before() if self._link is not None else []
             self._begin_link(view, frame)
@@ -511,7 +514,7 @@ class _Clip:
             offset += int(passed_s / (screen.packet_s * self._link.phase.repeats))
         time = tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
         time = self._start.time if self._start else time
-        self._link = _Link(time, tracking.BurstPhase(view.acquisition.repeats), offset)
+        self._link = _Link(time, tracking.BurstPhase(view.acquisition.repeats), _shape(view), offset)
         self._epoch += 1
         self._bursts.begin()
 
@@ -690,6 +693,11 @@ class _Clip:
         if soft is None:
             return None
         return replace(soft, source=result.source, frame=result.frame, time_s=result.time_s)
+
+
+def _shape(view: View) -> tuple[int, int]:
+    """Columns and slots of a packet: where these differ, another screen is seen."""
+    return view.acquisition.screen.columns, view.bursts.clock.packet_slots
 
 
 def _moved_to(located: Located, corners: FloatArray) -> Located:

@@ -30,9 +30,10 @@ MAX_BER_HAT = 0.1
 #: column's strips, and of it times the posterior's: strips err together, so the more they are the less it counts.
 _CALIBRATION = (3.33, 0.74, -1.97, -0.43, -0.54, 0.14, -0.71, -0.15)
 _MOST_ODDS, _MOST_AVERAGE = 5.0, 10.0
-#: Of clips: offset, slope of the log-odds of all symbols, and slope of the logarithm of what the payload slot says that
-#: is most against its codeword, nats; packets of `rxcli.lab.benchmark.clip_confidence`.
-_CLIP_CALIBRATION = (0.103, 0.477, -0.83)
+#: Of clips: offset, slope of the log-odds of all symbols up to a limit, and slope of the logarithm of what the payload
+#: slot says that is most against its codeword, nats; packets of `rxcli.lab.benchmark.clip_confidence` and of clips from
+#: a hand, compressed again at 6 to 25 Mb/s.
+_CLIP_CALIBRATION, _MOST_CLIP_ODDS = (0.115, 0.483, -1.097), 12.0
 _AGAINST_AT_LEAST = 0.5
 #: Wrong bits of packets as likely right as wrong, the least share of them, and the power of the odds of being wrong
 #: that it goes with.
@@ -376,7 +377,7 @@ class _Doubts:
     #: (B, C) probability that they are error-free, and expected share of wrong bits.
     confidence: FloatArray
     ber_hat: FloatArray
-    #: (B, C, 8) see `confidence_features`.
+    #: (B, C, 8) see `confidence_features`; (B, C, 3) of tracked bursts, see `clip_features`.
     confidence_features: FloatArray
 
     def reported(self, min_confidence: float) -> BoolArray:
@@ -386,8 +387,7 @@ class _Doubts:
 
 def _doubts(posteriors: BurstPosteriors, confidence_features: FloatArray) -> _Doubts:
     unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of few bits are filled up with NaN
-    still = confidence_features[..., : len(_CALIBRATION)]
-    return _Doubts(confidence(still), np.nanmean(unsure, axis=(2, 3)), confidence_features)
+    return _Doubts(confidence(confidence_features), np.nanmean(unsure, axis=(2, 3)), confidence_features)
 
 
 def _clip_doubts(burst: BurstInClip) -> _Doubts:
@@ -396,48 +396,33 @@ def _clip_doubts(burst: BurstInClip) -> _Doubts:
     Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
     What slots say against the codeword that was decided shows it.
     """
+    doubts = _doubts(burst.posteriors, burst.confidence_features[None])
     if burst.against is None:
-        return _doubts(burst.posteriors, burst.confidence_features[None])
-    features = clip_features(burst)
-    doubts = _doubts(burst.posteriors, features[None])
+        return doubts
+    features = clip_features(burst)[None]
     log_odds = clip_log_odds(burst)
     n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
     at_evens = np.maximum(WRONG_AT_EVENS / n_bits, BER_AT_EVENS)
     wrong = np.minimum(at_evens * np.exp(-BER_EXPONENT * log_odds), 0.5)
-    return replace(doubts, confidence=_probability(log_odds), ber_hat=np.maximum(doubts.ber_hat, wrong))
+    ber_hat = np.maximum(doubts.ber_hat, wrong)
+    return _Doubts(_probability(log_odds), ber_hat, features)
 
 
 def clip_log_odds(burst: BurstInClip) -> FloatArray:
     """(1, C) calibrated log-odds of the packets of a burst of a clip being error-free."""
     if burst.against is None:
         return confidence_log_odds(burst.confidence_features[None])
-    return np.asarray(clip_features(burst)[None, :, :3] @ np.array(_CLIP_CALIBRATION))
+    return np.asarray(clip_features(burst)[None] @ np.array(_CLIP_CALIBRATION))
 
 
 def clip_features(burst: BurstInClip) -> FloatArray:
-    """(C, k) what the confidence of a burst's packets is made of, in the order of `_CLIP_CALIBRATION`."""
+    """(C, 3) what the confidence of a tracked burst's packets is made of, in the order of `_CLIP_CALIBRATION`.
+
+    Beyond a limit surer symbols say nothing more: what errs then is not noise.
+    """
     assert burst.against is not None
-    log_odds = _log_odds(burst.posteriors.log_prob.sum(axis=2))[0]
-    capped = np.clip(log_odds, -8, 8)
-    n = log_odds.size
-    others = (capped.sum() - capped) / max(n - 1, 1)
-    beside = np.stack([np.r_[capped[:1], capped[:-1]], np.r_[capped[1:], capped[-1:]]]).min(axis=0)
-    return np.stack(
-        [
-            np.ones(n),
-            log_odds,
-            np.log(burst.against + _AGAINST_AT_LEAST),
-            others,
-            beside,
-            np.minimum(burst.posteriors.header_llr[0], 20),
-            _log_odds(burst.posteriors.log_prob.min(axis=2))[0],
-            np.full(n, np.log(len(burst.frames))),
-            burst.n_observed.sum(axis=1) / burst.n_observed.shape[1],
-            *burst.confidence_features[:, 1:].T,
-            _log_odds(burst.posteriors.w_log_prob.max(axis=1)),
-        ],
-        axis=1,
-    )
+    log_odds = np.minimum(_log_odds(burst.posteriors.log_prob.sum(axis=2))[0], _MOST_CLIP_ODDS)
+    return np.stack([np.ones_like(log_odds), log_odds, np.log(burst.against + _AGAINST_AT_LEAST)], axis=1)
 
 
 def _packet(
