@@ -323,7 +323,8 @@ class Bursts:
                     metrics[burst].copy(), n_observed, [view.frame], np.zeros(n_observed.shape[0], bool), view.tracked
                 )
                 continue
-            have.metrics += metrics[burst]
+            have.metrics, added = _of_one_memory(have.metrics, metrics[burst])
+            have.metrics += added
             have.n_observed = have.n_observed + n_observed
             have.frames.append(view.frame)
             have.tracked |= view.tracked
@@ -387,6 +388,23 @@ class Bursts:
             for number, entry in entries
             if entry is not None and entry.posteriors is not None
         ]
+
+
+def _of_one_memory(first: FloatArray, second: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Metrics (C, n + memory, patterns) of two frames, that of the shorter memory written as of the longer.
+
+    What a sample says of its last slots it says of every pattern that ends with them.
+    """
+    longest = max(first.shape[-1], second.shape[-1])
+    n_metrics = max(first.shape[1], second.shape[1])
+
+    def written(metrics: FloatArray) -> FloatArray:
+        if metrics.shape[-1] == longest:
+            return metrics
+        every = metrics[..., np.arange(longest) % metrics.shape[-1]]
+        return np.pad(every, ((0, 0), (0, n_metrics - metrics.shape[1]), (0, 0)))
+
+    return written(first), written(second)
 
 
 def _nothing_known(like: BurstPosteriors, n: int) -> BurstPosteriors:
