@@ -44,6 +44,8 @@ from rxcli.types import BoolArray, FloatArray, Frame, FrameResult, FrameSoftBits
 #: Frames at the start of a scene that are looked at once more when the picture is known better; how many are waited for
 #: where compression has taken much; and the share of the well lit packets that are then in doubt.
 _HELD, _HELD_LONG, _MUCH_DOUBT = 6, 24, 0.03
+#: Looks at so few frames: what one of them was decided to be tells in the next of the others.
+_LOOKS = 2
 #: Share in doubt, before the first of these looks, that it would not mend: it is left out.
 _TOO_MUCH_DOUBT = 0.25
 #: Share of columns that a quick look at a first frame may leave in doubt.
@@ -611,8 +613,9 @@ class _Clip:
         ]
         may_wait = self._n_held < _HELD_LONG and not at_last and not self._options.prompt
         if len(held) > 1 and not (may_wait and self._doubt(held) > _TOO_MUCH_DOUBT):
-            self._measure_again(held)
-            self._detect_again()
+            for _ in range(_LOOKS if len(held) <= _HELD else 1):
+                self._measure_again(held)
+                self._detect_again()
         self._hold(_HELD_LONG if may_wait and self._doubt(held) > _MUCH_DOUBT else 0)
 
     def _doubt(self, held: list[Waiting]) -> float:
@@ -628,7 +631,7 @@ class _Clip:
         assert self._scene is not None
         self._bursts.detect_stale(*held)
         known = [self._bursts.lit(waiting) for waiting in held]
-        doubtful = [self._bursts.doubts(waiting)[0] > 0 for waiting in held]
+        doubtful = [len(held) <= _HELD or self._bursts.doubts(waiting)[0] > 0 for waiting in held]
         self._scene.measure_again([w.view for w in held if w.view is not None], known, doubtful)
 
     def _detect_again(self) -> None:

@@ -25,8 +25,8 @@ _AROUND_ERROR, _LEAST_ERROR = 0.3, 0.02
 #: Rows in each direction, all strips of a column together, from which the picture is taken where those around were not
 #: lit either; its weight against theirs, and its relative error, which neighbouring rows have in common.
 _WIDE_ROWS, _WIDE, _WIDE_ERROR = 60, 0.1, 2.0
-#: Squared error of what a row is taken to see, in parts of full light, times the rows of a slot, which have it in common:
-#: a slot decided wrongly, or spilled light that is not as the model has it.
+#: Squared error of what a row is taken to see, in parts of full light, times the rows of a slot, which have it in
+#: common: a slot decided wrongly, or spilled light that is not as the model has it.
 _SEEN_ERROR = 0.03
 #: A slot's light is at 0.5 with this precision before anything is seen.
 PRIOR = 4.0
