@@ -21,7 +21,7 @@ _UNTOLD, _UNSURE = 0.01, 0.125
 #: Rows around, in each direction, from which the picture of a row that was never lit is taken.
 _AROUND_ROWS = 4
 #: Relative error of a picture taken from the rows around, and of one that was looked at well.
-_AROUND_ERROR, _LEAST_ERROR = 0.3, 0.02
+_AROUND_ERROR, _LEAST_ERROR = 0.6, 0.02
 #: Rows in each direction, all strips of a column together, from which the picture is taken where those around were not
 #: lit either; its weight against theirs, and its relative error, which neighbouring rows have in common.
 _WIDE_ROWS, _WIDE, _WIDE_ERROR = 60, 0.1, 2.0
