@@ -50,8 +50,8 @@ _LOOKS = 2
 _TOO_MUCH_DOUBT = 0.25
 #: Share of columns that a quick look at a first frame may leave in doubt.
 _QUICK_DOUBT = 0.5
-#: Share of columns in doubt from which a first frame is not explained by the camera that is named, and below which it is
-#: by another.
+#: Share of columns in doubt from which a first frame is not explained by the camera that is named, and below which it
+#: is by another.
 _UNLIKE_DOUBT, _LIKE_DOUBT = 0.85, 0.65
 #: Pixels of which one is compared with the frame before; least change from row to row, grey levels of 255, and share of
 #: it that a frame shown twice differs from itself.
