@@ -278,7 +278,8 @@ class KnownPicture:
         light, observed = (values.sum(axis=1) for values in (self._light, self._observed))
         usual = light.sum() / max(float(observed.sum()), 1e-6)
         some = np.float32(_WIDE)
-        return (box_sums(light, _WIDE_ROWS) + some * usual) / (box_sums(observed, _WIDE_ROWS) + some)
+        wide = (box_sums(light, _WIDE_ROWS) + some * usual) / (box_sums(observed, _WIDE_ROWS) + some)
+        return np.asarray(wide, np.float32)
 
     def _factor(self, measured: Float32Array | None = None) -> _System:
         """Normal equations A m = b of every row, A symmetric with two bands: A = L D L', and the diagonal of A^-1."""
