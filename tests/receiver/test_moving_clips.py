@@ -20,8 +20,6 @@ from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Frame, FrameResult
 
 N_FRAMES, SPEED_PX, SEED = 12, 3.0, 5
-#: Wrong packets of a confidence of 0.99 and more, of some 170, in clips that learn little: there should be none.
-FEW_SURELY_WRONG = 2
 Clip = tuple[tuple[Frame, ...], Truth, ReceiverOptions]
 
 
@@ -103,7 +101,7 @@ def test_a_picture_without_texture_is_followed_by_its_outline() -> None:
 def test_a_step_of_exposure_or_focus(change: Change) -> None:
     results, score = received(filmed(scene_in_hand(2.0, changes=(change,))))
     assert score.error_free >= 0.85 * score.expected
-    assert surely_wrong(results) <= FEW_SURELY_WRONG
+    assert surely_wrong(results) == 0
 
 
 def test_a_hand_across_the_screen_costs_its_own_frames_only(shaky: Clip) -> None:
@@ -139,7 +137,7 @@ def test_dropped_frames(shaky: Clip) -> None:
     shown = {b.burst for k in kept for b in shaky[1].frames[k].bursts if b.visible_slots >= 72}
     right = [p for r in marked for c in r.columns for p in c.packets if p.bit_errors == 0]
     assert len(right) >= 0.9 * 20 * len(shown)
-    assert surely_wrong(marked) <= FEW_SURELY_WRONG
+    assert surely_wrong(marked) == 0
 
 
 def test_a_frame_shown_twice_is_left_out(shaky: Clip) -> None:
@@ -152,7 +150,7 @@ def test_a_frame_shown_twice_is_left_out(shaky: Clip) -> None:
     scorer = Scorer(shaky[1])
     marked = [scorer.add(replace(r, frame=twice[r.frame])) for n, r in enumerate(results) if n not in (4, 9)]
     assert scorer.score().error_free >= 0.9 * scorer.score().expected
-    assert surely_wrong(marked) <= FEW_SURELY_WRONG
+    assert surely_wrong(marked) == 0
 
 
 @pytest.mark.parametrize("stamps", [[0] * 6, [9, 8, 7, 6, 5, 4], [None] * 6, [0, 1, 1, 2, 3, 3]])
@@ -171,6 +169,68 @@ def test_a_clip_without_times_says_so(shaky: Clip) -> None:
     results, score = received(shaky, frames)
     assert all("nominal frame rate" in (result.message or "") for result in results[1:])
     assert score.error_free >= 0.9 * score.expected
+
+
+@pytest.mark.parametrize("stretch", [2, 4, 8])
+def test_slow_motion_counts_on_the_links_time(shaky: Clip, stretch: int) -> None:
+    frames = tuple(replace(frame, time_s=stretch * frame.time_s) for frame in shaky[0])
+    results, score = received(shaky, frames)
+    assert all(f"slow motion: time stamps are {stretch} times" in (result.message or "") for result in results)
+    assert score.error_free >= 0.9 * score.expected
+    assert surely_wrong(results) == 0
+
+
+def test_a_clip_whose_speed_was_changed_is_received_frame_by_frame(shaky: Clip) -> None:
+    frames = tuple(replace(frame, time_s=frame.time_s * 1.37) for frame in shaky[0])
+    results, _ = received(shaky, frames)
+    assert all("do not fit the link's time" in (result.message or "") for result in results)
+    right = [p for r in results for c in r.columns for p in c.packets if p.bit_errors == 0]
+    assert len(right) >= 0.5 * 20 * len(frames)
+    assert surely_wrong(results) == 0
+
+
+def test_a_variable_frame_rate() -> None:
+    """Frames of a camera that waits for light: what passes between two of them is a multiple of nothing."""
+    scene = scene_in_hand(0.5, n_frames=130, frame_rate_hz=480.0)
+    take = prepare(scene, SEED)
+    waits = [8, 8, 11, 9, 8, 13, 8, 10, 16, 8, 9]
+    at = np.concatenate([[0], np.cumsum(waits)])
+    frames = tuple(Frame(np.asarray(take.frame(int(k)).pixels), "clip", n, k / 480) for n, k in enumerate(at))
+    scorer = Scorer(truth_of(take))
+    results = [scorer.add(replace(r, frame=int(at[r.frame]))) for r in receive(frames, options_of(take))]
+    right = [p for r in results for c in r.columns for p in c.packets if p.bit_errors == 0]
+    assert len(right) >= 0.5 * 20 * len(frames)
+    assert surely_wrong(results) == 0
+
+
+def test_a_stabilised_clip_of_a_named_camera_says_so() -> None:
+    pose = replace(scene_in_hand(1.0).pose, fill=0.78)
+    results, score = received(filmed(scene_in_hand(1.0, stabilised=True, pose=pose)))
+    assert all("1.06" in (result.message or "") and "stabilis" in (result.message or "") for result in results)
+    assert score.error_free >= 0.85 * score.expected
+    assert surely_wrong(results) == 0
+
+
+@pytest.mark.parametrize("factor", [1.06, 1 / 1.06])
+def test_a_step_of_the_zoom(shaky: Clip, factor: float) -> None:
+    scene = scene_in_hand(SPEED_PX)
+    zoomed = filmed(replace(scene, pose=replace(scene.pose, fill=scene.pose.fill / max(factor, 1.0))))
+    closer = filmed(replace(scene, pose=replace(scene.pose, fill=scene.pose.fill * min(factor, 1.0))))
+    first, second = (shaky, zoomed) if factor > 1 else (closer, shaky)
+    results, score = received(shaky, (*first[0][:6], *second[0][6:]))
+    assert score.error_free >= 0.85 * score.expected
+    assert surely_wrong(results) == 0
+
+
+def test_a_step_of_the_white_balance(shaky: Clip) -> None:
+    """What it makes of the luma: the tone of a picture's parts, each by its colour."""
+
+    def otherwise(frame: Frame) -> Frame:
+        return replace(frame, pixels=np.uint8(255 * (frame.pixels / 255) ** 1.15))
+
+    results, score = received(shaky, (*shaky[0][:6], *map(otherwise, shaky[0][6:])))
+    assert score.error_free >= 0.85 * score.expected
+    assert surely_wrong(results) == 0
 
 
 def test_two_clips_cut_together(shaky: Clip) -> None:

@@ -20,7 +20,7 @@ from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.receiver.channel.known_picture import KnownPicture, exposed
 from rxcli.receiver.decode.detect import detect
 from rxcli.receiver.pipeline import receive
-from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime
+from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime, of_one_memory
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Clock, Float32Array, Frame, FrameResult
 
@@ -249,7 +249,7 @@ def test_frames_before_and_after_an_occlusion_are_looked_at_again(clip: Clip, mo
     got = list(receive((*clip.frames[:3], dark, *clip.frames[4:]), clip.options))
     assert [result.frame for result in got] == [frame.index for frame in clip.frames]
     assert got[3].status in ("no_signal", "no_screen")
-    assert measured[:2] == [[0, 1, 2], [4, 5, 6, 7, 8, 9]]
+    assert measured[:4] == [[0, 1, 2]] * 2 + [[4, 5, 6, 7, 8, 9]] * 2
 
 
 def test_a_look_that_would_not_mend_much_is_left_out(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -418,6 +418,35 @@ def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
     alone, _ = other.picture()
     assert without == pytest.approx(alone, abs=1e-4)
     assert known.picture()[0] == pytest.approx(with_it)
+
+
+def test_rows_that_were_never_lit_are_not_known() -> None:
+    """Light that neighbours spill is no look at a picture: what is lit there at last is not taken for dark."""
+    known = KnownPicture(np.ones((3, 1, 60), bool), np.array([[0.05, 0.9, 0.05]]), 0.0, 1e-6, 1e-6)
+    lit = np.zeros((3, 60), np.float32)
+    lit[0] = 1.0
+    # The model has it that the neighbour spills a twentieth; three times as much comes.
+    light = np.where(np.arange(3)[:, None] == 1, 0.15, 0.9)[:, None] * np.ones((3, 1, 60)) * lit[:1]
+    for _ in range(4):
+        known.learn(light.astype(np.float32), lit, np.ones((3, 60), np.float32))
+    both = lit.copy()
+    both[1] = 1.0
+    now = (np.array([0.95, 0.95, 0.05])[:, None, None] * np.ones((3, 1, 60))).astype(np.float32)
+    seen = known.solve(now)
+    assert (seen.precision[1] * (1 - seen.value[1]) < 8).all()
+
+
+def test_metrics_of_unlike_memories_add_up() -> None:
+    rng = np.random.default_rng(3)
+    short, long = rng.normal(size=(2, 11, 4)), rng.normal(size=(2, 13, 16))
+    first, second = of_one_memory([short, long])
+    assert np.array_equal(second, long)
+    slots = rng.integers(0, 2, 16)
+    for place in range(11):
+        two = int(slots[place + 2] + 2 * slots[place + 1])
+        four = int(two + 4 * slots[place] + 8 * slots[max(place - 1, 0)])
+        assert np.array_equal(first[:, place, four], short[:, place, two])
+    assert not first[:, 11:].any()
 
 
 def test_columns_not_yet_tried_are_unknown() -> None:

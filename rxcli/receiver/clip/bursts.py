@@ -12,7 +12,7 @@ from rxcli.receiver import channel, sync
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble, detect
 from rxcli.receiver.reception import HOPELESS_WEIGHT
-from rxcli.receiver.sync.tracking import Bursts
+from rxcli.receiver.sync.tracking import Bursts, of_one_memory
 from rxcli.types import Float32Array, FloatArray, IntArray
 
 #: A burst of a column all of whose symbols have at least this log probability is not decoded again.
@@ -96,7 +96,7 @@ class BurstReader:
         if self._weights is None or self._weights.shape[0] != self.open.n_columns:
             self._weights = np.zeros((self.open.n_columns, len(WEIGHTS)), bool)
         places = [np.nonzero(wanted) for _, wanted in found]
-        metrics = [self.open.metrics(numbers) for numbers, _ in found]
+        metrics = of_one_memory([self.open.metrics(numbers) for numbers, _ in found])
         weights = [_settled_weights(self._weights, m, wanted) for m, (_, wanted) in zip(metrics, found, strict=True)]
         number = np.concatenate([numbers[burst] for (numbers, _), (burst, _) in zip(found, places, strict=True)])
         column = np.concatenate([c for _, c in places])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import channel, sync
 from rxcli.receiver.acquisition import Acquisition, sample_columns
-from rxcli.receiver.cameras import context_at
+from rxcli.receiver.cameras import context_at, has_profile
 from rxcli.receiver.clip import results
 from rxcli.receiver.clip.bursts import BurstReader
 from rxcli.receiver.clip.outline import FirstOutline
@@ -44,16 +44,25 @@ from rxcli.types import BoolArray, FloatArray, Frame, FrameResult, FrameSoftBits
 #: Frames at the start of a scene that are looked at once more when the picture is known better; how many are waited for
 #: where compression has taken much; and the share of the well lit packets that are then in doubt.
 _HELD, _HELD_LONG, _MUCH_DOUBT = 6, 24, 0.03
+#: Looks at so few frames: what one of them was decided to be tells in the next of the others.
+_LOOKS = 2
 #: Share in doubt, before the first of these looks, that it would not mend: it is left out.
 _TOO_MUCH_DOUBT = 0.25
 #: Share of columns that a quick look at a first frame may leave in doubt.
 _QUICK_DOUBT = 0.5
+#: Share of columns in doubt from which a first frame is not explained by the camera that is named, and below which it
+#: is by another.
+_UNLIKE_DOUBT, _LIKE_DOUBT = 0.85, 0.65
 #: Pixels of which one is compared with the frame before; least change from row to row, grey levels of 255, and share of
 #: it that a frame shown twice differs from itself.
 _SAME_STEP, _SAME_CONTRAST, _SAME_SHARE = 7, 3.0, 0.25
 _SAME = "it shows the frame before once more, so that its time is not that of its rows; it was left out"
 _NOMINAL_TIME = "the clip's time stamps do not advance here; its nominal frame rate was taken"
 _SLOW_MOTION = "slow motion: time stamps are {:g} times as long as the link's time, which was taken"
+_UNLIKE = (
+    "rows are {:.3f} times as quick as the named camera's, as in clips that were stabilised or cropped: the camera was "
+    "estimated instead; switch stabilisation off for the best"
+)
 _RETIMED = (
     "the clip's time stamps do not fit the link's time, as after a change of its speed: each frame is received alone; "
     "give the clip as the camera recorded it"
@@ -157,6 +166,9 @@ class _Clip:
         #: A frame with the camera and the screens that remain, and what they were found for.
         self._context: FrameContext | None = None
         self._taken_with: tuple[object, ...] = ()
+        #: Whether it was looked whether the camera's profile explains the clip; what there is to say of it.
+        self._tried_profile = False
+        self._camera_note: str | None = None
         self._corners: FloatArray | None = None
         #: Some pixels of the last frame.
         self._some: NDArray[np.float32] | None = None
@@ -241,6 +253,8 @@ class _Clip:
             waiting.result = replace(waiting.result, denoiser=report)
             if not isinstance(view, Failure):
                 self._go_on(view, frame)
+        if self._camera_note and not waiting.result.message:
+            waiting.result = replace(waiting.result, message=self._camera_note)
         if isinstance(view, Failure):
             self._scene = None
             waiting.result = replace(waiting.result, status=view.status, message=view.message)
@@ -328,6 +342,12 @@ class _Clip:
         can_track = self._can_track(context, acquisition)
         again = can_track and self._n_held == _HELD
         reception, denoised, report = self._decoded(acquisition, received.reception, again, timer)
+        estimated = self._with_estimated_camera(context, reception)
+        if estimated is not None:
+            context, acquisition = estimated.context, estimated.acquisition
+            can_track = self._can_track(context, acquisition)
+            again = can_track and self._n_held == _HELD
+            reception, denoised, report = self._decoded(acquisition, estimated.reception, again, timer)
         if self._start is None and shows_steady_light(reception):
             return Failure("no_signal", STEADY_LIGHT), None
         if assemble.all_dark(reception.snr):
@@ -410,6 +430,26 @@ class _Clip:
         context = replace(received.context, camera=camera)
         self._context = context
         return _Settled(context, received.acquisition, received.reception)
+
+    def _with_estimated_camera(self, context: FrameContext, reception: Reception) -> _Settled | None:
+        """A clip's first frame by a camera estimated from it, where that of the profile explains nothing of it.
+
+        Stabilisation crops and enlarges what was read, so that rows are no longer those of the profile.
+        """
+        tried, self._tried_profile = self._tried_profile, True
+        if tried or not has_profile(context.frame, self._options) or _doubt_of(reception) < _UNLIKE_DOUBT:
+            return None
+        before = self._options, self._context
+        self._options = replace(self._options, cameras=(), force_camera=False, camera_cache=None)
+        other = likely_camera(context.frame, context.corners, self._options, context.timer)
+        found = other if isinstance(other, Failure) else self._with_settled_camera(other)
+        if isinstance(found, Failure) or _doubt_of(found.reception or initial_pass(found.acquisition)) > _LIKE_DOUBT:
+            self._options, self._context = before
+            return None
+        self._context = found.context
+        stretch = context.camera.line_delay_s / found.context.camera.line_delay_s
+        self._camera_note = _UNLIKE.format(stretch)
+        return found
 
     def _go_on(self, view: View, frame: Frame) -> None:
         """After a frame received like a photograph: with the scene before, as long as such frames are few.
@@ -614,8 +654,9 @@ class _Clip:
         ]
         may_wait = self._n_held < _HELD_LONG and not at_last and not self._options.prompt
         if len(held) > 1 and not (may_wait and self._doubt(held) > _TOO_MUCH_DOUBT):
-            self._measure_again(held)
-            self._detect_again()
+            for _ in range(_LOOKS if len(held) <= _HELD else 1):
+                self._measure_again(held)
+                self._detect_again()
         self._hold(_HELD_LONG if may_wait and self._doubt(held) > _MUCH_DOUBT else 0)
 
     def _doubt(self, held: list[Waiting]) -> float:
@@ -631,7 +672,7 @@ class _Clip:
         assert self._scene is not None
         self._bursts.detect_stale(*held)
         known = [self._bursts.lit(waiting) for waiting in held]
-        doubtful = [self._bursts.doubts(waiting)[0] > 0 for waiting in held]
+        doubtful = [len(held) <= _HELD or self._bursts.doubts(waiting)[0] > 0 for waiting in held]
         self._scene.measure_again([w.view for w in held if w.view is not None], known, doubtful)
 
     def _detect_again(self) -> None:
@@ -705,6 +746,11 @@ def _moved_to(located: Located, corners: FloatArray) -> Located:
     context = located.context
     moved = context_at(context, corners) if isinstance(context, FrameContext) else context
     return Located(replace(located.outline, corners=corners), moved)
+
+
+def _doubt_of(reception: Reception) -> float:
+    """Share of the columns of a frame that are in doubt."""
+    return float(doubtful_columns(reception).size / reception.snr.shape[0])
 
 
 def _taken_with(frame: Frame) -> tuple[object, ...]:

@@ -38,6 +38,8 @@ _LOOK_EVERY, _STILL_LOOKS = 8, 3
 #: In screen widths: how far an outline may be from where the screen was to be there still; how far from the first that
 #: was; and how far it may move from one frame to the next to be found.
 _STILL_OUTLINE, _SAME_OUTLINE, _OUTLINE_REACH = 0.004, 0.006, 0.02
+#: How much of its shape an outline may lose or win between two looks, in screen widths.
+_BENT = 0.012
 #: A screen found anew whose corners are closer than this to where they were, in screen widths, is where it was.
 _NEAR = 0.06
 #: Frames from which the picture is learned one by one, and how often from then on.
@@ -145,13 +147,13 @@ class TrackedScreen:
         found = self._texture.find(frame)
         confirmed = found.fits
         if not found.tells:
-            outline = self._outline_near(frame, found.corners)
+            possible = _is_possible(self._expected - found.corners, found.covariance)
+            outline = self._outline_near(frame, self._expected, surprised=not possible)
             confirmed = confirmed or outline is not None or self._named
             found = self._untold(found, outline)
         if not confirmed:
             return False
-        at_rest = found.tells or self._named or self._n_still >= _STILL_LOOKS
-        if at_rest and _is_still(found.corners - self.corners, found.sd_px):
+        if (found.tells or self._rests) and _is_still(found.corners - self.corners, found.sd_px):
             found = replace(found, corners=self.corners)
         else:
             self._move(frame, found)
@@ -160,12 +162,10 @@ class TrackedScreen:
 
     def _untold(self, found: Registration, outline: FloatArray | None) -> Registration:
         """Where the screen is that has too little texture to tell: it rests, unless its outline says that it moves."""
-        rests = self._named or self._n_still >= _STILL_LOOKS
-        expected = self.corners if rests else self.corners + self._drift
-        at_rest = self._texture.with_outline(found, expected, _REST_SD)
-        if _is_possible(expected - found.corners, found.covariance):
-            at_rest = replace(at_rest, corners=expected)
-        if rests:
+        at_rest = self._texture.with_outline(found, self._expected, _REST_SD)
+        if self._rests or _is_possible(self._expected - found.corners, found.covariance):
+            at_rest = replace(at_rest, corners=self._expected)
+        if self._rests:
             return at_rest
         # It may have moved since the last look as far as the outline errs.
         corners = at_rest.corners
@@ -177,22 +177,35 @@ class TrackedScreen:
             self._looked = corners
         return replace(at_rest, corners=corners, covariance=np.eye(8) * (_MOVING_SD * self._width) ** 2)
 
-    def _outline_near(self, frame: Frame, corners: FloatArray) -> FloatArray | None:
+    @property
+    def _rests(self) -> bool:
+        """Whether a screen whose picture does not tell where it is stays where it is."""
+        return self._named or self._n_still >= _STILL_LOOKS
+
+    @property
+    def _expected(self) -> FloatArray:
+        """(4, 2) where a screen is expected whose picture does not tell."""
+        return self.corners if self._rests else self.corners + self._drift
+
+    def _outline_near(self, frame: Frame, corners: FloatArray, surprised: bool) -> FloatArray | None:
         """Corners (4, 2) of the screen by its outline, where the picture on it does not tell; None where it shows none.
 
-        It is looked for in every other frame, and less often as long as it stays where it is.
+        It is looked for in every other frame, and less often as long as it stays where it is and nothing is a surprise.
         """
         from rxcli.receiver.screen.find import track_screen
 
         self._n_untold += 1
-        if self._n_untold % (_LOOK_EVERY if self._n_still >= _STILL_LOOKS else 2):
+        if self._n_untold % (_LOOK_EVERY if self._n_still >= _STILL_LOOKS and not surprised else 2):
             return None
         stored, order = _stored_order(corners)
         found = track_screen(frame.pixels, stored, black=frame.black, white=frame.white, reach=_OUTLINE_REACH)
         if found.corners is None:
             return None
         outline = found.corners[order]
-        if np.abs(outline - corners).max() > 2 * _OUTLINE_REACH * self._width:
+        moved = outline - corners
+        if np.abs(moved).max() > 2 * _OUTLINE_REACH * self._width:
+            return None
+        if np.abs(moved - moved.mean(axis=0)).max() > _BENT * self._width:  # the edge of something else
             return None
         before = self._still_outline
         if before is None or np.abs(outline - before).max() > _SAME_OUTLINE * self._width:

@@ -323,7 +323,8 @@ class Bursts:
                     metrics[burst].copy(), n_observed, [view.frame], np.zeros(n_observed.shape[0], bool), view.tracked
                 )
                 continue
-            have.metrics += metrics[burst]
+            have.metrics, added = of_one_memory([have.metrics, metrics[burst]])
+            have.metrics += added
             have.n_observed = have.n_observed + n_observed
             have.frames.append(view.frame)
             have.tracked |= view.tracked
@@ -344,7 +345,7 @@ class Bursts:
 
     def metrics(self, numbers: IntArray) -> FloatArray:
         """(B, C, packet + memory, patterns) of open bursts, all frames added."""
-        return np.stack([self._open[int(n)].metrics for n in numbers])
+        return np.stack(of_one_memory([self._open[int(n)].metrics for n in numbers]))
 
     def n_observed(self, numbers: IntArray) -> IntArray:
         """(B, C, packet) how often each slot was seen."""
@@ -387,6 +388,24 @@ class Bursts:
             for number, entry in entries
             if entry is not None and entry.posteriors is not None
         ]
+
+
+def of_one_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:
+    """Metrics (..., n + memory, patterns) of several frames, those of shorter memories written as of the longest.
+
+    What a sample says of its last slots it says of every pattern that ends with them.
+    """
+    n_patterns = max((some.shape[-1] for some in metrics), default=0)
+    n_metrics = max((some.shape[-2] for some in metrics), default=0)
+
+    def written(some: FloatArray) -> FloatArray:
+        if some.shape[-1] == n_patterns:
+            return some
+        every = some[..., np.arange(n_patterns) % some.shape[-1]]
+        more = [(0, 0)] * (some.ndim - 2)
+        return np.pad(every, [*more, (0, n_metrics - some.shape[-2]), (0, 0)])
+
+    return [written(some) for some in metrics]
 
 
 def _nothing_known(like: BurstPosteriors, n: int) -> BurstPosteriors:

@@ -16,13 +16,18 @@ MEMORY = 0.95
 _SMOOTH = 0.05
 #: Share of a strip's light in doubt, inverse, from which it says nothing of the picture.
 _DOUBT = 1.4
+#: Squared error of the light expected of a strip, in parts of full light, and more of it per doubt.
+_UNTOLD, _UNSURE = 0.01, 0.125
 #: Rows around, in each direction, from which the picture of a row that was never lit is taken.
 _AROUND_ROWS = 4
 #: Relative error of a picture taken from the rows around, and of one that was looked at well.
-_AROUND_ERROR, _LEAST_ERROR = 0.3, 0.02
+_AROUND_ERROR, _LEAST_ERROR = 0.6, 0.02
 #: Rows in each direction, all strips of a column together, from which the picture is taken where those around were not
 #: lit either; its weight against theirs, and its relative error, which neighbouring rows have in common.
 _WIDE_ROWS, _WIDE, _WIDE_ERROR = 60, 0.1, 2.0
+#: Squared error of what a row is taken to see, in parts of full light, times the rows of a slot, which have it in
+#: common: a slot decided wrongly, or spilled light that is not as the model has it.
+_SEEN_ERROR = 0.03
 #: A slot's light is at 0.5 with this precision before anything is seen.
 PRIOR = 4.0
 #: Rows of a slot err alike; their log-likelihoods count this much.
@@ -165,7 +170,10 @@ class KnownPicture:
         expected = self._crosstalk @ _with_neighbours(slots)
         doubt = self._crosstalk @ (1 - _with_neighbours(trust, 1.0))
         inside = self._inside if placement is None else placement.inside
-        weighted = expected * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * inside
+        # Light over what little was expected is no picture: more of it than that may be another slot's.
+        power = expected * expected
+        told = power / (power + np.float32(_UNTOLD) + np.float32(_UNSURE) * doubt)
+        weighted = expected * (told * told) * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * inside
         lit, observed = weighted * (light - self._black_level), weighted * expected
         if placement is None:
             return lit, observed
@@ -259,7 +267,9 @@ class KnownPicture:
         # Light that neighbours spill is no look at a picture: it may be any number of times what was made of it.
         unknown = np.float32(_WIDE) / near
         error = np.float32(_AROUND_ERROR**2) + np.float32(_WIDE_ERROR**2) * unknown * unknown
-        error *= np.square(np.float32(_SMOOTH) / total)
+        error *= np.float32(_SMOOTH**2)
+        error += np.float32(_SEEN_ERROR) * self._observed
+        error /= total * total
         error += np.float32(_LEAST_ERROR**2)
         return picture, error
 
@@ -268,8 +278,8 @@ class KnownPicture:
         light, observed = (values.sum(axis=1) for values in (self._light, self._observed))
         usual = light.sum() / max(float(observed.sum()), 1e-6)
         some = np.float32(_WIDE)
-        around = (box_sums(light, _WIDE_ROWS) + some * usual) / (box_sums(observed, _WIDE_ROWS) + some)
-        return np.asarray(around, np.float32)
+        wide = (box_sums(light, _WIDE_ROWS) + some * usual) / (box_sums(observed, _WIDE_ROWS) + some)
+        return np.asarray(wide, np.float32)
 
     def _factor(self, measured: Float32Array | None = None) -> _System:
         """Normal equations A m = b of every row, A symmetric with two bands: A = L D L', and the diagonal of A^-1."""
