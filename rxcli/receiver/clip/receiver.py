@@ -224,7 +224,7 @@ class _Clip:
         frames, self._first = self._first or [], None
         if self._outline is not None and self._found is not None:
             index, located = self._found
-            self._found = index, _moved_to(located, self._outline.corners)
+            self._found = index, _moved_to(located, self._outline.corners, self._options)
             context = self._found[1].context
             if self._little and len(frames) > 1 and isinstance(context, FrameContext):
                 self._start = agree(frames, context)
@@ -741,11 +741,17 @@ def _shape(view: View) -> tuple[int, int]:
     return view.acquisition.screen.columns, view.bursts.clock.packet_slots
 
 
-def _moved_to(located: Located, corners: FloatArray) -> Located:
-    """The same with the corners elsewhere."""
+def _moved_to(located: Located, corners: FloatArray, options: ReceiverOptions) -> Located:
+    """The same with the corners elsewhere; a lens that was seen in the sides between them is looked for there."""
     context = located.context
-    moved = context_at(context, corners) if isinstance(context, FrameContext) else context
-    return Located(replace(located.outline, corners=corners), moved)
+    if isinstance(context, FrameContext) and corners is not context.corners:
+        estimated = context.camera.blind_estimate
+        if estimated is not None and estimated[1].side_curvature is not None:
+            found = likely_camera(context.frame, corners, options, context.timer)
+            context = found if isinstance(found, FrameContext) else None
+        else:
+            context = context_at(context, corners)
+    return Located(replace(located.outline, corners=corners), context)
 
 
 def _doubt_of(reception: Reception) -> float:
