@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of
 from rxcli.receiver.context import Failure, FrameContext
@@ -40,15 +41,20 @@ def with_data(
     with context.timer("detect"):
         if not isinstance(acquisition, Failure):
             return _without_data(acquisition) or acquisition
-        return Failure("no_signal", STEADY_LIGHT) if _is_switched(sampler.profiles) else acquisition
+        return Failure("no_signal", STEADY_LIGHT) if _is_switched(sampler.profiles, _headers(context)) else acquisition
 
 
-def _is_switched(profiles: RowProfiles) -> bool:
+def _headers(context: FrameContext) -> float:
+    """The largest share of headers in what the screens send."""
+    return PREAMBLE_SLOTS / min(screen.packet_slots for screen in context.screens)
+
+
+def _is_switched(profiles: RowProfiles, headers: float) -> bool:
     """Whether one period explains the light of all columns on their rows, of which no clock is known."""
     light, inside = profiles.light, profiles.inside.astype(np.float32)
     value, weight = sync.contrast(light, inside, _ROWS, noise_of(profiles))
     level = value * (weight > 0)
-    if not is_alike(value, weight):
+    if not is_alike(value, weight, headers):
         return False
     return periodic_share(level - level.mean(axis=1, keepdims=True), 2 * _MOST_PERIOD_ROWS) > _SWITCHED
 
@@ -62,7 +68,8 @@ def _without_data(acquisition: Acquisition) -> Failure | None:
     binned = acquisition.binned()
     samples = sync.sample_slots(binned.profiles, binned.clock, _SAMPLES_PER_SLOT)
     contrast = sync.contrast(samples.light, samples.valid, _SAMPLES_PER_SLOT, noise_of(binned.profiles))
-    if not is_alike(*contrast, _REACH_SLOTS * _SAMPLES_PER_SLOT):
+    headers = PREAMBLE_SLOTS / binned.screen.packet_slots
+    if not is_alike(*contrast, headers, _REACH_SLOTS * _SAMPLES_PER_SLOT):
         return None
     reception = initial_pass(_as_one_column(binned))
     if float(column_llr(reception).max()) > _PACKETS and not bool(

@@ -71,10 +71,20 @@ def test_columns_are_alike_that_show_one_light() -> None:
     slanted = np.stack([light[k : k + 300] for k in range(20)]).astype(np.float32)
     noisy = slanted + rng.normal(0, 0.5, slanted.shape).astype(np.float32)
     weight = np.ones_like(noisy)
-    assert is_alike(noisy, weight, 20)
-    assert not is_alike(noisy, weight)
+    assert is_alike(noisy, weight, 0.15, 20)
+    assert not is_alike(noisy, weight, 0.15)
     different = rng.normal(size=(20, 300)).astype(np.float32)
     different[:, ::4] = light[:75]
-    assert not is_alike(different, weight, 20)
-    assert not is_alike(different[:2], weight[:2])
-    assert not is_alike(np.zeros_like(weight), np.zeros_like(weight), 20)
+    assert not is_alike(different, weight, 0.15, 20)
+    assert not is_alike(different[:2], weight[:2], 0.15)
+    assert not is_alike(np.zeros_like(weight), np.zeros_like(weight), 0.15, 20)
+
+
+def test_columns_may_have_many_headers_in_common() -> None:
+    """Two fifths of the slots of a packet of three symbols are its header."""
+    rng = np.random.default_rng(2)
+    light = np.sign(rng.normal(size=(20, 300))).astype(np.float32)
+    light[:, np.arange(300) % 5 < 3] = light[0, np.arange(300) % 5 < 3]
+    weight = np.ones_like(light)
+    assert is_alike(light, weight, 0.0)
+    assert not is_alike(light, weight, 0.4)

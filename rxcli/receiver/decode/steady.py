@@ -22,9 +22,10 @@ _STEADY = 0.6
 _REACH_SLOTS = 2
 #: Spectra are computed on a grid so many times finer than the light's length resolves.
 _FINER = 4
-#: Columns this far apart, of all, and by number, share no light; correlation from which they show the same. Packets,
-#: which have headers in common, reach 0.5, and light that is the same everywhere 0.7 and more. Pairs that are compared.
-_APART_SHARE, _APART, _ALIKE, _MOST_PAIRS = 1 / 6, 3, 0.65, 300
+#: Columns this far apart, of all, and by number, share no light; correlation, beyond that of the headers which packets
+#: have in common, from which they show the same: packets reach 0.4, and light that is the same everywhere 0.65 or more.
+#: Pairs that are compared.
+_APART_SHARE, _APART, _ALIKE, _MOST_PAIRS = 1 / 6, 3, 0.59, 300
 
 
 def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, packet_slots: int) -> bool:
@@ -45,8 +46,14 @@ def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, pack
     return steady > _STEADY and steady > _share_of_slots(level, observed, lit, samples_per_slot)
 
 
-def is_alike(value: Float32Array, weight: Float32Array, reach: int = 0) -> bool:
-    """Whether columns far apart show the same light, up to `reach` samples later or earlier; see `is_steady`."""
+def is_alike(value: Float32Array, weight: Float32Array, shared: float, reach: int = 0) -> bool:
+    """Whether columns far apart show the same light.
+
+    Args:
+        value, weight: see `is_steady`.
+        shared: part of the light that all columns of a link have in common: the share of the headers.
+        reach: samples by which columns may be later or earlier.
+    """
     n_columns, n = value.shape
     first, second = np.triu_indices(n_columns, max(_APART, int(_APART_SHARE * n_columns)))
     if first.size == 0:
@@ -58,7 +65,7 @@ def is_alike(value: Float32Array, weight: Float32Array, reach: int = 0) -> bool:
     spectrum = np.fft.rfft(level, n + reach, axis=1)
     moved = np.fft.irfft(spectrum[first[some]] * np.conj(spectrum[second[some]]), n + reach, axis=1)
     likeness = np.concatenate([moved[:, : reach + 1], moved[:, moved.shape[1] - reach :]], axis=1).max(axis=1)
-    return bool(np.median(likeness) > _ALIKE)
+    return bool(np.median(likeness) > shared + (1 - shared) * _ALIKE)
 
 
 def _mean(value: Float32Array, observed: BoolArray) -> FloatArray:
