@@ -125,7 +125,12 @@ def find_outline(
 
 
 def locate(
-    frame: Frame, options: ReceiverOptions, timer: Timer, known: FrameContext | None = None
+    frame: Frame,
+    options: ReceiverOptions,
+    timer: Timer,
+    known: FrameContext | None = None,
+    *,
+    by_columns: bool = True,
 ) -> Located | Failure:
     """The outline of the screen in a frame, and what was learned of the camera on the way.
 
@@ -134,6 +139,7 @@ def locate(
         options: of the receiver.
         timer: time is counted there.
         known: another frame of the same camera, which need not be asked again.
+        by_columns: search for columns where the sides do not tell, which takes most of the time.
     """
     refused = unreadable_orientation(frame)
     if refused is not None:
@@ -141,7 +147,7 @@ def locate(
     if options.corners is not None:
         with timer("geometry"):
             return outside_the_picture(options.corners, frame) or Located(Outline(options.corners))
-    candidates, reason = possible_outlines(frame, options, timer)
+    candidates, reason = possible_outlines(frame, options, timer, by_columns=by_columns)
     located = Located(candidates[0]) if candidates else None
     if len(candidates) > 1 or (candidates and candidates[0].by_grid_alone):
         located = _by_packets(frame, candidates, options, timer, known)
@@ -152,9 +158,11 @@ def locate(
     return Located(Outline(whole_picture(frame), inferred=SIDE_NAMES, column_offset=None))
 
 
-def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> tuple[list[Outline], str]:
-    """Outlines that the screen may have, likeliest first; why there are none, and what to do."""
-    from rxcli.receiver.screen.columns import ColumnLayout, find_columns
+def possible_outlines(
+    frame: Frame, options: ReceiverOptions, timer: Timer, *, by_columns: bool = True
+) -> tuple[list[Outline], str]:
+    """Outlines that the screen may have, likeliest first; why there are none, and what to do; see `locate`."""
+    from rxcli.receiver.screen.columns import ColumnLayout, ColumnSearch, find_columns
     from rxcli.receiver.screen.find import find_screen
 
     levels = levels_of(frame)
@@ -162,12 +170,14 @@ def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> t
         sides = find_screen(frame.pixels, **levels)
         if sides.corners is None and (turned := turned_pixels(frame)):
             return [], turned
-        by_columns = {one.columns: ColumnLayout(one.columns, one.light_spread, one.aspect) for one in options.screens}
-        layout = by_columns[min(by_columns)]
+        layouts = {one.columns: ColumnLayout(one.columns, one.light_spread, one.aspect) for one in options.screens}
+        layout = layouts[min(layouts)]
         period, lens = int(levels.get("mosaic_period", 1)), known_lens(frame, options)
-        found = _by_sides(frame, sides, [by_columns[n] for n in sorted(by_columns)], period, lens)
+        found = _by_sides(frame, sides, [layouts[n] for n in sorted(layouts)], period, lens)
         if not found:
-            columns = find_columns(frame.pixels, layout, mosaic_period=period, lens=lens, lines=sides.lines)
+            columns = ColumnSearch(None, ())
+            if by_columns:
+                columns = find_columns(frame.pixels, layout, mosaic_period=period, lens=lens, lines=sides.lines)
             found = _joined(sides, columns.numberings, layout.n_columns)
             # Sides that no grid bears out may be a column off like any others.
             unsure = [replace(one, log_odds=0.0) for one in found if not columns.numberings or one.family < 0]

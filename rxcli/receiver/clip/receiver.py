@@ -69,6 +69,8 @@ _RETIMED = (
 )
 #: Frames in a row that may be received like photographs before the picture is learned anew.
 _MOST_UNKNOWN = 3
+#: Frames without a screen after which one of so many is searched for columns, which takes most of a search.
+_THOROUGH = 8
 #: Frames that find their clock together where each shows little.
 _TOGETHER = 8
 #: Copies between two frames that have none in common.
@@ -177,8 +179,8 @@ class _Clip:
         #: None where nothing is known, or frames cannot be tracked; and the one before the last search.
         self._scene: TrackedScreen | None = None
         self._scene_before: TrackedScreen | None = None
-        #: Frames in a row that were received like photographs.
-        self._n_unknown = 0
+        #: Frames in a row that were received like photographs, and that showed no screen.
+        self._n_unknown = self._n_without = 0
         self._hold_first()
 
     def _hold_first(self) -> None:
@@ -378,7 +380,8 @@ class _Clip:
             self._context = None
         found, self._found = self._found, None
         known = found is not None and found[0] == frame.index
-        located = found[1] if found and known else locate(frame, self._options, timer, self._context)
+        located = found[1] if found and known else self._located(frame, timer)
+        self._n_without = self._n_without + 1 if isinstance(located, Failure) else 0
         if isinstance(located, Failure):
             return located
         corners, self._certainty = located.outline.corners, located.outline.certainty
@@ -391,6 +394,11 @@ class _Clip:
                 return context
             self._context, self._taken_with = context, _taken_with(frame)
         return replace(self._context, frame=frame, corners=corners, timer=timer)
+
+    def _located(self, frame: Frame, timer: Timer) -> Located | Failure:
+        """The screen in a frame; where frame after frame shows none, its columns are searched in one of so many."""
+        thorough = self._n_without < _THOROUGH or self._n_without % _THOROUGH == 0
+        return locate(frame, self._options, timer, self._context, by_columns=thorough)
 
     def _with_settled_camera(self, context: FrameContext) -> _Settled | Failure:
         """The frame's clock; and where its camera was estimated, the camera that its slots tell, from then on."""
