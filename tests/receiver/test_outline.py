@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,8 @@ from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.receiver import outline as outlines
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.outline import Located, Outline, locate, possible_outlines
-from rxcli.receiver.screen import find, geometry
+from rxcli.receiver.pipeline import receive
+from rxcli.receiver.screen import columns, find, geometry
 from rxcli.receiver.screen.coherence import measure_coherence
 from rxcli.receiver.screen.find import ScreenSearch
 from rxcli.receiver.screen.grid import grid_between
@@ -158,7 +160,7 @@ def test_the_camera_is_asked_once_and_handed_on(packets: float, monkeypatch: pyt
         return camera_of(frame, corners)
 
     candidates = [Outline(moved(k), log_odds=-float(k)) for k in range(4)]
-    monkeypatch.setattr(outlines, "possible_outlines", lambda *_: (candidates, ""))
+    monkeypatch.setattr(outlines, "possible_outlines", lambda *_, **__: (candidates, ""))
     monkeypatch.setattr(outlines, "likely_camera", likely)
     monkeypatch.setattr(outlines, "_packets", lambda _: packets)
     located = locate(frame, OPTIONS, Timer())
@@ -173,9 +175,25 @@ def test_the_camera_is_asked_once_and_handed_on(packets: float, monkeypatch: pyt
 def test_a_camera_that_shows_under_no_first_column_is_not_asked_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     candidates = [replace(Outline(moved(k)), log_odds=-float(k), family=k // 3) for k in range(6)]
-    monkeypatch.setattr(outlines, "possible_outlines", lambda *_: (candidates, ""))
+    monkeypatch.setattr(outlines, "possible_outlines", lambda *_, **__: (candidates, ""))
     monkeypatch.setattr(outlines, "likely_camera", lambda *_: (asked.append(1), Failure("no_signal", "no camera"))[1])
     located = locate(Frame(np.zeros((200, 300), np.uint8), "drawn"), OPTIONS, Timer())
     assert isinstance(located, Located)
     assert isinstance(located.context, Failure)
     assert len(asked) == 2
+
+
+def test_clips_without_a_screen_are_not_searched_for_columns_in_every_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = []
+
+    def counted(pixels: NDArray[np.uint8], *given: Any, **named: Any) -> columns.ColumnSearch:
+        searched.append(pixels)
+        return columns.ColumnSearch(None, ())
+
+    monkeypatch.setattr(columns, "find_columns", counted)
+    rng = np.random.default_rng(1)
+    frames = [Frame(rng.integers(40, 60, (160, 240), np.uint8), "clip", i, time_s=i / 30) for i in range(40)]
+    results = list(receive(frames, OPTIONS))
+    assert {result.status for result in results} == {"no_screen"}
+    assert len(results) == 40
+    assert 8 < len(searched) < 16
