@@ -16,6 +16,9 @@ WINDOW_S = 1.0
 _LOCKED = ("ok", "partial")
 #: Share of light below which a picture is dark, and of pixels at white above which it is overexposed.
 _DARK, _BRIGHT = 0.02, 0.1
+#: Share of the picture's height that a screen may move in a frame, which clips bear (`benchmark motion`: 8 pixels of
+#: 1080), and share of the columns below which motion matters at all.
+_STILL, _FEW = 0.01, 0.5
 _WORDS = {"no_screen": "no screen", "no_signal": "no signal", "unreadable": "no picture"}
 
 
@@ -69,7 +72,7 @@ class AimState:
     ber_hat: float | None = None
     light: Light | None = None
     height_share: float | None = None
-    #: Why there is no lock, and what to do; empty where there is one.
+    #: Why there is no lock, and what to do; empty where there is one, but for a hand that shakes too much.
     reason: str = ""
     advice: str = ""
 
@@ -87,6 +90,8 @@ class Aim:
     """Follows the results of a live camera."""
 
     _recent: deque[_Moment] = field(default_factory=deque)
+    #: Of the last result.
+    _corners: FloatArray | None = None
 
     def update(self, result: FrameResult, now_s: float, height: int, light: Light | None = None) -> AimState:
         """The state with one more result.
@@ -105,17 +110,29 @@ class Aim:
             self._recent.popleft()
         locked = result.status in _LOCKED
         reason, advice = ("", "") if locked else split_message(result, light)
+        n_received = sum(column.status in ("ok", "weak") for column in result.columns) if locked else 0
+        moved = self._moved(result.corners, height)
+        if moved > _STILL and n_received <= _FEW * len(result.columns):
+            reason = f"The screen moves by {100 * moved:.1f} % of the picture's height from frame to frame."
+            advice = "Hold the camera still."
         return AimState(
             word="locked" if locked else _WORDS.get(result.status, result.status.replace("_", " ")),
             locked=locked,
             n_columns=len(result.columns),
-            n_received=sum(column.status in ("ok", "weak") for column in result.columns) if locked else 0,
+            n_received=n_received,
             light=light,
             height_share=height_share(result.corners, height),
             reason=reason,
             advice=advice,
             **self._rates(),
         )
+
+    def _moved(self, corners: FloatArray | None, height: int) -> float:
+        """How far the screen's corners have moved since the last result, as a share of the picture's height."""
+        before, self._corners = self._corners, corners
+        if before is None or corners is None:
+            return 0.0
+        return float(np.median(np.linalg.norm(corners - before, axis=1))) / height
 
     def _rates(self) -> dict[str, Any]:
         """Of the last second; what the first frame brought only starts the span."""

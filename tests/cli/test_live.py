@@ -387,3 +387,19 @@ def test_nothing_of_the_status_is_cut_off_by_a_narrow_terminal(width: int) -> No
     assert max(map(len, fitted)) <= width
     assert " ".join(fitted).split() == " ".join(lines).split()
     assert fit_lines(["", "a"], width) == ["", "a"]
+
+
+@pytest.mark.parametrize(
+    ("moved_px", "received", "said"), [(30.0, 2, True), (30.0, 18, False), (3.0, 2, False), (0.0, 0, False)]
+)
+def test_a_hand_is_told_to_hold_still_only_when_it_matters(moved_px: float, received: int, said: bool) -> None:
+    corners = np.array([[100.0, 100.0], [900.0, 100.0], [900.0, 600.0], [100.0, 600.0]])
+    columns = tuple(ColumnResult(k, "ok" if k < received else "no_packet") for k in range(20))
+    aim = Aim()
+    for frame in range(2):
+        at = corners + frame * moved_px
+        result = FrameResult("camera", frame, 0.0, "ok" if received else "no_signal", corners=at, columns=columns)
+        state = aim.update(result, frame / 30, 1080)
+    assert ("Hold the camera still." in state.advice) == said
+    if received and not said:
+        assert not state.reason

@@ -221,7 +221,7 @@
       const state = event.state;
       put("lock", state.word);
       $("lock").className = `lock ${state.locked ? "locked" : "waiting"}`;
-      put("aim", state.locked ? "" : [state.reason, state.advice].filter(Boolean).join(" "));
+      put("aim", [state.reason, state.advice].filter(Boolean).join(" "));
       put("m-columns", state.n_columns ? `${state.n_received} of ${state.n_columns}` : "–");
       put("m-packets", state.packets_per_s.toFixed(0));
       put("m-rate", `${(state.bits_per_s / 1000).toFixed(1)} kb/s`);
