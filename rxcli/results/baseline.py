@@ -79,7 +79,7 @@ def load_baseline(path: Path, min_confidence: float, slower: float) -> Baseline:
             for number, line in enumerate(file, start=1):
                 try:
                     _take(json.loads(line), earlier, min_confidence)
-                except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+                except (ValueError, ArithmeticError, KeyError, TypeError, AttributeError, RecursionError):
                     raise UsageError(
                         f"--baseline {path} line {number}: no result of `vlc-rx decode --json`", "name such a file"
                     ) from None

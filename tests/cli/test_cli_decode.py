@@ -364,3 +364,15 @@ def test_a_camera_is_not_kept_where_nothing_was_received(tmp_path: Path, capsys:
     assert "line_delay_s" in json.loads(out.read_text())["estimated"]
     assert "no packet was received with an estimated camera" in capsys.readouterr().err
     assert not profile.exists()
+
+
+@pytest.mark.parametrize("column", ["1e999", "[]", '"x"'])
+def test_a_baseline_of_impossible_numbers_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], column: str
+) -> None:
+    packet = '{"payload": "aa", "confidence": 1}'
+    columns = f'[{{"column": {column}, "packets": [{packet}]}}]'
+    (tmp_path / "old.jsonl").write_text(f'{{"source": "a", "columns": {columns}, "timing_ms": {{}}}}\n')
+    write_frame(tmp_path / "a.png", 1)
+    assert run(["decode", str(tmp_path / "a.png"), "--baseline", str(tmp_path / "old.jsonl")]) == 2
+    assert "line 1: no result of" in capsys.readouterr().err
