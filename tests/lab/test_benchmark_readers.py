@@ -111,3 +111,10 @@ def test_few_rows_are_no_reason_for_an_error(height: int, tmp_path: Path, capsys
     for name, picture in (("flat.png", flat), ("narrow.png", np.ascontiguousarray(flat.T))):
         assert cv2.imwrite(str(tmp_path / name), picture)
         _outcome([str(tmp_path / name), "--no-skip", "no_screen"], capsys)
+
+
+def test_a_screen_profile_that_tells_nothing_of_its_columns_breaks_nothing(
+    cases: readers.Cases, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(readers, "_peak_mb", lambda: 100.0)
+    assert cases.run(7522000672)["problems"] == []

@@ -73,6 +73,8 @@ def _expected_likeness(n_strips: int, reach: int, screen: ScreenProfile) -> Floa
     """(reach - 1,) correlation of strips 1, 2, .. apart, averaged over the screen."""
     u = (np.arange(n_strips) + 0.5) / n_strips * screen.columns
     offset = u[:, None] - (np.arange(screen.columns) + 0.5)
-    light = np.exp(-(offset**2) / (2 * max(screen.light_spread, 1e-3) ** 2))
+    square = offset**2
+    square -= square.min(axis=1, keepdims=True)  # Weights are compared; those of hardly any spread would all be 0.
+    light = np.exp(-square / (2 * max(screen.light_spread, 1e-3) ** 2))
     light /= np.linalg.norm(light, axis=1, keepdims=True)
     return np.array([float((light[:-d] * light[d:]).sum(axis=1).mean()) for d in range(1, reach)])
