@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
 from rxcli.outputs import OUTPUT_MARKER
+from rxcli.runs.environment import ONE_THREAD, environment
 from rxcli.runs.journal import Journal as Journal
 from rxcli.runs.journal import recover as recover
 from rxcli.types import Frame, FrameResult, FrameSoftBits
@@ -39,13 +40,6 @@ Decoded = tuple["Source", Iterator[FrameResult]]
 _FIRST_DECIDES = (signal.SIGINT, signal.SIGTERM)
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
 _AHEAD = 32
-_THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "OPENCV_FOR_THREADS_NUM",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,7 +352,7 @@ class _Pool:
     def _started(self) -> _Worker:
         ours, theirs = self._context.Pipe()
         process = self._context.Process(target=_work, args=(theirs, self._decoder, log_level()), daemon=True)
-        with _one_thread_environment(), _signals_held():
+        with environment(ONE_THREAD), _signals_held():
             process.start()
         theirs.close()
         self._workers.append(_Worker(process, ours))
@@ -472,18 +466,3 @@ def _signals_held() -> Iterator[None]:
 def _hold_signals(how: int) -> None:
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(how, _FIRST_DECIDES)
-
-
-@contextmanager
-def _one_thread_environment() -> Iterator[None]:
-    """The environment in which a worker's libraries start no threads of their own."""
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from hashlib import sha256
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rxcli.errors import InputError, UsageError
+from rxcli.runs.environment import ONE_THREAD, environment
 
 Record = dict[str, Any]
 #: A task is what its work needs, as JSON values; its key says what makes it the same task in another run.
@@ -164,22 +164,16 @@ def _in_processes(tasks: Sequence[tuple[str, Task]], work: Work, jobs: int) -> I
     from multiprocessing import get_context
 
     # Libraries read these when they are loaded, which in a spawned worker is later than here.
-    before = {name: os.environ.get(name) for name in _THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(_THREAD_VARIABLES, "1"))
-    try:
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_use_one_thread) as pool:
-            futures = {pool.submit(work, task): key for key, task in tasks}
-            try:
-                for future in as_completed(futures):
-                    yield futures[future], future.result()
-            finally:
-                pool.shutdown(wait=False, cancel_futures=True)
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+    with (
+        environment(ONE_THREAD),
+        ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_use_one_thread) as pool,
+    ):
+        futures = {pool.submit(work, task): key for key, task in tasks}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _use_one_thread() -> None:

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from rxcli.protocol import bits_to_hex, encode_packet, payload_bits
 from rxcli.resources import data_dir
+from rxcli.runs.environment import environment
 
 #: What one process may take: resident memory, and time for one case on a machine of its own.
 MOST_MB, MOST_S = 1500, 60.0
@@ -331,7 +332,9 @@ class Cases:
         """Run one case; what came of it."""
         rng = random.Random(seed)
         kind = rng.choices(list(_KINDS), list(_KINDS.values()))[0]
-        with _environment(VLC_RX_HOME=str(self._home), XDG_CACHE_HOME=str(self.folder / "cache")):
+        # Nobody's own profiles, settings and remembered cameras.
+        nobodys = {"VLC_RX_HOME": str(self._home), "XDG_CACHE_HOME": str(self.folder / "cache")}
+        with environment(nobodys):
             (self._home / "config.toml").unlink(missing_ok=True)
             name, arguments = self._file(rng) if kind == "file" else (kind, getattr(self, f"_{kind}")(rng))
             return self._outcome(seed, name, arguments)
@@ -426,21 +429,6 @@ class Cases:
             _call(self._program, ["decode", *self._both(), "--json", str(out), "--force"])
             self._whole = out.read_bytes()
         return self._whole
-
-
-@contextlib.contextmanager
-def _environment(**values: str) -> Iterator[None]:
-    """The environment with these values: nobody's own profiles, settings and remembered cameras."""
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def with_checksums(data: bytes) -> bytes:

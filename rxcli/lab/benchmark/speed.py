@@ -28,6 +28,7 @@ from rxcli.options import AUTO, receiver_options
 from rxcli.profiles import ScreenProfile, dump_profile, load_profile
 from rxcli.protocol import payload_bits
 from rxcli.receiver.pipeline import receive
+from rxcli.runs.environment import THREAD_VARIABLES
 from rxcli.types import Frame, FrameResult
 
 _T = TypeVar("_T")
@@ -41,7 +42,6 @@ _COLUMNS_AT_MP = 26.0
 _XS10_MP = 26.0
 #: Sums of stages, which are no stages themselves.
 _SUMS = ("total",)
-_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -357,7 +357,7 @@ def in_process(task: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ReceiverError: it failed.
     """
-    environment = {**os.environ, **dict.fromkeys(_THREAD_VARIABLES, str(task.get("threads", 1)))}
+    environment = {**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(task.get("threads", 1)))}
     root = str(Path(__file__).resolve().parents[3])
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, (root, environment.get("PYTHONPATH"))))
     command = [sys.executable, "-m", "rxcli.lab.benchmark.speed", json.dumps(task)]
