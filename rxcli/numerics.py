@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
-from rxcli.types import Float32Array, FloatArray, IntArray
+from rxcli.types import Float32Array, FloatArray
 
 #: Change of a header's slots, lit 1 and dark -1, at its borders.
 _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
@@ -59,66 +57,3 @@ def header_correlation(total: FloatArray, samples_per_slot: int) -> FloatArray:
     for slot in np.flatnonzero(_HEADER_STEPS):
         out -= _HEADER_STEPS[slot] * total[..., slot * samples_per_slot :][..., :n]
     return out / length
-
-
-def exposure_shares(centre: FloatArray, slots: NDArray[np.integer] | FloatArray, exposure_slots: float) -> FloatArray:
-    """Share of an exposure that falls into each slot; the one idea of a shutter that all light models have.
-
-    Args:
-        centre: centre of the exposure, slots.
-        slots: numbers of the slots, which begin there; broadcast against `centre`.
-        exposure_slots: length of the exposure, slots.
-    """
-    half = exposure_slots / 2
-    reach = np.minimum(centre + half, slots + 1) - np.maximum(centre - half, slots)
-    return np.asarray(np.maximum(reach, 0) / exposure_slots)
-
-
-class SlotLight:
-    """Slots (C, N) as light: what they add up to between any two instants.
-
-    Args:
-        slots: light of every slot, 0 dark to 1 lit, or the probability of that.
-        beyond: light of the slots before and after; unknown ones are half lit.
-    """
-
-    #: Slots before and after that an instant may reach.
-    _BEYOND = 8
-
-    def __init__(self, slots: Float32Array, beyond: float = 0.5) -> None:
-        n_columns, n = slots.shape
-        self._slots = np.full((n_columns, n + 2 * self._BEYOND + 1), beyond, np.float32)
-        self._slots[:, self._BEYOND : self._BEYOND + n] = slots
-        self._total = np.zeros_like(self._slots)
-        np.cumsum(self._slots[:, :-1], axis=1, out=self._total[:, 1:])
-
-    def seen(self, positions: FloatArray | Float32Array, exposure_slots: float) -> Float32Array:
-        """(C, R) mean over exposures centred at positions (C, R) or, the same for all columns, (1, R), in slots."""
-        late, _ = self._until(positions + np.float32(exposure_slots / 2))
-        early, _ = self._until(positions - np.float32(exposure_slots / 2))
-        late -= early
-        late *= np.float32(1 / exposure_slots)
-        return late
-
-    def seen_with_slope(
-        self, positions: FloatArray | Float32Array, exposure_slots: float
-    ) -> tuple[Float32Array, Float32Array]:
-        """What is `seen`, and its change per slot of time."""
-        late, late_slope = self._until(positions + np.float32(exposure_slots / 2))
-        early, early_slope = self._until(positions - np.float32(exposure_slots / 2))
-        scale = np.float32(1 / exposure_slots)
-        return (late - early) * scale, (late_slope - early_slope) * scale
-
-    def _until(self, instants: FloatArray | Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Light up to the instants, and the slots that they fall into."""
-        place = np.clip(instants + np.float64(self._BEYOND), 0, self._total.shape[1] - 1.001)
-        left = place.astype(np.intp)
-        slots, total = taken(self._slots, left), taken(self._total, left)
-        return total + slots * (place - left).astype(np.float32), slots
-
-
-def taken(values: NDArray[Any], index: IntArray) -> NDArray[Any]:
-    """`values` (C, n) at the places (C, R) or, the same for all rows, (1, R)."""
-    if index.shape[0] == 1:
-        return np.asarray(values.take(index[0], axis=1))
-    return np.asarray(values.ravel().take(index + (np.arange(values.shape[0]) * values.shape[1])[:, None]))

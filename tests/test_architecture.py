@@ -14,7 +14,7 @@ ROOT = Path(rxcli.__file__).parent
 BASE = {"rxcli", "rxcli.errors", "rxcli.outputs", "rxcli.resources"}
 DATA = BASE | {"rxcli.types", "rxcli.protocol", "rxcli.profiles"}
 #: What every stage may stand on beside the data model.
-GROUND = DATA | {"rxcli.numerics"}
+GROUND = DATA | {"rxcli.numerics", "rxcli.receiver.light"}
 #: Rooms of the receiver that turn one thing into the next, and know nothing of one another.
 STAGES = ("screen", "sampling", "camera", "sync", "channel", "decode")
 #: Rooms and files of `rxcli/`: the listing alone shows the way of the data.

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rxcli.numerics import SlotLight, exposure_shares, header_correlation
+from rxcli.numerics import header_correlation
 from rxcli.protocol import HEADER
+from rxcli.receiver.light import SlotLight, exposure_shares
 
 FINE = 2000
 

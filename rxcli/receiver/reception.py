@@ -37,7 +37,7 @@ class Reception:
     #: (C, N): squared contrast over variance of every slot.
     snr: Float32Array
     #: For the samples.
-    model: channel.LightModel
+    model: channel.ObservationModel
     #: (C, N + memory, patterns).
     metrics: FloatArray
     #: What the auto-encoder may be shown: the fine grid without the rows' own light; None where nothing was in doubt.
@@ -95,7 +95,7 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
 def shows_steady_light(reception: Reception) -> bool:
     """Whether the light is that of a lamp or of a screen that is dimmed by switching."""
     samples, clock = reception.samples, reception.clock
-    contrast = sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.sigma)
+    contrast = sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.noise.sigma)
     lit = channel.lit_on_grid(reception.posteriors, clock)
     return is_steady(*contrast, lit, clock.packet_slots)
 

@@ -15,6 +15,7 @@ from rxcli.receiver import channel, sync
 from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import detect
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
 from rxcli.receiver.reception import (
     HOPELESS_WEIGHT,
     Reception,
@@ -196,10 +197,10 @@ def _initial_pass(acquisition: Acquisition) -> Reception:
     clock = acquisition.clock
     samples = sync.sample_slots(acquisition.profiles, clock, _COARSE)
     model = _light_model(acquisition, samples)
-    contrast = sync.contrast(samples.light, samples.valid, _COARSE, model.sigma)
-    first = channel.first_metrics(*contrast, model.taps)
+    contrast = sync.contrast(samples.light, samples.valid, _COARSE, model.noise.sigma)
+    first = channel.first_metrics(*contrast, model.exposure)
     clock = _in_bursts(acquisition, clock, detect.slot_llr(first))
-    lit = channel.on_grid(_first_decision(metrics_by_burst(first, clock), model.isi_memory), clock)
+    lit = channel.on_grid(_first_decision(metrics_by_burst(first, clock), model.exposure.isi_memory), clock)
     columns = np.arange(samples.light.shape[0])
     likelihoods = channel.slot_likelihoods(samples, clock, model, lit, columns, thorough=False)
     clock = _in_bursts(acquisition, clock, detect.slot_llr(likelihoods.metrics))
@@ -279,7 +280,7 @@ def _refine_columns(
 
 def _view(
     acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64], samples_per_slot: int
-) -> tuple[SlotSamples, channel.LightModel]:
+) -> tuple[SlotSamples, channel.ObservationModel]:
     """All strips of some columns, and the light model of the quick look fitted to them."""
     clock, quick = reception.clock, reception.samples
     samples = sync.sample_slots(acquisition.profiles, clock, samples_per_slot, columns)
@@ -289,10 +290,9 @@ def _view(
     larger *= _rows_per_sample(clock, quick.samples_per_slot) / _rows_per_sample(clock, samples_per_slot)
     model = replace(
         reception.model,
-        sigma=reception.model.sigma * larger**0.5,
-        shot_gain=reception.model.shot_gain * larger,
-        crosstalk=channel.crosstalk_matrix(n_strips, acquisition.screen.light_spread),
-        taps=_taps(clock, samples_per_slot),
+        noise=reception.model.noise.over(1 / larger),
+        crosstalk=Crosstalk.of(n_strips, acquisition.screen.light_spread),
+        exposure=Exposure.of(clock.exposure_slots, samples_per_slot),
     )
     return samples, model
 
@@ -339,7 +339,7 @@ def apply_autoencoder(
         corrections[shown] = denoiser.slot_corrections(reception.scene, columns[shown])
     except ReceiverError as error:
         return reception, frozenset(), {**report, "columns": 0, "message": str(error)}
-    metrics = reception.metrics[columns] + channel.metrics_of(corrections, reception.model.isi_memory)
+    metrics = reception.metrics[columns] + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
     metrics = _words_weighed(reception, reception.scene, columns, metrics)
     posteriors = _detect(metrics, reception.clock)
     before, after = (p.log_prob.sum(axis=(0, 2)) for p in (reception.posteriors.of_columns(columns), posteriors))
@@ -371,14 +371,11 @@ def _words_weighed(
     posteriors, doubtful = detect.detect_with_words(bursts, candidates, _DOUBTFUL_WORD, _WORDS)
     asked = doubtful.log_prob[:, 0] > _HOPELESS_WORD
     places, words, log_prob = doubtful.places[asked], doubtful.words[asked], doubtful.log_prob[asked]
-    model = channel.LightModel(
-        scene.black_level, scene.sigma, scene.shot_gain, scene.crosstalk, _taps(clock, scene.samples.samples_per_slot)
-    )
     samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
     lit = channel.lit_on_grid(reception.posteriors.with_columns(columns, posteriors), clock)
     likely = log_prob > log_prob[:, :1] - _WORD_MARGIN
-    corrections = channel.word_corrections(samples, clock, model, lit, columns, places, words, likely)
-    return metrics + channel.metrics_of(corrections, reception.model.isi_memory)
+    corrections = channel.word_corrections(samples, clock, scene.model, lit, columns, places, words, likely)
+    return metrics + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
 
 
 def remove_row_noise(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
@@ -411,7 +408,7 @@ def remove_row_noise(acquisition: Acquisition, reception: Reception, columns: ND
 def _of_other_weight(
     clock: Clock,
     samples: SlotSamples,
-    model: channel.LightModel,
+    model: channel.ObservationModel,
     lit: Float32Array,
     columns: NDArray[np.int64],
     w: NDArray[np.int64],
@@ -437,17 +434,14 @@ def _denoiser() -> denoise.Denoiser:
     return denoise.load_denoiser()
 
 
-def _scene_of(reception: Reception, samples: SlotSamples, model: channel.LightModel) -> denoise.DenoiserInput:
+def _scene_of(reception: Reception, samples: SlotSamples, model: channel.ObservationModel) -> denoise.DenoiserInput:
     return denoise.DenoiserInput(
         samples=samples,
         clock=reception.clock,
         lit=channel.lit_on_grid(reception.posteriors, reception.clock),
         metrics=reception.metrics,
         w=reception.posteriors.w,
-        black_level=model.black_level,
-        sigma=model.sigma,
-        shot_gain=model.shot_gain,
-        crosstalk=model.crosstalk,
+        model=model,
     )
 
 
@@ -470,23 +464,18 @@ def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:
     return detect.detect(bursts, detect.plausible_weights(bursts, HOPELESS_WEIGHT))
 
 
-def _light_model(acquisition: Acquisition, samples: SlotSamples) -> channel.LightModel:
+def _light_model(acquisition: Acquisition, samples: SlotSamples) -> channel.ObservationModel:
     clock, profiles = acquisition.clock, acquisition.profiles
     rows = _rows_per_sample(clock, samples.samples_per_slot)
     black_level = channel.estimate_black_level(samples, clock)
-    return channel.LightModel(
+    sigma = channel.estimate_sigma(samples, black_level, 0.5 * noise_of(profiles) / rows**0.5)
+    return channel.ObservationModel(
         black_level=black_level,
-        sigma=channel.estimate_sigma(samples, black_level, 0.5 * noise_of(profiles) / rows**0.5),
-        shot_gain=profiles.noise_slope / max(float(np.median(profiles.count)), 1.0) / rows,
-        crosstalk=channel.crosstalk_matrix(samples.light.shape[1], acquisition.screen.light_spread),
-        taps=_taps(clock, samples.samples_per_slot),
+        noise=NoiseModel(sigma**2, profiles.noise_slope / max(float(np.median(profiles.count)), 1.0) / rows),
+        crosstalk=Crosstalk.of(samples.light.shape[1], acquisition.screen.light_spread),
+        exposure=Exposure.of(clock.exposure_slots, samples.samples_per_slot),
     )
 
 
 def _rows_per_sample(clock: Clock, samples_per_slot: int) -> float:
     return max(clock.rows_per_slot / samples_per_slot, 1.0)
-
-
-def _taps(clock: Clock, samples_per_slot: int) -> FloatArray:
-    isi_memory = channel.isi_memory_for(clock.exposure_slots)
-    return channel.exposure_taps(clock.exposure_slots, 1 / samples_per_slot, isi_memory, samples_per_slot)

@@ -39,7 +39,7 @@ from rxcli.receiver.camera.edges import by_edges
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis
 from rxcli.receiver.camera.refit import refit
 from rxcli.receiver.camera.search import MIN_EVIDENCE, BlindSearch, estimate_camera, stripes_are_curved
-from rxcli.receiver.camera.strips import Noise, Strips, in_readout_order, side_curvature_of, strips_of
+from rxcli.receiver.camera.strips import Strips, in_readout_order, side_curvature_of, strips_of
 from rxcli.receiver.camera.structure import structure_llr
 from rxcli.receiver.camera.tone import is_linear
 
@@ -48,7 +48,6 @@ __all__ = [
     "BlindEstimate",
     "BlindSearch",
     "Hypothesis",
-    "Noise",
     "Strips",
     "by_edges",
     "camera_profile",

@@ -8,7 +8,8 @@ import numpy as np
 
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.receiver.camera.strips import EXTREMES_SLOTS, Noise, levelled
+from rxcli.receiver.camera.strips import EXTREMES_SLOTS, levelled
+from rxcli.receiver.light import NoiseModel
 from rxcli.types import BoolArray, Clock, FloatArray, RowProfiles
 
 
@@ -60,7 +61,7 @@ def _strip_slots(profiles: RowProfiles, borders: FloatArray) -> tuple[FloatArray
 
     observed = integral(inside.astype(np.float64)) > 0.99
     means = (integral(light) * observed).astype(np.float32)
-    level, _ = levelled(means, observed.astype(np.float32), EXTREMES_SLOTS, Noise(1e-8, 0.0))
+    level, _ = levelled(means, observed.astype(np.float32), EXTREMES_SLOTS, NoiseModel(1e-8, 0.0))
     return level.astype(np.float64), observed
 
 

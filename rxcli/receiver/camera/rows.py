@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.numerics import SlotLight, local_mean
+from rxcli.numerics import local_mean
 from rxcli.receiver.camera.strips import Strips
 from rxcli.receiver.camera.waves import column_shares, local_moments, residual_of
+from rxcli.receiver.light import SlotLight
 from rxcli.types import Float32Array, FloatArray, IntArray
 
 #: Weights of a row, of its two neighbours together, and of the two next to those: of developed pictures in general, and

@@ -12,8 +12,9 @@ from rxcli.numerics import header_correlation
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.edges import edge_power
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis, distinct
-from rxcli.receiver.camera.strips import SAMPLES, Noise, Strips, levelled
+from rxcli.receiver.camera.strips import SAMPLES, Strips, levelled
 from rxcli.receiver.camera.structure import structure_llr
+from rxcli.receiver.light import NoiseModel
 from rxcli.types import Float32Array, FloatArray
 
 #: Rows per slot that are considered.
@@ -110,7 +111,7 @@ def _halved(values: Float32Array) -> Float32Array:
     return np.asarray((values[:, 0:even:2] + values[:, 1:even:2]) / 2, np.float32)
 
 
-def _pooled(light: Float32Array, inside: Float32Array, window: int, noise: Noise, n_columns: int) -> Float32Array:
+def _pooled(light: Float32Array, inside: Float32Array, window: int, noise: NoiseModel, n_columns: int) -> Float32Array:
     """(C, R) mean of the levelled strips of each column, small where little light is behind it."""
     level, weight = levelled(light, inside, window, noise)
     total = weight.reshape(n_columns, -1, weight.shape[1]).sum(axis=1)

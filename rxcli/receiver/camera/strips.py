@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from rxcli.receiver.light import NoiseModel
 from rxcli.types import Float32Array, FloatArray, RowProfiles
 
 #: Strips that a column keeps while its camera is unknown.
@@ -26,22 +27,6 @@ _LEAST_VARIANCE = 1e-10
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
-    """A strip's row of light x has variance floor + slope * x."""
-
-    floor: float
-    slope: float
-
-    def over(self, n: int) -> Noise:
-        """The noise of the mean of `n` rows."""
-        return Noise(self.floor / n, self.slope / n)
-
-    def variance(self, light: Float32Array) -> Float32Array:
-        """Variance of rows of some light."""
-        return np.maximum(light, np.float32(0)) * np.float32(self.slope) + np.float32(self.floor)
-
-
-@dataclass(frozen=True, slots=True)
 class Strips:
     """Light of M strips on R rows in readout order; the columns' strips lie side by side."""
 
@@ -53,7 +38,7 @@ class Strips:
     #: (R,) float64: rows counted in readout order from the picture's first one read.
     rows: FloatArray
     n_columns: int
-    noise: Noise
+    noise: NoiseModel
     #: Size of the picture.
     width: int
     height: int
@@ -115,7 +100,7 @@ def strips_of(
         x=centre_x.reshape(shape).mean(axis=1),
         rows=profiles.rows.astype(np.float64),
         n_columns=n_columns,
-        noise=Noise(profiles.noise_floor / pixels, profiles.noise_slope / pixels),
+        noise=NoiseModel(profiles.noise_floor / pixels, profiles.noise_slope / pixels),
         width=width,
         height=height,
         sides=sides,
@@ -150,7 +135,9 @@ def in_readout_order(strips: Strips) -> Strips:
     )
 
 
-def levelled(light: Float32Array, inside: Float32Array, window: int, noise: Noise) -> tuple[Float32Array, Float32Array]:
+def levelled(
+    light: Float32Array, inside: Float32Array, window: int, noise: NoiseModel
+) -> tuple[Float32Array, Float32Array]:
     """Light against mean and spread of the `window` rows around it; and the weight behind it, 0..1."""
     import cv2
 

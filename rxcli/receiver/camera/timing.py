@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import SlotLight, local_mean
+from rxcli.numerics import local_mean
 from rxcli.receiver.camera.curvature import BEND_PRECISION, BEND_SCALE
 from rxcli.receiver.camera.estimates import BlindEstimate
 from rxcli.receiver.camera.reading import Packets, Reading, read_slots
@@ -29,6 +29,7 @@ from rxcli.receiver.camera.waves import (
     packet_llr,
     residual_of,
 )
+from rxcli.receiver.light import SlotLight
 from rxcli.types import Float32Array, FloatArray
 
 #: Of the prior: next to nothing is known of start and period, which slots that tell nothing leave as they are.

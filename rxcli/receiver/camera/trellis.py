@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rxcli.numerics import exposure_shares
 from rxcli.protocol import slot_patterns
+from rxcli.receiver.light import exposure_shares
 from rxcli.types import Float32Array, FloatArray
 
 #: Slots that are walked together, and those before them from which their first state is told.

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import SlotLight, local_mean
+from rxcli.numerics import local_mean
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook
 from rxcli.receiver.camera.strips import SAMPLES, Strips
 from rxcli.receiver.camera.trellis import lit_probability, pattern_light
 from rxcli.receiver.camera.views import View
+from rxcli.receiver.light import SlotLight
 from rxcli.types import Float32Array, FloatArray
 
 #: Exposures that are compared, slots; and those near one, as factors.

@@ -25,27 +25,17 @@ its innovations.
 """
 
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
-from rxcli.receiver.channel.model import (
-    LightModel,
-    crosstalk_matrix,
-    estimate_black_level,
-    estimate_sigma,
-    exposure_taps,
-    isi_memory_for,
-)
+from rxcli.receiver.channel.model import ObservationModel, estimate_black_level, estimate_sigma
 from rxcli.receiver.channel.patterns import by_burst, first_metrics, lit_on_grid, metrics_of, on_grid
 from rxcli.receiver.channel.words import word_corrections
 
 __all__ = [
-    "LightModel",
+    "ObservationModel",
     "SlotLikelihoods",
     "by_burst",
-    "crosstalk_matrix",
     "estimate_black_level",
     "estimate_sigma",
-    "exposure_taps",
     "first_metrics",
-    "isi_memory_for",
     "lit_on_grid",
     "metrics_of",
     "on_grid",

@@ -29,8 +29,10 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from rxcli.errors import ProfileError
-from rxcli.numerics import SlotLight, box_sums
+from rxcli.numerics import box_sums
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, slot_patterns
+from rxcli.receiver.channel.model import ObservationModel
+from rxcli.receiver.light import SlotLight
 from rxcli.resources import data_dir
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
@@ -75,14 +77,7 @@ class DenoiserInput:
     metrics: FloatArray
     #: (C,) most likely weight.
     w: NDArray[np.int64]
-    #: Light of a dark slot.
-    black_level: float
-    #: Standard deviation of a sample of no light.
-    sigma: float
-    #: Variance of a sample per unit of light.
-    shot_gain: float
-    #: (S, 3) shares of columns -1, 0, +1 in the light of each strip, up to a factor.
-    crosstalk: FloatArray
+    model: ObservationModel
 
 
 class Denoiser(Protocol):
@@ -106,7 +101,8 @@ def remove_row_noise(scene: DenoiserInput) -> DenoiserInput:
     """
     some = slice(None, None, _ROW_STRIPS)
     thin = replace(scene.samples, light=scene.samples.light[:, some], valid=scene.samples.valid[:, some])
-    observed = _explain(replace(scene, samples=thin, crosstalk=scene.crosstalk[some]), np.arange(len(scene.lit)))
+    model = replace(scene.model, crosstalk=scene.model.crosstalk.of_strips(some))
+    observed = _explain(replace(scene, samples=thin, model=model), np.arange(len(scene.lit)))
     rows = _row_light(np.clip(observed.residual, -_ROW_SIGMAS, _ROW_SIGMAS), observed.scale)[:, None]
     samples = replace(scene.samples, light=scene.samples.light - rows * scene.samples.valid)
     return replace(scene, samples=samples)
@@ -144,15 +140,15 @@ class _Explained:
 
 def _explain(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Explained:
     valid, q = scene.samples.valid[columns], scene.samples.samples_per_slot
-    light = (scene.samples.light[columns] - np.float32(scene.black_level)) * valid
-    share = _against_middle(scene.crosstalk)[None, :, 1, None].astype(np.float32)
+    light = (scene.samples.light[columns] - np.float32(scene.model.black_level)) * valid
+    share = scene.model.crosstalk.against_middle()[None, :, None].astype(np.float32)
     own = share * _exposures(scene, columns, np.zeros(columns.size))[:, None]
     others = _from_neighbours(scene, columns)
     expected = own + others
-    picture, variance = _predict_picture(light, expected, valid, scene.sigma, q)
+    picture, variance = _predict_picture(light, expected, valid, scene.model.noise.sigma, q)
     believed = picture * expected
-    noise = variance * expected * expected + np.float32(scene.shot_gain) * believed + np.float32(scene.sigma**2)
-    scale = valid / np.sqrt(noise)
+    noise = scene.model.noise.through(picture, variance, expected)
+    scale = np.asarray(valid / np.sqrt(noise), np.float32)
     return _Explained(light, others, own, scale, picture * share * scale, (light - believed) * scale)
 
 
@@ -209,7 +205,7 @@ def _predict_picture(
 
 def _strip_features(scene: DenoiserInput, observed: _Explained, columns: NDArray[np.int64]) -> Float32Array:
     """(B, S, 26, N)"""
-    q, sigma = scene.samples.samples_per_slot, np.float32(max(scene.sigma, 1e-7))
+    q, sigma = scene.samples.samples_per_slot, np.float32(max(scene.model.noise.sigma, 1e-7))
     valid, light = scene.samples.valid[columns], observed.light
     level = _local_level(light, valid, q)
     base = np.float32(0.02) * level + 2 * sigma
@@ -226,8 +222,8 @@ def _strip_features(scene: DenoiserInput, observed: _Explained, columns: NDArray
         out[:, :, number * q : (number + 1) * q] = np.moveaxis(values.reshape(shape), -1, 2)
     by_slot = (
         valid.reshape(shape).mean(axis=-1),
-        *_noise_features(level.reshape(shape)[..., 0], sigma, np.float32(scene.shot_gain)),
-        _against_middle(scene.crosstalk)[None, :, 1, None],
+        *_noise_features(level.reshape(shape)[..., 0], sigma, np.float32(scene.model.noise.slope)),
+        scene.model.crosstalk.against_middle()[None, :, None],
         np.float32(scene.clock.exposure_slots),
         _known_slots(scene.clock),
     )
@@ -294,15 +290,8 @@ def _slot_llr(metrics: FloatArray, lit: Float32Array) -> Float32Array:
 
 def _local_level(light: Float32Array, valid: Float32Array, q: int) -> Float32Array:
     """(B, S, n) mean light of the valid samples around."""
-    import cv2
-
-    size = (2 * _LEVEL_SLOTS * q + 1, 1)
-    flat = (-1, light.shape[-1])
-    border = cv2.BORDER_CONSTANT
-    total = cv2.boxFilter(light.reshape(flat), -1, size, normalize=False, borderType=border)
-    count = cv2.boxFilter(valid.reshape(flat), -1, size, normalize=False, borderType=border)
-    mean = np.maximum(total / np.maximum(count, 1), 0)
-    return np.asarray(mean.reshape(light.shape), np.float32)
+    around = _LEVEL_SLOTS * q
+    return np.maximum(box_sums(light, around) / np.maximum(box_sums(valid, around), 1), 0)
 
 
 def _noise_features(level: Float32Array, sigma: np.float32, shot_gain: np.float32) -> tuple[Float32Array, Float32Array]:
@@ -320,12 +309,14 @@ def _known_slots(clock: Clock) -> Float32Array:
 
 def _from_neighbours(scene: DenoiserInput, columns: NDArray[np.int64]) -> Float32Array:
     """(B, S, N * Q) light that the adjacent columns should shed into each strip, per unit of picture."""
-    delay, crosstalk = scene.clock.delay_slots, _against_middle(scene.crosstalk).astype(np.float32)
+    delay = scene.clock.delay_slots
+    shares, own = scene.model.crosstalk.shares, scene.model.crosstalk.against_middle()
+    crosstalk = (shares / shares[:, 1:2] * own[:, None]).astype(np.float32)
     out = np.zeros((columns.size, *scene.samples.light.shape[1:]), np.float32)
     for side, share in ((-1, crosstalk[:, 0]), (1, crosstalk[:, 2])):
         there = (columns + side >= 0) & (columns + side < delay.size)
-        own, other = columns[there], columns[there] + side
-        out[there] += share[:, None] * _exposures(scene, other, delay[own] - delay[other])[:, None]
+        here, other = columns[there], columns[there] + side
+        out[there] += share[:, None] * _exposures(scene, other, delay[here] - delay[other])[:, None]
     return out
 
 
@@ -336,19 +327,6 @@ def _exposures(scene: DenoiserInput, columns: NDArray[np.int64], ahead: FloatArr
     exposure = max(scene.clock.exposure_slots, _LEAST_EXPOSURE)
     positions = centres + ahead[:, None] if ahead.any() else centres[None]
     return SlotLight(scene.lit[columns]).seen(positions, exposure)
-
-
-def _against_middle(crosstalk: FloatArray) -> FloatArray:
-    """(S, 3) light of columns -1, 0, +1 in each strip against the column's own light in its middle.
-
-    A Gaussian's shares tell where in the column the strip lies: their logarithms bend by 1 / sigma**2 and rise by the
-    strip's place over sigma**2.
-    """
-    log = np.log(np.maximum(crosstalk, 1e-12))
-    bend = np.maximum(2 * log[:, 1] - log[:, 0] - log[:, 2], 1e-6)
-    rise = (log[:, 2] - log[:, 0]) / 2
-    own = np.exp(-np.square(rise) / (2 * bend))
-    return np.asarray(crosstalk / crosstalk[:, 1:2] * own[:, None])
 
 
 def payload_observed(scene: DenoiserInput) -> Float32Array:

@@ -1,13 +1,14 @@
-"""What is the same all over a frame: exposure, light spread, floor and noise."""
+"""The observation model: exposure, crosstalk, black level and noise of a frame; what it expects of slots."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rxcli.numerics import exposure_shares
-from rxcli.types import Clock, FloatArray, SlotSamples
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
+from rxcli.types import Clock, Float32Array, SlotSamples
 
 #: Positions in the packet of the header's middle dark slot, where only the floor is seen.
 _DARK_FROM, _DARK_TO = 5.9, 7.1
@@ -16,63 +17,61 @@ _DARK_MARGIN = 0.002
 
 
 @dataclass(frozen=True, slots=True)
-class LightModel:
-    """What is the same all over the frame."""
+class ObservationModel:
+    """What is the same all over the frame: how slots and picture become the light of samples."""
 
     #: Light of a dark slot: room light, sensor floor.
     black_level: float
-    #: Standard deviation of a sample of no light.
-    sigma: float
-    #: Variance of a sample per unit of light.
-    shot_gain: float
-    #: (S, 3) share of the light of the columns to the left, of the column itself and to the right, in each strip.
-    crosstalk: FloatArray
-    #: (Q, memory + 1) weight of the slots n - memory .. n in sample q of metric n.
-    taps: FloatArray
+    #: Of a sample.
+    noise: NoiseModel
+    crosstalk: Crosstalk
+    exposure: Exposure
+
+    def expected(self, lit: Float32Array, clock: Clock, columns: NDArray[np.int64], slope: bool = False) -> Expected:
+        """What some columns should show per unit of picture, by the present idea (C, N) of all slots.
+
+        Args:
+            lit: (C, N) probability that each slot is lit.
+            clock: the clock.
+            columns: those that are asked for.
+            slope: whether to tell the change with time as well.
+        """
+        ahead = np.diff(clock.delay_slots) * self.exposure.samples_per_slot if clock.delay_slots.any() else None
+        shape = self.exposure.seen(lit)
+        others, own = self.crosstalk.from_neighbours(shape, columns, ahead), self.crosstalk.own
+        if not slope:
+            return Expected(others, own, shape[columns, None], None)
+        change = np.zeros_like(shape)
+        change[:, 1:-1] = (shape[:, 2:] - shape[:, :-2]) * np.float32(self.exposure.samples_per_slot / 2)
+        changes = self.crosstalk.from_neighbours(change, columns, ahead) + own * change[columns, None]
+        return Expected(others, own, shape[columns, None], changes)
+
+    def over_black(self, samples: SlotSamples) -> Float32Array:
+        """(C, S, n) light over that of a dark slot, 0 where nothing is seen."""
+        return (samples.light - np.float32(self.black_level)) * samples.valid
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What C columns should show, per unit of picture; arrays (C, S, n) or broadcasting to it."""
+
+    #: Light of the columns beside.
+    others: Float32Array
+    #: (1, S, 1) light of the column itself where its slots are lit, and (C, 1, n) how far they are.
+    own: Float32Array
+    shape: Float32Array
+    #: Change of the whole by a slot of time; None where it was not asked for.
+    slope: Float32Array | None
 
     @property
-    def isi_memory(self) -> int:
-        """Slots before a metric's own that it depends on."""
-        return int(self.taps.shape[1]) - 1
+    def whole(self) -> Float32Array:
+        """(C, S, n) light of all columns."""
+        return self.others + self.own * self.shape
 
-
-def isi_memory_for(exposure_slots: float) -> int:
-    """Slots of memory that cover an exposure; odd, so that metrics sit between samples."""
-    return 1 if exposure_slots <= 1.3 else 3 if exposure_slots <= 2.6 else 5
-
-
-def exposure_taps(exposure_slots: float, blur_slots: float, isi_memory: int, samples_per_slot: int) -> FloatArray:
-    """Weight of each slot in the samples of a metric, (Q, memory + 1).
-
-    Sample q of metric n has its exposure's centre at n - memory/2 + (q + 1/2) / Q. A slot is seen through a box of the
-    exposure and one of `blur_slots` (a row, and the sample's own length).
-
-    Args:
-        exposure_slots: exposure in slots.
-        blur_slots: width of the further box.
-        memory: slots of memory.
-        samples_per_slot: samples a slot, Q.
-    """
-    n_fine = 32
-    offsets = ((np.arange(n_fine) + 0.5) / n_fine - 0.5) * max(blur_slots, 1e-3)
-    centres = -isi_memory / 2 + (np.arange(samples_per_slot) + 0.5) / samples_per_slot
-    slots = np.arange(-isi_memory, 1)
-    fine = (centres[:, None] + offsets)[:, None, :]
-    return np.asarray(exposure_shares(fine, slots[:, None], max(exposure_slots, 1e-3)).mean(axis=2))
-
-
-def crosstalk_matrix(n_strips: int, light_spread: float) -> FloatArray:
-    """(S, 3) shares of columns -1, 0, +1 in the light of each strip, for a Gaussian of sigma `light_spread` pitches.
-
-    Shares, because the picture takes up any common factor; so a spread of 0 is no crosstalk, not no light.
-    """
-    fine = 16
-    across = (np.arange(n_strips * fine) + 0.5) / (n_strips * fine) - 0.5
-    distance = across[:, None] - np.arange(-1, 2)
-    exponent = (-(distance**2) / (2 * max(light_spread, 1e-3) ** 2)).reshape(n_strips, -1, 3)
-    # A strip sees the mean over its width: one that is a whole column has twice the crosstalk of the column's middle.
-    weight = np.exp(exponent - exponent.max(axis=(1, 2), keepdims=True)).mean(axis=1)
-    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+    def of(self, columns: NDArray[np.int64]) -> Expected:
+        """That of some of the columns."""
+        slope = None if self.slope is None else self.slope[columns]
+        return Expected(self.others[columns], self.own, self.shape[columns], slope)
 
 
 def estimate_black_level(samples: SlotSamples, clock: Clock) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rxcli.protocol import slot_patterns
+from rxcli.receiver.light import Exposure
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray
 
 #: Log-likelihood ratio of a slot that the first guess sees at full contrast in all strips.
@@ -15,33 +16,33 @@ _FIRST_GUESS_LLR = 8.0
 _FIRST_GUESS_STRIPS = 3.0
 
 
-def first_metrics(pooled: Float32Array, weight: Float32Array, taps: FloatArray) -> FloatArray:
+def first_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposure) -> FloatArray:
     """First guess of the metrics (C, N + memory, patterns), from contrast alone.
 
     Args:
         pooled: (C, N * Q) light between its local extremes, -1 dark to 1 lit.
         weight: (C, N * Q) strips of full contrast behind it.
-        taps: (Q, memory + 1), see `LightModel`.
+        exposure: of the samples.
     """
     # Squared errors, so weighted that a slot seen right in all samples has the log-likelihood ratio of the constant.
-    most = np.float32(_FIRST_GUESS_LLR / 4 / taps.shape[0])
+    most = np.float32(_FIRST_GUESS_LLR / 4 / exposure.samples_per_slot)
     trust = np.minimum(weight / np.float32(_FIRST_GUESS_STRIPS), 1) * most
     value = np.clip(pooled, -1.5, 1.5)
-    return by_pattern(taps, pooled.shape[1], lambda levels: -np.square(value - (2 * levels - 1)) * trust)
+    return by_pattern(exposure, pooled.shape[1], lambda levels: -np.square(value - (2 * levels - 1)) * trust)
 
 
-def by_pattern(taps: FloatArray, n: int, of_levels: Callable[[Float32Array], Float32Array]) -> FloatArray:
+def by_pattern(exposure: Exposure, n: int, of_levels: Callable[[Float32Array], Float32Array]) -> FloatArray:
     """(C, N + memory, patterns) sums over the samples of a metric of what (C, n) samples say of every pattern.
 
     Args:
-        taps: (Q, memory + 1).
+        exposure: of the samples.
         n: samples.
         of_levels: from the (n,) levels between dark and lit that a pattern has in every sample, to (C, n).
     """
-    q, isi_memory = taps.shape[0], taps.shape[1] - 1
+    q, isi_memory = exposure.samples_per_slot, exposure.isi_memory
     lead = isi_memory * q // 2
     # Many patterns have the same level in a sample, which need be asked but once: `chosen` numbers a sample's levels.
-    levels = slot_patterns(isi_memory) @ taps.T
+    levels = slot_patterns(isi_memory) @ exposure.taps.T
     distinct = [np.unique(in_sample, return_inverse=True) for in_sample in levels.T]
     chosen = np.stack([number for _, number in distinct], axis=1)
     tables = np.stack([np.resize(values, chosen.max() + 1) for values, _ in distinct], axis=1)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.numerics import box_sums
+from rxcli.receiver.channel.model import ObservationModel
 from rxcli.types import Float32Array
 
 #: Scales, in slots, over which the picture is predicted: fine texture to plain sky.
@@ -32,8 +33,7 @@ def predict_picture(
     light: Float32Array,
     expected: Float32Array,
     valid: Float32Array,
-    sigma: float,
-    samples_per_slot: int,
+    model: ObservationModel,
     thorough: bool = True,
 ) -> list[Prediction]:
     """The picture at every sample from both sides, from before and from after; on each the best of all scales.
@@ -42,14 +42,14 @@ def predict_picture(
         light: (C, S, n) light over the floor, 0 where not valid.
         expected: (C, S, n) light per unit of picture, by the present idea of the slots.
         valid: (C, S, n) 1 or 0.
-        sigma: standard deviation of a sample of no light.
-        samples_per_slot: samples a slot.
+        model: the observation model.
         thorough: else from both sides alone, on the middle scales.
     """
+    samples_per_slot, floor = model.exposure.samples_per_slot, np.float32(model.noise.floor)
     weighted = expected * valid
     numerator, denominator = weighted * light, weighted * expected
     hole = max(int(np.ceil(_HOLE_SLOTS * samples_per_slot)) - 1, 0)
-    texture = _Texture(light, expected, valid, sigma, samples_per_slot)
+    texture = _Texture(light, expected, valid, floor, samples_per_slot)
     pictures: list[Float32Array] = []
     variances: list[Float32Array] = []
     scales = PICTURE_SCALES if thorough else _QUICK_SCALES
@@ -63,9 +63,7 @@ def predict_picture(
             initial /= observed + np.float32(1e-4)
             # Which scale is best is asked once a slot, in its middle.
             variance = np.square(initial[..., samples_per_slot // 2 :: samples_per_slot]) * texture.of(initial)
-            variance += np.float32(sigma * sigma) / (
-                observed[..., samples_per_slot // 2 :: samples_per_slot] + np.float32(1e-6)
-            )
+            variance += floor / (observed[..., samples_per_slot // 2 :: samples_per_slot] + np.float32(1e-6))
             if len(pictures) <= side:
                 pictures.append(initial)
                 variances.append(variance)
@@ -107,14 +105,14 @@ class _Texture:
     """
 
     def __init__(
-        self, light: Float32Array, expected: Float32Array, valid: Float32Array, sigma: float, samples_per_slot: int
+        self, light: Float32Array, expected: Float32Array, valid: Float32Array, floor: np.float32, samples_per_slot: int
     ) -> None:
         self._q = samples_per_slot
         self._step = 2 if samples_per_slot % 2 == 0 else 1
         self._light = np.ascontiguousarray(light[..., :: self._step])
         self._expected = expected[..., :: self._step] * valid[..., :: self._step]
         count = self._around(np.ascontiguousarray(valid[..., :: self._step]))
-        self._noise = np.float32(sigma * sigma) * count
+        self._noise = floor * count
         self._least = np.float32(1e-5) * count + np.float32(1e-9)
 
     def of(self, picture: Float32Array) -> Float32Array:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import box_sums
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
-from rxcli.receiver.channel.likelihoods import from_neighbours, shape_on_grid
-from rxcli.receiver.channel.model import LightModel
+from rxcli.receiver.channel.model import ObservationModel
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
 #: Kinds of picture, smooth to rough: relative standard deviation about the local mean, and slots after which it is
@@ -43,7 +42,7 @@ class _Halves:
 def word_corrections(
     samples: SlotSamples,
     clock: Clock,
-    model: LightModel,
+    model: ObservationModel,
     lit: Float32Array,
     columns: NDArray[np.int64],
     places: NDArray[np.int64],
@@ -106,16 +105,14 @@ def _occurrences(places: NDArray[np.int64], clock: Clock) -> tuple[NDArray[np.in
 
 
 def _halves(
-    samples: SlotSamples, clock: Clock, model: LightModel, lit: Float32Array, columns: NDArray[np.int64]
+    samples: SlotSamples, clock: Clock, model: ObservationModel, lit: Float32Array, columns: NDArray[np.int64]
 ) -> _Halves:
-    shape, q = shape_on_grid(lit, model), samples.samples_per_slot
-    others = from_neighbours(shape, model, clock, columns)
-    light: Float32Array = (samples.light - np.float32(model.black_level)) * samples.valid
-    own = model.crosstalk[None, :, 1, None].astype(np.float32) * shape[columns, None]
-    weight = (others + own) * samples.valid
+    expected, light, q = model.expected(lit, clock, columns), model.over_black(samples), samples.samples_per_slot
+    weight = expected.whole * samples.valid
     light_around, seen_around = (box_sums(part * weight, _MEAN_SLOTS * q) for part in (light, weight))
     mean = np.maximum(light_around, np.float32(0)) / np.maximum(seen_around, np.float32(1e-3))
-    return _Halves(_paired(light), _paired(mean.astype(np.float32)), _paired(others), _paired(samples.valid) > 0.9)
+    observed = _paired(samples.valid) > 0.9
+    return _Halves(_paired(light), _paired(mean.astype(np.float32)), _paired(expected.others), observed)
 
 
 def _paired(values: Float32Array) -> Float32Array:
@@ -124,7 +121,7 @@ def _paired(values: Float32Array) -> Float32Array:
 
 
 def _word_levels(
-    lit: Float32Array, start: NDArray[np.int64], words: NDArray[np.uint8], model: LightModel
+    lit: Float32Array, start: NDArray[np.int64], words: NDArray[np.uint8], model: ObservationModel
 ) -> Float32Array:
     """(R, W) mean of the exposure over a word and the slots around it, as believed, at two samples a slot.
 
@@ -134,20 +131,17 @@ def _word_levels(
         words: (R, 10).
         model: the light model.
     """
-    lead = _AROUND_SLOTS + model.isi_memory
+    lead, q = _AROUND_SLOTS + model.exposure.isi_memory, model.exposure.samples_per_slot
     at = start[:, None] + np.arange(-lead, SLOTS_PER_SYMBOL + lead)
     slots = np.take_along_axis(lit, np.clip(at, 0, lit.shape[1] - 1), axis=1)
     slots[(at < 0) | (at >= lit.shape[1])] = 0.5
     slots[:, lead : lead + SLOTS_PER_SYMBOL] = words
-    windows = np.lib.stride_tricks.sliding_window_view(slots, model.isi_memory + 1, axis=1)
-    levels = (windows @ model.taps.T.astype(np.float32)).reshape(start.size, -1)
-    q = model.taps.shape[0]
-    skip = model.isi_memory * q // 2
-    return _paired(np.asarray(levels[:, skip : skip + (SLOTS_PER_SYMBOL + 2 * _AROUND_SLOTS) * q], np.float32))
+    skip = model.exposure.isi_memory * q
+    return _paired(model.exposure.seen(slots)[:, skip:-skip])
 
 
 def _process_likelihood(
-    halves: _Halves, column: NDArray[np.int64], start: NDArray[np.int64], levels: Float32Array, model: LightModel
+    halves: _Halves, column: NDArray[np.int64], start: NDArray[np.int64], levels: Float32Array, model: ObservationModel
 ) -> FloatArray:
     """(R,) log-likelihood of the light by R words, strips added, whatever kind of picture each shows."""
     n, width = halves.light.shape[2], levels.shape[1]
@@ -155,9 +149,8 @@ def _process_likelihood(
     index = (column[None, :, None], np.arange(halves.light.shape[1])[None, None], np.clip(at, 0, n - 1).T[:, :, None])
     # From here on time comes first: (W, R, S).
     mean, observed = halves.mean[index], halves.observed[index] & ((at >= 0) & (at < n)).T[:, :, None]
-    own = model.crosstalk[None, None, :, 1].astype(np.float32)
-    gain = (halves.others[index] + own * levels.T[:, :, None]) * mean
-    noise = np.float32(_PAIR_NOISE) * (np.float32(model.sigma**2) + np.float32(model.shot_gain) * gain)
+    gain = (halves.others[index] + model.crosstalk.own[..., 0] * levels.T[:, :, None]) * mean
+    noise = np.float32(_PAIR_NOISE) * model.noise.variance(gain)
     residual = np.where(observed, halves.light[index] - gain, np.float32(0))
     gain = np.where(observed, gain, np.float32(0))
     kinds = _innovations(residual, gain, noise, _PICTURE_KINDS)

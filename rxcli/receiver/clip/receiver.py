@@ -359,7 +359,7 @@ class _Clip:
             context,
             acquisition,
             _bursts_of(frame, reception),
-            reception.model.isi_memory,
+            reception.model.exposure.isi_memory,
             frame.height,
             reception.snr,
             denoised,

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.receiver import channel, sampling, sync
+from rxcli.receiver import sampling, sync
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel import known_picture
 from rxcli.receiver.clip.views import Pose, View
 from rxcli.receiver.context import Camera, FrameContext, Timer
+from rxcli.receiver.light import Crosstalk
 from rxcli.receiver.sampling import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
@@ -112,7 +113,7 @@ class TrackedScreen:
         profiles = acquisition.profiles
         return known_picture.KnownPicture(
             strips.inside,
-            channel.crosstalk_matrix(strips.inside.shape[1], acquisition.screen.light_spread),
+            Crosstalk.of(strips.inside.shape[1], acquisition.screen.light_spread).shares,
             black_level,
             max(profiles.noise_floor / strips.pixels, 1e-7),
             profiles.noise_slope / strips.pixels,

@@ -22,6 +22,7 @@ from rxcli.protocol import encode_packet, payload_bits
 from rxcli.receiver import camera as blind
 from rxcli.receiver import sampling
 from rxcli.receiver.camera.curvature import BEND_PRECISION
+from rxcli.receiver.light import NoiseModel
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.screen import geometry
 from rxcli.types import Clock, FloatArray, Frame, Lens, RowProfiles
@@ -192,7 +193,7 @@ def _flat_strips(light: FloatArray) -> blind.Strips:
         x=np.broadcast_to(np.linspace(10, 790, light.shape[0])[:, None], light.shape),
         rows=np.arange(n_rows, dtype=np.float64),
         n_columns=20,
-        noise=blind.Noise(0.002**2, 0.0),
+        noise=NoiseModel(0.002**2, 0.0),
         width=800,
         height=n_rows,
     )

@@ -14,6 +14,7 @@ from rxcli.receiver.camera.strips import SAMPLES
 from rxcli.receiver.camera.views import Views
 from rxcli.receiver.camera.waves import WORD_SHARES, Waves, read_freely
 from rxcli.receiver.decode.detect import free_log_evidence
+from rxcli.receiver.light import NoiseModel
 from rxcli.types import Float32Array, FloatArray
 
 LENGTHS = [70, 130, 260]
@@ -104,7 +105,7 @@ def test_a_hypothesis_is_read_whatever_length_and_start_it_came_with() -> None:
     n_rows = light.shape[1]
     x = np.repeat(np.linspace(50, 950, light.shape[0])[:, None], n_rows, axis=1)
     rows = np.arange(n_rows, dtype=np.float64)
-    noise = blind.Noise(0.0064, 0.0)
+    noise = NoiseModel(0.0064, 0.0)
     picture = blind.Strips(light, np.ones_like(light), x, rows, sent.shape[0], noise, 1000, n_rows)
     views = Views(picture)
     # Another length, another start; and 1.5 slots off by the end of the picture.

@@ -9,6 +9,7 @@ import pytest
 
 from rxcli.protocol import encode_packet, payload_bits
 from rxcli.receiver import camera as blind
+from rxcli.receiver.light import NoiseModel
 from rxcli.types import Clock, FloatArray
 
 WIDTH, ROWS, COLUMNS, LENGTH = 1600, 1200, 20, 130
@@ -40,7 +41,7 @@ def _strips(rng: np.random.Generator, curvature: FloatArray, reverse: bool) -> t
         x=x,
         rows=rows,
         n_columns=COLUMNS,
-        noise=blind.Noise(0.003**2, 0.0),
+        noise=NoiseModel(0.003**2, 0.0),
         width=WIDTH,
         height=ROWS,
     )

@@ -11,6 +11,7 @@ from rxcli.receiver import camera as blind
 from rxcli.receiver.camera.edges import by_edges, line_evidence
 from rxcli.receiver.camera.rows import RowModel, fit_rows
 from rxcli.receiver.camera.views import slot_time, time_terms
+from rxcli.receiver.light import NoiseModel
 from rxcli.types import Float32Array, FloatArray
 
 WIDTH, ROWS, COLUMNS = 1600, 900, 20
@@ -39,7 +40,7 @@ def _picture(rng: np.random.Generator, curvature: FloatArray) -> tuple[blind.Str
     below, above = (np.take_along_axis(np.asarray(mixed), low + k, 1) for k in (0, 1))
     light = below + (above - below) * (place - first - low)
     light = 0.2 * light * np.exp(rng.normal(0, 0.05, light.shape)) + rng.normal(0, 0.002, light.shape)
-    ones, noise = np.ones(light.shape, np.float32), blind.Noise(0.002**2, 0.0)
+    ones, noise = np.ones(light.shape, np.float32), NoiseModel(0.002**2, 0.0)
     return blind.Strips(light.astype(np.float32), ones, x, rows, COLUMNS, noise, WIDTH, ROWS), slots
 
 

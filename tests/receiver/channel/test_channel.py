@@ -12,6 +12,7 @@ from row_profiles import Link, Shot, random_link, row_profiles, sigma_of, slot_o
 from rxcli.protocol import slot_patterns
 from rxcli.receiver import channel, sync
 from rxcli.receiver.channel.words import _innovations
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
 from rxcli.types import Clock, SlotSamples
 
 FloatArray = NDArray[np.float64]
@@ -43,20 +44,23 @@ def true_slots(link: Link, shot_gain: Shot, n_slots: int) -> NDArray[np.float32]
     return link.slots()[:, before : before + n_slots].astype(np.float32)
 
 
-def model_for(shot_gain: Shot, sigma: float, black_level: float) -> channel.LightModel:
-    isi_memory = channel.isi_memory_for(shot_gain.exposure_slots)
-    return channel.LightModel(
+def model_for(shot_gain: Shot, sigma: float, black_level: float) -> channel.ObservationModel:
+    return channel.ObservationModel(
         black_level=black_level,
-        sigma=sigma,
-        shot_gain=0.0,
-        crosstalk=np.tile([shot_gain.crosstalk, 1.0, shot_gain.crosstalk], (shot_gain.n_strips, 1)),
-        taps=channel.exposure_taps(shot_gain.exposure_slots, 1 / Q, isi_memory, Q),
+        noise=NoiseModel(sigma**2, 0.0),
+        crosstalk=Crosstalk(np.tile([shot_gain.crosstalk, 1.0, shot_gain.crosstalk], (shot_gain.n_strips, 1))),
+        exposure=Exposure.of(shot_gain.exposure_slots, Q),
     )
+
+
+def brightened(model: channel.ObservationModel, factor: float) -> channel.ObservationModel:
+    noise = NoiseModel(model.noise.floor * factor**2, model.noise.slope * factor)
+    return replace(model, black_level=model.black_level * factor, noise=noise)
 
 
 def scene(
     shot_gain: Shot, seed: int, w: list[int] | None = None
-) -> tuple[Link, Clock, SlotSamples, channel.LightModel]:
+) -> tuple[Link, Clock, SlotSamples, channel.ObservationModel]:
     rng = np.random.default_rng(seed)
     link = random_link(rng, w or [5, 3, 7, 4, 6, 5], 5)
     profiles = row_profiles(link, shot_gain, rng)
@@ -81,7 +85,7 @@ def numeric_taps(exposure: float, blur: float, isi_memory: int, q: int) -> Float
 @pytest.mark.parametrize("blur", [0.01, 0.25, 0.6])
 @pytest.mark.parametrize(("exposure", "isi_memory"), [(0.05, 1), (0.5, 1), (1.08, 1), (1.08, 3), (2.2, 3), (4.0, 5)])
 def test_exposure_taps_against_numeric_integration(exposure: float, isi_memory: int, blur: float) -> None:
-    taps = channel.exposure_taps(exposure, blur, isi_memory, Q)
+    taps = Exposure.of(exposure, Q, isi_memory, blur).taps
     np.testing.assert_allclose(taps, numeric_taps(exposure, blur, isi_memory, Q), atol=4e-3)
 
 
@@ -89,7 +93,7 @@ def test_exposure_taps_against_numeric_integration(exposure: float, isi_memory: 
 @pytest.mark.parametrize("q", [1, 2, 4, 7])
 def test_exposure_taps_keep_the_energy(exposure: float, isi_memory: int, q: int) -> None:
     """As long as exposure and blur fit the memory, each sample's weights add up to one, and so do each slot's."""
-    taps = channel.exposure_taps(exposure, 0.25, isi_memory, q)
+    taps = Exposure.of(exposure, q, isi_memory, 0.25).taps
     assert (taps >= 0).all()
     np.testing.assert_allclose(taps.sum(axis=1), 1.0, atol=1e-9)
     np.testing.assert_allclose(taps, taps[::-1, ::-1], atol=1e-9)
@@ -98,16 +102,15 @@ def test_exposure_taps_keep_the_energy(exposure: float, isi_memory: int, q: int)
 
 @pytest.mark.parametrize("exposure", [1e-6, 0.2, 1.0, 1.08, 1.3, 2.0, 2.6, 3.0, 4.0])
 def test_memory_covers_the_exposure(exposure: float) -> None:
-    isi_memory = channel.isi_memory_for(exposure)
-    assert isi_memory in {1, 3, 5}
-    taps = channel.exposure_taps(exposure, 1 / Q, isi_memory, Q)
-    assert taps.sum(axis=1).min() > 0.83
-    assert channel.isi_memory_for(exposure) <= channel.isi_memory_for(exposure + 1.0)
+    found = Exposure.of(exposure, Q)
+    assert found.isi_memory in {1, 3, 5}
+    assert found.taps.sum(axis=1).min() > 0.83
+    assert found.isi_memory <= Exposure.of(exposure + 1.0, Q).isi_memory
 
 
 def test_crosstalk_of_the_specification() -> None:
     """With equal drive about 15 % of the light at a column's middle comes from its neighbours, half at its edge."""
-    shares = channel.crosstalk_matrix(101, 0.45)
+    shares = Crosstalk.of(101, 0.45).shares
     np.testing.assert_allclose(shares.sum(axis=1), 1.0)
     assert shares[50, 0] + shares[50, 2] == pytest.approx(0.15, abs=0.01)
     assert shares[0, 0] == pytest.approx(0.5, abs=0.02)
@@ -116,7 +119,7 @@ def test_crosstalk_of_the_specification() -> None:
 
 
 def test_no_spread_is_no_crosstalk() -> None:
-    np.testing.assert_allclose(channel.crosstalk_matrix(5, 0.0), np.tile([0.0, 1.0, 0.0], (5, 1)), atol=1e-12)
+    np.testing.assert_allclose(Crosstalk.of(5, 0.0).shares, np.tile([0.0, 1.0, 0.0], (5, 1)), atol=1e-12)
 
 
 @pytest.mark.parametrize("ambient", [0.0, 0.03, 0.2])
@@ -133,7 +136,7 @@ def test_sigma_is_the_noise_of_a_dark_sample() -> None:
         shot_gain = Shot(rows_per_slot=16.0, n_rows=3000, level=2e-4, sigma=sigma)
         _, _, samples, model = scene(shot_gain, seed=2)
         found = channel.estimate_sigma(samples, shot_gain.ambient, 1e-6)
-        assert found == pytest.approx(model.sigma, rel=0.2)
+        assert found == pytest.approx(model.noise.sigma, rel=0.2)
         assert channel.estimate_sigma(samples, shot_gain.ambient, 1.0) == 1.0
 
 
@@ -156,7 +159,7 @@ def test_clean_slots_have_the_right_sign(kind: str, thorough: bool) -> None:
         lit = true_slots(link, shot_gain, now.n_slots)
         idea = np.abs(lit - np.float32(0.1))
         found = channel.slot_likelihoods(samples, now, model, idea, np.arange(6), thorough=thorough)
-        llr = slot_odds(found.metrics, model.isi_memory)
+        llr = slot_odds(found.metrics, model.exposure.isi_memory)
         inner = slice(3, now.n_slots - 3)
         right.append(((llr > 0) == (lit > 0.5))[:, inner].ravel())
     assert np.concatenate(right).mean() > (0.999 if shot_gain.crosstalk == 0 else 0.995)
@@ -165,11 +168,12 @@ def test_clean_slots_have_the_right_sign(kind: str, thorough: bool) -> None:
 def test_likelihoods_start_from_nothing_but_contrast() -> None:
     shot_gain = Shot(texture=0.3, sigma=0.005, start_slot=12.3)
     link, now, samples, model = scene(shot_gain, seed=3)
-    contrast = sync.contrast(samples.light, samples.valid, Q, model.sigma)
-    first = slot_odds(channel.first_metrics(*contrast, model.taps), model.isi_memory)
+    contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
+    first = slot_odds(channel.first_metrics(*contrast, model.exposure), model.exposure.isi_memory)
     lit = true_slots(link, shot_gain, now.n_slots)
     idea = (1 / (1 + np.exp(-first))).astype(np.float32)
-    llr = slot_odds(channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics, model.isi_memory)
+    found = channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics
+    llr = slot_odds(found, model.exposure.isi_memory)
     inner = slice(3, now.n_slots - 3)
     wrong_first = ((first > 0) != (lit > 0.5))[:, inner].mean()
     wrong_then = ((llr > 0) != (lit > 0.5))[:, inner].mean()
@@ -208,7 +212,7 @@ def test_brightness_does_not_matter(factor: float) -> None:
     lit = true_slots(link, shot_gain, now.n_slots)
     idea = np.abs(lit - np.float32(0.1))
     brighter = replace(samples, light=samples.light * np.float32(factor))
-    scaled = replace(model, black_level=model.black_level * factor, sigma=model.sigma * factor)
+    scaled = brightened(model, factor)
     one = slot_odds(channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics, 1)
     other = slot_odds(channel.slot_likelihoods(brighter, now, scaled, idea, np.arange(6)).metrics, 1)
     np.testing.assert_allclose(other, one, rtol=0.05, atol=0.3)
@@ -222,7 +226,7 @@ def test_columns_asked_for_are_those_of_the_whole() -> None:
     two = SlotSamples(samples.light[[1, 4]], samples.valid[[1, 4]], samples.samples_per_slot)
     some = channel.slot_likelihoods(two, now, model, lit, np.array([1, 4]))
     np.testing.assert_allclose(some.metrics, whole.metrics[[1, 4]], rtol=1e-5, atol=1e-4)
-    assert whole.metrics.shape == (6, now.n_slots + model.isi_memory, 2 << model.isi_memory)
+    assert whole.metrics.shape == (6, now.n_slots + model.exposure.isi_memory, 2 << model.exposure.isi_memory)
     assert whole.snr.shape == (6, now.n_slots)
 
 
@@ -269,8 +273,8 @@ def test_hostile_light_gives_finite_likelihoods(kind: str, thorough: bool, idea:
     sigma = channel.estimate_sigma(samples, black_level, 1e-5)
     model = model_for(Shot(), sigma, black_level)
     lit = np.full((6, now.n_slots), idea, np.float32)
-    contrast = sync.contrast(samples.light, samples.valid, Q, model.sigma)
-    first = channel.first_metrics(*contrast, model.taps)
+    contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
+    first = channel.first_metrics(*contrast, model.exposure)
     found = channel.slot_likelihoods(samples, now, model, lit, np.arange(6), thorough=thorough)
     for values in (first, found.metrics, found.snr, found.timing):
         assert np.isfinite(values).all()
@@ -377,7 +381,7 @@ def test_words_are_weighed_alike_at_any_brightness_and_cut_by_the_grid() -> None
     likely = np.ones(words.shape[:2], bool)
     one = channel.word_corrections(samples, now, model, lit, np.arange(6), every, words, likely)
     brighter = replace(samples, light=samples.light * np.float32(3))
-    scaled = replace(model, black_level=model.black_level * 3, sigma=model.sigma * 3)
+    scaled = brightened(model, 3)
     other = channel.word_corrections(brighter, now, scaled, lit, np.arange(6), every, words, likely)
     assert one.shape == lit.shape
     assert np.isfinite(one).all()

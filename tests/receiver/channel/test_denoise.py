@@ -16,9 +16,10 @@ from rxcli.errors import ProfileError
 from rxcli.lab.benchmark.trial import Trial, acquired, simulate_trial
 from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
 from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
-from rxcli.receiver import still
+from rxcli.receiver import channel, still
 from rxcli.receiver.channel import denoise, metrics_of
 from rxcli.receiver.channel.denoise import COLUMN_FEATURES, STRIP_FEATURES, DenoiserInput, load_denoiser, network_inputs
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
 from rxcli.resources import data_dir
 from rxcli.results.truth import Score
 from rxcli.types import Clock, FrameResult, SlotSamples
@@ -62,11 +63,14 @@ def scene_of(slots: np.ndarray, rng: np.random.Generator, *, noise: float = 0.00
         lit=slots.astype(np.float32),
         metrics=metrics_of(9.0 * (2.0 * slots - 1), 1),
         w=np.full(len(slots), W),
-        black_level=0.01,
-        sigma=noise,
-        shot_gain=1e-6,
-        crosstalk=crosstalk,
+        model=channel.ObservationModel(
+            0.01, NoiseModel(noise**2, 1e-6), Crosstalk(crosstalk), Exposure.of(EXPOSURE, Q, isi_memory=1)
+        ),
     )
+
+
+def with_crosstalk(scene: DenoiserInput, shares: np.ndarray) -> DenoiserInput:
+    return replace(scene, model=replace(scene.model, crosstalk=Crosstalk(shares)))
 
 
 @pytest.fixture
@@ -111,18 +115,22 @@ def test_headers_are_known_and_no_other_slot(scene: DenoiserInput) -> None:
 def test_neighbours_light_is_slots_through_the_exposure(scene: DenoiserInput) -> None:
     strips, _ = network_inputs(scene, np.array([0, 1]))
     shape = through_exposure(scene.lit, EXPOSURE).reshape(N_COLUMNS, -1, Q)
-    expected = scene.crosstalk[:, 0, None, None] * shape[0] + scene.crosstalk[:, 2, None, None] * shape[2]
+    expected = (
+        scene.model.crosstalk.shares[:, 0, None, None] * shape[0]
+        + scene.model.crosstalk.shares[:, 2, None, None] * shape[2]
+    )
     np.testing.assert_allclose(np.moveaxis(feature(strips, "neighbours[4]")[1], 1, 2), expected, atol=0.02)
-    alone = scene.crosstalk[:, 2, None, None] * shape[1]
+    alone = scene.model.crosstalk.shares[:, 2, None, None] * shape[1]
     np.testing.assert_allclose(np.moveaxis(feature(strips, "neighbours[4]")[0], 1, 2), alone, atol=0.02)
 
 
 def test_shares_count_up_to_a_factor(scene: DenoiserInput) -> None:
-    shares = replace(scene, crosstalk=scene.crosstalk / scene.crosstalk.sum(axis=1, keepdims=True))
+    light = scene.model.crosstalk.shares
+    shares = with_crosstalk(scene, light / light.sum(axis=1, keepdims=True))
     np.testing.assert_allclose(
         network_inputs(shares, np.array([1]))[0], network_inputs(scene, np.array([1]))[0], atol=1e-5
     )
-    alone = replace(scene, crosstalk=np.array([[0.0, 1.0, 0.0]] * N_STRIPS))
+    alone = with_crosstalk(scene, np.array([[0.0, 1.0, 0.0]] * N_STRIPS))
     assert feature(network_inputs(alone, np.array([1]))[0], "neighbours[4]").max() < 1e-6
 
 
@@ -136,7 +144,7 @@ def test_delayed_neighbours_move(scene: DenoiserInput) -> None:
 def test_own_light_is_the_columns_slots_through_the_exposure(scene: DenoiserInput) -> None:
     strips, _ = network_inputs(scene, np.array([1]))
     shape = through_exposure(scene.lit, EXPOSURE)[1].reshape(-1, Q)
-    expected = scene.crosstalk[:, 1, None, None] * shape
+    expected = scene.model.crosstalk.shares[:, 1, None, None] * shape
     np.testing.assert_allclose(np.moveaxis(feature(strips, "own[4]")[0], 1, 2), expected, atol=0.02)
 
 
@@ -221,12 +229,12 @@ def test_only_the_own_belief_and_the_neighbours_are_looked_at(scene: DenoiserInp
 
 def test_brightness_does_not_matter(scene: DenoiserInput) -> None:
     """Twice the light with twice the noise is the same scene."""
+    noise = scene.model.noise
+    brighter = NoiseModel(4 * noise.floor, 2 * noise.slope)
     twice = replace(
         scene,
         samples=replace(scene.samples, light=2 * scene.samples.light),
-        black_level=2 * scene.black_level,
-        sigma=2 * scene.sigma,
-        shot_gain=2 * scene.shot_gain,
+        model=replace(scene.model, black_level=2 * scene.model.black_level, noise=brighter),
     )
     columns = np.arange(N_COLUMNS)
     np.testing.assert_allclose(network_inputs(twice, columns)[0], network_inputs(scene, columns)[0], atol=1e-4)
@@ -291,7 +299,7 @@ def test_columns_and_the_order_of_strips_do_not_touch_each_other(scene: Denoiser
     order = np.array([3, 0, 4, 1, 2])
     samples = SlotSamples(scene.samples.light[:, order], scene.samples.valid[:, order], Q)
     mixed = denoiser.slot_corrections(
-        replace(scene, samples=samples, crosstalk=scene.crosstalk[order]), np.array([0, 1, 2])
+        with_crosstalk(replace(scene, samples=samples), scene.model.crosstalk.shares[order]), np.array([0, 1, 2])
     )
     np.testing.assert_allclose(mixed, together, atol=1e-2)
 

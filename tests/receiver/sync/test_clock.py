@@ -12,6 +12,7 @@ from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_o
 from rxcli.protocol import encode_packet
 from rxcli.receiver import channel, sync
 from rxcli.receiver.decode import detect
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
 from rxcli.types import BurstPosteriors, Clock, RowProfiles, SlotSamples
 
 FloatArray = NDArray[np.float64]
@@ -37,17 +38,16 @@ def received(
 ) -> tuple[Clock, BurstPosteriors, SlotSamples]:
     """Light model and detection in turn, the clock corrected after each."""
     samples = sync.sample_slots(profiles, clock_, Q)
-    memory = channel.isi_memory_for(shot.exposure_slots)
     floor = channel.estimate_black_level(samples, clock_)
-    model = channel.LightModel(
+    model = channel.ObservationModel(
         black_level=floor,
-        sigma=channel.estimate_sigma(samples, floor, 1e-4),
-        shot_gain=0.0,
-        crosstalk=np.tile([shot.crosstalk, 1.0, shot.crosstalk], (shot.n_strips, 1)),
-        taps=channel.exposure_taps(shot.exposure_slots, 1 / Q, memory, Q),
+        noise=NoiseModel(channel.estimate_sigma(samples, floor, 1e-4) ** 2, 0.0),
+        crosstalk=Crosstalk(np.tile([shot.crosstalk, 1.0, shot.crosstalk], (shot.n_strips, 1))),
+        exposure=Exposure.of(shot.exposure_slots, Q),
     )
-    contrast = sync.contrast(samples.light, samples.valid, Q, model.sigma)
-    metrics = channel.first_metrics(*contrast, model.taps)
+    memory = model.exposure.isi_memory
+    contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
+    metrics = channel.first_metrics(*contrast, model.exposure)
     clock_ = sync.assign_bursts(clock_, detect.slot_llr(metrics), (REPEATS,))
     for _ in range(rounds):
         posteriors = detect.detect(channel.by_burst(metrics, clock_, memory))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.numerics import SlotLight, exposure_shares, taken
+from rxcli.receiver.light import SlotLight, exposure_shares, taken
 from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 #: Slots to each side that a blur reaches.
