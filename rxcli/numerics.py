@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.types import Float32Array, FloatArray
@@ -26,19 +25,6 @@ def local_mean(values: Float32Array, window: int) -> Float32Array:
     import cv2
 
     return np.asarray(cv2.blur(values, (window | 1, 1)))
-
-
-def log_alike(
-    first: NDArray[np.floating], second: NDArray[np.floating], share: NDArray[np.floating]
-) -> NDArray[np.floating]:
-    """Log-likelihood ratio of two slots being the same one over their being two independent ones.
-
-    Args:
-        first: probability that the first is lit.
-        second: probability that the second is lit.
-        share: of lit slots among all, 0..1 exclusive.
-    """
-    return np.asarray(np.log(first * second / share + (1 - first) * (1 - second) / (1 - share)))
 
 
 def header_correlation(total: FloatArray, samples_per_slot: int) -> FloatArray:

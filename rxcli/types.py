@@ -161,6 +161,22 @@ class Clock:
         """Copies that the grid touches."""
         return int(self.burst.size)
 
+    @property
+    def places(self) -> IntArray:
+        """(N,) position of every grid slot in its packet."""
+        return np.asarray((np.arange(self.n_slots) + self.first_slot) % self.packet_slots)
+
+    def to_copies(self, slots: NDArray[Any]) -> NDArray[Any]:
+        """(..., N) slot values of the grid as (..., n_copies, packet_slots), 0 where the grid does not reach."""
+        out = np.zeros((*slots.shape[:-1], self.n_copies * self.packet_slots), slots.dtype)
+        out[..., self.first_slot : self.first_slot + self.n_slots] = slots
+        return out.reshape(*slots.shape[:-1], self.n_copies, self.packet_slots)
+
+    def on_grid(self, slots: NDArray[Any]) -> NDArray[Any]:
+        """(C, N) values of the grid's slots from those of bursts (B, C, packet_slots)."""
+        copies = slots[self.burst].transpose(1, 0, 2)
+        return np.asarray(copies.reshape(copies.shape[0], -1)[:, self.first_slot : self.first_slot + self.n_slots])
+
 
 @dataclass(frozen=True, slots=True)
 class SlotSamples:

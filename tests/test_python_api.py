@@ -153,8 +153,7 @@ def test_nothing_received_has_no_taps() -> None:
 
 def test_taps_feed_the_detector(tapped: tuple[rxcli.FrameResult, rxcli.Taps]) -> None:
     _, taps = tapped
-    memory = taps.metrics.shape[1] - taps.clock.n_slots
-    again = detect(by_burst(taps.metrics, taps.clock, memory))
+    again = detect(by_burst(taps.metrics, taps.clock))
     assert (again.index == taps.posteriors.index).mean() > 0.99
 
 

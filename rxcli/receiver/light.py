@@ -181,8 +181,8 @@ class Crosstalk:
         shares = self.shares.astype(np.float32)
         return left[columns, None] * shares[None, :, 0, None] + right[columns, None] * shares[None, :, 2, None]
 
-    def against_middle(self) -> FloatArray:
-        """(S,) a column's own light in each strip against that in the column's middle.
+    def against_middle(self) -> Float32Array:
+        """(1, S, 1) a column's own light in each strip against that in the column's middle.
 
         A Gaussian's shares tell where in the column the strip lies: their logarithms bend by 1 / sigma**2 and rise by
         the strip's place over sigma**2.
@@ -190,7 +190,7 @@ class Crosstalk:
         log = np.log(np.maximum(self.shares, 1e-12))
         bend = np.maximum(2 * log[:, 1] - log[:, 0] - log[:, 2], 1e-6)
         rise = (log[:, 2] - log[:, 0]) / 2
-        return np.asarray(np.exp(-np.square(rise) / (2 * bend)))
+        return np.asarray(np.exp(-np.square(rise) / (2 * bend)), np.float32)[None, :, None]
 
 
 def _shifted(rows: Float32Array, by: FloatArray) -> Float32Array:

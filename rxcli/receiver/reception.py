@@ -46,13 +46,9 @@ class Reception:
     skipped: dict[str, int] = field(default_factory=dict)
 
 
-def metrics_by_burst(metrics: FloatArray, clock: Clock) -> FloatArray:
-    return channel.by_burst(metrics, clock, isi_memory=metrics.shape[1] - clock.n_slots)
-
-
 def packet_evidence(metrics: FloatArray, clock: Clock) -> FloatArray:
     """(C,) log evidence of columns, over all weights."""
-    bursts = metrics_by_burst(metrics, clock)
+    bursts = channel.by_burst(metrics, clock)
     candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
     return np.asarray(np.logaddexp.reduce(detect.weight_log_evidence(bursts, candidates), axis=1))
 
@@ -96,7 +92,7 @@ def shows_steady_light(reception: Reception) -> bool:
     """Whether the light is that of a lamp or of a screen that is dimmed by switching."""
     samples, clock = reception.samples, reception.clock
     contrast = sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.noise.sigma)
-    lit = channel.lit_on_grid(reception.posteriors, clock)
+    lit = clock.on_grid(reception.posteriors.lit)
     return is_steady(*contrast, lit, clock.packet_slots)
 
 
@@ -135,7 +131,7 @@ def best_packet(reception: Reception) -> FloatArray:
 
 def slot_margin(reception: Reception) -> Float32Array:
     """(C, N) what the light says for every slot as decided, nats."""
-    return detect.slot_margin(reception.metrics, channel.lit_on_grid(reception.posteriors, reception.clock) > 0.5)
+    return detect.slot_margin(reception.metrics, reception.clock.on_grid(reception.posteriors.lit) > 0.5)
 
 
 def soft_bits(

@@ -23,7 +23,6 @@ from rxcli.receiver.reception import (
     complete_packets,
     dark_columns,
     in_doubt,
-    metrics_by_burst,
     packet_confidence,
     packet_evidence,
     packet_llr,
@@ -200,7 +199,7 @@ def _initial_pass(acquisition: Acquisition) -> Reception:
     contrast = sync.contrast(samples.light, samples.valid, _COARSE, model.noise.sigma)
     first = channel.first_metrics(*contrast, model.exposure)
     clock = _in_bursts(acquisition, clock, detect.slot_llr(first))
-    lit = channel.on_grid(_first_decision(metrics_by_burst(first, clock), model.exposure.isi_memory), clock)
+    lit = clock.on_grid(_first_decision(channel.by_burst(first, clock), model.exposure.isi_memory))
     columns = np.arange(samples.light.shape[0])
     likelihoods = channel.slot_likelihoods(samples, clock, model, lit, columns, thorough=False)
     clock = _in_bursts(acquisition, clock, detect.slot_llr(likelihoods.metrics))
@@ -270,7 +269,7 @@ def _refine_columns(
 ) -> tuple[Reception, FloatArray]:
     """What is seen with some columns looked at again, and the (C, 2) timing of all, 0 for the others."""
     samples, model = _view(acquisition, reception, columns, samples_per_slot)
-    lit = channel.lit_on_grid(reception.posteriors, reception.clock)
+    lit = reception.clock.on_grid(reception.posteriors.lit)
     likelihoods = channel.slot_likelihoods(samples, reception.clock, model, lit, columns)
     metrics, snr, timing = reception.metrics.copy(), reception.snr.copy(), np.zeros((lit.shape[0], 2))
     metrics[columns], snr[columns], timing[columns] = likelihoods.metrics, likelihoods.snr, likelihoods.timing
@@ -366,13 +365,13 @@ def _words_weighed(
 ) -> FloatArray:
     """Metrics of some columns with the likeliest words of every symbol in doubt weighed as a whole."""
     clock = reception.clock
-    bursts = metrics_by_burst(metrics, clock)
+    bursts = channel.by_burst(metrics, clock)
     candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
     posteriors, doubtful = detect.detect_with_words(bursts, candidates, _DOUBTFUL_WORD, _WORDS)
     asked = doubtful.log_prob[:, 0] > _HOPELESS_WORD
     places, words, log_prob = doubtful.places[asked], doubtful.words[asked], doubtful.log_prob[asked]
     samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
-    lit = channel.lit_on_grid(reception.posteriors.with_columns(columns, posteriors), clock)
+    lit = clock.on_grid(reception.posteriors.with_columns(columns, posteriors).lit)
     likely = log_prob > log_prob[:, :1] - _WORD_MARGIN
     corrections = channel.word_corrections(samples, clock, scene.model, lit, columns, places, words, likely)
     return metrics + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
@@ -420,7 +419,7 @@ def _of_other_weight(
     for _ in range(_FRESH_ROUNDS):
         quick = channel.slot_likelihoods(samples, clock, model, lit, columns, thorough=False)
         found = _detect(quick.metrics, clock)
-        lit[columns] = channel.lit_on_grid(found, clock)
+        lit[columns] = clock.on_grid(found.lit)
     return np.flatnonzero(found.w != w), lit
 
 
@@ -438,7 +437,7 @@ def _scene_of(reception: Reception, samples: SlotSamples, model: channel.Observa
     return denoise.DenoiserInput(
         samples=samples,
         clock=reception.clock,
-        lit=channel.lit_on_grid(reception.posteriors, reception.clock),
+        lit=reception.clock.on_grid(reception.posteriors.lit),
         metrics=reception.metrics,
         w=reception.posteriors.w,
         model=model,
@@ -460,7 +459,7 @@ def _with_bursts_of(acquisition: Acquisition, reception: Reception, log_odds: Fl
 
 
 def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:
-    bursts = metrics_by_burst(metrics, clock)
+    bursts = channel.by_burst(metrics, clock)
     return detect.detect(bursts, detect.plausible_weights(bursts, HOPELESS_WEIGHT))
 
 

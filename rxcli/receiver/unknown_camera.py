@@ -10,7 +10,6 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import camera as blind
-from rxcli.receiver import channel
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera_memory import recall, remember
 from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, refittable, refitted_camera
@@ -159,7 +158,7 @@ def _with_settled_clock(received: Received) -> Received:
 
 def _slots_changed(before: Received, after: Received) -> bool:
     """Whether slots were decided otherwise than before, so that they may tell another camera."""
-    lit = [channel.lit_on_grid(one.reception.posteriors, one.reception.clock) for one in (before, after)]
+    lit = [one.reception.clock.on_grid(one.reception.posteriors.lit) for one in (before, after)]
     return lit[0].shape != lit[1].shape or float(np.abs(lit[0] - lit[1]).mean()) > _SLOTS_ALIKE
 
 
@@ -191,7 +190,7 @@ def with_refitted_camera(received: Received, skip: frozenset[str], slots_changed
 def _decided(received: Received) -> tuple[FrameContext, Acquisition, Clock, Float32Array]:
     """Frame, acquisition, clock, and the probability (C, N) that each slot is lit."""
     clock = received.reception.clock
-    return received.context, received.acquisition, clock, channel.lit_on_grid(received.reception.posteriors, clock)
+    return received.context, received.acquisition, clock, clock.on_grid(received.reception.posteriors.lit)
 
 
 def _with_camera(received: Received, camera: Camera) -> Received:

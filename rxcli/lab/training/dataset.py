@@ -126,11 +126,10 @@ def sample_of(
         weights: (C,) what was sent.
     """
     clock = scene.clock
-    isi_memory = scene.metrics.shape[1] - clock.n_slots
     lit, dark = (_by_packet(part, clock) for part in (slots[columns], 1 - slots[columns]))
     if (lit * dark).any():
         return []
-    bursts = by_burst(scene.metrics[columns], clock, isi_memory)
+    bursts = by_burst(scene.metrics[columns], clock)
     scores, words = [], []
     for burst in range(bursts.shape[0]):
         for row, w in enumerate(weights[columns]):
@@ -210,6 +209,5 @@ def sent_slots(exposure: Exposure, clock: Clock) -> NDArray[np.uint8]:
 
 def _headers_fit(slots: NDArray[np.uint8], clock: Clock) -> bool:
     """Whether headers lie where the clock has them: a wrong lock would teach nonsense."""
-    position = (np.arange(clock.n_slots) + clock.first_slot) % clock.packet_slots
-    inside = position < len(HEADER)
-    return bool(inside.any() and (slots[:, inside] == np.array(HEADER)[position[inside]]).mean() > 0.99)
+    inside = clock.places < len(HEADER)
+    return bool(inside.any() and (slots[:, inside] == np.array(HEADER)[clock.places[inside]]).mean() > 0.99)

@@ -24,9 +24,8 @@ def likely_columns(profiles: RowProfiles, clock: Clock, screens: Sequence[Screen
         clock: the clock that the screens share.
         screens: screens that differ in their columns.
     """
-    number = np.arange(clock.n_slots)
-    payload = number[(number + clock.first_slot) % clock.packet_slots >= PREAMBLE_SLOTS]
-    borders = clock.row0 + clock.rows_per_slot * np.stack([payload, payload + 1], axis=1).ravel()
+    payload = np.flatnonzero(clock.places >= PREAMBLE_SLOTS)
+    borders = np.asarray(clock.row0 + clock.rows_per_slot * np.stack([payload, payload + 1], axis=1).ravel(), float)
     slots, observed = _strip_slots(profiles, borders)
     n_strips = slots.shape[0]
     reach = max(2, min(n_strips - 1, round(1.5 * n_strips / min(screen.columns for screen in screens))))

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from rxcli.errors import ProfileError
 from rxcli.numerics import box_sums
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, slot_patterns
-from rxcli.receiver.channel.model import ObservationModel
-from rxcli.receiver.light import SlotLight
+from rxcli.receiver.channel.model import Expected, ObservationModel
+from rxcli.receiver.channel.picture import predict_picture
 from rxcli.resources import data_dir
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
@@ -48,12 +48,8 @@ COLUMN_FEATURES = ("known", "phase[10]", "believed", "lent", "weight", "score", 
 N_STRIP_FEATURES, N_COLUMN_FEATURES = 26, 16
 #: Slots on either side over which the local level is averaged.
 _LEVEL_SLOTS = 10
-#: Scales, in slots, over which the picture is predicted, and the half width of the hole in the middle.
-_PICTURE_SCALES, _HOLE_SLOTS = (0.75, 1.25, 2.5), 0.5
 #: The rows' own light is told by one strip in so many: strips of a column err alike.
 _ROW_STRIPS = 2
-#: Slots on either side over which the error of the prediction is averaged, and bounds of its relative variance.
-_ERROR_SLOTS, _TEXTURE_BOUNDS = 14, (0.003, 2.0)
 #: Largest residual, in standard deviations, in the rows' own light and as a feature.
 _ROW_SIGMAS, _RESIDUAL_SIGMAS = 3.0, 4.0
 #: Probabilities below this are not told apart.
@@ -61,8 +57,6 @@ _TINY = 1e-30
 #: Strips and samples err alike: about so much of their summed information is left.
 _ALIKE = 0.16
 _MAX_MODEL_BYTES = 2_000_000
-#: Slots that an exposure is taken to last at least.
-_LEAST_EXPOSURE = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,8 +123,7 @@ class _Explained:
     #: Light over the floor; 0 where nothing is seen.
     light: Float32Array
     #: Light per unit of picture that the neighbours and the column itself should have shed.
-    others: Float32Array
-    own: Float32Array
+    expected: Expected
     #: One over the standard deviation of what is left unexplained; 0 where nothing is seen.
     scale: Float32Array
     #: In standard deviations: what a lit slot adds, and what is left unexplained.
@@ -139,17 +132,15 @@ class _Explained:
 
 
 def _explain(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Explained:
-    valid, q = scene.samples.valid[columns], scene.samples.samples_per_slot
-    light = (scene.samples.light[columns] - np.float32(scene.model.black_level)) * valid
-    share = scene.model.crosstalk.against_middle()[None, :, None].astype(np.float32)
-    own = share * _exposures(scene, columns, np.zeros(columns.size))[:, None]
-    others = _from_neighbours(scene, columns)
-    expected = own + others
-    picture, variance = _predict_picture(light, expected, valid, scene.model.noise.sigma, q)
-    believed = picture * expected
-    noise = scene.model.noise.through(picture, variance, expected)
+    model, valid = scene.model, scene.samples.valid[columns]
+    light = model.over_black(scene.samples)[columns]
+    expected = model.expected(scene.lit, scene.clock, columns)
+    whole = expected.whole
+    (prediction,) = predict_picture(light, whole, valid, model, thorough=False)
+    noise = model.noise.through(prediction.picture, prediction.variance, whole)
     scale = np.asarray(valid / np.sqrt(noise), np.float32)
-    return _Explained(light, others, own, scale, picture * share * scale, (light - believed) * scale)
+    residual = (light - prediction.picture * whole) * scale
+    return _Explained(light, expected, scale, prediction.picture * expected.own * scale, residual)
 
 
 def _row_light(residual: Float32Array, scale: Float32Array) -> Float32Array:
@@ -168,51 +159,19 @@ def _row_light(residual: Float32Array, scale: Float32Array) -> Float32Array:
     return np.asarray(mean * np.float32(power) / (np.float32(power) + error + np.float32(1e-20)), np.float32)
 
 
-def _predict_picture(
-    light: Float32Array, expected: Float32Array, valid: Float32Array, sigma: float, q: int
-) -> tuple[Float32Array, Float32Array]:
-    """Picture and its variance at every sample, from both sides of it but never from its own slot.
-
-    On each of several scales; the one that has predicted best thereabouts is taken.
-    """
-    weighted = expected * valid
-    sums = [(part, box_sums(part, int(_HOLE_SLOTS * q))) for part in (weighted * light, weighted * expected)]
-    # Every other sample tells the error well enough.
-    some = (slice(None), slice(None), slice(None, None, 2))
-    light, weighted, around = light[some], weighted[some], _ERROR_SLOTS * q // 2
-    black_level = np.float32(sigma * sigma) * box_sums(valid[some], around)
-    picture = variance = None
-    for scale in _PICTURE_SCALES:
-        reach = int(_HOLE_SLOTS * q) + 2 * int(scale * q)
-        numerator, denominator = (box_sums(part, reach) - hole for part, hole in sums)
-        initial = np.maximum(numerator, 0) / (denominator + np.float32(1e-4))
-        predicted = initial[some] * weighted
-        error = box_sums(np.square(light - predicted), around) - black_level
-        texture = np.clip(error / (box_sums(np.square(predicted), around) + np.float32(1e-9)), *_TEXTURE_BOUNDS)
-        crosstalk = initial * initial * np.repeat(texture, 2, axis=2) + np.float32(sigma * sigma) / (
-            denominator + np.float32(1e-6)
-        )
-        if picture is None or variance is None:
-            picture, variance = initial, crosstalk
-            continue
-        # Arithmetic picks several times quicker than a masked copy.
-        picture += (crosstalk < variance) * (initial - picture)
-        np.minimum(variance, crosstalk, out=variance)
-    assert picture is not None
-    assert variance is not None
-    return picture, variance
-
-
 def _strip_features(scene: DenoiserInput, observed: _Explained, columns: NDArray[np.int64]) -> Float32Array:
     """(B, S, 26, N)"""
     q, sigma = scene.samples.samples_per_slot, np.float32(max(scene.model.noise.sigma, 1e-7))
-    valid, light = scene.samples.valid[columns], observed.light
+    valid, light, expected = scene.samples.valid[columns], observed.light, observed.expected
     level = _local_level(light, valid, q)
     base = np.float32(0.02) * level + 2 * sigma
+    middle = scene.model.crosstalk.against_middle()
+    # Light was learned from in parts of that in the column's middle.
+    part = middle / expected.own
     by_sample = (
         np.log((np.maximum(light, 0) + base) / (level + base)),
-        observed.others,
-        observed.own,
+        expected.others * part,
+        expected.own * part * expected.shape,
         np.clip(observed.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS),
         _tamed(observed.contrast),
     )
@@ -223,7 +182,7 @@ def _strip_features(scene: DenoiserInput, observed: _Explained, columns: NDArray
     by_slot = (
         valid.reshape(shape).mean(axis=-1),
         *_noise_features(level.reshape(shape)[..., 0], sigma, np.float32(scene.model.noise.slope)),
-        scene.model.crosstalk.against_middle()[None, :, None],
+        middle,
         np.float32(scene.clock.exposure_slots),
         _known_slots(scene.clock),
     )
@@ -238,7 +197,7 @@ def _column_features(scene: DenoiserInput, observed: _Explained, columns: NDArra
     lit = np.clip(scene.lit[columns], 1e-5, 1 - 1e-5)
     llr = _slot_llr(scene.metrics[columns], lit)
     contrast = _tamed(observed.contrast)
-    place = (np.arange(clock.n_slots) + clock.first_slot) % SLOTS_PER_SYMBOL
+    place = clock.places % SLOTS_PER_SYMBOL
     by_slot = (
         _known_slots(clock),
         *(np.arange(SLOTS_PER_SYMBOL)[:, None] == place),
@@ -302,31 +261,9 @@ def _noise_features(level: Float32Array, sigma: np.float32, shot_gain: np.float3
 
 def _known_slots(clock: Clock) -> Float32Array:
     """(N,) 1 lit, -1 dark in headers, 0 where nothing is known."""
-    position = (np.arange(clock.n_slots) + clock.first_slot) % clock.packet_slots
-    header = 2 * np.array(HEADER, np.float32) - 1
-    return np.where(position < len(HEADER), header[np.minimum(position, len(HEADER) - 1)], 0).astype(np.float32)
-
-
-def _from_neighbours(scene: DenoiserInput, columns: NDArray[np.int64]) -> Float32Array:
-    """(B, S, N * Q) light that the adjacent columns should shed into each strip, per unit of picture."""
-    delay = scene.clock.delay_slots
-    shares, own = scene.model.crosstalk.shares, scene.model.crosstalk.against_middle()
-    crosstalk = (shares / shares[:, 1:2] * own[:, None]).astype(np.float32)
-    out = np.zeros((columns.size, *scene.samples.light.shape[1:]), np.float32)
-    for side, share in ((-1, crosstalk[:, 0]), (1, crosstalk[:, 2])):
-        there = (columns + side >= 0) & (columns + side < delay.size)
-        here, other = columns[there], columns[there] + side
-        out[there] += share[:, None] * _exposures(scene, other, delay[here] - delay[other])[:, None]
-    return out
-
-
-def _exposures(scene: DenoiserInput, columns: NDArray[np.int64], ahead: FloatArray) -> Float32Array:
-    """(B, N * Q) mean of the believed slots of columns over every sample's exposure, read `ahead` slots later."""
-    n = scene.samples.light.shape[-1]
-    centres = (np.arange(n) + 0.5) / scene.samples.samples_per_slot
-    exposure = max(scene.clock.exposure_slots, _LEAST_EXPOSURE)
-    positions = centres + ahead[:, None] if ahead.any() else centres[None]
-    return SlotLight(scene.lit[columns]).seen(positions, exposure)
+    signs = np.zeros(clock.packet_slots, np.float32)
+    signs[: len(HEADER)] = 2 * np.array(HEADER) - 1
+    return signs[clock.places]
 
 
 def payload_observed(scene: DenoiserInput) -> Float32Array:
@@ -335,7 +272,7 @@ def payload_observed(scene: DenoiserInput) -> Float32Array:
     Only payloads have been learned from: header and dimming symbol are left to the light model.
     """
     clock = scene.clock
-    payload = (np.arange(clock.n_slots) + clock.first_slot) % clock.packet_slots >= PREAMBLE_SLOTS
+    payload = clock.places >= PREAMBLE_SLOTS
     valid = scene.samples.valid.max(axis=1)
     return np.asarray(payload & (valid.reshape(*scene.lit.shape, -1).max(axis=2) > 0), np.float32)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from rxcli.protocol import slot_patterns
 from rxcli.receiver.light import Exposure
-from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray
+from rxcli.types import Clock, Float32Array, FloatArray
 
 #: Log-likelihood ratio of a slot that the first guess sees at full contrast in all strips.
 _FIRST_GUESS_LLR = 8.0
@@ -68,26 +68,14 @@ def metrics_of(llr: Float32Array, isi_memory: int) -> FloatArray:
     return np.asarray(padded[..., None] / 2 * (2.0 * slot_patterns(isi_memory)[:, -1] - 1))
 
 
-def lit_on_grid(posteriors: BurstPosteriors, clock: Clock) -> Float32Array:
-    """(C, N) probability that each slot of the grid is lit."""
-    return on_grid(posteriors.lit, clock)
-
-
-def on_grid(lit: Float32Array, clock: Clock) -> Float32Array:
-    """(C, N) slots of the grid from those of bursts (B, C, packet)."""
-    copies = lit[clock.burst].transpose(1, 0, 2)
-    flat = copies.reshape(copies.shape[0], -1)
-    return flat[:, clock.first_slot : clock.first_slot + clock.n_slots]
-
-
-def by_burst(metrics: FloatArray, clock: Clock, isi_memory: int) -> FloatArray:
+def by_burst(metrics: FloatArray, clock: Clock) -> FloatArray:
     """Metrics of the grid (C, N + memory, patterns) added over the copies of each burst.
 
     Returns:
         (B, C, packet + memory, patterns); see `detect.detect`.
     """
-    n_columns, _, n_patterns = metrics.shape
-    length = clock.packet_slots
+    n_columns, n_metrics, n_patterns = metrics.shape
+    length, isi_memory = clock.packet_slots, n_metrics - clock.n_slots
     padded = np.zeros((n_columns, clock.n_copies * length + isi_memory, n_patterns))
     end = min(clock.first_slot + metrics.shape[1], padded.shape[1])
     padded[:, clock.first_slot : end] = metrics[:, : end - clock.first_slot]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.protocol import WEIGHTS
-from rxcli.receiver import channel, sync
+from rxcli.receiver import channel
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble, detect
 from rxcli.receiver.reception import HOPELESS_WEIGHT
@@ -46,7 +46,7 @@ class BurstReader:
 
     def add(self, view: View, numbers: IntArray) -> None:
         """Add a frame to its bursts (B,); they are detected when somebody asks what they say."""
-        metrics = channel.by_burst(view.bursts.metrics, view.bursts.clock, view.isi_memory)
+        metrics = channel.by_burst(view.bursts.metrics, view.bursts.clock)
         self.open.add(view.bursts, numbers, metrics)
 
     def detect_stale(self, *frames: Waiting) -> None:
@@ -122,7 +122,7 @@ class BurstReader:
         for place, number in enumerate(waiting.numbers):
             if self.open.is_open(int(number)):
                 lit[place] = self.open.lit(waiting.numbers[place : place + 1])[0]
-        return sync.from_copies(lit[clock.burst].transpose(1, 0, 2), clock)
+        return clock.on_grid(lit)
 
     def doubts(self, waiting: Waiting) -> tuple[int, int]:
         """Packets of a frame in columns that are well lit and of which all was seen: those in doubt, and all."""

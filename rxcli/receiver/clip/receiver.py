@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.options import ReceiverOptions
-from rxcli.receiver import channel, sync
 from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.cameras import context_at, has_profile
 from rxcli.receiver.clip import results
@@ -370,7 +369,7 @@ class _Clip:
                 black_level = reception.model.black_level
                 scene = TrackedScreen.of_frame(context, acquisition, black_level, self._scene_before, named)
                 view.light, view.pose = scene.strips(frame), scene.pose
-            scene.take(view, lambda: channel.lit_on_grid(reception.posteriors, reception.clock))
+            scene.take(view, lambda: reception.clock.on_grid(reception.posteriors.lit))
             self._scene = scene
         return view, report
 
@@ -613,7 +612,7 @@ class _Clip:
         assert self._link is not None
         clock = view.bursts.clock
         llr = detect.slot_llr(view.bursts.metrics)
-        copies = sync.to_copies(llr, clock).transpose(1, 0, 2) * (view.bursts.shown > 0)
+        copies = clock.to_copies(llr).transpose(1, 0, 2) * (view.bursts.shown > 0)
         self._link.phase.take(view.bursts.first_copy, np.asarray(copies, np.float64))
 
     def _settle(self) -> list[FrameResult]:

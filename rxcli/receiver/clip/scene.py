@@ -451,7 +451,7 @@ def _shown(inside: NDArray[np.bool_], positions: FloatArray, clock: Clock) -> In
     last = positions[columns, on_screen.shape[1] - 1 - on_screen[:, ::-1].argmax(axis=1)][:, None]
     middles = np.arange(clock.n_slots) + 0.5
     shown = (middles >= first) & (middles <= last) & np.asarray(on_screen.any(axis=1))[:, None]
-    return np.asarray(sync.to_copies(shown.astype(np.float32), clock), np.int64).transpose(1, 0, 2)
+    return np.asarray(clock.to_copies(shown.astype(np.float32)), np.int64).transpose(1, 0, 2)
 
 
 def _snr(flat: known_picture.ColumnLight, clock: Clock) -> Float32Array:

@@ -266,9 +266,7 @@ def slots_observed(samples: SlotSamples, clock: Clock) -> IntArray:
     """How often the middle of each slot of each burst's packet is on the screen and in the picture, (B, C, packet)."""
     q = samples.samples_per_slot
     shown = samples.valid[..., q // 2 :: q].max(axis=1) > 0
-    copies = np.zeros((shown.shape[0], clock.n_copies * clock.packet_slots), np.int64)
-    copies[:, clock.first_slot : clock.first_slot + clock.n_slots] = shown
-    by_copy = copies.reshape(shown.shape[0], clock.n_copies, clock.packet_slots)
+    by_copy = clock.to_copies(shown.astype(np.int64))
     return np.stack([by_copy[:, clock.burst == burst].sum(axis=1) for burst in range(int(clock.burst.max()) + 1)])
 
 

@@ -7,14 +7,12 @@ from rxcli.receiver.sync.clock import (
     corrected,
     find_clock,
     find_clocks,
-    from_copies,
     header_response,
     likely_repeats,
     pooled_strips,
     possible_bursts,
     resample,
     sample_slots,
-    to_copies,
     unbinned_strips,
 )
 
@@ -25,13 +23,11 @@ __all__ = [
     "corrected",
     "find_clock",
     "find_clocks",
-    "from_copies",
     "header_response",
     "likely_repeats",
     "pooled_strips",
     "possible_bursts",
     "resample",
     "sample_slots",
-    "to_copies",
     "unbinned_strips",
 ]

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import header_correlation, log_alike
-from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
+from rxcli.numerics import header_correlation
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
 #: Strips of which the search needs but half.
@@ -29,8 +30,8 @@ _CONTRAST_SIGMAS = 8.0
 _MAX_DELAY_SLOTS = 2.0
 #: Light beyond this many times white is no measurement.
 _MOST_LIGHT = 1e3
-#: Slots are taken to be at most this sure when copies are compared.
-_SURE_LLR = 5.0
+#: Slots are taken to be at most this sure when copies are compared: what was seen once may be wrong.
+SURE_LLR = 3.0
 #: Without delays, no more than this share of the columns seems to be off by more than so many slots.
 _MANY, _SAME_DELAY = 0.25, 0.12
 #: Header correlation, added over the copies, that the delay of a single column must win.
@@ -457,33 +458,27 @@ def likely_repeats(clock: Clock, repeats: Sequence[int]) -> int:
 def copy_likeness(llr: Float32Array, clock: Clock) -> FloatArray:
     """Log-likelihood ratio of each copy being the same packet as the next, against another one; (n_copies - 1,).
 
-    Two slots that are lit with probabilities p and q are alike with likelihood p q / r + (1 - p)(1 - q) / (1 - r)
-    against two independent ones, r being the column's share of lit slots.
-
     Args:
         llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
         clock: the clock.
     """
-    copies = to_copies(np.clip(llr, -_SURE_LLR, _SURE_LLR), clock)
-    observed = copies != 0
-    observed[..., :SLOTS_PER_SYMBOL] = False
-    lit = 1 / (1 + np.exp(-copies))
-    share = np.clip((lit * observed).sum(axis=(1, 2)) / np.maximum(observed.sum(axis=(1, 2)), 1), 0.1, 0.9)[
-        :, None, None
-    ]
-    first, second = lit[:, :-1], lit[:, 1:]
-    both = observed[:, :-1] & observed[:, 1:]
-    return np.asarray((log_alike(first, second, share) * both).sum(axis=(0, 2)), np.float64)
+    copies = np.moveaxis(clock.to_copies(np.clip(llr, -SURE_LLR, SURE_LLR)), 1, 0)
+    return np.array([likeness(first, second) for first, second in pairwise(copies)])
 
 
-def to_copies(slots: Float32Array, clock: Clock) -> Float32Array:
-    """(..., N) slot values of the grid as (..., n_copies, packet_slots), 0 where the grid does not reach."""
-    out = np.zeros((*slots.shape[:-1], clock.n_copies * clock.packet_slots), slots.dtype)
-    out[..., clock.first_slot : clock.first_slot + clock.n_slots] = slots
-    return out.reshape(*slots.shape[:-1], clock.n_copies, clock.packet_slots)
+def likeness(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
+    """Log-likelihood ratio of two copies being the same packet, against different ones.
 
+    Two slots that are lit with probabilities p and q are alike with likelihood p q / r + (1 - p)(1 - q) / (1 - r)
+    against two independent ones, r being the column's share of lit slots.
 
-def from_copies(copies: Float32Array, clock: Clock) -> Float32Array:
-    """The inverse of `to_copies`."""
-    flat = copies.reshape(*copies.shape[:-2], -1)
-    return flat[..., clock.first_slot : clock.first_slot + clock.n_slots]
+    Args:
+        first: (C, packet) log-likelihood ratios of its slots being lit, 0 where not seen.
+        second: likewise.
+    """
+    first, second = first[:, PREAMBLE_SLOTS:], second[:, PREAMBLE_SLOTS:]
+    both = (first != 0) & (second != 0)
+    p, q = 1 / (1 + np.exp(-first)), 1 / (1 + np.exp(-second))
+    share = ((p + q) * both).sum(axis=1, keepdims=True) / np.maximum(2 * both.sum(axis=1, keepdims=True), 1)
+    share = np.clip(share, 0.1, 0.9)
+    return float((np.log(p * q / share + (1 - p) * (1 - q) / (1 - share)) * both).sum())

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rxcli.numerics import log_alike
-from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS, bits_per_symbol
+from rxcli.protocol import WEIGHTS, bits_per_symbol
+from rxcli.receiver.sync.clock import SURE_LLR, likeness
 from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatArray, IntArray
 
 #: A clock that is off by more than this many slots from where the frames before foretell it belongs to another time.
@@ -29,8 +29,6 @@ _REMEMBERED = 4
 #: a clock may be off by: a share, slots, and the error of stamps, seconds, where they are not even.
 _JUDGED_LOCKS, _STRETCHES = 5, (2, 4, 8, 16, 32, 5, 10, 20, 3, 6)
 _RATE_SHARE, _RATE_SLOTS, _UNEVEN_S, _STEADY_SLOTS = 0.004, 0.4, 2e-3, 1.0
-#: Log-odds that a slot seen once is taken to be at most sure of: copies are compared with what may be wrong.
-_SURE = 3.0
 
 
 @dataclass(slots=True)
@@ -219,11 +217,11 @@ class BurstPhase:
             first_copy: number of the first one.
             llr: (n_copies, C, packet) log-odds of their slots, 0 where not seen.
         """
-        llr = np.clip(llr, -_SURE, _SURE)
+        llr = np.clip(llr, -SURE_LLR, SURE_LLR)
         for copy, slots in enumerate(llr, first_copy):
             for other in range(copy - self._most + 1, copy):
                 if other in self._copies:
-                    self._compare(other, copy, _alike(self._copies[other], slots))
+                    self._compare(other, copy, likeness(self._copies[other], slots))
             self._copies[copy] = self._copies[copy] + slots if copy in self._copies else slots
         self._copies = {c: s for c, s in self._copies.items() if c > first_copy + len(llr) - 1 - self._most}
 
@@ -231,16 +229,6 @@ class BurstPhase:
         repeats, phases = self._hypotheses.T
         same = (first + phases) // repeats == (second + phases) // repeats
         self._score += np.where(same, alike / 2, -alike / 2)
-
-
-def _alike(first: FloatArray, second: FloatArray) -> float:
-    """Log-likelihood ratio of two copies (C, packet) being the same packet against different ones."""
-    payload = np.s_[:, PREAMBLE_SLOTS:]
-    first, second = first[payload], second[payload]
-    both = (first != 0) & (second != 0)
-    p, q = 1 / (1 + np.exp(-first)), 1 / (1 + np.exp(-second))
-    lit = np.clip((p * both).sum(axis=1) / np.maximum(both.sum(axis=1), 1), 0.1, 0.9)[:, None]
-    return float((log_alike(p, q, lit) * both).sum())
 
 
 @dataclass(frozen=True, slots=True)

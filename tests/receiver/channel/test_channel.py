@@ -298,7 +298,7 @@ def test_metrics_of_copies_are_added(isi_memory: int) -> None:
     now = Clock(5.0, 1.0, 70, 0.0, 180, 33, np.array([0, 0, 0, 1]), np.zeros(2), 9.0)
     rng = np.random.default_rng(0)
     metrics = rng.normal(0, 1, (2, 180 + isi_memory, 2 << isi_memory))
-    found = channel.by_burst(metrics, now, isi_memory)
+    found = channel.by_burst(metrics, now)
     assert found.shape == (2, 2, 70 + isi_memory, 2 << isi_memory)
     at = 50  # seen in copies 0, 1 and 2, on grid slots 17, 87 and 157
     np.testing.assert_allclose(found[0, :, at], metrics[:, 17] + metrics[:, 87] + metrics[:, 157])

@@ -45,18 +45,17 @@ def received(
         crosstalk=Crosstalk(np.tile([shot.crosstalk, 1.0, shot.crosstalk], (shot.n_strips, 1))),
         exposure=Exposure.of(shot.exposure_slots, Q),
     )
-    memory = model.exposure.isi_memory
     contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
     metrics = channel.first_metrics(*contrast, model.exposure)
     clock_ = sync.assign_bursts(clock_, detect.slot_llr(metrics), (REPEATS,))
     for _ in range(rounds):
-        posteriors = detect.detect(channel.by_burst(metrics, clock_, memory))
-        lit = channel.lit_on_grid(posteriors, clock_)
+        posteriors = detect.detect(channel.by_burst(metrics, clock_))
+        lit = clock_.on_grid(posteriors.lit)
         found = channel.slot_likelihoods(samples, clock_, model, lit, np.arange(lit.shape[0]))
         metrics = found.metrics
         clock_ = sync.corrected(sync.assign_bursts(clock_, detect.slot_llr(metrics), (REPEATS,)), found.timing)
         samples = sync.sample_slots(profiles, clock_, Q)
-    posteriors = detect.detect(channel.by_burst(metrics, clock_, memory))
+    posteriors = detect.detect(channel.by_burst(metrics, clock_))
     return clock_, posteriors, samples
 
 
@@ -281,17 +280,17 @@ def test_copies_and_back() -> None:
         0.0,
         n_slots=180,
         first_slot=33,
-        burst=np.zeros(4, int),
+        burst=np.arange(4),
         delay_slots=np.zeros(2),
         header_peak_ratio=9,
     )
     slots = np.random.default_rng(0).random((2, 180)).astype(np.float32)
-    copies = sync.to_copies(slots, clock_)
+    copies = clock_.to_copies(slots)
     assert copies.shape == (2, 4, 70)
     assert (copies[:, 0, :33] == 0).all()
     assert (copies[:, 0, 33] == slots[:, 0]).all()
     assert (copies[:, 1, 0] == slots[:, 37]).all()
-    assert (sync.from_copies(copies, clock_) == slots).all()
+    assert (clock_.on_grid(np.moveaxis(copies, 1, 0)) == slots).all()
 
 
 @pytest.mark.parametrize(("n_strips", "n_pooled"), [(2, 1), (3, 3), (4, 2), (6, 3), (8, 2)])
