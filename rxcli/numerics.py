@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.types import Float32Array, FloatArray
@@ -25,6 +28,13 @@ def local_mean(values: Float32Array, window: int) -> Float32Array:
     import cv2
 
     return np.asarray(cv2.blur(values, (window | 1, 1)))
+
+
+def folded(values: NDArray[Any], period: int) -> NDArray[Any]:
+    """(..., period) sums of values (..., n) that lie a period apart: what comes back with it adds up."""
+    padded = np.zeros((*values.shape[:-1], -(-values.shape[-1] // period) * period), values.dtype)
+    padded[..., : values.shape[-1]] = values
+    return np.asarray(padded.reshape(*values.shape[:-1], -1, period).sum(axis=-2))
 
 
 def header_correlation(total: FloatArray, samples_per_slot: int) -> FloatArray:

@@ -92,15 +92,17 @@ def find_cameras(
         return Cameras(None, reason=known.message)
     if known is not None:
         return Cameras(FrameContext(frame, corners, known, options.screens, timer))
-    n_columns = min(screen.columns for screen in options.screens)
+    screen = min(options.screens, key=lambda one: one.columns)
     with timer("sampling"):
-        strips = _straightened_strips(frame, corners, n_columns, _sides_of(frame, corners), timer)
+        strips = _straightened_strips(
+            frame, corners, screen.columns, screen.light_spread, _sides_of(frame, corners), timer
+        )
     with timer("blind"):
         contradicted = strips.side_curvature is not None and blind.stripes_are_curved(strips)
     if contradicted:
         # Lenses that are left in a picture do not bend stripes: what looked like its sides are others.
         with timer("sampling"):
-            strips = _straightened_strips(frame, corners, n_columns, None, timer)
+            strips = _straightened_strips(frame, corners, screen.columns, screen.light_spread, None, timer)
     contexts: dict[int, FrameContext] = {}
 
     def with_camera(estimate: blind.BlindEstimate) -> FrameContext:
@@ -133,7 +135,9 @@ def context_at(context: FrameContext, corners: FloatArray) -> FrameContext:
         return replace(context, corners=corners)
     estimate, strips = camera.blind_estimate
     with context.timer("sampling"):
-        there = _straightened_strips(context.frame, corners, strips.n_columns, strips.sides, context.timer, camera.tone)
+        there = _straightened_strips(
+            context.frame, corners, strips.n_columns, strips.light_spread, strips.sides, context.timer, camera.tone
+        )
     return replace(context, corners=corners, camera=replace(camera, blind_estimate=(estimate, there)))
 
 
@@ -154,6 +158,7 @@ def _straightened_strips(
     frame: Frame,
     corners: FloatArray,
     n_columns: int,
+    light_spread: float,
     sides: tuple[float, float] | None,
     timer: Timer,
     tone: str = DEFAULT_TONE,
@@ -166,7 +171,7 @@ def _straightened_strips(
     profiles = timer.rows.sample(frame, outlines, tone)
     mosaic = frame.mosaic is not None
     undone = None if mosaic or frame.linear else tone
-    return blind.strips_of(profiles, centre_x, frame.width, frame.height, sides, mosaic, undone)
+    return blind.strips_of(profiles, centre_x, frame.width, frame.height, light_spread, sides, mosaic, undone)
 
 
 def _estimated_camera(estimate: blind.BlindEstimate, strips: blind.Strips, rate: float) -> Camera:
@@ -188,7 +193,9 @@ def refittable(context: FrameContext, acquisition: Acquisition) -> FrameContext:
     told = camera.estimated
     corrected = bool(told.get("distortion_corrected", (0.0, 0.0))[0])
     sides = _STRAIGHT_SIDES if corrected else told.get("k1")
-    strips = _straightened_strips(context.frame, context.corners, screen.columns, sides, context.timer, camera.tone)
+    strips = _straightened_strips(
+        context.frame, context.corners, screen.columns, screen.light_spread, sides, context.timer, camera.tone
+    )
     line_delay_s, sd = told["line_delay_s"]
     rows_per_slot = 1 / (line_delay_s * screen.slot_rate_hz)
     curvature = np.array([told.get(name, (0.0, 0.0)) for name in ("k1", "k2", "p1", "p2")]) * corrected
@@ -215,13 +222,13 @@ def refitted_camera(
     context: FrameContext, acquisition: Acquisition, clock: Clock, lit: Float32Array
 ) -> tuple[Camera, float]:
     """An estimated camera from slots (C, N) that were decoded on a clock; and how far that moves the clock, slots."""
-    camera, n_columns = context.camera, acquisition.screen.columns
+    camera, n_columns, light_spread = context.camera, acquisition.screen.columns, acquisition.screen.light_spread
     if camera.blind_estimate is None:
         return camera, 0.0
     estimate, strips = camera.blind_estimate
     if strips.n_columns != n_columns:
         strips = _straightened_strips(
-            context.frame, context.corners, n_columns, strips.sides, context.timer, camera.tone
+            context.frame, context.corners, n_columns, light_spread, strips.sides, context.timer, camera.tone
         )
     found, moved_slots = blind.refit(strips, estimate, clock, lit)
     return _estimated_camera(found, strips, acquisition.screen.slot_rate_hz), moved_slots
@@ -239,7 +246,7 @@ def linear_camera(context: FrameContext, acquisition: Acquisition, clock: Clock,
     if not blind.is_linear(estimate.tone):
         return camera
     as_stored = _straightened_strips(
-        context.frame, context.corners, screen.columns, strips.sides, context.timer, "linear"
+        context.frame, context.corners, screen.columns, screen.light_spread, strips.sides, context.timer, "linear"
     )
     found, _ = blind.refit(as_stored, estimate, clock, lit)
     if blind.is_linear(found.tone):

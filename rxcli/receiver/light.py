@@ -124,14 +124,17 @@ class Exposure:
         return np.ascontiguousarray(out[:, skip : skip + n_slots * q])
 
 
-def column_light(distance: FloatArray, light_spread: float) -> FloatArray:
-    """Light of a column at a distance, in column pitches, from its middle, against that in its middle.
+def light_of_columns(n_strips: int, n_columns: int, light_spread: float) -> FloatArray:
+    """(M, C) light of every column in the middles of strips spread evenly over a screen, the most in a strip being 1.
 
     Args:
-        distance: any shape.
-        light_spread: sigma of the Gaussian that the light falls off with, pitches.
+        n_strips: strips of the screen, M.
+        n_columns: its columns.
+        light_spread: sigma of the Gaussian that a column's light falls off with, column pitches.
     """
-    return np.asarray(np.exp(-(distance**2) / (2 * max(light_spread, 1e-3) ** 2)))
+    place = (np.arange(n_strips) + 0.5) / n_strips * n_columns
+    square = (place[:, None] - np.arange(n_columns) - 0.5) ** 2
+    return np.asarray(np.exp((square.min(axis=1, keepdims=True) - square) / (2 * max(light_spread, 1e-3) ** 2)))
 
 
 @dataclass(frozen=True, slots=True)

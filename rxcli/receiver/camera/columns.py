@@ -9,7 +9,7 @@ import numpy as np
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver.camera.strips import EXTREMES_SLOTS, levelled
-from rxcli.receiver.light import NoiseModel
+from rxcli.receiver.light import NoiseModel, light_of_columns
 from rxcli.types import BoolArray, Clock, FloatArray, RowProfiles
 
 
@@ -71,10 +71,6 @@ def _mean_likeness(slots: FloatArray, observed: BoolArray, distance: int) -> flo
 
 def _expected_likeness(n_strips: int, reach: int, screen: ScreenProfile) -> FloatArray:
     """(reach - 1,) correlation of strips 1, 2, .. apart, averaged over the screen."""
-    u = (np.arange(n_strips) + 0.5) / n_strips * screen.columns
-    offset = u[:, None] - (np.arange(screen.columns) + 0.5)
-    square = offset**2
-    square -= square.min(axis=1, keepdims=True)  # Weights are compared; those of hardly any spread would all be 0.
-    light = np.exp(-square / (2 * max(screen.light_spread, 1e-3) ** 2))
+    light = light_of_columns(n_strips, screen.columns, screen.light_spread)
     light /= np.linalg.norm(light, axis=1, keepdims=True)
     return np.array([float((light[:-d] * light[d:]).sum(axis=1).mean()) for d in range(1, reach)])

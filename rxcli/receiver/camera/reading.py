@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import folded
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, dimming_symbol
 from rxcli.receiver.camera.estimates import Hypothesis
 from rxcli.receiver.camera.views import View, Views, slot_time
@@ -161,7 +162,6 @@ def _of_length(
 ) -> Float32Array | FloatArray:
     """(C, 9, packet_slots) evidence of every start from that of words (10, C, 9) and preambles (C, 9, n)."""
     start = np.arange(packet_slots)
-    padded = np.pad(more, ((0, 0), (0, 0), (0, -more.shape[2] % packet_slots)))
-    preambles = padded.reshape(*more.shape[:2], -1, packet_slots).sum(axis=2)
+    preambles = folded(more, packet_slots)
     in_words = words[start % SLOTS_PER_SYMBOL].transpose(1, 2, 0)
     return np.asarray(preambles[..., (start + PREAMBLE_SLOTS) % packet_slots] + in_words)

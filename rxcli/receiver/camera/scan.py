@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import header_correlation
+from rxcli.numerics import folded, header_correlation
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.edges import edge_power
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis, distinct
@@ -180,11 +180,11 @@ def _comb(response: FloatArray, packet_slots: int) -> tuple[FloatArray, NDArray[
     """Best sums of responses (k, n) over copies of a packet, over the root of their number; and their samples, (k,)."""
     n_signs, n = response.shape
     period, lead = packet_slots * SAMPLES, SLOTS_PER_SYMBOL * SAMPLES
-    folded = np.zeros((n_signs, -(-n // period) * period))
-    folded[:, lead : n - lead] = response[:, lead : n - lead]
+    # Headers that are not seen as a whole do not count.
+    inner = np.where((np.arange(n) >= lead) & (np.arange(n) < n - lead), response, 0.0)
     phase = np.arange(period)
     count = (n - lead - 1 - phase) // period - (lead - 1 - phase) // period
-    score = folded.reshape(n_signs, -1, period).sum(axis=1) / np.sqrt(np.maximum(count, 1))
+    score = folded(inner, period) / np.sqrt(np.maximum(count, 1))
     best = score.argmax(axis=1)
     return score[np.arange(n_signs), best], best
 

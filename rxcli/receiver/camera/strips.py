@@ -47,6 +47,8 @@ class Strips:
     sides: tuple[float, float] | None = None
     #: Whether the picture is a mosaic, which no camera corrects.
     mosaic: bool = False
+    #: Sigma of the Gaussian that a column's light falls off with, column pitches.
+    light_spread: float = 0.45
     #: The tone curve that was undone; None where values are known to follow light.
     tone: str | None = None
 
@@ -74,6 +76,7 @@ def strips_of(
     centre_x: FloatArray,
     width: int,
     height: int,
+    light_spread: float,
     sides: tuple[float, float] | None = None,
     mosaic: bool = False,
     tone: str | None = None,
@@ -85,6 +88,7 @@ def strips_of(
         centre_x: (C*S, R) picture x of the strips' middles.
         width: of the picture, pixels.
         height: of the picture, rows.
+        light_spread: of the screen, column pitches.
         sides: k1 that the screen's sides show, and its standard deviation.
         mosaic: whether the picture is a mosaic.
         tone: the curve that was undone; None where values are known to follow light.
@@ -103,6 +107,7 @@ def strips_of(
         noise=NoiseModel(profiles.noise_floor / pixels, profiles.noise_slope / pixels),
         width=width,
         height=height,
+        light_spread=light_spread,
         sides=sides,
         mosaic=mosaic,
         tone=tone,

@@ -12,15 +12,12 @@ from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, co
 from rxcli.receiver.camera.strips import SAMPLES, Strips
 from rxcli.receiver.camera.trellis import lit_probability, pattern_light
 from rxcli.receiver.camera.views import View
-from rxcli.receiver.light import SlotLight
+from rxcli.receiver.light import SlotLight, light_of_columns
 from rxcli.types import Float32Array, FloatArray
 
 #: Exposures that are compared, slots; and those near one, as factors.
 _EXPOSURES = np.array([0.3, 0.7, 1.1, 1.5, 1.9, 2.3, 2.8])
 _AROUND_EXPOSURE = np.array([0.7, 0.85, 1.0, 1.17, 1.37])
-
-#: Reach of a column's light, columns; less than this share of a strip's light is left out.
-_LIGHT_SPREAD, _LEAST_SHARE = 0.45, 0.02
 
 #: Rounds of levels and slots at every step; slots over which levels are taken; weight of a column's own level there.
 _ROUNDS, _LEVEL_SLOTS = 1, 31
@@ -83,10 +80,7 @@ class Waves:
 
 def column_shares(strips: Strips) -> FloatArray:
     """(M, C) share of every column's light in every strip's, for columns that are lit alike."""
-    n_strips = strips.light.shape[0]
-    across = (np.arange(n_strips) + 0.5) / n_strips * strips.n_columns
-    light = np.exp(-((across[:, None] - np.arange(strips.n_columns) - 0.5) ** 2) / (2 * _LIGHT_SPREAD**2))
-    light[light < _LEAST_SHARE * light.max(axis=1, keepdims=True)] = 0
+    light = light_of_columns(strips.light.shape[0], strips.n_columns, strips.light_spread)
     return np.asarray(light / light.sum(axis=1, keepdims=True))
 
 

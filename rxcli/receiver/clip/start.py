@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sample_columns
 from rxcli.receiver.context import Camera, FrameContext
@@ -125,7 +124,7 @@ def _fold(
     for (slots, response), start in zip(responses, starts, strict=True):
         place = np.round((slots + start) * _SAMPLES_PER_SLOT).astype(np.int64) % n
         np.add.at(score, place, response)
+    # Stamps are rounded to milliseconds: neighbouring places say the same.
     score = (score + np.roll(score, 1) + np.roll(score, -1)) / 3
-    best = int(score.argmax())
-    away = np.abs((np.arange(n) - best + n // 2) % n - n // 2) > SLOTS_PER_SYMBOL * _SAMPLES_PER_SLOT // 4
-    return float(score[best]), float(score[best] / max(score[away].max(), 1e-12)), best / _SAMPLES_PER_SLOT
+    place, lead = sync.header_comb(score, _SAMPLES_PER_SLOT)
+    return float(score.max()), lead, place / _SAMPLES_PER_SLOT

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import header_correlation
+from rxcli.numerics import folded, header_correlation
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
@@ -232,7 +232,8 @@ def find_clocks(
     light, valid = resample(profiles, top, step, n)
     pooled, weight = contrast(light, valid, _SEARCH_SAMPLES, sigma / np.sqrt(max(step, 1.0)))
     response = header_response(pooled, weight, _SEARCH_SAMPLES)
-    start, header_peak_ratio = _comb(response, packet_slots * _SEARCH_SAMPLES)
+    power = folded(np.maximum(response, 0) ** 2, packet_slots * _SEARCH_SAMPLES)
+    start, header_peak_ratio = header_comb(power, _SEARCH_SAMPLES)
     if not np.isfinite(start):
         return ()
     delays = _delays(pooled, weight, start, packet_slots)
@@ -280,25 +281,27 @@ def _row_span(profiles: RowProfiles) -> tuple[float, float]:
     return float(rows[shown].min()) - 0.5, float(rows[shown].max()) + 0.5
 
 
-def _comb(response: FloatArray, period: int) -> tuple[float, float]:
-    """Start (in samples, 0 <= start < period) that collects most header correlation, and its lead over the others."""
-    folded = np.zeros(-(-response.size // period) * period)
-    folded[: response.size] = np.maximum(response, 0) ** 2
-    score = folded.reshape(-1, period).sum(axis=0)
+def header_comb(score: FloatArray, samples_per_slot: int) -> tuple[float, float]:
+    """Start of packets, in samples, that collects most header correlation, and its lead over all that are elsewhere.
+
+    Args:
+        score: (period,) power of the header correlation at every place in a packet, copies added.
+        samples_per_slot: samples a slot.
+    """
     best = int(score.argmax())
     if score[best] <= 0:
         return float("nan"), 0.0
-    left, middle, right = score[best - 1], score[best], score[(best + 1) % period]
-    curvature = left - 2 * middle + right
-    offset = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
-    rival = float(score[_away(period, best)].max(initial=0.0))
-    return best + float(np.clip(offset, -0.5, 0.5)), float(middle / max(rival, 1e-12))
+    around = score[[best - 1, best, (best + 1) % score.size]]
+    offset = float(_parabola(around[None], np.array([1]))[0])
+    return best + offset, float(score[best] / _rival(score, best, samples_per_slot))
 
 
-def _away(period: int, best: int, further: int = 0) -> BoolArray:
-    """(period,) samples that are further from `best` than a quarter of a header, and `further` samples."""
+def _rival(score: FloatArray, best: int, samples_per_slot: int, further: int = 0) -> float:
+    """The most of a score that is further from `best` than a quarter of a header, and `further` samples."""
+    period = score.size
     distance = np.abs((np.arange(period) - best + period // 2) % period - period // 2)
-    return np.asarray(distance > SLOTS_PER_SYMBOL * _SEARCH_SAMPLES // 4 + further)
+    away = score[distance > SLOTS_PER_SYMBOL * samples_per_slot // 4 + further]
+    return max(float(away.max(initial=0.0)), 1e-12)
 
 
 def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> tuple[float, float, FloatArray]:
@@ -315,16 +318,14 @@ def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> 
     support = (total[:, length:] - total[:, :-length]) / length
     responses = _header_correlation(pooled * (weight / (weight + 1.0)), _SEARCH_SAMPLES)
     # Twice a correlation less its bound: the log-likelihood ratio, up to a factor, of a header against random slots.
-    folded = np.zeros((n_columns, -(-pooled.shape[1] // period) * period))
-    folded[:, : pooled.shape[1]] = 2 * responses - support
-    folded = folded.reshape(n_columns, -1, period).sum(axis=1)
+    llr = folded(2 * responses - support, period)
     reach = int(_MAX_DELAY_SLOTS * _SEARCH_SAMPLES)
     wide = reach + _SEARCH_SAMPLES
-    wrapped = np.pad(folded, ((0, 0), (wide, wide)), mode="wrap")
+    wrapped = np.pad(llr, ((0, 0), (wide, wide)), mode="wrap")
     near = cv2.dilate(wrapped, np.ones((1, 2 * reach + 1), np.uint8))[:, wide : wide + period]
     score = np.maximum(near, 0).sum(axis=0)
     start = int(score.argmax())
-    header_peak_ratio = score[start] / max(float(score[_away(period, start, 2 * reach)].max(initial=0.0)), 1e-12)
+    header_peak_ratio = score[start] / _rival(score, start, _SEARCH_SAMPLES, 2 * reach)
     around = wrapped[:, start : start + 2 * wide + 1]
     best = around.argmax(axis=1)
     delays = best + _parabola(around, best) - wide

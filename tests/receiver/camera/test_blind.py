@@ -67,7 +67,8 @@ def strips_of(frame: Frame, corners: FloatArray, n_columns: int = 20) -> blind.S
     n_strips = sampling.strips_per_column(column_px)
     outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height)
     profiles = sampling.sample_rows(frame, outlines, "srgb")
-    return blind.strips_of(profiles, (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2, frame.width, frame.height)
+    centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
+    return blind.strips_of(profiles, centre_x, frame.width, frame.height, light_spread=0.45)
 
 
 @pytest.mark.parametrize(
