@@ -16,12 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.types import Float32Array, FloatArray, IntArray
+from rxcli.protocol import HEADER
+from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: The longest exposure, slots, that each memory of the trellis covers; longer ones have `MAX_MEMORY`.
 _MEMORY_COVERS = {1: 1.3, 3: 2.6}
 #: Longest memory of the trellis; five slots cover an exposure of four.
 MAX_MEMORY = 5
+#: The dark slots in the middle of a header.
+_DARK_FROM = HEADER.index(0, HEADER.index(1))
+_DARK_TO = HEADER.index(1, _DARK_FROM)
 #: A shutter is taken to be open for so many slots at least.
 _LEAST_SLOTS = 1e-3
 
@@ -66,6 +70,18 @@ def exposure_shares(centre: FloatArray, slots: NDArray[np.integer] | FloatArray,
     half = exposure_slots / 2
     reach = np.minimum(centre + half, slots + 1) - np.maximum(centre - half, slots)
     return np.asarray(np.maximum(reach, 0) / exposure_slots)
+
+
+def shows_dark_header(places: FloatArray, exposure_slots: float, least: float = 0.0) -> BoolArray:
+    """Exposures that see nothing but the three dark slots in the middle of a header.
+
+    Args:
+        places: their centres, slots from the start of a packet.
+        exposure_slots: their length.
+        least: how far from the middle, slots, they count however long the exposure.
+    """
+    reach = max((_DARK_TO - _DARK_FROM - exposure_slots) / 2, least)
+    return np.asarray(np.abs(places - (_DARK_FROM + _DARK_TO) / 2) <= reach)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,7 @@ from rxcli.numerics import box_sums
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, slot_patterns
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.picture import predict_picture
+from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.resources import data_dir
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
@@ -46,16 +47,10 @@ STRIP_FEATURES = (
 )
 COLUMN_FEATURES = ("known", "phase[10]", "believed", "lent", "weight", "score", "information")
 N_STRIP_FEATURES, N_COLUMN_FEATURES = 26, 16
-#: Slots on either side over which the local level is averaged.
-_LEVEL_SLOTS = 10
-#: The rows' own light is told by one strip in so many: strips of a column err alike.
-_ROW_STRIPS = 2
-#: Largest residual, in standard deviations, in the rows' own light and as a feature.
-_ROW_SIGMAS, _RESIDUAL_SIGMAS = 3.0, 4.0
+#: Largest residual, in standard deviations, as a feature; the network has learned with it.
+_RESIDUAL_SIGMAS = 4.0
 #: Probabilities below this are not told apart.
 _TINY = 1e-30
-#: Strips and samples err alike: about so much of their summed information is left.
-_ALIKE = 0.16
 _MAX_MODEL_BYTES = 2_000_000
 
 
@@ -93,11 +88,11 @@ def remove_row_noise(scene: DenoiserInput) -> DenoiserInput:
 
     For every column it is what the other columns leave unexplained at the same instant.
     """
-    some = slice(None, None, _ROW_STRIPS)
+    some = slice(None, None, SETTINGS.row_strips)
     thin = replace(scene.samples, light=scene.samples.light[:, some], valid=scene.samples.valid[:, some])
     model = replace(scene.model, crosstalk=scene.model.crosstalk.of_strips(some))
     observed = _explain(replace(scene, samples=thin, model=model), np.arange(len(scene.lit)))
-    rows = _row_light(np.clip(observed.residual, -_ROW_SIGMAS, _ROW_SIGMAS), observed.scale)[:, None]
+    rows = _row_light(np.clip(observed.residual, -SETTINGS.row_sigmas, SETTINGS.row_sigmas), observed.scale)[:, None]
     samples = replace(scene.samples, light=scene.samples.light - rows * scene.samples.valid)
     return replace(scene, samples=samples)
 
@@ -136,7 +131,7 @@ def _explain(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Explained:
     light = model.over_black(scene.samples)[columns]
     expected = model.expected(scene.lit, scene.clock, columns)
     whole = expected.whole
-    (prediction,) = predict_picture(light, whole, valid, model, thorough=False)
+    (prediction,) = predict_picture(light, whole, valid, model, one_sided=False)
     noise = model.noise.through(prediction.picture, prediction.variance, whole)
     scale = np.asarray(valid / np.sqrt(noise), np.float32)
     residual = (light - prediction.picture * whole) * scale
@@ -224,7 +219,9 @@ def _bounded(residual: Float32Array) -> Float32Array:
 
 def _pooled(values: NDArray[np.floating[Any]], q: int) -> Float32Array:
     """(B, N) sum over strips and the samples of a slot, as far as they are independent."""
-    return np.asarray(values.sum(axis=1).reshape(values.shape[0], -1, q).sum(axis=2) * np.float32(_ALIKE))
+    return np.asarray(
+        values.sum(axis=1).reshape(values.shape[0], -1, q).sum(axis=2) * np.float32(SETTINGS.slot_information / q)
+    )
 
 
 def _slot_llr(metrics: FloatArray, lit: Float32Array) -> Float32Array:
@@ -249,7 +246,7 @@ def _slot_llr(metrics: FloatArray, lit: Float32Array) -> Float32Array:
 
 def _local_level(light: Float32Array, valid: Float32Array, q: int) -> Float32Array:
     """(B, S, n) mean light of the valid samples around."""
-    around = _LEVEL_SLOTS * q
+    around = SETTINGS.level_slots * q
     return np.maximum(box_sums(light, around) / np.maximum(box_sums(valid, around), 1), 0)
 
 

@@ -11,17 +11,13 @@ from numpy.typing import NDArray
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.patterns import by_pattern
 from rxcli.receiver.channel.picture import Prediction, by_slot, predict_picture
+from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
-#: Prior of the predictions from both sides, from before, from after.
-_SIDES = (0.5, 0.25, 0.25)
 #: Degrees of freedom of the Student-t likelihood; `_density` is written for four.
 _DEGREES = 4.0
 #: Densities are taken to be at least this, so that their logarithm exists.
 _LEAST_DENSITY = np.float32(1e-37)
-#: Samples of one slot and strips of one column err alike: the log-likelihoods of a slot's samples, added over the
-#: strips, count as much as this many samples of one strip would.
-_TEMPER = 0.64
 #: Samples worked on at a time: what fits the cache.
 _SAMPLES_AT_A_TIME = 60_000
 #: NumPy works outside the interpreter's lock; more threads than this gain nothing on a few columns. Of fewer parts
@@ -85,7 +81,8 @@ def slot_likelihoods(
 def _likelihoods(
     light: Float32Array, valid: Float32Array, expected: Expected, model: ObservationModel, thorough: bool
 ) -> SlotLikelihoods:
-    predictions = predict_picture(light, expected.whole, valid, model, thorough)
+    scales = SETTINGS.picture_scales if thorough else SETTINGS.first_scales
+    predictions = predict_picture(light, expected.whole, valid, model, scales, one_sided=thorough)
     metrics = _pattern_metrics(light, valid, predictions, expected, model)
     timing = _timing(light, valid, predictions[0], expected, model)
     return SlotLikelihoods(metrics, _slot_snr(valid, predictions[0], expected.own, model), timing)
@@ -96,7 +93,7 @@ def _slot_snr(valid: Float32Array, prediction: Prediction, own: Float32Array, mo
     contrast = prediction.picture * own
     noise = model.noise.through(prediction.picture, prediction.variance, own)
     q = model.exposure.samples_per_slot
-    ratio = (contrast * contrast / noise * valid).sum(axis=1) * np.float32(_TEMPER / q)
+    ratio = (contrast * contrast / noise * valid).sum(axis=1) * np.float32(SETTINGS.slot_information / q)
     return by_slot(ratio, q)
 
 
@@ -122,14 +119,13 @@ def _pattern_metrics(
     model: ObservationModel,
 ) -> FloatArray:
     """Mixture log-likelihoods summed over strips and the samples of a metric; (C, N + memory, patterns)."""
-    weight = np.float32(_TEMPER / model.exposure.samples_per_slot) * valid
-    priors = _SIDES if len(predictions) > 1 else (1.0,)
+    weight = np.float32(SETTINGS.slot_information / model.exposure.samples_per_slot) * valid
 
     def log_likelihood(levels: Float32Array) -> Float32Array:
         whole = expected.others + expected.own * levels
         density = np.zeros_like(light)
-        for prediction, prior in zip(predictions, priors, strict=True):
-            density += _density(light, whole, prediction, model, prior)
+        for prediction in predictions:
+            density += _density(light, whole, prediction, model)
         np.log(np.maximum(density, _LEAST_DENSITY, out=density), out=density)
         density *= weight
         return np.asarray(density.sum(axis=1))
@@ -137,10 +133,8 @@ def _pattern_metrics(
     return by_pattern(model.exposure, light.shape[2], log_likelihood)
 
 
-def _density(
-    light: Float32Array, whole: Float32Array, prediction: Prediction, model: ObservationModel, prior: float
-) -> Float32Array:
-    """Student-t density of the light times a prior, up to a constant.
+def _density(light: Float32Array, whole: Float32Array, prediction: Prediction, model: ObservationModel) -> Float32Array:
+    """Student-t density of the light, up to a constant.
 
     With four degrees of freedom, variance v and residual r it is v^2 / (v + r^2 / 4)^2.5: a root, and no logarithm.
     """
@@ -151,6 +145,5 @@ def _density(
     wide += variance
     variance /= wide
     np.square(variance, out=variance)
-    variance *= np.float32(prior)
     variance /= np.sqrt(wide, out=wide)
     return variance

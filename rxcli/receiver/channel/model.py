@@ -7,13 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
+from rxcli.receiver.channel.settings import SETTINGS
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, shows_dark_header
 from rxcli.types import Clock, Float32Array, SlotSamples
-
-#: Positions in the packet of the header's middle dark slot, where only the floor is seen.
-_DARK_FROM, _DARK_TO = 5.9, 7.1
-#: Light over the floor up to which a sample counts as dark.
-_DARK_MARGIN = 0.002
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +73,8 @@ class Expected:
 def estimate_black_level(samples: SlotSamples, clock: Clock) -> float:
     """Light of a dark slot: the median of what is seen in the middle of the headers' three dark slots."""
     q = samples.samples_per_slot
-    position = (np.arange(samples.light.shape[-1]) / q + clock.first_slot) % clock.packet_slots
-    dark = (position >= _DARK_FROM) & (position < _DARK_TO)
+    places = (np.arange(samples.light.shape[-1]) + 0.5) / q + clock.first_slot
+    dark = shows_dark_header(places % clock.packet_slots, clock.exposure_slots, least=0.5)
     observed = samples.light[..., dark][samples.valid[..., dark] > 0]
     return float(np.median(observed)) if observed.size else 0.0
 
@@ -87,7 +83,7 @@ def estimate_sigma(samples: SlotSamples, black_level: float, least: float) -> fl
     """Noise of a dark sample, from second differences where it is dark; at least `least`."""
     light = samples.light
     mean = (light[..., 2:] + light[..., 1:-1] + light[..., :-2]) / 3
-    dark = (mean < black_level + _DARK_MARGIN) & (samples.valid[..., 2:] * samples.valid[..., :-2] > 0)
+    dark = (mean < black_level + SETTINGS.dark_light) & (samples.valid[..., 2:] * samples.valid[..., :-2] > 0)
     bend = (light[..., 2:] - 2 * light[..., 1:-1] + light[..., :-2])[dark]
     if bend.size < 50:
         return least

@@ -7,13 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from rxcli.protocol import slot_patterns
+from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.receiver.light import Exposure
 from rxcli.types import Clock, Float32Array, FloatArray
-
-#: Log-likelihood ratio of a slot that the first guess sees at full contrast in all strips.
-_FIRST_GUESS_LLR = 8.0
-#: Strips of full contrast at which the first guess is as sure as it gets.
-_FIRST_GUESS_STRIPS = 3.0
 
 
 def first_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposure) -> FloatArray:
@@ -25,8 +21,8 @@ def first_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposure
         exposure: of the samples.
     """
     # Squared errors, so weighted that a slot seen right in all samples has the log-likelihood ratio of the constant.
-    most = np.float32(_FIRST_GUESS_LLR / 4 / exposure.samples_per_slot)
-    trust = np.minimum(weight / np.float32(_FIRST_GUESS_STRIPS), 1) * most
+    most = np.float32(SETTINGS.first_llr / 4 / exposure.samples_per_slot)
+    trust = np.minimum(weight / np.float32(SETTINGS.first_strips), 1) * most
     value = np.clip(pooled, -1.5, 1.5)
     return by_pattern(exposure, pooled.shape[1], lambda levels: -np.square(value - (2 * levels - 1)) * trust)
 

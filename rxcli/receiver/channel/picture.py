@@ -8,17 +8,8 @@ import numpy as np
 
 from rxcli.numerics import box_sums
 from rxcli.receiver.channel.model import ObservationModel
+from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Float32Array
-
-#: Scales, in slots, over which the picture is predicted: fine texture to plain sky.
-PICTURE_SCALES = (0.3, 0.8, 2.5, 6.0)
-_QUICK_SCALES = (0.6, 2.5)
-#: Samples closer than this many slots to a sample say nothing of its picture: they show the same slot.
-_HOLE_SLOTS = 0.7
-#: The error of the prediction is averaged over this many slots.
-_ERROR_SLOTS = 28
-#: Bounds on the relative variance of a predicted picture.
-_TEXTURE_BOUNDS = (0.003, 2.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +25,8 @@ def predict_picture(
     expected: Float32Array,
     valid: Float32Array,
     model: ObservationModel,
-    thorough: bool = True,
+    scales: tuple[float, ...] = SETTINGS.picture_scales,
+    one_sided: bool = True,
 ) -> list[Prediction]:
     """The picture at every sample from both sides, from before and from after; on each the best of all scales.
 
@@ -43,18 +35,18 @@ def predict_picture(
         expected: (C, S, n) light per unit of picture, by the present idea of the slots.
         valid: (C, S, n) 1 or 0.
         model: the observation model.
-        thorough: else from both sides alone, on the middle scales.
+        scales: slots over which it is predicted.
+        one_sided: predict from before and from after as well.
     """
     samples_per_slot, floor = model.exposure.samples_per_slot, np.float32(model.noise.floor)
     weighted = expected * valid
     numerator, denominator = weighted * light, weighted * expected
-    hole = max(int(np.ceil(_HOLE_SLOTS * samples_per_slot)) - 1, 0)
+    hole = max(int(np.ceil(SETTINGS.hole_slots * samples_per_slot)) - 1, 0)
     texture = _Texture(light, expected, valid, floor, samples_per_slot)
     pictures: list[Float32Array] = []
     variances: list[Float32Array] = []
-    scales = PICTURE_SCALES if thorough else _QUICK_SCALES
     for half in dict.fromkeys(max(int(scale * samples_per_slot), 1) for scale in scales):
-        sides = _sides if thorough else _both_sides
+        sides = _sides if one_sided else _both_sides
         sums = zip(
             sides(box_sums(numerator, half), half, hole), sides(box_sums(denominator, half), half, hole), strict=True
         )
@@ -121,11 +113,11 @@ class _Texture:
         residual = self._light - predicted
         error = self._around(np.square(residual, out=residual)) - self._noise
         power = self._around(np.square(predicted, out=predicted)) + self._least
-        low, high = _TEXTURE_BOUNDS
+        low, high = SETTINGS.texture_bounds
         return np.asarray(np.clip(error / power, np.float32(low), np.float32(high)))
 
     def _around(self, values: Float32Array) -> Float32Array:
-        return box_sums(by_slot(values, self._q // self._step), _ERROR_SLOTS // 2)
+        return box_sums(by_slot(values, self._q // self._step), SETTINGS.error_slots // 2)
 
 
 def by_slot(values: Float32Array, samples_per_slot: int) -> Float32Array:

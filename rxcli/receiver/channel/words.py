@@ -10,19 +10,8 @@ from numpy.typing import NDArray
 from rxcli.numerics import box_sums
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.model import ObservationModel
+from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
-
-#: Kinds of picture, smooth to rough: relative standard deviation about the local mean, and slots after which it is
-#: another one (Ornstein-Uhlenbeck). Each strip may be of any.
-_PICTURE_KINDS = ((0.06, 0.7), (0.25, 2.0), (0.7, 3.0))
-#: The local mean is taken over this many slots on either side; a word is weighed with so many slots around it.
-_MEAN_SLOTS, _AROUND_SLOTS = 10, 3
-#: Variance of the mean of two adjacent samples against that of one: samples are interpolated, so they err alike.
-_PAIR_NOISE = 0.75
-#: Strips of a column err alike: what they say of a word, added, counts so much; and at most so many nats.
-_WORD_TEMPER, _WORD_NATS = 0.3, 12.0
-#: Ridge of the slots' corrections that make up a word's.
-_WORD_RIDGE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +63,8 @@ def word_corrections(
     observed = _process_likelihood(halves, places[symbol[item], 1], start[item], levels, model)
     score = np.zeros(likely.shape)
     np.add.at(score, (symbol[item], word), observed)
-    slots = _as_slots(_WORD_TEMPER * score, words, likely)
+    # Both halves of a slot together count as any other number of samples would.
+    slots = _as_slots(SETTINGS.slot_information / 2 * score, words, likely)
     _share_among_copies(out, slots, symbol, places[symbol, 1], start)
     return out
 
@@ -109,7 +99,7 @@ def _halves(
 ) -> _Halves:
     expected, light, q = model.expected(lit, clock, columns), model.over_black(samples), samples.samples_per_slot
     weight = expected.whole * samples.valid
-    light_around, seen_around = (box_sums(part * weight, _MEAN_SLOTS * q) for part in (light, weight))
+    light_around, seen_around = (box_sums(part * weight, SETTINGS.level_slots * q) for part in (light, weight))
     mean = np.maximum(light_around, np.float32(0)) / np.maximum(seen_around, np.float32(1e-3))
     observed = _paired(samples.valid) > 0.9
     return _Halves(_paired(light), _paired(mean.astype(np.float32)), _paired(expected.others), observed)
@@ -131,7 +121,7 @@ def _word_levels(
         words: (R, 10).
         model: the light model.
     """
-    lead, q = _AROUND_SLOTS + model.exposure.isi_memory, model.exposure.samples_per_slot
+    lead, q = SETTINGS.around_slots + model.exposure.isi_memory, model.exposure.samples_per_slot
     at = start[:, None] + np.arange(-lead, SLOTS_PER_SYMBOL + lead)
     slots = np.take_along_axis(lit, np.clip(at, 0, lit.shape[1] - 1), axis=1)
     slots[(at < 0) | (at >= lit.shape[1])] = 0.5
@@ -145,15 +135,15 @@ def _process_likelihood(
 ) -> FloatArray:
     """(R,) log-likelihood of the light by R words, strips added, whatever kind of picture each shows."""
     n, width = halves.light.shape[2], levels.shape[1]
-    at = 2 * (start[:, None] - _AROUND_SLOTS) + np.arange(width)
+    at = 2 * (start[:, None] - SETTINGS.around_slots) + np.arange(width)
     index = (column[None, :, None], np.arange(halves.light.shape[1])[None, None], np.clip(at, 0, n - 1).T[:, :, None])
     # From here on time comes first: (W, R, S).
     mean, observed = halves.mean[index], halves.observed[index] & ((at >= 0) & (at < n)).T[:, :, None]
     gain = (halves.others[index] + model.crosstalk.own[..., 0] * levels.T[:, :, None]) * mean
-    noise = np.float32(_PAIR_NOISE) * model.noise.variance(gain)
+    noise = np.float32(SETTINGS.pair_noise) * model.noise.variance(gain)
     residual = np.where(observed, halves.light[index] - gain, np.float32(0))
     gain = np.where(observed, gain, np.float32(0))
-    kinds = _innovations(residual, gain, noise, _PICTURE_KINDS)
+    kinds = _innovations(residual, gain, noise, SETTINGS.picture_kinds)
     return np.asarray(np.logaddexp.reduce(kinds, axis=0).sum(axis=1), np.float64)
 
 
@@ -197,8 +187,8 @@ def _innovations(
 def _as_slots(score: FloatArray, words: NDArray[np.uint8], likely: NDArray[np.bool_]) -> FloatArray:
     """(J, 10) least corrections of single slots that add up to what words (J, K) score against the first of them."""
     score = score - np.where(likely, score, -np.inf).max(axis=1, keepdims=True)
-    score = np.maximum(score, -_WORD_NATS)
+    score = np.maximum(score, -SETTINGS.word_nats)
     wanted = (score[:, 1:] - score[:, :1]) * likely[:, 1:]
     apart = (words[:, 1:].astype(np.float64) - words[:, :1]) * likely[:, 1:, None]
-    across = apart @ apart.transpose(0, 2, 1) + _WORD_RIDGE * np.eye(apart.shape[1])
+    across = apart @ apart.transpose(0, 2, 1) + SETTINGS.word_ridge * np.eye(apart.shape[1])
     return np.asarray((np.linalg.solve(across, wanted[..., None]).transpose(0, 2, 1) @ apart)[:, 0])

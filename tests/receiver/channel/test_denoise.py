@@ -37,13 +37,13 @@ def sent(rng: np.random.Generator) -> np.ndarray:
 
 
 def through_exposure(slots: np.ndarray, exposure: float) -> np.ndarray:
-    """(C, N * Q) by brute force: 64 instants of every sample's exposure, half lit beyond the ends."""
+    """(C, N * Q) by brute force: 64 instants of every exposure, 8 within a sample's length; half lit beyond the ends."""
     n = slots.shape[1]
-    centres = (np.arange(n * Q) + 0.5) / Q
+    centres = (np.arange(n * Q * 8) + 0.5) / (8 * Q)
     instants = centres[:, None] + ((np.arange(64) + 0.5) / 64 - 0.5) * exposure
     index = np.floor(instants).astype(int)
     values = slots[:, np.clip(index, 0, n - 1)].astype(float)
-    return np.where((index < 0) | (index >= n), 0.5, values).mean(axis=2)
+    return np.where((index < 0) | (index >= n), 0.5, values).mean(axis=2).reshape(len(slots), n * Q, 8).mean(axis=2)
 
 
 def scene_of(slots: np.ndarray, rng: np.random.Generator, *, noise: float = 0.005, rows: float = 0.0) -> DenoiserInput:

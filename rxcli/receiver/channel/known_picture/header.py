@@ -7,10 +7,11 @@ import numpy as np
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.known_picture.exposure import read_between
 from rxcli.receiver.channel.known_picture.picture import PRIOR, ColumnLight
+from rxcli.receiver.light import shows_dark_header
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray
 
-#: Slots of the header between which it is dark, and rows of a strip, over all frames, from which its light is known.
-_DARK_SLOTS, _LEAST_DARK_ROWS = (5.0, 8.0), 12
+#: Rows of a strip, over all frames, from which its light where nothing is lit is known.
+_LEAST_DARK_ROWS = 12
 #: Rows of a single column's header that must show, that it be judged.
 _LEAST_ROWS = 40
 
@@ -54,9 +55,7 @@ def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) 
 
 def header_dark(positions: FloatArray, clock: Clock) -> BoolArray:
     """(C, R) or (1, R) rows that see nothing but the three dark slots in the middle of a header."""
-    place = (positions + clock.first_slot) % clock.packet_slots
-    margin = clock.exposure_slots / 2
-    return np.asarray((place >= _DARK_SLOTS[0] + margin) & (place <= _DARK_SLOTS[1] - margin))
+    return shows_dark_header((positions + clock.first_slot) % clock.packet_slots, clock.exposure_slots)
 
 
 def dark_light(
