@@ -175,9 +175,11 @@ def possible_outlines(
         period, lens = int(levels.get("mosaic_period", 1)), known_lens(frame, options)
         found = _by_sides(frame, sides, [layouts[n] for n in sorted(layouts)], period, lens)
         if not found:
-            columns = ColumnSearch(None, ())
+            columns = ColumnSearch(None, (), layout)
             if by_columns:
-                columns = find_columns(frame.pixels, layout, mosaic_period=period, lens=lens, lines=sides.lines)
+                all_layouts = [layouts[n] for n in sorted(layouts)]
+                columns = find_columns(frame.pixels, *all_layouts, mosaic_period=period, lens=lens, lines=sides.lines)
+                layout = columns.layout
             found = _joined(sides, columns.numberings, layout.n_columns)
             # Sides that no grid bears out may be a column off like any others.
             unsure = [replace(one, log_odds=0.0) for one in found if not columns.numberings or one.family < 0]
@@ -238,7 +240,7 @@ def _with_shifts(
     n_strips = max(N_STRIPS, round(_STRIPS_A_COLUMN * frame.width / grid.pitch_px))
     coherence = measure_coherence(frame.pixels, mosaic_period=period, n_strips=n_strips)
     strips = StripLight.of(coherence, layout.sigma, lens)
-    start = first_columns(light_profile(strips, grid), grid, layout.n_columns, sides.lines)
+    start = first_columns(light_profile(strips, grid), grid, layout.n_columns, sides.lines, layout.aspect)
     shifted = [
         _moved(replace(own, fills=start.fills), int(first), float(odds), layout.n_columns, lens)
         for first, odds in zip(start.first, start.log_odds, strict=True)

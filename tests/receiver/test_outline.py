@@ -29,8 +29,16 @@ CORNERS = np.array([[150.0, 320.0], [1105.0, 290.0], [1130.0, 880.0], [120.0, 85
 OPTIONS = ReceiverOptions(screens=(load_profile("paper-17k3", ScreenProfile),))
 
 
-def drawn(first: int, last: int, corners: FloatArray = CORNERS) -> NDArray[np.uint8]:
-    """Luma of a screen that shows light in the columns from one to before another."""
+def drawn(
+    first: float,
+    last: float,
+    corners: FloatArray = CORNERS,
+    *,
+    panel: float = 0.0,
+    wall: float = 0.0,
+    fading: bool = False,
+) -> NDArray[np.uint8]:
+    """Luma of a screen that shows light between two places, columns, in a room that lights panel and wall."""
     rng = np.random.default_rng(3)
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
     at = np.linalg.inv(geometry.homography(corners)) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
@@ -39,7 +47,12 @@ def drawn(first: int, last: int, corners: FloatArray = CORNERS) -> NDArray[np.ui
     now = sent[(np.arange(HEIGHT) / ROWS_PER_SLOT).astype(int)]
     light = sum(np.exp(-((COLUMNS * u - k - 0.5) ** 2) / (2 * 0.45**2)) * now[:, k, None] for k in range(COLUMNS))
     light = light * ((COLUMNS * u > first) & (COLUMNS * u < last) & (v > 0) & (v < 1))
-    luma = 150 * light + 12 + rng.normal(0, 4, u.shape) + rng.normal(0, 0.5, (HEIGHT, 1))
+    if fading:
+        light *= np.clip(1 - np.abs(20 * u - (first + last) / 2) / ((last - first) / 2), 0, 1)
+    screen = (u > 0) & (u < 1) & (v > 0) & (v < 1)
+    luma = (
+        150 * light + 12 + np.where(screen, panel, wall) + rng.normal(0, 4, u.shape) + rng.normal(0, 0.5, (HEIGHT, 1))
+    )
     return np.clip(luma, 0, 255).astype(np.uint8)
 
 
@@ -84,10 +97,28 @@ def test_light_at_both_ends_leaves_one_first_column() -> None:
 
 
 def test_dark_columns_at_both_ends_leave_as_many_first_columns() -> None:
-    start = first_columns_of(drawn(4, 17))
+    start = first_columns_of(drawn(3.6, 17.2))
     share = np.exp(start.log_odds) / np.exp(start.log_odds).sum()
     assert share.max() < 0.5
     assert set(start.first[start.log_odds > -3]) >= {-1, 0, 1, 2}
+
+
+@pytest.mark.parametrize(("panel", "wall"), [(1.5, 0.0), (0.0, 1.5)])
+def test_the_edge_of_a_panel_in_the_light_of_a_room_tells_the_first_column(panel: float, wall: float) -> None:
+    start = first_columns_of(drawn(3.6, 17.2, panel=panel, wall=wall))
+    assert start.first[np.argmax(start.log_odds)] == 0
+    assert np.sort(start.log_odds)[-2] < -3
+
+
+def test_a_picture_whose_light_fades_out_is_no_film_in_the_middle() -> None:
+    grid = grid_between(CORNERS, COLUMNS, (WIDTH, HEIGHT), None)
+    sharp, soft = (
+        light_profile(StripLight.of(measure_coherence(luma), 0.45, None), grid).still.sharp_ends
+        for luma in (drawn(3, 17), drawn(3, 17, fading=True))
+    )
+    assert soft is None
+    assert sharp is not None
+    np.testing.assert_allclose(sharp, (3, 17), atol=0.15)
 
 
 LARGE = np.array([[-160.0, 300.0], [1380.0, 280.0], [1400.0, 1170.0], [-180.0, 1140.0]])
@@ -116,7 +147,7 @@ def test_a_side_in_view_tells_the_columns_of_a_screen_that_goes_on_outside_the_p
 
 
 def test_light_in_the_middle_as_bars_of_films_leave_it_speaks_for_it() -> None:
-    start = first_columns_of(drawn(3, 17))
+    start = first_columns_of(drawn(2.6, 17.4))
     assert start.first[np.argsort(start.log_odds)[-1]] == 0
     assert -4 < np.sort(start.log_odds)[-2] < -0.7
 
@@ -133,7 +164,7 @@ def test_sides_of_which_one_is_inferred_are_moved_to_where_no_light_is_left_out(
 
 def test_where_both_ends_are_dark_a_side_that_is_inferred_leaves_doubt(monkeypatch: pytest.MonkeyPatch) -> None:
     found_as(monkeypatch, moved(1), ("right",), 0.1)
-    candidates, _ = possible_outlines(Frame(drawn(4, 17), "drawn"), OPTIONS, Timer())
+    candidates, _ = possible_outlines(Frame(drawn(3.6, 17.2), "drawn"), OPTIONS, Timer())
     assert {shift_of(one) for one in candidates} >= {-1, 0, 1, 2}
     best = outlines._likeliest(candidates)
     assert best is not None
@@ -188,7 +219,7 @@ def test_clips_without_a_screen_are_not_searched_for_columns_in_every_frame(monk
 
     def counted(pixels: NDArray[np.uint8], *given: Any, **named: Any) -> columns.ColumnSearch:
         searched.append(pixels)
-        return columns.ColumnSearch(None, ())
+        return columns.ColumnSearch(None, (), columns.ColumnLayout())
 
     monkeypatch.setattr(columns, "find_columns", counted)
     rng = np.random.default_rng(1)

@@ -44,7 +44,7 @@ def sides_agree(
         part: read one of so many equal parts of the rows.
     """
     n_columns = layout.n_columns
-    scaled, x, y = strip_changes(pixels, mosaic_period=mosaic_period, part=part)
+    scaled, _, x, y = strip_changes(pixels, mosaic_period=mosaic_period, part=part)
     flat = corners if lens is None or lens.corrected else geometry.undistort(corners, lens)
     inverse = np.linalg.inv(geometry.homography(flat))
     points = np.stack(np.meshgrid(x, y), axis=-1)

@@ -8,7 +8,7 @@ show of one another.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,8 @@ class Coherence:
     #: (W, rows, S) float32: the strips' changes themselves, row noise taken off, and (W, rows) their rows, pixels.
     changes: Float32Array
     rows: FloatArray
+    #: (W, S) float32: mean light of the strips, values of a pixel as they are coded.
+    level: Float32Array
     #: (S,) and (W,): middle of the strips and of the windows, pixels.
     x: FloatArray
     y: FloatArray
@@ -63,6 +65,23 @@ class Coherence:
         """Largest distance of a pair, strips."""
         return int(self.pairs.shape[2]) - 1
 
+    def between(self, first: int, last: int) -> Coherence:
+        """The part of the picture that strips from one to before another show."""
+        part = slice(first, last)
+        width = round((last - first) * self.strip_px)
+        pairs = self.pairs[:, part].copy()
+        for apart in range(1, pairs.shape[2]):
+            pairs[:, max(last - first - apart, 0) :, apart] = 0
+        return replace(
+            self,
+            pairs=pairs,
+            lit=self.lit[:, part],
+            changes=self.changes[:, :, part],
+            level=self.level[:, part],
+            x=self.x[part] - self.x[first] + (self.strip_px - 1) / 2,
+            width=width,
+        )
+
 
 def measure_coherence(
     pixels: Pixels, *, mosaic_period: int = 1, n_strips: int = N_STRIPS, reach: float = 0.2
@@ -75,19 +94,19 @@ def measure_coherence(
         n_strips: strips across the picture, about.
         reach: largest distance of two strips, picture widths.
     """
-    scaled, x, starts = strip_changes(pixels, mosaic_period=mosaic_period, n_strips=n_strips)
+    scaled, level, x, starts = strip_changes(pixels, mosaic_period=mosaic_period, n_strips=n_strips)
     height, width = pixels.shape
     quiet, lit = _without_row_noise(scaled)
     n_rows = _independent_rows(quiet, lit)
     pairs = _pairs(quiet, int(np.ceil(reach * width / float(x[1] - x[0]))))
     step = (_LOW_SHORT_ROWS if height < _LOW_ROWS else _SHORT_ROWS) // 2
     at = starts[:, None] + step * (np.arange(scaled.shape[1], dtype=np.float64) - (scaled.shape[1] - 1) / 2)
-    return Coherence(pairs, lit, quiet, at, x, starts, n_rows, width, height)
+    return Coherence(pairs, lit, quiet, at, level, x, starts, n_rows, width, height)
 
 
 def strip_changes(
     pixels: Pixels, *, mosaic_period: int = 1, n_strips: int = N_STRIPS, part: int = 1
-) -> tuple[Float32Array, FloatArray, FloatArray]:
+) -> tuple[Float32Array, Float32Array, FloatArray, FloatArray]:
     """Changes of the strips of a picture from row to row.
 
     Args:
@@ -97,7 +116,8 @@ def strip_changes(
         part: read one of so many equal parts of every window's rows.
 
     Returns:
-        (W, rows, S) float32 of mean square one in every window of rows; (S,) and (W,) middles of strips and windows.
+        (W, rows, S) float32 of mean square one in every window of rows; (W, S) float32 mean values of a pixel there;
+        (S,) and (W,) middles of strips and windows.
     """
     height, width = pixels.shape
     low = height < _LOW_ROWS
@@ -106,21 +126,28 @@ def strip_changes(
     step = short // 2
     rows = height // _WINDOWS // part
     starts = (np.arange(_WINDOWS) * height + (height - rows * _WINDOWS) // 2) // _WINDOWS
-    changes = [_changes(pixels[start : start + rows], strip_px, short, long) for start in starts.tolist()]
-    scaled = _scaled(np.stack([change[::step] for change in changes]))
+    light = [_light(pixels[start : start + rows], strip_px) for start in starts.tolist()]
+    scaled = _scaled(np.stack([_changes(one, short, long)[::step] for one in light]))
+    level = np.stack([one.mean(axis=0) for one in light]) / np.float32(strip_px)
     x = (np.arange(scaled.shape[2]) + 0.5) * strip_px - 0.5
-    return scaled, x, starts + (rows - 1) / 2
+    return scaled, np.asarray(level, np.float32), x, starts + (rows - 1) / 2
 
 
-def _changes(rows: Pixels, strip_px: int, short: int, long: int) -> Float32Array:
-    """(rows, strips) means over a few rows, less those over many."""
+def _light(rows: Pixels, strip_px: int) -> Float32Array:
+    """(rows, strips) sums of the pixels of each strip."""
     import cv2
 
     n = rows.shape[1] // strip_px
     whole = np.ascontiguousarray(rows[:, : n * strip_px]).reshape(-1, strip_px)
     # Sums in whole numbers take half the time, but there are none of 16 bits.
     depth = cv2.CV_32S if rows.dtype == np.uint8 else cv2.CV_32F
-    light = cv2.reduce(whole, 1, cv2.REDUCE_SUM, dtype=depth).reshape(-1, n).astype(np.float32)
+    return np.asarray(cv2.reduce(whole, 1, cv2.REDUCE_SUM, dtype=depth).reshape(-1, n), np.float32)
+
+
+def _changes(light: Float32Array, short: int, long: int) -> Float32Array:
+    """(rows, strips) means over a few rows, less those over many."""
+    import cv2
+
     return np.asarray(cv2.blur(light, (1, short)) - cv2.blur(light, (1, long)), np.float32)
 
 

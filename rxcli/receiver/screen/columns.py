@@ -10,6 +10,7 @@ import numpy as np
 from rxcli.receiver.screen.coherence import Coherence, Pixels, measure_coherence
 from rxcli.receiver.screen.comb import find_combs
 from rxcli.receiver.screen.grid import Grid
+from rxcli.receiver.screen.narrow import find_narrow_columns, shows_narrow_columns
 from rxcli.receiver.screen.numbering import Numbering, possible_numberings
 from rxcli.receiver.screen.sides import Side
 from rxcli.receiver.screen.waveforms import StripLight, refine_by_waveforms, with_light
@@ -30,6 +31,8 @@ _BENT_GAIN = 0.01
 #: Grids that differ less than this over the picture, columns, are one; combs that differ less from a grid lead to it.
 _SAME, _WITHIN_REACH = 0.25, 0.4
 _MIN_SIZE = 96
+#: Columns from which on a screen's are narrow.
+_MANY_COLUMNS = 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +45,11 @@ class ColumnLayout:
     #: Width over height of the screen.
     aspect: float = 16 / 9
 
+    @property
+    def is_narrow(self) -> bool:
+        """Whether columns are so many that a picture is searched for them part by part."""
+        return self.n_columns >= _MANY_COLUMNS
+
 
 @dataclass(frozen=True, slots=True)
 class ColumnSearch:
@@ -51,12 +59,13 @@ class ColumnSearch:
     coherence: Coherence | None
     #: Likeliest first; none where no comb shows.
     numberings: tuple[Numbering, ...]
+    #: Whose columns were found.
+    layout: ColumnLayout
 
 
 def find_columns(
     pixels: Pixels,
-    layout: ColumnLayout,
-    *,
+    *layouts: ColumnLayout,
     mosaic_period: int = 1,
     lens: Lens | None = None,
     lines: Sequence[Side] = (),
@@ -65,19 +74,36 @@ def find_columns(
 
     Args:
         pixels: (height, width) uint8 or uint16: luma, or a mosaic.
-        layout: of the screen.
+        layouts: that the screen may have: one, or one of wide and one of narrow columns.
         mosaic_period: pixels after which the colours of a mosaic repeat; 1 for luma.
         lens: of the picture, where it is known.
         lines: top, right, bottom, left, where stripes begin; none: nothing is known of them.
     """
+    wide, narrow = (next((one for one in layouts if one.is_narrow is many), None) for many in (False, True))
+    either = wide or narrow or ColumnLayout()
     if min(pixels.shape) < _MIN_SIZE:
-        return ColumnSearch(None, ())
+        return ColumnSearch(None, (), either)
     coherence = measure_coherence(pixels, mosaic_period=mosaic_period)
-    strips = StripLight.of(coherence, layout.sigma, lens)
-    found = []
-    for grid in likely_grids(coherence, strips, lens):
+    if narrow is not None and shows_narrow_columns(coherence):
+        fine, strips, grids = find_narrow_columns(pixels, narrow.sigma, mosaic_period=mosaic_period, lens=lens)
+        if grids:
+            return ColumnSearch(coherence, _numbered(fine, strips, grids, narrow, lines), narrow)
+    if wide is None:
+        return ColumnSearch(coherence, (), either)
+    strips = StripLight.of(coherence, wide.sigma, lens)
+    return ColumnSearch(
+        coherence, _numbered(coherence, strips, likely_grids(coherence, strips, lens), wide, lines), wide
+    )
+
+
+def _numbered(
+    coherence: Coherence, strips: StripLight, grids: list[Grid], layout: ColumnLayout, lines: Sequence[Side]
+) -> tuple[Numbering, ...]:
+    """The numberings of all grids."""
+    found: list[Numbering] = []
+    for grid in grids:
         found += possible_numberings(coherence, strips, grid, layout.n_columns, layout.aspect, lines=lines)
-    return ColumnSearch(coherence, tuple(found))
+    return tuple(found)
 
 
 def likely_grids(coherence: Coherence, strips: StripLight, lens: Lens | None) -> list[Grid]:

@@ -8,7 +8,7 @@ sum over all pairs of about that distance: no edge of the screen, no picture and
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -20,16 +20,41 @@ from rxcli.types import Float32Array, FloatArray
 
 #: Distance of the pairs that show the comb best, columns.
 _APART = 0.72
-#: Columns a picture's width that are tried, and their step.
-_PITCHES = np.arange(9.0, 46.0, 0.25)
-#: Turns of the borders, change of pitch across and along the picture: as shares of the pitch.
-_TURNS = np.linspace(-0.12, 0.12, 17)
-_ACROSS = np.linspace(-0.2, 0.2, 7)
-_ALONG = np.linspace(-0.3, 0.3, 9)
 #: Combs that differ less than this in pitch and as much elsewhere are one.
 _SAME_PITCH, _SAME_SHAPE = 0.7, 0.8
 #: Pairs of one distance overlap, so that their noise is alike by this much more than were they independent.
 _OVERLAP = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class CombRange:
+    """Combs that are tried."""
+
+    #: Columns a picture's width, in steps of this.
+    pitches: FloatArray
+    step: float
+    #: Turns of the borders, change of pitch across and along the picture: as shares of the pitch.
+    turns: FloatArray
+    across: FloatArray
+    along: FloatArray
+
+
+WHOLE_PICTURE = CombRange(
+    np.arange(9.0, 46.0, 0.25),
+    0.25,
+    np.linspace(-0.12, 0.12, 17),
+    np.linspace(-0.2, 0.2, 7),
+    np.linspace(-0.3, 0.3, 9),
+)
+#: A fifth of a picture's width, which is some times as high: there pitches hardly change, and turns tell more. Turned
+#: by a column from window to window borders look as if they were not.
+FIFTH = CombRange(
+    np.arange(14.0, 46.0, 0.25),
+    0.25,
+    np.linspace(-0.1, 0.1, 33),
+    np.linspace(-0.03, 0.03, 3),
+    np.linspace(-0.05, 0.05, 7),
+)
 
 
 @dataclass(frozen=True)
@@ -90,20 +115,20 @@ class Comb:
         return abs(self.pitch - other.pitch) < _SAME_PITCH and shape * self.pitch < _SAME_SHAPE
 
 
-def find_combs(coherence: Coherence, sigma: float, most: int = 4) -> list[Comb]:
+def find_combs(coherence: Coherence, sigma: float, most: int = 4, tried: CombRange = WHOLE_PICTURE) -> list[Comb]:
     """The combs that show best in the coherence of a picture, best first.
 
     Args:
         coherence: of its strips.
         sigma: light spread of the screen, column pitches.
         most: so many at most.
+        tried: combs that there may be.
     """
     found: list[Comb] = []
     strip = coherence.strip_px / coherence.width
-    apart = np.clip(np.round(_APART / (_PITCHES * strip)), 1, coherence.widest).astype(np.int64)
+    apart = np.clip(np.round(_APART / (tried.pitches * strip)), 1, coherence.widest).astype(np.int64)
     for distance in np.unique(apart):
-        pitches = _PITCHES[apart == distance]
-        found += _combs_at(coherence, sigma, int(distance), pitches)
+        found += _combs_at(coherence, sigma, int(distance), replace(tried, pitches=tried.pitches[apart == distance]))
     chosen: list[Comb] = []
     for comb in sorted(found, key=lambda one: -one.score):
         if not any(comb.is_like(other) for other in chosen):
@@ -113,8 +138,9 @@ def find_combs(coherence: Coherence, sigma: float, most: int = 4) -> list[Comb]:
     return chosen
 
 
-def _combs_at(coherence: Coherence, sigma: float, distance: int, pitches: FloatArray) -> list[Comb]:
+def _combs_at(coherence: Coherence, sigma: float, distance: int, tried: CombRange) -> list[Comb]:
     """The best comb of each pitch, by pairs of one distance."""
+    pitches = tried.pitches
     tables = likeness(sigma)
     strip = coherence.strip_px / coherence.width
     n = coherence.x.size - distance
@@ -128,30 +154,29 @@ def _combs_at(coherence: Coherence, sigma: float, distance: int, pitches: FloatA
     mean, harmonic = tables.mean[step].mean(), tables.harmonic[step]
     rest = share * pairs - mean * both
     chance = np.sqrt(_OVERLAP * float(both.sum()) / (2 * coherence.n_rows)) + 1e-9
-    sums = _fourier(rest, middle, y, pitches) / chance * np.sign(harmonic[0])
+    sums = _fourier(rest, middle, y, tried) / chance * np.sign(harmonic[0])
     height = np.abs(sums)
     out = []
     for number, pitch in enumerate(pitches.tolist()):
         best = np.unravel_index(int(height[number].argmax()), height[number].shape)
-        across, along, turn = (float(v[i]) for v, i in zip((_ACROSS, _ALONG, _TURNS), best, strict=True))
+        across, along, turn = (float(v[i]) for v, i in zip((tried.across, tried.along, tried.turns), best, strict=True))
         phase = -float(np.angle(sums[number][best])) / (2 * np.pi)
         out.append(Comb(float(height[number][best]), pitch, turn, across, along, phase))
     return out
 
 
-def _fourier(rest: Float32Array, x: FloatArray, y: FloatArray, pitches: FloatArray) -> NDArray[np.complex64]:
+def _fourier(rest: Float32Array, x: FloatArray, y: FloatArray, tried: CombRange) -> NDArray[np.complex64]:
     """(pitches, across, along, turns) Fourier sums of (W, n) values: along the strips first, then over the windows."""
-    fine = 4
-    step = (_PITCHES[1] - _PITCHES[0]) / fine
-    reach = float(np.abs(_ALONG).max() * np.abs(y).max() * pitches.max())
+    pitches, step = tried.pitches, tried.step / 4
+    reach = float(np.abs(tried.along).max() * np.abs(y).max() * pitches.max())
     first = pitches.min() - reach
     frequencies = first + step * np.arange(int(np.ceil((pitches.max() + reach - first) / step)) + 1)
-    own = pitches[:, None, None] * (1 + _ALONG[:, None] * y)
+    own = pitches[:, None, None] * (1 + tried.along[:, None] * y)
     nearest = np.round((own - first) / step).astype(np.int64)
     wave = np.exp((2j * np.pi) * np.outer(x, frequencies)).astype(np.complex64)
-    turns = np.exp((2j * np.pi) * pitches[:, None, None] * np.multiply.outer(y, _TURNS)).astype(np.complex64)
-    out = np.empty((pitches.size, _ACROSS.size, _ALONG.size, _TURNS.size), np.complex64)
-    for number, across in enumerate(_ACROSS.tolist()):
+    turns = np.exp((2j * np.pi) * pitches[:, None, None] * np.multiply.outer(y, tried.turns)).astype(np.complex64)
+    out = np.empty((pitches.size, tried.across.size, tried.along.size, tried.turns.size), np.complex64)
+    for number, across in enumerate(tried.across.tolist()):
         bent = np.exp((2j * np.pi) * float(pitches.mean()) * across * x**2).astype(np.complex64)
         along_strips = (rest * bent) @ wave
         at_pitch = along_strips[np.arange(y.size), nearest]

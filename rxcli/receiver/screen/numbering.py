@@ -14,7 +14,8 @@ import numpy as np
 from rxcli.receiver.screen.coherence import Coherence
 from rxcli.receiver.screen.grid import Grid, columns_at
 from rxcli.receiver.screen.rows import find_rows
-from rxcli.receiver.screen.sides import LEFT, RIGHT, Side
+from rxcli.receiver.screen.sides import BOTTOM, LEFT, RIGHT, TOP, Side
+from rxcli.receiver.screen.still_light import StillSteps, still_steps
 from rxcli.receiver.screen.waveforms import StripLight, predicted_light
 from rxcli.types import BoolArray, FloatArray, IntArray
 
@@ -28,10 +29,16 @@ _ENDS = 0.05
 #: Log-odds of a screen that goes on outside the picture, for every column that is there; and by however much, where
 #: light reaches to that end of the picture.
 _OUTSIDE, _LARGER = -4.0, -3.0
-#: The light's middle is the screen's, but for this, columns.
-_LIGHT_SD = 3.5
-#: Films with bars have it there to this, columns, and take these shares of the screen's width: log-odds that this adds.
-_IN_MIDDLE, _BARS, _FILM = 0.2, (0.53, 0.95), 2.0
+#: The light's middle is the screen's, but for this, screen widths.
+_LIGHT_SD = 0.175
+#: Films with bars beside them begin and end sharply, lie in the screen's middle to this, columns, and take these shares
+#: of its width: log-odds that this adds, where top and bottom are the screen's and where they do not show, of so many
+#: columns.
+_USUAL_COLUMNS, _IN_MIDDLE, _BARS, _FILM, _PERHAPS_A_FILM = 20, 0.2, (0.53, 0.95), 3.5, 2.0
+#: Support from which top and bottom show, and how far their distance may be off that of a screen's, a share.
+_SHOWS, _AS_HIGH = 0.35, 0.05
+#: How well a border is known, columns, and by how much less as far beyond the light as this is wide.
+_BORDER_SD, _FURTHER_SD = 0.08, 0.35
 #: So much of the picture, columns, must lie beyond light that ends in it.
 _IN_VIEW = 0.4
 #: Support from which a line where stripes begin counts, how near it lies to a border then, columns, and the log-odds
@@ -77,7 +84,7 @@ def possible_numberings(
         least: log-odds against the likeliest down to which they are given.
     """
     light = light_profile(strips, grid)
-    start = first_columns(light, grid, n_columns, lines)
+    start = first_columns(light, grid, n_columns, lines, aspect)
     likely: IntArray = np.flatnonzero(start.log_odds > least)
     chosen = likely[np.argsort(-start.log_odds[likely], kind="stable")]
     best = int(start.first[chosen[0]])
@@ -104,6 +111,8 @@ class LightProfile:
     log_odds: FloatArray
     #: (W,) light of every window of rows.
     by_window: FloatArray
+    #: Steps of the light that does not change.
+    still: StillSteps
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -133,7 +142,8 @@ def light_profile(strips: StripLight, grid: Grid) -> LightProfile:
     odds = _PART_COUNTS * np.log(np.exp(-_DARK_PART) + (1 - np.exp(-_DARK_PART)) * lit / off)
     by_window = np.maximum(alike.mean(axis=(1, 2)), 0.0)
     place = first + (np.arange(n) + 0.5) / _PARTS
-    return LightProfile(place, shown, light, np.where(shown, odds, 0.0), np.asarray(by_window, np.float64))
+    still = still_steps(strips.level, u, by_window)
+    return LightProfile(place, shown, light, np.where(shown, odds, 0.0), np.asarray(by_window, np.float64), still)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,26 +157,29 @@ class FirstColumns:
     fills: bool = False
 
 
-def first_columns(light: LightProfile, grid: Grid, n_columns: int, lines: Sequence[Side] = ()) -> FirstColumns:
+def first_columns(
+    light: LightProfile, grid: Grid, n_columns: int, lines: Sequence[Side] = (), aspect: float = 16 / 9
+) -> FirstColumns:
     """How likely each column of a grid is the screen's first.
 
-    Light outside the screen, columns outside the picture, light that begins on a border and a line where stripes begin
-    tell. Where columns are dark at both ends the numberings stay alike.
+    Light outside the screen, columns outside the picture, light that begins on a border, a line where stripes begin,
+    steps of still light and films in the middle tell. Where columns are dark at both ends and none of these shows the
+    numberings stay alike.
     """
     shown = light.place[light.in_picture]
     left, right = float(shown.min()), float(shown.max())
     first = np.arange(int(left) - n_columns + 3, int(right) - 2)
     begin, end_of_light = light.ends
     reaches = (begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW)
-    # Light that goes on to where the picture ends has no bars beside it.
-    may_have_bars = not any(reaches) and _BARS[0] < (end_of_light - begin) / n_columns < _BARS[1]
+    film = _film(light, grid, n_columns, aspect, lines)
     scores = []
     for start in first.tolist():
         end = start + n_columns
         hidden = max(left - start, 0.0), max(end - right, 0.0)
         off = (begin + end_of_light) / 2 - start - n_columns / 2
-        score = _light_within(light, start, end) + _hidden(hidden, reaches) - 0.5 * (off / _LIGHT_SD) ** 2
-        score += _FILM if may_have_bars and abs(off) < _IN_MIDDLE else 0.0
+        score = _light_within(light, start, end) + _hidden(hidden, reaches) - 0.5 * (off / (_LIGHT_SD * n_columns)) ** 2
+        score += film[1] * (abs(film[0] - start - n_columns / 2) < _IN_MIDDLE)
+        score += _still_edges(light, (start, end), (begin, end_of_light))
         for border, side, number in ((start, 1, LEFT), (end, -1, RIGHT)):
             signs = (_begins(light, border, side), _line_on(grid, lines, number, border))
             score += _ON_BORDER * any(signs) + _BOTH_SIGNS * all(signs)
@@ -196,6 +209,34 @@ def _begins(light: LightProfile, border: int, side: int) -> bool:
     inside, outside = light.log_odds[(off > 1 / _PARTS) & (off < 0.5)].sum(), light.log_odds[beyond].sum()
     seen = light.in_picture[beyond].all()
     return bool(seen and inside > _BEGINS and outside < _BEYOND * inside)
+
+
+def _still_edges(light: LightProfile, borders: tuple[int, int], ends: tuple[float, float]) -> float:
+    """Log-odds of the steps of still light on two borders; of light that begins there the own step says no more."""
+    lit = max(ends[1] - ends[0], 1.0)
+    places, deviations = [], []
+    for border, side, end in zip(borders, (1, -1), ends, strict=True):
+        off = side * (light.place - border)
+        is_lit = light.log_odds[(off > 1 / _PARTS) & (off < 0.5)].sum() > _BEGINS
+        places.append(np.nan if is_lit else float(border))
+        beyond = max(side * (end - border), 0.0) / lit
+        deviations.append(_BORDER_SD + _FURTHER_SD * beyond**2)
+    return light.still.on_borders((places[0], places[1]), (deviations[0], deviations[1]))
+
+
+def _film(light: LightProfile, grid: Grid, n_columns: int, aspect: float, lines: Sequence[Side]) -> tuple[float, float]:
+    """Middle column of a picture that has dark bars left and right, and log-odds that it is the screen's middle."""
+    ends = light.still.sharp_ends
+    if ends is None or not _BARS[0] < (ends[1] - ends[0]) / n_columns < _BARS[1]:
+        return 0.0, 0.0
+    middle = (ends[0] + ends[1]) / 2
+    # The more columns there are the less likely it lies in their middle by chance.
+    by_chance = float(np.log(n_columns / _USUAL_COLUMNS))
+    if not lines or min(lines[number].support for number in (TOP, BOTTOM)) < _SHOWS:
+        return middle, _PERHAPS_A_FILM + by_chance
+    x = grid.width / 2
+    height = (lines[BOTTOM].at(x) - lines[TOP].at(x)) / grid.pitch_px * aspect / n_columns
+    return middle, (_FILM + by_chance) * (abs(height - 1) < _AS_HIGH)
 
 
 def _line_on(grid: Grid, lines: Sequence[Side], number: int, border: int) -> bool:

@@ -42,6 +42,8 @@ class StripLight:
     #: (W, S) offsets of the strips from the picture's middle, a known lens taken off, see `grid`.
     x: FloatArray
     y: FloatArray
+    #: (W, S) mean light of the strips, values of a pixel.
+    level: Float32Array
     #: Light spread of the screen, column pitches.
     sigma: float
     #: Independent rows of one window, and half of its height as a share of the picture's width.
@@ -55,7 +57,9 @@ class StripLight:
         even, odd = (np.ascontiguousarray(changes[:, half::2]) for half in (0, 1))
         x, y = strip_places(coherence, lens)
         half_height = float(np.ptp(coherence.rows[0])) / 2 / coherence.width
-        return cls((even, odd), (weight[:, ::2], weight[:, 1::2]), x, y, sigma, coherence.n_rows, half_height)
+        return cls(
+            (even, odd), (weight[:, ::2], weight[:, 1::2]), x, y, coherence.level, sigma, coherence.n_rows, half_height
+        )
 
     def thinned(self, every: int) -> StripLight:
         """One of so many windows."""
@@ -66,6 +70,20 @@ class StripLight:
             weights=(more[::every], less[::every]),
             x=self.x[::every],
             y=self.y[::every],
+            level=self.level[::every],
+        )
+
+    def between(self, first: int, last: int) -> StripLight:
+        """Strips from an even one to before another."""
+        (even, odd), (more, less), half = self.halves, self.weights, slice(first // 2, (last + 1) // 2)
+        odds = slice(first // 2, last // 2)
+        return replace(
+            self,
+            halves=(even[:, half], odd[:, odds]),
+            weights=(more[:, half], less[:, odds]),
+            x=self.x[:, first:last],
+            y=self.y[:, first:last],
+            level=self.level[:, first:last],
         )
 
 
