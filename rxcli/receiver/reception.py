@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel, sync
 from rxcli.receiver.channel import denoise
-from rxcli.receiver.decode import assemble, detect
+from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.decode.soft_bits import of_observed, still_soft_bits
 from rxcli.receiver.decode.steady import is_steady
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, SlotSamples
@@ -117,8 +117,8 @@ def packet_confidence(reception: Reception) -> FloatArray:
     """(B, C) confidence of packets, the auto-encoder not yet asked."""
     by_burst = assemble.slot_margin_by_burst(slot_margin(reception), reception.clock)
     n_columns, n_strips = reception.samples.light.shape[:2]
-    return assemble.confidence(
-        assemble.confidence_features(reception.posteriors, by_burst, np.zeros(n_columns, bool), n_strips)
+    return confidence.confidence(
+        confidence.confidence_features(reception.posteriors, by_burst, np.zeros(n_columns, bool), n_strips)
     )
 
 
@@ -140,7 +140,7 @@ def soft_bits(
     """What a photograph says of the payload's bits, cut packets included."""
     n_observed = assemble.slots_observed(reception.samples, reception.clock)
     n_columns, n_strips = reception.samples.light.shape[:2]
-    features = assemble.confidence_features(
+    features = confidence.confidence_features(
         of_observed(reception.posteriors, n_observed),
         assemble.slot_margin_by_burst(slot_margin(reception), reception.clock),
         np.isin(np.arange(n_columns), list(denoised)),

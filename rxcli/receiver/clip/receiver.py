@@ -21,7 +21,7 @@ from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.start import Start, acquisition_at, agree, shows_little
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.context import Failure, FrameContext, Timer
-from rxcli.receiver.decode import assemble, detect
+from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
 from rxcli.receiver.outline import Located, locate
 from rxcli.receiver.reception import Reception, shows_steady_light
@@ -735,7 +735,7 @@ class _Clip:
         return replace(result, soft_bits=self._soft_bits(result, view, ended)) if self._options.soft_bits else result
 
     def _soft_bits(
-        self, result: FrameResult, view: View, ended: Sequence[assemble.BurstInClip]
+        self, result: FrameResult, view: View, ended: Sequence[confidence.BurstInClip]
     ) -> FrameSoftBits | None:
         soft = clip_soft_bits(ended, assemble.snr_db_of_columns(view.snr), self._epoch)
         if soft is None:

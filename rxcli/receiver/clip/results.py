@@ -10,16 +10,16 @@ import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver.clip.views import View, Waiting
-from rxcli.receiver.decode import assemble, detect
+from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.sync.tracking import ClosedBurst
 from rxcli.types import ColumnResult, Float32Array, FloatArray, IntArray
 
 
-def bursts_of(closed: Sequence[ClosedBurst], first: int, view: View) -> list[assemble.BurstInClip]:
+def bursts_of(closed: Sequence[ClosedBurst], first: int, view: View) -> list[confidence.BurstInClip]:
     """Bursts that end in the frame of a view, for `assemble`; `first` is the number of the frame's first burst."""
     n_strips = view.acquisition.sampler.n_binned_strips
     return [
-        assemble.BurstInClip(
+        confidence.BurstInClip(
             number=burst.number,
             index=int(burst.number - first),
             posteriors=burst.posteriors,
@@ -33,7 +33,7 @@ def bursts_of(closed: Sequence[ClosedBurst], first: int, view: View) -> list[ass
 
 
 def columns_of(
-    view: View, ended: Sequence[assemble.BurstInClip], later: Float32Array | None, min_confidence: float
+    view: View, ended: Sequence[confidence.BurstInClip], later: Float32Array | None, min_confidence: float
 ) -> tuple[ColumnResult, ...]:
     """Results of a frame's columns.
 
@@ -50,7 +50,7 @@ def columns_of(
     return tuple(assemble.in_stored_rows(c, view.height) for c in columns) if view.context.camera.reversed else columns
 
 
-def taps(waiting: Waiting, view: View, ended: Sequence[assemble.BurstInClip]) -> dict[str, Any]:
+def taps(waiting: Waiting, view: View, ended: Sequence[confidence.BurstInClip]) -> dict[str, Any]:
     """What is written of a frame: as of a photograph, but strips as tracking samples them, and bursts that end here."""
     found: dict[str, Any] = {"geometry.corners": waiting.result.corners, "clock": view.bursts.clock}
     if view.light is not None and view.pose is not None:
@@ -67,7 +67,7 @@ def taps(waiting: Waiting, view: View, ended: Sequence[assemble.BurstInClip]) ->
 def _confidence_features(burst: ClosedBurst, n_strips: int) -> FloatArray:
     """(C, 8) what the confidence of packets is made of, all copies and frames together."""
     slot_margin = detect.slot_margin(burst.metrics[None], burst.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
-    confidence_features = assemble.confidence_features(
+    confidence_features = confidence.confidence_features(
         burst.posteriors, slot_margin, np.zeros(slot_margin.shape[1], bool), n_strips
     )
     return np.asarray(confidence_features[0])

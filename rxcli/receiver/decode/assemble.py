@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS, bits_to_hex, indices_to_bits
+from rxcli.receiver.decode.confidence import BurstInClip, Doubts, clip_doubts, confidence_features, doubts_of
+from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import (
     BoolArray,
     BurstPosteriors,
@@ -22,42 +24,10 @@ from rxcli.types import (
     SlotSamples,
 )
 
-#: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
-MAX_BER_HAT = 0.1
-#: Log-odds of being error-free: offset, and weights of the posterior's log-odds up to a limit, of whether corrections
-#: of the auto-encoder were kept, of the logarithms of what payload slots say against the packet, all together, and of
-#: what they say for it on average up to a limit, nats, and of the latter times the posterior's; of the logarithm of a
-#: column's strips, and of it times the posterior's: strips err together, so the more they are the less it counts.
-_CALIBRATION = (3.33, 0.74, -1.97, -0.43, -0.54, 0.14, -0.71, -0.15)
-_MOST_ODDS, _MOST_AVERAGE = 5.0, 10.0
-#: Of clips: offset, slope of the log-odds of all symbols up to a limit, and slope of the logarithm of what the payload
-#: slot says that is most against its codeword, nats; packets of `rxcli.lab.benchmark.clip_confidence` and of clips from
-#: a hand, compressed again at 6 to 25 Mb/s.
-_CLIP_CALIBRATION, _MOST_CLIP_ODDS = (0.115, 0.483, -1.097), 12.0
-_AGAINST_AT_LEAST = 0.5
-#: Wrong bits of packets as likely right as wrong, the least share of them, and the power of the odds of being wrong
-#: that it goes with.
-WRONG_AT_EVENS, BER_AT_EVENS, BER_EXPONENT = 1.4, 0.018, 0.85
-#: Headers of a column, all bursts together, less likely than this against slots that are anything, nats, are none.
-_CONTRADICTED = -2.0
-#: Together the columns' headers must be this much more likely than slots that are anything; one good header gives 12,
-#: and a bad one takes no more than a good one gives.
-_HEADERS_AT_LEAST, _GOOD_HEADER = 6.0, 12.0
 _HEADERLESS = "no packet header shows where this screen's packets have one; "
 _OVEREXPOSED = "the column is overexposed: expose shorter"
 _OTHER_SCREEN = "the screen may be another one (--screen auto tries all), or its place wrong (--corners)"
-#: Light of white, and the share of a column's samples at which its lit slots are cut off there.
-_WHITE, _CUT_OFF = 0.98, 0.2
 _ECHO = "it shows nothing but the light of the column beside it; show a brighter picture there"
-#: Doubt that is left in the surest packet, and at most in any, nats.
-_LEAST_DOUBT = 1e-9
-_MOST_DOUBT = 500.0
-#: A column with a packet below this confidence is weak.
-_WEAK_CONFIDENCE = 0.5
-#: A weight is reported from this probability on.
-MIN_WEIGHT_PROBABILITY = 0.99
-#: A column below this signal-to-noise ratio is too dark to try.
-_DARK_SNR_DB = 0.0
 
 
 def column_results(
@@ -86,7 +56,7 @@ def column_results(
     whole = complete(n_observed)
     was_denoised = np.isin(np.arange(len(snr)), list(denoised))
     by_burst = slot_margin_by_burst(slot_margin, clock)
-    doubts = _doubts(posteriors, confidence_features(posteriors, by_burst, was_denoised, samples.light.shape[1]))
+    doubts = doubts_of(posteriors, confidence_features(posteriors, by_burst, was_denoised, samples.light.shape[1]))
     snr_db = snr_db_of_columns(snr)
     echoing: BoolArray = np.any(echoes(posteriors, snr_db) & whole, axis=0)
     reported = whole & doubts.reported(min_confidence)
@@ -94,7 +64,7 @@ def column_results(
         _why_headerless(samples, column) if headerless[column] else _ECHO if echo else None
         for column, echo in enumerate(echoing)
     ]
-    held_back = np.where(whole & (doubts.ber_hat <= MAX_BER_HAT) & ~reported, doubts.confidence, 0.0).max(axis=0)
+    held_back = np.where(whole & doubts.reported(0.0) & ~reported, doubts.confidence, 0.0).max(axis=0)
     return tuple(
         _column_result(
             column,
@@ -115,7 +85,7 @@ def column_results(
 def _why_headerless(samples: SlotSamples, column: int) -> str:
     """What may be wrong with a column that shows slots but no header, by whether its light is cut off at white."""
     light = samples.light[column][samples.valid[column] > 0]
-    overexposed = light.size > 0 and float(np.mean(light >= _WHITE)) > _CUT_OFF
+    overexposed = light.size > 0 and float(np.mean(light >= SETTINGS.white)) > SETTINGS.cut_off_share
     return _HEADERLESS + (_OVEREXPOSED if overexposed else _OTHER_SCREEN)
 
 
@@ -124,25 +94,6 @@ def _held_back(confidence: float, min_confidence: float) -> str | None:
     if not 0 < confidence < min_confidence:
         return None
     return f"its packet has a confidence of {confidence:.4f}, below --min-confidence {min_confidence:g}"
-
-
-@dataclass(frozen=True, slots=True)
-class BurstInClip:
-    """A burst of a clip, as the last frame that shows it reports it."""
-
-    #: Number in the clip, and in the clock of the frame.
-    number: int
-    index: int
-    #: Of this burst alone.
-    posteriors: BurstPosteriors
-    #: (C, packet) how often each slot was seen, over all frames.
-    n_observed: IntArray
-    frames: tuple[int, ...]
-    #: (C, 8) see `confidence_features`.
-    confidence_features: FloatArray
-    #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
-    #: received like photographs.
-    against: Float32Array | None = None
 
 
 def clip_results(
@@ -158,13 +109,13 @@ def clip_results(
         min_confidence: packets below it are left out.
     """
     snr_db = snr_db_of_columns(snr)
-    doubts = [_clip_doubts(burst) for burst in bursts]
+    doubts = [clip_doubts(burst) for burst in bursts]
     reported = [
         complete(burst.n_observed[None])[0] & ~echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]
         for burst, doubt in zip(bursts, doubts, strict=True)
     ]
     surest = [
-        complete(burst.n_observed[None])[0] & (doubt.ber_hat[0] <= MAX_BER_HAT)
+        complete(burst.n_observed[None])[0] & (doubt.ber_hat[0] <= SETTINGS.most_ber_hat)
         for burst, doubt in zip(bursts, doubts, strict=True)
     ]
     own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
@@ -195,7 +146,7 @@ def _clip_column(
     packets: tuple[PacketResult, ...],
 ) -> ColumnResult:
     status = _column_status(packets, snr_db)
-    if not packets and going_on >= _WEAK_CONFIDENCE:
+    if not packets and going_on >= SETTINGS.weak_confidence:
         status = "ok"
     message = None
     if not packets:
@@ -239,7 +190,7 @@ def _snr_db(snr: Float32Array) -> float | None:
 
 def all_dark(snr: Float32Array) -> bool:
     """Whether no column has light enough; `snr` is (C, N), squared contrast over variance of every slot."""
-    return all(db is None or db < _DARK_SNR_DB for db in snr_db_of_columns(snr))
+    return all(db is None or db < SETTINGS.dark_snr_db for db in snr_db_of_columns(snr))
 
 
 def clip_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
@@ -286,14 +237,14 @@ def _column_result(
     snr_db: float | None,
     n_observed: IntArray,
     reported: BoolArray,
-    doubts: _Doubts,
+    doubts: Doubts,
     against: str | None,
     held_back: str | None,
     denoised: bool,
 ) -> ColumnResult:
     bursts = () if against else np.flatnonzero(reported)
     packets = tuple(_packet(int(burst), column, clock, posteriors, n_observed[burst], doubts) for burst in bursts)
-    sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(MIN_WEIGHT_PROBABILITY)
+    sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(SETTINGS.sure_weight)
     status = _column_status(packets, snr_db)
     return ColumnResult(
         column=column,
@@ -331,9 +282,9 @@ def without_header(header_llr: FloatArray) -> BoolArray:
         header_llr: (B, C) of bursts, see `BurstPosteriors`.
     """
     # A glare may spoil one header altogether: a good one elsewhere outweighs it.
-    by_column = np.maximum(header_llr, -_GOOD_HEADER).sum(axis=0)
-    together = np.maximum(by_column, -_GOOD_HEADER).sum() > _HEADERS_AT_LEAST
-    return np.asarray(by_column < (_CONTRADICTED if together else np.inf), bool)
+    by_column = np.maximum(header_llr, -SETTINGS.good_header_nats).sum(axis=0)
+    together = np.maximum(by_column, -SETTINGS.good_header_nats).sum() > SETTINGS.headers_nats
+    return np.asarray(by_column < (SETTINGS.contradicted_nats if together else np.inf), bool)
 
 
 def without_packets(columns: tuple[ColumnResult, ...], headerless: BoolArray) -> tuple[ColumnResult, ...]:
@@ -347,8 +298,8 @@ def without_packets(columns: tuple[ColumnResult, ...], headerless: BoolArray) ->
 
 def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:
     if packets:
-        return "ok" if max(p.confidence for p in packets) >= _WEAK_CONFIDENCE else "weak"
-    return "dark" if snr_db is None or snr_db < _DARK_SNR_DB else "no_packet"
+        return "ok" if max(p.confidence for p in packets) >= SETTINGS.weak_confidence else "weak"
+    return "dark" if snr_db is None or snr_db < SETTINGS.dark_snr_db else "no_packet"
 
 
 def _cut_off(n_observed: IntArray) -> str | None:
@@ -368,68 +319,13 @@ def _why_none(status: ColumnStatus, snr_db: float | None) -> str:
     return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
 
 
-@dataclass(frozen=True, slots=True)
-class _Doubts:
-    """How sure the packets of B bursts and C columns are."""
-
-    #: (B, C) probability that they are error-free, and expected share of wrong bits.
-    confidence: FloatArray
-    ber_hat: FloatArray
-    #: (B, C, 8) see `confidence_features`; (B, C, 3) of tracked bursts, see `clip_features`.
-    confidence_features: FloatArray
-
-    def reported(self, min_confidence: float) -> BoolArray:
-        """(B, C) packets that are sure enough to be reported."""
-        return np.asarray((self.ber_hat <= MAX_BER_HAT) & (self.confidence >= min_confidence))
-
-
-def _doubts(posteriors: BurstPosteriors, confidence_features: FloatArray) -> _Doubts:
-    unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of few bits are filled up with NaN
-    return _Doubts(confidence(confidence_features), np.nanmean(unsure, axis=(2, 3)), confidence_features)
-
-
-def _clip_doubts(burst: BurstInClip) -> _Doubts:
-    """How sure the packets of a burst of a clip are.
-
-    Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
-    What slots say against the codeword that was decided shows it.
-    """
-    doubts = _doubts(burst.posteriors, burst.confidence_features[None])
-    if burst.against is None:
-        return doubts
-    features = clip_features(burst)[None]
-    log_odds = clip_log_odds(burst)
-    n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
-    at_evens = np.maximum(WRONG_AT_EVENS / n_bits, BER_AT_EVENS)
-    wrong = np.minimum(at_evens * np.exp(-BER_EXPONENT * log_odds), 0.5)
-    ber_hat = np.maximum(doubts.ber_hat, wrong)
-    return _Doubts(_probability(log_odds), ber_hat, features)
-
-
-def clip_log_odds(burst: BurstInClip) -> FloatArray:
-    """(1, C) calibrated log-odds of the packets of a burst of a clip being error-free."""
-    if burst.against is None:
-        return confidence_log_odds(burst.confidence_features[None])
-    return np.asarray(clip_features(burst)[None] @ np.array(_CLIP_CALIBRATION))
-
-
-def clip_features(burst: BurstInClip) -> FloatArray:
-    """(C, 3) what the confidence of a tracked burst's packets is made of, in the order of `_CLIP_CALIBRATION`.
-
-    Beyond a limit surer symbols say nothing more: what errs then is not noise.
-    """
-    assert burst.against is not None
-    log_odds = np.minimum(_log_odds(burst.posteriors.log_prob.sum(axis=2))[0], _MOST_CLIP_ODDS)
-    return np.stack([np.ones_like(log_odds), log_odds, np.log(burst.against + _AGAINST_AT_LEAST)], axis=1)
-
-
 def _packet(
     burst: int,
     column: int,
     clock: Clock,
     posteriors: BurstPosteriors,
     n_observed: IntArray,
-    doubts: _Doubts,
+    doubts: Doubts,
     number: int | None = None,
     frames: tuple[int, ...] | None = None,
 ) -> PacketResult:
@@ -448,42 +344,6 @@ def _packet(
     )
 
 
-def confidence_features(
-    posteriors: BurstPosteriors, slot_margin: Float32Array, denoised: BoolArray, n_strips: int
-) -> FloatArray:
-    """What the confidence of packets is made of, (B, C, 8), in the order of `_CALIBRATION`.
-
-    The light model's likelihoods are tempered, since strips and samples err together; still they are too sure where
-    picture or camera are not as the model has them. There single slots speak against the packet. The weights are a
-    logistic regression on packets of `lab.benchmark.confidence` and of `lab.benchmark.phones`; whatever changes the
-    likelihoods of the light model or the auto-encoder asks for a new fit.
-
-    Args:
-        posteriors: of B bursts and C columns.
-        support: (B, C, n) what the light says for payload slots of the packets as decided, nats; 0 where nothing is
-            seen; see `slot_margin_by_burst`.
-        denoised: (C,) whether corrections of the auto-encoder were kept.
-        n_strips: strips of a column in a quick look.
-    """
-    log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), _MOST_ODDS)
-    against = np.log(_AGAINST_AT_LEAST - np.minimum(slot_margin, 0).sum(axis=2))
-    n_heard_slots = np.maximum((slot_margin != 0).sum(axis=2), 1)
-    average = np.log(np.clip(slot_margin.sum(axis=2) / n_heard_slots, 1, _MOST_AVERAGE))
-    strips = np.log(n_strips)
-    terms = (1.0, log_odds, denoised, against, average, average * log_odds, strips, strips * log_odds)
-    return np.stack([np.broadcast_to(term, log_odds.shape) for term in terms], axis=2).astype(np.float64)
-
-
-def confidence(confidence_features: FloatArray) -> FloatArray:
-    """Probability (...) that packets are error-free, from their evidence (..., 8)."""
-    return _probability(confidence_log_odds(confidence_features))
-
-
-def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
-    """Log-odds (...) of packets being error-free, from their evidence (..., 8)."""
-    return np.asarray(confidence_features @ np.array(_CALIBRATION))
-
-
 def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Array:
     """(B, C, N) the support (C, N) of the payload slots of each burst, 0 for the other slots of the grid."""
     slot = np.arange(clock.first_slot, clock.first_slot + clock.n_slots)
@@ -491,15 +351,6 @@ def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Arra
     bursts = np.arange(int(clock.burst.max()) + 1)
     payload_of = payload & (clock.burst[slot // clock.packet_slots] == bursts[:, None])
     return np.asarray(payload_of[:, None] * slot_margin)
-
-
-def _log_odds(log_prob: FloatArray) -> FloatArray:
-    at_most = np.clip(log_prob, -_MOST_DOUBT, -_LEAST_DOUBT)
-    return np.asarray(at_most - np.log(-np.expm1(at_most)))
-
-
-def _probability(log_odds: FloatArray | float) -> FloatArray:
-    return np.asarray(1 / (1 + np.exp(-log_odds)))
 
 
 def with_doubt(columns: tuple[ColumnResult, ...], certainty: float, min_confidence: float) -> tuple[ColumnResult, ...]:

@@ -27,14 +27,12 @@ from rxcli.protocol import (
     dimming_symbol,
     slot_patterns,
 )
+from rxcli.receiver.decode.settings import SETTINGS
+from rxcli.receiver.light import MAX_MEMORY
 from rxcli.types import BurstPosteriors, Float32Array, FloatArray
 
-#: Longest memory of the trellis; five slots cover an exposure of four.
-MAX_MEMORY = 5
 #: Likelihoods, over that of the likeliest state, are taken to be at least this, so that their logarithm exists.
 _LEAST = 1e-300
-#: Slots are taken to be at most this sure when weights are compared: one bad slot must not decide.
-_SURE_LLR = 12.0
 #: Probabilities below this are not told apart.
 _TINY = 1e-30
 #: Metrics that are worked on together: more leave the processor's cache, fewer take more calls.
@@ -323,7 +321,7 @@ def _symbols_llr(metrics: FloatArray) -> Float32Array:
 
 def _weight_scores(symbols: Float32Array) -> FloatArray:
     """(C, 9) log-likelihood of every weight from the log-likelihood ratios (B, C, symbols, 10) of slots."""
-    symbols = np.clip(symbols, -_SURE_LLR, _SURE_LLR)
+    symbols = np.clip(symbols, -SETTINGS.sure_nats, SETTINGS.sure_nats)
     payload = symbols[:, :, 2:]
     coefficients = np.zeros((*payload.shape[:3], SLOTS_PER_SYMBOL + 1))
     coefficients[..., 0] = 1.0

@@ -8,24 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
-from rxcli.receiver.decode.assemble import (
-    BER_AT_EVENS,
-    BER_EXPONENT,
-    MIN_WEIGHT_PROBABILITY,
-    WRONG_AT_EVENS,
-    BurstInClip,
-    clip_log_odds,
-    confidence_log_odds,
-    echoes,
-)
+from rxcli.receiver.decode.assemble import echoes
+from rxcli.receiver.decode.confidence import BurstInClip, clip_log_odds, confidence_log_odds, wrong_share
+from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, FrameSoftBits, IntArray
-
-#: No bit is surer: of those that look surest in simulated clips 0.05 % are wrong, mostly of symbols that a picture's
-#: border cuts.
-_MAX_LLR = 7.6
-#: Where a packet's own ratios expect as many wrong bits as its confidence does, this share of them is taken to hide
-#: among bits that look sure.
-_HIDDEN_SHARE = 0.1
 
 
 def observed_symbols(n_observed: IntArray) -> BoolArray:
@@ -50,16 +36,15 @@ def llr_limits(posteriors: BurstPosteriors, n_observed: IntArray, log_odds: Floa
     """
     known = observed_symbols(n_observed)[..., None] & ~np.isnan(posteriors.bit_llr)
     n_bits = np.maximum(known.sum(axis=(2, 3)), 1)
-    at_evens = np.maximum(WRONG_AT_EVENS / n_bits, BER_AT_EVENS)
-    wrong = np.minimum(at_evens * np.exp(-BER_EXPONENT * log_odds), 0.5)
+    wrong = wrong_share(log_odds, n_bits)
     own = (known / (1 + np.exp(np.abs(np.nan_to_num(posteriors.bit_llr))))).sum(axis=(2, 3)) / n_bits
-    hidden = np.maximum(wrong - own, _HIDDEN_SHARE * wrong)
-    return np.asarray(np.clip(-np.log(np.maximum(hidden, 1e-9)), 0.0, _MAX_LLR))
+    hidden = np.maximum(wrong - own, SETTINGS.hidden_share * wrong)
+    return np.asarray(np.clip(-np.log(np.maximum(hidden, 1e-9)), 0.0, SETTINGS.sure_bit_nats))
 
 
 def limited(posteriors: BurstPosteriors, limits: FloatArray, erased: BoolArray) -> Float32Array:
     """(B, N, C, 7) ratios within the limits (B, C), none of the columns and bursts that are erased, (B, C)."""
-    sure_of_w = posteriors.w_log_prob.max(axis=1) > np.log(MIN_WEIGHT_PROBABILITY)
+    sure_of_w = posteriors.w_log_prob.max(axis=1) > np.log(SETTINGS.sure_weight)
     most = np.where(erased | ~sure_of_w, 0.0, limits)[..., None, None]
     llr = np.clip(np.nan_to_num(posteriors.bit_llr), -most, most)
     return np.ascontiguousarray(llr.transpose(0, 2, 1, 3), np.float32)

@@ -12,20 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
-#: Lines of a waveform that are added up, and the longest period, packets: a packet sent again has lines of its own.
-_LINES, _LONGEST = 24, 0.5
-#: Share of the light's variance from which on it may be a steady waveform: packets reach 0.5, by repeating.
-_STEADY = 0.6
-#: Samples by which the exposure may move or spread a slot, slots.
-_REACH_SLOTS = 2
 #: Spectra are computed on a grid so many times finer than the light's length resolves.
 _FINER = 4
-#: Columns this far apart, of all, and by number, share no light; correlation, beyond that of the headers which packets
-#: have in common, from which they show the same: packets reach 0.4, and light that is the same everywhere 0.65 or more.
-#: Pairs that are compared.
-_APART_SHARE, _APART, _ALIKE, _MOST_PAIRS = 1 / 6, 3, 0.59, 300
+#: Pairs of columns that are compared, at most.
+_MOST_PAIRS = 300
 
 
 def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, packet_slots: int) -> bool:
@@ -43,7 +36,7 @@ def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, pack
     if not level.any():
         return False
     steady = periodic_share(level, packet_slots * samples_per_slot)
-    return steady > _STEADY and steady > _share_of_slots(level, observed, lit, samples_per_slot)
+    return steady > SETTINGS.steady_share and steady > _share_of_slots(level, observed, lit, samples_per_slot)
 
 
 def is_alike(value: Float32Array, weight: Float32Array, shared: float, reach: int = 0) -> bool:
@@ -55,7 +48,7 @@ def is_alike(value: Float32Array, weight: Float32Array, shared: float, reach: in
         reach: samples by which columns may be later or earlier.
     """
     n_columns, n = value.shape
-    first, second = np.triu_indices(n_columns, max(_APART, int(_APART_SHARE * n_columns)))
+    first, second = np.triu_indices(n_columns, max(SETTINGS.apart_columns, int(SETTINGS.apart_share * n_columns)))
     if first.size == 0:
         return False
     some = np.linspace(0, first.size - 1, min(first.size, _MOST_PAIRS)).astype(np.int64)
@@ -65,7 +58,7 @@ def is_alike(value: Float32Array, weight: Float32Array, shared: float, reach: in
     spectrum = np.fft.rfft(level, n + reach, axis=1)
     moved = np.fft.irfft(spectrum[first[some]] * np.conj(spectrum[second[some]]), n + reach, axis=1)
     likeness = np.concatenate([moved[:, : reach + 1], moved[:, moved.shape[1] - reach :]], axis=1).max(axis=1)
-    return bool(np.median(likeness) > shared + (1 - shared) * _ALIKE)
+    return bool(np.median(likeness) > shared + (1 - shared) * SETTINGS.alike)
 
 
 def _mean(value: Float32Array, observed: BoolArray) -> FloatArray:
@@ -79,9 +72,9 @@ def periodic_share(level: FloatArray | Float32Array, packet_samples: int) -> flo
     power = (np.abs(np.fft.rfft(level, size, axis=1)) ** 2).sum(axis=0) * (2 / (n * float((level**2).sum())))
     # The grid may miss a line by half a step.
     near = np.maximum(power, np.maximum(np.roll(power, 1), np.roll(power, -1)))
-    fundamental = np.arange(int(np.ceil(size / (_LONGEST * packet_samples))), size // 2)
+    fundamental = np.arange(int(np.ceil(size / (SETTINGS.steady_longest * packet_samples))), size // 2)
     share = np.zeros(fundamental.size)
-    for line in range(1, _LINES + 1):
+    for line in range(1, SETTINGS.steady_lines + 1):
         inside = line * fundamental <= size // 2
         share[inside] += near[line * fundamental[inside]]
     return float(share.max(initial=0.0))
@@ -90,7 +83,7 @@ def periodic_share(level: FloatArray | Float32Array, packet_samples: int) -> flo
 def _share_of_slots(level: FloatArray, observed: BoolArray, lit: Float32Array, samples_per_slot: int) -> float:
     """Share of the variance that the decided slots explain through any exposure; each column has its own."""
     slots = np.repeat(lit, samples_per_slot, axis=1)
-    reach = _REACH_SLOTS * samples_per_slot
+    reach = SETTINGS.reach_slots * samples_per_slot
     left = 0.0
     for light, shown, column in zip(level, observed, slots, strict=True):
         moved = np.stack([np.ones(column.size), *(np.roll(column, s) for s in range(-reach, reach + 1))], axis=1)[shown]

@@ -235,7 +235,7 @@ def test_brightness_does_not_matter(scene: DenoiserInput) -> None:
     np.testing.assert_allclose(network_inputs(twice, columns)[0], network_inputs(scene, columns)[0], atol=1e-4)
 
 
-SHIPPED = sorted(path.parent.name for path in data_dir("models").glob("*/model.toml"))
+SHIPPED = sorted(path.parent.name for path in data_dir("models").glob("*/model.onnx"))
 
 
 def test_a_model_is_shipped() -> None:

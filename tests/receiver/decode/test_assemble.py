@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rxcli.protocol import bits_per_symbol, bits_to_hex, indices_to_bits
-from rxcli.receiver.decode import assemble
+from rxcli.receiver.decode import assemble, confidence
 from rxcli.types import BurstPosteriors, Clock, ColumnResult, PacketResult, SlotSamples
 
 N_SYMBOLS, PACKET, Q = 3, 50, 4
@@ -210,7 +210,9 @@ def test_the_more_strips_a_column_has_the_less_its_posterior_counts() -> None:
     sure = posteriors_of(w, indices(w), 0.999)
     found = [
         float(
-            assemble.confidence(assemble.confidence_features(sure, slot_margin, np.zeros(1, bool), n_strips)).squeeze()
+            confidence.confidence(
+                confidence.confidence_features(sure, slot_margin, np.zeros(1, bool), n_strips)
+            ).squeeze()
         )
         for n_strips in (1, 2, 4, 7)
     ]

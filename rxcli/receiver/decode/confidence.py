@@ -1,0 +1,179 @@
+"""How sure packets are: calibrated confidence, and the expected share of wrong bits.
+
+The weights are fitted data, `models/confidence`.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from functools import lru_cache
+
+import msgspec
+import numpy as np
+
+from rxcli.receiver.decode.settings import SETTINGS
+from rxcli.resources import data_dir
+from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
+
+#: What slots say against a packet is taken to be at least this, nats, so that its logarithm exists.
+_AGAINST_AT_LEAST = 0.5
+#: Doubt that is left in the surest packet, and at most in any, nats: what a log-odds can hold.
+_LEAST_DOUBT, _MOST_DOUBT = 1e-9, 500.0
+
+
+class _Photographs(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    weights: tuple[float, ...]
+    most_log_odds: float
+    most_average: float
+
+
+class _Clips(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    weights: tuple[float, ...]
+    most_log_odds: float
+
+
+class _WrongBits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    at_evens: float
+    share_at_evens: float
+    exponent: float
+
+
+class ConfidenceModel(msgspec.Struct, frozen=True):
+    """`models/confidence/model.toml`: fitted weights; see the comments there."""
+
+    photographs: _Photographs
+    clips: _Clips
+    wrong_bits: _WrongBits
+
+
+@lru_cache(maxsize=1)
+def confidence_model() -> ConfidenceModel:
+    """The shipped weights."""
+    path = data_dir("models") / "confidence" / "model.toml"
+    return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), ConfidenceModel)
+
+
+@dataclass(frozen=True, slots=True)
+class BurstInClip:
+    """A burst of a clip, as the last frame that shows it reports it."""
+
+    #: Number in the clip, and in the clock of the frame.
+    number: int
+    index: int
+    #: Of this burst alone.
+    posteriors: BurstPosteriors
+    #: (C, packet) how often each slot was seen, over all frames.
+    n_observed: IntArray
+    frames: tuple[int, ...]
+    #: (C, 8) see `confidence_features`.
+    confidence_features: FloatArray
+    #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
+    #: received like photographs.
+    against: Float32Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Doubts:
+    """How sure the packets of B bursts and C columns are."""
+
+    #: (B, C) probability that they are error-free, and expected share of wrong bits.
+    confidence: FloatArray
+    ber_hat: FloatArray
+    #: (B, C, 8) see `confidence_features`; (B, C, 3) of tracked bursts, see `clip_features`.
+    confidence_features: FloatArray
+
+    def reported(self, min_confidence: float) -> BoolArray:
+        """(B, C) packets that are sure enough to be reported."""
+        return np.asarray((self.ber_hat <= SETTINGS.most_ber_hat) & (self.confidence >= min_confidence))
+
+
+def doubts_of(posteriors: BurstPosteriors, confidence_features: FloatArray) -> Doubts:
+    unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of few bits are filled up with NaN
+    return Doubts(confidence(confidence_features), np.nanmean(unsure, axis=(2, 3)), confidence_features)
+
+
+def clip_doubts(burst: BurstInClip) -> Doubts:
+    """How sure the packets of a burst of a clip are.
+
+    Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
+    What slots say against the codeword that was decided shows it.
+    """
+    doubts = doubts_of(burst.posteriors, burst.confidence_features[None])
+    if burst.against is None:
+        return doubts
+    features = clip_features(burst)[None]
+    log_odds = clip_log_odds(burst)
+    n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
+    ber_hat = np.maximum(doubts.ber_hat, wrong_share(log_odds, n_bits))
+    return Doubts(_probability(log_odds), ber_hat, features)
+
+
+def wrong_share(log_odds: FloatArray, n_bits: IntArray) -> FloatArray:
+    """Share of wrong bits to expect in packets that are error-free with some log-odds and have so many bits."""
+    model = confidence_model().wrong_bits
+    at_evens = np.maximum(model.at_evens / n_bits, model.share_at_evens)
+    return np.asarray(np.minimum(at_evens * np.exp(-model.exponent * log_odds), 0.5))
+
+
+def clip_log_odds(burst: BurstInClip) -> FloatArray:
+    """(1, C) calibrated log-odds of the packets of a burst of a clip being error-free."""
+    if burst.against is None:
+        return confidence_log_odds(burst.confidence_features[None])
+    return np.asarray(clip_features(burst)[None] @ np.array(confidence_model().clips.weights))
+
+
+def clip_features(burst: BurstInClip) -> FloatArray:
+    """(C, 3) what the confidence of a tracked burst's packets is made of, in the order of the weights.
+
+    Beyond a limit surer symbols say nothing more: what errs then is not noise.
+    """
+    assert burst.against is not None
+    log_odds = np.minimum(_log_odds(burst.posteriors.log_prob.sum(axis=2))[0], confidence_model().clips.most_log_odds)
+    return np.stack([np.ones_like(log_odds), log_odds, np.log(burst.against + _AGAINST_AT_LEAST)], axis=1)
+
+
+def confidence_features(
+    posteriors: BurstPosteriors, slot_margin: Float32Array, denoised: BoolArray, n_strips: int
+) -> FloatArray:
+    """What the confidence of packets is made of, (B, C, 8), in the order of the weights.
+
+    The light model's likelihoods are tempered, since strips and samples err together; still they are too sure where
+    picture or camera are not as the model has them. There single slots speak against the packet. The weights are a
+    logistic regression on packets of `lab.benchmark.confidence` and of `lab.benchmark.phones`; whatever changes the
+    likelihoods of the light model or the auto-encoder asks for a new fit.
+
+    Args:
+        posteriors: of B bursts and C columns.
+        support: (B, C, n) what the light says for payload slots of the packets as decided, nats; 0 where nothing is
+            seen; see `slot_margin_by_burst`.
+        denoised: (C,) whether corrections of the auto-encoder were kept.
+        n_strips: strips of a column in a quick look.
+    """
+    model = confidence_model().photographs
+    log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), model.most_log_odds)
+    against = np.log(_AGAINST_AT_LEAST - np.minimum(slot_margin, 0).sum(axis=2))
+    n_heard_slots = np.maximum((slot_margin != 0).sum(axis=2), 1)
+    average = np.log(np.clip(slot_margin.sum(axis=2) / n_heard_slots, 1, model.most_average))
+    strips = np.log(n_strips)
+    terms = (1.0, log_odds, denoised, against, average, average * log_odds, strips, strips * log_odds)
+    return np.stack([np.broadcast_to(term, log_odds.shape) for term in terms], axis=2).astype(np.float64)
+
+
+def confidence(confidence_features: FloatArray) -> FloatArray:
+    """Probability (...) that packets are error-free, from their evidence (..., 8)."""
+    return _probability(confidence_log_odds(confidence_features))
+
+
+def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
+    """Log-odds (...) of packets being error-free, from their evidence (..., 8)."""
+    return np.asarray(confidence_features @ np.array(confidence_model().photographs.weights))
+
+
+def _log_odds(log_prob: FloatArray) -> FloatArray:
+    at_most = np.clip(log_prob, -_MOST_DOUBT, -_LEAST_DOUBT)
+    return np.asarray(at_most - np.log(-np.expm1(at_most)))
+
+
+def _probability(log_odds: FloatArray | float) -> FloatArray:
+    return np.asarray(1 / (1 + np.exp(-log_odds)))

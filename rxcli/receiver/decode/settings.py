@@ -1,0 +1,54 @@
+"""Numbers of policy of detection and of what is reported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeSettings:
+    """Each with its unit and the reason for it."""
+
+    #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
+    most_ber_hat: float = 0.1
+    #: A column with a packet below this confidence is weak.
+    weak_confidence: float = 0.5
+    #: A weight is reported, and its soft bits count, from this probability on.
+    sure_weight: float = 0.99
+    #: A column below this signal-to-noise ratio, dB, is too dark to try.
+    dark_snr_db: float = 0.0
+    #: Headers of a column, all bursts together, less likely than this against slots that are anything, nats, are none.
+    contradicted_nats: float = -2.0
+    #: Together the columns' headers must be this much more likely than slots that are anything, nats; one good header
+    #: gives so many, and a bad one takes no more than a good one gives.
+    headers_nats: float = 6.0
+    good_header_nats: float = 12.0
+    #: Light of white, and the share of a column's samples from which on its lit slots are cut off there.
+    white: float = 0.98
+    cut_off_share: float = 0.2
+
+    #: Slots are at most this sure, nats, when weights are compared: one bad slot must not decide.
+    sure_nats: float = 12.0
+    #: No soft bit is surer, nats: of those that look surest in simulated clips 0.05 % are wrong, mostly of symbols that
+    #: a picture's border cuts.
+    sure_bit_nats: float = 7.6
+    #: Where a packet's own ratios expect as many wrong bits as its confidence does, this share of them is taken to hide
+    #: among bits that look sure.
+    hidden_share: float = 0.1
+
+    #: Steady light: share of its variance that one period explains, from which on it may be a lamp's; packets reach
+    #: 0.5, by repeating. Lines of the period that are added up, and the longest period, packets: a packet sent again
+    #: has lines of its own.
+    steady_share: float = 0.6
+    steady_lines: int = 24
+    steady_longest: float = 0.5
+    #: Slots by which the exposure may move or spread a slot.
+    reach_slots: int = 2
+    #: Columns this far apart, of all and by number, share no light; and correlation, beyond that of the headers which
+    #: packets have in common, from which they show the same: packets reach 0.4, one light everywhere 0.65 or more.
+    apart_share: float = 1 / 6
+    apart_columns: int = 3
+    alike: float = 0.59
+
+
+SETTINGS = DecodeSettings()
