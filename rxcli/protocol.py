@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 SLOTS_PER_SYMBOL = 10
+#: Any window of this many slots holds a lit and a dark one: two symbols meet dark to dark or lit to lit at worst.
+EXTREMES_SLOTS = 2 * SLOTS_PER_SYMBOL - 1
 WEIGHTS = range(1, SLOTS_PER_SYMBOL)
 HEADER: tuple[int, ...] = (0, 0, 1, 1, 1, 0, 0, 0, 1, 1)
 #: Header and dimming symbol: the slots of a packet that carry no payload.

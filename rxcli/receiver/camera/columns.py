@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.receiver.camera.strips import EXTREMES_SLOTS, levelled
+from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS
+from rxcli.receiver.camera.strips import levelled
 from rxcli.receiver.light import NoiseModel, light_of_columns
 from rxcli.types import BoolArray, Clock, FloatArray, RowProfiles
 

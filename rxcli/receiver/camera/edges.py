@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.numerics import local_mean
+from rxcli.protocol import EXTREMES_SLOTS
 from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.estimates import BlindEstimate
-from rxcli.receiver.camera.strips import EXTREMES_SLOTS, Strips, levelled
+from rxcli.receiver.camera.strips import Strips, levelled
 from rxcli.types import Float32Array, FloatArray
 
 #: Rows over which the edges' power is levelled.

@@ -13,9 +13,6 @@ from rxcli.types import Float32Array, FloatArray, RowProfiles
 #: Strips that a column keeps while its camera is unknown.
 _STRIPS = 4
 
-#: Any window of this many slots holds a lit and a dark one.
-EXTREMES_SLOTS = 19
-
 #: Samples a slot while the clock is sought.
 SAMPLES = 4
 #: Sides are straight up to so many standard deviations, where these are small enough to tell; bowed from so many on.

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rxcli.protocol import EXTREMES_SLOTS
 from rxcli.receiver.camera.curvature import curvature_terms, reversed_curvature
-from rxcli.receiver.camera.strips import EXTREMES_SLOTS, Strips, in_readout_order, levelled
+from rxcli.receiver.camera.strips import Strips, in_readout_order, levelled
 from rxcli.types import Float32Array, FloatArray
 
 #: Rows of one block of the normal equations; the bend is straight within, which in longer ones changes the period.

@@ -19,30 +19,20 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.receiver.sampling.settings import SETTINGS
 from rxcli.types import Float32Array, FloatArray, Frame, Mosaic, Outlines, RowProfiles
 
-#: Pixels that a strip should have before a column gets another one.
-_STRIP_PX = 12
-_MAX_STRIPS = 8
-#: Cells that a strip should have, so that the fractions at its slanted edges are fine.
-_CELLS_PER_STRIP = 4
 #: Pixels read at a time: what fits the cache.
 _BAND_PIXELS = 900_000
-#: One row in this many is kept for the noise model, and of those as many as hold this many cells.
-_NOISE_ROW_STEP = 16
-_NOISE_CELLS = 10_000
 #: Fewer bands than these are read sooner than threads for them are started.
 _MANY_BANDS = 4
-_NOISE_BINS = 24
-#: Edges that enclose less than this many values have no light between them.
-_LEAST_ENCLOSED = 0.1
 #: Places of the finer table for means of coded values, per value.
 _FINE_STEPS = 64
 
 
 def strips_per_column(column_px: float) -> int:
     """Lateral strips for columns of `column_px` pixels."""
-    return int(np.clip(column_px // _STRIP_PX, 1, _MAX_STRIPS))
+    return int(np.clip(column_px // SETTINGS.strip_px, 1, SETTINGS.most_strips))
 
 
 def tone_to_light(tone: str, encoded: FloatArray) -> FloatArray:
@@ -82,7 +72,7 @@ def sample_rows(
     reader = _reader(frame, edges, tone, quick=quick)
     n_rows = outlines.rows.size
     # Bands begin at rows of the noise model.
-    band_rows = max(_BAND_PIXELS // reader.width // _NOISE_ROW_STEP, 1) * _NOISE_ROW_STEP
+    band_rows = max(_BAND_PIXELS // reader.width // SETTINGS.noise_row_step, 1) * SETTINGS.noise_row_step
     light = np.empty((edges.shape[0] - 1, n_rows), np.float32)
     enclosed = np.empty_like(light)
 
@@ -107,7 +97,7 @@ def sample_rows(
         inside=inside,
         rows=outlines.rows,
         sensor_row=outlines.sensor_row,
-        count=np.median(enclosed[:, ::_NOISE_ROW_STEP], axis=1).reshape(inside.shape[:2]),
+        count=np.median(enclosed[:, :: SETTINGS.noise_row_step], axis=1).reshape(inside.shape[:2]),
         noise_floor=floor,
         noise_slope=slope,
     )
@@ -150,7 +140,7 @@ class _Reader(ABC):
         cells = self._cells(first, last)
         area = cv2.integral(cells, sdepth=cv2.CV_64F)
         light, enclosed = _between_edges(area, self._places(edges) * np.float32(1 / self.cell_px))
-        return light, enclosed * np.float32(self.cell_px), cells[::_NOISE_ROW_STEP].copy()
+        return light, enclosed * np.float32(self.cell_px), cells[:: SETTINGS.noise_row_step].copy()
 
     def _places(self, edges: Float32Array) -> Float32Array:
         """Edges as pixels from the left border of what is read."""
@@ -162,7 +152,7 @@ class _DevelopedReader(_Reader):
 
     def __init__(self, frame: Frame, edges: Float32Array, tone: str) -> None:
         strip_px = float(np.median(np.abs(np.diff(edges[:, edges.shape[1] // 2]))))
-        super().__init__(frame, edges, int(np.clip(strip_px // _CELLS_PER_STRIP, 1, min(16, frame.width))))
+        super().__init__(frame, edges, int(np.clip(strip_px // SETTINGS.cells_per_strip, 1, min(16, frame.width))))
         self._table = _light_table(int(np.iinfo(frame.pixels.dtype).max), 1, *_curve(frame, tone))
 
     def _cells(self, first: int, last: int) -> Float32Array:
@@ -193,7 +183,7 @@ class _CodedReader(_DevelopedReader):
         coded, enclosed = _between_edges(cv2.integral(rows, sdepth=cv2.CV_32S), self._places(edges))
         nearest = (coded * np.float32(_FINE_STEPS) + np.float32(0.5)).astype(np.intp)
         light = self._fine_table.take(nearest, mode="clip")
-        return light, enclosed, self._cells_of(rows[::_NOISE_ROW_STEP])
+        return light, enclosed, self._cells_of(rows[:: SETTINGS.noise_row_step])
 
 
 class _MosaicReader(_Reader):
@@ -281,7 +271,7 @@ def _between_edges(area: NDArray[Any], edges: Float32Array) -> tuple[Float32Arra
     at_edge += ((below.take(left) - above.take(left)).astype(np.float32) - at_edge) * part
     mean, widths = np.diff(at_edge, axis=0), np.diff(position, axis=0)
     enclosed = np.abs(widths)
-    widths[enclosed <= _LEAST_ENCLOSED] = np.inf
+    widths[enclosed <= SETTINGS.least_enclosed] = np.inf
     mean /= widths
     return mean, enclosed
 
@@ -294,10 +284,10 @@ def _noise_model(cells: Float32Array, cell_px: int) -> tuple[float, float]:
     """
     if cells.shape[1] < 2:
         return 1e-6 * cell_px, 0.0
-    rows = cells[:: max(1, cells.size // _NOISE_CELLS)]
+    rows = cells[:: max(1, cells.size // SETTINGS.noise_cells)]
     difference = np.abs(np.diff(rows, axis=1)).ravel()
     light = ((rows[:, 1:] + rows[:, :-1]) / 2).ravel()
-    n_bins = min(_NOISE_BINS, max(1, light.size // 50))
+    n_bins = min(SETTINGS.noise_bins, max(1, light.size // 50))
     # Bins of equal numbers; the few brightest that are left over do not matter.
     bins = np.argsort(light)[: light.size // n_bins * n_bins].reshape(n_bins, -1)
     x = np.median(light[bins], axis=1)

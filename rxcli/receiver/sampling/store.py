@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.receiver.sampling.rows import sample_rows
+from rxcli.receiver.sampling.settings import SETTINGS
 from rxcli.types import Frame, Outlines, RowProfiles
 
 #: Readings of one frame that are kept: of few and of many columns, quick and in depth, and some for outlines in doubt.
 _MOST_KEPT = 4
-#: Edges that are this near, pixels, enclose the same light.
-_SAME_EDGES_PX = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +77,7 @@ def _part_of(reading: _Reading, outlines: Outlines, first_column: int) -> RowPro
         return None
     edges = known.edges_x[columns.start * n_strips : columns.stop * n_strips + 1]
     same_rows = np.array_equal(known.rows, outlines.rows)
-    if not same_rows or float(np.abs(edges - outlines.edges_x).max()) > _SAME_EDGES_PX:
+    if not same_rows or float(np.abs(edges - outlines.edges_x).max()) > SETTINGS.same_edges_px:
         return None
     profiles = reading.profiles
     return replace(

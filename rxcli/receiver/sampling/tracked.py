@@ -17,14 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.receiver.sampling.settings import SETTINGS
 from rxcli.types import BoolArray, Float32Array, FloatArray, Frame, Outlines
 
-#: Cells of a strip, about; of a picture of more than 8 bits, the part of a strip that is one cell.
-_CELLS_PER_STRIP, _CELL_SHARE = 5, 0.6
 #: Pixels of eight bits in a half word, half words whose sum 16 bits hold, and rows that fit the cache at a time.
 _HALF, _MOST_HALVES, _ROWS_AT_A_TIME = 4, 64, 128
-#: Width of strips from which cells are whole half words: of narrower ones they would show what is beside them.
-_FROM_HALVES = 12.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,12 +103,12 @@ def sample_strips(frame: Frame, strips: StripMap) -> Float32Array:
 def _cells_of(strip_px: float, frame: Frame) -> tuple[int, int]:
     """Width of a cell and cells of a sample: whole half words where there are some, which are added up more quickly."""
     if frame.pixels.dtype != np.uint8:
-        return max(int(strip_px * _CELL_SHARE), 1), 1
-    halves = int(np.clip(round(strip_px / _CELLS_PER_STRIP / _HALF), 1, _MOST_HALVES))
-    if strip_px >= _FROM_HALVES and _has_words(frame, halves * _HALF):
+        return max(int(strip_px * SETTINGS.tracked_cell_share), 1), 1
+    halves = int(np.clip(round(strip_px / SETTINGS.tracked_cells / _HALF), 1, _MOST_HALVES))
+    if strip_px >= SETTINGS.from_halves_px and _has_words(frame, halves * _HALF):
         cell_px = halves * _HALF
     else:
-        cell_px = max(int(strip_px / _CELLS_PER_STRIP), 1)
+        cell_px = max(int(strip_px / SETTINGS.tracked_cells), 1)
     most = max((1 << 16) // (cell_px * 256), 1)
     return cell_px, int(np.clip(round(strip_px / cell_px), 1, most))
 

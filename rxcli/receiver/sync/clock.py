@@ -16,39 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.numerics import folded, header_correlation
-from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.protocol import EXTREMES_SLOTS, HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
-
-#: Strips of which the search needs but half.
-_MANY_STRIPS = 4
-#: Samples a slot while the clock is sought.
-_SEARCH_SAMPLES = 4
-#: Any window of this many slots holds a lit and a dark one (two symbols meet dark-to-dark or lit-to-lit at worst).
-_EXTREMES_SLOTS = 19
-#: Contrast that half-convinces, over the noise of a sample.
-_CONTRAST_SIGMAS = 8.0
-_MAX_DELAY_SLOTS = 2.0
-#: Light beyond this many times white is no measurement.
-_MOST_LIGHT = 1e3
-#: Slots are taken to be at most this sure when copies are compared: what was seen once may be wrong.
-SURE_LLR = 3.0
-#: Without delays, no more than this share of the columns seems to be off by more than so many slots.
-_MANY, _SAME_DELAY = 0.25, 0.12
-#: Header correlation, added over the copies, that the delay of a single column must win.
-_MIN_DELAY_LEAD = 0.3
-#: A lock below this may be one of columns that are spread in time.
-_SURE_LOCK = 2.5
-#: Columns without delays differ by less than this many slots (root mean square) in the light model's view.
-_SAME_TIMING = 0.03
-#: Weight of the first idea of a column's delay, as information: a standard deviation of a tenth of a slot.
-_DELAY_PRIOR = 100.0
-#: Largest correction of the clock at a time, slots.
-_MAX_CORRECTION = 0.25
 
 
 def pooled_strips(profiles: RowProfiles) -> RowProfiles:
     """Profiles of a few strips a column, to search the clock: pooled in pairs where there are four or more."""
-    return binned_strips(profiles) if profiles.light.shape[1] >= _MANY_STRIPS else profiles
+    return binned_strips(profiles) if profiles.light.shape[1] >= SETTINGS.many_strips else profiles
 
 
 def binned_strips(profiles: RowProfiles) -> RowProfiles:
@@ -106,9 +81,9 @@ def resample(
 
 def _bounded(light: Float32Array) -> Float32Array:
     """Light with what no sensor delivers taken as dark: one NaN would spoil every sum after it."""
-    if float(np.abs(light).max(initial=0.0)) <= _MOST_LIGHT:
+    if float(np.abs(light).max(initial=0.0)) <= SETTINGS.most_light:
         return light
-    return np.where(np.abs(light) <= _MOST_LIGHT, light, np.float32(0))
+    return np.where(np.abs(light) <= SETTINGS.most_light, light, np.float32(0))
 
 
 def _shown_rows(inside: BoolArray) -> tuple[IntArray, IntArray]:
@@ -165,7 +140,7 @@ def contrast(
     """
     import cv2
 
-    window = np.ones((1, _EXTREMES_SLOTS * samples_per_slot), np.uint8)
+    window = np.ones((1, EXTREMES_SLOTS * samples_per_slot), np.uint8)
     flat = light.reshape(-1, light.shape[-1])
     # An odd length, lest everything move by half a sample.
     smooth = cv2.blur(flat, (samples_per_slot // 2 * 2 + 1, 1)) if samples_per_slot > 1 else flat
@@ -177,7 +152,7 @@ def contrast(
     value = light - high
     value /= span * np.float32(0.5) + np.float32(1.5 * sigma)
     np.square(span, out=span)
-    weight = span / (span + np.float32((_CONTRAST_SIGMAS * sigma) ** 2))
+    weight = span / (span + np.float32((SETTINGS.contrast_sigmas * sigma) ** 2))
     weight *= valid
     total = weight.sum(axis=1)
     value *= weight
@@ -225,23 +200,23 @@ def find_clocks(
         sigma: standard deviation of a strip's row of no light.
     """
     top, bottom = _row_span(profiles)
-    step = rows_per_slot / _SEARCH_SAMPLES
+    step = rows_per_slot / SETTINGS.search_samples
     n = int((bottom - top) / step)
-    if n < SLOTS_PER_SYMBOL * _SEARCH_SAMPLES:
+    if n < SLOTS_PER_SYMBOL * SETTINGS.search_samples:
         return ()
     light, valid = resample(profiles, top, step, n)
-    pooled, weight = contrast(light, valid, _SEARCH_SAMPLES, sigma / np.sqrt(max(step, 1.0)))
-    response = header_response(pooled, weight, _SEARCH_SAMPLES)
-    power = folded(np.maximum(response, 0) ** 2, packet_slots * _SEARCH_SAMPLES)
-    start, header_peak_ratio = header_comb(power, _SEARCH_SAMPLES)
+    pooled, weight = contrast(light, valid, SETTINGS.search_samples, sigma / np.sqrt(max(step, 1.0)))
+    response = header_response(pooled, weight, SETTINGS.search_samples)
+    power = folded(np.maximum(response, 0) ** 2, packet_slots * SETTINGS.search_samples)
+    start, header_peak_ratio = header_comb(power, SETTINGS.search_samples)
     if not np.isfinite(start):
         return ()
     delays = _delays(pooled, weight, start, packet_slots)
     starts = [(start, delays)]
-    many_delays = np.count_nonzero(delays) > delays.size * _MANY
-    if header_peak_ratio < _SURE_LOCK or many_delays:
+    many_delays = np.count_nonzero(delays) > delays.size * SETTINGS.many_columns
+    if header_peak_ratio < SETTINGS.sure_lead or many_delays:
         staggered_start, staggered_ratio, staggered_delays = _staggered_comb(
-            pooled, weight, packet_slots * _SEARCH_SAMPLES
+            pooled, weight, packet_slots * SETTINGS.search_samples
         )
         if staggered_ratio > header_peak_ratio or many_delays:
             starts = [(staggered_start, staggered_delays), (start, np.zeros_like(delays))]
@@ -312,45 +287,53 @@ def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> 
     import cv2
 
     n_columns = pooled.shape[0]
-    length = SLOTS_PER_SYMBOL * _SEARCH_SAMPLES
+    length = SLOTS_PER_SYMBOL * SETTINGS.search_samples
     share = np.pad(weight / (weight + 1.0), ((0, 0), (0, length - 1)))
     total = np.cumsum(np.pad(share, ((0, 0), (1, 0))), axis=1)
     support = (total[:, length:] - total[:, :-length]) / length
-    responses = _header_correlation(pooled * (weight / (weight + 1.0)), _SEARCH_SAMPLES)
+    responses = _header_correlation(pooled * (weight / (weight + 1.0)), SETTINGS.search_samples)
     # Twice a correlation less its bound: the log-likelihood ratio, up to a factor, of a header against random slots.
     llr = folded(2 * responses - support, period)
-    reach = int(_MAX_DELAY_SLOTS * _SEARCH_SAMPLES)
-    wide = reach + _SEARCH_SAMPLES
+    reach = int(SETTINGS.most_delay_slots * SETTINGS.search_samples)
+    wide = reach + SETTINGS.search_samples
     wrapped = np.pad(llr, ((0, 0), (wide, wide)), mode="wrap")
     near = cv2.dilate(wrapped, np.ones((1, 2 * reach + 1), np.uint8))[:, wide : wide + period]
     score = np.maximum(near, 0).sum(axis=0)
     start = int(score.argmax())
-    header_peak_ratio = score[start] / _rival(score, start, _SEARCH_SAMPLES, 2 * reach)
+    header_peak_ratio = score[start] / _rival(score, start, SETTINGS.search_samples, 2 * reach)
     around = wrapped[:, start : start + 2 * wide + 1]
     best = around.argmax(axis=1)
     delays = best + _parabola(around, best) - wide
     sure = around[np.arange(n_columns), best] > 0
     middle = float(np.median(delays[sure])) if sure.any() else 0.0
-    return (start + middle) % period, float(header_peak_ratio), np.where(sure, delays - middle, 0.0) / _SEARCH_SAMPLES
+    return (
+        (start + middle) % period,
+        float(header_peak_ratio),
+        np.where(sure, delays - middle, 0.0) / SETTINGS.search_samples,
+    )
 
 
 def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slots: int) -> FloatArray:
     """Delay of each column against the common clock, slots; 0 where it cannot be told from none."""
-    reach = int(_MAX_DELAY_SLOTS * _SEARCH_SAMPLES) + 2
-    template = np.repeat(2.0 * np.array(HEADER) - 1, _SEARCH_SAMPLES) / (SLOTS_PER_SYMBOL * _SEARCH_SAMPLES)
+    reach = int(SETTINGS.most_delay_slots * SETTINGS.search_samples) + 2
+    template = np.repeat(2.0 * np.array(HEADER) - 1, SETTINGS.search_samples) / (
+        SLOTS_PER_SYMBOL * SETTINGS.search_samples
+    )
     share = weight / (weight + 1.0)
     n = pooled.shape[1]
-    starts = np.arange(round(start), n, packet_slots * _SEARCH_SAMPLES)
+    starts = np.arange(round(start), n, packet_slots * SETTINGS.search_samples)
     index = starts[:, None, None] + np.arange(-reach, reach + 1)[:, None] + np.arange(template.size)
     observed = (index >= 0) & (index < n)
     signal = (pooled * share)[:, np.clip(index, 0, n - 1)] * observed
     score = (signal * template).sum(axis=(1, 3))
     best = score.argmax(axis=1)
-    fine = (best + _parabola(score, best) - reach - (start - round(start))) / _SEARCH_SAMPLES
+    fine = (best + _parabola(score, best) - reach - (start - round(start))) / SETTINGS.search_samples
     top = score[np.arange(best.size), best]
     strong = top > 0.5 * np.median(top)
-    scattered = np.mean(np.abs(fine[strong]) > _SAME_DELAY) > _MANY if strong.any() else False
-    moved = (top - score[:, reach] > _MIN_DELAY_LEAD) | scattered
+    scattered = (
+        np.mean(np.abs(fine[strong]) > SETTINGS.same_delay_slots) > SETTINGS.many_columns if strong.any() else False
+    )
+    moved = (top - score[:, reach] > SETTINGS.delay_lead) | scattered
     return np.where(moved & strong & (best > 0) & (best < 2 * reach), fine, 0.0)
 
 
@@ -372,12 +355,19 @@ def corrected(clock: Clock, timing: FloatArray) -> Clock:
         timing: (C, 2) numerators and denominators of each column's lateness in slots.
     """
     numerator, denominator = timing.sum(axis=0)
-    late = float(np.clip(numerator / denominator, -_MAX_CORRECTION, _MAX_CORRECTION)) if denominator > 0 else 0.0
+    late = (
+        float(np.clip(numerator / denominator, -SETTINGS.most_correction_slots, SETTINGS.most_correction_slots))
+        if denominator > 0
+        else 0.0
+    )
     moved = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
-    own = (timing[:, 0] - late * timing[:, 1]) / (timing[:, 1] + _DELAY_PRIOR)
-    if not clock.delay_slots.any() and np.sqrt(np.mean(own**2)) < _SAME_TIMING:
+    own = (timing[:, 0] - late * timing[:, 1]) / (timing[:, 1] + SETTINGS.delay_information)
+    if not clock.delay_slots.any() and np.sqrt(np.mean(own**2)) < SETTINGS.same_timing_slots:
         return moved
-    return replace(moved, delay_slots=clock.delay_slots - np.clip(own, -_MAX_CORRECTION, _MAX_CORRECTION))
+    return replace(
+        moved,
+        delay_slots=clock.delay_slots - np.clip(own, -SETTINGS.most_correction_slots, SETTINGS.most_correction_slots),
+    )
 
 
 def sample_slots(
@@ -463,7 +453,7 @@ def copy_likeness(llr: Float32Array, clock: Clock) -> FloatArray:
         llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
         clock: the clock.
     """
-    copies = np.moveaxis(clock.to_copies(np.clip(llr, -SURE_LLR, SURE_LLR)), 1, 0)
+    copies = np.moveaxis(clock.to_copies(np.clip(llr, -SETTINGS.sure_nats, SETTINGS.sure_nats)), 1, 0)
     return np.array([likeness(first, second) for first, second in pairwise(copies)])
 
 

@@ -14,21 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rxcli.protocol import WEIGHTS, bits_per_symbol
-from rxcli.receiver.sync.clock import SURE_LLR, likeness
+from rxcli.receiver.sync.clock import likeness
+from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatArray, IntArray
-
-#: A clock that is off by more than this many slots from where the frames before foretell it belongs to another time.
-_MAX_JUMP_SLOTS = 2.0
-#: Share of a new measurement in the length of a frame.
-_PERIOD_SHARE = 0.2
-#: Likelihood ratio, in nats, that settles the phase of the bursts.
-_SETTLED = 12.0
-#: Closed bursts of which it is remembered whether they were certain.
-_REMEMBERED = 4
-#: Locks by which time stamps are judged; how often slow motion stretches them; what of the slots from frame to frame
-#: a clock may be off by: a share, slots, and the error of stamps, seconds, where they are not even.
-_JUDGED_LOCKS, _STRETCHES = 5, (2, 4, 8, 16, 32, 5, 10, 20, 3, 6)
-_RATE_SHARE, _RATE_SLOTS, _UNEVEN_S, _STEADY_SLOTS = 0.004, 0.4, 2e-3, 1.0
 
 
 @dataclass(slots=True)
@@ -64,7 +52,7 @@ class LinkTime:
     @property
     def sure_slots(self) -> float:
         """How far a clock may be from the foretold one: at first by the times, which may be rounded to milliseconds."""
-        return _MAX_JUMP_SLOTS if self._period is not None else self.packet_slots / 4
+        return SETTINGS.most_jump_slots if self._period is not None else self.packet_slots / 4
 
     def predict(self, frame: int, time_s: float) -> float | None:
         """Slot of sensor row 0 in a frame, from the locks before; None before the first."""
@@ -88,18 +76,18 @@ class LinkTime:
         else:
             first_copy = round((predicted - inside) / self.packet_slots)
             slot = inside + first_copy * self.packet_slots
-            if self._period is not None and abs(slot - predicted) > _MAX_JUMP_SLOTS:
+            if self._period is not None and abs(slot - predicted) > SETTINGS.most_jump_slots:
                 return None
             self._measure(frame, time_s / self.stretch, slot)
         self._last = (frame, time_s / self.stretch, slot)
-        if len(self._first) < _JUDGED_LOCKS:
+        if len(self._first) < SETTINGS.judged_locks:
             self._first.append((frame, time_s, slot))
         return first_copy
 
     @property
     def judged(self) -> bool:
         """Whether as many frames were locked as time stamps are judged by."""
-        return len(self._first) >= _JUDGED_LOCKS
+        return len(self._first) >= SETTINGS.judged_locks
 
     def stretch_of_stamps(self, least_frame_s: float) -> float | None:
         """How much longer the stamps of the first locks are than the time was; None where no factor explains them.
@@ -114,13 +102,13 @@ class LinkTime:
             return self.stretch
         period, slots_off = _line(frames, slots)
         stamp_s, stamps_off = _line(frames, stamps)
-        if slots_off > _STEADY_SLOTS or stamps_off > _UNEVEN_S or stamp_s <= 0:
+        if slots_off > SETTINGS.uneven_slots or stamps_off > SETTINGS.uneven_s or stamp_s <= 0:
             return self.stretch
-        uneven = 2 * stamps_off / np.ptp(frames) * self.slot_rate_hz + _RATE_SLOTS
-        for stretch in (1, *_STRETCHES):
+        uneven = 2 * stamps_off / np.ptp(frames) * self.slot_rate_hz + SETTINGS.rate_slots
+        for stretch in (1, *SETTINGS.stretches):
             expected = stamp_s / stretch * self.slot_rate_hz
             off = abs((period - expected + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2)
-            if off <= uneven / stretch + _RATE_SHARE * expected and stamp_s / stretch > least_frame_s:
+            if off <= uneven / stretch + SETTINGS.rate_share * expected and stamp_s / stretch > least_frame_s:
                 return float(stretch)
         return None
 
@@ -130,7 +118,9 @@ class LinkTime:
         if predicted is None or self._period is None:
             return True
         apart = clock.first_slot - clock.row0 / clock.rows_per_slot - predicted
-        return abs((apart + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2) <= _MAX_JUMP_SLOTS
+        return (
+            abs((apart + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2) <= SETTINGS.most_jump_slots
+        )
 
     def clock_at(self, frame: int, time_s: float, like: Clock, n_slots: int, top_row: float) -> Clock | None:
         """The clock that the frames before foretell.
@@ -168,7 +158,9 @@ class LinkTime:
         if frame - number == 1 and time_s > at_s:
             self._frame_s = min(self._frame_s, time_s - at_s)
         period = (slot - before) / max(self._frames_since(number, frame, time_s - at_s), 1)
-        self._period = period if self._period is None else self._period + _PERIOD_SHARE * (period - self._period)
+        self._period = (
+            period if self._period is None else self._period + SETTINGS.period_share * (period - self._period)
+        )
 
 
 def _line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
@@ -198,7 +190,7 @@ class BurstPhase:
         if self._score.size == 1:
             return True
         rival, best = np.sort(self._score)[-2:]
-        return bool(best - rival > _SETTLED)
+        return bool(best - rival > SETTINGS.settled_nats)
 
     def burst_of(self, copies: IntArray) -> IntArray:
         """Number of the burst of each copy, by its number in the clip."""
@@ -217,7 +209,7 @@ class BurstPhase:
             first_copy: number of the first one.
             llr: (n_copies, C, packet) log-odds of their slots, 0 where not seen.
         """
-        llr = np.clip(llr, -SURE_LLR, SURE_LLR)
+        llr = np.clip(llr, -SETTINGS.sure_nats, SETTINGS.sure_nats)
         for copy, slots in enumerate(llr, first_copy):
             for other in range(copy - self._most + 1, copy):
                 if other in self._copies:
@@ -370,7 +362,7 @@ class Bursts:
             self._closed = max(self._closed, int(numbers.max()))
         entries = [(int(n), self._open.pop(int(n), None)) for n in np.sort(numbers)]
         self._certain |= {number: entry.certain for number, entry in entries if entry is not None}
-        self._certain = {n: c for n, c in self._certain.items() if n > self._closed - _REMEMBERED}
+        self._certain = {n: c for n, c in self._certain.items() if n > self._closed - SETTINGS.remembered_bursts}
         return [
             ClosedBurst(number, entry.posteriors, entry.n_observed, tuple(entry.frames), entry.metrics, entry.tracked)
             for number, entry in entries
