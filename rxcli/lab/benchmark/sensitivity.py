@@ -1,5 +1,7 @@
 """What hangs on the receiver's numbers: each is moved by 0.7 and by 1.4, and the same pictures are received again.
 
+Numbers are the fields of the rooms' settings objects, and the numeric constants at the top of modules.
+
 A number that changes no packet can be round, or go; one that changes many is a place where a model is missing.
 """
 
@@ -11,7 +13,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -27,12 +29,14 @@ from rxcli.receiver.pipeline import receive_frame
 
 FACTORS = (0.7, 1.4)
 _ROOT = Path(rxcli.__file__).parent
-Value = float | tuple[float, ...]
+Value = float | tuple[Any, ...]
+#: Name of a room's settings object.
+_SETTINGS = "SETTINGS"
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A numeric constant of a module: a scalar, or a tuple that is scaled as a whole."""
+    """A numeric constant of a module, or a field of its settings object: a scalar, or a tuple scaled as a whole."""
 
     module: str
     name: str
@@ -46,12 +50,12 @@ class Number:
 
     def times(self, factor: float) -> Value:
         """The value moved; whole numbers stay whole and move by one at least."""
-        if isinstance(self.value, tuple):
-            return tuple(_moved(item, factor) for item in self.value)
         return _moved(self.value, factor)
 
 
-def _moved(value: float, factor: float) -> float:
+def _moved(value: Value, factor: float) -> Value:
+    if isinstance(value, tuple):
+        return tuple(_moved(item, factor) for item in value)
     if not isinstance(value, int):
         return value * factor
     up = factor > 1
@@ -79,51 +83,81 @@ def numbers(room: str = "receiver") -> list[Number]:
 
 def _numbers_of(path: Path) -> Iterator[Number]:
     module = ".".join(("rxcli", *path.relative_to(_ROOT).with_suffix("").parts)).removesuffix(".__init__")
-    for statement in ast.parse(path.read_text(encoding="utf-8")).body:
-        target, value = _assigned(statement)
-        literal = _literal(value)
-        if target is not None and literal is not None:
-            yield Number(module, target, statement.lineno, literal)
+    body = ast.parse(path.read_text(encoding="utf-8")).body
+    settings = {name for one in body if (name := _class_of_settings(one)) is not None}
+    for statement in body:
+        if isinstance(statement, ast.ClassDef) and statement.name in settings:
+            fields = [(f"{_SETTINGS}.{name}", line, value) for name, line, value in _assigned(statement.body)]
+        else:
+            fields = list(_assigned([statement]))
+        for name, line, value in fields:
+            literal = _literal(value)
+            if literal is not None:
+                yield Number(module, name, line, literal)
 
 
-def _assigned(statement: ast.stmt) -> tuple[str | None, ast.expr | None]:
-    if isinstance(statement, ast.Assign) and len(statement.targets) == 1:
-        target: ast.expr = statement.targets[0]
-    elif isinstance(statement, ast.AnnAssign):
-        target = statement.target
-    else:
-        return None, None
-    return (target.id if isinstance(target, ast.Name) else None), statement.value
+def _class_of_settings(statement: ast.stmt) -> str | None:
+    """The class of the settings object that a statement makes."""
+    if not isinstance(statement, ast.Assign) or _name_of(statement.targets[0]) != _SETTINGS:
+        return None
+    return _name_of(statement.value.func) if isinstance(statement.value, ast.Call) else None
 
 
-def _literal(expression: ast.expr | None) -> Value | None:
+def _name_of(expression: ast.AST) -> str | None:
+    return expression.id if isinstance(expression, ast.Name) else None
+
+
+def _assigned(statements: Sequence[ast.stmt]) -> Iterator[tuple[str, int, ast.expr]]:
+    """Names, lines and values of what statements assign; `A, B = 1, 2` is two."""
+    for statement in statements:
+        if isinstance(statement, ast.Assign) and len(statement.targets) == 1:
+            target, value = statement.targets[0], statement.value
+            if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) and len(target.elts) == len(value.elts):
+                pairs = list(zip(target.elts, value.elts, strict=True))
+            else:
+                pairs = [(target, value)]
+        elif isinstance(statement, ast.AnnAssign) and statement.value is not None:
+            pairs = [(statement.target, statement.value)]
+        else:
+            pairs = []
+        for one, its in pairs:
+            name = _name_of(one)
+            if name is not None:
+                yield name, statement.lineno, its
+
+
+def _literal(expression: ast.expr) -> Value | None:
     try:
-        value = ast.literal_eval(expression) if expression is not None else None
+        value = ast.literal_eval(expression)
     except ValueError:
         return None
-    items = value if isinstance(value, tuple) else (value,)
-    if not items or any(isinstance(item, bool) or not isinstance(item, int | float) for item in items):
-        return None
-    return value
+    return value if _is_number(value) else None
+
+
+def _is_number(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return bool(value) and all(_is_number(item) for item in value)
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 @contextmanager
 def moved(number: Number, factor: float) -> Iterator[None]:
     """The number moved for a while, in its own module and in those that import it by name."""
-    own = importlib.import_module(number.module)
-    before = getattr(own, number.name)
+    name, _, field = number.name.partition(".")
+    before = getattr(importlib.import_module(number.module), name)
+    after = replace(before, **{field: number.times(factor)}) if field else number.times(factor)
     holders = [
         module
-        for name, module in list(sys.modules.items())
-        if name.startswith("rxcli.") and module is not None and module.__dict__.get(number.name) is before
+        for path, module in list(sys.modules.items())
+        if path.startswith("rxcli.") and module is not None and module.__dict__.get(name) is before
     ]
     try:
         for module in holders:
-            setattr(module, number.name, number.times(factor))
+            setattr(module, name, after)
         yield
     finally:
         for module in holders:
-            setattr(module, number.name, before)
+            setattr(module, name, before)
 
 
 @lru_cache(maxsize=1)
@@ -155,7 +189,7 @@ def received(task: Task) -> Record:
 
 
 def _tuple(value: Any) -> Value:
-    return tuple(value) if isinstance(value, list) else value
+    return tuple(_tuple(item) for item in value) if isinstance(value, list) else value
 
 
 def run(room: str, pictures: int, journal: Journal, *, seed: int, jobs: int = 1, quiet: bool = False) -> list[Row]:
@@ -180,8 +214,7 @@ def run(room: str, pictures: int, journal: Journal, *, seed: int, jobs: int = 1,
 
 
 def _told(number: Number) -> Record:
-    value = list(number.value) if isinstance(number.value, tuple) else number.value
-    return {"module": number.module, "name": number.name, "line": number.line, "value": value}
+    return {"module": number.module, "name": number.name, "line": number.line, "value": number.value}
 
 
 def _row(number: Number, unmoved: Record, records: Sequence[Record]) -> Row:

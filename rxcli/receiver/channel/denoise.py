@@ -131,7 +131,7 @@ def _explain(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Explained:
     light = model.over_black(scene.samples)[columns]
     expected = model.expected(scene.lit, scene.clock, columns)
     whole = expected.whole
-    (prediction,) = predict_picture(light, whole, valid, model, one_sided=False)
+    (prediction,) = predict_picture(light, whole, valid, model, SETTINGS.picture_scales, one_sided=False)
     noise = model.noise.through(prediction.picture, prediction.variance, whole)
     scale = np.asarray(valid / np.sqrt(noise), np.float32)
     residual = (light - prediction.picture * whole) * scale

@@ -25,8 +25,8 @@ def predict_picture(
     expected: Float32Array,
     valid: Float32Array,
     model: ObservationModel,
-    scales: tuple[float, ...] = SETTINGS.picture_scales,
-    one_sided: bool = True,
+    scales: tuple[float, ...],
+    one_sided: bool,
 ) -> list[Prediction]:
     """The picture at every sample from both sides, from before and from after; on each the best of all scales.
 
