@@ -306,7 +306,7 @@ class TrackedScreen:
             positions = known_picture.row_positions(rows, clock)
             fit = known_picture.fit_response(flat, known_picture.exposures(lit, positions, exposure_slots))
         expected = fit.response.expected(lit, positions, exposure_slots)
-        flat, ratio = picture.judge(flat, expected, _NOISE_SHARE)
+        flat, ratio = picture.judge(flat, expected, _NOISE_SHARE, clock.rows_per_slot)
         if ratio > _MISFIT:
             return None
         metrics = known_picture.pattern_metrics(flat, positions, clock, isi_memory, fit.response, expected, lit)

@@ -36,6 +36,7 @@ _TEMPER = 0.5
 _COMMON_ERROR = 0.04
 #: Slots around, in each direction, over which a strip's error is averaged, and those of them left out as its own.
 _ERROR_SLOTS, _OWN_SLOTS = 20.0, 1.3
+_TOLD, _LIKE_OTHERS, _LEAST_ALIKE = 0.5, 20.0, 0.9
 #: A column's light further than this beyond dark or lit is not to be trusted.
 _BEYOND = 0.15
 
@@ -228,7 +229,9 @@ class KnownPicture:
         value = shrunk + (shrunk - np.float32(0.5)) * (np.float32(PRIOR) / np.maximum(precision, np.float32(1e-3)))
         return ColumnLight(value, self._tempered(value, precision), shrunk)
 
-    def judge(self, observed: ColumnLight, expected: Float32Array, share: float) -> tuple[ColumnLight, float]:
+    def judge(
+        self, observed: ColumnLight, expected: Float32Array, share: float, rows_per_slot: float
+    ) -> tuple[ColumnLight, float]:
         """Compare columns with what was decided; they are trusted accordingly, now and, in part, from now on.
 
         Args:
@@ -244,8 +247,9 @@ class KnownPicture:
         ratio = error.sum(axis=1) / np.maximum((observed.precision > 0).sum(axis=1), 1) / np.float32(_TEMPER)
         now = np.clip(self._excess * ratio, 0.25, 100.0)
         self._excess += np.float32(share) * (now - self._excess)
-        better = ColumnLight(observed.value, observed.precision / np.maximum(ratio, 0.5)[:, None], observed.shrunk)
-        return better, float(np.median(ratio))
+        precision = observed.precision / np.maximum(ratio, 0.5)[:, None]
+        precision /= _alike(observed.value - expected, precision, rows_per_slot)[:, None]
+        return ColumnLight(observed.value, precision, observed.shrunk), float(np.median(ratio))
 
     def _tempered(self, value: Float32Array, precision: Float32Array) -> Float32Array:
         variance = self._excess[:, None] / np.maximum(precision, np.float32(1e-6)) + np.float32(_COMMON_ERROR**2)
@@ -299,6 +303,21 @@ class KnownPicture:
         beside[:-1] = power[:-1, 3] + power[1:, 4]
         beyond[:-2] = power[1:-1, 5]
         return _System(gain, *_factored(middle, beside, beyond))
+
+
+def _alike(error: Float32Array, precision: Float32Array, rows_per_slot: float) -> Float32Array:
+    """(C,) squared error of the sums over a slot's rows over what was foreseen of them."""
+    n = max(round(rows_per_slot), 1)
+    n_slots = error.shape[1] // n
+    first = slice(0, n_slots * n)
+    weight = precision[:, first].reshape(len(error), n_slots, n)
+    total = (weight * error[:, first].reshape(weight.shape)).sum(axis=2)
+    known = weight.sum(axis=2)
+    told = known > _TOLD
+    squared = np.where(told, total * total / np.maximum(known, _TOLD), 0).sum(axis=1)
+    count = told.sum(axis=1)
+    every = squared.sum() / max(count.sum(), 1)
+    return np.maximum((squared + _LIKE_OTHERS * every) / (count + _LIKE_OTHERS), np.float32(_LEAST_ALIKE))
 
 
 def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
