@@ -282,6 +282,7 @@ class TrackedScreen:
         clock: Clock,
         isi_memory: int,
         thorough: bool,
+        known: Float32Array | None = None,
     ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, FloatArray] | None:
         """Clock, response and noise put right by a first decision slot by slot; then positions and metrics.
 
@@ -291,7 +292,7 @@ class TrackedScreen:
         positions, exposure_slots = known_picture.row_positions(rows, clock), clock.exposure_slots
         if known_picture.header_contrast(flat, positions, clock) < _LEAST_HEADER:
             return None
-        lit = known_picture.first_decision(flat, positions, clock)
+        lit = known_picture.first_decision(flat, positions, clock) if known is None else known
         slots = known_picture.exposures(lit, positions, exposure_slots)
         fit = known_picture.fit_response(flat, slots)
         if self._n_updates < _FEW_UPDATES or (thorough and fit.response.centre < _FADED):
@@ -390,9 +391,9 @@ class TrackedScreen:
         self._picture = self._new_picture(self._dark_light(views))
         updates = [self.learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
         alone = len(views) <= _MANY_VIEWS
-        for view, update, needed in zip(views, updates, doubtful, strict=True):
+        for view, update, needed, lit in zip(views, updates, doubtful, known, strict=True):
             if needed:
-                self._measure_again(view, update if alone else None)
+                self._measure_again(view, update if alone else None, lit)
 
     def _dark_light(self, views: Sequence[View]) -> Float32Array:
         """(C, S) light of the strips where nothing is lit."""
@@ -405,7 +406,7 @@ class TrackedScreen:
                 inside.append(view.pose.map.inside)
         return known_picture.dark_light(lights, dark, inside, self._begun_with[1])
 
-    def _measure_again(self, view: View, update: tuple[Float32Array, Float32Array] | None) -> None:
+    def _measure_again(self, view: View, update: tuple[Float32Array, Float32Array] | None, known: Float32Array) -> None:
         """Measure a frame by the picture, less what the frame itself has shown of it where that is given."""
         assert view.light is not None
         assert view.pose is not None
@@ -414,7 +415,7 @@ class TrackedScreen:
         picture = picture.placed(placement)
         flat = picture.solve(view.light)
         refined = self._refined(
-            picture, view.pose.rows, view.light, flat, view.bursts.clock, view.isi_memory, thorough=True
+            picture, view.pose.rows, view.light, flat, view.bursts.clock, view.isi_memory, thorough=True, known=known
         )
         if refined is not None:
             burst = view.bursts.clock.burst
