@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.protocol import PREAMBLE_SLOTS, bits_to_hex, indices_to_bits
+from rxcli.protocol import PREAMBLE_SLOTS, bits_per_symbol, indices_to_bits
 from rxcli.types import (
     BoolArray,
     BurstPosteriors,
@@ -95,6 +95,7 @@ def column_results(
         for column, echo in enumerate(echoing)
     ]
     held_back = np.where(whole & (doubts.ber_hat <= MAX_BER_HAT) & ~reported, doubts.confidence, 0.0).max(axis=0)
+    packets = [_Packets.of(burst, clock, posteriors, shown, doubts) for burst, shown in enumerate(n_observed)]
     return tuple(
         _column_result(
             column,
@@ -102,14 +103,18 @@ def column_results(
             posteriors,
             db,
             n_observed[:, column],
-            reported[:, column],
-            doubts,
+            () if against[column] else _of_column(packets, reported, column),
             against[column],
             _held_back(held_back[column], min_confidence),
             bool(was_denoised[column]),
         )
         for column, db in enumerate(snr_db)
     )
+
+
+def _of_column(packets: Sequence[_Packets], reported: BoolArray, column: int) -> tuple[PacketResult, ...]:
+    """The packets of a column that are reported, (B, C)."""
+    return tuple(one.result(column) for one, shown in zip(packets, reported[:, column], strict=True) if shown)
 
 
 def _why_headerless(samples: SlotSamples, column: int) -> str:
@@ -138,11 +143,11 @@ class BurstInClip:
     #: (C, packet) how often each slot was seen, over all frames.
     n_observed: IntArray
     frames: tuple[int, ...]
-    #: (C, 8) see `confidence_features`.
-    confidence_features: FloatArray
+    #: (C, 8) see `confidence_features`; None of tracked frames.
+    confidence_features: FloatArray | None
     #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
     #: received like photographs.
-    against: Float32Array | None = None
+    against: Float32Array | None
 
 
 def clip_results(
@@ -159,28 +164,29 @@ def clip_results(
     """
     snr_db = snr_db_of_columns(snr)
     doubts = [_clip_doubts(burst) for burst in bursts]
+    whole = [complete(burst.n_observed[None])[0] for burst in bursts]
     reported = [
-        complete(burst.n_observed[None])[0] & ~echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]
-        for burst, doubt in zip(bursts, doubts, strict=True)
+        (seen & ~echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]).tolist()
+        for burst, seen, doubt in zip(bursts, whole, doubts, strict=True)
     ]
-    surest = [
-        complete(burst.n_observed[None])[0] & (doubt.ber_hat[0] <= MAX_BER_HAT)
-        for burst, doubt in zip(bursts, doubts, strict=True)
-    ]
+    held_back = np.zeros(len(snr_db))
+    for seen, doubt in zip(whole, doubts, strict=True):
+        surest = np.where(seen & (doubt.ber_hat[0] <= MAX_BER_HAT), doubt.confidence[0], 0.0)
+        held_back = np.maximum(held_back, surest)
     own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
+    of_bursts = [
+        _Packets.of(0, clock, burst.posteriors, burst.n_observed, doubt)
+        for burst, clock, doubt in zip(bursts, own, doubts, strict=True)
+    ]
     out = []
-    for column in range(snr.shape[0]):
+    for column, db in enumerate(snr_db):
         packets = tuple(
-            _packet(0, column, clock, burst.posteriors, burst.n_observed[column], doubt, burst.number, burst.frames)
-            for burst, clock, doubt, shown in zip(bursts, own, doubts, reported, strict=True)
+            each.result(column, burst.number, burst.frames)
+            for burst, each, shown in zip(bursts, of_bursts, reported, strict=True)
             if shown[column]
         )
-        held_back = max(
-            (float(doubt.confidence[0, column]) for doubt, sure in zip(doubts, surest, strict=True) if sure[column]),
-            default=0.0,
-        )
-        result = _clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], packets)
-        if not packets and result.status != "ok" and (message := _held_back(held_back, min_confidence)):
+        result = _clip_column(column, clock, bursts, float(going_on[column]), db, packets)
+        if not packets and result.status != "ok" and (message := _held_back(float(held_back[column]), min_confidence)):
             result = replace(result, message=message)
         out.append(result)
     return tuple(out)
@@ -285,14 +291,11 @@ def _column_result(
     posteriors: BurstPosteriors,
     snr_db: float | None,
     n_observed: IntArray,
-    reported: BoolArray,
-    doubts: _Doubts,
+    packets: tuple[PacketResult, ...],
     against: str | None,
     held_back: str | None,
     denoised: bool,
 ) -> ColumnResult:
-    bursts = () if against else np.flatnonzero(reported)
-    packets = tuple(_packet(int(burst), column, clock, posteriors, n_observed[burst], doubts) for burst in bursts)
     sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(MIN_WEIGHT_PROBABILITY)
     status = _column_status(packets, snr_db)
     return ColumnResult(
@@ -384,8 +387,13 @@ class _Doubts:
 
 
 def _doubts(posteriors: BurstPosteriors, confidence_features: FloatArray) -> _Doubts:
+    return _Doubts(confidence(confidence_features), _share_unsure(posteriors), confidence_features)
+
+
+def _share_unsure(posteriors: BurstPosteriors) -> FloatArray:
+    """(B, C) share of the bits that is wrong if each is as sure as it seems."""
     unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of few bits are filled up with NaN
-    return _Doubts(confidence(confidence_features), np.nanmean(unsure, axis=(2, 3)), confidence_features)
+    return np.asarray(np.nanmean(unsure, axis=(2, 3)))
 
 
 def _clip_doubts(burst: BurstInClip) -> _Doubts:
@@ -394,21 +402,19 @@ def _clip_doubts(burst: BurstInClip) -> _Doubts:
     Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
     What slots say against the codeword that was decided shows it.
     """
-    doubts = _doubts(burst.posteriors, burst.confidence_features[None])
-    if burst.against is None:
-        return doubts
+    if burst.confidence_features is not None:
+        return _doubts(burst.posteriors, burst.confidence_features[None])
     features = clip_features(burst)[None]
     log_odds = clip_log_odds(burst)
     n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
     at_evens = np.maximum(WRONG_AT_EVENS / n_bits, BER_AT_EVENS)
     wrong = np.minimum(at_evens * np.exp(-BER_EXPONENT * log_odds), 0.5)
-    ber_hat = np.maximum(doubts.ber_hat, wrong)
-    return _Doubts(_probability(log_odds), ber_hat, features)
+    return _Doubts(_probability(log_odds), np.maximum(_share_unsure(burst.posteriors), wrong), features)
 
 
 def clip_log_odds(burst: BurstInClip) -> FloatArray:
     """(1, C) calibrated log-odds of the packets of a burst of a clip being error-free."""
-    if burst.against is None:
+    if burst.confidence_features is not None:
         return confidence_log_odds(burst.confidence_features[None])
     return np.asarray(clip_features(burst)[None] @ np.array(_CLIP_CALIBRATION))
 
@@ -423,29 +429,60 @@ def clip_features(burst: BurstInClip) -> FloatArray:
     return np.stack([np.ones_like(log_odds), log_odds, np.log(burst.against + _AGAINST_AT_LEAST)], axis=1)
 
 
-def _packet(
-    burst: int,
-    column: int,
-    clock: Clock,
-    posteriors: BurstPosteriors,
-    n_observed: IntArray,
-    doubts: _Doubts,
-    number: int | None = None,
-    frames: tuple[int, ...] | None = None,
-) -> PacketResult:
-    """The packet of one burst; `n_observed` is (packet,)."""
-    bits = indices_to_bits(posteriors.index[burst, column], int(posteriors.w[column]))
-    return PacketResult(
-        first_row=_header_row(int(np.flatnonzero(clock.burst == burst)[0]), column, clock),
-        copies=float(n_observed.sum() / clock.packet_slots),
-        payload_bits=int(bits.size),
-        payload=bits_to_hex(bits),
-        confidence=float(doubts.confidence[burst, column]),
-        ber_hat=float(doubts.ber_hat[burst, column]),
-        burst=number,
-        frames=frames,
-        confidence_features=tuple(doubts.confidence_features[burst, column].tolist()),
-    )
+@dataclass(frozen=True, slots=True)
+class _Packets:
+    """The packets of one burst, of all columns at once: what each costs alone adds up over a clip."""
+
+    payload: list[str]
+    n_bits: list[int]
+    copies: list[float]
+    first_row: list[float]
+    confidence: list[float]
+    ber_hat: list[float]
+    features: list[list[float]]
+
+    @classmethod
+    def of(
+        cls, burst: int, clock: Clock, posteriors: BurstPosteriors, n_observed: IntArray, doubts: _Doubts
+    ) -> _Packets:
+        """Of a burst; `n_observed` is (C, packet)."""
+        bits = [bits_per_symbol(w) for w in posteriors.w.tolist()]
+        copy = int((clock.burst == burst).argmax())
+        n_symbols = posteriors.index.shape[2]
+        return cls(
+            payload=_payloads(posteriors.index[burst], posteriors.w),
+            n_bits=[k * n_symbols for k in bits],
+            copies=(n_observed.sum(axis=1) / clock.packet_slots).tolist(),
+            first_row=_header_rows(copy, clock).tolist(),
+            confidence=doubts.confidence[burst].tolist(),
+            ber_hat=doubts.ber_hat[burst].tolist(),
+            features=doubts.confidence_features[burst].tolist(),
+        )
+
+    def result(self, column: int, number: int | None = None, frames: tuple[int, ...] | None = None) -> PacketResult:
+        """The packet of a column; in clips with the number of its burst and the frames that show it."""
+        return PacketResult(
+            first_row=self.first_row[column],
+            copies=self.copies[column],
+            payload_bits=self.n_bits[column],
+            payload=self.payload[column],
+            confidence=self.confidence[column],
+            ber_hat=self.ber_hat[column],
+            burst=number,
+            frames=frames,
+            confidence_features=tuple(self.features[column]),
+        )
+
+
+def _payloads(index: IntArray, weights: IntArray) -> list[str]:
+    """Hex of the payload of every column, whose words (C, N) are of the weights (C,)."""
+    payload = [""] * len(index)
+    for w in set(weights.tolist()):
+        columns = np.flatnonzero(weights == w)
+        bits = indices_to_bits(index[columns].ravel(), w).reshape(columns.size, -1)
+        for column, packed in zip(columns.tolist(), np.packbits(bits, axis=1), strict=True):
+            payload[column] = packed.tobytes().hex()
+    return payload
 
 
 def confidence_features(
@@ -524,10 +561,10 @@ def _doubted(column: ColumnResult, certainty: float, min_confidence: float) -> C
     return replace(column, packets=kept, status=status)
 
 
-def _header_row(copy: int, column: int, clock: Clock) -> float:
-    """Sensor row whose exposure starts with the header of `copy`."""
-    slots = copy * clock.packet_slots - clock.first_slot + clock.delay_slots[column] + clock.exposure_slots / 2
-    return float(clock.row0 + slots * clock.rows_per_slot)
+def _header_rows(copy: int, clock: Clock) -> FloatArray:
+    """(C,) sensor row whose exposure starts with the header of `copy`."""
+    slots = copy * clock.packet_slots - clock.first_slot + clock.delay_slots + clock.exposure_slots / 2
+    return np.asarray(clock.row0 + slots * clock.rows_per_slot)
 
 
 def in_stored_rows(column: ColumnResult, height: int) -> ColumnResult:

@@ -36,6 +36,8 @@ _TEMPER = 0.5
 _COMMON_ERROR = 0.04
 #: Slots around, in each direction, over which a strip's error is averaged, and those of them left out as its own.
 _ERROR_SLOTS, _OWN_SLOTS = 20.0, 1.3
+#: Precision of a slot's light from which its error tells how alike rows err; slots of all columns that count beside a
+#: column's own; and the least squared error against rows that err each for itself.
 _TOLD, _LIKE_OTHERS, _LEAST_ALIKE = 0.5, 20.0, 0.9
 #: A column's light further than this beyond dark or lit is not to be trusted.
 _BEYOND = 0.15
@@ -238,6 +240,7 @@ class KnownPicture:
             seen: as `solve` gave it.
             expected: (C, R) what the decided slots give.
             share: weight of this frame against those before, 0..1.
+            rows_per_slot: rows per slot.
 
         Returns:
             The light with its precision put right; and the median over the columns of the squared error over the
@@ -306,18 +309,22 @@ class KnownPicture:
 
 
 def _alike(error: Float32Array, precision: Float32Array, rows_per_slot: float) -> Float32Array:
-    """(C,) squared error of the sums over a slot's rows over what was foreseen of them."""
+    """(C,) squared error of the sums over a slot's rows, over what is foreseen of rows that err each for itself.
+
+    Sensor noise does; what an encoder leaves out of a picture lies on all rows of a slot alike. Columns of few slots
+    that tell are taken to be as the others.
+    """
     n = max(round(rows_per_slot), 1)
-    n_slots = error.shape[1] // n
-    first = slice(0, n_slots * n)
-    weight = precision[:, first].reshape(len(error), n_slots, n)
-    total = (weight * error[:, first].reshape(weight.shape)).sum(axis=2)
-    known = weight.sum(axis=2)
-    told = known > _TOLD
-    squared = np.where(told, total * total / np.maximum(known, _TOLD), 0).sum(axis=1)
+    shape = len(error), error.shape[1] // n, n
+    weight = precision[:, : shape[1] * n].reshape(shape)
+    total = np.einsum("csr,csr->cs", weight, error[:, : shape[1] * n].reshape(shape))
+    foreseen = weight.sum(axis=2)
+    told = foreseen > _TOLD
+    squared = np.sum(np.square(total) / np.maximum(foreseen, _TOLD), axis=1, where=told)
     count = told.sum(axis=1)
-    every = squared.sum() / max(count.sum(), 1)
-    return np.maximum((squared + _LIKE_OTHERS * every) / (count + _LIKE_OTHERS), np.float32(_LEAST_ALIKE))
+    of_all = squared.sum() / max(int(count.sum()), 1)
+    alike = (squared + _LIKE_OTHERS * of_all) / (count + _LIKE_OTHERS)
+    return np.asarray(np.maximum(alike, _LEAST_ALIKE), np.float32)
 
 
 def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
