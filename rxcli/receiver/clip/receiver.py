@@ -680,7 +680,8 @@ class _Clip:
         self._bursts.detect_stale(*held)
         known = [self._bursts.lit(waiting) for waiting in held]
         doubtful = [len(held) <= _HELD or self._bursts.doubts(waiting)[0] > 0 for waiting in held]
-        self._scene.measure_again([w.view for w in held if w.view is not None], known, doubtful)
+        numbers = [w.numbers for w in held if w.numbers is not None]
+        self._scene.measure_again([w.view for w in held if w.view is not None], known, numbers, doubtful)
 
     def _detect_again(self) -> None:
         """The bursts of all frames that wait, each once: in the last frame that shows it."""

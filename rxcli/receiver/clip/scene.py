@@ -358,12 +358,10 @@ class TrackedScreen:
             self._n_updates += 1
         self.last = view
 
-    def learn(
-        self, view: View, lit: Float32Array, keep: float = known_picture.MEMORY
-    ) -> tuple[Float32Array, Float32Array] | None:
+    def learn(self, view: View, lit: Float32Array, keep: float = known_picture.MEMORY) -> known_picture.Look | None:
         """Take a frame into the picture; returns what it showed.
 
-        See `known_picture.KnownPicture.learn` for `keep`, and for what is returned: slots and trust.
+        See `known_picture.KnownPicture.learn` for `keep`.
         """
         if view.light is None or view.pose is None:
             return None
@@ -373,27 +371,35 @@ class TrackedScreen:
         slots = known_picture.exposed(lit, positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
         self._picture.learn(view.light, slots, trust, keep, view.pose.placement)
-        return slots, trust
+        return known_picture.Look(view.light, slots, trust, view.pose.placement)
 
     def can_measure_again(self, view: View) -> bool:
         """Whether a frame's strips are those of this screen."""
         return view.light is not None and view.pose is not None and view.pose.map.light is self._first_pose.map.light
 
-    def measure_again(self, views: Sequence[View], known: Sequence[Float32Array], doubtful: Sequence[bool]) -> None:
-        """Learn the picture anew from frames, and measure those in doubt by what the others say of it.
+    def measure_again(
+        self,
+        views: Sequence[View],
+        known: Sequence[Float32Array],
+        numbers: Sequence[IntArray],
+        doubtful: Sequence[bool],
+    ) -> None:
+        """Learn the picture anew from frames, and measure those in doubt by what other bursts say of it.
 
         Args:
             views: the frames.
             known: (C, N) of each, probability that each slot is lit.
+            numbers: (B,) of each, the numbers of its bursts.
             doubtful: of each, whether it is to be measured.
         """
         self._n_updates = 0
         self._picture = self._new_picture(self._dark_light(views))
-        updates = [self.learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
+        looks = [self.learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
         alone = len(views) <= _MANY_VIEWS
-        for view, update, needed, lit in zip(views, updates, doubtful, known, strict=True):
+        for view, lit, shown, needed in zip(views, known, numbers, doubtful, strict=True):
             if needed:
-                self._measure_again(view, update if alone else None, lit)
+                own = [_of_bursts(*each, shown) for each in zip(looks, views, numbers, strict=True)] if alone else []
+                self._measure_again(view, [look for look in own if look is not None], lit)
 
     def _dark_light(self, views: Sequence[View]) -> Float32Array:
         """(C, S) light of the strips where nothing is lit."""
@@ -406,13 +412,12 @@ class TrackedScreen:
                 inside.append(view.pose.map.inside)
         return known_picture.dark_light(lights, dark, inside, self._begun_with[1])
 
-    def _measure_again(self, view: View, update: tuple[Float32Array, Float32Array] | None, known: Float32Array) -> None:
-        """Measure a frame by the picture, less what the frame itself has shown of it where that is given."""
+    def _measure_again(self, view: View, own: Sequence[known_picture.Look], known: Float32Array) -> None:
+        """Measure a frame by the picture, less what the frame's `own` bursts have shown of it."""
         assert view.light is not None
         assert view.pose is not None
-        placement = view.pose.placement
-        picture = self._picture if update is None else self._picture.without(view.light, *update, placement)
-        picture = picture.placed(placement)
+        picture = self._picture.without(own) if own else self._picture
+        picture = picture.placed(view.pose.placement)
         flat = picture.solve(view.light)
         refined = self._refined(
             picture, view.pose.rows, view.light, flat, view.bursts.clock, view.isi_memory, thorough=True, known=known
@@ -422,6 +427,18 @@ class TrackedScreen:
             view.flat, clock, _, metrics = refined
             view.snr = _snr(view.flat, clock)
             view.bursts = replace(view.bursts, clock=replace(clock, burst=burst), metrics=metrics, tracked=True)
+
+
+def _of_bursts(
+    look: known_picture.Look | None, view: View, numbers: IntArray, bursts: IntArray
+) -> known_picture.Look | None:
+    """What a frame that shows the bursts `numbers` taught where it shows some of the `bursts`; None where none."""
+    if look is None or view.pose is None or not np.isin(numbers, bursts).any():
+        return None
+    clock = view.bursts.clock
+    slots = np.clip((view.pose.rows - clock.row0) / clock.rows_per_slot, 0, clock.n_slots - 1)
+    copies = (slots.astype(np.int64) + clock.first_slot) // clock.packet_slots
+    return replace(look, rows=np.isin(numbers[clock.burst[copies]], bursts))
 
 
 def _less_ends(inside: BoolArray, rows: float) -> BoolArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -79,6 +80,21 @@ class Placement:
     inside: BoolArray
 
 
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What a frame taught of the picture."""
+
+    #: (C, S, R) light of the strips.
+    light: Float32Array
+    #: (C, R) exposure-averaged slots, 0..1, and how far each is trusted.
+    slots: Float32Array
+    trust: Float32Array
+    #: Where the frame shows the picture; None for where the first one did.
+    placement: Placement | None
+    #: (R,) the rows that are meant; None for all.
+    rows: BoolArray | None = None
+
+
 class KnownPicture:
     """The picture without stripes, learned frame by frame, on the rows of the screen as the first frame showed it.
 
@@ -147,29 +163,30 @@ class KnownPicture:
         self._observed = self._observed * np.float32(keep) + observed
         self._system = self._made = None
 
-    def without(
-        self, light: Float32Array, slots: Float32Array, trust: Float32Array, placement: Placement | None = None
-    ) -> KnownPicture:
-        """What the other frames say alone, for a frame that was learned last or with nothing forgotten since.
+    def without(self, looks: Sequence[Look]) -> KnownPicture:
+        """What is known but for some looks, that were learned with nothing forgotten since.
 
         A picture learned from a frame's own light bears out whatever was decided there, wrong or right.
-
-        Args:
-            light: (C, S, R) as it was learned.
-            slots: (C, R) likewise.
-            trust: (C, R) likewise.
-            placement: likewise.
         """
-        lit, observed = self._update_of(light, slots, trust, placement)
         other = copy(self)
-        other._light, other._observed = self._light - lit, np.maximum(self._observed - observed, 0)
+        for look in looks:
+            lit, observed = self._update_of(look.light, look.slots, look.trust, look.placement, look.rows)
+            other._light, other._observed = other._light - lit, np.maximum(other._observed - observed, 0)
         other._system, other._made, other._excess = None, None, self._excess.copy()
         return other
 
     def _update_of(
-        self, light: Float32Array, slots: Float32Array, trust: Float32Array, placement: Placement | None
+        self,
+        light: Float32Array,
+        slots: Float32Array,
+        trust: Float32Array,
+        placement: Placement | None,
+        rows: BoolArray | None = None,
     ) -> tuple[Float32Array, Float32Array]:
-        """Light and light expected of a picture of 1, each weighted with the latter, on the rows of the picture."""
+        """Light and light expected of a picture of 1, each weighted with the latter, on the rows of the picture.
+
+        Those of some `rows` (R,) alone where they are given.
+        """
         expected = self._crosstalk @ _with_neighbours(slots)
         doubt = self._crosstalk @ (1 - _with_neighbours(trust, 1.0))
         inside = self._inside if placement is None else placement.inside
@@ -177,6 +194,8 @@ class KnownPicture:
         power = expected * expected
         told = power / (power + np.float32(_UNTOLD) + np.float32(_UNSURE) * doubt)
         weighted = expected * (told * told) * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * inside
+        if rows is not None:
+            weighted *= rows
         lit, observed = weighted * (light - self._black_level), weighted * expected
         if placement is None:
             return lit, observed
