@@ -22,8 +22,6 @@ from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntAr
 
 #: Strips of a column, at most: more tell no more of a picture that is known, and take time.
 _STRIPS = 4
-#: Frames beyond which each one's share of what is known of the picture does not matter.
-_MANY_VIEWS = 12
 #: Movement that is none: pixels, or standard deviations of what was found.
 _STILL_PX, _STILL_SDS = 0.3, 2.5
 #: Where texture tells little: how well rest is known in screen sizes, and standard deviations of what may be rest;
@@ -395,10 +393,9 @@ class TrackedScreen:
         self._n_updates = 0
         self._picture = self._new_picture(self._dark_light(views))
         looks = [self.learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
-        alone = len(views) <= _MANY_VIEWS
         for view, lit, shown, needed in zip(views, known, numbers, doubtful, strict=True):
             if needed:
-                own = [_of_bursts(*each, shown) for each in zip(looks, views, numbers, strict=True)] if alone else []
+                own = (_of_bursts(*each, shown) for each in zip(looks, views, numbers, strict=True))
                 self._measure_again(view, [look for look in own if look is not None], lit)
 
     def _dark_light(self, views: Sequence[View]) -> Float32Array:
@@ -416,8 +413,7 @@ class TrackedScreen:
         """Measure a frame by the picture, less what the frame's `own` bursts have shown of it."""
         assert view.light is not None
         assert view.pose is not None
-        picture = self._picture.without(own) if own else self._picture
-        picture = picture.placed(view.pose.placement)
+        picture = self._picture.without(own).placed(view.pose.placement)
         flat = picture.solve(view.light)
         refined = self._refined(
             picture, view.pose.rows, view.light, flat, view.bursts.clock, view.isi_memory, thorough=True, known=known
