@@ -104,7 +104,7 @@ class TrackedScreen:
         pose = before.pose if before is not None and corners is before.corners else None
         if pose is None or pose.map.inside.shape[0] != n_columns:
             pose = Pose(corners, _map(context.frame, corners, camera, acquisition))
-        return cls(context.frame, replace(pose, placement=None), acquisition, camera.lens, black_level, named)
+        return cls(context.frame, Pose(pose.corners, pose.map), acquisition, camera.lens, black_level, named)
 
     def _new_picture(self, black_level: float | Float32Array) -> known_picture.KnownPicture:
         acquisition, strips = self._begun_with[0], self._first_pose.map
@@ -228,7 +228,7 @@ class TrackedScreen:
         outlines = replace(outlines, inside=_less_ends(outlines.inside, _LEAST_END + _END_SDS * sd))
         strips = tracked.moved_map(self._first_pose.map, outlines)
         placement = _placement(self._first_pose, corners, strips, self._lens)
-        self.pose = Pose(corners, strips, placement)
+        self.pose = Pose(corners, strips, placement, self._first_pose.map)
 
     # -- a frame ------------------------------------------------------------------------------------------------
 
@@ -368,12 +368,13 @@ class TrackedScreen:
         positions = known_picture.row_positions(view.pose.rows, clock)
         slots = known_picture.exposed(lit, positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
-        self._picture.learn(view.light, slots, trust, keep, view.pose.placement)
-        return known_picture.Look(view.light, slots, trust, view.pose.placement)
+        look = known_picture.Look(view.light, slots, trust, view.pose.placement)
+        self._picture.learn(look, keep)
+        return look
 
     def can_measure_again(self, view: View) -> bool:
         """Whether a frame's strips are those of this screen."""
-        return view.light is not None and view.pose is not None and view.pose.map.light is self._first_pose.map.light
+        return view.light is not None and view.pose is not None and view.pose.home is self._first_pose.map
 
     def measure_again(
         self,

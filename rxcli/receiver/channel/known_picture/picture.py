@@ -90,7 +90,7 @@ class Look:
     slots: Float32Array
     trust: Float32Array
     #: Where the frame shows the picture; None for where the first one did.
-    placement: Placement | None
+    placement: Placement | None = None
     #: (R,) the rows that are meant; None for all.
     rows: BoolArray | None = None
 
@@ -141,24 +141,9 @@ class KnownPicture:
         other._system = other._of_one = None
         return other
 
-    def learn(
-        self,
-        light: Float32Array,
-        slots: Float32Array,
-        trust: Float32Array,
-        keep: float = MEMORY,
-        placement: Placement | None = None,
-    ) -> None:
-        """Take a frame whose slots are known into the picture.
-
-        Args:
-            light: (C, S, R).
-            slots: (C, R) exposure-averaged slots, 0..1.
-            trust: (C, R) 0..1.
-            keep: share of their weight that the frames before keep.
-            placement: where the frame shows the picture; None for where the first one did.
-        """
-        lit, observed = self._update_of(light, slots, trust, placement)
+    def learn(self, look: Look, keep: float = MEMORY) -> None:
+        """Take a frame whose slots are known into the picture; those before keep the share `keep` of their weight."""
+        lit, observed = self._update_of(look)
         self._light = self._light * np.float32(keep) + lit
         self._observed = self._observed * np.float32(keep) + observed
         self._system = self._made = None
@@ -170,33 +155,24 @@ class KnownPicture:
         """
         other = copy(self)
         for look in looks:
-            lit, observed = self._update_of(look.light, look.slots, look.trust, look.placement, look.rows)
+            lit, observed = self._update_of(look)
             other._light, other._observed = other._light - lit, np.maximum(other._observed - observed, 0)
         other._system, other._made, other._excess = None, None, self._excess.copy()
         return other
 
-    def _update_of(
-        self,
-        light: Float32Array,
-        slots: Float32Array,
-        trust: Float32Array,
-        placement: Placement | None,
-        rows: BoolArray | None = None,
-    ) -> tuple[Float32Array, Float32Array]:
-        """Light and light expected of a picture of 1, each weighted with the latter, on the rows of the picture.
-
-        Those of some `rows` (R,) alone where they are given.
-        """
-        expected = self._crosstalk @ _with_neighbours(slots)
-        doubt = self._crosstalk @ (1 - _with_neighbours(trust, 1.0))
+    def _update_of(self, look: Look) -> tuple[Float32Array, Float32Array]:
+        """Light and light expected of a picture of 1, each weighted with the latter, on the rows of the picture."""
+        placement = look.placement
+        expected = self._crosstalk @ _with_neighbours(look.slots)
+        doubt = self._crosstalk @ (1 - _with_neighbours(look.trust, 1.0))
         inside = self._inside if placement is None else placement.inside
         # Light over what little was expected is no picture: more of it than that may be another slot's.
         power = expected * expected
         told = power / (power + np.float32(_UNTOLD) + np.float32(_UNSURE) * doubt)
         weighted = expected * (told * told) * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * inside
-        if rows is not None:
-            weighted *= rows
-        lit, observed = weighted * (light - self._black_level), weighted * expected
+        if look.rows is not None:
+            weighted *= look.rows
+        lit, observed = weighted * (look.light - self._black_level), weighted * expected
         if placement is None:
             return lit, observed
         row = placement.frame_row
