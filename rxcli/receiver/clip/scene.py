@@ -22,6 +22,9 @@ from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntAr
 
 #: Strips of a column, at most: more tell no more of a picture that is known, and take time.
 _STRIPS = 4
+#: Frames from which a frame is measured without what others that show its bursts have taught of the picture there; of
+#: fewer, too little would be left.
+_ENOUGH_VIEWS = 6
 #: Movement that is none: pixels, or standard deviations of what was found.
 _STILL_PX, _STILL_SDS = 0.3, 2.5
 #: Where texture tells little: how well rest is known in screen sizes, and standard deviations of what may be rest;
@@ -383,7 +386,8 @@ class TrackedScreen:
         numbers: Sequence[IntArray],
         doubtful: Sequence[bool],
     ) -> None:
-        """Learn the picture anew from frames, and measure those in doubt by what other bursts say of it.
+        """Learn the picture anew from frames, and measure those in doubt by what others say of it, where these are many
+        enough by what other bursts say of it.
 
         Args:
             views: the frames.
@@ -394,10 +398,11 @@ class TrackedScreen:
         self._n_updates = 0
         self._picture = self._new_picture(self._dark_light(views))
         looks = [self.learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
-        for view, lit, shown, needed in zip(views, known, numbers, doubtful, strict=True):
+        for view, look, lit, shown, needed in zip(views, looks, known, numbers, doubtful, strict=True):
             if needed:
-                own = (_of_bursts(*each, shown) for each in zip(looks, views, numbers, strict=True))
-                self._measure_again(view, [look for look in own if look is not None], lit)
+                others = zip(looks, views, numbers, strict=True) if len(views) >= _ENOUGH_VIEWS else ()
+                own = (_of_bursts(*each, shown) for each in others if each[1] is not view)
+                self._measure_again(view, [each for each in (look, *own) if each is not None], lit)
 
     def _dark_light(self, views: Sequence[View]) -> Float32Array:
         """(C, S) light of the strips where nothing is lit."""
