@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
 import numpy as np
 import pytest
 
+from rxcli.ingest import open_source
 from rxcli.ingest.video import _Progress, _time_s
 from rxcli.lab.simulate.capture import Take, prepare
 from rxcli.lab.simulate.scenes import Change, Scene, preset
 from rxcli.lab.simulate.truth import build_camera_profile
+from rxcli.lab.simulate.video import write_video
 from rxcli.options import SKIPS, ReceiverOptions
+from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver.pipeline import receive
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Frame, FrameResult
@@ -23,8 +27,8 @@ N_FRAMES, SPEED_PX, SEED = 12, 3.0, 5
 Clip = tuple[tuple[Frame, ...], Truth, ReceiverOptions]
 
 
-def scene_in_hand(hand_px: float, n_frames: int = N_FRAMES, **changes: object) -> Scene:
-    base = preset("video-1080p", "paper-8k65").scaled(0.5, 0.5, keep_readout=True)
+def scene_in_hand(hand_px: float, n_frames: int = N_FRAMES, screen: str = "paper-8k65", **changes: object) -> Scene:
+    base = preset("video-1080p", screen).scaled(0.5, 0.5, keep_readout=True)
     pose = replace(base.pose, fill=0.86, roll_deg=0.5)
     scene = replace(base, picture="coffee", pose=pose, shake_px=0.0, hand_px=hand_px, n_frames=n_frames)
     return replace(scene, **changes)  # type: ignore[arg-type]
@@ -62,6 +66,29 @@ def received(clip: Clip, frames: tuple[Frame, ...] | None = None, **changes: obj
 
 def surely_wrong(results: list[FrameResult]) -> int:
     return sum(p.bit_errors != 0 for r in results for c in r.columns for p in c.packets if p.confidence >= 0.99)
+
+
+def at_rate(rate_hz: float, screen: str, n_frames: int) -> Take:
+    """A clip of any frame rate; a readout takes most of the time from frame to frame, or what the sensor needs."""
+    scene = scene_in_hand(2.0, n_frames, screen, frame_rate_hz=rate_hz)
+    sensor = scene.sensor
+    readout_s = min(0.92 / rate_hz, sensor.line_delay_s * sensor.height)
+    return prepare(replace(scene, sensor=replace(sensor, line_delay_s=readout_s / sensor.height)), SEED)
+
+
+def shown_as_a_whole(take: Take, margin: float) -> set[int]:
+    """Bursts all of whose payload frames show together, `margin` slots at either end of the screen not counted."""
+    screen = take.scene.screen
+    rate = take.scene.sensor.line_delay_s * screen.slot_rate_hz
+    shown: dict[int, set[int]] = {}
+    for frame in take.truth("clip")["frames"]:
+        heights = np.array(frame["corners_sensor_px"])[:, 1]
+        first, last = heights[:2].max() * rate + margin, heights[2:].min() * rate - margin
+        for slot in np.arange(
+            np.ceil(frame["start_slot"] + first), frame["start_slot"] + last, dtype=np.int64
+        ).tolist():
+            shown.setdefault(slot // (screen.packet_slots * screen.repeats), set()).add(slot % screen.packet_slots)
+    return {burst for burst, slots in shown.items() if slots >= set(range(PREAMBLE_SLOTS, screen.packet_slots))}
 
 
 @pytest.fixture(scope="module")
@@ -201,6 +228,24 @@ def test_a_variable_frame_rate() -> None:
     right = [p for r in results for c in r.columns for p in c.packets if p.bit_errors == 0]
     assert len(right) >= 0.5 * 20 * len(frames)
     assert surely_wrong(results) == 0
+
+
+@pytest.mark.parametrize(("rate_hz", "n_frames", "share"), [(24, 6, 0.9), (120, 10, 0.9), (240, 26, 0.75)])
+def test_files_of_24_to_240_frames_a_second(rate_hz: int, n_frames: int, share: float, tmp_path: Path) -> None:
+    """Of quick ones no frame shows a whole packet: the frames of a burst do together, once the picture
+    is known."""
+    take = at_rate(rate_hz, "paper-17k3", n_frames)
+    path, sensor = tmp_path / "clip.mp4", take.scene.sensor
+    bit_rate = int(0.6 * sensor.width * sensor.height * rate_hz)
+    write_video((take.frame(k).rgb for k in range(n_frames)), path, "h264", rate_hz, bit_rate)
+    whole = len(shown_as_a_whole(take, margin=2.0)) * 20
+    assert whole >= 20
+    for options in (options_of(take), ReceiverOptions()):
+        scorer = Scorer(truth_of(take))
+        results = [scorer.add(result) for result in receive(open_source(path), options)]
+        right = {(c.column, p.burst) for r in results for c in r.columns for p in c.packets if p.bit_errors == 0}
+        assert surely_wrong(results) == 0
+        assert len(right) >= share * whole
 
 
 def test_a_stabilised_clip_of_a_named_camera_says_so() -> None:

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,8 @@ _RETIMED = (
 _MOST_UNKNOWN = 3
 #: Frames without a screen after which one of so many is searched for columns, which takes most of a search.
 _THOROUGH = 8
+#: How much longer than from one frame to the next a readout may seem to take: time stamps are rounded.
+_READOUT_SLACK = 1.1
 #: Frames that find their clock together where each shows little.
 _TOGETHER = 8
 #: Copies between two frames that have none in common.
@@ -225,11 +228,32 @@ class _Clip:
         frames, self._first = self._first or [], None
         if self._outline is not None and self._found is not None:
             index, located = self._found
-            self._found = index, _moved_to(located, self._outline.corners, self._options)
-            context = self._found[1].context
+            located = self._read_in_time(_moved_to(located, self._outline.corners, self._options), frames)
+            self._found = index, located
+            context = located.context
             if self._little and len(frames) > 1 and isinstance(context, FrameContext):
                 self._start = agree(frames, context)
         return [result for frame in frames for result in self._take(frame)]
+
+    def _read_in_time(self, located: Located, frames: Sequence[Frame]) -> Located:
+        """The same with another camera, where the one estimated would need more than a frame's time to read it.
+
+        An estimate tells rows per slot; with a slower screen than the right one the camera seems slower, too.
+        """
+        context, period_s = located.context, _shortest_period_s(frames)
+        if not isinstance(context, FrameContext) or context.camera.blind_estimate is None or period_s is None:
+            return located
+        too_long = context.camera.line_delay_s * context.frame.height / (period_s * _READOUT_SLACK)
+        if too_long <= 1:
+            return located
+        slowest_hz = too_long * max(screen.slot_rate_hz for screen in context.screens)
+        screens = tuple(screen for screen in self._options.screens if screen.slot_rate_hz >= slowest_hz)
+        options = replace(self._options, screens=screens)
+        found = likely_camera(context.frame, context.corners, options, context.timer) if screens else None
+        if not isinstance(found, FrameContext):
+            return located
+        self._options, self._little = options, shows_little(found)
+        return replace(located, context=found)
 
     def _take(self, frame: Frame) -> list[FrameResult]:
         timer = Timer()
@@ -680,7 +704,8 @@ class _Clip:
         self._bursts.detect_stale(*held)
         known = [self._bursts.lit(waiting) for waiting in held]
         doubtful = [len(held) <= _HELD or self._bursts.doubts(waiting)[0] > 0 for waiting in held]
-        self._scene.measure_again([w.view for w in held if w.view is not None], known, doubtful)
+        numbers = [w.numbers for w in held if w.numbers is not None]
+        self._scene.measure_again([w.view for w in held if w.view is not None], known, numbers, doubtful)
 
     def _detect_again(self) -> None:
         """The bursts of all frames that wait, each once: in the last frame that shows it."""
@@ -746,6 +771,16 @@ class _Clip:
 def _shape(view: View) -> tuple[int, int]:
     """Columns and slots of a packet: where these differ, another screen is seen."""
     return view.acquisition.screen.columns, view.bursts.clock.packet_slots
+
+
+def _shortest_period_s(frames: Sequence[Frame]) -> float | None:
+    """The shortest time from one frame to the next, by their time stamps; None where these do not tell."""
+    passed = [
+        after.time_s - before.time_s
+        for before, after in pairwise(frames)
+        if not after.nominal_time and after.time_s > before.time_s
+    ]
+    return min(passed, default=None)
 
 
 def _moved_to(located: Located, corners: FloatArray, options: ReceiverOptions) -> Located:

@@ -25,7 +25,7 @@ def bursts_of(closed: Sequence[ClosedBurst], first: int, view: View) -> list[con
             posteriors=burst.posteriors,
             n_observed=burst.n_observed,
             frames=burst.frames,
-            confidence_features=_confidence_features(burst, n_strips),
+            confidence_features=None if burst.tracked else _confidence_features(burst, n_strips),
             against=_against(burst),
         )
         for burst in closed

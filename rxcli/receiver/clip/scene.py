@@ -22,8 +22,9 @@ from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntAr
 
 #: Strips of a column, at most: more tell no more of a picture that is known, and take time.
 _STRIPS = 4
-#: Frames beyond which each one's share of what is known of the picture does not matter.
-_MANY_VIEWS = 12
+#: Frames from which a frame is measured without what others that show its bursts have taught of the picture there; of
+#: fewer, too little would be left.
+_ENOUGH_VIEWS = 6
 #: Movement that is none: pixels, or standard deviations of what was found.
 _STILL_PX, _STILL_SDS = 0.3, 2.5
 #: Where texture tells little: how well rest is known in screen sizes, and standard deviations of what may be rest;
@@ -106,7 +107,7 @@ class TrackedScreen:
         pose = before.pose if before is not None and corners is before.corners else None
         if pose is None or pose.map.inside.shape[0] != n_columns:
             pose = Pose(corners, _map(context.frame, corners, camera, acquisition))
-        return cls(context.frame, replace(pose, placement=None), acquisition, camera.lens, black_level, named)
+        return cls(context.frame, Pose(pose.corners, pose.map), acquisition, camera.lens, black_level, named)
 
     def _new_picture(self, black_level: float | Float32Array) -> known_picture.KnownPicture:
         acquisition, strips = self._begun_with[0], self._first_pose.map
@@ -230,7 +231,7 @@ class TrackedScreen:
         outlines = replace(outlines, inside=_less_ends(outlines.inside, _LEAST_END + _END_SDS * sd))
         strips = tracked.moved_map(self._first_pose.map, outlines)
         placement = _placement(self._first_pose, corners, strips, self._lens)
-        self.pose = Pose(corners, strips, placement)
+        self.pose = Pose(corners, strips, placement, self._first_pose.map)
 
     # -- a frame ------------------------------------------------------------------------------------------------
 
@@ -282,6 +283,7 @@ class TrackedScreen:
         clock: Clock,
         isi_memory: int,
         thorough: bool,
+        known: Float32Array | None = None,
     ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, FloatArray] | None:
         """Clock, response and noise put right by a first decision slot by slot; then positions and metrics.
 
@@ -291,7 +293,7 @@ class TrackedScreen:
         positions, exposure_slots = known_picture.row_positions(rows, clock), clock.exposure_slots
         if known_picture.header_contrast(flat, positions, clock) < _LEAST_HEADER:
             return None
-        lit = known_picture.first_decision(flat, positions, clock)
+        lit = known_picture.first_decision(flat, positions, clock) if known is None else known
         slots = known_picture.exposures(lit, positions, exposure_slots)
         fit = known_picture.fit_response(flat, slots)
         if self._n_updates < _FEW_UPDATES or (thorough and fit.response.centre < _FADED):
@@ -306,7 +308,7 @@ class TrackedScreen:
             positions = known_picture.row_positions(rows, clock)
             fit = known_picture.fit_response(flat, known_picture.exposures(lit, positions, exposure_slots))
         expected = fit.response.expected(lit, positions, exposure_slots)
-        flat, ratio = picture.judge(flat, expected, _NOISE_SHARE)
+        flat, ratio = picture.judge(flat, expected, _NOISE_SHARE, clock.rows_per_slot)
         if ratio > _MISFIT:
             return None
         metrics = known_picture.pattern_metrics(flat, positions, clock, isi_memory, fit.response, expected, lit)
@@ -357,12 +359,10 @@ class TrackedScreen:
             self._n_updates += 1
         self.last = view
 
-    def learn(
-        self, view: View, lit: Float32Array, keep: float = known_picture.MEMORY
-    ) -> tuple[Float32Array, Float32Array] | None:
+    def learn(self, view: View, lit: Float32Array, keep: float = known_picture.MEMORY) -> known_picture.Look | None:
         """Take a frame into the picture; returns what it showed.
 
-        See `known_picture.KnownPicture.learn` for `keep`, and for what is returned: slots and trust.
+        See `known_picture.KnownPicture.learn` for `keep`.
         """
         if view.light is None or view.pose is None:
             return None
@@ -371,28 +371,38 @@ class TrackedScreen:
         positions = known_picture.row_positions(view.pose.rows, clock)
         slots = known_picture.exposed(lit, positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
-        self._picture.learn(view.light, slots, trust, keep, view.pose.placement)
-        return slots, trust
+        look = known_picture.Look(view.light, slots, trust, view.pose.placement)
+        self._picture.learn(look, keep)
+        return look
 
     def can_measure_again(self, view: View) -> bool:
         """Whether a frame's strips are those of this screen."""
-        return view.light is not None and view.pose is not None and view.pose.map.light is self._first_pose.map.light
+        return view.light is not None and view.pose is not None and view.pose.home is self._first_pose.map
 
-    def measure_again(self, views: Sequence[View], known: Sequence[Float32Array], doubtful: Sequence[bool]) -> None:
-        """Learn the picture anew from frames, and measure those in doubt by what the others say of it.
+    def measure_again(
+        self,
+        views: Sequence[View],
+        known: Sequence[Float32Array],
+        numbers: Sequence[IntArray],
+        doubtful: Sequence[bool],
+    ) -> None:
+        """Learn the picture anew from frames, and measure those in doubt by what others say of it, where these are many
+        enough by what other bursts say of it.
 
         Args:
             views: the frames.
             known: (C, N) of each, probability that each slot is lit.
+            numbers: (B,) of each, the numbers of its bursts.
             doubtful: of each, whether it is to be measured.
         """
         self._n_updates = 0
         self._picture = self._new_picture(self._dark_light(views))
-        updates = [self.learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
-        alone = len(views) <= _MANY_VIEWS
-        for view, update, needed in zip(views, updates, doubtful, strict=True):
+        looks = [self.learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
+        for view, look, lit, shown, needed in zip(views, looks, known, numbers, doubtful, strict=True):
             if needed:
-                self._measure_again(view, update if alone else None)
+                others = zip(looks, views, numbers, strict=True) if len(views) >= _ENOUGH_VIEWS else ()
+                own = (_of_bursts(*each, shown) for each in others if each[1] is not view)
+                self._measure_again(view, [each for each in (look, *own) if each is not None], lit)
 
     def _dark_light(self, views: Sequence[View]) -> Float32Array:
         """(C, S) light of the strips where nothing is lit."""
@@ -405,22 +415,32 @@ class TrackedScreen:
                 inside.append(view.pose.map.inside)
         return known_picture.dark_light(lights, dark, inside, self._begun_with[1])
 
-    def _measure_again(self, view: View, update: tuple[Float32Array, Float32Array] | None) -> None:
-        """Measure a frame by the picture, less what the frame itself has shown of it where that is given."""
+    def _measure_again(self, view: View, own: Sequence[known_picture.Look], known: Float32Array) -> None:
+        """Measure a frame by the picture, less what the frame's `own` bursts have shown of it."""
         assert view.light is not None
         assert view.pose is not None
-        placement = view.pose.placement
-        picture = self._picture if update is None else self._picture.without(view.light, *update, placement)
-        picture = picture.placed(placement)
+        picture = self._picture.without(own).placed(view.pose.placement)
         flat = picture.solve(view.light)
         refined = self._refined(
-            picture, view.pose.rows, view.light, flat, view.bursts.clock, view.isi_memory, thorough=True
+            picture, view.pose.rows, view.light, flat, view.bursts.clock, view.isi_memory, thorough=True, known=known
         )
         if refined is not None:
             burst = view.bursts.clock.burst
             view.flat, clock, _, metrics = refined
             view.snr = _snr(view.flat, clock)
             view.bursts = replace(view.bursts, clock=replace(clock, burst=burst), metrics=metrics, tracked=True)
+
+
+def _of_bursts(
+    look: known_picture.Look | None, view: View, numbers: IntArray, bursts: IntArray
+) -> known_picture.Look | None:
+    """What a frame that shows the bursts `numbers` taught where it shows some of the `bursts`; None where none."""
+    if look is None or view.pose is None or not np.isin(numbers, bursts).any():
+        return None
+    clock = view.bursts.clock
+    slots = np.clip((view.pose.rows - clock.row0) / clock.rows_per_slot, 0, clock.n_slots - 1)
+    copies = (slots.astype(np.int64) + clock.first_slot) // clock.packet_slots
+    return replace(look, rows=np.isin(numbers[clock.burst[copies]], bursts))
 
 
 def _less_ends(inside: BoolArray, rows: float) -> BoolArray:

@@ -21,6 +21,13 @@ class Pose:
     map: tracked.StripMap
     #: Where the known picture lies on the frame's rows; None for where it was when its screen was found.
     placement: Placement | None = None
+    #: The strips on whose rows that picture is known; None for these.
+    known_on: tracked.StripMap | None = None
+
+    @property
+    def home(self) -> tracked.StripMap:
+        """The strips on whose rows the picture is known that lies here."""
+        return self.known_on or self.map
 
     @property
     def rows(self) -> FloatArray:

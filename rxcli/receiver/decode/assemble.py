@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.protocol import PREAMBLE_SLOTS, bits_to_hex, indices_to_bits
+from rxcli.protocol import PREAMBLE_SLOTS, bits_per_symbol, indices_to_bits
 from rxcli.receiver.decode.confidence import BurstInClip, Doubts, clip_doubts, confidence_features, doubts_of
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import (
@@ -65,6 +65,7 @@ def column_results(
         for column, echo in enumerate(echoing)
     ]
     held_back = np.where(whole & doubts.reported(0.0) & ~reported, doubts.confidence, 0.0).max(axis=0)
+    packets = [_Packets.of(burst, clock, posteriors, shown, doubts) for burst, shown in enumerate(n_observed)]
     return tuple(
         _column_result(
             column,
@@ -72,14 +73,18 @@ def column_results(
             posteriors,
             db,
             n_observed[:, column],
-            reported[:, column],
-            doubts,
+            () if against[column] else _of_column(packets, reported, column),
             against[column],
             _held_back(held_back[column], min_confidence),
             bool(was_denoised[column]),
         )
         for column, db in enumerate(snr_db)
     )
+
+
+def _of_column(packets: Sequence[_Packets], reported: BoolArray, column: int) -> tuple[PacketResult, ...]:
+    """The packets of a column that are reported, (B, C)."""
+    return tuple(one.result(column) for one, shown in zip(packets, reported[:, column], strict=True) if shown)
 
 
 def _why_headerless(samples: SlotSamples, column: int) -> str:
@@ -110,28 +115,29 @@ def clip_results(
     """
     snr_db = snr_db_of_columns(snr)
     doubts = [clip_doubts(burst) for burst in bursts]
+    whole = [complete(burst.n_observed[None])[0] for burst in bursts]
     reported = [
-        complete(burst.n_observed[None])[0] & ~echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]
-        for burst, doubt in zip(bursts, doubts, strict=True)
+        (seen & ~echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]).tolist()
+        for burst, seen, doubt in zip(bursts, whole, doubts, strict=True)
     ]
-    surest = [
-        complete(burst.n_observed[None])[0] & (doubt.ber_hat[0] <= SETTINGS.most_ber_hat)
-        for burst, doubt in zip(bursts, doubts, strict=True)
-    ]
+    held_back = np.zeros(len(snr_db))
+    for seen, doubt in zip(whole, doubts, strict=True):
+        surest = np.where(seen & (doubt.ber_hat[0] <= SETTINGS.most_ber_hat), doubt.confidence[0], 0.0)
+        held_back = np.maximum(held_back, surest)
     own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
+    of_bursts = [
+        _Packets.of(0, clock, burst.posteriors, burst.n_observed, doubt)
+        for burst, clock, doubt in zip(bursts, own, doubts, strict=True)
+    ]
     out = []
-    for column in range(snr.shape[0]):
+    for column, db in enumerate(snr_db):
         packets = tuple(
-            _packet(0, column, clock, burst.posteriors, burst.n_observed[column], doubt, burst.number, burst.frames)
-            for burst, clock, doubt, shown in zip(bursts, own, doubts, reported, strict=True)
+            each.result(column, burst.number, burst.frames)
+            for burst, each, shown in zip(bursts, of_bursts, reported, strict=True)
             if shown[column]
         )
-        held_back = max(
-            (float(doubt.confidence[0, column]) for doubt, sure in zip(doubts, surest, strict=True) if sure[column]),
-            default=0.0,
-        )
-        result = _clip_column(column, clock, bursts, float(going_on[column]), snr_db[column], packets)
-        if not packets and result.status != "ok" and (message := _held_back(held_back, min_confidence)):
+        result = _clip_column(column, clock, bursts, float(going_on[column]), db, packets)
+        if not packets and result.status != "ok" and (message := _held_back(float(held_back[column]), min_confidence)):
             result = replace(result, message=message)
         out.append(result)
     return tuple(out)
@@ -236,14 +242,11 @@ def _column_result(
     posteriors: BurstPosteriors,
     snr_db: float | None,
     n_observed: IntArray,
-    reported: BoolArray,
-    doubts: Doubts,
+    packets: tuple[PacketResult, ...],
     against: str | None,
     held_back: str | None,
     denoised: bool,
 ) -> ColumnResult:
-    bursts = () if against else np.flatnonzero(reported)
-    packets = tuple(_packet(int(burst), column, clock, posteriors, n_observed[burst], doubts) for burst in bursts)
     sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(SETTINGS.sure_weight)
     status = _column_status(packets, snr_db)
     return ColumnResult(
@@ -319,29 +322,60 @@ def _why_none(status: ColumnStatus, snr_db: float | None) -> str:
     return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
 
 
-def _packet(
-    burst: int,
-    column: int,
-    clock: Clock,
-    posteriors: BurstPosteriors,
-    n_observed: IntArray,
-    doubts: Doubts,
-    number: int | None = None,
-    frames: tuple[int, ...] | None = None,
-) -> PacketResult:
-    """The packet of one burst; `n_observed` is (packet,)."""
-    bits = indices_to_bits(posteriors.index[burst, column], int(posteriors.w[column]))
-    return PacketResult(
-        first_row=_header_row(int(np.flatnonzero(clock.burst == burst)[0]), column, clock),
-        copies=float(n_observed.sum() / clock.packet_slots),
-        payload_bits=int(bits.size),
-        payload=bits_to_hex(bits),
-        confidence=float(doubts.confidence[burst, column]),
-        ber_hat=float(doubts.ber_hat[burst, column]),
-        burst=number,
-        frames=frames,
-        confidence_features=tuple(doubts.confidence_features[burst, column].tolist()),
-    )
+@dataclass(frozen=True, slots=True)
+class _Packets:
+    """The packets of one burst, of all columns at once: what each costs alone adds up over a clip."""
+
+    payload: list[str]
+    n_bits: list[int]
+    copies: list[float]
+    first_row: list[float]
+    confidence: list[float]
+    ber_hat: list[float]
+    features: list[list[float]]
+
+    @classmethod
+    def of(
+        cls, burst: int, clock: Clock, posteriors: BurstPosteriors, n_observed: IntArray, doubts: Doubts
+    ) -> _Packets:
+        """Of a burst; `n_observed` is (C, packet)."""
+        bits = [bits_per_symbol(w) for w in posteriors.w.tolist()]
+        copy = int((clock.burst == burst).argmax())
+        n_symbols = posteriors.index.shape[2]
+        return cls(
+            payload=_payloads(posteriors.index[burst], posteriors.w),
+            n_bits=[k * n_symbols for k in bits],
+            copies=(n_observed.sum(axis=1) / clock.packet_slots).tolist(),
+            first_row=_header_rows(copy, clock).tolist(),
+            confidence=doubts.confidence[burst].tolist(),
+            ber_hat=doubts.ber_hat[burst].tolist(),
+            features=doubts.confidence_features[burst].tolist(),
+        )
+
+    def result(self, column: int, number: int | None = None, frames: tuple[int, ...] | None = None) -> PacketResult:
+        """The packet of a column; in clips with the number of its burst and the frames that show it."""
+        return PacketResult(
+            first_row=self.first_row[column],
+            copies=self.copies[column],
+            payload_bits=self.n_bits[column],
+            payload=self.payload[column],
+            confidence=self.confidence[column],
+            ber_hat=self.ber_hat[column],
+            burst=number,
+            frames=frames,
+            confidence_features=tuple(self.features[column]),
+        )
+
+
+def _payloads(index: IntArray, weights: IntArray) -> list[str]:
+    """Hex of the payload of every column, whose words (C, N) are of the weights (C,)."""
+    payload = [""] * len(index)
+    for w in set(weights.tolist()):
+        columns = np.flatnonzero(weights == w)
+        bits = indices_to_bits(index[columns].ravel(), w).reshape(columns.size, -1)
+        for column, packed in zip(columns.tolist(), np.packbits(bits, axis=1), strict=True):
+            payload[column] = packed.tobytes().hex()
+    return payload
 
 
 def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Array:
@@ -375,10 +409,10 @@ def _doubted(column: ColumnResult, certainty: float, min_confidence: float) -> C
     return replace(column, packets=kept, status=status)
 
 
-def _header_row(copy: int, column: int, clock: Clock) -> float:
-    """Sensor row whose exposure starts with the header of `copy`."""
-    slots = copy * clock.packet_slots - clock.first_slot + clock.delay_slots[column] + clock.exposure_slots / 2
-    return float(clock.row0 + slots * clock.rows_per_slot)
+def _header_rows(copy: int, clock: Clock) -> FloatArray:
+    """(C,) sensor row whose exposure starts with the header of `copy`."""
+    slots = copy * clock.packet_slots - clock.first_slot + clock.delay_slots + clock.exposure_slots / 2
+    return np.asarray(clock.row0 + slots * clock.rows_per_slot)
 
 
 def in_stored_rows(column: ColumnResult, height: int) -> ColumnResult:

@@ -66,11 +66,11 @@ class BurstInClip:
     #: (C, packet) how often each slot was seen, over all frames.
     n_observed: IntArray
     frames: tuple[int, ...]
-    #: (C, 8) see `confidence_features`.
-    confidence_features: FloatArray
+    #: (C, 8) see `confidence_features`; None of tracked frames.
+    confidence_features: FloatArray | None
     #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
     #: received like photographs.
-    against: Float32Array | None = None
+    against: Float32Array | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +89,13 @@ class Doubts:
 
 
 def doubts_of(posteriors: BurstPosteriors, confidence_features: FloatArray) -> Doubts:
+    return Doubts(confidence(confidence_features), _share_unsure(posteriors), confidence_features)
+
+
+def _share_unsure(posteriors: BurstPosteriors) -> FloatArray:
+    """(B, C) share of the bits that is wrong if each is as sure as it seems."""
     unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of few bits are filled up with NaN
-    return Doubts(confidence(confidence_features), np.nanmean(unsure, axis=(2, 3)), confidence_features)
+    return np.asarray(np.nanmean(unsure, axis=(2, 3)))
 
 
 def clip_doubts(burst: BurstInClip) -> Doubts:
@@ -99,13 +104,12 @@ def clip_doubts(burst: BurstInClip) -> Doubts:
     Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
     What slots say against the codeword that was decided shows it.
     """
-    doubts = doubts_of(burst.posteriors, burst.confidence_features[None])
-    if burst.against is None:
-        return doubts
+    if burst.confidence_features is not None:
+        return doubts_of(burst.posteriors, burst.confidence_features[None])
     features = clip_features(burst)[None]
     log_odds = clip_log_odds(burst)
     n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
-    ber_hat = np.maximum(doubts.ber_hat, wrong_share(log_odds, n_bits))
+    ber_hat = np.maximum(_share_unsure(burst.posteriors), wrong_share(log_odds, n_bits))
     return Doubts(_probability(log_odds), ber_hat, features)
 
 
@@ -118,7 +122,7 @@ def wrong_share(log_odds: FloatArray, n_bits: IntArray) -> FloatArray:
 
 def clip_log_odds(burst: BurstInClip) -> FloatArray:
     """(1, C) calibrated log-odds of the packets of a burst of a clip being error-free."""
-    if burst.against is None:
+    if burst.confidence_features is not None:
         return confidence_log_odds(burst.confidence_features[None])
     return np.asarray(clip_features(burst)[None] @ np.array(confidence_model().clips.weights))
 

@@ -12,13 +12,14 @@ it, `header` where headers show, and `metrics` makes of it all what detection ne
 from rxcli.receiver.channel.known_picture.exposure import exposed, row_positions, trusted
 from rxcli.receiver.channel.known_picture.header import dark_light, first_decision, header_contrast, header_dark
 from rxcli.receiver.channel.known_picture.metrics import pattern_metrics
-from rxcli.receiver.channel.known_picture.picture import MEMORY, ColumnLight, KnownPicture, Placement
+from rxcli.receiver.channel.known_picture.picture import MEMORY, ColumnLight, KnownPicture, Look, Placement
 from rxcli.receiver.channel.known_picture.response import equalized, exposures, fit_response
 
 __all__ = [
     "MEMORY",
     "ColumnLight",
     "KnownPicture",
+    "Look",
     "Placement",
     "dark_light",
     "equalized",

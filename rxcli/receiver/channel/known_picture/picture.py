@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -36,6 +37,9 @@ _TEMPER = 0.5
 _COMMON_ERROR = 0.04
 #: Slots around, in each direction, over which a strip's error is averaged, and those of them left out as its own.
 _ERROR_SLOTS, _OWN_SLOTS = 20.0, 1.3
+#: Precision of a slot's light from which its error tells how alike rows err; slots of all columns that count beside a
+#: column's own; and the least squared error against rows that err each for itself.
+_TOLD, _LIKE_OTHERS, _LEAST_ALIKE = 0.5, 20.0, 0.9
 #: A column's light further than this beyond dark or lit is not to be trusted.
 _BEYOND = 0.15
 
@@ -74,6 +78,21 @@ class Placement:
     frame_row: Float32Array
     #: (C, S, R) bool: the strip is on the screen there.
     inside: BoolArray
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What a frame taught of the picture."""
+
+    #: (C, S, R) light of the strips.
+    light: Float32Array
+    #: (C, R) exposure-averaged slots, 0..1, and how far each is trusted.
+    slots: Float32Array
+    trust: Float32Array
+    #: Where the frame shows the picture; None for where the first one did.
+    placement: Placement | None = None
+    #: (R,) the rows that are meant; None for all.
+    rows: BoolArray | None = None
 
 
 class KnownPicture:
@@ -122,59 +141,38 @@ class KnownPicture:
         other._system = other._of_one = None
         return other
 
-    def learn(
-        self,
-        light: Float32Array,
-        slots: Float32Array,
-        trust: Float32Array,
-        keep: float = MEMORY,
-        placement: Placement | None = None,
-    ) -> None:
-        """Take a frame whose slots are known into the picture.
-
-        Args:
-            light: (C, S, R).
-            slots: (C, R) exposure-averaged slots, 0..1.
-            trust: (C, R) 0..1.
-            keep: share of their weight that the frames before keep.
-            placement: where the frame shows the picture; None for where the first one did.
-        """
-        lit, observed = self._update_of(light, slots, trust, placement)
+    def learn(self, look: Look, keep: float = MEMORY) -> None:
+        """Take a frame whose slots are known into the picture; those before keep the share `keep` of their weight."""
+        lit, observed = self._update_of(look)
         self._light = self._light * np.float32(keep) + lit
         self._observed = self._observed * np.float32(keep) + observed
         self._system = self._made = None
 
-    def without(
-        self, light: Float32Array, slots: Float32Array, trust: Float32Array, placement: Placement | None = None
-    ) -> KnownPicture:
-        """What the other frames say alone, for a frame that was learned last or with nothing forgotten since.
+    def without(self, looks: Sequence[Look]) -> KnownPicture:
+        """What is known but for some looks, that were learned with nothing forgotten since.
 
         A picture learned from a frame's own light bears out whatever was decided there, wrong or right.
-
-        Args:
-            light: (C, S, R) as it was learned.
-            slots: (C, R) likewise.
-            trust: (C, R) likewise.
-            placement: likewise.
         """
-        lit, observed = self._update_of(light, slots, trust, placement)
         other = copy(self)
-        other._light, other._observed = self._light - lit, np.maximum(self._observed - observed, 0)
+        for look in looks:
+            lit, observed = self._update_of(look)
+            other._light, other._observed = other._light - lit, np.maximum(other._observed - observed, 0)
         other._system, other._made, other._excess = None, None, self._excess.copy()
         return other
 
-    def _update_of(
-        self, light: Float32Array, slots: Float32Array, trust: Float32Array, placement: Placement | None
-    ) -> tuple[Float32Array, Float32Array]:
+    def _update_of(self, look: Look) -> tuple[Float32Array, Float32Array]:
         """Light and light expected of a picture of 1, each weighted with the latter, on the rows of the picture."""
-        expected = self._crosstalk @ _with_neighbours(slots)
-        doubt = self._crosstalk @ (1 - _with_neighbours(trust, 1.0))
+        placement = look.placement
+        expected = self._crosstalk @ _with_neighbours(look.slots)
+        doubt = self._crosstalk @ (1 - _with_neighbours(look.trust, 1.0))
         inside = self._inside if placement is None else placement.inside
         # Light over what little was expected is no picture: more of it than that may be another slot's.
         power = expected * expected
         told = power / (power + np.float32(_UNTOLD) + np.float32(_UNSURE) * doubt)
         weighted = expected * (told * told) * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * inside
-        lit, observed = weighted * (light - self._black_level), weighted * expected
+        if look.rows is not None:
+            weighted *= look.rows
+        lit, observed = weighted * (look.light - self._black_level), weighted * expected
         if placement is None:
             return lit, observed
         row = placement.frame_row
@@ -228,13 +226,16 @@ class KnownPicture:
         value = shrunk + (shrunk - np.float32(0.5)) * (np.float32(PRIOR) / np.maximum(precision, np.float32(1e-3)))
         return ColumnLight(value, self._tempered(value, precision), shrunk)
 
-    def judge(self, observed: ColumnLight, expected: Float32Array, share: float) -> tuple[ColumnLight, float]:
+    def judge(
+        self, observed: ColumnLight, expected: Float32Array, share: float, rows_per_slot: float
+    ) -> tuple[ColumnLight, float]:
         """Compare columns with what was decided; they are trusted accordingly, now and, in part, from now on.
 
         Args:
             seen: as `solve` gave it.
             expected: (C, R) what the decided slots give.
             share: weight of this frame against those before, 0..1.
+            rows_per_slot: rows per slot.
 
         Returns:
             The light with its precision put right; and the median over the columns of the squared error over the
@@ -244,8 +245,9 @@ class KnownPicture:
         ratio = error.sum(axis=1) / np.maximum((observed.precision > 0).sum(axis=1), 1) / np.float32(_TEMPER)
         now = np.clip(self._excess * ratio, 0.25, 100.0)
         self._excess += np.float32(share) * (now - self._excess)
-        better = ColumnLight(observed.value, observed.precision / np.maximum(ratio, 0.5)[:, None], observed.shrunk)
-        return better, float(np.median(ratio))
+        precision = observed.precision / np.maximum(ratio, 0.5)[:, None]
+        precision /= _alike(observed.value - expected, precision, rows_per_slot)[:, None]
+        return ColumnLight(observed.value, precision, observed.shrunk), float(np.median(ratio))
 
     def _tempered(self, value: Float32Array, precision: Float32Array) -> Float32Array:
         variance = self._excess[:, None] / np.maximum(precision, np.float32(1e-6)) + np.float32(_COMMON_ERROR**2)
@@ -299,6 +301,25 @@ class KnownPicture:
         beside[:-1] = power[:-1, 3] + power[1:, 4]
         beyond[:-2] = power[1:-1, 5]
         return _System(gain, *_factored(middle, beside, beyond))
+
+
+def _alike(error: Float32Array, precision: Float32Array, rows_per_slot: float) -> Float32Array:
+    """(C,) squared error of the sums over a slot's rows, over what is foreseen of rows that err each for itself.
+
+    Sensor noise does; what an encoder leaves out of a picture lies on all rows of a slot alike. Columns of few slots
+    that tell are taken to be as the others.
+    """
+    n = max(round(rows_per_slot), 1)
+    shape = len(error), error.shape[1] // n, n
+    weight = precision[:, : shape[1] * n].reshape(shape)
+    total = np.einsum("csr,csr->cs", weight, error[:, : shape[1] * n].reshape(shape))
+    foreseen = weight.sum(axis=2)
+    told = foreseen > _TOLD
+    squared = np.sum(np.square(total) / np.maximum(foreseen, _TOLD), axis=1, where=told)
+    count = told.sum(axis=1)
+    of_all = squared.sum() / max(int(count.sum()), 1)
+    alike = (squared + _LIKE_OTHERS * of_all) / (count + _LIKE_OTHERS)
+    return np.asarray(np.maximum(alike, _LEAST_ALIKE), np.float32)
 
 
 def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
