@@ -38,9 +38,8 @@ class ChannelSettings:
     around_slots: int = 3
     #: Variance of the mean of two adjacent samples against that of one: samples are interpolated between rows.
     pair_noise: float = 0.75
-    #: Most that a word may be less likely than the best, nats, and ridge of the slots' corrections that make it up.
+    #: Most that a word may be less likely than the best, nats.
     word_nats: float = 12.0
-    word_ridge: float = 0.05
 
     #: A row's own light is told by one strip in so many: strips of a column err alike.
     row_strips: int = 2

@@ -13,6 +13,9 @@ from rxcli.receiver.channel.model import ObservationModel
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
+#: Words that are alike make no singular system.
+_LEAST_NORM = 1e-3
+
 
 @dataclass(frozen=True, slots=True)
 class _Halves:
@@ -190,5 +193,5 @@ def _as_slots(score: FloatArray, words: NDArray[np.uint8], likely: NDArray[np.bo
     score = np.maximum(score, -SETTINGS.word_nats)
     wanted = (score[:, 1:] - score[:, :1]) * likely[:, 1:]
     apart = (words[:, 1:].astype(np.float64) - words[:, :1]) * likely[:, 1:, None]
-    across = apart @ apart.transpose(0, 2, 1) + SETTINGS.word_ridge * np.eye(apart.shape[1])
+    across = apart @ apart.transpose(0, 2, 1) + _LEAST_NORM * np.eye(apart.shape[1])
     return np.asarray((np.linalg.solve(across, wanted[..., None]).transpose(0, 2, 1) @ apart)[:, 0])
