@@ -197,6 +197,8 @@ class BurstPosteriors:
     w: NDArray[np.int64]
     #: (C, 9) float64: log evidence of w = 1..9, normalised to a sum of 1 in probability.
     w_log_prob: FloatArray
+    #: (C,) float64: log evidence of the column's slots being packets, over the weights that were considered.
+    log_evidence: FloatArray
     #: (B, C, 20 + 10 N) float32: probability that the slot is lit.
     lit: Float32Array
     #: (B, C, N) int64: most probable codebook index of every symbol.
@@ -224,8 +226,8 @@ class BurstPosteriors:
 
 
 def _columns_of(name: str, columns: IntArray) -> Any:
-    """Index of some columns in a field of the posteriors; bursts come first in all but the weights."""
-    return columns if name.startswith("w") else (slice(None), columns)
+    """Index of some columns in a field of the posteriors; bursts come first in all but the weights and the evidence."""
+    return columns if name in ("w", "w_log_prob", "log_evidence") else (slice(None), columns)
 
 
 FrameStatus = Literal["ok", "partial", "no_screen", "no_signal", "unreadable"]

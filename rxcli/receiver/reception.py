@@ -46,13 +46,6 @@ class Reception:
     skipped: dict[str, int] = field(default_factory=dict)
 
 
-def packet_evidence(metrics: FloatArray, clock: Clock) -> FloatArray:
-    """(C,) log evidence of columns, over all weights."""
-    bursts = channel.by_burst(metrics, clock)
-    candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
-    return np.asarray(np.logaddexp.reduce(detect.weight_log_evidence(bursts, candidates), axis=1))
-
-
 def packet_llr(reception: Reception) -> float:
     """Log-likelihood ratio of all columns' slots being packets, on the clock they were received with, over any slots.
 
@@ -64,14 +57,8 @@ def packet_llr(reception: Reception) -> float:
 
 def column_llr(reception: Reception) -> FloatArray:
     """(C,) log-likelihood ratio of each column's slots being packets, over slots that are anything."""
-    return _packets_over_any(reception, np.arange(reception.snr.shape[0]))
-
-
-def _packets_over_any(reception: Reception, columns: NDArray[np.int64]) -> FloatArray:
-    """Log-likelihood ratio of each column's slots being packets, over slots that are anything."""
-    metrics = reception.metrics[columns]
-    packets = packet_evidence(metrics, reception.clock) - np.log(len(WEIGHTS))
-    return np.asarray(packets - detect.free_log_evidence(metrics, reception.posteriors.w[columns] / SLOTS_PER_SYMBOL))
+    packets = reception.posteriors.log_evidence - np.log(len(WEIGHTS))
+    return np.asarray(packets - detect.free_log_evidence(reception.metrics, reception.posteriors.w / SLOTS_PER_SYMBOL))
 
 
 def headerless(reception: Reception) -> NDArray[np.bool_]:
@@ -84,7 +71,7 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
     if not out.all() and shows_steady_light(reception):
         return np.ones_like(out)
     if out.any():
-        out[out] = _packets_over_any(reception, np.flatnonzero(out)) < _PACKETS_WITHOUT_HEADER
+        out &= column_llr(reception) < _PACKETS_WITHOUT_HEADER
     return out
 
 

@@ -24,7 +24,6 @@ from rxcli.receiver.reception import (
     dark_columns,
     in_doubt,
     packet_confidence,
-    packet_evidence,
     packet_llr,
 )
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
@@ -230,7 +229,7 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
         if number not in tried:
             width = float(np.hypot(clock.exposure_slots, _MIXED_ROWS[number] / clock.rows_per_slot))
             reception = initial_pass(replace(acquisition, clock=replace(clock, exposure_slots=width)))
-            tried[number] = float(packet_evidence(reception.metrics, reception.clock).sum()), reception
+            tried[number] = float(reception.posteriors.log_evidence.sum()), reception
         return tried[number][0]
 
     best = min(_USUAL_MIX, len(_MIXED_ROWS) - 1)
@@ -394,10 +393,10 @@ def remove_row_noise(acquisition: Acquisition, reception: Reception, columns: ND
     if lost.size:
         there = columns[lost]
         fresh = channel.slot_likelihoods(light, reception.clock, model, lit, there)
-        better = packet_evidence(fresh.metrics, reception.clock) > packet_evidence(metrics[there], reception.clock)
+        again = _detect(fresh.metrics, reception.clock)
+        better = again.log_evidence > posteriors.log_evidence[lost]
         metrics[there[better]], snr[there[better]] = fresh.metrics[better], fresh.snr[better]
-        again = _detect(metrics[there], reception.clock)
-        posteriors = posteriors.with_columns(lost, again)
+        posteriors = posteriors.with_columns(lost[better], again.of_columns(np.flatnonzero(better)))
     cleaned = replace(
         reception, metrics=metrics, snr=snr, posteriors=reception.posteriors.with_columns(columns, posteriors)
     )

@@ -33,6 +33,8 @@ from rxcli.types import BurstPosteriors, Float32Array, FloatArray
 
 #: Likelihoods, over that of the likeliest state, are taken to be at least this, so that their logarithm exists.
 _LEAST = 1e-300
+#: The same for words, a logarithm: what float32 holds.
+_LEAST_WORD = -85.0
 #: Probabilities below this are not told apart.
 _TINY = 1e-30
 #: Metrics that are worked on together: more leave the processor's cache, fewer take more calls.
@@ -169,8 +171,8 @@ class _Trellis:
     common: FloatArray
     #: (N, n, states, beginnings) as in `_Payload`.
     meeting: FloatArray
-    #: (N, n, words) likelihood of each word's slots from the first that no state before it reaches.
-    rest: FloatArray
+    #: (N, n, words) float32: likelihood of each word's slots from the first that no state before it reaches.
+    rest: Float32Array
     #: (n, states) before the first symbol, and what the header that follows says of the last.
     start: FloatArray
     end: FloatArray
@@ -178,29 +180,33 @@ class _Trellis:
     def forward(self) -> tuple[list[FloatArray], FloatArray, FloatArray]:
         """Likelihood (n, words) of what leads to each word and of the word, by symbol, each scaled; that of the last
         states, and the logarithm of its scale."""
-        by_symbol, state, log_scale = [], self.start, np.zeros(len(self.start))
-        for meeting, rest in zip(self.meeting, self.rest, strict=True):
+        by_symbol, state = [], self.start
+        tops = np.empty((len(self.meeting), len(self.start)))
+        for meeting, rest, top in zip(self.meeting, self.rest, tops, strict=True):
             words = np.matmul(state[:, None], meeting)[:, 0].take(self.branches.first, axis=1)
             words *= rest
             by_symbol.append(words)
-            state, log_scale = _scaled(words @ self.branches.ends, log_scale)
-        return by_symbol, state, log_scale
+            state = words @ self.branches.ends
+            _scale(state, top)
+        return by_symbol, state, np.log(tops).sum(axis=0)
 
     def backward(self) -> FloatArray:
         """(N, n, states) likelihood of what follows each symbol, by the state that it ends in, scaled."""
-        out, state = [self.end], self.end
-        for meeting, rest in zip(self.meeting[:0:-1], self.rest[:0:-1], strict=True):
-            words = state.take(self.branches.last, axis=1)
-            words *= rest
-            state, _ = _scaled(np.matmul(meeting, (words @ self.branches.begins)[..., None])[..., 0])
-            out.append(state)
-        return np.stack(out[::-1])
+        out = np.empty((len(self.meeting), *self.end.shape))
+        out[-1], top = self.end, np.empty(len(self.end))
+        for number in range(len(out) - 1, 0, -1):
+            words = out[number].take(self.branches.last, axis=1)
+            words *= self.rest[number]
+            np.matmul(self.meeting[number], (words @ self.branches.begins)[..., None], out=out[number - 1, ..., None])
+            _scale(out[number - 1], top)
+        return out
 
 
-def _scaled(state: FloatArray, log_scale: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
-    """States (n, S), the likeliest being 1; and the logarithm of what was taken off added to that of before."""
-    top = np.maximum(state.max(axis=1), _LEAST)
-    return state / top[:, None], np.asarray(log_scale + np.log(top))
+def _scale(state: FloatArray, top: FloatArray) -> None:
+    """Divide states (n, S) by the likeliest, which is written to `top` (n,)."""
+    np.max(state, axis=1, out=top)
+    np.maximum(top, _LEAST, out=top)
+    state /= top[:, None]
 
 
 def _trellis(payload: _Payload, w: int) -> _Trellis:
@@ -210,7 +216,11 @@ def _trellis(payload: _Payload, w: int) -> _Trellis:
     n, length, n_patterns = metrics.shape
     known = metrics[:, np.arange(isi_memory, PREAMBLE_SLOTS), branches.preamble].sum(axis=1)
     slots = metrics[:, PREAMBLE_SLOTS : length - isi_memory].reshape(n * n_symbols, -1)
-    rest, top = _over_likeliest(slots[:, isi_memory * n_patterns :] @ branches.features)
+    of_words = slots[:, isi_memory * n_patterns :] @ branches.features
+    top = of_words.max(axis=1)
+    of_words -= top[:, None]
+    # Words add up to one: seven digits are enough, and a fifth of the time.
+    rest = np.exp(np.maximum(of_words, _LEAST_WORD).astype(np.float32))
     end, top_end = _over_likeliest(metrics[:, length - isi_memory + np.arange(isi_memory), branches.tail].sum(axis=2))
     start = np.zeros((n, 1 << isi_memory))
     start[:, branches.first_state] = 1.0
@@ -234,17 +244,23 @@ def _over_likeliest(log_values: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _log_evidence(trellis: _Trellis) -> FloatArray:
     """(n,) log evidence of packets, for which going forward is enough."""
     _, state, log_scale = trellis.forward()
+    return _evidence_of(trellis, state, log_scale)
+
+
+def _evidence_of(trellis: _Trellis, state: FloatArray, log_scale: FloatArray) -> FloatArray:
+    """(n,) log evidence of packets from the likelihood of their last states, see `_Trellis.forward`."""
     return np.asarray(trellis.common + log_scale + np.log(np.maximum((state * trellis.end).sum(axis=1), _LEAST)))
 
 
-def _word_posteriors(trellis: _Trellis) -> FloatArray:
-    """(n, N, words) probability of the words of n packets, by forward-backward."""
-    by_symbol, _, _ = trellis.forward()
+def _word_posteriors(trellis: _Trellis) -> tuple[FloatArray, FloatArray]:
+    """(n, N, words) probability of the words of n packets, by forward-backward, and (n,) their log evidence."""
+    by_symbol, state, log_scale = trellis.forward()
     joint = np.stack(by_symbol)
     joint *= trellis.backward().take(trellis.branches.last, axis=2)
     total = joint.sum(axis=2, keepdims=True)
     uniform = np.full_like(joint, 1 / joint.shape[2])
-    return np.asarray(np.divide(joint, total, out=uniform, where=total > 0)).swapaxes(0, 1)
+    posterior = np.asarray(np.divide(joint, total, out=uniform, where=total > 0)).swapaxes(0, 1)
+    return posterior, _evidence_of(trellis, state, log_scale)
 
 
 def slot_llr(metrics: FloatArray) -> Float32Array:
@@ -260,16 +276,16 @@ def slot_llr(metrics: FloatArray) -> Float32Array:
     """
     isi_memory = _isi_memory_of(metrics)
     n_slots = metrics.shape[-2] - isi_memory
-    likelihood = np.exp(metrics - _over_few(np.maximum, metrics)[..., None])
-    sums = np.log(likelihood @ _lit_and_dark(isi_memory) + _TINY)
+    likelihood = np.exp((metrics - _over_few(np.maximum, metrics)[..., None]).astype(np.float32))
+    sums = np.log(likelihood @ _lit_and_dark(isi_memory) + np.float32(_TINY))
     odds = sums[..., : isi_memory + 1] - sums[..., isi_memory + 1 :]
     return np.asarray(sum(odds[..., age : age + n_slots, age] for age in range(isi_memory + 1)), np.float32)
 
 
 @lru_cache(maxsize=8)
-def _lit_and_dark(isi_memory: int) -> FloatArray:
+def _lit_and_dark(isi_memory: int) -> Float32Array:
     """(patterns, 2 * (memory + 1)): 1 where the slot `age` slots ago is lit, by age; and where it is dark."""
-    lit = slot_patterns(isi_memory)[:, ::-1].astype(np.float64)
+    lit = slot_patterns(isi_memory)[:, ::-1].astype(np.float32)
     return np.concatenate([lit, 1 - lit], axis=1)
 
 
@@ -487,12 +503,12 @@ def _in_doubt(word: FloatArray, w: int, columns: NDArray[np.int64], certain: flo
 
 
 def _weights(payload: _Payload, candidates: NDArray[np.bool_]) -> FloatArray:
-    """(C, 9) log probability of every weight; no evidence is needed where one candidate is left."""
-    log_prob = np.where(candidates, 0.0, -np.inf)
+    """(C, 9) log evidence of every weight; 0 where one candidate is left, which needs none to be chosen."""
+    log_evidence = np.where(candidates, 0.0, -np.inf)
     open_columns = candidates.sum(axis=1) > 1
     if open_columns.any():
-        log_prob[open_columns] = _of_weights(payload, candidates & open_columns[:, None])[open_columns]
-    return np.asarray(log_prob - _log_sum(log_prob, 1)[:, None])
+        log_evidence[open_columns] = _of_weights(payload, candidates & open_columns[:, None])[open_columns]
+    return log_evidence
 
 
 def _posteriors(
@@ -509,15 +525,20 @@ def _posteriors(
     index = np.empty((n_bursts, n_columns, n_symbols), np.int64)
     log_prob = np.empty((n_bursts, n_columns, n_symbols))
     bit_llr = np.full((n_bursts, n_columns, n_symbols, 7), np.nan)
+    log_evidence = np.empty(n_columns)
     for batch in _batches(metrics):
         payload = _payload_of(_packets(metrics, batch))
         packets = np.arange(len(payload.metrics)).reshape(n_bursts, batch.size)
-        w_log_prob[batch] = _weights(payload, candidates[batch])
+        w_log_evidence = _weights(payload, candidates[batch])
+        log_evidence[batch] = _log_sum(w_log_evidence, 1)
+        w_log_prob[batch] = w_log_evidence - log_evidence[batch][:, None]
         weights = w_log_prob[batch].argmax(axis=1) + 1
         for w in np.unique(weights).tolist():
             alike = np.flatnonzero(weights == w)
             columns, words = batch[alike], codebook(w)
-            posterior = _word_posteriors(_trellis(payload.of_packets(packets[:, alike].ravel()), w))
+            posterior, of_packets = _word_posteriors(_trellis(payload.of_packets(packets[:, alike].ravel()), w))
+            decided = candidates[columns].sum(axis=1) == 1
+            log_evidence[columns[decided]] = of_packets.reshape(n_bursts, -1).sum(axis=0)[decided]
             posterior = posterior.reshape(n_bursts, columns.size, n_symbols, -1)
             if on_posteriors is not None:
                 on_posteriors(w, columns, posterior)
@@ -527,7 +548,7 @@ def _posteriors(
             log_prob[:, columns] = _log_of_best(posterior, best)
             bit_llr[:, columns, :, : bits_per_symbol(w)] = _bit_llr(posterior, bits_per_symbol(w))
     weights = w_log_prob.argmax(axis=1) + 1
-    return BurstPosteriors(weights, w_log_prob, lit, index, log_prob, bit_llr, _header_llr(metrics))
+    return BurstPosteriors(weights, w_log_prob, log_evidence, lit, index, log_prob, bit_llr, _header_llr(metrics))
 
 
 def _batches(metrics: FloatArray) -> list[NDArray[np.int64]]:

@@ -398,6 +398,7 @@ def _nothing_known(like: BurstPosteriors, n: int) -> BurstPosteriors:
     return BurstPosteriors(
         w=np.full(n, middle, np.int64),
         w_log_prob=np.full((n, weights), -np.log(weights)),
+        log_evidence=np.zeros(n),
         lit=np.full((1, n, slots), 0.5, np.float32),
         index=np.zeros((1, n, symbols), np.int64),
         log_prob=np.full((1, n, symbols), -k * np.log(2)),

@@ -49,6 +49,7 @@ def posteriors_of(
     return BurstPosteriors(
         w=np.array(w),
         w_log_prob=w_log_prob,
+        log_evidence=np.zeros(n_columns),
         lit=np.zeros((n_bursts, n_columns, PACKET), np.float32),
         index=index,
         log_prob=np.full(index.shape, np.log(probability)),
