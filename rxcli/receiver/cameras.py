@@ -77,6 +77,8 @@ def find_cameras(
     options: ReceiverOptions,
     timer: Timer,
     shows_packets: Callable[[FrameContext], bool] = lambda _: False,
+    *,
+    widely: bool = True,
 ) -> Cameras:
     """The camera that a profile tells, or those that may be, estimated from the frame.
 
@@ -86,6 +88,7 @@ def find_cameras(
         options: screens and cameras.
         timer: of the frame.
         shows_packets: whether packets show with a camera beyond doubt; asked before the search is widened.
+        widely: see `estimate_camera`.
     """
     known = _camera_of(frame, options)
     if isinstance(known, Failure):
@@ -114,7 +117,11 @@ def find_cameras(
 
     with timer("blind"):
         found = blind.estimate_camera(
-            strips, options.screens, frame.metadata.exposure_s, lambda estimate: shows_packets(with_camera(estimate))
+            strips,
+            options.screens,
+            frame.metadata.exposure_s,
+            lambda estimate: shows_packets(with_camera(estimate)),
+            widely=widely,
         )
     first = with_camera(found.estimate) if found.estimate else None
     rivals = tuple(with_camera(rival) for rival in found.rivals)
@@ -131,7 +138,9 @@ def find_camera(frame: Frame, corners: FloatArray, options: ReceiverOptions, tim
 def context_at(context: FrameContext, corners: FloatArray) -> FrameContext:
     """A frame with its camera, the screen elsewhere: what the camera was estimated from is read there."""
     camera = context.camera
-    if corners is context.corners or camera.blind_estimate is None:
+    if corners is context.corners:
+        return context
+    if camera.blind_estimate is None:
         return replace(context, corners=corners)
     estimate, strips = camera.blind_estimate
     with context.timer("sampling"):

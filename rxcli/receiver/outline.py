@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rxcli.options import ReceiverOptions
+from rxcli.profiles import ScreenProfile
 from rxcli.receiver.cameras import context_at, known_lens
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.corners import (
@@ -65,8 +66,9 @@ _BETTER_ROWS = 10.0
 _NO_LIGHT = 25.0
 #: Headers without symbols count so much.
 _HEADERS_ALONE = 0.1
-#: Packets that must show at a first look where nothing but the grid says that there is a screen, nats.
-_SOME_PACKETS = 10.0
+#: Packets that must show at a first look where nothing but the grid says that there is a screen, nats; and from which
+#: on other outlines are looked at with the screen that shows them alone.
+_SOME_PACKETS, _PLAIN_PACKETS = 10.0, 200.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,7 +331,7 @@ def _by_packets(
     if isinstance(context, Failure):
         best = _likeliest([one for one in candidates if not one.by_grid_alone])
         return Located(best, context if best.family in asked else None) if best else None
-    candidates, packets = _with_likely_rows(context, candidates)
+    candidates, packets, looked_at = _with_likely_rows(context, candidates)
     if max(packets.values()) < _SOME_PACKETS:
         if context.camera.remembered:
             return _by_packets(frame, candidates, replace(options, camera_cache=None), timer)
@@ -340,11 +342,19 @@ def _by_packets(
         least = max(lost.values())
         odds = [one.log_odds - _PACKETS_COUNT * lost.get(one.family, least) for one in candidates]
         best = _likeliest([replace(one, log_odds=score) for one, score in zip(candidates, odds, strict=True)])
-    return Located(best, context_at(context, best.corners)) if best else None
+    if best is None:
+        return None
+    chosen = context_at(context, best.corners)
+    for other in looked_at:
+        if other.corners is best.corners:
+            chosen.kept.update(other.kept)
+    return Located(best, chosen)
 
 
-def _with_likely_rows(context: FrameContext, candidates: list[Outline]) -> tuple[list[Outline], dict[int, float]]:
-    """The candidates, each family with the rows under which most packets show; and how many these are, nats."""
+def _with_likely_rows(
+    context: FrameContext, candidates: list[Outline]
+) -> tuple[list[Outline], dict[int, float], list[FrameContext]]:
+    """The candidates, each family with the rows under which most packets show; how many these are, nats; all looks."""
     families: dict[int, Outline] = {}
     for one in candidates:
         families.setdefault(one.family, one)
@@ -354,15 +364,32 @@ def _with_likely_rows(context: FrameContext, candidates: list[Outline]) -> tuple
     looks.sort(key=lambda look: look[1] > 0)
     packets: dict[int, float] = {}
     rows_of: dict[int, int] = {}
+    looked_at: list[FrameContext] = []
+    screens = context.screens
     for family, rows in looks[:_MOST_LOOKS]:
-        shown = _packets(replace(context, corners=corners[family][rows]))
+        there = corners[family][rows]
+        if there is not context.corners or screens is not context.screens:
+            there_context = replace(context, corners=there, screens=screens)
+        else:
+            there_context = context
+        looked_at.append(there_context)
+        shown = _packets(there_context)
         if shown > packets.get(family, -1.0) + (_BETTER_ROWS if rows else 0):
             packets[family], rows_of[family] = shown, rows
+        if shown > _PLAIN_PACKETS:
+            # Whatever the outline, the screen sends at one rate.
+            screens = _screens_shown(there_context)
     moved = [
         replace(one, corners=(one.corners, *one.other_rows)[rows_of.get(one.family, 0)], other_rows=())
         for one in candidates
     ]
-    return moved, packets
+    return moved, packets, looked_at
+
+
+def _screens_shown(context: FrameContext) -> tuple[ScreenProfile, ...]:
+    """The screens that a quick look leaves."""
+    acquisition = quick_look(context)
+    return context.screens if isinstance(acquisition, Failure) else acquisition.variants or (acquisition.screen,)
 
 
 def _likeliest(candidates: list[Outline]) -> Outline | None:
@@ -393,16 +420,18 @@ def _context_of_any(
 
     It hardly depends on which columns are whose, so one candidate of a family speaks for all.
     """
-    found: FrameContext | Failure = Failure("no_signal", "")
+    found: FrameContext | Failure | None = None
     asked: set[int] = set()
     for candidate in candidates:
         if candidate.family in asked:
             continue
+        # Rows are the same moments wherever the columns are: of further families what stands out by itself will do.
+        context = likely_camera(frame, candidate.corners, options, timer, widely=not asked)
         asked.add(candidate.family)
-        found = likely_camera(frame, candidate.corners, options, timer)
-        if not isinstance(found, Failure):
-            break
-    return found, asked
+        if not isinstance(context, Failure):
+            return context, asked
+        found = found or context
+    return found or Failure("no_signal", ""), asked
 
 
 def _packets(context: FrameContext) -> float:

@@ -69,6 +69,8 @@ def estimate_camera(
     screens: Sequence[ScreenProfile],
     exposure_s: float | None = None,
     shows_packets: Callable[[BlindEstimate], bool] = lambda _: False,
+    *,
+    widely: bool = True,
 ) -> BlindSearch:
     """Estimate the camera from one picture of a sending screen.
 
@@ -77,6 +79,7 @@ def estimate_camera(
         screens: screens that it may be.
         exposure_s: exposure, None where the file does not tell it.
         shows_packets: whether packets show with an estimate beyond doubt; asked before the search is widened.
+        widely: look at all periods where those that stand out read as nothing; else that is the end.
 
     Raises:
         ValueError: no screens.
@@ -97,6 +100,8 @@ def estimate_camera(
     readings = sorted(
         _read_until_sure(views, _clocks(short_list, straight, curves, lengths)[:_READ], lengths), key=_by_evidence
     )
+    if not widely and _best(readings) < _HOPELESS:
+        return BlindSearch(None, why_not(strips))
     estimates: list[BlindEstimate] = []
     if _HOPELESS < _best(readings) < _READ_SURELY:
         estimates = refined(readings[0])
@@ -191,9 +196,9 @@ def _worth_reading(estimates: list[BlindEstimate]) -> tuple[BlindEstimate, ...]:
 
 
 def _worth_refining(readings: list[Reading]) -> list[Reading]:
-    """The best reading, and where it is not beyond doubt others of other slots that come close."""
-    if not readings:
-        return []
+    """The best reading, and where it is neither beyond doubt nor hopeless others of other slots that come close."""
+    if not readings or readings[0].log_evidence < _HOPELESS:
+        return readings[:1]
     least = _CLOSE_EVIDENCE * readings[0].log_evidence
     close = [one for one in readings if one.log_evidence >= least]
     return distinct(close, _same_slots, 1 if readings[0].log_evidence > _READ_SURELY else _REFINED) or readings[:1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,6 +198,7 @@ def _expected_skewness(w: int, exposure_slots: float) -> float:
     return float(third / variance**1.5)
 
 
+@lru_cache(maxsize=128)
 def _expected_moments(w: int, exposure_slots: float) -> tuple[float, float, float]:
     """Mean, variance and third central moment of the light 0..1 of symbols of weight `w`."""
     duty = w / SLOTS_PER_SYMBOL

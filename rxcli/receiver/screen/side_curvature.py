@@ -16,11 +16,13 @@ from rxcli.receiver.screen.pose import INDEPENDENT
 from rxcli.receiver.screen.sides import BOTTOM, LEFT, RIGHT, TOP, Side, across, from_top_left, width_of
 from rxcli.types import FloatArray
 
-#: Coefficients around which steps of light are looked for, and those tried around each.
-_GUESSES = np.linspace(-0.28, 0.28, 5)
+#: Coefficients around which steps of light are looked for, likeliest first, and those tried around each.
+_GUESSES = (0.0, -0.14, 0.14, -0.28, 0.28)
 _TRIED = np.linspace(-0.075, 0.075, 16)
 #: Share of the four sides, added up, that must lie on the arcs.
 _LEAST_SUPPORT = 0.25
+#: The same, from which on no other guess is made: half of what is found along all sides lies on one arc then.
+_SETTLED = 2.0
 #: Sides that must say something, and the places, as a number and as a share of all, by which one does.
 _LEAST_SIDES, _LEAST_PLACES, _LEAST_SHARE = 2, 6, 0.1
 #: Squared distance of a corner from the picture's middle, widths, up to which a lens has an inverse; the shortest side,
@@ -59,9 +61,12 @@ def measure_side_curvature(
     if not _have_sides(corners, picture):
         return None
     size = width_of(corners)
-    support, k1, steps = max(
-        (_best_around(picture, corners, initial, size) for initial in _GUESSES), key=lambda one: one[0]
-    )
+    support, k1, steps = 0.0, 0.0, list[Steps]()
+    for initial in _GUESSES:
+        found = _best_around(picture, corners, initial, size)
+        support, k1, steps = max((support, k1, steps), found, key=lambda one: one[0])
+        if support > _SETTLED:
+            break
     return _by_least_squares(picture, corners, k1, steps, size) if support >= _LEAST_SUPPORT else None
 
 
