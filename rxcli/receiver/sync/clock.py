@@ -20,6 +20,9 @@ from rxcli.protocol import EXTREMES_SLOTS, HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYM
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
+#: Samples whose rows are told by those of the first and of the next after them.
+_SMOOTH_SAMPLES = 8
+
 
 def pooled_strips(profiles: RowProfiles) -> RowProfiles:
     """Profiles of a few strips a column, to search the clock: pooled in pairs where there are four or more."""
@@ -53,20 +56,20 @@ def unbinned_strips(profiles: RowProfiles) -> RowProfiles:
 
 
 def resample(
-    profiles: RowProfiles, row0: float, rows_per_sample: float, n_samples: int
+    profiles: RowProfiles, row0: float | FloatArray, rows_per_sample: float, n_samples: int
 ) -> tuple[Float32Array, Float32Array]:
     """Mean light over equal steps of sensor rows.
 
     Args:
         profiles: C columns, S strips, R rows.
-        row0: sensor row at which sample 0 starts; row r covers r - 0.5 .. r + 0.5.
+        row0: sensor row at which sample 0 starts, of all columns or of each (C,); row r covers r - 0.5 .. r + 0.5.
         rows_per_sample: length of a sample.
         n_samples: samples.
 
     Returns:
         (C, S, n_samples) float32 light, 0 where not valid; and 1 where a sample lies on the screen altogether, else 0.
     """
-    borders = row0 + rows_per_sample * np.arange(n_samples + 1, dtype=np.float64)
+    borders = np.reshape(row0, (-1, 1)) + rows_per_sample * np.arange(n_samples + 1, dtype=np.float64)
     light = _bounded(profiles.light.reshape(-1, profiles.light.shape[-1]))
     first, stop = _shown_rows(profiles.inside.reshape(light.shape))
     positions = _row_positions(profiles, borders)
@@ -96,13 +99,23 @@ def _shown_rows(inside: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def _row_positions(profiles: RowProfiles, borders: FloatArray) -> FloatArray:
-    """Sensor rows as positions in the strips' row arrays, (1 or C*S, n) float64; position 0 is the top of row 0."""
-    n_rows = profiles.rows.size
+    """Sensor rows (1 or C, n) as positions in the strips' row arrays, (1 or C*S, n); position 0 is the top of row 0."""
+    n_rows, n_strips = profiles.rows.size, profiles.light.shape[1]
     if profiles.sensor_row is None:
-        return np.asarray(np.clip(borders - profiles.rows[0] + 0.5, 0, n_rows))[None]
+        out = borders - (profiles.rows[0] - 0.5)
+        return np.asarray(np.clip(out if len(out) == 1 else np.repeat(out, n_strips, axis=0), 0, n_rows))
     strips = profiles.sensor_row.reshape(-1, n_rows)
-    index = np.arange(n_rows) + 0.5
-    return np.stack([np.clip(np.interp(borders, strip, index, left=0, right=n_rows), 0, n_rows) for strip in strips])
+    # Lenses move rows so smoothly that some borders tell where the others are; strips go straight on at their ends.
+    few = np.arange(0, borders.shape[1] - 1 + _SMOOTH_SAMPLES, _SMOOTH_SAMPLES)
+    at_few = borders[:, :1] + few * (borders[:, -1:] - borders[:, :1]) / max(borders.shape[1] - 1, 1)
+    at_few = np.broadcast_to(at_few, (profiles.light.shape[0], few.size)).repeat(n_strips, axis=0)
+    further = n_rows * (np.diff(strips, axis=1) if n_rows > 1 else np.ones_like(strips))
+    index = np.concatenate([[0.5 - n_rows], np.arange(n_rows) + 0.5, [2 * n_rows - 0.5]])
+    rows = np.concatenate([strips[:, :1] - further[:, :1], strips, strips[:, -1:] + further[:, -1:]], axis=1)
+    found = np.stack([np.interp(at, strip, index) for at, strip in zip(at_few, rows, strict=True)])
+    between = np.arange(_SMOOTH_SAMPLES) / _SMOOTH_SAMPLES
+    every = found[:, :-1, None] + np.diff(found, axis=1)[:, :, None] * between
+    return np.clip(every.reshape(len(strips), -1)[:, : borders.shape[1]], 0, n_rows)
 
 
 def _integrate(values: Float32Array, positions: FloatArray) -> FloatArray:
@@ -117,8 +130,12 @@ def _integrate(values: Float32Array, positions: FloatArray) -> FloatArray:
     if positions.shape[0] == 1:
         below, above = total[:, left[0]], total[:, left[0] + 1]
     else:
-        below, above = np.take_along_axis(total, left, 1), np.take_along_axis(total, left + 1, 1)
-    return np.asarray(np.diff(below + (above - below) * part, axis=1))
+        left += (np.arange(left.shape[0]) * (n_rows + 1))[:, None]
+        below, above = total.take(left), total.take(left + 1)
+    above -= below
+    above *= part
+    above += below
+    return np.asarray(np.diff(above, axis=1))
 
 
 def contrast(
@@ -386,17 +403,12 @@ def sample_slots(
     delays = clock.delay_slots if columns is None else clock.delay_slots[columns]
     if columns is not None:
         profiles = _of_columns(profiles, columns)
-    if not delays.any():
-        light, valid = resample(profiles, clock.row0, step, n)
-        return SlotSamples(light, valid, samples_per_slot)
-    parts = [
-        resample(_of_columns(profiles, slice(column, column + 1)), clock.row0 + delay * clock.rows_per_slot, step, n)
-        for column, delay in enumerate(delays)
-    ]
-    return SlotSamples(np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts]), samples_per_slot)
+    row0 = clock.row0 + delays * clock.rows_per_slot if delays.any() else clock.row0
+    light, valid = resample(profiles, row0, step, n)
+    return SlotSamples(light, valid, samples_per_slot)
 
 
-def _of_columns(profiles: RowProfiles, columns: IntArray | slice) -> RowProfiles:
+def _of_columns(profiles: RowProfiles, columns: IntArray) -> RowProfiles:
     rows = profiles.sensor_row
     return replace(
         profiles,

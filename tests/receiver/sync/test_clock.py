@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -302,3 +303,39 @@ def test_pooled_strips_keep_the_light(n_strips: int, n_pooled: int) -> None:
     assert pooled.light.shape == (2, n_pooled, 60)
     np.testing.assert_allclose(pooled.light[:, -1], profiles.light[:, -together:].mean(axis=1), rtol=1e-5)
     np.testing.assert_allclose(pooled.count, together)
+
+
+def test_columns_that_start_at_their_own_rows_are_resampled_as_each_by_itself() -> None:
+    rng = np.random.default_rng(5)
+    rows = np.arange(200.0) + 6e-4 * (np.arange(200.0) - 90) ** 2 + rng.uniform(-0.2, 0.2, (3, 2, 1))
+    profiles = RowProfiles(
+        light=rng.random((3, 2, 200), dtype=np.float32),
+        inside=np.ones((3, 2, 200), bool),
+        rows=np.arange(200),
+        sensor_row=rows,
+        count=np.ones((3, 2), np.float32),
+        noise_floor=1e-4,
+        noise_slope=0.0,
+    )
+    row0 = np.array([12.0, 13.7, 9.2])
+    light, valid = sync.resample(profiles, row0, 1.3, 170)
+    for column, start in enumerate(row0):
+        one = replace(
+            profiles,
+            light=profiles.light[column : column + 1],
+            inside=profiles.inside[:1],
+            sensor_row=rows[column][None],
+        )
+        alone, shown = sync.resample(one, float(start), 1.3, 170)
+        np.testing.assert_allclose(light[column], alone[0], atol=1e-6)
+        np.testing.assert_array_equal(valid[column], shown[0])
+        # The mean over each sample of light that is constant over a row, row by row.
+        borders = np.interp(start + 1.3 * np.arange(171), rows[column, 0], np.arange(200) + 0.5, left=0, right=200)
+        fine = np.array(
+            [
+                profiles.light[column, 0][np.minimum(np.linspace(a, b, 400, endpoint=False), 199).astype(int)].mean()
+                for a, b in pairwise(borders)
+            ]
+        )
+        shown_well = valid[column, 0] > 0
+        np.testing.assert_allclose(light[column, 0][shown_well], fine[shown_well], atol=0.02)
