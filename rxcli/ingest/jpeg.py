@@ -36,8 +36,9 @@ def decode_luma(data: Any, source: object) -> NDArray[np.uint8]:
         height, width, _, _ = simplejpeg.decode_jpeg_header(data, strict=False)
     except _FAULTS:
         raise InputError(f"{source}: the JPEG header is damaged or cut", "copy the file again") from None
-    check_size(source, width, height, _held(data), len(data))
-    if bytes(data).count(b"\xff\xda") > _MAX_SCANS:
+    held, is_one_scan = _frame_of(data)
+    check_size(source, width, height, held, len(data))
+    if not is_one_scan and bytes(data).count(b"\xff\xda") > _MAX_SCANS:
         raise InputError(f"{source}: the JPEG has more than {_MAX_SCANS} scans", "the file is damaged or a bomb")
     try:
         return _gray(data)
@@ -45,20 +46,23 @@ def decode_luma(data: Any, source: object) -> NDArray[np.uint8]:
         return _second_look(data, reason_of(error), source)
 
 
-def _held(data: Any) -> float:
-    """Bytes a pixel that decoding takes: luma, and the coefficients of all components where they come in several scans.
+def _frame_of(data: Any) -> tuple[float, bool]:
+    """Bytes a pixel that decoding takes, and whether all of it is one scan.
 
-    ITU-T T.81, B.2.2: the frame header's marker tells the process, its sixth byte the number of components.
+    Luma, and the coefficients of all components where they come in several scans. ITU-T T.81, B.2.2: the frame header's
+    marker tells the process, its sixth byte the number of components; B.2.3: the first byte of a scan's header is how
+    many of them it has.
     """
-    at, data = 2, memoryview(data)
+    at, data, held, n_components, is_progressive = 2, memoryview(data), 1.0, 0, False
     while at + 10 <= len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], data[at + 2] << 8 | data[at + 3]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            return 1 + (2 * data[at + 9] if marker in _PROGRESSIVE else 0)
         if marker == 0xDA:
-            break
+            return held, not is_progressive and data[at + 4] == n_components
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            n_components, is_progressive = data[at + 9], marker in _PROGRESSIVE
+            held = 1.0 + (2 * n_components if is_progressive else 0)
         at += 1 if marker == 0xFF else 2 + max(length, 2)
-    return 1
+    return held, False
 
 
 def _gray(data: Any, strict: bool = True) -> NDArray[np.uint8]:

@@ -74,6 +74,18 @@ def test_a_progressive_jpeg_of_many_scans_or_of_giant_size(tmp_path: Path) -> No
     assert "scans" in str(read_all(path)[1])
 
 
+def test_a_jpeg_of_one_scan_ends_with_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    noise = np.random.default_rng(0).integers(0, 255, (256, 256, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(path)
+    data = path.read_bytes()
+    scan = data[data.index(b"\xff\xda") : -2]
+    path.write_bytes(data[:-2] + scan * 200 + data[-2:])
+    frames, error = read_all(path)
+    assert not frames
+    assert "more than one scan" in str(error)
+
+
 def test_an_exif_block_that_claims_a_thousandfold_is_passed_over(tmp_path: Path) -> None:
     block = directory([(0x010F, 2, 900_000, 8)] * 4000, 1_000_000)
     picture = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
