@@ -186,7 +186,8 @@ def camera_of(frame: Frame, corners: FloatArray) -> FrameContext:
 def test_the_camera_is_asked_once_and_handed_on(packets: float, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, asked = Frame(np.zeros((200, 300), np.uint8), "drawn"), []
 
-    def likely(frame: Frame, corners: FloatArray, *_: object) -> FrameContext:
+    def likely(frame: Frame, corners: FloatArray, *_: object, widely: bool) -> FrameContext:
+        assert widely
         asked.append(corners)
         return camera_of(frame, corners)
 
@@ -204,14 +205,45 @@ def test_the_camera_is_asked_once_and_handed_on(packets: float, monkeypatch: pyt
 
 
 def test_a_camera_that_shows_under_no_first_column_is_not_asked_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
+    asked: list[bool] = []
+
+    def none(*_: object, widely: bool) -> Failure:
+        asked.append(widely)
+        return Failure("no_signal", "no camera")
+
     candidates = [replace(Outline(moved(k)), log_odds=-float(k), family=k // 3) for k in range(6)]
     monkeypatch.setattr(outlines, "possible_outlines", lambda *_, **__: (candidates, ""))
-    monkeypatch.setattr(outlines, "likely_camera", lambda *_: (asked.append(1), Failure("no_signal", "no camera"))[1])
+    monkeypatch.setattr(outlines, "likely_camera", none)
     located = locate(Frame(np.zeros((200, 300), np.uint8), "drawn"), OPTIONS, Timer())
     assert isinstance(located, Located)
     assert isinstance(located.context, Failure)
-    assert len(asked) == 2
+    # The second search of the same rows is a short one.
+    assert asked == [True, False]
+
+
+def test_once_a_screen_shows_plainly_other_outlines_are_looked_at_with_it_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frame = Frame(np.zeros((200, 300), np.uint8), "drawn")
+    looked: list[FrameContext] = []
+
+    def packets(context: FrameContext) -> float:
+        looked.append(context)
+        context.kept["look"] = len(looked)
+        return 1000.0 - len(looked)
+
+    candidates = [replace(Outline(moved(k)), family=k) for k in range(3)]
+    monkeypatch.setattr(outlines, "possible_outlines", lambda *_, **__: (candidates, ""))
+    monkeypatch.setattr(outlines, "likely_camera", lambda frame, corners, *_, **__: camera_of(frame, corners))
+    monkeypatch.setattr(outlines, "_packets", packets)
+    monkeypatch.setattr(outlines, "_screens_shown", lambda context: context.screens[:1])
+    located = locate(frame, OPTIONS, Timer())
+    assert isinstance(located, Located)
+    assert [len(context.screens) for context in looked] == [len(OPTIONS.screens), 1, 1]
+    # What the look at the chosen outline worked out is handed on.
+    assert isinstance(located.context, FrameContext)
+    assert located.context.kept["look"] == 1
+    assert located.context.screens == OPTIONS.screens
 
 
 def test_clips_without_a_screen_are_not_searched_for_columns_in_every_frame(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,7 @@ def _with_camera(frame: Frame, rows_per_slot: float) -> FrameContext:
 
 
 def _chosen(frame: Frame, found: Cameras, monkeypatch: pytest.MonkeyPatch) -> FrameContext | Failure:
-    monkeypatch.setattr(unknown_camera, "find_cameras", lambda *_: found)
+    monkeypatch.setattr(unknown_camera, "find_cameras", lambda *_, **__: found)
     return unknown_camera.likely_camera(frame, CORNERS, OPTIONS, Timer())
 
 

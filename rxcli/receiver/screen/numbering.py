@@ -173,6 +173,7 @@ def first_columns(
     reaches = (begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW)
     film = _film(light, grid, n_columns, aspect, lines)
     scores = []
+    lying = {number: _columns_of_line(grid, lines, number) for number in (LEFT, RIGHT)}
     for start in first.tolist():
         end = start + n_columns
         hidden = max(left - start, 0.0), max(end - right, 0.0)
@@ -181,7 +182,7 @@ def first_columns(
         score += film[1] * (abs(film[0] - start - n_columns / 2) < _IN_MIDDLE)
         score += _still_edges(light, (start, end), (begin, end_of_light))
         for border, side, number in ((start, 1, LEFT), (end, -1, RIGHT)):
-            signs = (_begins(light, border, side), _line_on(grid, lines, number, border))
+            signs = (_begins(light, border, side), _is_on(lying[number], border))
             score += _ON_BORDER * any(signs) + _BOTH_SIGNS * all(signs)
         scores.append(score)
     return FirstColumns(first, np.array(scores) - max(scores), all(reaches))
@@ -239,11 +240,15 @@ def _film(light: LightProfile, grid: Grid, n_columns: int, aspect: float, lines:
     return middle, (_FILM + by_chance) * (abs(height - 1) < _AS_HIGH)
 
 
-def _line_on(grid: Grid, lines: Sequence[Side], number: int, border: int) -> bool:
-    """Whether the line where stripes begin on a side lies on a border of the columns."""
+def _columns_of_line(grid: Grid, lines: Sequence[Side], number: int) -> FloatArray | None:
+    """Columns on which the line where stripes begin on a side lies, at some places; None where it does not show."""
     if not lines or lines[number].support < _LINE_SHOWS:
-        return False
+        return None
     line = lines[number]
     y = line.middle + line.half * np.linspace(-0.8, 0.8, 5)
-    off = np.abs(grid.columns_at(np.stack([line.at(y), y], axis=-1)) - border)
-    return bool(np.median(off) < _NEAR_BORDER)
+    return grid.columns_at(np.stack([line.at(y), y], axis=-1))
+
+
+def _is_on(columns: FloatArray | None, border: int) -> bool:
+    """Whether columns, of a line, are those of a border."""
+    return columns is not None and bool(np.median(np.abs(columns - border)) < _NEAR_BORDER)

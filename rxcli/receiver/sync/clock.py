@@ -106,7 +106,7 @@ def _row_positions(profiles: RowProfiles, borders: FloatArray) -> FloatArray:
         return np.asarray(np.clip(out if len(out) == 1 else np.repeat(out, n_strips, axis=0), 0, n_rows))
     strips = profiles.sensor_row.reshape(-1, n_rows)
     # Lenses move rows so smoothly that some borders tell where the others are; strips go straight on at their ends.
-    few = np.arange(0, borders.shape[1] - 1 + _SMOOTH_SAMPLES, _SMOOTH_SAMPLES)
+    few = np.arange(0, borders.shape[1] + _SMOOTH_SAMPLES, _SMOOTH_SAMPLES)
     at_few = borders[:, :1] + few * (borders[:, -1:] - borders[:, :1]) / max(borders.shape[1] - 1, 1)
     at_few = np.broadcast_to(at_few, (profiles.light.shape[0], few.size)).repeat(n_strips, axis=0)
     further = n_rows * (np.diff(strips, axis=1) if n_rows > 1 else np.ones_like(strips))

@@ -305,7 +305,8 @@ def test_pooled_strips_keep_the_light(n_strips: int, n_pooled: int) -> None:
     np.testing.assert_allclose(pooled.count, together)
 
 
-def test_columns_that_start_at_their_own_rows_are_resampled_as_each_by_itself() -> None:
+@pytest.mark.parametrize("n", [168, 170])
+def test_columns_that_start_at_their_own_rows_are_resampled_as_each_by_itself(n: int) -> None:
     rng = np.random.default_rng(5)
     rows = np.arange(200.0) + 6e-4 * (np.arange(200.0) - 90) ** 2 + rng.uniform(-0.2, 0.2, (3, 2, 1))
     profiles = RowProfiles(
@@ -318,7 +319,7 @@ def test_columns_that_start_at_their_own_rows_are_resampled_as_each_by_itself() 
         noise_slope=0.0,
     )
     row0 = np.array([12.0, 13.7, 9.2])
-    light, valid = sync.resample(profiles, row0, 1.3, 170)
+    light, valid = sync.resample(profiles, row0, 1.3, n)
     for column, start in enumerate(row0):
         one = replace(
             profiles,
@@ -326,11 +327,11 @@ def test_columns_that_start_at_their_own_rows_are_resampled_as_each_by_itself() 
             inside=profiles.inside[:1],
             sensor_row=rows[column][None],
         )
-        alone, shown = sync.resample(one, float(start), 1.3, 170)
+        alone, shown = sync.resample(one, float(start), 1.3, n)
         np.testing.assert_allclose(light[column], alone[0], atol=1e-6)
         np.testing.assert_array_equal(valid[column], shown[0])
         # The mean over each sample of light that is constant over a row, row by row.
-        borders = np.interp(start + 1.3 * np.arange(171), rows[column, 0], np.arange(200) + 0.5, left=0, right=200)
+        borders = np.interp(start + 1.3 * np.arange(n + 1), rows[column, 0], np.arange(200) + 0.5, left=0, right=200)
         fine = np.array(
             [
                 profiles.light[column, 0][np.minimum(np.linspace(a, b, 400, endpoint=False), 199).astype(int)].mean()
