@@ -40,6 +40,8 @@ _SAY_OF_LINE = 0.03
 #: Rows per slot this close, relative, are one hypothesis.
 ALIKE_ROWS = 0.015
 
+#: Periods whose combs are looked at together.
+_AT_ONCE = 64
 #: Hypotheses that are tried: so many of different clocks or packets, and so many of different clocks.
 _TRIALS = 24
 #: The same of the short list; lines and peaks that an octave has on it, those of every length of packet; and slots over
@@ -158,35 +160,39 @@ def _slot_line(columns: Float32Array) -> FloatArray:
     return np.asarray(spectrum / max(float(power @ power), 1e-30))
 
 
-def _header_response(total: FloatArray, rows_per_slot: float) -> FloatArray:
+def _header_responses(total: FloatArray, rows_per_slot: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """Correlation with a header that starts at each quarter of a slot, the first one a header's length before row 0.
+
+    The negative of it shows the header read backwards.
 
     Args:
         total: (R + 1,) running sum of the columns' mean.
-        rows_per_slot: rows a slot.
+        rows_per_slot: (K,) rows a slot.
 
     Returns:
-        (2, n): of the light as it is, and of its negative, which shows the header read backwards.
+        (K, n) for every period; and (K,) how many places the picture has then.
     """
     lead = SLOTS_PER_SYMBOL * SAMPLES
-    starts = int((total.size - 1) / rows_per_slot * SAMPLES) + lead
-    grid = np.arange(-lead, starts + 1) * (rows_per_slot / SAMPLES)
-    summed = np.interp(grid, np.arange(total.size), total)
-    out = header_correlation(summed, SAMPLES)[:starts] * (SAMPLES / rows_per_slot)
-    return np.stack([out, -out])
+    n_places = ((total.size - 1) / rows_per_slot * SAMPLES).astype(np.int64) + lead
+    step = rows_per_slot[:, None] / SAMPLES
+    summed = np.interp(np.arange(-lead, int(n_places.max()) + 1) * step, np.arange(total.size), total)
+    return header_correlation(summed, SAMPLES)[:, : int(n_places.max())] / step, n_places
 
 
-def _comb(response: FloatArray, packet_slots: int) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Best sums of responses (k, n) over copies of a packet, over the root of their number; and their samples, (k,)."""
-    n_signs, n = response.shape
+def _comb(
+    responses: FloatArray, n_places: NDArray[np.int64], packet_slots: int
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Best sums of responses (K, n) over copies of a packet, over the root of their number; and their places, (K,)."""
+    n = responses.shape[1]
     period, lead = packet_slots * SAMPLES, SLOTS_PER_SYMBOL * SAMPLES
     # Headers that are not seen as a whole do not count.
-    inner = np.where((np.arange(n) >= lead) & (np.arange(n) < n - lead), response, 0.0)
+    place = np.arange(n)
+    inner = np.where((place >= lead) & (place < n_places[:, None] - lead), responses, 0.0)
     phase = np.arange(period)
-    count = (n - lead - 1 - phase) // period - (lead - 1 - phase) // period
+    count = (n_places[:, None] - lead - 1 - phase) // period - (lead - 1 - phase) // period
     score = folded(inner, period) / np.sqrt(np.maximum(count, 1))
     best = score.argmax(axis=1)
-    return score[np.arange(n_signs), best], best
+    return score[np.arange(len(score)), best], best
 
 
 def short_list(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesis]:
@@ -202,14 +208,13 @@ def short_list(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesis
     pairs = []
     for octave in _octaves(strips):
         total = _running_mean_sum(octave)
-        for rows_per_slot, lengths in _outstanding_periods(octave, packet_lengths):
-            for off in _OFF_SLOTS:
-                near = rows_per_slot * (1 + off * rows_per_slot / strips.rows.size)
-                pairs += [(one, octave) for one in _combs(octave, total, near, lengths)]
+        for periods, lengths in _outstanding_periods(octave, packet_lengths):
+            near = periods * (1 + np.array(_OFF_SLOTS)[:, None] * periods / strips.rows.size)
+            pairs += [(one, octave) for one in _combs(octave, total, near.ravel(), lengths)]
     return _tried(pairs, _SHORT_TRIALS)
 
 
-def _outstanding_periods(octave: _Octave, packet_lengths: Sequence[int]) -> list[tuple[float, Sequence[int]]]:
+def _outstanding_periods(octave: _Octave, packet_lengths: Sequence[int]) -> list[tuple[FloatArray, Sequence[int]]]:
     """Rows per slot at the strongest lines of the edges' power and peaks of the autocorrelation, with packets' lengths.
 
     A line says nothing of packets; a peak is one of packets of some length.
@@ -217,16 +222,16 @@ def _outstanding_periods(octave: _Octave, packet_lengths: Sequence[int]) -> list
     n_rows = octave.columns.shape[1] * octave.rows
     low, high = (int(_LINE_FINE * n_rows / period) for period in (octave.high, octave.low))
     lines = _strongest(octave.line_uncapped[low : high + 2], _LINES, 2 * _LINE_FINE)
-    found: list[tuple[float, Sequence[int]]] = [(_LINE_FINE * n_rows / (low + at), packet_lengths) for at in lines]
+    found: list[tuple[FloatArray, Sequence[int]]] = [(_LINE_FINE * n_rows / (low + lines), packet_lengths)]
     for packet_slots in packet_lengths:
         least, most = (int(period * packet_slots / octave.rows) for period in (octave.low, octave.high))
         slot = max(int(octave.low / octave.rows), 1)
         peaks = _strongest(octave.repeats[least : most + 1], _PEAKS, 2 * slot)
-        found += [((least + at) * octave.rows / packet_slots, [packet_slots]) for at in peaks]
-    return found
+        found.append(((least + peaks) * octave.rows / packet_slots, [packet_slots]))
+    return [(periods, lengths) for periods, lengths in found if periods.size]
 
 
-def _strongest(values: FloatArray, most: int, apart: int) -> list[float]:
+def _strongest(values: FloatArray, most: int, apart: int) -> FloatArray:
     """Places of the highest peaks, to fractions of a place by a parabola; none nearer to a higher one than `apart`."""
     inner = np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])) + 1
     chosen = distinct(inner[np.argsort(-values[inner])].tolist(), lambda one, other: abs(one - other) < apart, most)
@@ -234,7 +239,7 @@ def _strongest(values: FloatArray, most: int, apart: int) -> list[float]:
     for at in chosen:
         before, here, after = values[at - 1 : at + 2]
         out.append(at + 0.5 * (before - after) / (before - 2 * here + after))
-    return out
+    return np.array(out)
 
 
 def every_clock(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesis]:
@@ -269,31 +274,39 @@ def same_slots(one: Hypothesis | BlindEstimate, other: Hypothesis | BlindEstimat
 def _scan_octave(octave: _Octave, n_rows: int, packet_lengths: Sequence[int]) -> list[Hypothesis]:
     out = []
     total = _running_mean_sum(octave)
-    rows_per_slot = octave.low
-    while rows_per_slot < octave.high:
-        out += _combs(octave, total, rows_per_slot, packet_lengths)
-        rows_per_slot *= 1 + _SCAN_STEP / min(n_rows / rows_per_slot, _SCAN_SLOTS)
+    periods = [octave.low]
+    while periods[-1] < octave.high:
+        periods.append(periods[-1] * (1 + _SCAN_STEP / min(n_rows / periods[-1], _SCAN_SLOTS)))
+    for first in range(0, len(periods) - 1, _AT_ONCE):
+        out += _combs(octave, total, np.array(periods[first : min(first + _AT_ONCE, len(periods) - 1)]), packet_lengths)
     return out
 
 
-def _combs(octave: _Octave, total: FloatArray, rows_per_slot: float, packet_lengths: Sequence[int]) -> list[Hypothesis]:
-    """The best comb of headers at a period, in both directions, for every length of packet."""
+def _combs(
+    octave: _Octave, total: FloatArray, rows_per_slot: FloatArray, packet_lengths: Sequence[int]
+) -> list[Hypothesis]:
+    """The best combs of headers at some periods, in both directions, for every length of packet."""
     import cv2
 
-    response = _header_response(total, rows_per_slot / octave.rows)
+    response, n_places = _header_responses(total, rows_per_slot / octave.rows)
     # Neighbouring quarters of a slot say the same.
-    size = np.abs(response[0, ::2])
-    spread = 1.4826 * float(np.partition(size, size.size // 2)[size.size // 2]) + 1e-6
+    size = np.abs(response[:, : int(n_places.min()) : 2])
+    spread = 1.4826 * np.partition(size, size.shape[1] // 2, axis=1)[:, size.shape[1] // 2] + 1e-6
     # The largest response within a slot: a period may then miss copies by a slot.
-    near = cv2.dilate(response, np.ones((1, 2 * SAMPLES + 1), np.uint8))
-    line = 2 * octave.line_near(rows_per_slot, _SCAN_STEP / 2)
+    reach = np.ones((1, 2 * SAMPLES + 1), np.uint8)
+    line = [2 * octave.line_near(period, _SCAN_STEP / 2) for period in rows_per_slot.tolist()]
     out = []
+    either = [(is_reversed, cv2.dilate(-response if is_reversed else response, reach)) for is_reversed in (False, True)]
     for packet_slots in packet_lengths:
-        repeats = _repeats_near(octave, rows_per_slot, packet_slots)
-        for number, (score, sample) in enumerate(zip(*_comb(near, packet_slots), strict=True)):
-            start = (float(sample) / SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
-            log_evidence = float(score / spread) ** 2 + repeats**2 + line
-            out.append(Hypothesis(rows_per_slot, packet_slots, start, number == 1, log_evidence))
+        repeats = [_repeats_near(octave, period, packet_slots) for period in rows_per_slot.tolist()]
+        for is_reversed, near in either:
+            score, place = _comb(near, n_places, packet_slots)
+            start = (place / SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
+            log_evidence = (score / spread) ** 2 + np.square(repeats) + line
+            out += [
+                Hypothesis(period, packet_slots, at, is_reversed, nats)
+                for period, at, nats in zip(*(v.tolist() for v in (rows_per_slot, start, log_evidence)), strict=True)
+            ]
     return out
 
 
@@ -334,21 +347,19 @@ def _slot_means(total: FloatArray, borders: FloatArray) -> FloatArray:
 
 def _fine_clock(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
     """The clock near the hypothesis with the highest header peaks."""
-    total = _running_mean_sum(octave)
-    sign = int(hypothesis.reversed)
     n_rows = octave.columns.shape[1] * octave.rows
     step = 0.3 / min(n_rows / hypothesis.rows_per_slot, _SCAN_SLOTS)
-    best, best_score = hypothesis, -np.inf
-    for rows_per_slot in hypothesis.rows_per_slot * (1 + step * np.arange(-8, 9)):
-        response = _header_response(total, rows_per_slot / octave.rows)[sign : sign + 1]
-        (score,), (sample,) = _comb(response, hypothesis.packet_slots)
-        score += 0.03 * _repeats_at(octave, rows_per_slot, hypothesis.packet_slots)
-        score += _SAY_OF_LINE * octave.line_at(rows_per_slot)
-        if score > best_score:
-            start = (float(sample) / SAMPLES - SLOTS_PER_SYMBOL) * rows_per_slot
-            best = replace(hypothesis, rows_per_slot=float(rows_per_slot), start_row=float(start))
-            best_score = score
-    return best
+    tried = hypothesis.rows_per_slot * (1 + step * np.arange(-8, 9))
+    responses, n_places = _header_responses(_running_mean_sum(octave), tried / octave.rows)
+    score, place = _comb(-responses if hypothesis.reversed else responses, n_places, hypothesis.packet_slots)
+    score += [
+        0.03 * _repeats_at(octave, rows_per_slot, hypothesis.packet_slots)
+        + _SAY_OF_LINE * octave.line_at(rows_per_slot)
+        for rows_per_slot in tried.tolist()
+    ]
+    best = int(score.argmax())
+    start = (float(place[best]) / SAMPLES - SLOTS_PER_SYMBOL) * float(tried[best])
+    return replace(hypothesis, rows_per_slot=float(tried[best]), start_row=start)
 
 
 def _repeats_at(octave: _Octave, rows_per_slot: float, packet_slots: int) -> float:

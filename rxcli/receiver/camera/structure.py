@@ -60,9 +60,11 @@ def repeat_evidence(lit: BoolArray, position: NDArray[np.int64], packet_slots: i
 
 def _sliced(slots: FloatArray | Float32Array) -> BoolArray:
     """Whether every slot is nearer to the lightest or to the darkest of those around it."""
-    windows = np.pad(slots, ((0, 0), (EXTREMES_SLOTS // 2, EXTREMES_SLOTS // 2)), mode="edge")
-    around = np.lib.stride_tricks.sliding_window_view(windows, EXTREMES_SLOTS, axis=1)
-    return np.asarray(slots > (around.max(axis=2) + around.min(axis=2)) / 2)
+    import cv2
+
+    around = np.ones((1, EXTREMES_SLOTS), np.uint8)
+    most, least = (extreme(slots, around, borderType=cv2.BORDER_REPLICATE) for extreme in (cv2.dilate, cv2.erode))
+    return np.asarray(slots > (most + least) / 2)
 
 
 def _weight_evidence(count: NDArray[np.int64], share: FloatArray) -> FloatArray:

@@ -51,6 +51,8 @@ _RIGID_STEPS = 2
 _SLOW, _MOST_EXTRAPOLATED = 0.2, 3.0
 #: Slots that were read on a clock further off than this, slots, are read anew; so many readings at most.
 _FAR, _MOST_READINGS = 0.4, 4
+#: Evidence, nats, from which slots that were read so near are the right ones.
+_READ_SURELY = 200.0
 #: Packets of another length that are less likely by no more than this, nats, are estimates too.
 _CLOSE = 60.0
 
@@ -109,8 +111,12 @@ def refine(
     least = exposure_of_length(reading.packets[0].packet_slots)
     for _ in range(_MOST_READINGS):
         timing, corrected = _fit_timing(view, reading, least, sure)
+        moved = _moved(view, reading, timing)
+        if moved < _FAR and reading.log_evidence > _READ_SURELY:
+            again = reading
+            break
         again = _read_again(views, reading, timing, packet_lengths)
-        if again.log_evidence <= reading.log_evidence or _moved(view, reading, timing) < _FAR:
+        if again.log_evidence <= reading.log_evidence or moved < _FAR:
             break
         reading = again
     likely = [packets for packets in again.packets if packets.log_evidence > again.packets[0].log_evidence - _CLOSE]
