@@ -78,7 +78,7 @@ def find_cameras(
     timer: Timer,
     shows_packets: Callable[[FrameContext], bool] = lambda _: False,
     *,
-    widely: bool = True,
+    periods: blind.Periods = "all",
 ) -> Cameras:
     """The camera that a profile tells, or those that may be, estimated from the frame.
 
@@ -88,7 +88,7 @@ def find_cameras(
         options: screens and cameras.
         timer: of the frame.
         shows_packets: whether packets show with a camera beyond doubt; asked before the search is widened.
-        widely: see `estimate_camera`.
+        periods: see `estimate_camera`.
     """
     known = _camera_of(frame, options)
     if isinstance(known, Failure):
@@ -121,7 +121,7 @@ def find_cameras(
             options.screens,
             frame.metadata.exposure_s,
             lambda estimate: shows_packets(with_camera(estimate)),
-            widely=widely,
+            periods=periods,
         )
     first = with_camera(found.estimate) if found.estimate else None
     rivals = tuple(with_camera(rival) for rival in found.rivals)

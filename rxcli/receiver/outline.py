@@ -325,12 +325,12 @@ def _by_packets(
     """The likeliest candidate by what they were worth before and by how much their columns look like packets."""
     context: FrameContext | Failure
     if known is not None:
-        context, asked = replace(known, frame=frame, timer=timer), {one.family for one in candidates}
+        context = replace(known, frame=frame, timer=timer)
     else:
-        context, asked = _context_of_any(frame, candidates, options, timer)
+        context = _context_of_any(frame, candidates, options, timer)
     if isinstance(context, Failure):
         best = _likeliest([one for one in candidates if not one.by_grid_alone])
-        return Located(best, context if best.family in asked else None) if best else None
+        return Located(best, context) if best else None
     candidates, packets, looked_at = _with_likely_rows(context, candidates)
     if max(packets.values()) < _SOME_PACKETS:
         if context.camera.remembered:
@@ -415,23 +415,21 @@ def _leftmost(outline: Outline) -> float:
 
 def _context_of_any(
     frame: Frame, candidates: list[Outline], options: ReceiverOptions, timer: Timer
-) -> tuple[FrameContext | Failure, set[int]]:
-    """The camera by the first candidate that shows one; and the families that were asked.
+) -> FrameContext | Failure:
+    """The camera by the first candidate that shows one.
 
     It hardly depends on which columns are whose, so one candidate of a family speaks for all.
     """
-    found: FrameContext | Failure | None = None
-    asked: set[int] = set()
+    families: dict[int, Outline] = {}
     for candidate in candidates:
-        if candidate.family in asked:
-            continue
-        # Rows are the same moments wherever the columns are: of further families what stands out by itself will do.
-        context = likely_camera(frame, candidate.corners, options, timer, widely=not asked)
-        asked.add(candidate.family)
-        if not isinstance(context, Failure):
-            return context, asked
-        found = found or context
-    return found or Failure("no_signal", ""), asked
+        families.setdefault(candidate.family, candidate)
+    # Rows are the same moments wherever the columns are: what stands out by itself is looked for with all of them,
+    # before the first is searched widely.
+    for one in families.values():
+        found = likely_camera(frame, one.corners, options, timer, periods="outstanding")
+        if not isinstance(found, Failure):
+            return found
+    return likely_camera(frame, candidates[0].corners, options, timer, periods="others")
 
 
 def _packets(context: FrameContext) -> float:

@@ -55,18 +55,18 @@ class Received:
 
 
 def likely_camera(
-    frame: Frame, corners: FloatArray, options: ReceiverOptions, timer: Timer, *, widely: bool = True
+    frame: Frame, corners: FloatArray, options: ReceiverOptions, timer: Timer, *, periods: blind.Periods = "all"
 ) -> FrameContext | Failure:
     """The frame with its camera, known or estimated, and the screens that remain.
 
     Where several estimates are left, they have initial passes by turns until one shows packets plainly: the one under
     which headers, packets and symbols show best is it, and without packets none, unless the first is beyond doubt.
-    Where the same picture showed none with other corners it is not searched so `widely` again.
+    For `periods` see `camera.estimate_camera`.
     """
     remembered = None if options.force_camera else recall(options.camera_cache, frame)
     if remembered is not None and not has_profile(frame, options):
         return FrameContext(frame, corners, remembered.camera(frame), options.screens, timer)
-    found = find_cameras(frame, corners, options, timer, shows_packets, widely=widely)
+    found = find_cameras(frame, corners, options, timer, shows_packets, periods=periods)
     if found.first is not None and not found.rivals:
         return found.first
     best, most = found.first if found.sure else None, -np.inf

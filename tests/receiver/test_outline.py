@@ -186,8 +186,8 @@ def camera_of(frame: Frame, corners: FloatArray) -> FrameContext:
 def test_the_camera_is_asked_once_and_handed_on(packets: float, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, asked = Frame(np.zeros((200, 300), np.uint8), "drawn"), []
 
-    def likely(frame: Frame, corners: FloatArray, *_: object, widely: bool) -> FrameContext:
-        assert widely
+    def likely(frame: Frame, corners: FloatArray, *_: object, periods: str) -> FrameContext:
+        assert periods == "outstanding"
         asked.append(corners)
         return camera_of(frame, corners)
 
@@ -205,10 +205,10 @@ def test_the_camera_is_asked_once_and_handed_on(packets: float, monkeypatch: pyt
 
 
 def test_a_camera_that_shows_under_no_first_column_is_not_asked_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[bool] = []
+    asked: list[str] = []
 
-    def none(*_: object, widely: bool) -> Failure:
-        asked.append(widely)
+    def none(*_: object, periods: str) -> Failure:
+        asked.append(periods)
         return Failure("no_signal", "no camera")
 
     candidates = [replace(Outline(moved(k)), log_odds=-float(k), family=k // 3) for k in range(6)]
@@ -217,8 +217,8 @@ def test_a_camera_that_shows_under_no_first_column_is_not_asked_of_each(monkeypa
     located = locate(Frame(np.zeros((200, 300), np.uint8), "drawn"), OPTIONS, Timer())
     assert isinstance(located, Located)
     assert isinstance(located.context, Failure)
-    # The second search of the same rows is a short one.
-    assert asked == [True, False]
+    # A search of one family short, of the other, then one of all periods.
+    assert asked == ["outstanding", "outstanding", "others"]
 
 
 def test_once_a_screen_shows_plainly_other_outlines_are_looked_at_with_it_alone(

@@ -43,7 +43,7 @@ ALIKE_ROWS = 0.015
 #: Periods whose combs are looked at together.
 _AT_ONCE = 64
 #: Hypotheses that are tried: so many of different clocks or packets, and so many of different clocks.
-_TRIALS = 24
+_TRIALS = 12
 #: The same of the short list; lines and peaks that an octave has on it, those of every length of packet; and slots over
 #: the picture by which a period is off.
 _SHORT_TRIALS, _LINES, _PEAKS, _OFF_SLOTS = 5, 4, 3, (-1.0, 0.0, 1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from rxcli.receiver.camera.strips import Strips
 from rxcli.receiver.camera.timing import ALIKE, refine
 from rxcli.receiver.camera.views import Views
 from rxcli.types import FloatArray
+
+#: Which rows per slot are looked at: those that stand out in a picture, and others.
+Periods = Literal["all", "outstanding", "others"]
 
 #: Log-likelihood ratio of header and weights, over chance, that a clock must reach.
 MIN_EVIDENCE = 45.0
@@ -40,7 +44,7 @@ _REFINED, _CLOSE_EVIDENCE = 3, 0.3
 _READ_SURELY, _NOTHING_READ, _HOPELESS = 200.0, 150.0, 50.0
 #: Clocks of the short list, and of all periods, that are read; of how many of them the neighbours are read too, and by
 #: how many slots those are off by the end of the picture.
-_READ, _READ_OF_ALL, _READ_AROUND = 4, 12, 2
+_READ, _READ_OF_ALL, _READ_AROUND = 4, 4, 2
 _OFF_SLOTS = (-1.2, -0.6, 0.6, 1.2)
 #: What doubling the length of a packet costs, nats.
 _LONGER_PACKET = 3.0
@@ -70,7 +74,7 @@ def estimate_camera(
     exposure_s: float | None = None,
     shows_packets: Callable[[BlindEstimate], bool] = lambda _: False,
     *,
-    widely: bool = True,
+    periods: Periods = "all",
 ) -> BlindSearch:
     """Estimate the camera from one picture of a sending screen.
 
@@ -79,7 +83,7 @@ def estimate_camera(
         screens: screens that it may be.
         exposure_s: exposure, None where the file does not tell it.
         shows_packets: whether packets show with an estimate beyond doubt; asked before the search is widened.
-        widely: look at all periods where those that stand out read as nothing; else that is the end.
+        periods: those that stand out and, where these read as nothing, all; or the ones without the others.
 
     Raises:
         ValueError: no screens.
@@ -97,10 +101,9 @@ def estimate_camera(
     def refined(reading: Reading) -> list[BlindEstimate]:
         return refine(views, reading, lengths, lambda length: (exposure_s or 0.0) * rates[length], sure)
 
-    readings = sorted(
-        _read_until_sure(views, _clocks(short_list, straight, curves, lengths)[:_READ], lengths), key=_by_evidence
-    )
-    if not widely and _best(readings) < _HOPELESS:
+    outstanding = _clocks(short_list, straight, curves, lengths)[:_READ] if periods != "others" else []
+    readings = sorted(_read_until_sure(views, outstanding, lengths), key=_by_evidence)
+    if periods == "outstanding" and _best(readings) < _HOPELESS:
         return BlindSearch(None, why_not(strips))
     estimates: list[BlindEstimate] = []
     if _HOPELESS < _best(readings) < _READ_SURELY:
