@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 CaeMode = Literal["auto", "always", "never"]
 #: Names of the shortcuts that `ReceiverOptions.skip` may hold; every one is counted in the report.
-SKIPS = ("no_screen", "dark_columns", "certain_columns", "tracking")
+SKIPS = ("no_screen", "no_packets", "dark_columns", "certain_columns", "tracking")
 #: In place of a profile's name: all that are known, of which the picture decides.
 AUTO = "auto"
 _Profile = TypeVar("_Profile", ScreenProfile, CameraProfile)

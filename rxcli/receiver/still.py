@@ -57,6 +57,9 @@ _LOST, _FRESH_ROUNDS = -0.3, 2
 _CLEAR_COLUMNS, _CLEAR, _PLAIN_BURSTS = 0.9, 0.9, 300.0
 #: How alike copies are is half told by the packets' evidence.
 _SAY_OF_COPIES = 0.5
+#: Headers and packets, all columns together, under which an initial pass leaves no hope of packets, nats: of 120 hard
+#: pictures that show any, none had less than 74.
+_NO_PACKETS = 20.0
 #: Of two clocks the one whose slots are so much likelier packets on an initial pass, nats, is it.
 _PLAIN_CLOCK = 60.0
 
@@ -73,6 +76,8 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
     """
     first = first_pass(acquisition)
+    if "no_packets" in skip and not _may_show_packets(acquisition, first):
+        return replace(first, skipped={"no_packets": first.snr.shape[0]})
     if acquisition.rival is not None:
         return _likelier_clock(acquisition, first, skip)
     weighed = [first]
@@ -86,6 +91,15 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
     if _same_bursts(likeliest, reception):
         return reception
     return max(reception, decode(_in_bursts_of(acquisition, likeliest), skip, likeliest), key=packet_llr)
+
+
+def _may_show_packets(acquisition: Acquisition, first: Reception) -> bool:
+    """Whether an initial pass leaves hope of packets, on the clock or on another that it may be."""
+    if packet_llr(first) + max(float(first.posteriors.header_llr.sum()), 0.0) > _NO_PACKETS:
+        return True
+    return acquisition.rival is not None and _may_show_packets(
+        replace(acquisition, rival=None), first_pass(replace(acquisition, clock=acquisition.rival, rival=None))
+    )
 
 
 def decode_alike(acquisition: Acquisition, skip: frozenset[str], before: Reception) -> Reception:
