@@ -137,7 +137,8 @@ _OPTIONS = (
         multiple=True,
         metavar="NAME",
         callback=_check_skip,
-        help="Switch off a shortcut (no_screen, no_packets, dark_columns, certain_columns, tracking); may be given several times.",
+        help="Switch off a shortcut (no_screen, no_packets, dark_columns, certain_columns, tracking); may be given "
+        "several times.",
     ),
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,8 @@ class Reception:
     scene: denoise.DenoiserInput | None = None
     #: What was skipped: name -> columns.
     skipped: dict[str, int] = field(default_factory=dict)
+    #: What was worked out of it already, see `packet_confidence`; another reception begins anew.
+    kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
 
 def packet_llr(reception: Reception) -> float:
@@ -101,7 +104,14 @@ def complete_packets(reception: Reception) -> NDArray[np.bool_]:
 
 
 def packet_confidence(reception: Reception) -> FloatArray:
-    """(B, C) confidence of packets, the auto-encoder not yet asked."""
+    """(B, C) confidence of packets, the auto-encoder not yet asked; worked out once for a reception."""
+    if "confidence" not in reception.kept:
+        reception.kept["confidence"] = _packet_confidence(reception)
+    kept: FloatArray = reception.kept["confidence"]
+    return kept
+
+
+def _packet_confidence(reception: Reception) -> FloatArray:
     by_burst = assemble.slot_margin_by_burst(slot_margin(reception), reception.clock)
     n_columns, n_strips = reception.samples.light.shape[:2]
     return confidence.confidence(
