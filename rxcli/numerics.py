@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,21 @@ from rxcli.types import Float32Array, FloatArray
 
 #: Change of a header's slots, lit 1 and dark -1, at its borders.
 _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
+
+
+@lru_cache(maxsize=1)
+def one_blas_thread() -> Callable[[], AbstractContextManager[object]]:
+    """Matrix products on one thread for a while.
+
+    Ours are small: further threads only wait for the next one, busily, and take from the decoder's what they need. So
+    they double the time that a picture takes of the processor.
+    """
+    try:
+        from threadpoolctl import ThreadpoolController
+    except ImportError:  # nothing but slower without it
+        return nullcontext
+    controller = ThreadpoolController()
+    return lambda: controller.limit(limits=1, user_api="blas")
 
 
 def box_sums(values: Float32Array, half: int) -> Float32Array:

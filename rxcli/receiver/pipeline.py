@@ -13,6 +13,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from rxcli.numerics import one_blas_thread
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import sync
@@ -75,7 +76,8 @@ def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
 def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     """Receive one frame as a photograph."""
     timer = Timer()
-    result = _receive_still(frame, options, timer, options.camera_cache)
+    with one_blas_thread()():
+        result = _receive_still(frame, options, timer, options.camera_cache)
     return replace(result, message=_with_tried(result, options.screens), timing_ms=timer.total())
 
 

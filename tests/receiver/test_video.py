@@ -19,7 +19,7 @@ from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.receiver.channel.known_picture import KnownPicture, Look, exposed
 from rxcli.receiver.decode.detect import detect
-from rxcli.receiver.pipeline import receive
+from rxcli.receiver.pipeline import receive, receive_frame
 from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime, of_one_memory
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Clock, Float32Array, Frame, FrameResult
@@ -208,6 +208,21 @@ def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypa
         between = [threads() for _ in receive(clip.frames[:3], clip.options)]
     assert inside == [[1] * len(threads())] * 3
     assert all(max(counts) == 2 for counts in between)
+
+
+def test_products_take_one_thread_while_a_photograph_is_received(monkeypatch: pytest.MonkeyPatch) -> None:
+    blas = pytest.importorskip("threadpoolctl").ThreadpoolController()
+    inside: list[int] = []
+
+    def received(frame: Frame, *_: object) -> FrameResult:
+        inside.extend(library["num_threads"] for library in blas.info() if library["user_api"] == "blas")
+        return FrameResult(frame.source, 0, 0.0, "no_screen")
+
+    monkeypatch.setattr("rxcli.receiver.pipeline._receive_still", received)
+    with blas.limit(limits=2, user_api="blas"):
+        receive_frame(Frame(np.zeros((8, 8), np.uint8), "dark"), ReceiverOptions())
+    assert inside
+    assert set(inside) == {1}
 
 
 def test_a_single_frame_is_a_photograph(clip: Clip) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.cameras import context_at, has_profile
@@ -85,7 +85,7 @@ _MAX_WAITING = 8
 
 def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
     """Receive the frames of a clip; results come a frame or more late. An error of `frames` comes after all results."""
-    clip, one_thread = _Clip(options), _one_blas_thread()
+    clip, one_thread = _Clip(options), one_blas_thread()
     try:
         for frame in frames:
             with one_thread():
@@ -95,20 +95,6 @@ def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[
         yield from clip.finish()
         raise
     yield from clip.finish()
-
-
-def _one_blas_thread() -> Callable[[], AbstractContextManager[object]]:
-    """Matrix products on one thread for a while.
-
-    Ours are small: further threads only wait for the next one, busily, and take from the decoder's what they need. So
-    they double the time that a clip takes of the processor.
-    """
-    try:
-        from threadpoolctl import ThreadpoolController
-    except ImportError:  # nothing but slower without it
-        return nullcontext
-    controller = ThreadpoolController()
-    return lambda: controller.limit(limits=1, user_api="blas")
 
 
 @dataclass(slots=True, eq=False)
