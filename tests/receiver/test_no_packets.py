@@ -1,0 +1,66 @@
+"""Pictures whose first look shows neither headers nor packets are not looked at in depth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rxcli.options import SKIPS
+from rxcli.receiver import still
+from rxcli.receiver.acquisition import Acquisition
+from rxcli.receiver.reception import Reception
+from rxcli.types import BurstPosteriors, Clock
+
+CLOCK = Clock(
+    row0=0.0,
+    rows_per_slot=8.0,
+    exposure_slots=0.5,
+    packet_slots=130,
+    first_slot=0,
+    n_slots=260,
+    header_peak_ratio=3.0,
+    burst=np.zeros(2, np.int64),
+    delay_slots=np.zeros(3),
+)
+
+
+def _first(headers: float) -> Reception:
+    posteriors = BurstPosteriors(
+        w=np.full(3, 5),
+        w_log_prob=np.zeros((3, 9)),
+        log_evidence=np.full(3, -1e4),
+        lit=np.zeros((1, 3, 130), np.float32),
+        index=np.zeros((1, 3, 11), np.int64),
+        log_prob=np.zeros((1, 3, 11)),
+        bit_llr=np.zeros((1, 3, 11, 7)),
+        header_llr=np.full((1, 3), headers / 3),
+    )
+    nothing = np.zeros((3, 261, 4))
+    return Reception(CLOCK, None, posteriors, np.zeros((3, 260), np.float32), None, nothing)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("headers", "of_rival", "skip", "looked"),
+    [
+        (5.0, None, frozenset(SKIPS), False),
+        (90.0, None, frozenset(SKIPS), True),
+        (5.0, 90.0, frozenset(SKIPS), True),
+        (5.0, 5.0, frozenset(SKIPS), False),
+        (5.0, None, frozenset(SKIPS) - {"no_packets"}, True),
+    ],
+)
+def test_only_what_may_show_packets_is_looked_at_in_depth(
+    headers: float, of_rival: float | None, skip: frozenset[str], looked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rival = None if of_rival is None else replace(CLOCK, row0=4.0)
+    acquisition = Acquisition(None, None, CLOCK, rival)  # type: ignore[arg-type]
+    monkeypatch.setattr(still, "first_pass", lambda one: _first(headers if one.clock is CLOCK else of_rival or 0.0))
+    seen: list[str] = []
+    monkeypatch.setattr(still, "decode", lambda *rest: (seen.append("decode"), rest[2])[1])
+    monkeypatch.setattr(still, "_likelier_clock", lambda _, first, __: (seen.append("clocks"), first)[1])
+    monkeypatch.setattr(still, "_with_likeliest_bursts", lambda _, reception, *rest: reception)
+    reception = still.decode_likeliest(acquisition, skip)
+    assert bool(seen) == looked
+    assert reception.skipped == ({} if looked else {"no_packets": 3})
