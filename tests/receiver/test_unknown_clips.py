@@ -37,9 +37,9 @@ def test_the_camera_is_estimated_once_and_refitted(clip: Clip, monkeypatch: pyte
     asked: list[Frame] = []
     find = cameras.find_cameras
 
-    def counted(frame: Frame, *rest: object) -> cameras.Cameras:
+    def counted(frame: Frame, *rest: object, **named: str) -> cameras.Cameras:
         asked.append(frame)
-        return find(frame, *rest)  # type: ignore[arg-type]
+        return find(frame, *rest, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr("rxcli.receiver.unknown_camera.find_cameras", counted)
     results, score = scored(list(receive(clip.frames, _unknown(clip))), clip.truth)
