@@ -54,8 +54,9 @@ _LIKELIHOOD_COUNTS = 0.01
 _CLEAR = 6.0
 #: What packets say counts so much: the light model is surer than it should be. At most so many outlines are received.
 _PACKETS_COUNT, _MOST_LOOKS = 0.08, 6
-#: Outlines whose packets differ by less than this, nats, show the same; and the certainty from which one is likely.
-_SAME_PACKETS, _LIKELY = 40.0, 0.5
+#: Outlines whose packets differ by less than this, nats, show the same; the certainty from which one is likely, and
+#: that from which its columns' numbers are said to be the screen's.
+_SAME_PACKETS, _LIKELY, _SURE = 40.0, 0.5, 0.9
 #: Where no numbering is likely, columns are counted from the left of what is seen, if that is less likely than the
 #: likeliest by no more than this, log-odds.
 _MAY_BE = 3.0
@@ -79,7 +80,8 @@ class Outline:
     certainty: float = 1.0
     #: Sides of the stored picture that were inferred, not seen.
     inferred: tuple[str, ...] = ()
-    #: Column of the screen that is the first; None where columns are counted from the left of what is seen.
+    #: Column of the screen that is the first; None where that is not sure, or where columns are counted from the left of
+    #: what is seen.
     column_offset: int | None = 0
     log_odds: float = 0.0
     #: Whether nothing but the grid says that there is a screen.
@@ -94,7 +96,7 @@ class Outline:
     @property
     def is_counted_from_left(self) -> bool:
         """Whether no side is in view that tells which column is the first."""
-        return self.fills and self.column_offset is None
+        return self.fills and self.column_offset is None and self.certainty < _LIKELY
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -153,6 +155,7 @@ def locate(
         located = _by_packets(frame, candidates, options, timer, known)
     if located:
         return located
+    reason = _reason(frame, reason)
     if "no_screen" in options.skip or not may_fill(frame):
         return Failure("no_screen", f"no screen found: {reason}")
     return Located(Outline(whole_picture(frame), inferred=SIDE_NAMES, column_offset=None))
@@ -168,8 +171,6 @@ def possible_outlines(
     levels = levels_of(frame)
     with timer("geometry"):
         sides = find_screen(frame.pixels, **levels)
-        if sides.corners is None and (turned := turned_pixels(frame)):
-            return [], turned
         layouts = {one.columns: ColumnLayout(one.columns, one.light_spread, one.aspect) for one in options.screens}
         layout = layouts[min(layouts)]
         period, lens = int(levels.get("mosaic_period", 1)), known_lens(frame, options)
@@ -190,6 +191,11 @@ def possible_outlines(
                 found = rest + [replace(one, log_odds=one.log_odds + less) for one in shifted]
                 found.sort(key=lambda one: -one.log_odds)
     return [_as_viewed(one, frame.metadata.orientation) for one in found], f"{sides.reason}; {sides.advice}"
+
+
+def _reason(frame: Frame, found: str) -> str:
+    """Why no screen was found, and what to do: pixels may lie on their side."""
+    return turned_pixels(frame) or found
 
 
 def _as_viewed(outline: Outline, orientation: int) -> Outline:
@@ -301,8 +307,8 @@ def _bonus(by_sides: Outline) -> float:
 
 def _odds_of(numbering: Numbering, numberings: tuple[Numbering, ...]) -> float:
     """Log-odds of a numbering, grids that explain less counting less."""
-    best = max(one.grid.likelihood for one in numberings)
-    return numbering.log_odds - _LIKELIHOOD_COUNTS * (best - numbering.grid.likelihood)
+    less = max(one.grid.likelihood for one in numberings) - numbering.grid.likelihood
+    return numbering.log_odds - (0.0 if numbering.grid.by_drive else _LIKELIHOOD_COUNTS * less)
 
 
 def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:
@@ -372,9 +378,9 @@ def _likeliest(candidates: list[Outline]) -> Outline | None:
     odds = np.array([one.log_odds for one in candidates])
     share = np.exp(odds - odds.max())
     best, certainty = candidates[int(share.argmax())], float(1 / share.sum())
-    if certainty >= _LIKELY:
+    if certainty >= _SURE:
         return replace(best, certainty=certainty)
-    if best.fills:
+    if best.fills and certainty < _LIKELY:
         alike = [one for one in candidates if one.family == best.family and one.log_odds > best.log_odds - _MAY_BE]
         best = max(alike, key=_leftmost)
     return replace(best, certainty=certainty, column_offset=None)
