@@ -80,8 +80,8 @@ class Outline:
     certainty: float = 1.0
     #: Sides of the stored picture that were inferred, not seen.
     inferred: tuple[str, ...] = ()
-    #: Column of the screen that is the first; None where that is not sure, or where columns are counted from the left of
-    #: what is seen.
+    #: Column of the screen that is the first; None where that is not sure, or columns are counted from the left of what
+    #: is seen.
     column_offset: int | None = 0
     log_odds: float = 0.0
     #: Whether nothing but the grid says that there is a screen.
@@ -308,7 +308,8 @@ def _bonus(by_sides: Outline) -> float:
 def _odds_of(numbering: Numbering, numberings: tuple[Numbering, ...]) -> float:
     """Log-odds of a numbering, grids that explain less counting less."""
     less = max(one.grid.likelihood for one in numberings) - numbering.grid.likelihood
-    return numbering.log_odds - (0.0 if numbering.grid.by_drive else _LIKELIHOOD_COUNTS * less)
+    by_drive = numbering.grid.drive_odds
+    return numbering.log_odds + (-_LIKELIHOOD_COUNTS * less if by_drive is None else by_drive)
 
 
 def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:

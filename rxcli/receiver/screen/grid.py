@@ -38,8 +38,8 @@ class Grid:
     #: half a column further; 0 where it was not asked.
     explained: float = 0.0
     contrast: float = 0.0
-    #: Whether it is the likeliest one if columns are of unlike drive: that it explains less then says nothing.
-    by_drive: bool = False
+    #: Of the likeliest grid if columns are of unlike drive: log-odds against the one that explains most. None: another.
+    drive_odds: float | None = None
 
     @property
     def likelihood(self) -> float:
