@@ -33,7 +33,7 @@ from rxcli.receiver.unknown_camera import likely_camera
 from rxcli.types import FloatArray, Frame, Lens
 
 if TYPE_CHECKING:
-    from rxcli.receiver.screen.columns import ColumnLayout
+    from rxcli.receiver.screen.columns import ColumnLayout, ColumnSearch
     from rxcli.receiver.screen.find import ScreenSearch
     from rxcli.receiver.screen.numbering import Numbering
 
@@ -48,6 +48,9 @@ _RIVAL_SHIFT, _STRIPS_A_COLUMN = -7.0, 6.0
 #: Log-odds of an outline by sides that contradict the grid; what sides that agree with a numbering add to it; what
 #: sides add that were found for top or bottom less. Where left or right is missing, the other one's line says all.
 _CONTRADICTED, _CONFIRMED, _INFERRED = -3.0, 4.0, 1.0
+#: Lines of text may have been taken for the screen's sides where packets prefer sides that contradict a grid, or where
+#: no grid shows: how sure their columns' numbers are at most.
+_TRUST_IF_CONTRADICTED, _TRUST_IF_ALONE = 0.85, 0.9
 #: What tells a grid from others counts so much: strips err together.
 _LIKELIHOOD_COUNTS = 0.01
 #: Log-odds by which an outline must lead so that packets are not asked.
@@ -84,6 +87,8 @@ class Outline:
     #: is seen.
     column_offset: int | None = 0
     log_odds: float = 0.0
+    #: The most that its certainty may be.
+    trust: float = 1.0
     #: Whether nothing but the grid says that there is a screen.
     by_grid_alone: bool = False
     #: Outlines of one family are alike but for the first column.
@@ -150,7 +155,8 @@ def locate(
         with timer("geometry"):
             return outside_the_picture(options.corners, frame) or Located(Outline(options.corners))
     candidates, reason = possible_outlines(frame, options, timer, by_columns=by_columns)
-    located = Located(candidates[0]) if candidates else None
+    best = _likeliest(candidates[:1])
+    located = Located(best) if best else None
     if len(candidates) > 1 or (candidates and candidates[0].by_grid_alone):
         located = _by_packets(frame, candidates, options, timer, known)
     if located:
@@ -188,7 +194,8 @@ def possible_outlines(
                 shifted = _with_shifts(frame, unsure, sides, layout, period, lens)
                 less = _CONTRADICTED if columns.numberings else 0.0
                 rest = [one for one in found if one.family >= 0] if columns.numberings else []
-                found = rest + [replace(one, log_odds=one.log_odds + less) for one in shifted]
+                trust = _trust_in_sides(columns)
+                found = rest + [replace(one, log_odds=one.log_odds + less, trust=trust) for one in shifted]
                 found.sort(key=lambda one: -one.log_odds)
     return [_as_viewed(one, frame.metadata.orientation) for one in found], f"{sides.reason}; {sides.advice}"
 
@@ -196,6 +203,13 @@ def possible_outlines(
 def _reason(frame: Frame, found: str) -> str:
     """Why no screen was found, and what to do: pixels may lie on their side."""
     return turned_pixels(frame) or found
+
+
+def _trust_in_sides(columns: ColumnSearch) -> float:
+    """How sure the columns' numbers can be between sides that no grid of columns bears out."""
+    if columns.coherence is None:
+        return 1.0  # Nobody asked.
+    return _TRUST_IF_CONTRADICTED if columns.numberings else _TRUST_IF_ALONE
 
 
 def _as_viewed(outline: Outline, orientation: int) -> Outline:
@@ -378,7 +392,8 @@ def _likeliest(candidates: list[Outline]) -> Outline | None:
         return None
     odds = np.array([one.log_odds for one in candidates])
     share = np.exp(odds - odds.max())
-    best, certainty = candidates[int(share.argmax())], float(1 / share.sum())
+    best = candidates[int(share.argmax())]
+    certainty = min(float(1 / share.sum()), best.trust)
     if certainty >= _SURE:
         return replace(best, certainty=certainty)
     if best.fills and certainty < _LIKELY:
