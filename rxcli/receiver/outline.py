@@ -50,7 +50,7 @@ _RIVAL_SHIFT, _STRIPS_A_COLUMN = -7.0, 6.0
 _CONTRADICTED, _CONFIRMED, _INFERRED = -3.0, 4.0, 1.0
 #: Lines of text may have been taken for the screen's sides where packets prefer sides that contradict a grid, or where
 #: no grid shows: how sure their columns' numbers are at most.
-_TRUST_IF_CONTRADICTED, _TRUST_IF_ALONE = 0.85, 0.9
+_TRUST_IN_SIDES_ALONE = 0.85
 #: What tells a grid from others counts so much: strips err together.
 _LIKELIHOOD_COUNTS = 0.01
 #: Log-odds by which an outline must lead so that packets are not asked.
@@ -207,9 +207,7 @@ def _reason(frame: Frame, found: str) -> str:
 
 def _trust_in_sides(columns: ColumnSearch) -> float:
     """How sure the columns' numbers can be between sides that no grid of columns bears out."""
-    if columns.coherence is None:
-        return 1.0  # Nobody asked.
-    return _TRUST_IF_CONTRADICTED if columns.numberings else _TRUST_IF_ALONE
+    return 1.0 if columns.coherence is None else _TRUST_IN_SIDES_ALONE  # None: nobody asked.
 
 
 def _as_viewed(outline: Outline, orientation: int) -> Outline:
