@@ -34,7 +34,7 @@ from rxcli.receiver.unknown_camera import likely_camera
 from rxcli.types import FloatArray, Frame, Lens
 
 if TYPE_CHECKING:
-    from rxcli.receiver.screen.columns import ColumnLayout
+    from rxcli.receiver.screen.columns import ColumnLayout, ColumnSearch
     from rxcli.receiver.screen.find import ScreenSearch
     from rxcli.receiver.screen.numbering import Numbering
 
@@ -49,14 +49,18 @@ _RIVAL_SHIFT, _STRIPS_A_COLUMN = -7.0, 6.0
 #: Log-odds of an outline by sides that contradict the grid; what sides that agree with a numbering add to it; what
 #: sides add that were found for top or bottom less. Where left or right is missing, the other one's line says all.
 _CONTRADICTED, _CONFIRMED, _INFERRED = -3.0, 4.0, 1.0
+#: Lines of text may have been taken for the screen's sides where packets prefer sides that contradict a grid, or where
+#: no grid shows: how sure their columns' numbers are at most.
+_TRUST_IN_SIDES_ALONE = 0.85
 #: What tells a grid from others counts so much: strips err together.
 _LIKELIHOOD_COUNTS = 0.01
 #: Log-odds by which an outline must lead so that packets are not asked.
 _CLEAR = 6.0
 #: What packets say counts so much: the light model is surer than it should be. At most so many outlines are received.
 _PACKETS_COUNT, _MOST_LOOKS = 0.08, 6
-#: Outlines whose packets differ by less than this, nats, show the same; and the certainty from which one is likely.
-_SAME_PACKETS, _LIKELY = 40.0, 0.5
+#: Outlines whose packets differ by less than this, nats, show the same; the certainty from which one is likely, and
+#: that from which its columns' numbers are said to be the screen's.
+_SAME_PACKETS, _LIKELY, _SURE = 40.0, 0.5, 0.9
 #: Where no numbering is likely, columns are counted from the left of what is seen, if that is less likely than the
 #: likeliest by no more than this, log-odds.
 _MAY_BE = 3.0
@@ -81,9 +85,12 @@ class Outline:
     certainty: float = 1.0
     #: Sides of the stored picture that were inferred, not seen.
     inferred: tuple[str, ...] = ()
-    #: Column of the screen that is the first; None where columns are counted from the left of what is seen.
+    #: Column of the screen that is the first; None where that is not sure, or columns are counted from the left of what
+    #: is seen.
     column_offset: int | None = 0
     log_odds: float = 0.0
+    #: The most that its certainty may be.
+    trust: float = 1.0
     #: Whether nothing but the grid says that there is a screen.
     by_grid_alone: bool = False
     #: Outlines of one family are alike but for the first column.
@@ -96,7 +103,7 @@ class Outline:
     @property
     def is_counted_from_left(self) -> bool:
         """Whether no side is in view that tells which column is the first."""
-        return self.fills and self.column_offset is None
+        return self.fills and self.column_offset is None and self.certainty < _LIKELY
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -150,11 +157,13 @@ def locate(
         with timer("geometry"):
             return outside_the_picture(options.corners, frame) or Located(Outline(options.corners))
     candidates, reason = possible_outlines(frame, options, timer, by_columns=by_columns)
-    located = Located(candidates[0]) if candidates else None
+    best = _likeliest(candidates[:1])
+    located = Located(best) if best else None
     if len(candidates) > 1 or (candidates and candidates[0].by_grid_alone):
         located = _by_packets(frame, candidates, options, timer, known)
     if located:
         return located
+    reason = _reason(frame, reason)
     if "no_screen" in options.skip or not may_fill(frame):
         return Failure("no_screen", f"no screen found: {reason}")
     return Located(Outline(whole_picture(frame), inferred=SIDE_NAMES, column_offset=None))
@@ -170,8 +179,6 @@ def possible_outlines(
     levels = levels_of(frame)
     with timer("geometry"):
         sides = find_screen(frame.pixels, **levels)
-        if sides.corners is None and (turned := turned_pixels(frame)):
-            return [], turned
         layouts = {one.columns: ColumnLayout(one.columns, one.light_spread, one.aspect) for one in options.screens}
         layout = layouts[min(layouts)]
         period, lens = int(levels.get("mosaic_period", 1)), known_lens(frame, options)
@@ -189,9 +196,20 @@ def possible_outlines(
                 shifted = _with_shifts(frame, unsure, sides, layout, period, lens)
                 less = _CONTRADICTED if columns.numberings else 0.0
                 rest = [one for one in found if one.family >= 0] if columns.numberings else []
-                found = rest + [replace(one, log_odds=one.log_odds + less) for one in shifted]
+                trust = _trust_in_sides(columns)
+                found = rest + [replace(one, log_odds=one.log_odds + less, trust=trust) for one in shifted]
                 found.sort(key=lambda one: -one.log_odds)
     return [_as_viewed(one, frame.metadata.orientation) for one in found], f"{sides.reason}; {sides.advice}"
+
+
+def _reason(frame: Frame, found: str) -> str:
+    """Why no screen was found, and what to do: pixels may lie on their side."""
+    return turned_pixels(frame) or found
+
+
+def _trust_in_sides(columns: ColumnSearch) -> float:
+    """How sure the columns' numbers can be between sides that no grid of columns bears out."""
+    return 1.0 if columns.coherence is None else _TRUST_IN_SIDES_ALONE  # None: nobody asked.
 
 
 def _as_viewed(outline: Outline, orientation: int) -> Outline:
@@ -303,8 +321,9 @@ def _bonus(by_sides: Outline) -> float:
 
 def _odds_of(numbering: Numbering, numberings: tuple[Numbering, ...]) -> float:
     """Log-odds of a numbering, grids that explain less counting less."""
-    best = max(one.grid.likelihood for one in numberings)
-    return numbering.log_odds - _LIKELIHOOD_COUNTS * (best - numbering.grid.likelihood)
+    less = max(one.grid.likelihood for one in numberings) - numbering.grid.likelihood
+    by_drive = numbering.grid.drive_odds
+    return numbering.log_odds + (-_LIKELIHOOD_COUNTS * less if by_drive is None else by_drive)
 
 
 def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:
@@ -398,10 +417,11 @@ def _likeliest(candidates: list[Outline]) -> Outline | None:
         return None
     odds = np.array([one.log_odds for one in candidates])
     share = np.exp(odds - odds.max())
-    best, certainty = candidates[int(share.argmax())], float(1 / share.sum())
-    if certainty >= _LIKELY:
+    best = candidates[int(share.argmax())]
+    certainty = min(float(1 / share.sum()), best.trust)
+    if certainty >= _SURE:
         return replace(best, certainty=certainty)
-    if best.fills:
+    if best.fills and certainty < _LIKELY:
         alike = [one for one in candidates if one.family == best.family and one.log_odds > best.log_odds - _MAY_BE]
         best = max(alike, key=_leftmost)
     return replace(best, certainty=certainty, column_offset=None)

@@ -120,12 +120,17 @@ def _with_likeliest_bursts(
     Passes that were `weighed` before are not made again; new ones are added there. How alike copies are, by themselves,
     counts as said: where they were decoded as copies of one another they say nothing new.
     """
-    confidence = np.where(complete_packets(reception), packet_confidence(reception), 0.0).max(axis=0)
-    if not confidence.any() or (confidence > _CLEAR).mean() >= _CLEAR_COLUMNS:
-        return reception
+    complete = complete_packets(reception)
+    if not complete.any():
+        # Told apart like this copies leave no packet whole: what they say of one another is asked of packets alone.
+        say_of_copies = 0.0
+    else:
+        confidence = np.where(complete, packet_confidence(reception), 0.0).max(axis=0)
+        if not confidence.any() or (confidence > _CLEAR).mean() >= _CLEAR_COLUMNS:
+            return reception
     possible = sync.possible_bursts(reception.clock, detect.slot_llr(reception.metrics), acquisition.repeats)
     plain = len(possible) == 1 or possible[0][1] - possible[1][1] > _PLAIN_BURSTS
-    if plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
+    if complete.any() and plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
         return reception
     # How far rows are mixed does not depend on the bursts.
     clocks = [replace(clock, exposure_slots=reception.clock.exposure_slots) for clock, _ in possible]

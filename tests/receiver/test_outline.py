@@ -260,3 +260,19 @@ def test_clips_without_a_screen_are_not_searched_for_columns_in_every_frame(monk
     assert {result.status for result in results} == {"no_screen"}
     assert len(results) == 40
     assert 8 < len(searched) < 16
+
+
+def test_sides_that_contradict_the_columns_are_never_sure() -> None:
+    sides = Outline(CORNERS, log_odds=5.0, trust=0.85, family=-1)
+    best = outlines._likeliest([sides, Outline(moved(3), log_odds=-5.0)])
+    assert best is not None
+    assert best.certainty == 0.85
+    assert best.column_offset is None
+
+
+@pytest.mark.parametrize(("odds", "offset"), [(3.5, 0), (1.0, None)])
+def test_columns_are_said_to_be_the_screens_only_where_that_is_sure(odds: float, offset: int | None) -> None:
+    best = outlines._likeliest([Outline(CORNERS, log_odds=odds), Outline(moved(1))])
+    assert best is not None
+    assert best.column_offset == offset
+    np.testing.assert_array_equal(best.corners, CORNERS)

@@ -461,6 +461,19 @@ def test_copies_of_two_packets_taken_for_one_are_told_apart(monkeypatch: pytest.
         np.testing.assert_array_equal(again.posteriors.index, right.posteriors.index)
 
 
+def test_copies_told_apart_so_that_no_packet_is_whole_are_weighed_by_packets(monkeypatch: pytest.MonkeyPatch) -> None:
+    acquisition, options = acquired(clean())
+    right = still.decode_likeliest(acquisition, options.skip).clock.burst
+    last = int(np.flatnonzero(right == right[0])[-1])
+    split = np.where(np.arange(right.size) >= max(last, 1), right[0] + 1, right[0])
+    assert not np.array_equal(split, right)
+    monkeypatch.setattr(sync, "assign_bursts", lambda clock, *_: replace(clock, burst=split))
+    whole = still.complete_packets
+    monkeypatch.setattr(still, "complete_packets", lambda one: whole(one) & np.array_equal(one.clock.burst, right))
+    assert np.array_equal(still.initial_pass(replace(acquisition)).clock.burst, split)
+    assert np.array_equal(still.decode_likeliest(replace(acquisition), options.skip).clock.burst, right)
+
+
 def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:
     acquisition, options = acquired(clean())
     reception = still.decode(acquisition, options.skip)

@@ -1,7 +1,8 @@
 """Screens that are searched, against true corners: packets, wrong column numbers, packets wrong though confident.
 
-Half of the pictures are dark in one of the ways of `lab.simulate.dark_pictures`; the screen stands anywhere in the
-picture, turned and tilted. Cameras are those that a user has: the X-S10 by its profile, phones without one.
+Half of the pictures are dark in one of the ways of `lab.simulate.dark_pictures`, and one screen of eight has a hundred
+columns; the screen stands anywhere in the picture, turned and tilted. Cameras are those that a user has: the X-S10 by
+its profile, phones without one.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from rxcli.types import FrameResult
 
 #: From this confidence on a packet counts as confident.
 CONFIDENT = 0.99
-_SCREENS = ("paper-8k65", "paper-17k3", "paper-34k6")
+_SCREENS, _MANY_COLUMNS, _MANY = ("paper-8k65", "paper-17k3", "paper-34k6"), ("wide-100",), 0.12
 _PRESETS = ("xs10-still", "phone-corrected", "phone-plain")
 #: Packets that the screen's height holds at least.
 _LEAST_PACKETS = 1.25
@@ -39,8 +40,9 @@ _SHOWN = 5
 def scene_of(seed: int, number: int) -> tuple[Scene, str]:
     """A screen anywhere in a picture, and what kind of picture it shows."""
     rng = np.random.default_rng([seed, number, 17])
+    screens = _MANY_COLUMNS if rng.random() < _MANY else _SCREENS
     while True:
-        base = preset(str(rng.choice(_PRESETS)), str(rng.choice(_SCREENS)))
+        base = preset(str(rng.choice(_PRESETS)), str(rng.choice(screens)))
         share = rng.uniform(0.6, 0.97)
         rows = share * base.sensor.height / base.rows_per_slot
         if rows >= _LEAST_PACKETS * base.screen.packet_slots:

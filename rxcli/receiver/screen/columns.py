@@ -9,6 +9,7 @@ import numpy as np
 
 from rxcli.receiver.screen.coherence import Coherence, Pixels, measure_coherence
 from rxcli.receiver.screen.comb import find_combs
+from rxcli.receiver.screen.drive import explained_with_drive
 from rxcli.receiver.screen.grid import Grid
 from rxcli.receiver.screen.narrow import find_narrow_columns, shows_narrow_columns
 from rxcli.receiver.screen.numbering import Numbering, possible_numberings
@@ -21,6 +22,10 @@ from rxcli.types import FloatArray, Lens
 _COMBS, _EVERY, _FITTED, _HOPELESS = 12, 2, 4, 0.8
 #: By how much less a grid may explain, a share, that it is still a rival.
 _RIVAL = 0.05
+#: The same if columns are of unlike drive; and contrast, a share of what is explained, from which on they are not.
+_RIVAL_BY_DRIVE, _PLAIN_CONTRAST = 0.12, 0.27
+#: Log-odds that drives make the difference, and what each nat adds that is explained more then than by the other grid.
+_UNLIKE_DRIVE, _DRIVE_COUNTS = -3.0, 0.025
 #: Contrast of a grid, a share of what it explains, from which there may be columns, for one independent row: by chance
 #: it is the smaller, the more rows there are.
 _LEAST_CONTRAST = 0.95
@@ -119,14 +124,32 @@ def likely_grids(coherence: Coherence, strips: StripLight, lens: Lens | None) ->
         if not any(_apart(grid, known) < _WITHIN_REACH for known in refined):
             refined.append(refine_by_waveforms(strips, grid))
     refined.sort(key=lambda one: -one.likelihood)
+    refined = _with_likely_by_drive(strips, thinned, combs, refined)
     least = _LEAST_CONTRAST / np.sqrt(coherence.n_rows * coherence.y.size)
     distinct: list[Grid] = []
     for grid in refined:
-        near = grid.likelihood > (1 - _RIVAL) * refined[0].likelihood
+        near = grid.drive_odds is not None or grid.likelihood > (1 - _RIVAL) * refined[0].likelihood
         new = not any(_apart(grid, known) < _SAME for known in distinct)
         if near and new and grid.contrast > max(least * grid.explained, _LEAST_IN_STRIP * strips.x.size):
             distinct.append(grid)
     return [_bent(strips, grid) for grid in distinct] if lens is None else distinct
+
+
+def _with_likely_by_drive(
+    strips: StripLight, thinned: StripLight, combs: list[Grid], refined: list[Grid]
+) -> list[Grid]:
+    """The grids with the one marked that is likeliest if columns are of unlike drive, where that may be."""
+    if not refined or refined[0].contrast > _PLAIN_CONTRAST * refined[0].explained:
+        return refined
+    light = np.array([explained_with_drive(thinned, comb) for comb in combs])
+    best = int(light.argmax())
+    grid = refine_by_waveforms(strips, combs[best])
+    if grid.likelihood < (1 - _RIVAL_BY_DRIVE) * refined[0].likelihood or _apart(grid, refined[0]) < _SAME:
+        return refined
+    others = [one for one in refined if _apart(grid, one) >= _SAME]
+    nearer = [_apart(comb, refined[0]) < _apart(comb, grid) for comb in combs]
+    more = float(light[best]) - float(light[nearer].max(initial=float(light.min())))
+    return [*others, replace(grid, drive_odds=min(_UNLIKE_DRIVE + _DRIVE_COUNTS * more, 0.0))]
 
 
 def _bent(strips: StripLight, grid: Grid) -> Grid:

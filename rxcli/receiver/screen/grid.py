@@ -38,6 +38,8 @@ class Grid:
     #: half a column further; 0 where it was not asked.
     explained: float = 0.0
     contrast: float = 0.0
+    #: Of the likeliest grid if columns are of unlike drive: log-odds against the one that explains most. None: another.
+    drive_odds: float | None = None
 
     @property
     def likelihood(self) -> float:

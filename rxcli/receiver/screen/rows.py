@@ -26,7 +26,7 @@ _FEW_STRIPS = 0.5
 #: Light counts from this share of what the lit rows have.
 _LIT_SHARE = 0.18
 #: Bars take no more than this, screen heights; and so many more rows are kept than have light.
-_BARS, _MORE = 0.45, 0.03
+_BARS, _MORE, _COVERED = 0.45, 0.03, 0.1
 #: Sides are no further apart than the screen's height and this share of it.
 _WHOLE = 0.035
 #: Support from which top and bottom show well; how far they may be slanted against the columns, and the least distance
@@ -148,7 +148,9 @@ def _possible_ends(light: FloatArray, shown: FloatArray) -> list[FloatArray]:
     anchored = [tight[0] + np.array([[0.0], [1.0]]), tight[1] + np.array([[-1.0], [0.0]])]
     if sees.any():
         return [tight, anchored[int(sees.argmax())]]
-    whole = [light + less / 2 * np.array([[-1.0], [1.0]])]
+    # A little more than the screen costs less than rows that are left out.
+    around = min(less, _COVERED) if less < _BARS else less / 2
+    whole = [light + around * np.array([[-1.0], [1.0]])]
     if less < 2 * _WHOLE:
         return whole
     return [*whole, tight, *anchored] if less < _BARS else [*whole, *anchored, tight]

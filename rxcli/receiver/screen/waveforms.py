@@ -24,7 +24,8 @@ _SETTLED = 0.0015
 _RIDGE = 0.5
 #: Strips whose mixes are further off than so many standard deviations count less.
 _ROBUST = 2.0
-_LARGEST = np.array([0.1, 0.3, 0.3, 0.04, 0.04, 0.02])
+#: Largest step of a grid's numbers.
+LARGEST_STEP = np.array([0.1, 0.3, 0.3, 0.04, 0.04, 0.02])
 #: Columns on either side of the middle beyond which strips are not told apart: a plane seen nearly edge-on counts any.
 _REACH = 100.0
 #: Places of the borders at which light is explained, columns.
@@ -111,9 +112,8 @@ def _waveforms(strips: Float32Array, share: Float32Array, weight: Float32Array) 
     return np.asarray(np.matmul(np.linalg.inv(normal), np.matmul(turned, strips)), np.float32)
 
 
-def explained_light(strips: StripLight, u: FloatArray) -> float:
-    """How much of the strips' light the other strips' waveforms explain, nats, with (W, S) columns of the strips."""
-    share, _ = _mixes(u, strips.sigma)
+def explained_light(strips: StripLight, share: Float32Array) -> float:
+    """How much of the strips' light the other strips' waveforms explain, nats, with (W, S, K) shares of the columns."""
     total = 0.0
     for known, asked in ((0, 1), (1, 0)):
         waves = _waveforms(strips.halves[known], share[:, known::2], strips.weights[known])
@@ -138,7 +138,7 @@ def with_light(strips: StripLight, grid: Grid) -> Grid:
     """A grid, its borders moved to where they explain most of the light, with how much that is; see `Grid`."""
     u = columns_at(grid.numbers, strips.x, strips.y)
     places = np.arange(_PHASES) / _PHASES
-    light = np.array([explained_light(strips, u + place) for place in places.tolist()])
+    light = np.array([explained_light(strips, _mixes(u + place, strips.sigma)[0]) for place in places.tolist()])
     wave = complex((light * np.exp(-2j * np.pi * places)).sum()) * 2 / _PHASES
     moved = grid.shifted(float(np.angle(wave)) / (2 * np.pi))
     return replace(moved, explained=float(light.mean()) + abs(wave), contrast=2 * abs(wave))
@@ -154,16 +154,15 @@ def refine_by_waveforms(strips: StripLight, grid: Grid) -> Grid:
     best, prior = with_light(strips, grid), grid_prior(grid.bent)
     numbers = best.numbers
     for _ in range(_ROUNDS):
-        off, precision = _off(strips, columns_at(numbers, strips.x, strips.y))
-        limit = _ROBUST / np.sqrt(np.maximum(precision, 1e-9))
-        weight = (precision / np.maximum(np.abs(off) / limit, 1.0)).ravel()
+        mixes = _mixes(columns_at(numbers, strips.x, strips.y), strips.sigma)
+        off, weight = (values.ravel() for values in strip_offsets(strips, *mixes))
         if not weight.any():
             break  # A black picture: nothing says where the borders are.
         flat = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
         normal = (flat * weight) @ flat.T
         gradient = flat @ (weight * off.ravel()) - prior * numbers
         damped = normal + np.diag(prior + 1e-3 * np.diag(normal))
-        step = np.clip(_LONGER * np.linalg.solve(damped, gradient), -_LARGEST, _LARGEST)
+        step = np.clip(_LONGER * np.linalg.solve(damped, gradient), -LARGEST_STEP, LARGEST_STEP)
         numbers = numbers + step
         if step @ normal @ step < _SETTLED**2 * weight.sum():
             break
@@ -171,16 +170,23 @@ def refine_by_waveforms(strips: StripLight, grid: Grid) -> Grid:
     return refined if refined.likelihood > best.likelihood else best
 
 
-def _off(strips: StripLight, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(W, S) how far each strip lies from where the grid has it, columns, and the precision of that."""
-    off, precision = np.zeros(u.shape), np.zeros(u.shape)
-    share, apart = _mixes(u, strips.sigma)
+def strip_offsets(strips: StripLight, share: Float32Array, apart: Float32Array) -> tuple[FloatArray, FloatArray]:
+    """(W, S) how far each strip lies from where a grid has it, columns, and what that counts.
+
+    Args:
+        strips: of the picture.
+        share: (W, S, K) shares of the columns in every strip's light.
+        apart: (W, S, K) how far each strip lies from the columns' middles.
+    """
+    off, precision = np.zeros(strips.x.shape), np.zeros(strips.x.shape)
     turned = _slopes(share, apart, strips.sigma)
     for known, asked in ((0, 1), (1, 0)):
         waves = _waveforms(strips.halves[known], share[:, known::2], strips.weights[known])
         model, slope = np.matmul(share[:, asked::2], waves), np.matmul(turned[:, asked::2], waves)
         off[:, asked::2], precision[:, asked::2] = _asked(strips.halves[asked], model, slope)
-    return off, precision * (strips.n_rows / strips.halves[0].shape[2])
+    precision *= strips.n_rows / strips.halves[0].shape[2]
+    limit = _ROBUST / np.sqrt(np.maximum(precision, 1e-9))
+    return off, precision / np.maximum(np.abs(off) / limit, 1.0)
 
 
 def _asked(strips: Float32Array, model: Float32Array, slope: Float32Array) -> tuple[FloatArray, FloatArray]:

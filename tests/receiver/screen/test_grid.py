@@ -15,6 +15,7 @@ from rxcli.receiver.screen.agreement import sides_agree
 from rxcli.receiver.screen.coherence import measure_coherence
 from rxcli.receiver.screen.columns import ColumnLayout, ColumnSearch, find_columns
 from rxcli.receiver.screen.comb import find_combs, likeness
+from rxcli.receiver.screen.drive import explained_with_drive
 from rxcli.receiver.screen.grid import grid_between
 from rxcli.receiver.screen.numbering import first_columns, light_profile
 from rxcli.receiver.screen.rows import lit_range
@@ -137,6 +138,34 @@ def test_the_true_grid_explains_more_than_others_and_is_reached_from_near() -> N
     near = replace(true, numbers=true.numbers * np.array([1, 1.015, 1, 1, 1, 1]) + np.array([0.1, 0, 0.2, 0, 0, 0]))
     off = refine_by_waveforms(strips, near).numbers[:3] - true.numbers[:3]
     assert np.abs(off - np.array([round(off[0]), 0, 0])).max() < 0.3
+
+
+def lamps(seed: int) -> NDArray[np.uint8]:
+    """Luma of a screen whose columns are lit unlike one another, by up to some ten times."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(WIDTH, dtype=np.float64), np.arange(HEIGHT, dtype=np.float64))
+    u = grid_between(CORNERS, 20, (WIDTH, HEIGHT), None).columns_at(np.stack([x, y], axis=-1))
+    lit = rng.integers(0, 2, (int(HEIGHT / ROWS_PER_SLOT) + 2, 20))[(np.arange(HEIGHT) / ROWS_PER_SLOT).astype(int)]
+    drive = np.exp(rng.normal(0, 1.2, 20))
+    light = sum(drive[k] * np.exp(-((u - k - 0.5) ** 2) / (2 * 0.45**2)) * lit[:, k, None] for k in range(20))
+    light = light * ((u > 0) & (u < 20) & (y > 330) & (y < 850))
+    luma = 60 * light + 12 + rng.normal(0, 4, u.shape) + rng.normal(0, 0.5, (HEIGHT, 1))
+    return np.clip(luma, 0, 255).astype(np.uint8)
+
+
+def test_columns_of_unlike_drive_speak_for_the_true_grid_when_their_drive_is_estimated() -> None:
+    strips = StripLight.of(measure_coherence(lamps(0)), LAYOUT.sigma, None)
+    true = grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    plain, driven = [with_light(strips, true).explained], [explained_with_drive(strips, true)]
+    for factor in (0.9, 0.95, 1.06):
+        numbers = true.numbers * np.array([factor, factor, factor, 1, 1, 1])
+        other = refine_by_waveforms(strips, replace(true, numbers=numbers))
+        plain.append(other.explained)
+        driven.append(explained_with_drive(strips, other))
+    assert np.argmax(driven) == 0
+    # More is explained of all of them, and most of the true one.
+    assert min(np.subtract(driven, plain)) > 0
+    assert np.argmax(np.subtract(driven, plain)) == 0
 
 
 @pytest.mark.parametrize("seed", range(3))
