@@ -449,7 +449,7 @@ def test_errors_that_rows_have_in_common_count_as_one(together: int) -> None:
     slots = np.repeat(rng.integers(0, 2, (8, 200)), 5, axis=1).astype(np.float32)
     seen = ColumnLight(slots + noise, np.full((8, 1000), 50, np.float32), slots)
     judged, _ = known.judge(seen, slots, 0.0, 5.0)
-    # Of rows that err together five tell what one does, 1 / 0.1^2; of others half counts, as foreseen, and a little more.
+    # Five rows that err together tell what one does, 1 / 0.1^2; of others half counts, as foreseen, and a little more.
     expected = 100 / 5 if together == 5 else 50 / 0.9
     assert np.median(judged.precision) == pytest.approx(expected, rel=0.1)
 
