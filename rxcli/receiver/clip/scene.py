@@ -372,7 +372,8 @@ class TrackedScreen:
                 if here < most:
                     break
                 best, most = shifted, here
-        return (best, most) if most > contrast + _PLAINLY_BETTER else (clock, contrast)
+        plain = most > max(contrast + _PLAINLY_BETTER, _PLAIN_HEADER)
+        return (best, most) if plain else (clock, contrast)
 
     def _header(self, flat: known_picture.ColumnLight, clock: Clock) -> float:
         return known_picture.header_contrast(flat, known_picture.row_positions(self.rows, clock), clock)
