@@ -17,7 +17,7 @@ from rxcli.lab.simulate.capture import Take, prepare
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
-from rxcli.receiver.channel.known_picture import KnownPicture, Look, exposed
+from rxcli.receiver.channel.known_picture import ColumnLight, KnownPicture, Look, exposed
 from rxcli.receiver.decode.detect import detect
 from rxcli.receiver.pipeline import receive, receive_frame
 from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime, of_one_memory
@@ -438,6 +438,20 @@ def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
     assert half[..., : n_rows // 2 - 70] == pytest.approx(alone[..., : n_rows // 2 - 70], abs=1e-4)
     assert half[..., n_rows // 2 + 70 :] == pytest.approx(with_it[..., n_rows // 2 + 70 :], abs=1e-4)
     assert known.picture()[0] == pytest.approx(with_it)
+
+
+@pytest.mark.parametrize("together", [1, 5])
+def test_errors_that_rows_have_in_common_count_as_one(together: int) -> None:
+    """Noise of the same variance on every row alone, or on five rows at a time: the latter leaves less to be told."""
+    rng = np.random.default_rng(11)
+    known = KnownPicture(np.ones((8, 1, 1000), bool), np.array([[0.0, 1.0, 0.0]]), 0.0, 1e-4, 0.0)
+    noise = np.repeat(rng.normal(0, 0.1, (8, 1000 // together)), together, axis=1).astype(np.float32)
+    slots = np.repeat(rng.integers(0, 2, (8, 200)), 5, axis=1).astype(np.float32)
+    seen = ColumnLight(slots + noise, np.full((8, 1000), 50, np.float32), slots)
+    judged, _ = known.judge(seen, slots, 0.0, 5.0)
+    # Five rows that err together tell what one does, 1 / 0.1^2; of others half counts, as foreseen, and a little more.
+    expected = 100 / 5 if together == 5 else 50 / 0.9
+    assert np.median(judged.precision) == pytest.approx(expected, rel=0.1)
 
 
 def test_rows_that_were_never_lit_are_not_known() -> None:

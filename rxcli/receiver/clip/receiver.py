@@ -25,7 +25,7 @@ from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
 from rxcli.receiver.outline import Located, locate
-from rxcli.receiver.reception import Reception, shows_steady_light
+from rxcli.receiver.reception import Reception, complete_packets, shows_steady_light
 from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.single_light import STEADY_LIGHT, with_data
 from rxcli.receiver.still import apply_autoencoder, decode, decode_likeliest, doubtful_columns, initial_pass
@@ -454,13 +454,15 @@ class _Clip:
         Stabilisation crops and enlarges what was read, so that rows are no longer those of the profile.
         """
         tried, self._tried_profile = self._tried_profile, True
-        if tried or not has_profile(context.frame, self._options) or _doubt_of(reception) < _UNLIKE_DOUBT:
+        if tried or not has_profile(context.frame, self._options) or _shows_packets(reception, _UNLIKE_DOUBT):
             return None
         before = self._options, self._context
         self._options = replace(self._options, cameras=(), force_camera=False, camera_cache=None)
         other = likely_camera(context.frame, context.corners, self._options, context.timer)
         found = other if isinstance(other, Failure) else self._with_settled_camera(other)
-        if isinstance(found, Failure) or _doubt_of(found.reception or initial_pass(found.acquisition)) > _LIKE_DOUBT:
+        if isinstance(found, Failure) or not _shows_packets(
+            found.reception or initial_pass(found.acquisition), _LIKE_DOUBT
+        ):
             self._options, self._context = before
             return None
         self._context = found.context
@@ -785,6 +787,12 @@ def _moved_to(located: Located, corners: FloatArray, options: ReceiverOptions) -
 def _doubt_of(reception: Reception) -> float:
     """Share of the columns of a frame that are in doubt."""
     return float(doubtful_columns(reception).size / reception.snr.shape[0])
+
+
+def _shows_packets(reception: Reception, doubt: float) -> bool:
+    """Whether a camera explains a frame: less than a share of the columns is in `doubt` where packets are whole, and
+    the slots look like packets where none is."""
+    return _doubt_of(reception) < doubt if complete_packets(reception).any() else fits(reception)
 
 
 def _taken_with(frame: Frame) -> tuple[object, ...]:

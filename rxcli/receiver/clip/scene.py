@@ -53,10 +53,17 @@ _MISFIT = 40.0
 #: Slots of lateness that are put right, contrast of headers, against full, below which nothing is known any more, and
 #: contrast of a frame below which compression has taken much of it.
 _LATE, _LEAST_HEADER, _FADED = 0.03, 0.3, 0.85
+#: Slots that a clock may drift from halfway down to the last row: rows that are instants drift by 0.02 at most, those
+#: that a camera has stretched to hold a picture still by 0.1 to 0.4. How often such rows are timed anew, and the share
+#: of a frame's rows per slot in what is expected of the next.
+_DRIFTS, _RETIMINGS, _RETIMED_SHARE = 0.05, 4, 0.2
 #: Share of a frame's noise in what is expected of the next.
 _NOISE_SHARE = 0.2
 #: Contrast of its headers at which the foretold clock is not doubted.
 _GOOD_HEADER = 0.6
+#: Contrast of its headers from which a foretold clock needs no shift; step and number of shifts tried, slots; and
+#: how much better headers must show for one.
+_PLAIN_HEADER, _SHIFT, _MOST_SHIFTS, _PLAINLY_BETTER = 0.8, 0.3, 5, 0.1
 #: How much better its headers must show for a clock to be taken instead of the foretold one.
 _BETTER = 0.05
 #: Every so manieth row tells enough of a column's signal-to-noise ratio.
@@ -90,6 +97,8 @@ class TrackedScreen:
         self._looked: FloatArray | None = None
         self._drift: FloatArray = np.zeros(2)
         self._begun_with = acquisition, black_level
+        #: Rows per slot of the frames so far.
+        self._rows_per_slot = acquisition.clock.rows_per_slot
         self._n_updates = 0
         self._picture = self._new_picture(black_level)
 
@@ -252,7 +261,8 @@ class TrackedScreen:
             picture = self._picture.placed(pose.placement)
             flat = picture.solve(light)
         with timer("clock"):
-            clock = self._clock(frame, flat, last.acquisition.clock, time)
+            old = replace(last.acquisition.clock, rows_per_slot=self._rows_per_slot)
+            clock = self._clock(frame, flat, old, time)
             if clock is None:
                 return None
         with timer("detect"):
@@ -260,6 +270,7 @@ class TrackedScreen:
             if refined is None:
                 return None
             flat, clock, positions, metrics = refined
+            self._rows_per_slot += _RETIMED_SHARE * (clock.rows_per_slot - self._rows_per_slot)
             shown = _shown(pose.map.inside, positions, clock)
             snr = _snr(flat, clock)
         return View(
@@ -293,9 +304,14 @@ class TrackedScreen:
         positions, exposure_slots = known_picture.row_positions(rows, clock), clock.exposure_slots
         if known_picture.header_contrast(flat, positions, clock) < _LEAST_HEADER:
             return None
-        lit = known_picture.first_decision(flat, positions, clock) if known is None else known
-        slots = known_picture.exposures(lit, positions, exposure_slots)
-        fit = known_picture.fit_response(flat, slots)
+        for _ in range(_RETIMINGS):
+            lit = known_picture.first_decision(flat, positions, clock) if known is None else known
+            slots = known_picture.exposures(lit, positions, exposure_slots)
+            fit = known_picture.fit_response(flat, slots)
+            if abs(fit.drift) <= _DRIFTS:
+                break
+            clock = _retimed(clock, rows, fit)
+            positions = known_picture.row_positions(rows, clock)
         if self._n_updates < _FEW_UPDATES or (thorough and fit.response.centre < _FADED):
             expected = fit.response.expected(lit, positions, exposure_slots)
             flat = picture.solve_again(light, expected, clock.rows_per_slot)
@@ -322,6 +338,8 @@ class TrackedScreen:
         n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
         predicted = time.clock_at(frame.index, frame.time_s, old, n_slots, float(rows[0]) - 0.5)
         contrast = self._header(flat, predicted) if predicted is not None else 0.0
+        if predicted is not None and contrast < _PLAIN_HEADER:
+            predicted, contrast = self._shifted(flat, predicted, contrast)
         if contrast > _GOOD_HEADER:
             return predicted
         profiles = RowProfiles(
@@ -340,6 +358,22 @@ class TrackedScreen:
         if predicted is not None and _apart(found, predicted) > time.sure_slots:
             return predicted
         return found if self._header(flat, found) > contrast + _BETTER else predicted
+
+    def _shifted(self, flat: known_picture.ColumnLight, clock: Clock, contrast: float) -> tuple[Clock, float]:
+        """The clock, shifted to where its headers show plainly better, and their contrast.
+
+        Where a camera holds the picture still, rows are not those that were read at their time.
+        """
+        best, most = clock, contrast
+        for step in (-_SHIFT, _SHIFT):
+            for n in range(1, _MOST_SHIFTS + 1):
+                shifted = replace(clock, row0=clock.row0 + n * step * clock.rows_per_slot)
+                here = self._header(flat, shifted)
+                if here < most:
+                    break
+                best, most = shifted, here
+        plain = most > max(contrast + _PLAINLY_BETTER, _PLAIN_HEADER)
+        return (best, most) if plain else (clock, contrast)
 
     def _header(self, flat: known_picture.ColumnLight, clock: Clock) -> float:
         return known_picture.header_contrast(flat, known_picture.row_positions(self.rows, clock), clock)
@@ -441,6 +475,14 @@ def _of_bursts(
     slots = np.clip((view.pose.rows - clock.row0) / clock.rows_per_slot, 0, clock.n_slots - 1)
     copies = (slots.astype(np.int64) + clock.first_slot) // clock.packet_slots
     return replace(look, rows=np.isin(numbers[clock.burst[copies]], bursts))
+
+
+def _retimed(clock: Clock, rows: FloatArray, fit: known_picture.Fit) -> Clock:
+    """The clock put right by what a fit says of rows that were stretched after they were read."""
+    middle, half = (rows[0] + rows[-1]) / 2, (rows[-1] - rows[0]) / 2
+    rows_per_slot = 1 / (1 / clock.rows_per_slot + fit.drift / half)
+    at_middle = (middle - clock.row0) / clock.rows_per_slot + fit.late
+    return replace(clock, row0=float(middle - at_middle * rows_per_slot), rows_per_slot=float(rows_per_slot))
 
 
 def _less_ends(inside: BoolArray, rows: float) -> BoolArray:

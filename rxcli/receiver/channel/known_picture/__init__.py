@@ -13,11 +13,12 @@ from rxcli.receiver.channel.known_picture.exposure import exposed, row_positions
 from rxcli.receiver.channel.known_picture.header import dark_light, first_decision, header_contrast, header_dark
 from rxcli.receiver.channel.known_picture.metrics import pattern_metrics
 from rxcli.receiver.channel.known_picture.picture import MEMORY, ColumnLight, KnownPicture, Look, Placement
-from rxcli.receiver.channel.known_picture.response import equalized, exposures, fit_response
+from rxcli.receiver.channel.known_picture.response import Fit, equalized, exposures, fit_response
 
 __all__ = [
     "MEMORY",
     "ColumnLight",
+    "Fit",
     "KnownPicture",
     "Look",
     "Placement",

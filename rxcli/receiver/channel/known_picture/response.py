@@ -58,8 +58,10 @@ class Fit:
     """A frame's response, fitted."""
 
     response: Response
-    #: How many slots the clock is late.
+    #: How many slots the clock is late, and how much later at the last row than halfway, as rows are that a camera has
+    #: stretched after reading them.
     late: float
+    drift: float
 
 
 def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
@@ -70,17 +72,21 @@ def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
         slots: what they should have seen.
     """
     value, precision = (values.take(slots.rows, axis=1).ravel() for values in (observed.value, observed.precision))
-    parts = np.stack([slots.here, slots.beside, np.ones_like(slots.here), slots.slope]).reshape(4, -1)
+    down = np.linspace(-1, 1, slots.rows.size, dtype=np.float32)
+    terms = [slots.here, slots.beside, np.ones_like(slots.here), slots.slope, slots.slope * down]
+    parts = np.stack(terms).reshape(len(terms), -1)
     weighted = parts * precision
     weight = float(precision.sum()) + 1e-9
     normal, right = weighted @ parts.T / weight, weighted @ value / weight
     # Drawn, a little, to no blur.
-    usual = np.array([1.0, 0.0, 0.0, 0.0])
-    centre, side, offset, late = usual + np.linalg.solve(normal + _RIDGE * np.eye(4), right - normal @ usual)
+    usual = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+    fitted = usual + np.linalg.solve(normal + _RIDGE * np.eye(len(usual)), right - normal @ usual)
+    centre, side, offset = (float(part) for part in fitted[:3])
+    late, drift = np.clip(fitted[3:] / max(centre + 2 * side, 0.3), -_MAX_LATE, _MAX_LATE)
     response = Response(
         float(np.clip(centre, *_CENTRE)), float(np.clip(side, *_AT_SIDE)), float(np.clip(offset, -0.2, 0.2))
     )
-    return Fit(response, float(np.clip(late / max(centre + 2 * side, 0.3), -_MAX_LATE, _MAX_LATE)))
+    return Fit(response, float(late), float(drift))
 
 
 def equalized(observed: ColumnLight, slots: Exposures) -> ColumnLight:
