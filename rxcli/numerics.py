@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
 from typing import Any
@@ -18,18 +17,23 @@ _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]
 
 
 @lru_cache(maxsize=1)
-def one_blas_thread() -> Callable[[], AbstractContextManager[object]]:
+def _blas() -> Any:
+    """The controller of the threads of matrix products; None without threadpoolctl: nothing but slower."""
+    try:
+        from threadpoolctl import ThreadpoolController
+    except ImportError:
+        return None
+    return ThreadpoolController()
+
+
+def one_blas_thread() -> AbstractContextManager[object]:
     """Matrix products on one thread for a while.
 
     Ours are small: further threads only wait for the next one, busily, and take from the decoder's what they need. So
     they double the time that a picture takes of the processor.
     """
-    try:
-        from threadpoolctl import ThreadpoolController
-    except ImportError:  # nothing but slower without it
-        return nullcontext
-    controller = ThreadpoolController()
-    return lambda: controller.limit(limits=1, user_api="blas")
+    controller = _blas()
+    return nullcontext() if controller is None else controller.limit(limits=1, user_api="blas")
 
 
 def box_sums(values: Float32Array, half: int) -> Float32Array:

@@ -163,7 +163,7 @@ def locate(
         located = _by_packets(frame, candidates, options, timer, known)
     if located:
         return located
-    reason = _reason(frame, reason)
+    reason = turned_pixels(frame) or reason  # Pixels may lie on their side.
     if "no_screen" in options.skip or not may_fill(frame):
         return Failure("no_screen", f"no screen found: {reason}")
     return Located(Outline(whole_picture(frame), inferred=SIDE_NAMES, column_offset=None))
@@ -200,11 +200,6 @@ def possible_outlines(
                 found = rest + [replace(one, log_odds=one.log_odds + less, trust=trust) for one in shifted]
                 found.sort(key=lambda one: -one.log_odds)
     return [_as_viewed(one, frame.metadata.orientation) for one in found], f"{sides.reason}; {sides.advice}"
-
-
-def _reason(frame: Frame, found: str) -> str:
-    """Why no screen was found, and what to do: pixels may lie on their side."""
-    return turned_pixels(frame) or found
 
 
 def _trust_in_sides(columns: ColumnSearch) -> float:

@@ -76,7 +76,7 @@ def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
 def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     """Receive one frame as a photograph."""
     timer = Timer()
-    with one_blas_thread()():
+    with one_blas_thread():
         result = _receive_still(frame, options, timer, options.camera_cache)
     return replace(result, message=_with_tried(result, options.screens), timing_ms=timer.total())
 

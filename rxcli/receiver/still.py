@@ -178,7 +178,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
     """A quick look first; where that leaves doubt, the light model in depth.
 
     Args:
-        lock: the clock and the row profiles.
+        acquisition: the clock and the row profiles.
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
         first: what the quick look showed, where there was one.
     """

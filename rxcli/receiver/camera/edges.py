@@ -30,7 +30,7 @@ def line_evidence(strips: Strips, rows_per_slot: float, curvature: FloatArray) -
     Args:
         strips: as the picture has them.
         rows_per_slot: of the grid.
-        bend: (4,) of the stripes.
+        curvature: (4,) of the stripes.
     """
     level, weight = levelled(strips.light, strips.inside, round(EXTREMES_SLOTS * rows_per_slot), strips.noise)
     shape = (strips.n_columns, -1, strips.rows.size)

@@ -251,7 +251,7 @@ def gauss_newton(
         terms: see `time_terms`.
         values: (6,) the row-time map.
         time: (M, R) its slot positions.
-        seen: (M, R) light 0..1 that the slots give, and its change per slot.
+        observed: (M, R) light 0..1 that the slots give, and its change per slot.
         n_free: values that are fitted, the first ones.
         local_slots: slots over which the picture may be taken as constant.
         order: rows by which what is left of a row is foretold; the picture's texture is alike in neighbouring rows.

@@ -85,10 +85,10 @@ _MAX_WAITING = 8
 
 def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
     """Receive the frames of a clip; results come a frame or more late. An error of `frames` comes after all results."""
-    clip, one_thread = _Clip(options), one_blas_thread()
+    clip = _Clip(options)
     try:
         for frame in frames:
-            with one_thread():
+            with one_blas_thread():
                 done = clip.take(frame)
             yield from done
     except Exception:

@@ -47,7 +47,7 @@ def column_results(
         posteriors: of B bursts and C columns.
         snr: (C, N) squared contrast over variance of every slot of the grid.
         samples: the samples, for what was visible.
-        support: (C, N) what the light says for every slot as decided, see `detect.slot_margin`.
+        slot_margin: (C, N) what the light says for every slot as decided, see `detect.slot_margin`.
         headerless: (C,) columns that show no packets, whatever was decided of their slots, see `without_header`.
         min_confidence: packets below it are left out.
         denoised: columns in which corrections of the auto-encoder were kept.
@@ -231,7 +231,7 @@ def complete(n_observed: IntArray) -> BoolArray:
     """(B, C) whether every payload slot was seen, so that the packet can be reported.
 
     Args:
-        seen: (B, C, packet) from `slots_observed`.
+        n_observed: (B, C, packet) from `slots_observed`.
     """
     return np.asarray((n_observed[:, :, PREAMBLE_SLOTS:] > 0).all(axis=2))
 
@@ -379,7 +379,7 @@ def _payloads(index: IntArray, weights: IntArray) -> list[str]:
 
 
 def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Array:
-    """(B, C, N) the support (C, N) of the payload slots of each burst, 0 for the other slots of the grid."""
+    """(B, C, N) the margins (C, N) of the payload slots of each burst, 0 for the other slots of the grid."""
     slot = np.arange(clock.first_slot, clock.first_slot + clock.n_slots)
     payload = slot % clock.packet_slots >= PREAMBLE_SLOTS
     bursts = np.arange(int(clock.burst.max()) + 1)

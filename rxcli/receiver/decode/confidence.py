@@ -149,7 +149,7 @@ def confidence_features(
 
     Args:
         posteriors: of B bursts and C columns.
-        support: (B, C, n) what the light says for payload slots of the packets as decided, nats; 0 where nothing is
+        slot_margin: (B, C, n) what the light says for payload slots of the packets as decided, nats; 0 where nothing is
             seen; see `slot_margin_by_burst`.
         denoised: (C,) whether corrections of the auto-encoder were kept.
         n_strips: strips of a column in a quick look.

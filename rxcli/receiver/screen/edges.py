@@ -79,7 +79,7 @@ def refine(
 
     Args:
         picture: the picture.
-        guess: the four sides, within half a hundredth of the screen's width or so.
+        initial: the four sides, within half a hundredth of the screen's width or so.
         pose: (8,) the pose that fits them.
         rectangle: picture and screen.
     """
@@ -182,7 +182,7 @@ def steps_of(picture: Picture, initial: list[Side], side: int, size: float) -> S
 
     Args:
         picture: the picture.
-        guess: the four sides, within half a hundredth of the screen's width or so.
+        initial: the four sides, within half a hundredth of the screen's width or so.
         side: which of them.
         size: the screen's width, pixels.
     """

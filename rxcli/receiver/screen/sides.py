@@ -131,7 +131,7 @@ def outermost_line(
         t: (n,) place along the side.
         depth: (n,) where energy begins, growing inwards.
         weight: (n,) support that a place may give, 0..1.
-        seen: (n,) places that may speak against one.
+        observed: (n,) places that may speak against one.
         tolerance: distance at which support ends.
         slope: expected slope.
         spread: largest deviation from it.

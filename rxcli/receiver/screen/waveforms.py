@@ -160,7 +160,7 @@ def refine_by_waveforms(strips: StripLight, grid: Grid) -> Grid:
             break  # A black picture: nothing says where the borders are.
         flat = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
         normal = (flat * weight) @ flat.T
-        gradient = flat @ (weight * off.ravel()) - prior * numbers
+        gradient = flat @ (weight * off) - prior * numbers
         damped = normal + np.diag(prior + 1e-3 * np.diag(normal))
         step = np.clip(_LONGER * np.linalg.solve(damped, gradient), -LARGEST_STEP, LARGEST_STEP)
         numbers = numbers + step

@@ -20,7 +20,7 @@ def first_decision(observed: ColumnLight, positions: FloatArray, clock: Clock) -
     """(C, N) probability that each slot is lit, from the rows around its middle alone.
 
     Args:
-        seen: the columns' light.
+        observed: the columns' light.
         positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
         clock: the clock.
     """
@@ -38,7 +38,7 @@ def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) 
     """Contrast of the headers where the clock has them, 1 being full and 0 none; 1 where no header shows.
 
     Args:
-        seen: the columns' light.
+        observed: the columns' light.
         positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
         clock: the clock.
     """

@@ -22,10 +22,10 @@ def pattern_metrics(
     """Log-likelihood of every slot pattern at every slot, (C, N + memory, patterns); see `channel.SlotLikelihoods`.
 
     Args:
-        seen: the columns' light.
+        observed: the columns' light.
         positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
         clock: the clock.
-        memory: slots of memory.
+        isi_memory: slots of memory.
         response: what becomes of the exposed slots.
         expected: (C, R) light that the slots give by it.
         lit: (C, N) present idea of the slots, for what reaches beyond the memory.

@@ -100,10 +100,10 @@ class KnownPicture:
 
     Args:
         inside: (C, S, R) the strip is on the screen there.
-        spread: (S, 3) share of the light of columns -1, 0, +1 in each strip.
-        floor: light of a dark slot, one for all or (C, S).
+        crosstalk: (S, 3) share of the light of columns -1, 0, +1 in each strip.
+        black_level: light of a dark slot, one for all or (C, S).
         variance: of a strip's light where it is dark.
-        shot: variance per unit of light.
+        shot_gain: variance per unit of light.
     """
 
     def __init__(
@@ -232,7 +232,7 @@ class KnownPicture:
         """Compare columns with what was decided; they are trusted accordingly, now and, in part, from now on.
 
         Args:
-            seen: as `solve` gave it.
+            observed: as `solve` gave it.
             expected: (C, R) what the decided slots give.
             share: weight of this frame against those before, 0..1.
             rows_per_slot: rows per slot.

@@ -68,7 +68,7 @@ def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
     """The response of a frame by least squares over all columns.
 
     Args:
-        seen: the columns' light.
+        observed: the columns' light.
         slots: what they should have seen.
     """
     value, precision = (values.take(slots.rows, axis=1).ravel() for values in (observed.value, observed.precision))
@@ -95,7 +95,7 @@ def equalized(observed: ColumnLight, slots: Exposures) -> ColumnLight:
     Rows are grouped by their precision; in each group the contrast that is left is measured against the slots.
 
     Args:
-        seen: the columns' light.
+        observed: the columns' light.
         slots: what they should have seen.
     """
     half = np.float32(0.5)
