@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -76,10 +77,11 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
     """
     first = first_pass(acquisition)
-    if "no_packets" in skip and not _may_show_packets(acquisition, first):
+    either = _with_either_clock(acquisition)
+    if "no_packets" in skip and not any(_may_show_packets(first_pass(one)) for one in either):
         return replace(first, skipped={"no_packets": first.snr.shape[0]})
-    if acquisition.rival is not None:
-        return _likelier_clock(acquisition, first, skip)
+    if len(either) > 1:
+        return _likelier_clock(either, skip)
     weighed = [first]
     likeliest = _with_likeliest_bursts(acquisition, first, weighed, _SAY_OF_COPIES)
     reception = decode(
@@ -93,13 +95,18 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
     return max(reception, decode(_in_bursts_of(acquisition, likeliest), skip, likeliest), key=packet_llr)
 
 
-def _may_show_packets(acquisition: Acquisition, first: Reception) -> bool:
-    """Whether an initial pass leaves hope of packets, on the clock or on another that it may be."""
-    if packet_llr(first) + max(float(first.posteriors.header_llr.sum()), 0.0) > _NO_PACKETS:
-        return True
-    return acquisition.rival is not None and _may_show_packets(
-        replace(acquisition, rival=None), first_pass(replace(acquisition, clock=acquisition.rival, rival=None))
-    )
+def _may_show_packets(first: Reception) -> bool:
+    """Whether an initial pass leaves hope of packets."""
+    return packet_llr(first) + max(float(first.posteriors.header_llr.sum()), 0.0) > _NO_PACKETS
+
+
+def _with_either_clock(acquisition: Acquisition) -> list[Acquisition]:
+    """The acquisition as one of its clock alone, and as one of its rival where there is one."""
+    if acquisition.rival is None:
+        return [acquisition]
+    either = [replace(acquisition, clock=clock, rival=None) for clock in (acquisition.clock, acquisition.rival)]
+    either[0].kept.update(acquisition.kept)
+    return either
 
 
 def decode_alike(acquisition: Acquisition, skip: frozenset[str], before: Reception) -> Reception:
@@ -156,12 +163,9 @@ def _same_bursts(one: Reception, other: Reception) -> bool:
     return np.array_equal(one.clock.burst, other.clock.burst)
 
 
-def _likelier_clock(acquisition: Acquisition, first: Reception, skip: frozenset[str]) -> Reception:
+def _likelier_clock(either: Sequence[Acquisition], skip: frozenset[str]) -> Reception:
     """What is decoded on the likelier of two clocks; a further look tells where an initial pass does not plainly."""
-    assert acquisition.rival is not None
-    either = [replace(acquisition, clock=clock, rival=None) for clock in (acquisition.clock, acquisition.rival)]
-    either[0].kept.update(acquisition.kept)
-    evidence = [packet_llr(first), packet_llr(first_pass(either[1]))]
+    evidence = [packet_llr(first_pass(one)) for one in either]
     if abs(evidence[0] - evidence[1]) < _PLAIN_CLOCK:
         evidence = [packet_llr(_refined_once(one)) for one in either]
     return decode_likeliest(either[int(np.argmax(evidence))], skip)

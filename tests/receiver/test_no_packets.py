@@ -59,7 +59,9 @@ def test_only_what_may_show_packets_is_looked_at_in_depth(
     monkeypatch.setattr(still, "first_pass", lambda one: _first(headers if one.clock is CLOCK else of_rival or 0.0))
     seen: list[str] = []
     monkeypatch.setattr(still, "decode", lambda *rest: (seen.append("decode"), rest[2])[1])
-    monkeypatch.setattr(still, "_likelier_clock", lambda _, first, __: (seen.append("clocks"), first)[1])
+    monkeypatch.setattr(
+        still, "_likelier_clock", lambda either, _: (seen.append("clocks"), still.first_pass(either[0]))[1]
+    )
     monkeypatch.setattr(still, "_with_likeliest_bursts", lambda _, reception, *rest: reception)
     reception = still.decode_likeliest(acquisition, skip)
     assert bool(seen) == looked
