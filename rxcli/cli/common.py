@@ -130,7 +130,7 @@ _OPTIONS = (
     click.option(
         "--min-confidence",
         type=click.FloatRange(0, 1),
-        help="Report only packets of at least this confidence. [default: all]",
+        help="Report only packets of at least this confidence; 0 for all. [default: 0.1]",
     ),
     click.option(
         "--no-skip",
@@ -160,9 +160,10 @@ def receiver_options(
         UsageError: the corners are no convex quadrilateral.
     """
     from rxcli.options import receiver_options as options_of
+    from rxcli.types import LEAST_CONFIDENCE
 
     if options.get("min_confidence") is None:
-        options["min_confidence"] = 0.0
+        options["min_confidence"] = LEAST_CONFIDENCE
     return options_of(screens or AUTO, cameras or AUTO, corners or None, **options)
 
 

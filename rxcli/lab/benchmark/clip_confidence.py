@@ -127,6 +127,7 @@ def options_for(clip: ClipScene, take: Take, *, corners: bool, cae: CaeMode = "a
         force_camera=clip.camera_told,
         corners=exposure.corners if corners else None,
         cae=cae,
+        min_confidence=0.0,
     )
 
 

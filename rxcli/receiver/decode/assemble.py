@@ -11,6 +11,7 @@ from rxcli.protocol import PREAMBLE_SLOTS, bits_per_symbol, indices_to_bits
 from rxcli.receiver.decode.confidence import BurstInClip, Doubts, clip_doubts, confidence_features, doubts_of
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import (
+    LEAST_CONFIDENCE,
     BoolArray,
     BurstPosteriors,
     Clock,
@@ -95,8 +96,9 @@ def _why_headerless(samples: SlotSamples, column: int) -> str:
 
 
 def _held_back(confidence: float, min_confidence: float) -> str | None:
-    """What to say of a column whose surest packet is not sure enough to be reported; None where there is none."""
-    if not 0 < confidence < min_confidence:
+    """What to say of a column whose surest packet is not sure enough to be reported; None where there is none that is
+    worth a word."""
+    if not LEAST_CONFIDENCE <= confidence < min_confidence:
         return None
     return f"its packet has a confidence of {confidence:.4f}, below --min-confidence {min_confidence:g}"
 
