@@ -37,6 +37,8 @@ _LEAST = 1e-300
 _LEAST_WORD = -85.0
 #: Probabilities below this are not told apart.
 _TINY = 1e-30
+#: Slots after which likelihoods that shrink are scaled, and the least of a slot, so that none is lost till then.
+_SCALED_AFTER, _LEAST_OF_SLOT = 4, 1e-60
 #: Metrics that are worked on together: more leave the processor's cache, fewer take more calls.
 _AT_ONCE = 250_000
 
@@ -56,9 +58,8 @@ class _Branches:
     #: (words,) the word's first slots, and its last ones, as states.
     first: NDArray[np.int64]
     last: NDArray[np.int64]
-    #: (words, states): 1 where a word begins, or ends, so.
-    begins: FloatArray
-    ends: FloatArray
+    #: (words, states * states): 1 where a word begins and ends so.
+    passes: Float32Array
     #: Patterns of header and dimming symbol, from the first slot whose predecessors are known.
     preamble: NDArray[np.int64]
     #: State that header and dimming symbol end in.
@@ -95,7 +96,7 @@ def _branches(w: int, isi_memory: int) -> _Branches:
     features = (index[..., None] == np.arange(2 * n_states)).reshape(len(words), -1)
     place = 1 << np.arange(isi_memory - 1, -1, -1)
     first, last = words[:, :isi_memory] @ place, words[:, SLOTS_PER_SYMBOL - isi_memory :] @ place
-    begins, ends = ((slots[:, None] == np.arange(n_states)).astype(np.float64) for slots in (first, last))
+    passes = (first * n_states + last)[:, None] == np.arange(n_states * n_states)
     preamble = np.concatenate([np.array(HEADER, np.int64), dimming_symbol(w)])
     header = np.broadcast_to(np.array(HEADER[:isi_memory], np.int64), (n_states, isi_memory))
     return _Branches(
@@ -103,8 +104,7 @@ def _branches(w: int, isi_memory: int) -> _Branches:
         np.ascontiguousarray(features.T, np.float64),
         first,
         last,
-        begins,
-        ends,
+        passes.astype(np.float32),
         _pattern_index(preamble, isi_memory),
         int(_pattern_index(preamble[PREAMBLE_SLOTS - isi_memory :], isi_memory - 1)[0]),
         _pattern_index(np.concatenate([_states(isi_memory), header], axis=1), isi_memory),
@@ -177,36 +177,84 @@ class _Trellis:
     start: FloatArray
     end: FloatArray
 
-    def forward(self) -> tuple[list[FloatArray], FloatArray, FloatArray]:
-        """Likelihood (n, words) of what leads to each word and of the word, by symbol, each scaled; that of the last
-        states, and the logarithm of its scale."""
-        by_symbol, state = [], self.start
-        tops = np.empty((len(self.meeting), len(self.start)))
-        for meeting, rest, top in zip(self.meeting, self.rest, tops, strict=True):
-            words = np.matmul(state[:, None], meeting)[:, 0].take(self.branches.first, axis=1)
-            words *= rest
-            by_symbol.append(words)
-            state = words @ self.branches.ends
-            _scale(state, top)
-        return by_symbol, state, np.log(tops).sum(axis=0)
+    def transitions(self) -> FloatArray:
+        """(N, n, states, states) likelihood of all words from each state to each state."""
+        passing: FloatArray = (self.rest @ self.branches.passes).reshape(self.meeting.shape).astype(np.float64)
+        return np.asarray(np.matmul(self.meeting, passing))
 
-    def backward(self) -> FloatArray:
-        """(N, n, states) likelihood of what follows each symbol, by the state that it ends in, scaled."""
-        out = np.empty((len(self.meeting), *self.end.shape))
-        out[-1], top = self.end, np.empty(len(self.end))
-        for number in range(len(out) - 1, 0, -1):
-            words = out[number].take(self.branches.last, axis=1)
-            words *= self.rest[number]
-            np.matmul(self.meeting[number], (words @ self.branches.begins)[..., None], out=out[number - 1, ..., None])
-            _scale(out[number - 1], top)
-        return out
+    def word_posteriors(self, before: FloatArray, after: FloatArray, packets: NDArray[np.int64]) -> FloatArray:
+        """(packets, N, words) probability of the words of some packets.
+
+        Args:
+            before: (N + 1, n, states) likelihood of what leads to each state before a symbol.
+            after: likewise, of what follows.
+            packets: those that are asked for.
+        """
+        leads = np.matmul(before[:-1, packets, None], self.meeting[:, packets])[:, :, 0]
+        joint = leads.take(self.branches.first, axis=2)
+        joint *= self.rest[:, packets]
+        joint *= after[1:, packets].take(self.branches.last, axis=2)
+        total = joint.sum(axis=2, keepdims=True)
+        uniform = np.full_like(joint, 1 / joint.shape[2])
+        return np.asarray(np.divide(joint, total, out=uniform, where=total > 0)).swapaxes(0, 1)
 
 
-def _scale(state: FloatArray, top: FloatArray) -> None:
-    """Divide states (n, S) by the likeliest, which is written to `top` (n,)."""
-    np.max(state, axis=1, out=top)
-    np.maximum(top, _LEAST, out=top)
-    state /= top[:, None]
+@dataclass(frozen=True, slots=True)
+class _Hypothesis:
+    """Columns as ones of a weight: their packets' trellis, burst by burst, and what came of it."""
+
+    w: int
+    #: (columns,) numbers of the columns.
+    columns: NDArray[np.int64]
+    trellis: _Trellis
+    #: (N + 1, packets, states) likelihood of what leads to each state, and of what follows it, scaled.
+    before: FloatArray
+    after: FloatArray
+    #: (columns,).
+    log_evidence: FloatArray
+
+    def word_posteriors(self, columns: NDArray[np.int64]) -> FloatArray:
+        """(B, columns, N, words) probability of the words of some of its columns, by forward-backward."""
+        packets = np.arange(len(self.trellis.common)).reshape(-1, len(self.columns))
+        asked = packets[:, np.searchsorted(self.columns, columns)]
+        posterior = self.trellis.word_posteriors(self.before, self.after, asked.ravel())
+        return posterior.reshape(*asked.shape, *posterior.shape[1:])
+
+
+def _hypotheses(payload: _Payload, candidates: NDArray[np.bool_]) -> list[_Hypothesis]:
+    """The packets of C columns as ones of every weight that may be, (C, 9)."""
+    packets = np.arange(len(payload.metrics)).reshape(-1, len(candidates))
+    columns = {w: np.flatnonzero(candidates[:, w - 1]) for w in WEIGHTS}
+    weights = [w for w in WEIGHTS if columns[w].size]
+    trellises = [_trellis(payload.of_packets(packets[:, columns[w]].ravel()), w) for w in weights]
+    # One chain for all weights, there and back: symbols come one after the other, whatever else is worked on together.
+    there = np.concatenate([one.transitions() for one in trellises], axis=1)
+    back = there[::-1].swapaxes(2, 3)
+    ends = [np.concatenate([getattr(one, end) for one in trellises]) for end in ("start", "end")]
+    states, log_scale = _chain(np.concatenate([there, back], axis=1), np.concatenate(ends))
+    n = there.shape[1]
+    before, after = states[:, :n], states[::-1, n:]
+    last = np.log(np.maximum((before[-1] * ends[1]).sum(axis=1), _LEAST)) + log_scale[:n]
+    out, first = [], 0
+    for w, trellis in zip(weights, trellises, strict=True):
+        part = slice(first, first + len(trellis.common))
+        log_evidence = (trellis.common + last[part]).reshape(-1, columns[w].size).sum(axis=0)
+        out.append(_Hypothesis(w, columns[w], trellis, before[:, part], after[:, part], log_evidence))
+        first = part.stop
+    return out
+
+
+def _chain(transitions: FloatArray, first: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """States (N + 1, n, S) that transitions (N, n, S, S) lead to from the first (n, S), each over its likeliest; and
+    (n,) the logarithm of what they were scaled by altogether."""
+    states = np.empty((len(transitions) + 1, *first.shape))
+    tops = np.empty((len(transitions), len(first), 1))
+    states[0] = first
+    for before, transition, after, top in zip(states, transitions, states[1:], tops, strict=False):
+        np.matmul(before[:, None], transition, out=after[:, None])
+        np.maximum(after.max(axis=1, keepdims=True), _LEAST, out=top)
+        after /= top
+    return states, np.log(tops[..., 0]).sum(axis=0)
 
 
 def _trellis(payload: _Payload, w: int) -> _Trellis:
@@ -239,28 +287,6 @@ def _over_likeliest(log_values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Exponentials of the last axis over the largest there, and the largest itself, (..., 1)."""
     top = log_values.max(axis=-1, keepdims=True)
     return np.exp(log_values - top), top
-
-
-def _log_evidence(trellis: _Trellis) -> FloatArray:
-    """(n,) log evidence of packets, for which going forward is enough."""
-    _, state, log_scale = trellis.forward()
-    return _evidence_of(trellis, state, log_scale)
-
-
-def _evidence_of(trellis: _Trellis, state: FloatArray, log_scale: FloatArray) -> FloatArray:
-    """(n,) log evidence of packets from the likelihood of their last states, see `_Trellis.forward`."""
-    return np.asarray(trellis.common + log_scale + np.log(np.maximum((state * trellis.end).sum(axis=1), _LEAST)))
-
-
-def _word_posteriors(trellis: _Trellis) -> tuple[FloatArray, FloatArray]:
-    """(n, N, words) probability of the words of n packets, by forward-backward, and (n,) their log evidence."""
-    by_symbol, state, log_scale = trellis.forward()
-    joint = np.stack(by_symbol)
-    joint *= trellis.backward().take(trellis.branches.last, axis=2)
-    total = joint.sum(axis=2, keepdims=True)
-    uniform = np.full_like(joint, 1 / joint.shape[2])
-    posterior = np.asarray(np.divide(joint, total, out=uniform, where=total > 0)).swapaxes(0, 1)
-    return posterior, _evidence_of(trellis, state, log_scale)
 
 
 def slot_llr(metrics: FloatArray) -> Float32Array:
@@ -377,9 +403,11 @@ def weight_log_evidence(metrics: FloatArray, candidates: NDArray[np.bool_]) -> F
         metrics: (B, C, packet + memory, patterns) log-likelihoods of B bursts.
         candidates: (C, 9) which weights to try for each column.
     """
-    out = np.full(candidates.shape, -np.inf)
+    out = np.empty(candidates.shape)
     for columns in _batches(metrics):
-        out[columns] = _of_weights(_payload_of(_packets(metrics, columns)), candidates[columns])
+        out[columns] = _of_weights(
+            _hypotheses(_payload_of(_packets(metrics, columns)), candidates[columns]), columns.size
+        )
     return out
 
 
@@ -388,15 +416,11 @@ def _packets(metrics: FloatArray, columns: NDArray[np.int64]) -> FloatArray:
     return metrics[:, columns].reshape(-1, *metrics.shape[2:])
 
 
-def _of_weights(payload: _Payload, candidates: NDArray[np.bool_]) -> FloatArray:
-    """Log evidence (C, 9) of the weights that may be, from the packets of C columns."""
-    out = np.full(candidates.shape, -np.inf)
-    packets = np.arange(len(payload.metrics)).reshape(-1, len(candidates))
-    for w in WEIGHTS:
-        columns = np.flatnonzero(candidates[:, w - 1])
-        if columns.size:
-            trellis = _trellis(payload.of_packets(packets[:, columns].ravel()), w)
-            out[columns, w - 1] = _log_evidence(trellis).reshape(-1, columns.size).sum(axis=0)
+def _of_weights(hypotheses: list[_Hypothesis], n_columns: int) -> FloatArray:
+    """(C, 9) log evidence of every weight, -inf where nobody asked."""
+    out = np.full((n_columns, len(WEIGHTS)), -np.inf)
+    for one in hypotheses:
+        out[one.columns, one.w - 1] = one.log_evidence
     return out
 
 
@@ -410,12 +434,18 @@ def free_log_evidence(metrics: FloatArray, share: FloatArray) -> FloatArray:
     n_columns, _, n_patterns = metrics.shape
     prior = np.log(np.stack([1 - share, share], axis=1))
     # A pattern is the state, the slots before, and the slot itself; the next state drops the oldest of them.
-    steps = metrics.reshape(n_columns, -1, n_patterns // 2, 2) + prior[:, None, None]
-    state = np.full((n_columns, n_patterns // 2), -np.log(n_patterns // 2))
-    for step in steps.transpose(1, 0, 2, 3):
-        pattern = (state[..., None] + step).reshape(n_columns, 2, -1)
-        state = np.logaddexp(pattern[:, 0], pattern[:, 1])
-    return np.asarray(np.logaddexp.reduce(state, axis=1))
+    by_slot, tops = _over_likeliest(metrics.swapaxes(0, 1) + np.tile(prior, n_patterns // 2))
+    steps = np.maximum(by_slot, _LEAST_OF_SLOT).reshape(-1, n_columns, 2, n_patterns // 4, 2)
+    log_evidence = tops[..., 0].sum(axis=0)
+    state = np.full((n_columns, n_patterns // 2), 2 / n_patterns)
+    for number, step in enumerate(steps, 1):
+        pattern = state.reshape(n_columns, 2, -1, 1) * step
+        state = (pattern[:, 0] + pattern[:, 1]).reshape(n_columns, -1)
+        if number % _SCALED_AFTER == 0:
+            top = np.maximum(state.max(axis=1), _LEAST)
+            log_evidence += np.log(top)
+            state /= top[:, None]
+    return np.asarray(log_evidence + np.log(np.maximum(state.sum(axis=1), _LEAST)))
 
 
 def _isi_memory_of(metrics: FloatArray) -> int:
@@ -502,15 +532,6 @@ def _in_doubt(word: FloatArray, w: int, columns: NDArray[np.int64], certain: flo
     return DoubtfulWords(places, codebook(w)[order], np.log(np.take_along_axis(doubtful, order, axis=1) + _TINY))
 
 
-def _weights(payload: _Payload, candidates: NDArray[np.bool_]) -> FloatArray:
-    """(C, 9) log evidence of every weight; 0 where one candidate is left, which needs none to be chosen."""
-    log_evidence = np.where(candidates, 0.0, -np.inf)
-    open_columns = candidates.sum(axis=1) > 1
-    if open_columns.any():
-        log_evidence[open_columns] = _of_weights(payload, candidates & open_columns[:, None])[open_columns]
-    return log_evidence
-
-
 def _posteriors(
     metrics: FloatArray,
     candidates: NDArray[np.bool_],
@@ -527,23 +548,20 @@ def _posteriors(
     bit_llr = np.full((n_bursts, n_columns, n_symbols, 7), np.nan)
     log_evidence = np.empty(n_columns)
     for batch in _batches(metrics):
-        payload = _payload_of(_packets(metrics, batch))
-        packets = np.arange(len(payload.metrics)).reshape(n_bursts, batch.size)
-        w_log_evidence = _weights(payload, candidates[batch])
+        hypotheses = _hypotheses(_payload_of(_packets(metrics, batch)), candidates[batch])
+        w_log_evidence = _of_weights(hypotheses, batch.size)
         log_evidence[batch] = _log_sum(w_log_evidence, 1)
         w_log_prob[batch] = w_log_evidence - log_evidence[batch][:, None]
         weights = w_log_prob[batch].argmax(axis=1) + 1
-        for w in np.unique(weights).tolist():
-            alike = np.flatnonzero(weights == w)
-            columns, words = batch[alike], codebook(w)
-            posterior, of_packets = _word_posteriors(_trellis(payload.of_packets(packets[:, alike].ravel()), w))
-            decided = candidates[columns].sum(axis=1) == 1
-            log_evidence[columns[decided]] = of_packets.reshape(n_bursts, -1).sum(axis=0)[decided]
-            posterior = posterior.reshape(n_bursts, columns.size, n_symbols, -1)
+        for hypothesis in hypotheses:
+            alike, w = np.flatnonzero(weights == hypothesis.w), hypothesis.w
+            if not alike.size:
+                continue
+            columns, posterior = batch[alike], hypothesis.word_posteriors(alike)
             if on_posteriors is not None:
                 on_posteriors(w, columns, posterior)
             lit[:, columns, :PREAMBLE_SLOTS] = np.concatenate([np.array(HEADER), dimming_symbol(w)])
-            lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ words).reshape(n_bursts, columns.size, -1)
+            lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(w)).reshape(n_bursts, columns.size, -1)
             index[:, columns] = best = posterior.argmax(axis=3)
             log_prob[:, columns] = _log_of_best(posterior, best)
             bit_llr[:, columns, :, : bits_per_symbol(w)] = _bit_llr(posterior, bits_per_symbol(w))

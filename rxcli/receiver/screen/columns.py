@@ -18,8 +18,8 @@ from rxcli.receiver.screen.waveforms import StripLight, refine_by_waveforms, wit
 from rxcli.types import FloatArray, Lens
 
 #: Combs that are looked at, by one of so many windows, and the best that are refined, unless they explain less than
-#: this share of the first one.
-_COMBS, _EVERY, _FITTED, _HOPELESS = 12, 2, 4, 0.8
+#: this share of the first one; and steps that those near the best are refined by all windows then.
+_COMBS, _EVERY, _FITTED, _HOPELESS, _LAST_ROUNDS = 12, 2, 4, 0.8, 3
 #: By how much less a grid may explain, a share, that it is still a rival.
 _RIVAL = 0.05
 #: The same if columns are of unlike drive; and contrast, a share of what is explained, from which on they are not.
@@ -29,6 +29,8 @@ _UNLIKE_DRIVE, _DRIVE_COUNTS = -3.0, 0.025
 #: Contrast of a grid, a share of what it explains, from which there may be columns, for one independent row: by chance
 #: it is the smaller, the more rows there are.
 _LEAST_CONTRAST = 0.95
+#: Share of that which one of the combs must show at first sight; those of grids have shown 0.83 and more.
+_AT_FIRST_SIGHT = 0.75
 #: The same for every strip of a window, nats: in noise it is a third of this.
 _LEAST_IN_STRIP = 0.05
 #: How much more a lens that nobody knows must explain, a share.
@@ -116,34 +118,46 @@ def likely_grids(coherence: Coherence, strips: StripLight, lens: Lens | None) ->
     thinned = strips.thinned(_EVERY)
     combs = [Grid.of_comb(comb, coherence, lens) for comb in find_combs(coherence, strips.sigma, _COMBS)]
     combs = sorted((with_light(thinned, grid) for grid in combs), key=lambda one: -one.likelihood)
-    refined: list[Grid] = []
-    for grid in combs:
-        hopeless = refined and _EVERY * grid.likelihood < _HOPELESS * refined[0].likelihood
-        if hopeless or len(refined) == _FITTED:
-            break
-        if not any(_apart(grid, known) < _WITHIN_REACH for known in refined):
-            refined.append(refine_by_waveforms(strips, grid))
-    refined.sort(key=lambda one: -one.likelihood)
-    refined = _with_likely_by_drive(strips, thinned, combs, refined)
     least = _LEAST_CONTRAST / np.sqrt(coherence.n_rows * coherence.y.size)
+    if not any(grid.contrast > _AT_FIRST_SIGHT * least * grid.explained for grid in combs):
+        return []
+    hopeful = _near_the_best(_with_likely_by_drive(thinned, combs, _refined(thinned, combs)), 2 * _RIVAL)
+    refined = sorted(
+        (refine_by_waveforms(strips, grid, _LAST_ROUNDS) for grid in hopeful), key=lambda one: -one.likelihood
+    )
     distinct: list[Grid] = []
-    for grid in refined:
-        near = grid.drive_odds is not None or grid.likelihood > (1 - _RIVAL) * refined[0].likelihood
+    for grid in _near_the_best(refined, _RIVAL):
         new = not any(_apart(grid, known) < _SAME for known in distinct)
-        if near and new and grid.contrast > max(least * grid.explained, _LEAST_IN_STRIP * strips.x.size):
+        if new and grid.contrast > max(least * grid.explained, _LEAST_IN_STRIP * strips.x.size):
             distinct.append(grid)
     return [_bent(strips, grid) for grid in distinct] if lens is None else distinct
 
 
-def _with_likely_by_drive(
-    strips: StripLight, thinned: StripLight, combs: list[Grid], refined: list[Grid]
-) -> list[Grid]:
-    """The grids with the one marked that is likeliest if columns are of unlike drive, where that may be."""
+def _refined(strips: StripLight, combs: list[Grid]) -> dict[int, Grid]:
+    """The best combs, by number, refined; of those that lead to one grid the first."""
+    refined: dict[int, Grid] = {}
+    for number, grid in enumerate(combs):
+        if len(refined) == _FITTED or (refined and grid.likelihood < _HOPELESS * refined[0].likelihood):
+            break
+        if not any(_apart(grid, known) < _WITHIN_REACH for known in refined.values()):
+            refined[number] = refine_by_waveforms(strips, grid)
+    return refined
+
+
+def _near_the_best(grids: list[Grid], less: float) -> list[Grid]:
+    """Grids that explain less than the likeliest by no more than a share, and that of columns of unlike drive."""
+    best = max((one.likelihood for one in grids), default=0.0)
+    return [one for one in grids if one.drive_odds is not None or one.likelihood > (1 - less) * best]
+
+
+def _with_likely_by_drive(strips: StripLight, combs: list[Grid], fitted: dict[int, Grid]) -> list[Grid]:
+    """The fitted grids with the one marked that is likeliest if columns are of unlike drive, where that may be."""
+    refined = sorted(fitted.values(), key=lambda one: -one.likelihood)
     if not refined or refined[0].contrast > _PLAIN_CONTRAST * refined[0].explained:
         return refined
-    light = np.array([explained_with_drive(thinned, comb) for comb in combs])
+    light = np.array([explained_with_drive(strips, comb) for comb in combs])
     best = int(light.argmax())
-    grid = refine_by_waveforms(strips, combs[best])
+    grid = fitted[best] if best in fitted else refine_by_waveforms(strips, combs[best])
     if grid.likelihood < (1 - _RIVAL_BY_DRIVE) * refined[0].likelihood or _apart(grid, refined[0]) < _SAME:
         return refined
     others = [one for one in refined if _apart(grid, one) >= _SAME]

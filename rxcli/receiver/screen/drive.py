@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_prior, grid_slopes
-from rxcli.receiver.screen.waveforms import LARGEST_STEP, StripLight, explained_light, strip_offsets
+from rxcli.receiver.screen.waveforms import LARGEST_STEP, LEAST_SHARE, StripLight, explained_light, strip_offsets
 from rxcli.types import Float32Array, FloatArray
 
 #: Steps; standard deviation of the logarithm of a column's drive, its largest value, and how much longer its steps are.
@@ -42,9 +42,12 @@ def explained_with_drive(strips: StripLight, grid: Grid) -> float:
 def _mixes(u: FloatArray, sigma: float, drive: FloatArray) -> tuple[Float32Array, Float32Array]:
     """(W, S, K) shares of the columns in every strip's light, and how far off its middle each column lies."""
     apart = (u[..., None] - (np.arange(drive.shape[1]) + 0.5)).astype(np.float32)
-    spread = np.exp(apart * apart * np.float32(-0.5 / sigma**2) + drive[:, None].astype(np.float32))
-    power = np.einsum("wsk,wsk->ws", spread, spread) + np.float32(1e-20)
-    return spread / np.sqrt(power)[..., None], apart
+    spread = np.square(apart)
+    spread *= np.float32(-0.5 / sigma**2)
+    spread += drive[:, None].astype(np.float32)
+    np.exp(np.maximum(spread, LEAST_SHARE, out=spread), out=spread)
+    spread /= np.sqrt(np.einsum("wsk,wsk->ws", spread, spread))[..., None]
+    return spread, apart
 
 
 def _solved(
@@ -87,9 +90,10 @@ def _solved(
     flat = slopes.reshape(numbers.size, -1)
     normal = (flat * weight.ravel()) @ flat.T
     gradient = flat @ (weight * off).ravel() - prior * numbers
-    reduced = normal - np.einsum("wik,wkl,wjl->ij", both, inverse, both, optimize=True)
-    gradient = gradient - np.einsum("wik,wkl,wl->i", both, inverse, asked, optimize=True)
+    eliminated = np.matmul(both, inverse)
+    reduced = normal - np.matmul(eliminated, both.transpose(0, 2, 1)).sum(axis=0)
+    gradient = gradient - np.matmul(eliminated, asked[..., None]).sum(axis=0)[:, 0]
     damped = reduced + np.diag(prior + 1e-3 * np.diag(normal) + 1e-9)
     step = np.clip(_GRID_LONGER * np.linalg.solve(damped, gradient), -LARGEST_STEP, LARGEST_STEP)
-    left_over = asked - np.einsum("wik,i->wk", both, step)
-    return step, np.einsum("wkl,wl->wk", inverse, left_over)
+    left_over = asked - step @ both
+    return step, np.matmul(inverse, left_over[..., None])[..., 0]

@@ -19,7 +19,7 @@ from rxcli.types import Float32Array, FloatArray, Lens
 #: Waveforms follow the grid that they are estimated with and have noise in them, so that steps come out too short.
 _ROUNDS, _LONGER = 10, 2.5
 #: Movement of the strips, columns on average, below which nothing more is to be expected.
-_SETTLED = 0.0015
+_SETTLED = 0.003
 #: Weight against waveforms of columns that hardly show, strips.
 _RIDGE = 0.5
 #: Strips whose mixes are further off than so many standard deviations count less.
@@ -31,6 +31,8 @@ _REACH = 100.0
 #: Places of the borders at which light is explained, columns.
 _PHASES = 4
 _TINY = np.float32(1e-6)
+#: Logarithm of the least share of a column: smaller numbers, and their products, would take many times the time.
+LEAST_SHARE = np.float32(-30)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,14 +96,24 @@ def _mixes(u: FloatArray, sigma: float) -> tuple[Float32Array, Float32Array]:
     u = np.clip(u, middle - _REACH, middle + _REACH)
     centres = np.arange(int(np.floor(u.min())), int(np.ceil(u.max())) + 1) + 0.5
     apart = u.astype(np.float32)[..., None] - centres.astype(np.float32)
-    spread = np.exp(apart * apart * np.float32(-0.5 / sigma**2))
-    return spread / np.sqrt(np.einsum("wsk,wsk->ws", spread, spread))[..., None], apart
+    share = np.square(apart)
+    share *= np.float32(-0.5 / sigma**2)
+    np.exp(np.maximum(share, LEAST_SHARE, out=share), out=share)
+    share /= np.sqrt(_dot(share, share))[..., None]
+    return share, apart
 
 
 def _slopes(share: Float32Array, apart: Float32Array, sigma: float) -> Float32Array:
     """(W, S, K) slopes of the shares with the strips' places, columns."""
-    slope = share * apart * np.float32(-1 / sigma**2)
-    return np.asarray(slope - share * np.einsum("wsk,wsk->ws", slope, share)[..., None], np.float32)
+    slope = share * apart
+    slope *= np.float32(-1 / sigma**2)
+    slope -= share * _dot(slope, share)[..., None]
+    return slope
+
+
+def _dot(one: Float32Array, other: Float32Array) -> Float32Array:
+    """(W, S) sums of products over the last axis."""
+    return np.asarray(np.einsum("wsk,wsk->ws", one, other), np.float32)
 
 
 def _waveforms(strips: Float32Array, share: Float32Array, weight: Float32Array) -> Float32Array:
@@ -112,14 +124,33 @@ def _waveforms(strips: Float32Array, share: Float32Array, weight: Float32Array) 
     return np.asarray(np.matmul(np.linalg.inv(normal), np.matmul(turned, strips)), np.float32)
 
 
+@dataclass(frozen=True, slots=True)
+class _Predicted:
+    """What the waveforms (W, K, rows) of one half of the strips say of the other half, by products of columns.
+
+    A strip that is some share of every column is the same share of its products; and there are fewer columns than rows.
+    """
+
+    #: (W, K, K) of waveforms with one another, (W, S / 2, K) of strips with waveforms, (W, S / 2) of strips alone.
+    waves: Float32Array
+    strips: Float32Array
+    power: Float32Array
+
+    @classmethod
+    def of(cls, light: StripLight, share: Float32Array, known: int) -> _Predicted:
+        """What the even strips (0) say of the odd ones, or these (1) of them."""
+        waves = _waveforms(light.halves[known], share[:, known::2], light.weights[known])
+        turned, asked = waves.transpose(0, 2, 1), light.halves[1 - known]
+        return cls(np.matmul(waves, turned), np.matmul(asked, turned), _dot(asked, asked))
+
+
 def explained_light(strips: StripLight, share: Float32Array) -> float:
     """How much of the strips' light the other strips' waveforms explain, nats, with (W, S, K) shares of the columns."""
     total = 0.0
     for known, asked in ((0, 1), (1, 0)):
-        waves = _waveforms(strips.halves[known], share[:, known::2], strips.weights[known])
-        model, own = np.matmul(share[:, asked::2], waves), strips.halves[asked]
-        power = np.einsum("wsr,wsr->ws", model, model) * np.einsum("wsr,wsr->ws", own, own) + _TINY
-        alike = np.maximum(np.einsum("wsr,wsr->ws", model, own), 0) ** 2 / power
+        predicted, own = _Predicted.of(strips, share, known), share[:, asked::2]
+        power = _dot(np.matmul(own, predicted.waves), own) * predicted.power + _TINY
+        alike = np.maximum(_dot(own, predicted.strips), 0) ** 2 / power
         total -= 0.5 * strips.n_rows * float(np.log1p(-np.minimum(alike, np.float32(0.999))).sum())
     return total
 
@@ -144,16 +175,17 @@ def with_light(strips: StripLight, grid: Grid) -> Grid:
     return replace(moved, explained=float(light.mean()) + abs(wave), contrast=2 * abs(wave))
 
 
-def refine_by_waveforms(strips: StripLight, grid: Grid) -> Grid:
+def refine_by_waveforms(strips: StripLight, grid: Grid, rounds: int = _ROUNDS) -> Grid:
     """The grid that explains the strips' light best as mixes of their columns' waveforms.
 
     Args:
         strips: of the picture.
         grid: right to some tenths of a column.
+        rounds: steps that it may take.
     """
     best, prior = with_light(strips, grid), grid_prior(grid.bent)
     numbers = best.numbers
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         mixes = _mixes(columns_at(numbers, strips.x, strips.y), strips.sigma)
         off, weight = (values.ravel() for values in strip_offsets(strips, *mixes))
         if not weight.any():
@@ -179,25 +211,25 @@ def strip_offsets(strips: StripLight, share: Float32Array, apart: Float32Array) 
         apart: (W, S, K) how far each strip lies from the columns' middles.
     """
     off, precision = np.zeros(strips.x.shape), np.zeros(strips.x.shape)
-    turned = _slopes(share, apart, strips.sigma)
+    turned, n = _slopes(share, apart, strips.sigma), strips.halves[0].shape[2]
     for known, asked in ((0, 1), (1, 0)):
-        waves = _waveforms(strips.halves[known], share[:, known::2], strips.weights[known])
-        model, slope = np.matmul(share[:, asked::2], waves), np.matmul(turned[:, asked::2], waves)
-        off[:, asked::2], precision[:, asked::2] = _asked(strips.halves[asked], model, slope)
-    precision *= strips.n_rows / strips.halves[0].shape[2]
+        predicted = _Predicted.of(strips, share, known)
+        off[:, asked::2], precision[:, asked::2] = _asked(predicted, share[:, asked::2], turned[:, asked::2], n)
+    precision *= strips.n_rows / n
     limit = _ROBUST / np.sqrt(np.maximum(precision, 1e-9))
     return off, precision / np.maximum(np.abs(off) / limit, 1.0)
 
 
-def _asked(strips: Float32Array, model: Float32Array, slope: Float32Array) -> tuple[FloatArray, FloatArray]:
-    """How far strips (W, S, rows) lie off, and the precision of that: by light and its slope, of whatever strength."""
-    product = "wsr,wsr->ws"
-    power = np.einsum(product, model, model) + _TINY
-    gain = np.einsum(product, model, strips) / power
-    shared = np.einsum(product, model, slope) / power
-    told = np.maximum(np.einsum(product, slope, slope) - shared * shared * power, _TINY)
-    left = np.einsum(product, slope, strips) - shared * gain * power
-    noise = np.maximum(np.einsum(product, strips, strips) - gain * gain * power, 0) / strips.shape[2] + _TINY
-    lit = np.maximum(gain, 0.0)
-    off = left / (np.maximum(lit, 0.05) * told)
-    return np.asarray(off, np.float64), np.asarray(lit * lit * told / noise, np.float64)
+def _asked(
+    predicted: _Predicted, share: Float32Array, slope: Float32Array, n_rows: int
+) -> tuple[Float32Array, Float32Array]:
+    """How far strips of some shares lie off, and how precise that is: by light and its slope, of whatever strength."""
+    model = np.matmul(share, predicted.waves)
+    power = _dot(model, share) + _TINY
+    gain = _dot(predicted.strips, share) / power
+    shared = _dot(model, slope) / power
+    told = np.maximum(_dot(np.matmul(slope, predicted.waves), slope) - shared * shared * power, _TINY)
+    left = _dot(predicted.strips, slope) - shared * gain * power
+    noise = np.maximum(predicted.power - gain * gain * power, 0) / np.float32(n_rows) + _TINY
+    lit = np.maximum(gain, np.float32(0))
+    return left / (np.maximum(lit, np.float32(0.05)) * told), lit * lit * told / noise
