@@ -41,12 +41,22 @@ class Reception:
     model: channel.ObservationModel
     #: (C, N + memory, patterns).
     metrics: FloatArray
-    #: What the auto-encoder may be shown: the fine grid without the rows' own light; None where nothing was in doubt.
-    scene: denoise.DenoiserInput | None = None
+    #: All strips on the fine grid without the rows' own light, and the model for them; None where nothing was in doubt.
+    cleaned: tuple[SlotSamples, channel.ObservationModel] | None = None
     #: What was skipped: name -> columns.
     skipped: dict[str, int] = field(default_factory=dict)
     #: What was worked out of it already, see `packet_confidence`; another reception begins anew.
     kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @property
+    def scene(self) -> denoise.DenoiserInput | None:
+        """What the auto-encoder may be shown; None where nothing was in doubt."""
+        return None if self.cleaned is None else self.scene_of(*self.cleaned)
+
+    def scene_of(self, samples: SlotSamples, model: channel.ObservationModel) -> denoise.DenoiserInput:
+        """Samples of all columns with what was decided of them."""
+        lit = self.clock.on_grid(self.posteriors.lit)
+        return denoise.DenoiserInput(samples, self.clock, lit, self.metrics, self.posteriors.w, model)
 
 
 def packet_llr(reception: Reception) -> float:
@@ -59,9 +69,18 @@ def packet_llr(reception: Reception) -> float:
 
 
 def column_llr(reception: Reception) -> FloatArray:
-    """(C,) log-likelihood ratio of each column's slots being packets, over slots that are anything."""
-    packets = reception.posteriors.log_evidence - np.log(len(WEIGHTS))
-    return np.asarray(packets - detect.free_log_evidence(reception.metrics, reception.posteriors.w / SLOTS_PER_SYMBOL))
+    """(C,) log-likelihood ratio of each column's slots being packets, over slots that are anything; found once."""
+    if "llr" not in reception.kept:
+        packets = reception.posteriors.log_evidence - np.log(len(WEIGHTS))
+        share = reception.posteriors.w / SLOTS_PER_SYMBOL
+        reception.kept["llr"] = np.asarray(packets - detect.free_log_evidence(reception.metrics, share))
+    kept: FloatArray = reception.kept["llr"]
+    return kept
+
+
+def word_log_prob(reception: Reception) -> FloatArray:
+    """(C,) log probability that all words decided of a column are right, as far as the light model is."""
+    return np.asarray(reception.posteriors.log_prob.sum(axis=(0, 2)))
 
 
 def headerless(reception: Reception) -> NDArray[np.bool_]:

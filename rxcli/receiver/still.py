@@ -26,20 +26,18 @@ from rxcli.receiver.reception import (
     in_doubt,
     packet_confidence,
     packet_llr,
+    word_log_prob,
 )
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
 _COARSE, _FINE = 2, 4
-_MAX_ITERATIONS = 3
 #: Below so many rows a slot it shows that developing mixes rows; as how wide a box of rows, is tried.
 _FEW_ROWS = 4.0
 _MIXED_ROWS, _USUAL_MIX = (0.0, 1.0, 1.7, 2.4, 3.0), 1
-#: A column whose packets have at least this confidence, or whose symbols this log probability whatever slots say,
-#: is not looked at again. Of 2699 packets of simulated frames a quick look leaves 1322 so, two of them wrong.
-_CERTAIN = 0.99
-#: A column with a packet of less confidence is looked at without the rows' own light, and gets a second opinion, in
-#: which symbols of less than this log probability are weighed. Where the gate comes from: docs/auto_encoder.md.
+#: A column with a packet of less confidence, whose symbols do not have this log probability whatever slots say, is
+#: looked at again, at last by the auto-encoder, and symbols of less log probability are weighed as words. Where the
+#: gate comes from: docs/auto_encoder.md. Of 2699 packets of simulated frames an initial pass leaves half so sure.
 _DOUBTFUL, _DOUBTFUL_WORD = 0.985, -1e-2
 #: A column none of whose packets has symbols of at least this mean log probability is beyond repair: of 133 packets of
 #: such columns no second opinion made one error-free.
@@ -50,9 +48,6 @@ _WORDS, _WORD_MARGIN, _HOPELESS_WORD = 4, 5.0, -1.4
 #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least sure,
 #: have their words weighed alone.
 _MOST_SHOWN = 58_000
-#: A column whose symbols have a mean log probability below this may have settled on a wrong weight: it starts again,
-#: after so many quick rounds.
-_LOST, _FRESH_ROUNDS = -0.3, 2
 #: Bursts are doubted where less than this share of the columns has packets of such a confidence, and where they are
 #: not so much likelier than others by how alike copies are, nats.
 _CLEAR_COLUMNS, _CLEAR, _PLAIN_BURSTS = 0.9, 0.9, 300.0
@@ -175,25 +170,28 @@ def _refined_once(acquisition: Acquisition) -> Reception:
     """The first pass and a look at all scales of every column that has light."""
     first = first_pass(acquisition)
     lit = np.flatnonzero(~dark_columns(first.snr))
-    return _refine_columns(acquisition, first, lit, _COARSE)[0] if lit.size else first
+    return _seen_again(acquisition, first, lit, _COARSE)[0] if lit.size else first
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
-    """A quick look first; where that leaves doubt, the light model in depth.
+    """An initial pass, and where that leaves doubt the others of `_PASSES`.
 
     Args:
         acquisition: the clock and the row profiles.
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
-        first: what the quick look showed, where there was one.
+        first: what the initial pass showed, where there was one.
     """
     reception = first or first_pass(acquisition)
-    doubtful = in_doubt(reception, _CERTAIN) if "certain_columns" in skip else np.ones(reception.snr.shape[0], bool)
-    if not doubtful.any():
-        return replace(reception, skipped={"certain_columns": reception.snr.shape[0]})
-    acquisition = acquisition.in_depth(np.flatnonzero(doubtful))
-    reception = iterate(acquisition, reception, doubtful, skip)
-    columns = doubtful_columns(reception)
-    return remove_row_noise(acquisition, reception, columns) if columns.size else reception
+    asked = doubtful_columns(reception) if "certain_columns" in skip else np.arange(reception.snr.shape[0])
+    lit = asked[~dark_columns(reception.snr)[asked]] if "dark_columns" in skip else asked
+    skipped = {"certain_columns": reception.snr.shape[0] - asked.size, "dark_columns": asked.size - lit.size}
+    if lit.size:
+        acquisition = acquisition.in_depth(lit)
+    for look in _PASSES:
+        columns = np.intersect1d(lit, doubtful_columns(reception)) if "certain_columns" in skip else lit
+        if columns.size:
+            reception = look(acquisition, reception, columns)
+    return replace(reception, skipped={name: count for name, count in skipped.items() if count})
 
 
 def first_pass(acquisition: Acquisition) -> Reception:
@@ -252,7 +250,7 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
         if number not in tried:
             width = float(np.hypot(clock.exposure_slots, _MIXED_ROWS[number] / clock.rows_per_slot))
             reception = initial_pass(replace(acquisition, clock=replace(clock, exposure_slots=width)))
-            tried[number] = float(reception.posteriors.log_evidence.sum()), reception
+            tried[number] = packet_llr(reception), reception
         return tried[number][0]
 
     best = min(_USUAL_MIX, len(_MIXED_ROWS) - 1)
@@ -262,41 +260,45 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
     return tried[best][1]
 
 
-def iterate(
-    acquisition: Acquisition, reception: Reception, doubtful: NDArray[np.bool_], skip: frozenset[str]
-) -> Reception:
-    """Light model and detection in turn, until every column is certain or nothing more is to be expected.
-
-    Columns in doubt, (C,), are looked at on the coarse grid once, and those that still are on the fine one.
-    """
-    every = np.ones(reception.snr.shape[0], bool)
-    wanted = ~dark_columns(reception.snr) if "dark_columns" in skip else every
-    skipped = {"dark_columns": int((~wanted).sum()), "certain_columns": 0}
-    for iteration in range(_MAX_ITERATIONS):
-        columns = np.flatnonzero(wanted & doubtful)
-        skipped["certain_columns"] += int(wanted.sum()) - columns.size
-        if columns.size == 0:
-            break
-        before = reception.posteriors.index
-        reception, timing = _refine_columns(acquisition, reception, columns, _COARSE if iteration == 0 else _FINE)
-        if iteration == 0:
-            reception = _with_bursts_of(acquisition, reception, detect.slot_llr(reception.metrics))
-            reception = replace(reception, clock=sync.corrected(reception.clock, timing))
-        doubtful = _unsettled(reception, before, iteration, skip)
-    return replace(reception, skipped={name: count for name, count in skipped.items() if count})
+def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
+    """Columns that get a second opinion."""
+    return np.flatnonzero(in_doubt(reception, _DOUBTFUL))
 
 
-def _refine_columns(
+def _coarse(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
+    """All strips, the picture on all scales; after it the bursts are told apart anew and the clock is corrected."""
+    after, timing = _seen_again(acquisition, reception, columns, _COARSE)
+    after = _with_bursts_of(acquisition, after, detect.slot_llr(after.metrics))
+    return replace(after, clock=sync.corrected(after.clock, timing))
+
+
+def _fine(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
+    """The same with more samples a slot."""
+    return _seen_again(acquisition, reception, columns, _FINE)[0]
+
+
+def _seen_again(
     acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64], samples_per_slot: int
 ) -> tuple[Reception, FloatArray]:
     """What is seen with some columns looked at again, and the (C, 2) timing of all, 0 for the others."""
     samples, model = _view(acquisition, reception, columns, samples_per_slot)
     lit = reception.clock.on_grid(reception.posteriors.lit)
     likelihoods = channel.slot_likelihoods(samples, reception.clock, model, lit, columns)
-    metrics, snr, timing = reception.metrics.copy(), reception.snr.copy(), np.zeros((lit.shape[0], 2))
-    metrics[columns], snr[columns], timing[columns] = likelihoods.metrics, likelihoods.snr, likelihoods.timing
-    posteriors = reception.posteriors.with_columns(columns, _detect(metrics[columns], reception.clock))
-    return replace(reception, metrics=metrics, snr=snr, posteriors=posteriors), timing
+    timing = np.zeros((lit.shape[0], 2))
+    timing[columns] = likelihoods.timing
+    return _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr), timing
+
+
+def _with_metrics(
+    reception: Reception, columns: NDArray[np.int64], metrics: FloatArray, snr: Float32Array | None = None
+) -> Reception:
+    """The same with other metrics of some columns, their words detected from these."""
+    of_all, snr_of_all = reception.metrics.copy(), reception.snr.copy()
+    of_all[columns] = metrics
+    if snr is not None:
+        snr_of_all[columns] = snr
+    posteriors = reception.posteriors.with_columns(columns, _detect(metrics, reception.clock))
+    return replace(reception, metrics=of_all, snr=snr_of_all, posteriors=posteriors)
 
 
 def _view(
@@ -318,68 +320,59 @@ def _view(
     return samples, model
 
 
-def _unsettled(
-    reception: Reception, before: NDArray[np.int64], iteration: int, skip: frozenset[str]
-) -> NDArray[np.bool_]:
-    """(C,) which columns are worth another iteration."""
-    if "certain_columns" not in skip:
-        return np.ones(reception.snr.shape[0], bool)
-    doubtful = in_doubt(reception, _CERTAIN)
-    index = reception.posteriors.index
-    if iteration and before.shape == index.shape:
-        # What does not change any more will not do so later.
-        doubtful &= (before != index).any(axis=(0, 2))
-    return doubtful
-
-
 def apply_autoencoder(
     acquisition: Acquisition, reception: Reception, options: ReceiverOptions
 ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
-    """Doubtful columns once more, with the auto-encoder's corrections and words weighed; kept where less doubt is left.
+    """The last pass: doubtful columns once more, with the auto-encoder's corrections and words weighed.
 
     Returns:
         What was received then, the columns whose corrections were kept, what to report; None where nothing was done.
     """
     if options.cae == "never":
         return reception, frozenset(), None
-    if options.cae == "always":
+    always = options.cae == "always"
+    if always:
         columns = np.arange(reception.snr.shape[0])
-        reception = remove_row_noise(acquisition.in_depth(columns), reception, columns)
+        reception = _without_row_noise(acquisition.in_depth(columns), reception, columns)
     else:
-        columns = doubtful_columns(reception)
-        columns = columns[best_packet(reception)[columns] > _BEYOND_REPAIR]
-    if columns.size == 0 or reception.scene is None:
+        columns = np.intersect1d(doubtful_columns(reception), np.flatnonzero(best_packet(reception) > _BEYOND_REPAIR))
+    if columns.size == 0 or reception.cleaned is None:
         return reception, frozenset(), None
+    shown = columns if always else _worth_showing(reception, columns)
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
     try:
         denoiser = options.denoiser or _denoiser()
-        corrections = np.zeros((columns.size, reception.clock.n_slots), np.float32)
-        shown = (
-            np.arange(columns.size) if options.cae == "always" else _worth_showing(reception, reception.scene, columns)
-        )
-        corrections[shown] = denoiser.slot_corrections(reception.scene, columns[shown])
+        after = _second_opinion(reception, columns, shown, denoiser)
     except ReceiverError as error:
         return reception, frozenset(), {**report, "columns": 0, "message": str(error)}
-    metrics = reception.metrics[columns] + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
-    metrics = _words_weighed(reception, reception.scene, columns, metrics)
-    posteriors = _detect(metrics, reception.clock)
-    before, after = (p.log_prob.sum(axis=(0, 2)) for p in (reception.posteriors.of_columns(columns), posteriors))
-    better = np.flatnonzero(after > before)
-    kept = columns[better]
-    # The network is told where headers are; whether they show there, the light alone must say.
-    corrected = replace(posteriors.of_columns(better), header_llr=reception.posteriors.header_llr[:, kept])
-    of_all = reception.metrics.copy()
-    of_all[kept] = metrics[better]
+    kept = columns[(word_log_prob(after) > word_log_prob(reception))[columns]]
     report.update(model=denoiser.name, kept=kept.size)
-    reception = replace(reception, metrics=of_all, posteriors=reception.posteriors.with_columns(kept, corrected))
-    return reception, frozenset(kept.tolist()), report
+    metrics = reception.metrics.copy()
+    metrics[kept] = after.metrics[kept]
+    posteriors = reception.posteriors.with_columns(kept, after.posteriors.of_columns(kept))
+    return replace(reception, metrics=metrics, posteriors=posteriors), frozenset(kept.tolist()), report
 
 
-def _worth_showing(reception: Reception, scene: denoise.DenoiserInput, columns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Places in `columns` of those that the network is shown: the surest, and no more than its time allows."""
-    _, n_strips, _ = scene.samples.light.shape
+def _second_opinion(
+    reception: Reception, columns: NDArray[np.int64], shown: NDArray[np.int64], denoiser: denoise.Denoiser
+) -> Reception:
+    """Some columns with words weighed, and those `shown` to the auto-encoder with its corrections."""
+    scene = reception.scene
+    assert scene is not None
+    corrections = np.zeros((reception.snr.shape[0], reception.clock.n_slots), np.float32)
+    corrections[shown] = denoiser.slot_corrections(scene, shown)
+    metrics = reception.metrics[columns] + channel.metrics_of(corrections[columns], reception.model.exposure.isi_memory)
+    after = _with_metrics(reception, columns, _words_weighed(reception, scene, columns, metrics))
+    # The network is told where headers are; whether they show there, the light alone must say.
+    return replace(after, posteriors=replace(after.posteriors, header_llr=reception.posteriors.header_llr))
+
+
+def _worth_showing(reception: Reception, columns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Those of `columns` that the network is shown: the surest, and no more than its time allows."""
+    assert reception.cleaned is not None
+    n_strips = reception.cleaned[0].light.shape[1]
     most = max(_MOST_SHOWN // (n_strips * reception.clock.n_slots), 1)
-    return np.sort(np.argsort(-best_packet(reception)[columns], kind="stable")[:most])
+    return np.sort(columns[np.argsort(-best_packet(reception)[columns], kind="stable")[:most]])
 
 
 def _words_weighed(
@@ -399,71 +392,24 @@ def _words_weighed(
     return metrics + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
 
 
-def remove_row_noise(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """Some columns looked at again once the light that a sensor row shows everywhere is taken off."""
+def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
+    """Some columns on the fine grid once the light that a sensor row shows everywhere is taken off."""
     samples, model = _view(acquisition, reception, np.arange(reception.snr.shape[0]), denoise.SAMPLES_PER_SLOT)
-    scene = denoise.remove_row_noise(_scene_of(reception, samples, model))
-    asked = replace(samples, light=scene.samples.light[columns], valid=samples.valid[columns])
+    scene = denoise.remove_row_noise(reception.scene_of(samples, model))
+    asked = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
     likelihoods = channel.slot_likelihoods(asked, reception.clock, model, scene.lit, columns)
-    metrics, snr = reception.metrics.copy(), reception.snr.copy()
-    metrics[columns], snr[columns] = likelihoods.metrics, likelihoods.snr
-    posteriors = _detect(metrics[columns], reception.clock)
-    lost = np.flatnonzero(posteriors.log_prob.mean(axis=(0, 2)) < _LOST)
-    if lost.size:
-        light = replace(asked, light=asked.light[lost], valid=asked.valid[lost])
-        other, lit = _of_other_weight(reception.clock, light, model, scene.lit, columns[lost], posteriors.w[lost])
-        lost, light = lost[other], replace(light, light=light.light[other], valid=light.valid[other])
-    if lost.size:
-        there = columns[lost]
-        fresh = channel.slot_likelihoods(light, reception.clock, model, lit, there)
-        again = _detect(fresh.metrics, reception.clock)
-        better = again.log_evidence > posteriors.log_evidence[lost]
-        metrics[there[better]], snr[there[better]] = fresh.metrics[better], fresh.snr[better]
-        posteriors = posteriors.with_columns(lost[better], again.of_columns(np.flatnonzero(better)))
-    cleaned = replace(
-        reception, metrics=metrics, snr=snr, posteriors=reception.posteriors.with_columns(columns, posteriors)
-    )
-    return replace(cleaned, scene=_scene_of(cleaned, scene.samples, model))
+    cleaned = replace(reception, cleaned=(scene.samples, model))
+    return _with_metrics(cleaned, columns, likelihoods.metrics, likelihoods.snr)
 
 
-def _of_other_weight(
-    clock: Clock,
-    samples: SlotSamples,
-    model: channel.ObservationModel,
-    lit: Float32Array,
-    columns: NDArray[np.int64],
-    w: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], Float32Array]:
-    """Columns that seem to have another weight than `w` to a light model that knows nothing of them, which may have
-    explained itself: their places in `columns`; and the slots (C, N) of all as it has them."""
-    lit = lit.copy()
-    lit[columns] = 0.5
-    for _ in range(_FRESH_ROUNDS):
-        quick = channel.slot_likelihoods(samples, clock, model, lit, columns, thorough=False)
-        found = _detect(quick.metrics, clock)
-        lit[columns] = clock.on_grid(found.lit)
-    return np.flatnonzero(found.w != w), lit
-
-
-def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
-    """Columns that get a second opinion."""
-    return np.flatnonzero(in_doubt(reception, _DOUBTFUL))
+#: Looks at columns in doubt, after the initial pass and before the auto-encoder. Each sees more of the light than the
+#: one before and takes its place: kept only where words are likelier then, they lose 1 to 3 % of the packets.
+_PASSES = (_coarse, _fine, _fine, _without_row_noise)
 
 
 @lru_cache(maxsize=1)
 def _denoiser() -> denoise.Denoiser:
     return denoise.load_denoiser()
-
-
-def _scene_of(reception: Reception, samples: SlotSamples, model: channel.ObservationModel) -> denoise.DenoiserInput:
-    return denoise.DenoiserInput(
-        samples=samples,
-        clock=reception.clock,
-        lit=reception.clock.on_grid(reception.posteriors.lit),
-        metrics=reception.metrics,
-        w=reception.posteriors.w,
-        model=model,
-    )
 
 
 def _in_bursts(acquisition: Acquisition, clock: Clock, log_odds: Float32Array) -> Clock:

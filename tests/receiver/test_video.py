@@ -18,7 +18,9 @@ from rxcli.lab.simulate.scenes import preset
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.receiver.channel.known_picture import ColumnLight, KnownPicture, Look, exposed
+from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.decode.detect import detect
+from rxcli.receiver.light import Crosstalk, NoiseModel
 from rxcli.receiver.pipeline import receive, receive_frame
 from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime, of_one_memory
 from rxcli.results.truth import Score, Scorer, Truth
@@ -244,7 +246,7 @@ def test_another_scene_is_searched_anew(clip: Clip) -> None:
 
 def test_another_scene_while_frames_are_held_back(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
     """The frames held back are looked at again by their own picture, and leave that of the new scene alone."""
-    monkeypatch.setattr("rxcli.receiver.clip.receiver._MUCH_DOUBT", -1.0)
+    monkeypatch.setattr("rxcli.receiver.clip.receiver.SETTINGS", replace(SETTINGS, much_doubt=-1.0))
     other = simulate(8, 8, "chelsea")
     moved = tuple(replace(frame, index=6 + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames))
     got = list(receive((*clip.frames[:6], *moved), clip.options))
@@ -259,7 +261,7 @@ def test_frames_before_and_after_an_occlusion_are_looked_at_again(clip: Clip, mo
         measured.append([view.bursts.frame for view in views])
 
     monkeypatch.setattr("rxcli.receiver.clip.scene.TrackedScreen.measure_again", measure_again)
-    monkeypatch.setattr("rxcli.receiver.clip.receiver._TOO_MUCH_DOUBT", 1.0)
+    monkeypatch.setattr("rxcli.receiver.clip.receiver.SETTINGS", replace(SETTINGS, too_much_doubt=1.0))
     dark = replace(clip.frames[3], pixels=np.full_like(clip.frames[3].pixels, 2))
     got = list(receive((*clip.frames[:3], dark, *clip.frames[4:]), clip.options))
     assert [result.frame for result in got] == [frame.index for frame in clip.frames]
@@ -364,7 +366,7 @@ def test_known_picture_gives_back_the_columns_light() -> None:
     picture = rng.uniform(0.02, 0.5, (columns, strips, rows)).astype(np.float32)
     crosstalk = rng.uniform(0.1, 1.0, (strips, 3))
     inside = np.ones(picture.shape, bool)
-    known = KnownPicture(inside, crosstalk, black_level, 1e-7, 1e-6)
+    known = KnownPicture(inside, Crosstalk(crosstalk), black_level, NoiseModel(1e-7, 1e-6))
 
     def frame() -> tuple[np.ndarray, np.ndarray]:
         slots = exposed(rng.integers(0, 2, (columns, 42)).astype(np.float32), np.arange(rows)[None] / 5 + 0.5, 1.08)
@@ -389,7 +391,7 @@ def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, r
     """A picture known from many frames, 5 rows a slot; and what makes a frame of it: light and exposed slots."""
     picture = rng.uniform(0.1, 0.5, (columns, strips, rows)).astype(np.float32)
     crosstalk = np.tile([0.0, 1.0, 0.0], (strips, 1))
-    known = KnownPicture(np.ones(picture.shape, bool), crosstalk, 0.0, 1e-6, 0.0)
+    known = KnownPicture(np.ones(picture.shape, bool), Crosstalk(crosstalk), 0.0, NoiseModel(1e-6, 0.0))
 
     def frame() -> tuple[Float32Array, Float32Array]:
         bits = rng.integers(0, 2, (columns, rows // 5 + 2)).astype(np.float32)
@@ -427,7 +429,7 @@ def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
     other = copy.deepcopy(known)
     light, slots = frame()
     look = Look(light, slots, np.full_like(slots, 0.7))
-    known.learn(look, keep=1.0)
+    known.learn(look, forget=False)
     with_it, _ = known.picture()
     without, _ = known.without([look]).picture()
     alone, _ = other.picture()
@@ -444,7 +446,9 @@ def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
 def test_errors_that_rows_have_in_common_count_as_one(together: int) -> None:
     """Noise of the same variance on every row alone, or on five rows at a time: the latter leaves less to be told."""
     rng = np.random.default_rng(11)
-    known = KnownPicture(np.ones((8, 1, 1000), bool), np.array([[0.0, 1.0, 0.0]]), 0.0, 1e-4, 0.0)
+    known = KnownPicture(
+        np.ones((8, 1, 1000), bool), Crosstalk(np.array([[0.0, 1.0, 0.0]])), 0.0, NoiseModel(1e-4, 0.0)
+    )
     noise = np.repeat(rng.normal(0, 0.1, (8, 1000 // together)), together, axis=1).astype(np.float32)
     slots = np.repeat(rng.integers(0, 2, (8, 200)), 5, axis=1).astype(np.float32)
     seen = ColumnLight(slots + noise, np.full((8, 1000), 50, np.float32), slots)
@@ -456,7 +460,9 @@ def test_errors_that_rows_have_in_common_count_as_one(together: int) -> None:
 
 def test_rows_that_were_never_lit_are_not_known() -> None:
     """Light that neighbours spill is no look at a picture: what is lit there at last is not taken for dark."""
-    known = KnownPicture(np.ones((3, 1, 60), bool), np.array([[0.05, 0.9, 0.05]]), 0.0, 1e-6, 1e-6)
+    known = KnownPicture(
+        np.ones((3, 1, 60), bool), Crosstalk(np.array([[0.05, 0.9, 0.05]])), 0.0, NoiseModel(1e-6, 1e-6)
+    )
     lit = np.zeros((3, 60), np.float32)
     lit[0] = 1.0
     # The model has it that the neighbour spills a twentieth; three times as much comes.

@@ -38,13 +38,12 @@ from rxcli.receiver.camera.curvature import curvature_terms, estimate_curvature,
 from rxcli.receiver.camera.edges import by_edges
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis
 from rxcli.receiver.camera.refit import refit
-from rxcli.receiver.camera.search import MIN_EVIDENCE, BlindSearch, Periods, estimate_camera, stripes_are_curved
+from rxcli.receiver.camera.search import BlindSearch, Periods, estimate_camera, stripes_are_curved
 from rxcli.receiver.camera.strips import Strips, in_readout_order, side_curvature_of, strips_of
 from rxcli.receiver.camera.structure import structure_llr
 from rxcli.receiver.camera.tone import is_linear
 
 __all__ = [
-    "MIN_EVIDENCE",
     "BlindEstimate",
     "BlindSearch",
     "Hypothesis",

@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from rxcli.receiver.camera.curvature import BEND_LEVEL_ROWS, strip_distances
-from rxcli.receiver.camera.scan import HALF_WIDTH, MIN_ROWS_PER_SLOT, autocorrelation, half_width
+from rxcli.receiver.camera.curvature import strip_distances
+from rxcli.receiver.camera.scan import autocorrelation, half_width
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, levelled
 from rxcli.types import BoolArray, Float32Array, FloatArray
-
-#: Likeness of neighbouring strips, over the light's own variance, below which a picture has no stripes.
-_STRIPED = 0.25
-
-#: Share of the screen's height that must be striped.
-_STRIPED_SHARE = 0.7
-
-_LIKENESS_BANDS = 16
 
 
 def why_not(strips: Strips) -> str:
     """Why no clock was found: what the picture looks like, and the next step."""
     likeness, lit = stripe_likeness(strips)
-    striped = lit & (likeness > _STRIPED)
+    striped = lit & (likeness > SETTINGS.striped_likeness)
     if not lit.any():
         return "the screen is dark; show a brighter picture or raise the exposure"
     if not striped.any():
@@ -29,7 +22,7 @@ def why_not(strips: Strips) -> str:
             "the screen shows no stripes, or too faint ones; check that it sends, show a brighter picture, and take it "
             "with the electronic shutter, HDR and night mode off (a mechanical or global shutter sees no slots)"
         )
-    if striped[lit].mean() < _STRIPED_SHARE:
+    if striped[lit].mean() < SETTINGS.striped_share:
         return (
             "only a part of the screen's height shows stripes; the picture may be merged from several exposures or "
             "taken with flash: switch HDR and flash off, or use a manual-camera app"
@@ -37,10 +30,10 @@ def why_not(strips: Strips) -> str:
     level, weight = levelled(strips.light, strips.inside, 38, strips.noise)
     columns = (level * weight).reshape(strips.n_columns, -1, strips.rows.size).mean(axis=1)
     width = half_width(autocorrelation(columns))
-    if width < HALF_WIDTH[0] * MIN_ROWS_PER_SLOT:
+    if width < SETTINGS.half_width_slots[0] * SETTINGS.least_rows_per_slot:
         return (
             f"the stripes are about {width:.1f} rows wide, too few to tell slots apart (at least "
-            f"{MIN_ROWS_PER_SLOT} rows a slot); use the picture in its full size, or a slower slot rate"
+            f"{SETTINGS.least_rows_per_slot} rows a slot); use the picture in its full size, or a slower slot rate"
         )
     return (
         "there are stripes but no packet header among them; the screen may show less than one packet (move closer), "
@@ -50,8 +43,8 @@ def why_not(strips: Strips) -> str:
 
 def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
     """Correlation of neighbouring strips in bands of rows, 0..1; and whether a band is lit."""
-    level, weight = levelled(strips.light, strips.inside, BEND_LEVEL_ROWS, strips.noise)
-    blocks = np.linspace(0, strips.rows.size, _LIKENESS_BANDS + 1).astype(int)[:-1]
+    level, weight = levelled(strips.light, strips.inside, SETTINGS.bend_level_rows, strips.noise)
+    blocks = np.linspace(0, strips.rows.size, SETTINGS.likeness_bands + 1).astype(int)[:-1]
     step = strip_distances(strips)[0] if strip_distances(strips) else 1
 
     def summed(values: Float32Array) -> FloatArray:
@@ -62,6 +55,6 @@ def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
     product = summed(level[:-step] * level[step:]).sum(axis=0)
     power = np.sqrt(summed(level[:-step] ** 2).sum(axis=0) * summed(level[step:] ** 2).sum(axis=0))
     likeness = product / np.maximum(power, 1e-9)
-    lit = summed(weight).max(axis=0) > 0.2 * strips.rows.size / _LIKENESS_BANDS
-    lit |= summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / _LIKENESS_BANDS
+    lit = summed(weight).max(axis=0) > 0.2 * strips.rows.size / SETTINGS.likeness_bands
+    lit |= summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / SETTINGS.likeness_bands
     return np.asarray(likeness), np.asarray(lit)

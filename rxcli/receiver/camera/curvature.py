@@ -7,22 +7,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, levelled
 from rxcli.types import Float32Array, FloatArray
 
 #: Scale of the coefficients k1 k2 p1 p2 for a focal length of one picture width, as a camera may have them.
 BEND_SCALE = np.array([0.3, 0.6, 1.5e-3, 1.5e-3])
-#: Lenses bend back further out: k2 is about -k1 for such a focal length, give or take so much.
-_BACK = 0.2
 #: (4, 4) inverse covariance of the coefficients before the picture was seen.
 BEND_PRECISION: FloatArray = np.diag(BEND_SCALE**-2 * [1, 0, 1, 1])
-BEND_PRECISION[:2, :2] += _BACK**-2
-
-#: Distances of compared strips, in columns; a column's light reaches over its neighbours.
-_BEND_DISTANCES = (0.5, 1.0, 2.0)
-
-#: Lags looked at, rows; windows of rows; rows over which light is levelled.
-_BEND_LAGS, _BEND_WINDOWS, BEND_LEVEL_ROWS = 24, 20, 100
+BEND_PRECISION[:2, :2] += SETTINGS.bend_back_sd**-2
 
 
 def reversed_curvature(curvature: FloatArray) -> FloatArray:
@@ -54,7 +47,7 @@ def estimate_curvature(strips: Strips) -> tuple[FloatArray, float]:
         (4,) k1 k2 p1 p2 for a focal length of one width; and how much better it fits than none, nats.
     """
     lags = [_lag_correlations(strips, distance) for distance in strip_distances(strips)]
-    total = sum(float(correlation[_BEND_LAGS].sum()) for correlation, _ in lags)
+    total = sum(float(correlation[SETTINGS.bend_lags].sum()) for correlation, _ in lags)
     if not lags or total <= 0:
         return np.zeros(4), 0.0
     # The sum of correlations is worth about this many nats: rows times strips, many of which say the same.
@@ -70,9 +63,9 @@ def estimate_curvature(strips: Strips) -> tuple[FloatArray, float]:
 
 def strip_distances(strips: Strips) -> list[int]:
     per_column = strips.light.shape[0] // strips.n_columns
-    steps = {max(1, round(distance * per_column)) for distance in _BEND_DISTANCES}
+    steps = {max(1, round(distance * per_column)) for distance in SETTINGS.bend_distances}
     n_strips, n_rows = strips.light.shape
-    if n_rows < 2 * _BEND_LAGS + _BEND_WINDOWS:
+    if n_rows < 2 * SETTINGS.bend_lags + SETTINGS.bend_windows:
         return []
     return sorted(step for step in steps if step < n_strips)
 
@@ -84,17 +77,17 @@ def _lag_correlations(strips: Strips, distance: int) -> tuple[Float32Array, Floa
         (lags, strips, windows) float32; (4, strips, windows) float64 rows.
     """
     n_rows = strips.light.shape[1]
-    level = levelled(strips.light, strips.inside, BEND_LEVEL_ROWS, strips.noise)[0]
-    borders = np.linspace(_BEND_LAGS, n_rows - _BEND_LAGS, _BEND_WINDOWS + 1).astype(int)
+    level = levelled(strips.light, strips.inside, SETTINGS.bend_level_rows, strips.noise)[0]
+    borders = np.linspace(SETTINGS.bend_lags, n_rows - SETTINGS.bend_lags, SETTINGS.bend_windows + 1).astype(int)
     middles = (borders[1:] + borders[:-1]) // 2
     rows, x = strips.rows[middles], strips.x[:, middles]
     terms = curvature_terms(x, rows, strips.width, strips.height)
     left, right = level[:-distance], level[distance:]
-    inner = left[:, _BEND_LAGS : n_rows - _BEND_LAGS]
-    out = np.empty((2 * _BEND_LAGS + 1, left.shape[0], _BEND_WINDOWS), np.float32)
-    for number, lag in enumerate(range(-_BEND_LAGS, _BEND_LAGS + 1)):
-        product = inner * right[:, _BEND_LAGS - lag : n_rows - _BEND_LAGS - lag]
-        out[number] = np.add.reduceat(product, borders[:-1] - _BEND_LAGS, axis=1)
+    inner = left[:, SETTINGS.bend_lags : n_rows - SETTINGS.bend_lags]
+    out = np.empty((2 * SETTINGS.bend_lags + 1, left.shape[0], SETTINGS.bend_windows), np.float32)
+    for number, lag in enumerate(range(-SETTINGS.bend_lags, SETTINGS.bend_lags + 1)):
+        product = inner * right[:, SETTINGS.bend_lags - lag : n_rows - SETTINGS.bend_lags - lag]
+        out[number] = np.add.reduceat(product, borders[:-1] - SETTINGS.bend_lags, axis=1)
     return out, terms[:, distance:] - terms[:, :-distance]
 
 

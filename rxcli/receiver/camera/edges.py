@@ -8,20 +8,16 @@ from rxcli.numerics import local_mean
 from rxcli.protocol import EXTREMES_SLOTS
 from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.estimates import BlindEstimate
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, levelled
 from rxcli.types import Float32Array, FloatArray
-
-#: Rows over which the edges' power is levelled.
-LOCAL_ROWS = 41
-#: Nats of a line beyond doubt: wrong periods reach 5, right ones 46 and more where the line is seen at all.
-_BEYOND_DOUBT = 20.0
 
 
 def edge_power(columns: Float32Array) -> Float32Array:
     """(C, R - 1) squared steps of columns (C, R) from row to row, less their mean thereabouts."""
     steps = np.diff(columns, axis=1)
     square = np.asarray(steps * steps, np.float32)
-    return square - local_mean(square, LOCAL_ROWS)
+    return square - local_mean(square, SETTINGS.edge_level_rows)
 
 
 def line_evidence(strips: Strips, rows_per_slot: float, curvature: FloatArray) -> float:
@@ -46,10 +42,10 @@ def by_edges(strips: Strips, estimates: list[BlindEstimate]) -> BlindEstimate | 
 
     A period twice as long, to which they keep too, has it as its harmonic.
     """
-    best, most = None, _BEYOND_DOUBT
+    best, most = None, SETTINGS.line_beyond_doubt_nats
     for estimate in estimates:
         curvature = estimate.curvature * estimate.corrected
         nats, double = (line_evidence(strips, n * estimate.rows_per_slot, curvature) for n in (1, 2))
-        if nats > most and double < _BEYOND_DOUBT:
+        if nats > most and double < SETTINGS.line_beyond_doubt_nats:
             best, most = estimate, nats
     return best

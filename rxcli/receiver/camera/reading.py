@@ -16,20 +16,13 @@ from numpy.typing import NDArray
 from rxcli.numerics import folded
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, dimming_symbol
 from rxcli.receiver.camera.estimates import Hypothesis
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.views import View, Views, slot_time
 from rxcli.receiver.camera.waves import WORD_SHARES, Grid, column_waves, read_freely, shared_weights
 from rxcli.types import Float32Array, FloatArray
 
-#: Exposure that slots are read through while none is known, slots.
-_EXPOSURE = 1.2
-#: Share of the slots of headers and dimming symbols that may read wrongly, and the most that a slot says, nats.
-_WRONG, _MOST = 0.02, 6.0
 #: (9, 20) whether slots of header and dimming symbol are lit, for every weight.
 _PREAMBLES = np.array([[*HEADER, *dimming_symbol(w)] for w in WEIGHTS], bool)
-#: Slots before the first row, so that a clock that is put right leaves none out.
-_SLOTS_BEFORE = 2
-#: Below this evidence, nats, levels are tried that a weight of five would give: stars and lamps spoil the skewness.
-_LEVELS_IN_DOUBT = 90.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +74,7 @@ def read(views: Views, clock: Hypothesis, curvature: FloatArray, packet_lengths:
     view = views.at(clock.rows_per_slot, clock.reversed)
     rows = view.strips.rows
     first_row = rows[0] - 0.5 * (rows[1] - rows[0])
-    start = first_row + clock.start_row % clock.rows_per_slot - _SLOTS_BEFORE * clock.rows_per_slot
+    start = first_row + clock.start_row % clock.rows_per_slot - SETTINGS.slots_before * clock.rows_per_slot
     values = np.concatenate([[start, clock.rows_per_slot], view.curvature(curvature)])
     return read_slots(views, clock.rows_per_slot, clock.reversed, values, packet_lengths)
 
@@ -92,7 +85,7 @@ def read_slots(
     """The slots on a row-time map (6,), read from the view for some rows per slot."""
     view = views.at(rows_per_slot, is_reversed)
     lit, packets = _read_at_levels(view, values, packet_lengths, None)
-    if packets[0].log_evidence < _LEVELS_IN_DOUBT:
+    if packets[0].log_evidence < SETTINGS.levels_in_doubt:
         even = _read_at_levels(view, values, packet_lengths, SLOTS_PER_SYMBOL // 2)
         lit, packets = max((lit, packets), even, key=lambda pair: pair[1][0].log_evidence)
     return Reading(values, rows_per_slot, is_reversed, lit, packets)
@@ -102,7 +95,7 @@ def _read_at_levels(
     view: View, values: FloatArray, packet_lengths: Sequence[int], w: int | None
 ) -> tuple[Float32Array, tuple[Packets, ...]]:
     waves = column_waves(view, slot_time(view.strips, view.terms, values))
-    lit, log_odds = read_freely(waves, _EXPOSURE, w)
+    lit, log_odds = read_freely(waves, SETTINGS.read_exposure_slots, w)
     found = []
     for packet_slots, by_weight in zip(packet_lengths, start_evidence(log_odds, packet_lengths), strict=True):
         log_evidence = over_weights(by_weight)
@@ -132,7 +125,7 @@ def start_evidence(
     Returns:
         (C, 9, packet_slots) for every length: of columns of every weight, over columns of any.
     """
-    odds = np.exp(np.clip(log_odds, -_MOST, _MOST))[:, None]
+    odds = np.exp(np.clip(log_odds, -SETTINGS.most_slot_nats, SETTINGS.most_slot_nats))[:, None]
     kind = odds.dtype
     duty = (np.array(WEIGHTS)[:, None] / SLOTS_PER_SYMBOL).astype(kind)
     free = np.log(1 - duty + duty * odds)
@@ -140,7 +133,10 @@ def start_evidence(
     # (places, C, 9, N): every slot at every place of a codeword, and of header and dimming symbol.
     shares = WORD_SHARES[1:].T[..., None].astype(kind)
     in_words = np.stack([np.log(1 - share + share * odds) - free for share in shares])
-    dark, lit = (np.log(kind.type(1 - share) + kind.type(share) * odds) - free for share in (_WRONG, 1 - _WRONG))
+    dark, lit = (
+        np.log(kind.type(1 - share) + kind.type(share) * odds) - free
+        for share in (SETTINGS.wrong_preamble, 1 - SETTINGS.wrong_preamble)
+    )
     in_preamble = np.where(_PREAMBLES.T[:, None, :, None], lit, dark)
     # (10, C, 9): words that start at slots 0 to 9, over all slots: slots in tens, by their place in the ten.
     by_place = np.pad(in_words, ((0, 0), (0, 0), (0, 0), (0, -n % SLOTS_PER_SYMBOL)))

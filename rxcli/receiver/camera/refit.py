@@ -12,10 +12,10 @@ import numpy as np
 
 from rxcli.receiver.camera.estimates import BlindEstimate
 from rxcli.receiver.camera.rows import fit_rows
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Correction, Strips, halved
 from rxcli.receiver.camera.timing import (
     FLAT,
-    UNDERSTATED,
     curvature_chi_square,
     gauss_newton,
 )
@@ -24,20 +24,9 @@ from rxcli.receiver.camera.views import BLOCK_ROWS, View, Views, slot_time
 from rxcli.receiver.camera.waves import column_waves, exposure_of_known, fitted
 from rxcli.types import Clock, Float32Array, FloatArray
 
-_STEPS = 6
-#: The fit ends when no row moves by more slots than the first; exposure and rows are fitted anew after the second.
-_CONVERGED, _ROWS_ANEW = 0.005, 0.1
-#: Slots over which the picture is taken as constant.
-_LOCAL_SLOTS = 25.0
-#: Rows by which the picture's texture in a row is foretold.
-_ORDER = 4
 #: Chi-square of a bend beyond doubt, by whether the picture was corrected: with slots as received, unbent ones reach
 #: 205, bent ones have 441 and more but for star fields, few slots at long exposures, and a bend next to none.
 _BENT_CHI_SQUARE: dict[Correction, float] = {"no": np.inf, "likely": 30.0, "unknown": 240.0}
-#: Slots that explain less of the light's local variance were decoded on a wrong clock.
-_LEAST_EXPLAINED = 0.1
-#: The share is of weights that go with the residuals: it may fall a little where the fit is better.
-_NOT_LESS = 0.97
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +64,10 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
     if may_curve and not corrected:
         before = fit.explained_first
         fit = replace(_fit(view, first * FLAT, lit, fit.exposure_slots, 2, shutter), explained_first=before)
-    if fit.explained < max(_NOT_LESS * fit.explained_first, _LEAST_EXPLAINED):
+    if fit.explained < max(SETTINGS.not_less_share * fit.explained_first, SETTINGS.refit_least_explained):
         return estimate, 0.0
     moved = np.abs(slot_time(ordered, view.terms, fit.values) - slot_time(ordered, view.terms, first)) * ordered.inside
-    sd = UNDERSTATED * np.sqrt(np.diag(fit.covariance))
+    sd = SETTINGS.understated_spread * np.sqrt(np.diag(fit.covariance))
     found = replace(
         estimate,
         rows_per_slot=float(fit.values[1]),
@@ -106,24 +95,24 @@ def _fit(
     strips, terms = view.strips, view.terms
     pitch = float(strips.rows[1] - strips.rows[0])
     exposure, exposure_sd, explained_first = exposure_slots, 0.0, 0.0
-    window = round(_LOCAL_SLOTS * values[1] / pitch)
+    window = round(SETTINGS.picture_slots * values[1] / pitch)
     time = slot_time(strips, terms, values)
     moved = np.inf
-    for _ in range(_STEPS):
+    for _ in range(SETTINGS.refit_steps):
         slots = fitted(lit, max(int(time.max()) + 3, lit.shape[1]))
-        if moved > _ROWS_ANEW:
+        if moved > SETTINGS.rows_anew_slots:
             exposure, exposure_sd = exposure_of_known(column_waves(view, time), lit, exposure)
             rows = fit_rows(strips, time, values, slots, exposure, window, shutter_slots)
             moved = 0.0
         observed = rows.observed(strips, time, values, slots)
         change, covariance, explained = gauss_newton(
-            strips, terms, values, time, observed, n_free, _LOCAL_SLOTS, _ORDER
+            strips, terms, values, time, observed, n_free, SETTINGS.picture_slots, SETTINGS.texture_order
         )
         explained_first = explained_first or explained
         values = values + change
         before, time = time, slot_time(strips, terms, values)
         step = float(np.abs(time - before)[:, ::BLOCK_ROWS].max())
         moved += step
-        if step < _CONVERGED:
+        if step < SETTINGS.refit_converged_slots:
             break
     return _Fit(values, covariance, exposure, exposure_sd, explained_first, explained, observed[0], window)

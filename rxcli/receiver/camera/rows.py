@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.numerics import local_mean
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips
 from rxcli.receiver.camera.waves import column_shares, local_moments, residual_of
 from rxcli.receiver.light import SlotLight
@@ -22,12 +23,6 @@ from rxcli.types import Float32Array, FloatArray, IntArray
 #: Weights of a row, of its two neighbours together, and of the two next to those: of developed pictures in general, and
 #: how far they differ.
 _KERNEL = np.array([0.75, 0.4, -0.15])
-_KERNEL_SD = 0.3
-#: Samples and strips err alike: so many of them say what one would.
-_ALIKE = 10.0
-#: Shutter times that are tried, as shares of the exposure that is seen: the mix of rows adds to it.
-_SHUTTERS = (0.35, 0.5, 0.65, 0.8, 0.9, 1.0, 1.1)
-_KERNEL_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,13 +72,13 @@ def fit_rows(
         window: rows over which the picture may be taken as constant.
         shutter_slots: exposure that the file tells, 0 where it does not.
     """
-    tried = (shutter_slots,) if shutter_slots else [share * exposure_slots for share in _SHUTTERS]
+    tried = (shutter_slots,) if shutter_slots else [share * exposure_slots for share in SETTINGS.shutter_shares]
     rows, fits = _SensorRows.of(strips, time, values), []
     for shutter in tried:
         table, _ = rows.seen(strips, values, lit, shutter)
         light = np.stack([rows.read(_mixed(table, part)) for part in np.eye(_KERNEL.size)])
         kernel = _KERNEL
-        for _ in range(_KERNEL_ROUNDS):
+        for _ in range(SETTINGS.kernel_rounds):
             kernel, misfit = _fit_kernel(strips, light, kernel, window)
         fits.append((misfit, RowModel(shutter, kernel)))
     return min(fits, key=lambda fit: fit[0])[1]
@@ -163,7 +158,7 @@ def _fit_kernel(strips: Strips, parts: Float32Array, kernel: FloatArray, window:
     )
     target = ((strips.light - near.value) * weight).ravel()
     information, pull = (basis @ basis.T).astype(np.float64), (basis @ target).astype(np.float64)
-    prior = _ALIKE / _KERNEL_SD**2
+    prior = SETTINGS.samples_as_one / SETTINGS.kernel_sd**2
     found = np.linalg.solve(information + prior * np.eye(kernel.size), pull + prior * _KERNEL)
     power = float(target @ target)
     misfit = (power - 2 * found @ pull + found @ information @ found) / max(power, 1e-9)

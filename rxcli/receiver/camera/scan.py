@@ -12,41 +12,14 @@ from rxcli.numerics import folded, header_correlation
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.edges import edge_power
 from rxcli.receiver.camera.estimates import BlindEstimate, Hypothesis, distinct
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import SAMPLES, Strips, levelled
 from rxcli.receiver.camera.structure import structure_llr
 from rxcli.receiver.light import NoiseModel
 from rxcli.types import Float32Array, FloatArray
 
-#: Rows per slot that are considered.
-MIN_ROWS_PER_SLOT, MAX_ROWS_PER_SLOT = 1.2, 60.0
-
-#: Rows per slot, at one octave's reduction, that its window of this many reduced rows serves.
-_OCTAVE, _OCTAVE_ROWS = (2.4, 4.8), 76
-
-#: Lag, in slots, at which a column is half as like itself: from short exposures to those of three slots.
-HALF_WIDTH = (0.5, 1.8)
-
-#: Copies further apart than this many slots are not compared: the grid of rows per slot would have to be too fine.
-_SCAN_SLOTS = 700
-
-#: Steps of the scan, slots over the picture.
-_SCAN_STEP = 2.0
-
-#: Most that the slots' line in the edges' power counts, nats; and its places a slot over the picture.
-_MOST_FOR_LINE, _LINE_FINE = 30.0, 4
-#: A nat of it beside the height of the headers.
-_SAY_OF_LINE = 0.03
-
-#: Rows per slot this close, relative, are one hypothesis.
-ALIKE_ROWS = 0.015
-
 #: Periods whose combs are looked at together.
 _AT_ONCE = 64
-#: Hypotheses that are tried: so many of different clocks or packets, and so many of different clocks.
-_TRIALS = 12
-#: The same of the short list; lines and peaks that an octave has on it, those of every length of packet; and slots over
-#: the picture by which a period is off.
-_SHORT_TRIALS, _LINES, _PEAKS, _OFF_SLOTS = 5, 4, 3, (-1.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,37 +46,37 @@ class _Octave:
 
     def line_near(self, rows_per_slot: float, slots: float) -> float:
         """The most of `line_at` within so many slots over the whole picture."""
-        middle, reach = self._line_place(rows_per_slot), _LINE_FINE * slots
+        middle, reach = self._line_place(rows_per_slot), SETTINGS.line_fine * slots
         return float(self.line[max(int(middle - reach), 0) : int(middle + reach) + 2].max(initial=0.0))
 
     def _line_place(self, rows_per_slot: float) -> float:
-        return float(_LINE_FINE * self.columns.shape[1] * self.rows / rows_per_slot)
+        return float(SETTINGS.line_fine * self.columns.shape[1] * self.rows / rows_per_slot)
 
 
 def _octaves(strips: Strips) -> list[_Octave]:
     """All octaves whose slots, by the columns' autocorrelation at short lags, may be of its length."""
     out = []
     light, inside, rows = strips.light, strips.inside, 1
-    low, high = _OCTAVE
-    bounds = [(1, MIN_ROWS_PER_SLOT, low)]
-    while low * (1 << (len(bounds) - 1)) < MAX_ROWS_PER_SLOT:
+    low, high = SETTINGS.octave_rows_per_slot
+    bounds = [(1, SETTINGS.least_rows_per_slot, low)]
+    while low * (1 << (len(bounds) - 1)) < SETTINGS.most_rows_per_slot:
         reduce = 1 << (len(bounds) - 1)
-        bounds.append((reduce, low * reduce, min(high * reduce, MAX_ROWS_PER_SLOT)))
+        bounds.append((reduce, low * reduce, min(high * reduce, SETTINGS.most_rows_per_slot)))
     for reduce, least, most in bounds:
         if reduce > rows:
             light, inside, rows = _halved(light), _halved(inside), reduce
         if light.shape[1] * rows < 2 * PREAMBLE_SLOTS * least:
             break
-        window = round(_OCTAVE_ROWS * most / (_OCTAVE[1] * rows))
+        window = round(SETTINGS.octave_rows * most / (SETTINGS.octave_rows_per_slot[1] * rows))
         noise = strips.noise.over(rows)
         columns = _pooled(light, (inside > 0.99).astype(np.float32), window, noise, strips.n_columns)
         correlation = autocorrelation(columns)
         width = half_width(correlation) * rows
-        least, most = max(least, width / HALF_WIDTH[1]), min(most, width / HALF_WIDTH[0])
+        least, most = max(least, width / SETTINGS.half_width_slots[1]), min(most, width / SETTINGS.half_width_slots[0])
         if least < most:
             surprise = _surprise(correlation, round(PREAMBLE_SLOTS * least / rows))
             line = _slot_line(columns)
-            capped = np.minimum(line, _MOST_FOR_LINE)
+            capped = np.minimum(line, SETTINGS.most_for_line)
             out.append(_Octave(columns, rows, least, most, surprise, capped, line))
     return out
 
@@ -151,12 +124,12 @@ def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:
 
 
 def _slot_line(columns: Float32Array) -> FloatArray:
-    """Spectrum of the edges' power, nats over chance, by slots over the whole picture times _LINE_FINE.
+    """Spectrum of the edges' power, nats over chance, by slots over the whole picture times SETTINGS.line_fine.
 
     It tells rows per slot where there is but one header, or where those drown.
     """
     power = edge_power(columns).sum(axis=0, dtype=np.float64)
-    spectrum = np.abs(np.fft.rfft(power, _LINE_FINE * columns.shape[1])) ** 2
+    spectrum = np.abs(np.fft.rfft(power, SETTINGS.line_fine * columns.shape[1])) ** 2
     return np.asarray(spectrum / max(float(power @ power), 1e-30))
 
 
@@ -209,9 +182,9 @@ def short_list(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesis
     for octave in _octaves(strips):
         total = _running_mean_sum(octave)
         for periods, lengths in _outstanding_periods(octave, packet_lengths):
-            near = periods * (1 + np.array(_OFF_SLOTS)[:, None] * periods / strips.rows.size)
+            near = periods * (1 + np.array(SETTINGS.short_off_slots)[:, None] * periods / strips.rows.size)
             pairs += [(one, octave) for one in _combs(octave, total, near.ravel(), lengths)]
-    return _tried(pairs, _SHORT_TRIALS)
+    return _tried(pairs, SETTINGS.short_trials)
 
 
 def _outstanding_periods(octave: _Octave, packet_lengths: Sequence[int]) -> list[tuple[FloatArray, Sequence[int]]]:
@@ -220,13 +193,13 @@ def _outstanding_periods(octave: _Octave, packet_lengths: Sequence[int]) -> list
     A line says nothing of packets; a peak is one of packets of some length.
     """
     n_rows = octave.columns.shape[1] * octave.rows
-    low, high = (int(_LINE_FINE * n_rows / period) for period in (octave.high, octave.low))
-    lines = _strongest(octave.line_uncapped[low : high + 2], _LINES, 2 * _LINE_FINE)
-    found: list[tuple[FloatArray, Sequence[int]]] = [(_LINE_FINE * n_rows / (low + lines), packet_lengths)]
+    low, high = (int(SETTINGS.line_fine * n_rows / period) for period in (octave.high, octave.low))
+    lines = _strongest(octave.line_uncapped[low : high + 2], SETTINGS.short_lines, 2 * SETTINGS.line_fine)
+    found: list[tuple[FloatArray, Sequence[int]]] = [(SETTINGS.line_fine * n_rows / (low + lines), packet_lengths)]
     for packet_slots in packet_lengths:
         least, most = (int(period * packet_slots / octave.rows) for period in (octave.low, octave.high))
         slot = max(int(octave.low / octave.rows), 1)
-        peaks = _strongest(octave.repeats[least : most + 1], _PEAKS, 2 * slot)
+        peaks = _strongest(octave.repeats[least : most + 1], SETTINGS.short_peaks, 2 * slot)
         found.append(((least + peaks) * octave.rows / packet_slots, [packet_slots]))
     return [(periods, lengths) for periods, lengths in found if periods.size]
 
@@ -250,7 +223,7 @@ def every_clock(strips: Strips, packet_lengths: Sequence[int]) -> list[Hypothesi
         packet_lengths: slots of a packet, of every screen in question.
     """
     pairs = [(h, o) for o in _octaves(strips) for h in _scan_octave(o, strips.rows.size, packet_lengths)]
-    return _tried(pairs, _TRIALS)
+    return _tried(pairs, SETTINGS.scan_trials)
 
 
 def _tried(found: list[tuple[Hypothesis, _Octave]], most: int) -> list[Hypothesis]:
@@ -267,7 +240,7 @@ def alike(one: Hypothesis, other: Hypothesis) -> bool:
 
 
 def same_slots(one: Hypothesis | BlindEstimate, other: Hypothesis | BlindEstimate) -> bool:
-    near = abs(np.log(one.rows_per_slot / other.rows_per_slot)) < ALIKE_ROWS
+    near = abs(np.log(one.rows_per_slot / other.rows_per_slot)) < SETTINGS.same_rows_per_slot
     return near and one.reversed == other.reversed
 
 
@@ -276,7 +249,7 @@ def _scan_octave(octave: _Octave, n_rows: int, packet_lengths: Sequence[int]) ->
     total = _running_mean_sum(octave)
     periods = [octave.low]
     while periods[-1] < octave.high:
-        periods.append(periods[-1] * (1 + _SCAN_STEP / min(n_rows / periods[-1], _SCAN_SLOTS)))
+        periods.append(periods[-1] * (1 + SETTINGS.scan_step / min(n_rows / periods[-1], SETTINGS.scan_slots)))
     for first in range(0, len(periods) - 1, _AT_ONCE):
         out += _combs(octave, total, np.array(periods[first : min(first + _AT_ONCE, len(periods) - 1)]), packet_lengths)
     return out
@@ -294,7 +267,7 @@ def _combs(
     spread = 1.4826 * np.partition(size, size.shape[1] // 2, axis=1)[:, size.shape[1] // 2] + 1e-6
     # The largest response within a slot: a period may then miss copies by a slot.
     reach = np.ones((1, 2 * SAMPLES + 1), np.uint8)
-    line = [2 * octave.line_near(period, _SCAN_STEP / 2) for period in rows_per_slot.tolist()]
+    line = [2 * octave.line_near(period, SETTINGS.scan_step / 2) for period in rows_per_slot.tolist()]
     out = []
     either = [(is_reversed, cv2.dilate(-response if is_reversed else response, reach)) for is_reversed in (False, True)]
     for packet_slots in packet_lengths:
@@ -348,13 +321,13 @@ def _slot_means(total: FloatArray, borders: FloatArray) -> FloatArray:
 def _fine_clock(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
     """The clock near the hypothesis with the highest header peaks."""
     n_rows = octave.columns.shape[1] * octave.rows
-    step = 0.3 / min(n_rows / hypothesis.rows_per_slot, _SCAN_SLOTS)
+    step = 0.3 / min(n_rows / hypothesis.rows_per_slot, SETTINGS.scan_slots)
     tried = hypothesis.rows_per_slot * (1 + step * np.arange(-8, 9))
     responses, n_places = _header_responses(_running_mean_sum(octave), tried / octave.rows)
     score, place = _comb(-responses if hypothesis.reversed else responses, n_places, hypothesis.packet_slots)
     score += [
-        0.03 * _repeats_at(octave, rows_per_slot, hypothesis.packet_slots)
-        + _SAY_OF_LINE * octave.line_at(rows_per_slot)
+        SETTINGS.say_of_rest
+        * (_repeats_at(octave, rows_per_slot, hypothesis.packet_slots) + octave.line_at(rows_per_slot))
         for rows_per_slot in tried.tolist()
     ]
     best = int(score.argmax())

@@ -7,20 +7,14 @@ from typing import Literal
 
 import numpy as np
 
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.light import NoiseModel
 from rxcli.types import Float32Array, FloatArray, RowProfiles
 
-#: Strips that a column keeps while its camera is unknown.
-_STRIPS = 4
-
 #: Samples a slot while the clock is sought.
 SAMPLES = 4
-#: Sides are straight up to so many standard deviations, where these are small enough to tell; bowed from so many on.
-_STRAIGHT, _TELLING, _BOWED = 1.5, 0.03, 3.0
 #: Whether the camera took the distortion out of a picture.
 Correction = Literal["no", "likely", "unknown"]
-#: Of light that is nothing but rounding.
-_LEAST_VARIANCE = 1e-10
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +53,17 @@ class Strips:
         """Whether the camera took the distortion out of the picture, which straightens sides and bends stripes."""
         if self.mosaic or self.side_curvature:
             return "no"
-        straight = self.sides and abs(self.sides[0]) < _STRAIGHT * self.sides[1] and self.sides[1] < _TELLING
+        straight = (
+            self.sides
+            and abs(self.sides[0]) < SETTINGS.straight_sds * self.sides[1]
+            and self.sides[1] < SETTINGS.telling_sd
+        )
         return "likely" if straight else "unknown"
 
 
 def side_curvature_of(sides: tuple[float, float] | None) -> tuple[float, float] | None:
     """k1 that sides show and its standard deviation, None where they may be straight."""
-    return sides if sides and abs(sides[0]) > _BOWED * sides[1] else None
+    return sides if sides and abs(sides[0]) > SETTINGS.bowed_sds * sides[1] else None
 
 
 def strips_of(
@@ -91,7 +89,7 @@ def strips_of(
         tone: the curve that was undone; None where values are known to follow light.
     """
     n_columns, n_strips, n_rows = profiles.light.shape
-    join = n_strips // _STRIPS if n_strips % _STRIPS == 0 else 1
+    join = n_strips // SETTINGS.most_strips if n_strips % SETTINGS.most_strips == 0 else 1
     shape = (n_columns * n_strips // join, join, n_rows)
     inside = profiles.inside.reshape(shape).astype(np.float32).min(axis=1)
     pixels = max(float(np.median(profiles.count)), 1.0) * join
@@ -147,7 +145,7 @@ def levelled(
     size = (max(window, 1) | 1, 1)
     share = cv2.blur(inside, size) + np.float32(1e-3)
     mean = cv2.blur(light, size) / share
-    random = noise.variance(mean) + np.float32(_LEAST_VARIANCE)
+    random = noise.variance(mean) + np.float32(SETTINGS.least_variance)
     signal = np.maximum(cv2.blur(light * light, size) / share - mean * mean - random, 0)
     level = np.clip((light - mean) / np.sqrt(signal + 9 * random), -3, 3) * inside
     return level, signal / (signal + 16 * random) * inside

@@ -12,11 +12,11 @@ from rxcli.numerics import local_mean
 from rxcli.receiver.camera.curvature import BEND_PRECISION, BEND_SCALE
 from rxcli.receiver.camera.estimates import BlindEstimate
 from rxcli.receiver.camera.reading import Packets, Reading, read_slots
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Correction, Strips
 from rxcli.receiver.camera.structure import repeat_evidence
 from rxcli.receiver.camera.views import BLOCK_ROWS, View, Views, slot_time
 from rxcli.receiver.camera.waves import (
-    LOCAL_SLOTS,
     Grid,
     Moments,
     Slots,
@@ -36,28 +36,6 @@ from rxcli.types import Float32Array, FloatArray
 _PRECISION: FloatArray = np.diag([1e-6] * 6)
 _PRECISION[2:, 2:] = BEND_PRECISION
 
-#: Samples of a slot and strips of a column err alike: so many of them say what one would.
-ALIKE = 10.0
-
-#: Slots that are wrong are wrong in neighbouring columns alike: the spread between columns says this much too little.
-UNDERSTATED = 3.0
-
-#: Rounds of slots and clock, at most and at least; those before which the exposure is estimated.
-_REFINE_STEPS, _LEAST_STEPS = 8, 3
-_EXPOSURE_STEPS = (0, 2)
-#: Steps in which the clock alone moves, where no bend is known: slots that are wrong yet would bend it.
-_RIGID_STEPS = 2
-#: Steps that are this share of the one before, or more, are extrapolated, up to so many times.
-_SLOW, _MOST_EXTRAPOLATED = 0.2, 3.0
-#: Slots that were read on a clock further off than this, slots, are read anew; so many readings at most.
-_FAR, _MOST_READINGS = 0.4, 4
-#: Evidence, nats, from which slots that were read so near are the right ones.
-_READ_SURELY = 200.0
-#: Packets of another length that are less likely by no more than this, nats, are estimates too.
-_CLOSE = 60.0
-
-#: The descent ends when no row moves by more slots than this.
-_CONVERGED = 0.03
 
 #: Chi-square of the four coefficients that a bend beyond doubt has, by whether the picture was corrected. Columns share
 #: too much for it to be taken at its word: unbent pictures reach 150.
@@ -65,12 +43,6 @@ _BENT_CHI_SQUARE: dict[Correction, float] = {"no": np.inf, "likely": 30.0, "unkn
 
 #: Keeps the clock of a row-time map and drops its bend.
 FLAT = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
-
-#: Share of what a row leaves that is its own; and the least of the mean spread that is left anywhere.
-_WHITE, _LEAST_SPREAD = 1e-3, 0.2
-
-#: How far the light per unit of the wave differs from its usual share of the mean light.
-_GAIN_SD = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,18 +81,22 @@ def refine(
     """
     view = views.at(reading.rows_per_slot, reading.is_reversed)
     least = exposure_of_length(reading.packets[0].packet_slots)
-    for _ in range(_MOST_READINGS):
+    for _ in range(SETTINGS.most_readings):
         timing, corrected = _fit_timing(view, reading, least, sure)
         moved = _moved(view, reading, timing)
-        if moved < _FAR and reading.log_evidence > _READ_SURELY:
+        if moved < SETTINGS.far_slots and reading.log_evidence > SETTINGS.read_surely_nats:
             again = reading
             break
         again = _read_again(views, reading, timing, packet_lengths)
-        if again.log_evidence <= reading.log_evidence or moved < _FAR:
+        if again.log_evidence <= reading.log_evidence or moved < SETTINGS.far_slots:
             break
         reading = again
-    likely = [packets for packets in again.packets if packets.log_evidence > again.packets[0].log_evidence - _CLOSE]
-    found, sd = timing.values[2:], UNDERSTATED * np.sqrt(np.diag(timing.covariance))
+    likely = [
+        packets
+        for packets in again.packets
+        if packets.log_evidence > again.packets[0].log_evidence - SETTINGS.another_length_nats
+    ]
+    found, sd = timing.values[2:], SETTINGS.understated_spread * np.sqrt(np.diag(timing.covariance))
     return [
         BlindEstimate(
             rows_per_slot=float(timing.values[1]),
@@ -194,14 +170,14 @@ def _descend(
     strips, terms = view.strips, view.terms
     exposure, exposure_sd = exposure_slots, 0.0
     change, factor, period = np.zeros(6), 1.0, float(values[1])
-    for step in range(_REFINE_STEPS):
+    for step in range(SETTINGS.refine_steps):
         time = slot_time(strips, terms, values)
         waves = column_waves(view, time)
-        if estimating and step in _EXPOSURE_STEPS:
+        if estimating and step in SETTINGS.exposure_steps:
             exposure, exposure_sd = exposure_of_known(waves, slots.lit, exposure if step else None)
             exposure, exposure_sd = (exposure, exposure_sd) if exposure > exposure_slots else (exposure_slots, 0.0)
         slots = decide(waves, exposure, grid, slots)
-        free = n_free if step >= _RIGID_STEPS or values[2:].any() else 2
+        free = n_free if step >= SETTINGS.rigid_steps or values[2:].any() else 2
         observed = seen_by_strips(strips, time, slots.lit, exposure)
         before, (change, covariance, explained) = (
             change,
@@ -213,7 +189,7 @@ def _descend(
         if not (0.5 < following[1] / period < 2.0 and moved < grid.packet_slots):
             break  # no step of a clock that was read: nothing here looks like slots
         values = following
-        if moved < _CONVERGED and step >= _LEAST_STEPS - 1:
+        if moved < SETTINGS.converged_slots and step >= SETTINGS.least_steps - 1:
             break
     return _Timing(values, covariance, exposure, exposure_sd, explained, slots, waves)
 
@@ -223,7 +199,7 @@ def _extrapolation(before: FloatArray, change: FloatArray, covariance: FloatArra
     metric = np.linalg.pinv(covariance[:2, :2])
     length = float(before[:2] @ metric @ before[:2])
     ratio = float(before[:2] @ metric @ change[:2]) / length if length > 0 else 0.0
-    return min(1 / (1 - min(ratio, 0.9)), _MOST_EXTRAPOLATED) if ratio > _SLOW else 1.0
+    return min(1 / (1 - min(ratio, 0.9)), SETTINGS.most_extrapolated) if ratio > SETTINGS.slow else 1.0
 
 
 def seen_by_strips(
@@ -241,7 +217,7 @@ def gauss_newton(
     time: Float32Array,
     observed: tuple[Float32Array, Float32Array],
     n_free: int,
-    local_slots: float = LOCAL_SLOTS,
+    local_slots: float = SETTINGS.local_slots,
     order: int = 0,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Step of the row-time map, its covariance, and the share of variance explained before the step.
@@ -287,7 +263,7 @@ def _likely_gain(near: Moments, spread: Float32Array, window: int) -> Float32Arr
     told = float((weight * light * light * near.variance).sum())
     usual = np.float32(max(float((weight * light * near.covariance).sum()), 0.0) / max(told, 1e-12)) * light
     trust = np.float32(window) * near.share * np.maximum(near.variance, 0) / spread
-    prior = 1 / (np.float32(_GAIN_SD) * usual + np.float32(1e-6)) ** 2
+    prior = 1 / (np.float32(SETTINGS.gain_sd) * usual + np.float32(1e-6)) ** 2
     raw = near.covariance / (near.variance + np.float32(0.02))
     return np.asarray(np.maximum((trust * raw + prior * usual) / (trust + prior), 0), np.float32)
 
@@ -301,7 +277,7 @@ def _whitened(
     residual, n = residual * scale, residual.shape[1]
     alike = [float((residual[:, k:] * residual[:, : n - k]).sum()) for k in range(order + 1)]
     lags = np.abs(np.subtract.outer(np.arange(order), np.arange(order)))
-    known = np.array(alike)[lags] + (_WHITE * alike[0] + 1e-9) * np.eye(order)
+    known = np.array(alike)[lags] + (SETTINGS.own_row_share * alike[0] + 1e-9) * np.eye(order)
     foretold = np.linalg.solve(known, alike[1:]).astype(np.float32)
     out_residual, out_power, counted = residual.copy(), power * scale, inside.copy()
     power = out_power.copy()
@@ -312,7 +288,7 @@ def _whitened(
         counted[:, k:] *= inside[:, : n - k]
     square = out_residual * out_residual * counted
     spread = local_mean(square, window) / (local_mean(counted, window) + np.float32(1e-3))
-    least = np.float32(_LEAST_SPREAD * float(square.sum()) / max(float(counted.sum()), 1.0) + 1e-9)
+    least = np.float32(SETTINGS.least_spread * float(square.sum()) / max(float(counted.sum()), 1.0) + 1e-9)
     return out_residual, out_power, np.asarray(counted / np.maximum(spread, least), np.float32)
 
 
@@ -333,7 +309,7 @@ def _solve(
     """Step and covariance; the spread of the columns' pulls stands for all that makes residuals alike."""
     free = jacobian[:n_free]
     flat = free.reshape(n_free, -1)
-    prior = ALIKE * _PRECISION[:n_free, :n_free]
+    prior = SETTINGS.samples_as_one * _PRECISION[:n_free, :n_free]
     hessian = (flat * information.ravel()) @ flat.T + prior
     inverse = np.linalg.inv(hessian)
     by_column = (free * pull).reshape(n_free, n_columns, -1).sum(axis=2)

@@ -9,18 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.numerics import local_mean
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips
 from rxcli.receiver.camera.waves import local_moments, residual_of
 from rxcli.types import Float32Array, FloatArray
 
 #: Exponent that makes light of values, as nearly as a power of them does, by the tone curve.
 _EXPONENTS = {"srgb": 2.2, "linear": 1.0}
-#: Curves of a smaller exponent are nearer to none at all than to sRGB.
-_LINEAR_BELOW = 1.5
-#: How far the bend of a picture whose curve is known is off: textures, sharpening and slots that are wrong.
-_BEND_SD = 0.25
-#: Half of the light is never more than so near to none, whatever the bend.
-_LEAST_HALF = 0.05
 
 
 def tone_exponent(strips: Strips, wave: Float32Array, window: int) -> tuple[float, float] | None:
@@ -57,8 +52,8 @@ def tone_exponent(strips: Strips, wave: Float32Array, window: int) -> tuple[floa
     if information.sum() <= 0:
         return None
     curvature = pull.sum() / information.sum()
-    sd = np.hypot(np.linalg.norm(pull - curvature * information) / information.sum(), _BEND_SD)
-    half = max(0.5 + curvature / 4, _LEAST_HALF)
+    sd = np.hypot(np.linalg.norm(pull - curvature * information) / information.sum(), SETTINGS.tone_bend_sd)
+    half = max(0.5 + curvature / 4, SETTINGS.least_half)
     power = -np.log2(half)
     exponent = _EXPONENTS[strips.tone] / power
     return float(exponent), float(exponent * sd / (4 * np.log(2) * half * power))
@@ -66,4 +61,4 @@ def tone_exponent(strips: Strips, wave: Float32Array, window: int) -> tuple[floa
 
 def is_linear(tone: tuple[float, float] | None) -> bool:
     """Whether a picture of some exponent is read as one whose values follow light."""
-    return tone is not None and tone[0] < _LINEAR_BELOW
+    return tone is not None and tone[0] < SETTINGS.linear_below

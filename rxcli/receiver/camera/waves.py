@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import local_mean
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import SAMPLES, Strips
 from rxcli.receiver.camera.trellis import lit_probability, pattern_light
 from rxcli.receiver.camera.views import View
@@ -20,26 +21,12 @@ from rxcli.types import Float32Array, FloatArray
 _EXPOSURES = np.array([0.3, 0.7, 1.1, 1.5, 1.9, 2.3, 2.8])
 _AROUND_EXPOSURE = np.array([0.7, 0.85, 1.0, 1.17, 1.37])
 
-#: Rounds of levels and slots at every step; slots over which levels are taken; weight of a column's own level there.
-_ROUNDS, _LEVEL_SLOTS = 1, 31
-_GAIN_PRIOR = np.float32(0.05)
-#: Log-odds of known slots; and the say of a sample, as samples of a slot err alike.
-_KNOWN, _TEMPER = 6.0, 0.5
 #: (10, 10) share of the codewords that are lit, by weight (nothing for 0) and place. The codebook is the first part of
 #: all words in ascending order: early slots are dark more often than late ones, of weights 2 to 5 the first one nearly
 #: always. None is surer than a header's.
 WORD_SHARES: FloatArray = np.clip(
     [np.full(SLOTS_PER_SYMBOL, 0.5), *(codebook(w).mean(axis=0) for w in WEIGHTS)], 0.01, 0.99
 )
-#: Rounds of levels and slots that are read freely; and the share of them that may be lit.
-_FREE_ROUNDS, _FREE_DUTY = 1, (0.15, 0.85)
-#: Noise that is expected of levelled light before any is known.
-_FIRST_POWER = 0.3
-#: Rounds of weights and how many columns have them.
-_SHARING_ROUNDS = 5
-
-#: Slots over which the light of a strip may be taken as constant.
-LOCAL_SLOTS = 15
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +43,7 @@ class Grid:
         preamble = position < PREAMBLE_SLOTS
         symbol = np.arange(SLOTS_PER_SYMBOL) < w[:, None]
         known = np.concatenate([np.broadcast_to(np.array(HEADER, bool), symbol.shape), symbol], axis=1)
-        out[:, preamble] = np.where(known[:, position[preamble]], _KNOWN, -_KNOWN)
+        out[:, preamble] = np.where(known[:, position[preamble]], SETTINGS.known_log_odds, -SETTINGS.known_log_odds)
         return out
 
 
@@ -113,13 +100,12 @@ def read_freely(waves: Waves, exposure_slots: float, w: int | None = None) -> tu
     levels = np.array([_expected_levels(one, exposure_slots) for one in WEIGHTS], np.float32)
     weights = likely_weights(waves, exposure_slots) if w is None else np.full(shape[0], w)
     gain, offset = (np.broadcast_to(one[weights - 1][:, None], waves.value.shape) for one in levels.T)
-    power = np.full((shape[0], 1), _FIRST_POWER, np.float32)
+    power = np.full((shape[0], 1), SETTINGS.first_power, np.float32)
     prior = _log_odds(weights[:, None] / SLOTS_PER_SYMBOL) + np.zeros(shape)
     lit, _ = lit_probability(_pattern_metric(waves, gain, offset, power, pattern), prior)
-    for _ in range(_FREE_ROUNDS):
-        gain, offset, residual = _levels(waves, lit, exposure_slots)
-        prior = _log_odds(np.clip(lit.mean(axis=1, keepdims=True, dtype=np.float64), *_FREE_DUTY)) + np.zeros(shape)
-        lit, _ = lit_probability(_pattern_metric(waves, gain, offset, _power(waves, residual), pattern), prior)
+    gain, offset, residual = _levels(waves, lit, exposure_slots)
+    prior = _log_odds(np.clip(lit.mean(axis=1, keepdims=True, dtype=np.float64), *SETTINGS.free_duty)) + np.zeros(shape)
+    lit, _ = lit_probability(_pattern_metric(waves, gain, offset, _power(waves, residual), pattern), prior)
     return lit, np.asarray(_log_odds(np.clip(lit.astype(np.float64), 1e-4, 1 - 1e-4)) - prior, np.float32)
 
 
@@ -142,30 +128,27 @@ def _log_odds(share: FloatArray) -> FloatArray:
 def shared_weights(log_evidence: FloatArray) -> NDArray[np.int64]:
     """(C,) most probable weight of each column, where weights that many columns have are more probable."""
     prior = np.full((log_evidence.shape[0], 1), 1 / log_evidence.shape[0])
-    for _ in range(_SHARING_ROUNDS):
+    for _ in range(SETTINGS.sharing_rounds):
         posterior = np.exp(log_evidence - log_evidence.max(axis=0)) * prior
         posterior /= posterior.sum(axis=0)
         prior = posterior.mean(axis=1, keepdims=True) + 0.01
     return np.asarray(posterior.argmax(axis=0))
 
 
-def decide(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots, rounds: int = _ROUNDS) -> Slots:
-    """Slots by rounds of levels from slots and slots from levels; weights stay.
+def decide(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots) -> Slots:
+    """Levels from slots, and slots from levels; weights stay.
 
     Args:
         waves: light by slot position.
         exposure_slots: exposure.
         grid: where the headers are.
         slots: to start from.
-        rounds: of levels and slots.
     """
     n = waves.value.shape[1] // SAMPLES
     lit = fitted(slots.lit, n)
-    known = grid.log_odds(slots.w, n)
-    pattern = pattern_light(exposure_slots, SAMPLES)
-    for _ in range(rounds):
-        gain, offset, residual = _levels(waves, lit, exposure_slots)
-        lit, _ = lit_probability(_pattern_metric(waves, gain, offset, _power(waves, residual), pattern), known)
+    gain, offset, residual = _levels(waves, lit, exposure_slots)
+    metric = _pattern_metric(waves, gain, offset, _power(waves, residual), pattern_light(exposure_slots, SAMPLES))
+    lit, _ = lit_probability(metric, grid.log_odds(slots.w, n))
     return Slots(lit, slots.w)
 
 
@@ -231,7 +214,7 @@ def _pattern_metric(
     waves: Waves, gain: Float32Array, offset: Float32Array, power: Float32Array, pattern: FloatArray
 ) -> Float32Array:
     """(C, N, patterns) log-likelihood of every slot's samples at given levels and noise, up to a constant."""
-    scale = _trust(waves) * np.float32(_TEMPER / 2) / power
+    scale = _trust(waves) * np.float32(SETTINGS.sample_information / 2) / power
     shape = (waves.value.shape[0], -1, SAMPLES)
     value, gain, scale = ((waves.value - offset).reshape(shape), gain.reshape(shape), scale.reshape(shape))
     light = pattern.astype(np.float32)
@@ -246,11 +229,12 @@ def _levels(waves: Waves, lit: Float32Array, exposure_slots: float) -> tuple[Flo
     unsure = SlotLight(lit * (1 - lit), 0.0).seen(centres, exposure_slots)
     unsure /= np.float32(max(exposure_slots, 1.0))
     weight = waves.weight
-    near = local_moments(waves.value, wave, weight, _LEVEL_SLOTS * SAMPLES, unsure)
+    near = local_moments(waves.value, wave, weight, SETTINGS.level_slots * SAMPLES, unsure)
     both, power = near.covariance, near.variance
     total = weight.sum(axis=1, keepdims=True) + np.float32(1e-6)
     overall = (both * weight).sum(axis=1, keepdims=True) / ((power * weight).sum(axis=1, keepdims=True) + 0.01 * total)
-    gain = (np.maximum(both, 0) + _GAIN_PRIOR * np.maximum(overall, 0)) / (np.maximum(power, 0) + _GAIN_PRIOR)
+    own = np.float32(SETTINGS.gain_prior)
+    gain = (np.maximum(both, 0) + own * np.maximum(overall, 0)) / (np.maximum(power, 0) + own)
     offset = near.value - gain * near.wave
     return gain, offset, (waves.value - offset - gain * wave) ** 2 + gain * gain * unsure
 
@@ -317,7 +301,7 @@ def _misfit(waves: Waves, exposure_slots: float, lit: Float32Array) -> float:
     centres = (np.arange(waves.value.shape[1])[None] + 0.5) / SAMPLES
     wave = SlotLight(lit, 0.0).seen(centres, exposure_slots)
     weight = waves.weight
-    near = local_moments(waves.value, wave, weight, LOCAL_SLOTS * SAMPLES)
+    near = local_moments(waves.value, wave, weight, SETTINGS.local_slots * SAMPLES)
     residual = waves.value - near.value - near.gain * (wave - near.wave)
     total = float((weight * (waves.value - near.value) ** 2).sum())
     return float((weight * residual * residual).sum()) / max(total, 1e-9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +34,8 @@ class SlotLikelihoods:
     #: (C, N) float32: (lit minus dark) squared over the noise's variance, of a slot.
     snr: Float32Array
     #: (C, 2) float64: correlation of the residual with its change by the clock, and that change's power; their ratio is
-    #: how many slots the column's clock is late.
-    timing: FloatArray
+    #: how many slots the column's clock is late. Empty where the clock was put right before.
+    timing: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def slot_likelihoods(

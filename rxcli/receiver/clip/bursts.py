@@ -9,20 +9,12 @@ from numpy.typing import NDArray
 
 from rxcli.protocol import WEIGHTS
 from rxcli.receiver import channel
+from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble, detect
 from rxcli.receiver.reception import HOPELESS_WEIGHT
 from rxcli.receiver.sync.tracking import Bursts, of_one_memory
 from rxcli.types import Float32Array, FloatArray, IntArray
-
-#: A burst of a column all of whose symbols have at least this log probability is not decoded again.
-_CERTAIN = -1e-4
-#: Squared contrast over variance of a slot that is well lit, and log probability of a packet in doubt.
-_WELL_LIT_SNR, _DOUBTFUL = 10.0, -0.05
-#: Squared contrast over variance of a slot, at which all copies of a packet together do not give one.
-_DARK_SNR = 0.5
-#: Dark columns are tried all the same in every so manieth frame.
-_TRY_DARK_EVERY = 30
 
 
 class BurstReader:
@@ -83,10 +75,10 @@ class BurstReader:
 
     def _dark(self, view: View) -> NDArray[np.bool_]:
         """(C,) columns of a tracked frame with too little light to try; now and then they are tried all the same."""
-        tried = (view.bursts.frame + 1) % _TRY_DARK_EVERY == 0
+        tried = (view.bursts.frame + 1) % SETTINGS.try_dark_every == 0
         if view.flat is None or "dark_columns" not in self._skip or tried:
             return np.zeros(view.snr.shape[0], bool)
-        return np.asarray(np.median(view.snr, axis=1) < _DARK_SNR)
+        return np.asarray(np.median(view.snr, axis=1) < SETTINGS.dark_snr)
 
     def _detect_open(self, found: list[tuple[IntArray, NDArray[np.bool_]]]) -> None:
         """Detect the columns wanted, (B, C), of the open bursts of some frames.
@@ -104,7 +96,7 @@ class BurstReader:
             np.concatenate([m[place] for m, place in zip(metrics, places, strict=True)])[None],
             np.concatenate([w[c] for w, (_, c) in zip(weights, places, strict=True)]),
         )
-        certain = posteriors.log_prob[0].min(axis=1) >= _CERTAIN
+        certain = posteriors.log_prob[0].min(axis=1) >= SETTINGS.certain_log_prob
         for one in np.unique(number):
             mine = np.flatnonzero(number == one)
             self.open.note(int(one), column[mine], posteriors.of_columns(mine), certain[mine])
@@ -129,13 +121,13 @@ class BurstReader:
         assert waiting.view is not None
         assert waiting.numbers is not None
         self.detect_stale(waiting)
-        lit = np.median(waiting.view.snr, axis=1) >= _WELL_LIT_SNR
+        lit = np.median(waiting.view.snr, axis=1) >= SETTINGS.well_lit_snr
         doubtful = total = 0
         for number in waiting.numbers:
             known = self.open.known(int(number)) if self.open.is_open(int(number)) else None
             if known is not None:
                 whole = assemble.complete(self.open.n_observed(np.array([number])))[0] & lit
-                doubtful += int((known.log_prob[0].sum(axis=1) < _DOUBTFUL)[whole].sum())
+                doubtful += int((known.log_prob[0].sum(axis=1) < SETTINGS.doubtful_log_prob)[whole].sum())
                 total += int(whole.sum())
         return doubtful, total
 

@@ -10,13 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.options import ReceiverOptions
+from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.outline import find_outline
 from rxcli.receiver.screen.registration import ScreenTexture
 from rxcli.types import FloatArray, Frame
-
-#: Corners of two searches that differ by less than this, in screen widths, agree; searches where they do not.
-_AGREE, _MOST_SEARCHES = 0.003, 5
 
 
 class FirstOutline:
@@ -41,9 +39,11 @@ class FirstOutline:
     @property
     def settled(self) -> bool:
         """Whether no further frame is asked."""
-        if self._texture is None or len(self._differences) >= _MOST_SEARCHES:
+        if self._texture is None or len(self._differences) >= SETTINGS.most_searches:
             return True
-        return len(self._differences) == 2 and bool(np.abs(self._differences[1]).max() < _AGREE * self._width)
+        return len(self._differences) == 2 and bool(
+            np.abs(self._differences[1]).max() < SETTINGS.outlines_agree * self._width
+        )
 
     @property
     def corners(self) -> FloatArray:

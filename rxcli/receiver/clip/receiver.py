@@ -19,10 +19,12 @@ from rxcli.receiver.clip import results
 from rxcli.receiver.clip.bursts import BurstReader
 from rxcli.receiver.clip.outline import FirstOutline
 from rxcli.receiver.clip.scene import TrackedScreen
+from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.start import Start, acquisition_at, agree, shows_little
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.decode import assemble, confidence, detect
+from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
 from rxcli.receiver.outline import Located, locate
 from rxcli.receiver.reception import Reception, complete_packets, shows_steady_light
@@ -41,21 +43,6 @@ from rxcli.receiver.unknown_camera import (
 from rxcli.results.dump import dump_stages
 from rxcli.types import BoolArray, FloatArray, Frame, FrameResult, FrameSoftBits, IntArray
 
-#: Frames at the start of a scene that are looked at once more when the picture is known better; how many are waited for
-#: where compression has taken much; and the share of the well lit packets that are then in doubt.
-_HELD, _HELD_LONG, _MUCH_DOUBT = 6, 24, 0.03
-#: Looks at so few frames: what one of them was decided to be tells in the next of the others.
-_LOOKS = 2
-#: Share in doubt, before the first of these looks, that it would not mend: it is left out.
-_TOO_MUCH_DOUBT = 0.25
-#: Share of columns that a quick look at a first frame may leave in doubt.
-_QUICK_DOUBT = 0.5
-#: Share of columns in doubt from which a first frame is not explained by the camera that is named, and below which it
-#: is by another.
-_UNLIKE_DOUBT, _LIKE_DOUBT = 0.85, 0.65
-#: Pixels of which one is compared with the frame before; least change from row to row, grey levels of 255, and share of
-#: it that a frame shown twice differs from itself.
-_SAME_STEP, _SAME_CONTRAST, _SAME_SHARE = 7, 3.0, 0.25
 _SAME = "it shows the frame before once more, so that its time is not that of its rows; it was left out"
 _NOMINAL_TIME = "the clip's time stamps do not advance here; its nominal frame rate was taken"
 _SLOW_MOTION = "slow motion: time stamps are {:g} times as long as the link's time, which was taken"
@@ -67,20 +54,8 @@ _RETIMED = (
     "the clip's time stamps do not fit the link's time, as after a change of its speed: each frame is received alone; "
     "give the clip as the camera recorded it"
 )
-#: Frames in a row that may be received like photographs before the picture is learned anew.
-_MOST_UNKNOWN = 3
-#: Frames without a screen after which one of so many is searched for columns, which takes most of a search.
-_THOROUGH = 8
-#: How much longer than from one frame to the next a readout may seem to take: time stamps are rounded.
-_READOUT_SLACK = 1.1
-#: Frames that find their clock together where each shows little.
-_TOGETHER = 8
 #: Copies between two frames that have none in common.
 _FAR_APART = 1 << 12
-#: What the header of one burst may say of a column, nats.
-_MOST_HEADER = 12.0
-#: Frames that may wait until it is clear which copies begin a burst.
-_MAX_WAITING = 8
 
 
 def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
@@ -116,8 +91,9 @@ class _Link:
     def headerless(self, closed: Sequence[tracking.ClosedBurst], n_columns: int) -> BoolArray:
         """(C,) columns that show no headers, in all bursts up to some that are closed."""
         header_llr = np.zeros((1, n_columns)) if self.header_llr is None else self.header_llr
+        most = decode_settings.good_header_nats
         for burst in closed:
-            header_llr = header_llr + np.clip(burst.posteriors.header_llr, -_MOST_HEADER, _MOST_HEADER)
+            header_llr = header_llr + np.clip(burst.posteriors.header_llr, -most, most)
         self.header_llr = header_llr
         return assemble.without_header(header_llr) if closed else np.zeros(n_columns, bool)
 
@@ -173,7 +149,7 @@ class _Clip:
 
     def _hold_first(self) -> None:
         """Hold back the first frames of a scene, to be looked at once more."""
-        self._hold(_HELD if "tracking" in self._options.skip else 0)
+        self._hold(SETTINGS.frames_held if "tracking" in self._options.skip else 0)
 
     def _hold(self, n_frames: int) -> None:
         """Hold back so many frames; 0 from then on."""
@@ -193,7 +169,7 @@ class _Clip:
         if self._first:
             self._outline.take(frame)
         self._first.append(frame)
-        enough = len(self._first) == _TOGETHER or not self._little
+        enough = len(self._first) == SETTINGS.frames_together or not self._little
         return self._begin() if self._outline.settled and enough else []
 
     def _opens(self, frame: Frame) -> bool:
@@ -229,7 +205,7 @@ class _Clip:
         context, period_s = located.context, _shortest_period_s(frames)
         if not isinstance(context, FrameContext) or context.camera.blind_estimate is None or period_s is None:
             return located
-        too_long = context.camera.line_delay_s * context.frame.height / (period_s * _READOUT_SLACK)
+        too_long = context.camera.line_delay_s * context.frame.height / (period_s * SETTINGS.readout_slack)
         if too_long <= 1:
             return located
         slowest_hz = too_long * max(screen.slot_rate_hz for screen in context.screens)
@@ -287,11 +263,11 @@ class _Clip:
         """Whether a frame is the one before once more, as a change of the frame rate makes them: its time is wrong."""
         if "tracking" not in self._options.skip or self._corners is None:
             return False
-        some = frame.pixels[::_SAME_STEP, ::_SAME_STEP].astype(np.float32)
+        some = frame.pixels[:: SETTINGS.same_step, :: SETTINGS.same_step].astype(np.float32)
         before, self._some = self._some, some
         if before is None or before.shape != some.shape:
             return False
-        (left, top), (right, bottom) = (self._corners[[0, 2]] / _SAME_STEP).astype(int).clip(0)
+        (left, top), (right, bottom) = (self._corners[[0, 2]] / SETTINGS.same_step).astype(int).clip(0)
         screen = np.s_[min(top, bottom) : max(top, bottom), min(left, right) : max(left, right)]
         some, before = some[screen], before[screen]
         if min(some.shape) < 2:
@@ -300,7 +276,7 @@ class _Clip:
         unit = (frame.white - frame.black) / 255
         contrast = float(np.abs(np.diff(some, axis=0)).mean())
         changed = float(np.abs(some - before).mean())
-        return contrast > _SAME_CONTRAST * unit and changed < _SAME_SHARE * contrast
+        return contrast > SETTINGS.same_contrast * unit and changed < SETTINGS.same_share * contrast
 
     def _shows_nothing_new(self, frame: Frame) -> bool:
         """Whether all bursts that a frame should show are certain already in all columns that are lit."""
@@ -351,13 +327,13 @@ class _Clip:
             return received, None
         context, acquisition = received.context, received.acquisition
         can_track = self._can_track(context, acquisition)
-        again = can_track and self._n_held == _HELD
+        again = can_track and self._n_held == SETTINGS.frames_held
         reception, denoised, report = self._decoded(acquisition, received.reception, again, timer)
         estimated = self._with_estimated_camera(context, reception)
         if estimated is not None:
             context, acquisition = estimated.context, estimated.acquisition
             can_track = self._can_track(context, acquisition)
-            again = can_track and self._n_held == _HELD
+            again = can_track and self._n_held == SETTINGS.frames_held
             reception, denoised, report = self._decoded(acquisition, estimated.reception, again, timer)
         if self._start is None and shows_steady_light(reception):
             return Failure("no_signal", STEADY_LIGHT), None
@@ -406,7 +382,7 @@ class _Clip:
 
     def _located(self, frame: Frame, timer: Timer) -> Located | Failure:
         """The screen in a frame; where frame after frame shows none, its columns are searched in one of so many."""
-        thorough = self._n_without < _THOROUGH or self._n_without % _THOROUGH == 0
+        thorough = self._n_without < SETTINGS.search_every or self._n_without % SETTINGS.search_every == 0
         return locate(frame, self._options, timer, self._context, by_columns=thorough)
 
     def _with_settled_camera(self, context: FrameContext) -> _Settled | Failure:
@@ -454,14 +430,14 @@ class _Clip:
         Stabilisation crops and enlarges what was read, so that rows are no longer those of the profile.
         """
         tried, self._tried_profile = self._tried_profile, True
-        if tried or not has_profile(context.frame, self._options) or _shows_packets(reception, _UNLIKE_DOUBT):
+        if tried or not has_profile(context.frame, self._options) or _shows_packets(reception, SETTINGS.unlike_doubt):
             return None
         before = self._options, self._context
         self._options = replace(self._options, cameras=(), force_camera=False, camera_cache=None)
         other = likely_camera(context.frame, context.corners, self._options, context.timer)
         found = other if isinstance(other, Failure) else self._with_settled_camera(other)
         if isinstance(found, Failure) or not _shows_packets(
-            found.reception or initial_pass(found.acquisition), _LIKE_DOUBT
+            found.reception or initial_pass(found.acquisition), SETTINGS.like_doubt
         ):
             self._options, self._context = before
             return None
@@ -477,7 +453,7 @@ class _Clip:
         """
         before, begun = self._scene_before, self._scene
         self._n_unknown += 1
-        if before is None or begun is None or self._link is None or self._n_unknown > _MOST_UNKNOWN:
+        if before is None or begun is None or self._link is None or self._n_unknown > SETTINGS.most_unknown:
             return
         screen, was = view.acquisition.screen, before.last and before.last.acquisition.screen
         if (
@@ -499,7 +475,7 @@ class _Clip:
         if reception is None and again and self._options.cae != "always":
             with timer("detect"):
                 reception = initial_pass(acquisition)
-                if doubtful_columns(reception).size <= _QUICK_DOUBT * reception.snr.shape[0]:
+                if doubtful_columns(reception).size <= SETTINGS.quick_doubt * reception.snr.shape[0]:
                     return reception, frozenset(), None
         if reception is None:
             with timer("detect"):
@@ -531,7 +507,7 @@ class _Clip:
             if not scene.follow(frame):
                 return None
             self._corners = scene.corners
-        return scene.view(frame, self._link.time, self._n_held != _HELD_LONG, timer)
+        return scene.view(frame, self._link.time, self._n_held != SETTINGS.frames_held_long, timer)
 
     # -- bursts ---------------------------------------------------------------------------------------------------
 
@@ -558,7 +534,7 @@ class _Clip:
             n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)
             if self._n_held and self._link.time.judged and not self._link.judged:
                 self._judge_stamps()
-            if self._link.phase.settled or n_unsettled > _MAX_WAITING:
+            if self._link.phase.settled or n_unsettled > SETTINGS.most_waiting:
                 self._settle_bursts()
                 if self._n_held and len(self._waiting) >= self._n_held:
                     self._receive_first_again(at_last=False)
@@ -671,12 +647,12 @@ class _Clip:
         held = [
             w for w in self._waiting if w.view is not None and w.numbers is not None and self._can_receive_again(w.view)
         ]
-        may_wait = self._n_held < _HELD_LONG and not at_last and not self._options.prompt
-        if len(held) > 1 and not (may_wait and self._doubt(held) > _TOO_MUCH_DOUBT):
-            for _ in range(_LOOKS if len(held) <= _HELD else 1):
+        may_wait = self._n_held < SETTINGS.frames_held_long and not at_last and not self._options.prompt
+        if len(held) > 1 and not (may_wait and self._doubt(held) > SETTINGS.too_much_doubt):
+            for _ in range(SETTINGS.looks_again if len(held) <= SETTINGS.frames_held else 1):
                 self._measure_again(held)
                 self._detect_again()
-        self._hold(_HELD_LONG if may_wait and self._doubt(held) > _MUCH_DOUBT else 0)
+        self._hold(SETTINGS.frames_held_long if may_wait and self._doubt(held) > SETTINGS.much_doubt else 0)
 
     def _doubt(self, held: list[Waiting]) -> float:
         """Share of the well lit packets of some frames that is in doubt."""
@@ -691,7 +667,7 @@ class _Clip:
         assert self._scene is not None
         self._bursts.detect_stale(*held)
         known = [self._bursts.lit(waiting) for waiting in held]
-        doubtful = [len(held) <= _HELD or self._bursts.doubts(waiting)[0] > 0 for waiting in held]
+        doubtful = [len(held) <= SETTINGS.frames_held or self._bursts.doubts(waiting)[0] > 0 for waiting in held]
         numbers = [w.numbers for w in held if w.numbers is not None]
         self._scene.measure_again([w.view for w in held if w.view is not None], known, numbers, doubtful)
 

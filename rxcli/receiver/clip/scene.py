@@ -10,64 +10,16 @@ from numpy.typing import NDArray
 
 from rxcli.receiver import sampling, sync
 from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.channel import known_picture
+from rxcli.receiver.channel import SlotLikelihoods, known_picture
+from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import Pose, View
 from rxcli.receiver.context import Camera, FrameContext, Timer
-from rxcli.receiver.light import Crosstalk
+from rxcli.receiver.light import Crosstalk, NoiseModel
 from rxcli.receiver.sampling import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
 from rxcli.receiver.sync import tracking
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, Lens, RowProfiles
-
-#: Strips of a column, at most: more tell no more of a picture that is known, and take time.
-_STRIPS = 4
-#: Frames from which a frame is measured without what others that show its bursts have taught of the picture there; of
-#: fewer, too little would be left.
-_ENOUGH_VIEWS = 6
-#: Movement that is none: pixels, or standard deviations of what was found.
-_STILL_PX, _STILL_SDS = 0.3, 2.5
-#: Where texture tells little: how well rest is known in screen sizes, and standard deviations of what may be rest;
-#: and how well the place of one that does not rest is known.
-_REST_SD, _REST_SDS, _MOVING_SD = 0.0005, 4.0, 0.003
-#: Share of its motion between two looks that a screen is expected to repeat.
-_DRIFT = 0.7
-#: Rows at the screen's ends that are not counted on where a screen moves: least, most, and in standard deviations of
-#: the corners. A row beyond the end is dark, whatever the known picture expects there.
-_LEAST_END, _MOST_END, _END_SDS = 1.0, 14.0, 1.0
-#: How often a still outline is looked for where the picture does not tell, and looks that make it still.
-_LOOK_EVERY, _STILL_LOOKS = 8, 3
-#: In screen widths: how far an outline may be from where the screen was to be there still; how far from the first that
-#: was; and how far it may move from one frame to the next to be found.
-_STILL_OUTLINE, _SAME_OUTLINE, _OUTLINE_REACH = 0.004, 0.006, 0.02
-#: How much of its shape an outline may lose or win between two looks, in screen widths.
-_BENT = 0.012
-#: A screen found anew whose corners are closer than this to where they were, in screen widths, is where it was.
-_NEAR = 0.06
-#: Frames from which the picture is learned one by one, and how often from then on.
-_FIRST_UPDATES, _UPDATE_EVERY = 12, 6
-#: Frames of which the picture is known so little that strips are compared with what is expected of them.
-_FEW_UPDATES = 4
-#: Columns decided worse than this many times the foreseen variance do not fit what is known.
-_MISFIT = 40.0
-#: Slots of lateness that are put right, contrast of headers, against full, below which nothing is known any more, and
-#: contrast of a frame below which compression has taken much of it.
-_LATE, _LEAST_HEADER, _FADED = 0.03, 0.3, 0.85
-#: Slots that a clock may drift from halfway down to the last row: rows that are instants drift by 0.02 at most, those
-#: that a camera has stretched to hold a picture still by 0.1 to 0.4. How often such rows are timed anew, and the share
-#: of a frame's rows per slot in what is expected of the next.
-_DRIFTS, _RETIMINGS, _RETIMED_SHARE = 0.05, 4, 0.2
-#: Share of a frame's noise in what is expected of the next.
-_NOISE_SHARE = 0.2
-#: Contrast of its headers at which the foretold clock is not doubted.
-_GOOD_HEADER = 0.6
-#: Contrast of its headers from which a foretold clock needs no shift; step and number of shifts tried, slots; and
-#: how much better headers must show for one.
-_PLAIN_HEADER, _SHIFT, _MOST_SHIFTS, _PLAINLY_BETTER = 0.8, 0.3, 5, 0.1
-#: How much better its headers must show for a clock to be taken instead of the foretold one.
-_BETTER = 0.05
-#: Every so manieth row tells enough of a column's signal-to-noise ratio.
-_SNR_EVERY = 5
 
 
 class TrackedScreen:
@@ -123,10 +75,11 @@ class TrackedScreen:
         profiles = acquisition.profiles
         return known_picture.KnownPicture(
             strips.inside,
-            Crosstalk.of(strips.inside.shape[1], acquisition.screen.light_spread).shares,
+            Crosstalk.of(strips.inside.shape[1], acquisition.screen.light_spread),
             black_level,
-            max(profiles.noise_floor / strips.pixels, 1e-7),
-            profiles.noise_slope / strips.pixels,
+            NoiseModel(max(profiles.noise_floor, SETTINGS.least_noise * strips.pixels), profiles.noise_slope).over(
+                strips.pixels
+            ),
         )
 
     @property
@@ -147,11 +100,11 @@ class TrackedScreen:
 
     def near(self, corners: FloatArray) -> bool:
         """Whether a screen found at the corners is where this one is."""
-        return bool(np.abs(corners - self.corners).max() < _NEAR * np.ptp(self.corners[:, 0]))
+        return bool(np.abs(corners - self.corners).max() < SETTINGS.near_outline * np.ptp(self.corners[:, 0]))
 
     def is_at(self, corners: FloatArray) -> bool:
         """Whether a screen found at the corners may not have moved at all."""
-        return bool(np.abs(corners - self.corners).max() < _STILL_OUTLINE * np.ptp(self.corners[:, 0]))
+        return bool(np.abs(corners - self.corners).max() < SETTINGS.still_outline * np.ptp(self.corners[:, 0]))
 
     def follow(self, frame: Frame) -> bool:
         """Find where the screen is in a frame, by the picture on it; returns whether that is certain."""
@@ -173,7 +126,7 @@ class TrackedScreen:
 
     def _untold(self, found: Registration, outline: FloatArray | None) -> Registration:
         """Where the screen is that has too little texture to tell: it rests, unless its outline says that it moves."""
-        at_rest = self._texture.with_outline(found, self._expected, _REST_SD)
+        at_rest = self._texture.with_outline(found, self._expected, SETTINGS.rest_sd)
         if self._rests or _is_possible(self._expected - found.corners, found.covariance):
             at_rest = replace(at_rest, corners=self._expected)
         if self._rests:
@@ -181,17 +134,17 @@ class TrackedScreen:
         # It may have moved since the last look as far as the outline errs.
         corners = at_rest.corners
         if outline is not None:
-            far = np.abs(outline - corners).max() > _SAME_OUTLINE * self._width
+            far = np.abs(outline - corners).max() > SETTINGS.same_outline * self._width
             corners = outline if far else (corners + outline) / 2
             if self._looked is not None:
-                self._drift = (corners - self._looked).mean(axis=0) * (_DRIFT / 2)
+                self._drift = (corners - self._looked).mean(axis=0) * (SETTINGS.drift_share / 2)
             self._looked = corners
-        return replace(at_rest, corners=corners, covariance=np.eye(8) * (_MOVING_SD * self._width) ** 2)
+        return replace(at_rest, corners=corners, covariance=np.eye(8) * (SETTINGS.moving_sd * self._width) ** 2)
 
     @property
     def _rests(self) -> bool:
         """Whether a screen whose picture does not tell where it is stays where it is."""
-        return self._named or self._n_still >= _STILL_LOOKS
+        return self._named or self._n_still >= SETTINGS.still_looks
 
     @property
     def _expected(self) -> FloatArray:
@@ -206,20 +159,20 @@ class TrackedScreen:
         from rxcli.receiver.screen.find import track_screen
 
         self._n_untold += 1
-        if self._n_untold % (_LOOK_EVERY if self._n_still >= _STILL_LOOKS and not surprised else 2):
+        if self._n_untold % (SETTINGS.look_every if self._n_still >= SETTINGS.still_looks and not surprised else 2):
             return None
         stored, order = _stored_order(corners)
-        found = track_screen(frame.pixels, stored, black=frame.black, white=frame.white, reach=_OUTLINE_REACH)
+        found = track_screen(frame.pixels, stored, black=frame.black, white=frame.white, reach=SETTINGS.outline_reach)
         if found.corners is None:
             return None
         outline = found.corners[order]
         moved = outline - corners
-        if np.abs(moved).max() > 2 * _OUTLINE_REACH * self._width:
+        if np.abs(moved).max() > 2 * SETTINGS.outline_reach * self._width:
             return None
-        if np.abs(moved - moved.mean(axis=0)).max() > _BENT * self._width:  # the edge of something else
+        if np.abs(moved - moved.mean(axis=0)).max() > SETTINGS.bent_outline * self._width:  # the edge of something else
             return None
         before = self._still_outline
-        if before is None or np.abs(outline - before).max() > _SAME_OUTLINE * self._width:
+        if before is None or np.abs(outline - before).max() > SETTINGS.same_outline * self._width:
             self._n_still, self._still_outline = 0, outline
         self._n_still += 1
         return outline
@@ -237,7 +190,7 @@ class TrackedScreen:
         corners = found.corners
         outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, self._lens)
         sd = float(np.sqrt(np.diag(found.covariance)[1::2].max()))
-        outlines = replace(outlines, inside=_less_ends(outlines.inside, _LEAST_END + _END_SDS * sd))
+        outlines = replace(outlines, inside=_less_ends(outlines.inside, SETTINGS.least_end + sd))
         strips = tracked.moved_map(self._first_pose.map, outlines)
         placement = _placement(self._first_pose, corners, strips, self._lens)
         self.pose = Pose(corners, strips, placement, self._first_pose.map)
@@ -269,17 +222,16 @@ class TrackedScreen:
             refined = self._refined(picture, pose.rows, light, flat, clock, last.isi_memory, thorough)
             if refined is None:
                 return None
-            flat, clock, positions, metrics = refined
-            self._rows_per_slot += _RETIMED_SHARE * (clock.rows_per_slot - self._rows_per_slot)
+            flat, clock, positions, likelihoods = refined
+            self._rows_per_slot += SETTINGS.frame_share * (clock.rows_per_slot - self._rows_per_slot)
             shown = _shown(pose.map.inside, positions, clock)
-            snr = _snr(flat, clock)
         return View(
             replace(last.context, frame=frame, corners=self.corners, timer=timer),
             replace(last.acquisition, clock=clock),
-            tracking.FrameBursts(frame.index, 0, clock, metrics, shown, tracked=True),
+            tracking.FrameBursts(frame.index, 0, clock, likelihoods.metrics, shown, tracked=True),
             last.isi_memory,
             frame.height,
-            snr,
+            likelihoods.snr,
             light=light,
             pose=pose,
             flat=flat,
@@ -295,40 +247,41 @@ class TrackedScreen:
         isi_memory: int,
         thorough: bool,
         known: Float32Array | None = None,
-    ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, FloatArray] | None:
-        """Clock, response and noise put right by a first decision slot by slot; then positions and metrics.
+    ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, SlotLikelihoods] | None:
+        """Clock, response and noise put right by a first decision slot by slot; then positions and likelihoods.
 
         Not `thorough` is enough of faded frames that will be measured again.
         None where the headers are not where the clock has them: another scene, or something in front of the screen.
         """
         positions, exposure_slots = known_picture.row_positions(rows, clock), clock.exposure_slots
-        if known_picture.header_contrast(flat, positions, clock) < _LEAST_HEADER:
+        if known_picture.header_contrast(flat, positions, clock) < SETTINGS.least_header:
             return None
-        for _ in range(_RETIMINGS):
+        for _ in range(SETTINGS.retimings):
             lit = known_picture.first_decision(flat, positions, clock) if known is None else known
             slots = known_picture.exposures(lit, positions, exposure_slots)
             fit = known_picture.fit_response(flat, slots)
-            if abs(fit.drift) <= _DRIFTS:
+            if abs(fit.drift) <= SETTINGS.drift_slots:
                 break
             clock = _retimed(clock, rows, fit)
             positions = known_picture.row_positions(rows, clock)
-        if self._n_updates < _FEW_UPDATES or (thorough and fit.response.centre < _FADED):
+        if self._n_updates < SETTINGS.few_updates or (thorough and fit.response.centre < SETTINGS.faded):
             expected = fit.response.expected(lit, positions, exposure_slots)
             flat = picture.solve_again(light, expected, clock.rows_per_slot)
             fit = known_picture.fit_response(flat, slots)
-        if thorough and fit.response.centre < _FADED:
+        if thorough and fit.response.centre < SETTINGS.faded:
             flat = known_picture.equalized(flat, slots)
             fit = known_picture.fit_response(flat, slots)
-        if abs(fit.late) > _LATE:
+        if abs(fit.late) > SETTINGS.late_slots:
             clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)
             positions = known_picture.row_positions(rows, clock)
             fit = known_picture.fit_response(flat, known_picture.exposures(lit, positions, exposure_slots))
         expected = fit.response.expected(lit, positions, exposure_slots)
-        flat, ratio = picture.judge(flat, expected, _NOISE_SHARE, clock.rows_per_slot)
-        if ratio > _MISFIT:
+        flat, ratio = picture.judge(flat, expected, SETTINGS.frame_share, clock.rows_per_slot)
+        if ratio > SETTINGS.misfit:
             return None
-        metrics = known_picture.pattern_metrics(flat, positions, clock, isi_memory, fit.response, expected, lit)
-        return flat, clock, positions, metrics
+        response = fit.response
+        found = known_picture.slot_likelihoods(flat, positions, clock, isi_memory, response, expected, lit)
+        return flat, clock, positions, found
 
     def _clock(
         self, frame: Frame, flat: known_picture.ColumnLight, old: Clock, time: tracking.LinkTime
@@ -338,9 +291,9 @@ class TrackedScreen:
         n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
         predicted = time.clock_at(frame.index, frame.time_s, old, n_slots, float(rows[0]) - 0.5)
         contrast = self._header(flat, predicted) if predicted is not None else 0.0
-        if predicted is not None and contrast < _PLAIN_HEADER:
+        if predicted is not None and contrast < SETTINGS.plain_header:
             predicted, contrast = self._shifted(flat, predicted, contrast)
-        if contrast > _GOOD_HEADER:
+        if contrast > SETTINGS.good_header:
             return predicted
         profiles = RowProfiles(
             light=flat.shrunk[:, None],
@@ -357,7 +310,7 @@ class TrackedScreen:
         found = replace(found, delay_slots=old.delay_slots)
         if predicted is not None and _apart(found, predicted) > time.sure_slots:
             return predicted
-        return found if self._header(flat, found) > contrast + _BETTER else predicted
+        return found if self._header(flat, found) > contrast + SETTINGS.better_header else predicted
 
     def _shifted(self, flat: known_picture.ColumnLight, clock: Clock, contrast: float) -> tuple[Clock, float]:
         """The clock, shifted to where its headers show plainly better, and their contrast.
@@ -365,14 +318,14 @@ class TrackedScreen:
         Where a camera holds the picture still, rows are not those that were read at their time.
         """
         best, most = clock, contrast
-        for step in (-_SHIFT, _SHIFT):
-            for n in range(1, _MOST_SHIFTS + 1):
+        for step in (-SETTINGS.header_shift, SETTINGS.header_shift):
+            for n in range(1, SETTINGS.most_shifts + 1):
                 shifted = replace(clock, row0=clock.row0 + n * step * clock.rows_per_slot)
                 here = self._header(flat, shifted)
                 if here < most:
                     break
                 best, most = shifted, here
-        plain = most > max(contrast + _PLAINLY_BETTER, _PLAIN_HEADER)
+        plain = most > max(contrast + SETTINGS.plainly_better, SETTINGS.plain_header)
         return (best, most) if plain else (clock, contrast)
 
     def _header(self, flat: known_picture.ColumnLight, clock: Clock) -> float:
@@ -387,16 +340,16 @@ class TrackedScreen:
             view: the frame.
             lit: gives the probability (C, N) that each of its slots is lit.
         """
-        if self._n_updates < _FIRST_UPDATES or (self._n_updates + 1) % _UPDATE_EVERY == 0:
+        if self._n_updates < SETTINGS.first_updates or (self._n_updates + 1) % SETTINGS.update_every == 0:
             self.learn(view, lit())
         else:
             self._n_updates += 1
         self.last = view
 
-    def learn(self, view: View, lit: Float32Array, keep: float = known_picture.MEMORY) -> known_picture.Look | None:
+    def learn(self, view: View, lit: Float32Array, *, forget: bool = True) -> known_picture.Look | None:
         """Take a frame into the picture; returns what it showed.
 
-        See `known_picture.KnownPicture.learn` for `keep`.
+        See `known_picture.KnownPicture.learn` for `forget`.
         """
         if view.light is None or view.pose is None:
             return None
@@ -406,7 +359,7 @@ class TrackedScreen:
         slots = known_picture.exposed(lit, positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
         look = known_picture.Look(view.light, slots, trust, view.pose.placement)
-        self._picture.learn(look, keep)
+        self._picture.learn(look, forget=forget)
         return look
 
     def can_measure_again(self, view: View) -> bool:
@@ -431,10 +384,10 @@ class TrackedScreen:
         """
         self._n_updates = 0
         self._picture = self._new_picture(self._dark_light(views))
-        looks = [self.learn(view, lit, keep=1.0) for view, lit in zip(views, known, strict=True)]
+        looks = [self.learn(view, lit, forget=False) for view, lit in zip(views, known, strict=True)]
         for view, look, lit, shown, needed in zip(views, looks, known, numbers, doubtful, strict=True):
             if needed:
-                others = zip(looks, views, numbers, strict=True) if len(views) >= _ENOUGH_VIEWS else ()
+                others = zip(looks, views, numbers, strict=True) if len(views) >= SETTINGS.enough_views else ()
                 own = (_of_bursts(*each, shown) for each in others if each[1] is not view)
                 self._measure_again(view, [each for each in (look, *own) if each is not None], lit)
 
@@ -460,9 +413,9 @@ class TrackedScreen:
         )
         if refined is not None:
             burst = view.bursts.clock.burst
-            view.flat, clock, _, metrics = refined
-            view.snr = _snr(view.flat, clock)
-            view.bursts = replace(view.bursts, clock=replace(clock, burst=burst), metrics=metrics, tracked=True)
+            view.flat, clock, _, found = refined
+            view.snr = found.snr
+            view.bursts = replace(view.bursts, clock=replace(clock, burst=burst), metrics=found.metrics, tracked=True)
 
 
 def _of_bursts(
@@ -487,7 +440,7 @@ def _retimed(clock: Clock, rows: FloatArray, fit: known_picture.Fit) -> Clock:
 
 def _less_ends(inside: BoolArray, rows: float) -> BoolArray:
     """(C, S, R) strips on the screen, without so many rows at its ends."""
-    n = int(np.ceil(min(rows, _MOST_END)))
+    n = int(np.ceil(min(rows, SETTINGS.most_end)))
     left = np.zeros_like(inside)
     left[..., n:-n] = inside[..., 2 * n :] & inside[..., : -2 * n]
     return left
@@ -500,7 +453,7 @@ def _map(
     n_columns = acquisition.screen.columns
     if n_strips is None:
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
-        n_strips = min(sampling.strips_per_column(column_px), _STRIPS)
+        n_strips = min(sampling.strips_per_column(column_px), SETTINGS.most_strips)
     outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, camera.lens)
     return tracked.map_strips(outlines, frame, lambda coded: sampling.tone_to_light(camera.tone, coded))
 
@@ -514,12 +467,6 @@ def _shown(inside: NDArray[np.bool_], positions: FloatArray, clock: Clock) -> In
     middles = np.arange(clock.n_slots) + 0.5
     shown = (middles >= first) & (middles <= last) & np.asarray(on_screen.any(axis=1))[:, None]
     return np.asarray(clock.to_copies(shown.astype(np.float32)), np.int64).transpose(1, 0, 2)
-
-
-def _snr(flat: known_picture.ColumnLight, clock: Clock) -> Float32Array:
-    """(C, N) squared contrast over variance of a slot: the mean of the rows around."""
-    mean = np.median(flat.precision[:, ::_SNR_EVERY], axis=1) * np.float32(clock.rows_per_slot)
-    return np.repeat(mean[:, None], clock.n_slots, axis=1).astype(np.float32)
 
 
 def _apart(first: Clock, second: Clock) -> float:
@@ -540,13 +487,16 @@ def _stored_order(corners: FloatArray) -> tuple[FloatArray, IntArray]:
 
 def _is_possible(moved: FloatArray, covariance: FloatArray) -> bool:
     """Whether corners (4, 2) that seem to have moved may have stayed, each coordinate for itself."""
-    return bool((np.square(moved.ravel()) < _REST_SDS**2 * np.diag(covariance)).all())
+    return bool((np.square(moved.ravel()) < SETTINGS.rest_sds**2 * np.diag(covariance)).all())
 
 
 def _is_still(moved: FloatArray, sd_px: float) -> bool:
     """Whether corners (4, 2) that seem to have moved may be where they were."""
     shift, each = np.abs(moved.mean(axis=0)).max(), float(np.sqrt(np.square(moved).mean()))
-    return bool(shift < max(_STILL_PX, _STILL_SDS * sd_px / 2) and each < max(_STILL_PX, _STILL_SDS * sd_px))
+    return bool(
+        shift < max(SETTINGS.still_px, SETTINGS.still_sds * sd_px / 2)
+        and each < max(SETTINGS.still_px, SETTINGS.still_sds * sd_px)
+    )
 
 
 def _placement(

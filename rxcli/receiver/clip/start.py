@@ -14,18 +14,15 @@ import numpy as np
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sample_columns
+from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.context import Camera, FrameContext
 from rxcli.receiver.screen_choice import told_apart_by_clock, variants_of
+from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.receiver.sync.tracking import LinkTime
 from rxcli.types import Clock, FloatArray, Frame, RowProfiles
 
-#: A frame that shows fewer packets than this finds its clock with others; one that shows more does better alone.
-_FEW_PACKETS = 1.05
-_SAMPLES_PER_SLOT = 4
 #: Errors of the frames' period that are tried, in slots over all frames: times are rounded to milliseconds.
 _DRIFTS = np.linspace(-6, 6, 25)
-#: Lead of the headers' place over the best elsewhere.
-_MIN_LEAD = 1.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +39,9 @@ def shows_little(context: FrameContext) -> bool:
     """Whether a frame shows too few packets to find its clock alone."""
     corners, height = context.corners, context.frame.height
     shown = min(float(corners[:, 1].max()), height - 1.0) - max(float(corners[:, 1].min()), 0.0)
-    return shown * context.camera.line_delay_s < _FEW_PACKETS * min(screen.packet_s for screen in context.screens)
+    return shown * context.camera.line_delay_s < SETTINGS.few_packets * min(
+        screen.packet_s for screen in context.screens
+    )
 
 
 def agree(frames: Sequence[Frame], context: FrameContext) -> Start | None:
@@ -52,7 +51,7 @@ def agree(frames: Sequence[Frame], context: FrameContext) -> Start | None:
         profiles_of = [sample_columns(replace(context, frame=frame), n_columns).profiles for frame in frames]
         for screen in (s for s in told_apart_by_clock(context.screens) if s.columns == n_columns):
             lead, slot, period = _phase(frames, profiles_of, screen, context.camera)
-            if lead > _MIN_LEAD and (best is None or lead > best[0]):
+            if lead > SETTINGS.min_lead and (best is None or lead > best[0]):
                 time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
                 time.begin(frames[0].index, frames[0].time_s, slot, period)
                 best = lead, Start(screen, variants_of(screen, context.screens), time)
@@ -108,23 +107,27 @@ def _response(profiles: RowProfiles, rows_per_slot: float) -> tuple[FloatArray, 
     shown = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
     if shown.size == 0:
         return np.zeros(0), np.zeros(0)
-    top, step = float(profiles.rows[shown[0]]) - 0.5, rows_per_slot / _SAMPLES_PER_SLOT
+    q = sync_settings.search_samples
+    top, step = float(profiles.rows[shown[0]]) - 0.5, rows_per_slot / q
     light, valid = sync.resample(profiles, top, step, int(shown.size / step))
-    pooled, weight = sync.contrast(light, valid, _SAMPLES_PER_SLOT, noise_of(profiles) / np.sqrt(max(step, 1.0)))
-    response = sync.header_response(pooled, weight, _SAMPLES_PER_SLOT)
-    return top / rows_per_slot + np.arange(response.size) / _SAMPLES_PER_SLOT, np.maximum(response, 0) ** 2
+    pooled, weight = sync.contrast(
+        light, valid, sync_settings.search_samples, noise_of(profiles) / np.sqrt(max(step, 1.0))
+    )
+    response = sync.header_response(pooled, weight, sync_settings.search_samples)
+    return top / rows_per_slot + np.arange(response.size) / sync_settings.search_samples, np.maximum(response, 0) ** 2
 
 
 def _fold(
     responses: Sequence[tuple[FloatArray, FloatArray]], starts: FloatArray, packet_slots: int
 ) -> tuple[float, float, float]:
     """Power of the best place of a header in the packet's length, its lead, and that place in slots."""
-    n = packet_slots * _SAMPLES_PER_SLOT
+    q = sync_settings.search_samples
+    n = packet_slots * q
     score = np.zeros(n)
     for (slots, response), start in zip(responses, starts, strict=True):
-        place = np.round((slots + start) * _SAMPLES_PER_SLOT).astype(np.int64) % n
+        place = np.round((slots + start) * q).astype(np.int64) % n
         np.add.at(score, place, response)
     # Stamps are rounded to milliseconds: neighbouring places say the same.
     score = (score + np.roll(score, 1) + np.roll(score, -1)) / 3
-    place, lead = sync.header_comb(score, _SAMPLES_PER_SLOT)
-    return float(score.max()), lead, place / _SAMPLES_PER_SLOT
+    place, lead = sync.header_comb(score, q)
+    return float(score.max()), lead, place / q

@@ -22,6 +22,7 @@ from rxcli.protocol import encode_packet, payload_bits
 from rxcli.receiver import camera as blind
 from rxcli.receiver import sampling
 from rxcli.receiver.camera.curvature import BEND_PRECISION
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.light import NoiseModel
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.screen import geometry
@@ -153,7 +154,7 @@ def test_structure_evidence_knows_packets_from_other_bits() -> None:
     assert right > 100
     wrong = [(slots, 41, 130), (slots, 37, 260), (1 - slots[:, ::-1], 0, 130), (rng.normal(size=(4, 263)), 37, 130)]
     assert max(blind.structure_llr(*case) for case in wrong) < 0.8 * right
-    assert blind.structure_llr(rng.normal(size=(4, 263)), 37, 130) < blind.MIN_EVIDENCE
+    assert blind.structure_llr(rng.normal(size=(4, 263)), 37, 130) < SETTINGS.least_evidence
 
 
 def test_an_estimate_can_be_kept_as_a_profile() -> None:

@@ -6,17 +6,16 @@ frames of z against what was expected. Then all columns' m of a row are one smal
 once: no crosstalk is left, strips are pooled by what they tell, and every column is a single series with a precision.
 
 `picture` learns and solves, `exposure` says what slots give through an exposure, `response` what compression leaves of
-it, `header` where headers show, and `metrics` makes of it all what detection needs.
+it, `header` where headers show, and `metrics` makes of it all the likelihoods of slots that detection needs.
 """
 
 from rxcli.receiver.channel.known_picture.exposure import exposed, row_positions, trusted
 from rxcli.receiver.channel.known_picture.header import dark_light, first_decision, header_contrast, header_dark
-from rxcli.receiver.channel.known_picture.metrics import pattern_metrics
-from rxcli.receiver.channel.known_picture.picture import MEMORY, ColumnLight, KnownPicture, Look, Placement
+from rxcli.receiver.channel.known_picture.metrics import slot_likelihoods
+from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Look, Placement
 from rxcli.receiver.channel.known_picture.response import Fit, equalized, exposures, fit_response
 
 __all__ = [
-    "MEMORY",
     "ColumnLight",
     "Fit",
     "KnownPicture",
@@ -30,7 +29,7 @@ __all__ = [
     "fit_response",
     "header_contrast",
     "header_dark",
-    "pattern_metrics",
     "row_positions",
+    "slot_likelihoods",
     "trusted",
 ]

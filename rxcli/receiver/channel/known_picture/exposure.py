@@ -6,13 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rxcli.receiver.channel.known_picture.settings import SETTINGS
 from rxcli.receiver.light import SlotLight, exposure_shares, taken
 from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
-#: Slots to each side that a blur reaches.
-SIDE = 0.5
-#: A slot that is lit, or dark, but for this probability is sure.
-_SURE = 1e-4
 #: Slots beyond the grid that a position may reach.
 _BEYOND_SLOTS = 8
 
@@ -33,7 +30,7 @@ def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> 
     doubt = lit * (1 - lit)
     each: IntArray = np.arange(len(lit))
     if len(positions) == 1:  # columns without doubt are alike
-        unsure = np.flatnonzero(doubt.max(axis=1) > _SURE)
+        unsure = np.flatnonzero(doubt.max(axis=1) > SETTINGS.sure_probability)
         each = np.zeros(len(lit), np.int64)
         each[unsure] = 1 + np.arange(unsure.size)
         doubt = np.concatenate([np.zeros_like(doubt[:1]), doubt[unsure]])
@@ -75,7 +72,7 @@ class Response:
 
     def _of_rows(self, lit: Float32Array, centre: FloatArray, exposure_slots: float) -> Float32Array:
         """(C, R) light that slots give to rows at `centre` (R,)."""
-        reach = exposure_slots / 2 + (SIDE if self.side else 0)
+        reach = exposure_slots / 2 + (SETTINGS.side_slots if self.side else 0)
         slots = np.floor(centre - reach).astype(np.intp)[:, None] + np.arange(int(np.ceil(2 * reach)) + 1)
         share = shares_of_slots(centre, slots, exposure_slots, self)
         beyond = _BEYOND_SLOTS
@@ -96,6 +93,6 @@ def shares_of_slots(centre: FloatArray, slots: IntArray, exposure_slots: float, 
     """(R, n) share of each of the `slots` (R, n) in what a row at `centre` (R,) sees."""
     share = response.centre * exposure_shares(centre[:, None], slots, exposure_slots)
     if response.side:
-        share += response.side * exposure_shares((centre - SIDE)[:, None], slots, exposure_slots)
-        share += response.side * exposure_shares((centre + SIDE)[:, None], slots, exposure_slots)
+        share += response.side * exposure_shares((centre - SETTINGS.side_slots)[:, None], slots, exposure_slots)
+        share += response.side * exposure_shares((centre + SETTINGS.side_slots)[:, None], slots, exposure_slots)
     return np.asarray(share, np.float32)

@@ -6,14 +6,10 @@ import numpy as np
 
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.known_picture.exposure import read_between
-from rxcli.receiver.channel.known_picture.picture import PRIOR, ColumnLight
+from rxcli.receiver.channel.known_picture.picture import ColumnLight
+from rxcli.receiver.channel.known_picture.settings import SETTINGS
 from rxcli.receiver.light import shows_dark_header
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray
-
-#: Rows of a strip, over all frames, from which its light where nothing is lit is known.
-_LEAST_DARK_ROWS = 12
-#: Rows of a single column's header that must show, that it be judged.
-_LEAST_ROWS = 40
 
 
 def first_decision(observed: ColumnLight, positions: FloatArray, clock: Clock) -> Float32Array:
@@ -47,8 +43,8 @@ def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) 
     place = place[:, rows]
     sign = np.where(place < SLOTS_PER_SYMBOL, 2.0 * np.array(HEADER)[np.minimum(place, SLOTS_PER_SYMBOL - 1)] - 1, 0)
     value, precision = (values.take(rows, axis=1) for values in (observed.value, observed.precision))
-    weight = np.abs(sign) * np.minimum(precision, np.float32(PRIOR))
-    if weight.sum() < PRIOR * _LEAST_ROWS:
+    weight = np.abs(sign) * np.minimum(precision, np.float32(SETTINGS.prior_precision))
+    if weight.sum() < SETTINGS.prior_precision * SETTINGS.least_header_rows:
         return 1.0
     return float((weight * sign * np.clip(2 * value - 1, -1.5, 1.5)).sum() / weight.sum())
 
@@ -76,7 +72,7 @@ def dark_light(
         for light, rows, on in zip(lights, dark, inside, strict=True)
     ]
     together = np.concatenate(observed, axis=2)
-    few = (~np.isnan(together)).sum(axis=2) < _LEAST_DARK_ROWS
+    few = (~np.isnan(together)).sum(axis=2) < SETTINGS.least_dark_rows
     if together.shape[2] == 0:
         return np.full(together.shape[:2], usual, np.float32)
     together[few] = np.float32(usual)

@@ -7,10 +7,12 @@ import numpy as np
 from rxcli.protocol import slot_patterns
 from rxcli.receiver.channel.known_picture.exposure import Response, alike_columns, shares_of_slots
 from rxcli.receiver.channel.known_picture.picture import ColumnLight
+from rxcli.receiver.channel.known_picture.settings import SETTINGS
+from rxcli.receiver.channel.likelihoods import SlotLikelihoods
 from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 
-def pattern_metrics(
+def slot_likelihoods(
     observed: ColumnLight,
     positions: FloatArray,
     clock: Clock,
@@ -18,8 +20,8 @@ def pattern_metrics(
     response: Response,
     expected: Float32Array,
     lit: Float32Array,
-) -> FloatArray:
-    """Log-likelihood of every slot pattern at every slot, (C, N + memory, patterns); see `channel.SlotLikelihoods`.
+) -> SlotLikelihoods:
+    """Log-likelihood of every slot pattern at every slot, as `channel.slot_likelihoods` has it of an unknown picture.
 
     Args:
         observed: the columns' light.
@@ -35,7 +37,10 @@ def pattern_metrics(
         _row_metrics(value[group], observed.precision[group], centre, clock, isi_memory, response, lit[group])
         for group, centre in zip(alike_columns(positions), positions, strict=True)
     ]
-    return np.concatenate(parts).astype(np.float64)
+    # Squared contrast over variance of a slot is the precision of the rows around.
+    mean = np.median(observed.precision[:, :: SETTINGS.snr_every_row], axis=1) * np.float32(clock.rows_per_slot)
+    snr = np.repeat(mean[:, None], clock.n_slots, axis=1).astype(np.float32)
+    return SlotLikelihoods(np.concatenate(parts).astype(np.float64), snr)
 
 
 def _row_metrics(

@@ -9,39 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.numerics import box_sums
-from rxcli.types import BoolArray, Float32Array, FloatArray
-
-#: Share of its weight that a frame keeps with every frame after it.
-MEMORY = 0.95
-#: Weight of the picture around a row against one frame's look at the row itself at full light.
-_SMOOTH = 0.05
-#: Share of a strip's light in doubt, inverse, from which it says nothing of the picture.
-_DOUBT = 1.4
-#: Squared error of the light expected of a strip, in parts of full light, and more of it per doubt.
-_UNTOLD, _UNSURE = 0.01, 0.125
-#: Rows around, in each direction, from which the picture of a row that was never lit is taken.
-_AROUND_ROWS = 4
-#: Relative error of a picture taken from the rows around, and of one that was looked at well.
-_AROUND_ERROR, _LEAST_ERROR = 0.6, 0.02
-#: Rows in each direction, all strips of a column together, from which the picture is taken where those around were not
-#: lit either; its weight against theirs, and its relative error, which neighbouring rows have in common.
-_WIDE_ROWS, _WIDE, _WIDE_ERROR = 60, 0.1, 2.0
-#: Squared error of what a row is taken to see, in parts of full light, times the rows of a slot, which have it in
-#: common: a slot decided wrongly, or spilled light that is not as the model has it.
-_SEEN_ERROR = 0.03
-#: A slot's light is at 0.5 with this precision before anything is seen.
-PRIOR = 4.0
-#: Rows of a slot err alike; their log-likelihoods count this much.
-_TEMPER = 0.5
-#: Error of a column's light, in parts of full light, that no pooling removes.
-_COMMON_ERROR = 0.04
-#: Slots around, in each direction, over which a strip's error is averaged, and those of them left out as its own.
-_ERROR_SLOTS, _OWN_SLOTS = 20.0, 1.3
-#: Precision of a slot's light from which its error tells how alike rows err; slots of all columns that count beside a
-#: column's own; and the least squared error against rows that err each for itself.
-_TOLD, _LIKE_OTHERS, _LEAST_ALIKE = 0.5, 20.0, 0.9
-#: A column's light further than this beyond dark or lit is not to be trusted.
-_BEYOND = 0.15
+from rxcli.receiver.channel.known_picture.settings import SETTINGS
+from rxcli.receiver.light import Crosstalk, NoiseModel
+from rxcli.types import BoolArray, Float32Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,24 +70,22 @@ class KnownPicture:
 
     Args:
         inside: (C, S, R) the strip is on the screen there.
-        crosstalk: (S, 3) share of the light of columns -1, 0, +1 in each strip.
+        crosstalk: of the strips.
         black_level: light of a dark slot, one for all or (C, S).
-        variance: of a strip's light where it is dark.
-        shot_gain: variance per unit of light.
+        noise: of a strip's light.
     """
 
     def __init__(
         self,
         inside: BoolArray,
-        crosstalk: FloatArray,
+        crosstalk: Crosstalk,
         black_level: float | Float32Array,
-        variance: float,
-        shot_gain: float,
+        noise: NoiseModel,
     ) -> None:
         self._inside = inside.astype(np.float32)
-        self._crosstalk = crosstalk.astype(np.float32)
+        self._crosstalk = crosstalk.shares.astype(np.float32)
         self._black_level = np.asarray(black_level, np.float32)[..., None]
-        self._variance, self._shot_gain = np.float32(variance), np.float32(shot_gain)
+        self._noise = noise
         self._light: Float32Array = np.zeros(inside.shape, np.float32)
         self._observed: Float32Array = np.zeros(inside.shape, np.float32)
         self._system: _System | None = None
@@ -141,11 +109,12 @@ class KnownPicture:
         other._system = other._of_one = None
         return other
 
-    def learn(self, look: Look, keep: float = MEMORY) -> None:
-        """Take a frame whose slots are known into the picture; those before keep the share `keep` of their weight."""
+    def learn(self, look: Look, *, forget: bool = True) -> None:
+        """Take a frame whose slots are known into the picture; with `forget` those before count a little less."""
         lit, observed = self._update_of(look)
-        self._light = self._light * np.float32(keep) + lit
-        self._observed = self._observed * np.float32(keep) + observed
+        keep = np.float32(SETTINGS.memory_share if forget else 1.0)
+        self._light = self._light * keep + lit
+        self._observed = self._observed * keep + observed
         self._system = self._made = None
 
     def without(self, looks: Sequence[Look]) -> KnownPicture:
@@ -168,8 +137,8 @@ class KnownPicture:
         inside = self._inside if placement is None else placement.inside
         # Light over what little was expected is no picture: more of it than that may be another slot's.
         power = expected * expected
-        told = power / (power + np.float32(_UNTOLD) + np.float32(_UNSURE) * doubt)
-        weighted = expected * (told * told) * np.maximum(1 - np.float32(_DOUBT) * doubt, 0) * inside
+        told = power / (power + np.float32(SETTINGS.untold_error) + np.float32(SETTINGS.unsure_error) * doubt)
+        weighted = expected * (told * told) * np.maximum(1 - np.float32(SETTINGS.doubt_weight) * doubt, 0) * inside
         if look.rows is not None:
             weighted *= look.rows
         lit, observed = weighted * (look.light - self._black_level), weighted * expected
@@ -218,12 +187,13 @@ class KnownPicture:
 
     def _solved(self, light: Float32Array, system: _System) -> ColumnLight:
         observed = self._crosstalk.T @ (system.gain * (light - self._black_level))
-        right = observed[:, 1] + np.float32(PRIOR / 2)
+        prior = np.float32(SETTINGS.prior_precision)
+        right = observed[:, 1] + prior / 2
         right[1:] += observed[:-1, 2]
         right[:-1] += observed[1:, 0]
         shrunk = _solve(system, right)
-        precision = np.maximum(system.precision - np.float32(PRIOR), 0)
-        value = shrunk + (shrunk - np.float32(0.5)) * (np.float32(PRIOR) / np.maximum(precision, np.float32(1e-3)))
+        precision = np.maximum(system.precision - prior, 0)
+        value = shrunk + (shrunk - np.float32(0.5)) * (prior / np.maximum(precision, np.float32(1e-3)))
         return ColumnLight(value, self._tempered(value, precision), shrunk)
 
     def judge(
@@ -242,7 +212,8 @@ class KnownPicture:
             variance foreseen.
         """
         error = np.square(observed.value - expected) * observed.precision
-        ratio = error.sum(axis=1) / np.maximum((observed.precision > 0).sum(axis=1), 1) / np.float32(_TEMPER)
+        seen = np.maximum((observed.precision > 0).sum(axis=1), 1)
+        ratio = error.sum(axis=1) / seen / np.float32(SETTINGS.row_information)
         now = np.clip(self._excess * ratio, 0.25, 100.0)
         self._excess += np.float32(share) * (now - self._excess)
         precision = observed.precision / np.maximum(ratio, 0.5)[:, None]
@@ -250,10 +221,11 @@ class KnownPicture:
         return ColumnLight(observed.value, precision, observed.shrunk), float(np.median(ratio))
 
     def _tempered(self, value: Float32Array, precision: Float32Array) -> Float32Array:
-        variance = self._excess[:, None] / np.maximum(precision, np.float32(1e-6)) + np.float32(_COMMON_ERROR**2)
-        beyond = np.maximum(np.abs(value - np.float32(0.5)) - np.float32(0.5 + _BEYOND), 0)
+        variance = self._excess[:, None] / np.maximum(precision, np.float32(1e-6))
+        variance += np.float32(SETTINGS.common_error**2)
+        beyond = np.maximum(np.abs(value - np.float32(0.5)) - np.float32(0.5 + SETTINGS.beyond_light), 0)
         variance += 4 * beyond * beyond
-        return np.where(precision > 1e-3, np.float32(_TEMPER) / variance, np.float32(0))
+        return np.where(precision > 1e-3, np.float32(SETTINGS.row_information) / variance, np.float32(0))
 
     def picture(self) -> tuple[Float32Array, Float32Array]:
         """The picture and its relative variance, (C, S, R) each."""
@@ -262,39 +234,40 @@ class KnownPicture:
         return self._made
 
     def _make(self) -> tuple[Float32Array, Float32Array]:
-        near = box_sums(self._observed, _AROUND_ROWS) + np.float32(_WIDE)
-        around = (box_sums(self._light, _AROUND_ROWS) + np.float32(_WIDE) * self._wide()[:, None]) / near
-        total = self._observed + np.float32(_SMOOTH)
-        picture = np.maximum(self._light + np.float32(_SMOOTH) * around, 0) / total
+        wide, smooth = np.float32(SETTINGS.wide_weight), np.float32(SETTINGS.smooth_weight)
+        near = box_sums(self._observed, SETTINGS.around_rows) + wide
+        around = (box_sums(self._light, SETTINGS.around_rows) + wide * self._wide()[:, None]) / near
+        total = self._observed + smooth
+        picture = np.maximum(self._light + smooth * around, 0) / total
         # Light that neighbours spill is no look at a picture: it may be any number of times what was made of it.
-        unknown = np.float32(_WIDE) / near
-        error = np.float32(_AROUND_ERROR**2) + np.float32(_WIDE_ERROR**2) * unknown * unknown
-        error *= np.float32(_SMOOTH**2)
-        error += np.float32(_SEEN_ERROR) * self._observed
+        unknown = wide / near
+        error = np.float32(SETTINGS.around_error**2) + np.float32(SETTINGS.wide_error**2) * unknown * unknown
+        error *= smooth * smooth
+        error += np.float32(SETTINGS.seen_error) * self._observed
         error /= total * total
-        error += np.float32(_LEAST_ERROR**2)
+        error += np.float32(SETTINGS.least_error**2)
         return picture, error
 
     def _wide(self) -> Float32Array:
         """(C, R) mean of the picture over a column's strips and many rows."""
         light, observed = (values.sum(axis=1) for values in (self._light, self._observed))
         usual = light.sum() / max(float(observed.sum()), 1e-6)
-        some = np.float32(_WIDE)
-        wide = (box_sums(light, _WIDE_ROWS) + some * usual) / (box_sums(observed, _WIDE_ROWS) + some)
+        some = np.float32(SETTINGS.wide_weight)
+        wide = (box_sums(light, SETTINGS.wide_rows) + some * usual) / (box_sums(observed, SETTINGS.wide_rows) + some)
         return np.asarray(wide, np.float32)
 
     def _factor(self, measured: Float32Array | None = None) -> _System:
         """Normal equations A m = b of every row, A symmetric with two bands: A = L D L', and the diagonal of A^-1."""
         picture, error = self.picture()
-        half = np.float32(0.5) * picture
-        variance = self._variance + half * (self._shot_gain + half * error)
+        # Half of what is seen is lit.
+        variance = self._noise.through(picture, picture * picture * error, np.full(1, 0.5, np.float32))
         if measured is not None:
             variance += measured
         gain = picture * self._inside / variance
         left, own, right = self._crosstalk.T
         products = np.stack([own * own, left * left, right * right, own * right, left * own, left * right])
         power = products @ (gain * picture)
-        middle = power[:, 0] + np.float32(PRIOR)
+        middle = power[:, 0] + np.float32(SETTINGS.prior_precision)
         middle[:-1] += power[1:, 1]
         middle[1:] += power[:-1, 2]
         beside, beyond = np.zeros_like(middle), np.zeros_like(middle)
@@ -314,13 +287,13 @@ def _alike(error: Float32Array, precision: Float32Array, rows_per_slot: float) -
     weight = precision[:, : shape[1] * n].reshape(shape)
     total = np.einsum("csr,csr->cs", weight, error[:, : shape[1] * n].reshape(shape))
     foreseen = weight.sum(axis=2)
-    told = foreseen > _TOLD
+    told = foreseen > SETTINGS.told_precision
     # Means, not medians: with medians a clip of 4 surely wrong packets of 91 has 19 of 102.
-    squared = np.sum(np.square(total) / np.maximum(foreseen, _TOLD), axis=1, where=told)
+    squared = np.sum(np.square(total) / np.maximum(foreseen, SETTINGS.told_precision), axis=1, where=told)
     count = told.sum(axis=1)
     of_all = squared.sum() / max(int(count.sum()), 1)
-    alike = (squared + _LIKE_OTHERS * of_all) / (count + _LIKE_OTHERS)
-    return np.asarray(np.maximum(alike, _LEAST_ALIKE), np.float32)
+    alike = (squared + SETTINGS.like_others_slots * of_all) / (count + SETTINGS.like_others_slots)
+    return np.asarray(np.maximum(alike, SETTINGS.least_alike_error), np.float32)
 
 
 def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
@@ -331,7 +304,7 @@ def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
 
 def _around(values: Float32Array, rows_per_slot: float) -> Float32Array:
     """Sum over the slots around, a row's own left out; last axis."""
-    near, far = (int(slots * rows_per_slot) for slots in (_OWN_SLOTS, _ERROR_SLOTS))
+    near, far = (int(slots * rows_per_slot) for slots in (SETTINGS.own_slots, SETTINGS.error_slots))
     return box_sums(values, far) - box_sums(values, near)
 
 
