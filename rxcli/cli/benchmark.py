@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,19 +13,15 @@ from rxcli.cli.groups import SuggestingGroup
 
 if TYPE_CHECKING:
     from rxcli.lab.benchmark.confidence import Calibration
-    from rxcli.lab.benchmark.journal import Journal
+    from rxcli.lab.benchmark.journal import Run
     from rxcli.lab.benchmark.speed import Medium
     from rxcli.lab.benchmark.sweeps import Summary
+    from rxcli.lab.benchmark.tables import Row
 
 _COUNT, _SOME = click.IntRange(1), click.IntRange(0)
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-_RESULTS = (
-    "--out",
-    click.Path(file_okay=False, path_type=Path),
-    Path("benchmark-results"),
-    "Folder of results.",
-)
+_RESULTS = ("--out", click.Path(file_okay=False, path_type=Path), Path("benchmark-results"), "Folder of results.")
 _SEED = ("--seed", click.IntRange(0, 10**6), 0, "Of all random scenes.")
 _QUIET = ("--quiet", None, False, "No progress bar.")
 _FRESH = ("--fresh", None, False, "Forget what an earlier run has left in the journal.")
@@ -47,27 +43,40 @@ def _claim(out: Path) -> None:
     claim_own_folder("--out", out, ("*.journal.jsonl", *(f"{name}.json" for name in _WITHOUT_JOURNAL)))
 
 
-def _journal(out: Path, name: str, fresh: bool) -> Journal:
-    from rxcli.lab.benchmark.journal import Journal
+def _begin(name: str, out: Path, fresh: bool, **how: Any) -> Run:
+    """A run that keeps its journal in the folder of results."""
+    from rxcli.lab.benchmark.journal import Journal, Run
 
     _claim(out)
     path = out / f"{name}.journal.jsonl"
     if fresh:
         path.unlink(missing_ok=True)
-    return Journal(path)
+    return Run(Journal(path), **how)
 
 
 def _say_written(paths: Sequence[Path]) -> None:
     click.echo("written: " + ", ".join(str(path) for path in paths), err=True)
 
 
-def _random(label: str, work: Callable[..., Any], count: int, run: dict[str, Any], **more: Any) -> list[Any]:
-    """Records of `count` random scenes of one kind."""
-    from rxcli.lab.benchmark.journal import run_scenes
+def _report(
+    out: Path, name: str, rows: Sequence[Row], details: Any = None, said: str = "", titles: Sequence[str] = ()
+) -> list[Path]:
+    """Print a table, and write it with its details; returns the files.
 
-    journal = _journal(run["out"], label, run["fresh"])
-    told = {name: run[name] for name in ("seed", "jobs", "quiet")}
-    return run_scenes(label, work, count, journal, **told, **more)
+    Args:
+        out: folder of results.
+        name: of the files.
+        rows: the table.
+        details: what the JSON holds beside it.
+        said: printed below it.
+        titles: of the table and of the details, where these are printed as another one.
+    """
+    from rxcli.lab.benchmark.tables import format_table, titled, write_outputs
+
+    click.echo(titled(zip(titles, (rows, details), strict=True)) if titles else format_table(rows))
+    if said:
+        click.echo(said)
+    return write_outputs(out, name, rows, details)
 
 
 @click.group(cls=SuggestingGroup, invoke_without_command=True)
@@ -77,7 +86,7 @@ def _random(label: str, work: Callable[..., Any], count: int, run: dict[str, Any
     *_RUN,
 )
 @click.pass_context
-def benchmark(context: click.Context, quick: bool, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
+def benchmark(context: click.Context, /, quick: bool, **run: Any) -> None:
     """Run time against error; stability.
 
     Every run keeps a journal in the folder --out and goes on where it was interrupted. Options given here belong to
@@ -93,11 +102,9 @@ def benchmark(context: click.Context, quick: bool, jobs: int, out: Path, seed: i
     from rxcli.lab.benchmark import quick as work
     from rxcli.lab.benchmark.tables import titled, write_text
 
-    journal = _journal(out, "quick", fresh)
-    headline = work.run(out / "media", journal, seed=seed, jobs=jobs, quiet=quiet)
-    text = titled(headline.sections)
+    text = titled(work.run(run["out"] / "media", _begin("quick", **run)))
     click.echo(text)
-    _say_written([write_text(out / "quick.txt", text + "\n")])
+    _say_written([write_text(run["out"] / "quick.txt", text + "\n")])
 
 
 @benchmark.command()
@@ -105,12 +112,7 @@ def benchmark(context: click.Context, quick: bool, jobs: int, out: Path, seed: i
     ("--frames", _COUNT, 600, "Random frames, some 20 packets each."),
     ("--clips", _COUNT, None, "Random compressed clips in place of frames, some 70 packets each."),
     _CAE,
-    (
-        "--also journals",
-        [_FILE],
-        None,
-        "Count an earlier run's packets too; may be given several times.",
-    ),
+    ("--also journals", [_FILE], None, "Count an earlier run's packets too; may be given several times."),
     *_MANY,
 )
 def confidence(frames: int, clips: int | None, cae: str, journals: tuple[Path, ...], **run: Any) -> None:
@@ -118,18 +120,17 @@ def confidence(frames: int, clips: int | None, cae: str, journals: tuple[Path, .
     from rxcli.lab.benchmark import clip_confidence, plots
     from rxcli.lab.benchmark import confidence as work
     from rxcli.lab.benchmark.journal import Journal
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
+    from rxcli.lab.benchmark.tables import format_table
 
     earlier = [record for path in journals for record in Journal(path).records]
     packets_of = work.packets_of if clips is None else clip_confidence.packets_of
-    records = _random("confidence" if clips is None else "clips", packets_of, clips or frames, run, cae=cae)
+    label = "confidence" if clips is None else "clips"
+    records = _begin(label, **run).scenes(label, packets_of, clips or frames, cae=cae)
     result = work.calibration(records + earlier)
-    rows = work.rows(result)
-    click.echo(format_table(rows))
-    click.echo("\n".join(_calibration_notes(result)))
+    said = _calibration_notes(result)
     if clips is not None:
-        click.echo(format_table(clip_confidence.rows(records)))
-    paths = write_outputs(run["out"], "confidence", rows, work.details(result))
+        said.append(format_table(clip_confidence.rows(records)))
+    paths = _report(run["out"], "confidence", work.rows(result), work.details(result), "\n".join(said))
     if plots.available():
         paths.append(run["out"] / "confidence.png")
         plots.plot_confidence(result.bins, paths[-1])
@@ -157,13 +158,10 @@ def _calibration_notes(result: Calibration) -> list[str]:
 def phones(count: int, cae: str, **run: Any) -> None:
     """Simulated phones received without a camera profile: rows per slot, and wrong packets by confidence."""
     from rxcli.lab.benchmark import phones as work
-    from rxcli.lab.benchmark.tables import titled, write_outputs
 
-    records = _random("phones", work.packets_of, count, run, cae=cae)
-    rows, missed = work.rows(records), work.missed(records)
-    bound = f"rows per slot within {100 * work.BOUND:g} %"
-    click.echo(titled([(bound, rows), ("phones further off", missed)]))
-    _say_written(write_outputs(run["out"], "phones", rows, missed))
+    records = _begin("phones", **run).scenes("phones", work.packets_of, count, cae=cae)
+    titles = (f"rows per slot within {100 * work.BOUND:g} %", "phones further off")
+    _say_written(_report(run["out"], "phones", work.rows(records), work.missed(records), titles=titles))
 
 
 @benchmark.command()
@@ -171,12 +169,9 @@ def phones(count: int, cae: str, **run: Any) -> None:
 def outline(frames: int, **run: Any) -> None:
     """Corners of found screens against the true ones: any place, size and tilt, any room and picture."""
     from rxcli.lab.benchmark import outline as work
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
-    found = [work.found_of(record) for record in _random("outline", work.search_record, frames, run)]
-    rows = work.rows(found)
-    click.echo(format_table(rows))
-    _say_written(write_outputs(run["out"], "outline", rows))
+    records = _begin("outline", **run).scenes("outline", work.search_record, frames)
+    _say_written(_report(run["out"], "outline", work.rows(records)))
 
 
 @benchmark.command()
@@ -184,11 +179,9 @@ def outline(frames: int, **run: Any) -> None:
 def screens(frames: int, **run: Any) -> None:
     """Dark and ordinary pictures received with the screen searched, and with its corners handed over."""
     from rxcli.lab.benchmark import screens as work
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
-    rows = work.rows(_random("screens", work.packets_of, frames, run))
-    click.echo(format_table(rows))
-    _say_written(write_outputs(run["out"], "screens", rows))
+    records = _begin("screens", **run).scenes("screens", work.packets_of, frames)
+    _say_written(_report(run["out"], "screens", work.rows(records)))
 
 
 @benchmark.command()
@@ -197,17 +190,14 @@ def screens(frames: int, **run: Any) -> None:
     ("--pictures", _COUNT, 8, "Random pictures, half of them dark, received for each move: about a second each."),
     *_MANY,
 )
-def sensitivity(room: str, pictures: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
+def sensitivity(room: str, pictures: int, **run: Any) -> None:
     """What hangs on each of the receiver's numbers: moved by 0.7 and by 1.4, on the same pictures."""
     from rxcli.lab.benchmark import sensitivity as work
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
-    journal = _journal(out, "sensitivity", fresh)
-    rows = work.run(room, pictures, journal, seed=seed, jobs=jobs, quiet=quiet)
+    rows = work.run(room, pictures, _begin("sensitivity", **run))
     still = sum(row["changed"] == 0 for row in rows)
-    click.echo(format_table(rows))
-    click.echo(f"{still} of {len(rows)} numbers change no packet of {pictures} pictures")
-    _say_written(write_outputs(out, "sensitivity", rows))
+    said = f"{still} of {len(rows)} numbers change no packet of {pictures} pictures"
+    _say_written(_report(run["out"], "sensitivity", rows, said=said))
 
 
 @benchmark.command()
@@ -219,11 +209,9 @@ def sensitivity(room: str, pictures: int, jobs: int, out: Path, seed: int, fresh
 def motion(clips: int, frames: int, **run: Any) -> None:
     """Clips from a hand by how fast it moves, against their frames one by one."""
     from rxcli.lab.benchmark import motion as work
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
-    rows = work.rows(_random("motion", work.record_of, clips, run, n_frames=frames))
-    click.echo(format_table(rows))
-    _say_written(write_outputs(run["out"], "motion", rows))
+    records = _begin("motion", **run).scenes("motion", work.record_of, clips, n_frames=frames)
+    _say_written(_report(run["out"], "motion", work.rows(records)))
 
 
 @benchmark.command()
@@ -240,12 +228,11 @@ def nodata(count: int, camera: str, frames: int, **run: Any) -> int:
     """
     from rxcli.errors import ExitCode
     from rxcli.lab.benchmark import nodata as work
-    from rxcli.lab.benchmark.tables import titled, write_outputs
 
-    records = _random("nodata", work.packets_of, count, run, camera=camera, n_frames=frames)
-    rows, offenders = work.rows(records), work.offenders(records)
-    click.echo(titled([("pictures without data", rows), ("pictures that gave packets", offenders)]))
-    _say_written(write_outputs(run["out"], "nodata", rows, offenders))
+    records = _begin("nodata", **run).scenes("nodata", work.packets_of, count, camera=camera, n_frames=frames)
+    offenders = work.offenders(records)
+    titles = ("pictures without data", "pictures that gave packets")
+    _say_written(_report(run["out"], "nodata", work.rows(records), offenders, titles=titles))
     return ExitCode.NOT_RECEIVED if offenders else ExitCode.OK
 
 
@@ -259,22 +246,18 @@ def _check_sweeps(_context: click.Context, _parameter: click.Parameter, names: t
 
 
 @benchmark.command()
-@click.option(
-    "--only", multiple=True, metavar="NAME", callback=_check_sweeps, help="A sweep; may be given several times."
+@options(
+    ("--only", [str], None, "A sweep; may be given several times.", {"metavar": "NAME", "callback": _check_sweeps}),
 )
 @options(("--frames", _COUNT, 12, "Frames of each point."), *_MANY)
-def sweep(only: tuple[str, ...], frames: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool) -> None:
+def sweep(only: tuple[str, ...], frames: int, **run: Any) -> None:
     """Error and run time over slot rate, light, exposure, picture, tilt, camera, and the receiver's variants."""
     from rxcli.lab.benchmark import sweeps
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
-    names = only or tuple(sweeps.SWEEPS)
-    journal = _journal(out, "sweep", fresh)
-    summaries = sweeps.run(sweeps.points_of(names), frames, journal, seed=seed, jobs=jobs, quiet=quiet)
-    rows = [summary.as_row() for summary in summaries]
-    click.echo(format_table(rows))
-    paths = write_outputs(out, "sweep", rows, [summary.details() for summary in summaries])
-    _say_written([*paths, *_plot_sweeps(summaries, out)])
+    summaries = sweeps.run(sweeps.points_of(only or sweeps.SWEEPS), frames, _begin("sweep", **run))
+    rows, details = [summary.as_row() for summary in summaries], [summary.details() for summary in summaries]
+    paths = _report(run["out"], "sweep", rows, details)
+    _say_written([*paths, *_plot_sweeps(summaries, run["out"])])
 
 
 def _plot_sweeps(summaries: Sequence[Summary], out: Path) -> list[Path]:
@@ -365,48 +348,43 @@ def _speed_of_media(
 def _mutated_readers(n: int, seconds: float | None, out: Path, seed: int) -> int:
     from rxcli.errors import ExitCode
     from rxcli.lab.benchmark import readers as work
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
     _claim(out)
     first = 1_000_000 * seed
     verdict = work.run(n, first, out / "readers", seconds)
-    table = work.rows(verdict)
-    click.echo(format_table(table))
-    click.echo(
+    said = (
         f"{verdict.n} cases with seeds from {first} on; exit codes {dict(sorted(verdict.codes.items()))}; slowest "
         f"{verdict.slowest_s:.1f} s (seed {verdict.slowest_seed}); at most {verdict.most_mb:.0f} MB"
     )
-    _say_written(write_outputs(out, "readers", table, {"n": verdict.n, "seed": first}))
+    _say_written(_report(out, "readers", work.rows(verdict), {"n": verdict.n, "seed": first}, said))
     return ExitCode.NOT_RECEIVED if verdict.problems else ExitCode.OK
 
 
 @benchmark.command()
 @options(("--scenes", _SOME, 10_000, "Random scenes."), *_MANY)
-@click.option("--readers", type=click.IntRange(1), metavar="N", help="N mutated files and options, instead of scenes.")
-@click.option("--seconds", type=click.FloatRange(1), help="With --readers: begin nothing after so long.")
-def stability(
-    scenes: int, jobs: int, out: Path, seed: int, fresh: bool, quiet: bool, readers: int | None, seconds: float | None
-) -> int:
+@options(
+    ("--readers=N", click.IntRange(1), None, "N mutated files and options, instead of scenes."),
+    ("--seconds", click.FloatRange(1), None, "With --readers: begin nothing after so long."),
+)
+def stability(scenes: int, readers: int | None, seconds: float | None, **run: Any) -> int:
     """Random scenes: no exception, no warning, no NaN, no confident nonsense.
 
     With --readers: mutated files of all formats, truths, profiles, journals and options through the whole program: no
     internal error, no process above 1.5 GB, no case above 60 s. Exit code 1 where something was found.
     """
     if readers is not None:
-        return _mutated_readers(readers, seconds, out, seed)
+        return _mutated_readers(readers, seconds, run["out"], run["seed"])
     from rxcli.errors import ExitCode
     from rxcli.lab.benchmark import stability as work
-    from rxcli.lab.benchmark.tables import format_table, format_value, write_outputs
+    from rxcli.lab.benchmark.tables import format_value
 
-    verdict = work.run(scenes, _journal(out, "stability", fresh), seed=seed, jobs=jobs, quiet=quiet)
-    rows = work.rows(verdict)
-    click.echo(format_table(rows))
-    click.echo(
+    verdict = work.run(scenes, _begin("stability", **run))
+    said = (
         f"{verdict.wrong} of {verdict.confident} packets of confidence {work.CONFIDENT} or more are wrong "
         f"({format_value(verdict.wrong_interval)}); scenes by status: {verdict.status}"
     )
     summary = {"confident": verdict.confident, "wrong": verdict.wrong, "status": verdict.status}
-    _say_written(write_outputs(out, "stability", rows, summary))
+    _say_written(_report(run["out"], "stability", work.rows(verdict), summary, said))
     return ExitCode.OK if verdict.stable else ExitCode.NOT_RECEIVED
 
 
@@ -430,7 +408,6 @@ def compare(checkout: Path, out: Path, **given: Any) -> int:
 
     from rxcli.errors import ExitCode
     from rxcli.lab.benchmark import compare as work
-    from rxcli.lab.benchmark.tables import titled, write_outputs
     from rxcli.resources import data_dir
 
     other, seed = work.check_checkout(checkout), given["seed"]
@@ -441,9 +418,9 @@ def compare(checkout: Path, out: Path, **given: Any) -> int:
     jobs += work.random_phones(out / "compare", given["phones"], seed, screens)
     with tqdm(total=2 * given["repeats"], desc="compare", leave=False, disable=given["quiet"] or None) as bar:
         found = work.compare(jobs, work.this_checkout(), other, given["repeats"], bar.update)
-    rows, differing = work.rows(found), work.differing(found)
-    click.echo(titled([("this checkout against the other", rows), ("results that differ", differing)]))
-    _say_written(write_outputs(out, "compare", rows, differing))
+    differing = work.differing(found)
+    titles = ("this checkout against the other", "results that differ")
+    _say_written(_report(out, "compare", work.rows(found), differing, titles=titles))
     return ExitCode.NOT_RECEIVED if differing else ExitCode.OK
 
 
@@ -452,28 +429,26 @@ def compare(checkout: Path, out: Path, **given: Any) -> int:
 def memory(frames: int, out: Path) -> None:
     """Memory of `vlc-rx decode` over a long clip."""
     from rxcli.lab.benchmark import long_clip as work
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
     _claim(out)
     clip = work.make_clip(out / "media", frames)
     places = tuple(sorted({max(round(frames * share), 1) for share in (0.1, 0.2, 0.5, 1.0)}))
     found = work.measure(clip, places, out / "media" / "long.jsonl")
-    click.echo(format_table(work.rows(found)))
-    click.echo(f"{found.growth_kb:.3g} kB a frame, {found.packets} packets")
-    _say_written(write_outputs(out, "memory", work.rows(found), {"growth_kb": found.growth_kb}))
+    said = f"{found.growth_kb:.3g} kB a frame, {found.packets} packets"
+    _say_written(_report(out, "memory", work.rows(found), {"growth_kb": found.growth_kb}, said))
 
 
 @benchmark.command()
-@click.option("--screen", "screens", multiple=True, default=("data-34k6",), show_default=True, help="Screen profiles.")
-@click.option(
-    "--picture", "pictures", multiple=True, type=click.Choice(["bright", "china"]), default=("bright", "china")
+@options(
+    ("--screen screens", [str], None, "Screen profiles.", {"default": ("data-34k6",), "show_default": True}),
+    ("--picture pictures", [click.Choice(["bright", "china"])], None, None, {"default": ("bright", "china")}),
+    ("--camera=FPS,READOUT cameras", [str], None, "[default: five, see docs/link.md]"),
+    ("--size sizes", [click.IntRange(1)], None, None, {"default": (100, 1000, 10000, 100000)}),
+    ("--starts", click.IntRange(1), 20, "Random starts of each point."),
+    ("--mother", click.IntRange(0, 2), 2, "0: 1/1.5, 1: 1/2, 2: 1/3."),
+    ("--seed", click.IntRange(0), 0, None),
+    ("--out", click.Path(file_okay=False, path_type=Path), Path("benchmark-results"), None, {"show_default": False}),
 )
-@click.option("--camera", "cameras", multiple=True, metavar="FPS,READOUT", help="[default: five, see docs/link.md]")
-@click.option("--size", "sizes", multiple=True, type=click.IntRange(1), default=(100, 1000, 10_000, 100_000))
-@click.option("--starts", type=click.IntRange(1), default=20, show_default=True, help="Random starts of each point.")
-@click.option("--mother", type=click.IntRange(0, 2), default=2, show_default=True, help="0: 1/1.5, 1: 1/2, 2: 1/3.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("benchmark-results"))
 def goodput(
     screens: tuple[str, ...],
     pictures: tuple[str, ...],
@@ -490,15 +465,13 @@ def goodput(
     from tqdm import tqdm
 
     from rxcli.lab.benchmark import goodput as work
-    from rxcli.lab.benchmark.tables import format_table, write_outputs
 
     _claim(out)
     chosen = [_camera_of(text) for text in cameras] or work.CAMERAS
     grid = [replace(point, mother=mother) for point in work.points(screens, pictures, chosen, sizes)]
     bar = tqdm(grid, unit="point", leave=False, disable=None)
     rows = [work.row(point, work.measure(point, starts, seed)) for point in bar]
-    click.echo(format_table(rows))
-    _say_written(write_outputs(out, "goodput", rows, {"starts": starts, "seed": seed, "mother": mother}))
+    _say_written(_report(out, "goodput", rows, {"starts": starts, "seed": seed, "mother": mother}))
 
 
 def _camera_of(text: str) -> tuple[float, float]:

@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import claim_outputs, force_argument, json_output, write_json
+from rxcli.cli.common import claim_outputs, force_argument, json_output, options, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from rxcli.calibrate.lens import Board, GrayImage, LensCalibration, Rejected
     from rxcli.calibrate.shutter import ShutterCalibration
-    from rxcli.profiles import ReadoutMode
+    from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
     from rxcli.types import Frame, Metadata
 
 _NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]*"
-_SAVE = click.option(
-    "--save", type=click.Path(dir_okay=False, path_type=Path), help="Camera profile to write, or to add to."
-)
-_NAME = click.option("--name", help="Keep it as the camera NAME, for --camera NAME from anywhere.")
-_JSON = click.option(
-    "--json", "json_path", type=click.Path(allow_dash=True), metavar="FILE|-", help="Write the result as JSON."
-)
+_FILE = click.Path(dir_okay=False, path_type=Path)
 _PATHS = click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
+#: Where what was found goes: the options that `_Results` takes.
+_RESULTS = (
+    ("--save", _FILE, None, "Camera profile to write, or to add to."),
+    ("--name", str, None, "Keep it as the camera NAME, for --camera NAME from anywhere."),
+    ("--json=FILE|- json_path", click.Path(allow_dash=True), None, "Write the result as JSON."),
+)
 
 
 @click.group(cls=SuggestingGroup)
@@ -38,15 +38,15 @@ def calibrate() -> None:
 
 @calibrate.command(short_help="A lens, from pictures of a chessboard.")
 @_PATHS
-@click.option("--board", "board_size", default="9x6", show_default=True, help="Inner corners, across x down.")
-@click.option("--square", "square_mm", type=float, default=25.0, show_default=True, help="Side of a square, mm.")
-@click.option("--charuco", "dictionary", metavar="DICT", help="ChArUco board of this dictionary (DICT_5X5_100, ...).")
-@click.option("--marker", "marker_ratio", type=float, default=0.75, show_default=True, help="Marker over square side.")
-@click.option("--every", type=click.IntRange(1), default=10, show_default=True, help="Use every Nth frame of a clip.")
-@click.option("--picture", type=click.Path(dir_okay=False, path_type=Path), help="Draw the residuals into this PNG.")
-@_SAVE
-@_NAME
-@_JSON
+@options(
+    ("--board board_size", str, "9x6", "Inner corners, across x down."),
+    ("--square square_mm", float, 25.0, "Side of a square, mm."),
+    ("--charuco=DICT dictionary", str, None, "ChArUco board of this dictionary (DICT_5X5_100, ...)."),
+    ("--marker marker_ratio", float, 0.75, "Marker over square side."),
+    ("--every", click.IntRange(1), 10, "Use every Nth frame of a clip."),
+    ("--picture", _FILE, None, "Draw the residuals into this PNG."),
+    *_RESULTS,
+)
 @force_argument
 def lens(
     paths: tuple[Path, ...],
@@ -56,32 +56,28 @@ def lens(
     marker_ratio: float,
     every: int,
     picture: Path | None,
-    save: Path | None,
-    name: str | None,
-    json_path: str | None,
-    force: bool,
+    **results: Any,
 ) -> None:
     """Lens model from PATHS: pictures of a chessboard or ChArUco board, folders of them, or clips.
 
     Pictures are taken as stored, never rotated. Fill the field out to its corners and tilt the board both ways.
     """
     from rxcli.calibrate.lens import calibrate_lens, find_boards
-    from rxcli.calibrate.saving import profile_to_extend, with_lens, write_profile
+    from rxcli.calibrate.saving import with_lens
 
     board = _board(board_size, square_mm, dictionary, marker_ratio)
-    target, files = _target(save, name), _files(paths)
-    _claim(files, (), target, json_path, ("rms_px", "camera_matrix"), force, picture)
+    wanted, files = _Results(**results), _files(paths)
+    wanted.claim(files, ("rms_px", "camera_matrix"), picture=picture)
     reader = _BoardReader(every)
-    results, width, height = find_boards(reader.read(files), board)
-    result = calibrate_lens([*reader.unreadable, *results], width, height)
+    found, width, height = find_boards(reader.read(files), board)
+    result = calibrate_lens([*reader.unreadable, *found], width, height)
     if picture is not None:
         from rxcli.calibrate.picture import write_residuals
 
         write_residuals(result, picture)
-    if target is not None:
-        profile = profile_to_extend(target, reader.metadata)
-        write_profile(with_lens(profile, result.model, reader.metadata.lens if reader.metadata else None), target)
-    _say_lens(result, json_path, target)
+    lens_name = reader.metadata.lens if reader.metadata else None
+    wanted.extend(reader.metadata, lambda profile: with_lens(profile, result.model, lens_name))
+    wanted.tell(_lens_record(result), _lens_lines(result))
 
 
 def _board(size: str, square_mm: float, dictionary: str | None, marker_ratio: float) -> Board:
@@ -93,37 +89,80 @@ def _board(size: str, square_mm: float, dictionary: str | None, marker_ratio: fl
     return Board(int(found[1]), int(found[2]), square_mm, dictionary, marker_ratio)
 
 
-def _claim(
-    files: list[Path],
-    profiles: tuple[str | None, ...],
-    target: Path | None,
-    json_path: str | None,
-    json_keys: tuple[str, ...],
-    force: bool,
-    picture: Path | None = None,
-) -> None:
-    """Refuse outputs that would destroy something; the profile may be added to."""
-    from rxcli import outputs
+class _Results:
+    """The profile that a command extends, and the JSON that it writes.
 
-    found = [json_output(json_path, *json_keys)]
-    if target is not None:
-        found.append(outputs.Output("--save", target, outputs.CAMERA, makes_folder=True))
-    if picture is not None:
-        found.append(outputs.Output("--picture", picture, outputs.PICTURE))
-    claim_outputs(found, files, profiles, force)
+    Args:
+        save: file of the profile.
+        name: of the profile, in place of a file.
+        json_path: file of the JSON, "-" for stdout; None: text on stdout.
+        force: replace files that others wrote.
+
+    Raises:
+        UsageError: both say where the profile goes, or the name is none.
+    """
+
+    def __init__(self, save: Path | None, name: str | None, json_path: str | None, force: bool) -> None:
+        self._json_path, self._force = json_path, force
+        if name is not None and save is not None:
+            raise UsageError("--save and --name both say where the profile goes", "give one of them")
+        self._target = save if name is None else _file_of(name)
+
+    def claim(
+        self, read: list[Path], json_keys: tuple[str, ...], screen: str | None = None, picture: Path | None = None
+    ) -> None:
+        """Refuse outputs that would destroy something; the profile may be added to.
+
+        Args:
+            read: files that the command reads.
+            json_keys: what an earlier JSON of it holds.
+            screen: name or file of a profile that it reads.
+            picture: that it writes.
+        """
+        from rxcli import outputs
+
+        found = [json_output(self._json_path, *json_keys)]
+        if self._target is not None:
+            found.append(outputs.Output("--save", self._target, outputs.CAMERA, makes_folder=True))
+        if picture is not None:
+            found.append(outputs.Output("--picture", picture, outputs.PICTURE))
+        claim_outputs(found, read, (screen,), self._force)
+
+    def extend(self, metadata: Metadata | None, extended: Callable[[CameraProfile], CameraProfile]) -> None:
+        """Write the profile, where one is asked for: that of the camera in `metadata`, extended."""
+        from rxcli.calibrate.saving import profile_to_extend, write_profile
+
+        if self._target is not None:
+            write_profile(extended(profile_to_extend(self._target, metadata)), self._target)
+
+    def tell(self, record: dict[str, Any], lines: Iterable[str]) -> None:
+        """Write what was found as JSON, and as lines unless that went to stdout."""
+        if self._json_path is not None:
+            write_json({**record, "profile": None if self._target is None else str(self._target)}, self._json_path)
+        if self._json_path != "-":
+            click.echo("\n".join([*lines, *([] if self._target is None else [f"written     {self._target}"])]))
 
 
-def _target(save: Path | None, name: str | None) -> Path | None:
-    """The profile to write."""
-    if name is None:
-        return save
-    if save is not None:
-        raise UsageError("--save and --name both say where the profile goes", "give one of them")
+def _file_of(name: str) -> Path:
+    """The user's camera profile of a name."""
     if not re.fullmatch(_NAME_PATTERN, name):
         raise UsageError(f"--name {name!r} cannot name a profile", "use letters, digits, dots, dashes and underscores")
     from rxcli.resources import user_dir
 
     return user_dir() / "cameras" / f"{name}.toml"
+
+
+def _model_record(model: LensModel) -> dict[str, Any]:
+    return {
+        "camera_matrix": [list(row) for row in model.camera_matrix],
+        "dist_coeffs": list(model.dist_coeffs),
+        "width": model.width,
+        "height": model.height,
+    }
+
+
+def _distortion(model: LensModel) -> str:
+    return "distortion  " + " ".join(f"{value:.5f}" for value in model.dist_coeffs) + "  (k1 k2 p1 p2 k3)"
 
 
 class _BoardReader:
@@ -163,54 +202,41 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
     return files
 
 
-def _say_lens(result: LensCalibration, json_path: str | None, target: Path | None) -> None:
-    if json_path is not None:
-        write_json(_lens_record(result, target), json_path)
-    if json_path == "-":
-        return
+def _lens_lines(result: LensCalibration) -> Iterator[str]:
     matrix = result.model.camera_matrix
-    click.echo(f"RMS         {result.rms_px:.3f} px ({result.detector} corners of {len(result.accepted)} boards)")
-    click.echo(f"fx fy       {matrix[0][0]:.2f} {matrix[1][1]:.2f} px (+- {result.intrinsic_sd_px[0]:.2f})")
-    click.echo(f"cx cy       {matrix[0][2]:.2f} {matrix[1][2]:.2f} px (+- {result.intrinsic_sd_px[2]:.2f})")
-    click.echo("distortion  " + " ".join(f"{value:.5f}" for value in result.model.dist_coeffs) + "  (k1 k2 p1 p2 k3)")
-    for rejected in result.rejected:
-        click.echo(f"rejected    {rejected.name}: {rejected.reason}")
+    yield f"RMS         {result.rms_px:.3f} px ({result.detector} corners of {len(result.accepted)} boards)"
+    yield f"fx fy       {matrix[0][0]:.2f} {matrix[1][1]:.2f} px (+- {result.intrinsic_sd_px[0]:.2f})"
+    yield f"cx cy       {matrix[0][2]:.2f} {matrix[1][2]:.2f} px (+- {result.intrinsic_sd_px[2]:.2f})"
+    yield _distortion(result.model)
+    yield from (f"rejected    {rejected.name}: {rejected.reason}" for rejected in result.rejected)
     if result.uncovered:
-        click.echo(f"no corners  {', '.join(result.uncovered)}")
-    if target is not None:
-        click.echo(f"written     {target}")
+        yield f"no corners  {', '.join(result.uncovered)}"
 
 
-def _lens_record(result: LensCalibration, target: Path | None) -> dict[str, Any]:
+def _lens_record(result: LensCalibration) -> dict[str, Any]:
     return {
         "rms_px": result.rms_px,
-        "camera_matrix": [list(row) for row in result.model.camera_matrix],
-        "dist_coeffs": list(result.model.dist_coeffs),
-        "width": result.model.width,
-        "height": result.model.height,
+        **_model_record(result.model),
         "detector": result.detector,
         "accepted": [{"name": name, "rms_px": rms} for name, rms in result.accepted.items()],
         "rejected": [{"name": r.name, "reason": r.reason} for r in result.rejected],
         "uncovered": list(result.uncovered),
         "intrinsic_sd_px": list(result.intrinsic_sd_px),
-        "profile": str(target) if target is not None else None,
     }
 
 
 @calibrate.command(short_help="Readout and line delay, from a blinking lamp.")
 @_PATHS
-@click.option("--frequency", "frequencies", type=float, multiple=True, metavar="HZ", help="Lamp; may be repeated.")
-@click.option("--screen", metavar="NAME|FILE", help="Screen profile, whose slot rate is known, instead of a lamp.")
-@click.option(
-    "--axis", type=click.Choice(["auto", "rows", "columns"]), default="auto", show_default=True, help="Readout axis."
+@options(
+    ("--frequency=HZ frequencies", [float], None, "Lamp; may be repeated."),
+    ("--screen=NAME|FILE", str, None, "Screen profile, whose slot rate is known, instead of a lamp."),
+    ("--axis", ("auto", "rows", "columns"), "auto", "Readout axis."),
+    ("--region=X,Y,W,H", str, None, "Look at this part of the pictures only, stored pixels."),
+    ("--exposure exposure_s", float, None, "Exposure in seconds, where the files do not tell it."),
+    ("--frames", click.IntRange(1), 8, "Frames used of a clip."),
+    ("--mode mode_name", str, None, "Name of the readout mode to save.  [default: by the size, as 1920x1080]"),
+    *_RESULTS,
 )
-@click.option("--region", metavar="X,Y,W,H", help="Look at this part of the pictures only, stored pixels.")
-@click.option("--exposure", "exposure_s", type=float, help="Exposure in seconds, where the files do not tell it.")
-@click.option("--frames", type=click.IntRange(1), default=8, show_default=True, help="Frames used of a clip.")
-@click.option("--mode", "mode_name", help="Name of the readout mode to save.  [default: by the size, as 1920x1080]")
-@_SAVE
-@_NAME
-@_JSON
 @force_argument
 def shutter(
     paths: tuple[Path, ...],
@@ -221,28 +247,25 @@ def shutter(
     exposure_s: float | None,
     frames: int,
     mode_name: str | None,
-    save: Path | None,
-    name: str | None,
-    json_path: str | None,
-    force: bool,
+    **results: Any,
 ) -> None:
     """Line delay and readout from PATHS: pictures or clips, of one readout mode, of blinking lamps.
 
     Let the lamp fill much of the frame, out of focus, with an exposure well below half a period.
     """
-    from rxcli.calibrate.saving import profile_to_extend, with_mode, write_profile
+    from rxcli.calibrate.saving import with_mode
 
     if bool(frequencies) == bool(screen):
         raise UsageError("either --frequency or --screen is needed", "say what the lamp blinks at, as --frequency 1000")
     _check_positive(frequencies, exposure_s)
-    target, window, files = _target(save, name), _window(region), _files(paths)
-    _claim(files, (screen,), target, json_path, ("readout_s", "line_delay_s"), force)
+    wanted, window, files = _Results(**results), _window(region), _files(paths)
+    wanted.claim(files, ("readout_s", "line_delay_s"), screen)
     chosen = [frame for path in files for frame in _some_frames(path, frames)]
     result = _measure(chosen, frequencies, screen, axis, window, exposure_s)
-    if target is not None:
-        mode = _mode(result, mode_name)
-        write_profile(with_mode(profile_to_extend(target, chosen[0].metadata), mode), target)
-    _say_shutter(result, json_path, target)
+    wanted.extend(chosen[0].metadata, lambda profile: with_mode(profile, _mode(result, mode_name)))
+    for warning in result.warnings:
+        click.echo(f"vlc-rx: {warning}", err=True)
+    wanted.tell(_shutter_record(result), _shutter_lines(result))
 
 
 def _check_positive(frequencies: tuple[float, ...], exposure_s: float | None) -> None:
@@ -338,32 +361,24 @@ def _mode(result: ShutterCalibration, name: str | None) -> ReadoutMode:
     )
 
 
-def _say_shutter(result: ShutterCalibration, json_path: str | None, target: Path | None) -> None:
-    for warning in result.warnings:
-        click.echo(f"vlc-rx: {warning}", err=True)
-    if json_path is not None:
-        write_json(_shutter_record(result, target), json_path)
-    if json_path == "-":
-        return
+def _shutter_lines(result: ShutterCalibration) -> Iterator[str]:
     low, high = result.readout_interval_s
     n_lines = result.height if result.axis == "rows" else result.width
-    click.echo(
+    yield (
         f"readout     {result.readout_s * 1e3:.4f} ms over {n_lines} {result.axis} "
         f"(95 %: {low * 1e3:.4f} to {high * 1e3:.4f})"
     )
     low, high = result.line_delay_interval_s
-    click.echo(f"line delay  {result.line_delay_s * 1e6:.5f} us (95 %: {low * 1e6:.5f} to {high * 1e6:.5f})")
-    click.echo(f"periods     {result.periods:.2f}")
+    yield f"line delay  {result.line_delay_s * 1e6:.5f} us (95 %: {low * 1e6:.5f} to {high * 1e6:.5f})"
+    yield f"periods     {result.periods:.2f}"
     exposure = "unknown" if result.exposure_s is None else f"{result.exposure_s * 1e6:.1f} us"
-    click.echo(f"exposure    {exposure} ({result.exposure_note})")
+    yield f"exposure    {exposure} ({result.exposure_note})"
     for lamp in result.lamps:
         frequency = "unknown frequency" if lamp.frequency_hz is None else f"{lamp.frequency_hz:g} Hz"
-        click.echo(f"lamp        {frequency} at {lamp.stripes.bounds}, period {lamp.stripes.period_px:.3f} px")
-    if target is not None:
-        click.echo(f"written     {target}")
+        yield f"lamp        {frequency} at {lamp.stripes.bounds}, period {lamp.stripes.period_px:.3f} px"
 
 
-def _shutter_record(result: ShutterCalibration, target: Path | None) -> dict[str, Any]:
+def _shutter_record(result: ShutterCalibration) -> dict[str, Any]:
     return {
         "readout_s": result.readout_s,
         "readout_interval_s": list(result.readout_interval_s),
@@ -390,40 +405,31 @@ def _shutter_record(result: ShutterCalibration, target: Path | None) -> dict[str
             for lamp in result.lamps
         ],
         "warnings": list(result.warnings),
-        "profile": str(target) if target is not None else None,
     }
 
 
 @calibrate.command(short_help="A lens that the lensfun database knows.")
 @click.argument("path", type=click.Path(path_type=Path))
-@click.option("--make", help="Camera maker, where the file does not tell it.")
-@click.option("--camera-model", "model", help="Camera model, where the file does not tell it.")
-@click.option("--lens", "lens_name", help="Lens as lensfun names it, where the file does not tell it.")
-@click.option("--focal-length", "focal_mm", type=click.FloatRange(0, 5000, min_open=True), help="Millimetres.")
-@_SAVE
-@_NAME
-@_JSON
+@options(
+    ("--make", str, None, "Camera maker, where the file does not tell it."),
+    ("--camera-model model", str, None, "Camera model, where the file does not tell it."),
+    ("--lens lens_name", str, None, "Lens as lensfun names it, where the file does not tell it."),
+    ("--focal-length focal_mm", click.FloatRange(0, 5000, min_open=True), None, "Millimetres."),
+    *_RESULTS,
+)
 @force_argument
 def lensfun(
-    path: Path,
-    make: str | None,
-    model: str | None,
-    lens_name: str | None,
-    focal_mm: float | None,
-    save: Path | None,
-    name: str | None,
-    json_path: str | None,
-    force: bool,
+    path: Path, make: str | None, model: str | None, lens_name: str | None, focal_mm: float | None, **results: Any
 ) -> None:
     """Lens model of the picture PATH from the lensfun database, by camera, lens and focal length (extra [lensfun])."""
     from dataclasses import replace
 
     from rxcli.calibrate.lensfun import lens_from_database
-    from rxcli.calibrate.saving import profile_to_extend, with_lens, write_profile
+    from rxcli.calibrate.saving import with_lens
     from rxcli.ingest import open_source
 
-    target = _target(save, name)
-    _claim([path], (), target, json_path, ("camera", "lens", "camera_matrix"), force)
+    wanted = _Results(**results)
+    wanted.claim([path], ("camera", "lens", "camera_matrix"))
     frame = next(open_source(path))
     told = frame.metadata
     metadata = replace(
@@ -434,90 +440,68 @@ def lensfun(
         focal_length_mm=focal_mm or told.focal_length_mm,
     )
     found = lens_from_database(metadata, frame.width, frame.height)
-    if target is not None:
-        write_profile(with_lens(profile_to_extend(target, metadata), found.lens, metadata.lens), target)
-    record = {
-        "camera": found.camera_name,
-        "lens": found.lens_name,
-        "camera_matrix": [list(row) for row in found.lens.camera_matrix],
-        "dist_coeffs": list(found.lens.dist_coeffs),
-        "width": found.lens.width,
-        "height": found.lens.height,
-        "worst_px": found.worst_px,
-        "profile": str(target) if target is not None else None,
-    }
-    if json_path is not None:
-        write_json(record, json_path)
-    if json_path != "-":
-        click.echo(f"camera      {found.camera_name}")
-        click.echo(f"lens        {found.lens_name} at {metadata.focal_length_mm:g} mm")
-        click.echo(f"focal       {found.lens.camera_matrix[0][0]:.1f} px")
-        click.echo("distortion  " + " ".join(f"{v:.5f}" for v in found.lens.dist_coeffs) + "  (k1 k2 p1 p2 k3)")
-        click.echo(f"conversion  within {found.worst_px:.2f} px of lensfun's own")
-        if target is not None:
-            click.echo(f"written     {target}")
+    wanted.extend(metadata, lambda profile: with_lens(profile, found.lens, metadata.lens))
+    names = {"camera": found.camera_name, "lens": found.lens_name}
+    lines = [
+        f"camera      {found.camera_name}",
+        f"lens        {found.lens_name} at {metadata.focal_length_mm:g} mm",
+        f"focal       {found.lens.camera_matrix[0][0]:.1f} px",
+        _distortion(found.lens),
+        f"conversion  within {found.worst_px:.2f} px of lensfun's own",
+    ]
+    wanted.tell({**names, **_model_record(found.lens), "worst_px": found.worst_px}, lines)
 
 
 @calibrate.command(short_help="A lens from a Gyroflow profile; its readout, checked.")
 @click.argument("path", type=click.Path(path_type=Path))
-@click.option("--size", metavar="WxH", help="Size of the pictures it is for. [default: as calibrated]")
-@click.option("--photo", type=click.Path(path_type=Path), help="Check the readout with this picture of a screen.")
-@click.option("--screen", metavar="NAME|FILE", help="The screen of --photo.")
-@_SAVE
-@_NAME
-@_JSON
+@options(
+    ("--size=WxH", str, None, "Size of the pictures it is for. [default: as calibrated]"),
+    ("--photo", click.Path(path_type=Path), None, "Check the readout with this picture of a screen."),
+    ("--screen=NAME|FILE", str, None, "The screen of --photo."),
+    *_RESULTS,
+)
 @force_argument
-def gyroflow(
-    path: Path,
-    size: str | None,
-    photo: Path | None,
-    screen: str | None,
-    save: Path | None,
-    name: str | None,
-    json_path: str | None,
-    force: bool,
-) -> None:
+def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | None, **results: Any) -> None:
     """Lens model from PATH, a lens profile of the Gyroflow community (.json).
 
     The readout in such a profile is what some user told. It is written only where a picture of a known screen (--photo
     and --screen) bears it out, and then as the picture measures it.
     """
     from rxcli.calibrate.gyroflow import load_gyroflow
-    from rxcli.calibrate.saving import profile_to_extend, with_lens, with_mode, write_profile
+    from rxcli.calibrate.saving import with_lens, with_mode
     from rxcli.types import Metadata
 
     if (photo is None) != (screen is None):
         raise UsageError("--photo and --screen belong together", "give both, or neither")
-    target = _target(save, name)
-    read = [path] if photo is None else [path, photo]
-    _claim(read, (screen,), target, json_path, ("camera", "lens", "camera_matrix"), force)
+    wanted = _Results(**results)
+    wanted.claim([path] if photo is None else [path, photo], ("camera", "lens", "camera_matrix"), screen)
     found = load_gyroflow(path, _size(size))
     measured = None if photo is None else _measure(_some_frames(photo, 8), (), screen, "auto", None, None)
     notes = [*found.notes, *([] if measured is None else [_agreement(found.readout_s, measured.readout_s)])]
-    if target is not None:
-        metadata = Metadata(make=found.make or None, model=found.model or None)
-        profile = with_lens(profile_to_extend(target, metadata), found.lens, found.lens_name or None)
-        if measured is not None:
-            profile = with_mode(profile, _mode(measured, None))
-        write_profile(profile, target)
+
+    def extended(profile: CameraProfile) -> CameraProfile:
+        profile = with_lens(profile, found.lens, found.lens_name or None)
+        return profile if measured is None else with_mode(profile, _mode(measured, None))
+
+    wanted.extend(Metadata(make=found.make or None, model=found.model or None), extended)
     record = {
         "camera": f"{found.make} {found.model}".strip(),
         "lens": found.lens_name,
-        "camera_matrix": [list(row) for row in found.lens.camera_matrix],
-        "dist_coeffs": list(found.lens.dist_coeffs),
-        "width": found.lens.width,
-        "height": found.lens.height,
+        **_model_record(found.lens),
         "worst_px": found.worst_px,
         "readout_told_s": found.readout_s,
         "readout_measured_s": measured.readout_s if measured else None,
         "reversed": found.reversed,
         "notes": notes,
-        "profile": str(target) if target is not None else None,
     }
-    if json_path is not None:
-        write_json(record, json_path)
-    if json_path != "-":
-        _say_gyroflow(record)
+    lines = [
+        f"camera      {record['camera'] or 'not told'}",
+        f"lens        {found.lens_name or 'not told'}, {found.lens.width} x {found.lens.height}",
+        f"focal       {found.lens.camera_matrix[0][0]:.1f} px",
+        _distortion(found.lens),
+        f"conversion  within {found.worst_px:.2f} px of the fisheye model",
+    ]
+    wanted.tell(record, [*lines, *(f"readout     {note}" for note in notes)])
 
 
 def _size(text: str | None) -> tuple[int, int] | None:
@@ -536,15 +520,3 @@ def _agreement(told_s: float | None, measured_s: float) -> str:
     apart = told_s / measured_s - 1
     verdict = "agrees with" if abs(apart) < 0.01 else f"is {100 * abs(apart):.0f} % {'above' if apart > 0 else 'below'}"
     return f"the readout told ({told_s * 1e3:.2f} ms) {verdict} what the picture says ({measured_s * 1e3:.2f} ms)"
-
-
-def _say_gyroflow(record: dict[str, Any]) -> None:
-    click.echo(f"camera      {record['camera'] or 'not told'}")
-    click.echo(f"lens        {record['lens'] or 'not told'}, {record['width']} x {record['height']}")
-    click.echo(f"focal       {record['camera_matrix'][0][0]:.1f} px")
-    click.echo("distortion  " + " ".join(f"{v:.5f}" for v in record["dist_coeffs"]) + "  (k1 k2 p1 p2 k3)")
-    click.echo(f"conversion  within {record['worst_px']:.2f} px of the fisheye model")
-    for note in record["notes"]:
-        click.echo(f"readout     {note}")
-    if record["profile"]:
-        click.echo(f"written     {record['profile']}")

@@ -17,18 +17,24 @@ if TYPE_CHECKING:
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 AUTO = "auto"
+_SHARE = click.FloatRange(0, 1)
 
 
-def options(*rows: tuple[str, Any, Any, str]) -> Callable[[_F], _F]:
-    """Options of a command as a table of flags, type, default and help.
+def options(*rows: tuple[Any, ...]) -> Callable[[_F], _F]:
+    """Options of a command as a table of flags, type, default and help; and, where that is not all, further arguments.
 
-    Flags are as click takes them, separated by spaces, a parameter's name of its own among them. A type of None makes a
-    switch, a list takes the option several times, and a default that is not None is shown.
+    Flags are as click takes them, separated by spaces, a parameter's name of its own among them; the first may have
+    what help calls its value, as in "--json=FILE|- json_path". A type of None makes a switch, a list takes the option
+    several times, a tuple holds the choices, and a default that is not None is shown. Further arguments are a
+    dictionary of `click.option`'s.
     """
 
     def decorate(command: _F) -> _F:
-        for flags, kind, default, text in reversed(rows):
-            command = click.option(*flags.split(), **_option(kind, default), help=text)(command)
+        for flags, kind, default, text, *more in reversed(rows):
+            first, *others = flags.split()
+            flag, _, metavar = first.partition("=")
+            arguments = {"metavar": metavar or None, **_option(kind, default), **(more[0] if more else {})}
+            command = click.option(flag, *others, help=text, **arguments)(command)
         return command
 
     return decorate
@@ -36,12 +42,11 @@ def options(*rows: tuple[str, Any, Any, str]) -> Callable[[_F], _F]:
 
 def _option(kind: Any, default: Any) -> dict[str, Any]:
     if kind is None:
-        return {"is_flag": True, "default": bool(default)} if default is not None else {"default": None}
+        return {"default": None} if default is None else {"is_flag": True, "default": default}
     if isinstance(kind, list):
         return {"type": kind[0], "multiple": True}
-    if isinstance(kind, tuple):
-        return {"type": click.Choice(kind), "default": default, "show_default": default is not None}
-    return {"type": kind, "default": default, "show_default": default is not None}
+    shown = {} if default is None else {"default": default, "show_default": True}
+    return {"type": click.Choice(kind) if isinstance(kind, tuple) else kind, **shown}
 
 
 class _Point(click.ParamType[tuple[float, float]]):
@@ -93,78 +98,68 @@ def _complete_profiles(folder: str, incomplete: str) -> list[CompletionItem]:
     return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
 
 
-_OPTIONS = (
-    click.option(
-        "--screen",
-        "screens",
-        shell_complete=complete_screens,
-        multiple=True,
-        envvar="VLC_RX_SCREEN",
-        metavar="NAME|FILE|auto",
-        help="Screen profile; may be given several times. [default: auto, the one whose clock fits best]",
+#: What `receiver_options` takes.
+receiver_arguments = options(
+    (
+        "--screen=NAME|FILE|auto screens",
+        [str],
+        None,
+        "Screen profile; may be given several times. [default: auto, the one whose clock fits best]",
+        {"shell_complete": complete_screens, "envvar": "VLC_RX_SCREEN"},
     ),
-    click.option(
-        "--camera",
-        "cameras",
-        shell_complete=complete_cameras,
-        multiple=True,
-        envvar="VLC_RX_CAMERA",
-        metavar="NAME|FILE|auto",
-        help="Camera profile; of several, each file takes the one that matches its make, model and size. "
+    (
+        "--camera=NAME|FILE|auto cameras",
+        [str],
+        None,
+        "Camera profile; of several, each file takes the one that matches its make, model and size. "
         "[default: auto, all that are known]",
+        {"shell_complete": complete_cameras, "envvar": "VLC_RX_CAMERA"},
     ),
-    click.option(
+    (
         "--corners",
-        nargs=4,
-        type=_Point(),
-        metavar="x,y x,y x,y x,y",
-        help="The screen's corners in stored pixels, top-left first, clockwise as a viewer sees the screen.",
+        _Point(),
+        None,
+        "The screen's corners in stored pixels, top-left first, clockwise as a viewer sees the screen.",
+        {"nargs": 4, "metavar": "x,y x,y x,y x,y"},
     ),
-    click.option(
-        "--cae",
-        type=click.Choice(["auto", "always", "never"]),
-        default="auto",
-        show_default=True,
-        help="When the auto-encoder runs.",
-    ),
-    click.option(
+    ("--cae", ("auto", "always", "never"), "auto", "When the auto-encoder runs."),
+    (
         "--min-confidence",
-        type=click.FloatRange(0, 1),
-        help="Report only packets of at least this confidence; 0 for all. [default: 0.1]",
+        click.FloatRange(0, 1),
+        None,
+        "Report only packets of at least this confidence; 0 for all. [default: 0.1]",
     ),
-    click.option(
-        "--no-skip",
-        multiple=True,
-        metavar="NAME",
-        callback=_check_skip,
-        help="Switch off a shortcut (no_screen, no_packets, dark_columns, certain_columns, tracking); may be given "
-        "several times.",
+    (
+        "--no-skip=NAME",
+        [str],
+        None,
+        "Switch off a shortcut (no_screen, no_packets, dark_columns, certain_columns, tracking); may be given several "
+        "times.",
+        {"callback": _check_skip},
     ),
+)
+_RECEIVER = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
+#: For every command that writes files which may be somebody's.
+force_argument = options(
+    ("--force", None, False, "Replace files that are there already and were not written by the same option."),
 )
 
 
-def receiver_arguments(command: _F) -> _F:
-    """Add the options that `receiver_options` takes: screens, cameras, corners, cae, min_confidence, no_skip."""
-    for option in reversed(_OPTIONS):
-        command = option(command)
-    return command
-
-
-def receiver_options(
-    screens: tuple[str, ...] = (), cameras: tuple[str, ...] = (), corners: Any = None, **options: Any
-) -> ReceiverOptions:
+def receiver_options(given: dict[str, Any], **more: Any) -> ReceiverOptions:
     """`rxcli.options.receiver_options` of what the command line gave: an option not given is `auto`.
+
+    Args:
+        given: the options of a command, those of `receiver_arguments` among them.
+        more: what the command knows besides.
 
     Raises:
         ProfileError: a profile is missing or malformed.
         UsageError: the corners are no convex quadrilateral.
     """
     from rxcli.options import receiver_options as options_of
-    from rxcli.types import LEAST_CONFIDENCE
 
-    if options.get("min_confidence") is None:
-        options["min_confidence"] = LEAST_CONFIDENCE
-    return options_of(screens or AUTO, cameras or AUTO, corners or None, **options)
+    told = {name: given[name] for name in _RECEIVER if given[name] not in (None, ())}
+    return options_of(**told, **more)
 
 
 def camera_cache_folder() -> Path:
@@ -172,12 +167,6 @@ def camera_cache_folder() -> Path:
     from platformdirs import user_cache_path
 
     return user_cache_path("vlc-rx") / "cameras"
-
-
-#: For every command that writes files which may be somebody's.
-force_argument = click.option(
-    "--force", is_flag=True, help="Replace files that are there already and were not written by the same option."
-)
 
 
 def claim_outputs(

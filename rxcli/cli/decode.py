@@ -19,6 +19,7 @@ from rxcli.cli.common import (
     claim_outputs,
     complete_files,
     force_argument,
+    options,
     receiver_arguments,
     receiver_options,
 )
@@ -51,79 +52,60 @@ STDIN = "-"
 @click.command()
 @click.argument("paths", nargs=-1, required=True, metavar="PATH...", shell_complete=complete_files)
 @receiver_arguments
-@click.option("--json", "json_path", metavar="FILE|-", help="Write one JSON object a frame, instead of the table.")
-@click.option("--truth", metavar="FILE|auto", help="Score against this truth, or the NAME.truth.json beside each file.")
-@click.option(
-    "--max-ber", type=click.FloatRange(0, 1), help="Fail a file whose bit error rate is above (needs --truth)."
+@options(
+    ("--json=FILE|- json_path", str, None, "Write one JSON object a frame, instead of the table."),
+    ("--truth=FILE|auto", str, None, "Score against this truth, or the NAME.truth.json beside each file."),
+    ("--max-ber", click.FloatRange(0, 1), None, "Fail a file whose bit error rate is above (needs --truth)."),
+    (
+        "--min-packets",
+        click.IntRange(1),
+        1,
+        "Fail a file with fewer packets; those below --min-confidence (0.5, where it is not given) do not count.",
+    ),
+    ("--baseline=FILE", _FILE, None, "Fail a file that lost packets, or is slower, since this --json run."),
+    ("--slower", click.FloatRange(1), 1.5, "How many times as long as in the --baseline a file may take."),
+    (
+        "--min-packet-confidence",
+        click.FloatRange(0, 1),
+        None,
+        "Fail a file with a packet of lower confidence, which is still reported.",
+    ),
+    ("--junit", _FILE, None, "Write one JUnit test case per file."),
+    ("--summary", _FILE, None, "Write one row per file, as .csv or .parquet."),
+    ("--resume", None, False, "Go on with the run that wrote the file of --json."),
+    (
+        "--workers",
+        click.IntRange(1),
+        1,
+        "Decode in this many processes.",
+        {"show_default": False, "envvar": "VLC_RX_WORKERS"},
+    ),
+    ("--cluster=ADDRESS", str, None, "Decode on the Dask cluster whose scheduler is at this address."),
+    ("--dump-dir", _FOLDER, None, "Write the arrays of every stage boundary into this folder."),
+    ("--save-undistorted", _FOLDER, None, "Write every frame without its lens distortion into this folder."),
+    ("--save-camera", _FILE, None, "Write what was estimated of an unknown camera as a profile (TOML)."),
+    ("--stop-when-certain", None, False, "Pass over frames of a clip all of whose packets are certain already."),
+    ("--out", _FOLDER, None, "Write files that came whole into this folder, under their own names."),
+    ("--payloads", _FILE, None, "Write one row a packet (CSV): where it is from, bits, hex, confidence."),
+    (
+        "--no-camera-cache/--camera-cache",
+        None,
+        False,
+        "Estimate unknown cameras anew, and remember none (see vlc-rx profiles forget). [env: VLC_RX_NO_CAMERA_CACHE]",
+        {"envvar": "VLC_RX_NO_CAMERA_CACHE"},
+    ),
+    ("--quiet", None, False, "No table, no summary, no progress."),
 )
-@click.option(
-    "--min-packets",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Fail a file with fewer packets; those below --min-confidence (0.5, where it is not given) do not count.",
-)
-@click.option(
-    "--baseline", type=_FILE, metavar="FILE", help="Fail a file that lost packets, or is slower, since this --json run."
-)
-@click.option(
-    "--slower",
-    type=click.FloatRange(1),
-    default=1.5,
-    show_default=True,
-    help="How many times as long as in the --baseline a file may take.",
-)
-@click.option(
-    "--min-packet-confidence",
-    type=click.FloatRange(0, 1),
-    help="Fail a file with a packet of lower confidence, which is still reported.",
-)
-@click.option("--junit", type=_FILE, help="Write one JUnit test case per file.")
-@click.option("--summary", type=_FILE, help="Write one row per file, as .csv or .parquet.")
-@click.option("--resume", is_flag=True, help="Go on with the run that wrote the file of --json.")
-@click.option(
-    "--workers", type=click.IntRange(1), default=1, envvar="VLC_RX_WORKERS", help="Decode in this many processes."
-)
-@click.option("--cluster", metavar="ADDRESS", help="Decode on the Dask cluster whose scheduler is at this address.")
-@click.option("--dump-dir", type=_FOLDER, help="Write the arrays of every stage boundary into this folder.")
-@click.option(
-    "--save-undistorted", type=_FOLDER, help="Write every frame without its lens distortion into this folder."
-)
-@click.option("--save-camera", type=_FILE, help="Write what was estimated of an unknown camera as a profile (TOML).")
-@click.option(
-    "--stop-when-certain", is_flag=True, help="Pass over frames of a clip all of whose packets are certain already."
-)
-@click.option("--out", type=_FOLDER, help="Write files that came whole into this folder, under their own names.")
-@click.option("--payloads", type=_FILE, help="Write one row a packet (CSV): where it is from, bits, hex, confidence.")
-@click.option(
-    "--no-camera-cache/--camera-cache",
-    default=False,
-    envvar="VLC_RX_NO_CAMERA_CACHE",
-    help="Estimate unknown cameras anew, and remember none (see vlc-rx profiles forget). [env: VLC_RX_NO_CAMERA_CACHE]",
-)
-@click.option("--quiet", is_flag=True, help="No table, no summary, no progress.")
 @force_argument
 def decode(paths: tuple[str, ...], **options: Any) -> int:
     """Decode photos, RAW files and clips; PATH may be a folder, or - for one picture on stdin."""
     _check(paths, options)
     log.info("paths: %s", ", ".join(paths))
-    receiver = {
-        name: options[name]
-        for name in (
-            "screens",
-            "cameras",
-            "corners",
-            "cae",
-            "min_confidence",
-            "no_skip",
-            "dump_dir",
-            "stop_when_certain",
-        )
-    }
     from rxcli.runs.batch import standard_decoder
 
     cache = None if options["no_camera_cache"] else camera_cache_folder()
-    configured = receiver_options(**receiver, camera_cache=cache, soft_bits=True)
+    more = {name: options[name] for name in ("dump_dir", "stop_when_certain")}
+    configured = receiver_options(options, **more, camera_cache=cache, soft_bits=True)
     tap, after = None, None
     if options["save_undistorted"]:
         from rxcli.results.undistort import UndistortedWriter

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import claim_outputs, force_argument
+from rxcli.cli.common import claim_outputs, force_argument, options
 from rxcli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -29,22 +29,18 @@ _USUAL_READOUT = 0.61
 
 @click.command()
 @click.argument("path", type=click.Path(path_type=Path), required=False)
-@click.option("--text", help="Send this text; one of more than 199 bytes goes as a file.")
-@click.option("--uri", help="Send this URI, of at most 199 bytes.")
-@click.option("--screen", default="data-34k6", show_default=True, help="Screen profile: a name or a TOML file.")
-@click.option(
-    "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), help="Where to write: .npy, or .csv."
+@options(
+    ("--text", str, None, "Send this text; one of more than 199 bytes goes as a file."),
+    ("--uri", str, None, "Send this URI, of at most 199 bytes."),
+    ("--screen", str, "data-34k6", "Screen profile: a name or a TOML file."),
+    ("--out", click.Path(dir_okay=False, path_type=Path), None, "Where to write: .npy, or .csv.", {"required": True}),
+    ("--bursts", click.IntRange(1), None, "How many bursts. [default: what a receiver needs, and more]"),
+    ("--seconds", click.FloatRange(0, min_open=True), None, "How much time of the link, instead."),
+    ("--slots", None, False, "Write the slots themselves, bit-packed (.npy), instead of labels."),
+    ("--weights", str, "5", "Lit slots of ten: N, a list N,N,..., or a JSON file per burst."),
+    ("--mother", tuple(_RATES), "1/3", "Mother rate of a file's code."),
+    ("--object-id", click.IntRange(0, 65533), None, "Number of a file. [default: from its content]"),
 )
-@click.option("--bursts", type=click.IntRange(1), help="How many bursts. [default: what a receiver needs, and more]")
-@click.option("--seconds", type=click.FloatRange(0, min_open=True), help="How much time of the link, instead.")
-@click.option("--slots", is_flag=True, help="Write the slots themselves, bit-packed (.npy), instead of labels.")
-@click.option(
-    "--weights", default="5", show_default=True, help="Lit slots of ten: N, a list N,N,..., or a JSON file per burst."
-)
-@click.option(
-    "--mother", type=click.Choice(list(_RATES)), default="1/3", show_default=True, help="Mother rate of a file's code."
-)
-@click.option("--object-id", type=click.IntRange(0, 0xFFFD), help="Number of a file. [default: from its content]")
 @force_argument
 def encode(path: Path | None, out: Path, **options: Any) -> None:
     """Encode the file PATH, a text or a URI as labels, or slots, for a transmitter."""

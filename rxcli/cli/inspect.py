@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import claim_outputs, complete_files, force_argument, receiver_arguments, receiver_options
+from rxcli.cli.common import (
+    claim_outputs,
+    complete_files,
+    force_argument,
+    options,
+    receiver_arguments,
+    receiver_options,
+)
 from rxcli.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -25,11 +32,11 @@ _MOST_FRAMES = 240
 @click.command()
 @click.argument("path", shell_complete=complete_files)
 @receiver_arguments
-@click.option("--frame", type=click.IntRange(0), help="Frame of a clip. [default: the one with the most packets]")
-@click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), help="Folder to write. [default: ./inspect-NAME]"
+@options(
+    ("--frame", click.IntRange(0), None, "Frame of a clip. [default: the one with the most packets]"),
+    ("--out", click.Path(file_okay=False, path_type=Path), None, "Folder to write. [default: ./inspect-NAME]"),
+    ("--truth=FILE|auto", str, None, "Count wrong bits against this truth."),
 )
-@click.option("--truth", metavar="FILE|auto", help="Count wrong bits against this truth.")
 @force_argument
 def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, force: bool, **options: Any) -> int:
     """Write a page that shows how PATH was received, stage by stage, or why not; prints the page's path.
@@ -49,7 +56,7 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
     claim_outputs([Output("--out", page, own, makes_folder=True)], (path,), (), force)
     if folder.exists():  # a new one is made when there is something to put into it
         claim_own_folder("--out", folder, (page.name,), force)
-    configured = receiver_options(**options, soft_bits=True)
+    configured = receiver_options(options, soft_bits=True)
     results, picture = _received(path, frame, configured, truth)
     shown = next(result for result in results if result.frame == picture.index)
     screen = next((s for s in configured.screens if s.name == shown.screen_profile), None)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
-from rxcli.cli.common import claim_outputs, force_argument, receiver_arguments, receiver_options
+from rxcli.cli.common import claim_outputs, force_argument, options, receiver_arguments, receiver_options
 from rxcli.errors import ExitCode, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -47,28 +47,29 @@ class Exposure(click.ParamType[float]):
 
 @click.command()
 @click.argument("device", type=click.Path(path_type=Path))
-@click.option("--width", type=click.IntRange(1), help="Pixels across. [default: the largest that is fast enough]")
-@click.option("--height", type=click.IntRange(1), help="Rows. [default: the largest that is fast enough]")
-@click.option("--fps", type=click.FloatRange(0, min_open=True), help="Frames a second. [default: the camera's most]")
-@click.option("--format", "pixel_format", metavar="FOURCC", help="GREY, Y10, Y12, Y16, NV12, YUYV, UYVY or MJPG.")
-@click.option("--exposure", type=Exposure(), help="Seconds, or 1/8000. [default: as short as the camera can]")
-@click.option("--gain", type=int, help="In the camera's own units. [default: as it is]")
-@click.option("--wait", is_flag=True, help="Wait for a camera that is missing, busy or unplugged.")
-@click.option("--list", "list_only", is_flag=True, help="Show the camera's modes and leave.")
-@click.option("--frames", "n_frames", type=click.IntRange(1), help="Stop after this many frames.")
-@click.option("--duration", type=click.FloatRange(0, min_open=True), metavar="SECONDS", help="Stop after this time.")
-@click.option("--json", "json_path", metavar="FILE|-", help="Write one JSON object a frame, instead of tables.")
-@click.option("--out", type=_FOLDER, help="Write files that came whole into this folder, under their own names.")
-@click.option("--until-complete", is_flag=True, help="Stop when a message or a file has come whole.")
-@click.option("--quiet", is_flag=True, help="No status line.")
+@options(
+    ("--width", click.IntRange(1), None, "Pixels across. [default: the largest that is fast enough]"),
+    ("--height", click.IntRange(1), None, "Rows. [default: the largest that is fast enough]"),
+    ("--fps", click.FloatRange(0, min_open=True), None, "Frames a second. [default: the camera's most]"),
+    ("--format=FOURCC pixel_format", str, None, "GREY, Y10, Y12, Y16, NV12, YUYV, UYVY or MJPG."),
+    ("--exposure", Exposure(), None, "Seconds, or 1/8000. [default: as short as the camera can]"),
+    ("--gain", int, None, "In the camera's own units. [default: as it is]"),
+    ("--wait", None, False, "Wait for a camera that is missing, busy or unplugged."),
+    ("--list list_only", None, False, "Show the camera's modes and leave."),
+    ("--frames n_frames", click.IntRange(1), None, "Stop after this many frames."),
+    ("--duration=SECONDS", click.FloatRange(0, min_open=True), None, "Stop after this time."),
+    ("--json=FILE|- json_path", str, None, "Write one JSON object a frame, instead of tables."),
+    ("--out", _FOLDER, None, "Write files that came whole into this folder, under their own names."),
+    ("--until-complete", None, False, "Stop when a message or a file has come whole."),
+    ("--quiet", None, False, "No status line."),
+)
 @receiver_arguments
 @force_argument
 def live(device: Path, **options: Any) -> int:
     """Receive from the V4L2 camera DEVICE, such as /dev/video0, until Ctrl-C."""
     if options["list_only"]:
         return _show_modes(device)
-    names = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
-    configured = replace(receiver_options(**{name: options[name] for name in names}, soft_bits=True), prompt=True)
+    configured = replace(receiver_options(options, soft_bits=True), prompt=True)
     _claim(device, options)
     from rxcli.ingest.v4l2 import LiveSource
     from rxcli.link.collector import Collector

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import receiver_arguments, receiver_options
+from rxcli.cli.common import options, receiver_arguments, receiver_options
 from rxcli.cli.live import Exposure
 from rxcli.errors import ExitCode, UsageError
 
@@ -18,15 +18,19 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("device", required=False, type=click.Path(path_type=Path))
-@click.option(
-    "--host",
-    help="Address to listen at, such as 0.0.0.0 for phones in the same network. [default: this machine alone]",
+@options(
+    (
+        "--host",
+        str,
+        None,
+        "Address to listen at, such as 0.0.0.0 for phones in the same network. [default: this machine alone]",
+    ),
+    ("--port", click.IntRange(0, 65535), 8017, "0 takes any free one."),
+    ("--keep", click.Path(file_okay=False, path_type=Path), None, "Keep uploads in this folder."),
+    ("--max-upload", click.IntRange(1, 4096), 96, "Megabytes a file."),
+    ("--exposure", Exposure(), None, "Of the live camera: seconds, or 1/8000. [default: the shortest]"),
+    ("--gain", int, None, "Of the live camera, in its own units. [default: as it is]"),
 )
-@click.option("--port", type=click.IntRange(0, 65535), default=8017, show_default=True, help="0 takes any free one.")
-@click.option("--keep", type=click.Path(file_okay=False, path_type=Path), help="Keep uploads in this folder.")
-@click.option("--max-upload", type=click.IntRange(1, 4096), default=96, show_default=True, help="Megabytes a file.")
-@click.option("--exposure", type=Exposure(), help="Of the live camera: seconds, or 1/8000. [default: the shortest]")
-@click.option("--gain", type=int, help="Of the live camera, in its own units. [default: as it is]")
 @receiver_arguments
 def serve(device: Path | None, **options: Any) -> int:
     """Serve a page that decodes photos from a phone, and shows the live camera DEVICE where one is named.
@@ -59,9 +63,8 @@ def _site(device: Path | None, options: dict[str, Any]) -> Site:
     from rxcli.ingest.v4l2 import CameraSettings
     from rxcli.web.server import Bounds, Site
 
-    names = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
     return Site(
-        options=receiver_options(**{name: options[name] for name in names}, soft_bits=True),
+        options=receiver_options(options, soft_bits=True),
         host=options["host"] or "127.0.0.1",
         port=options["port"],
         token=secrets.token_urlsafe(12) if options["host"] else None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import claim_outputs, force_argument
+from rxcli.cli.common import claim_outputs, force_argument, options
 from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -33,84 +33,73 @@ _SCENE_OPTIONS = (
 
 @click.command()
 @click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
-@click.option("--preset", type=click.Choice(_PRESETS), default="xs10-still", show_default=True, help="Kind of camera.")
-@click.option("--screen", default="paper-34k6", show_default=True, help="Screen profile: a name or a TOML file.")
-@click.option("--picture", default="coffee", show_default=True, help="Picture shown: a file, or a name (see --list).")
-@click.option(
-    "--payload", default="random", show_default=True, help="'random', 'hex:...', or a file; sent over and over."
-)
-@click.option("--text", help="Send this text (a longer one as a file), for the link layer to receive.")
-@click.option("--uri", help="Send this URI.")
-@click.option("--file", "file_path", type=click.Path(path_type=Path), help="Send this file.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Same seed, same pixels.")
-@click.option(
-    "--format",
-    "file_format",
-    type=click.Choice((*_STILLS, *_CODECS)),
-    metavar="NAME",
-    help=f"Format of OUT, {', '.join((*_STILLS, *_CODECS))}; by its suffix where not given.",
-)
-@click.option(
-    "--w", "weights", default="5", show_default=True, help="Lit slots of ten: N, a list N,N,..., or 'dimming'."
-)
-@click.option("--dimming", type=click.Choice(["max", "none"]), default="max", show_default=True, help="Local dimming.")
-@click.option("--exposure", "exposure_s", help="Exposure in seconds, or as 1/32000.  [default: the preset's]")
-@click.option("--electrons", type=float, help="Electrons of a green pixel that sees white, in one exposure.")
-@click.option("--iso", type=click.IntRange(1), help="ISO written to the file; has no effect on the pixels.")
-@click.option("--roll", type=float, help="Degrees about the line of sight; 180 for a camera upside down.")
-@click.option("--yaw", type=float, help="Degrees about the vertical.")
-@click.option("--pitch", type=float, help="Degrees about the horizontal.")
-@click.option("--distance", "distance_mm", type=float, help="Distance of the screen in millimetres.")
-@click.option("--fill", type=float, help="Share of the picture's width that the screen fills, instead of a distance.")
-@click.option("--focal", "focal_widths", type=float, help="Focal length in picture widths.")
-@click.option("--distortion", help="Lens distortion k1,k2,p1,p2,k3.")
-@click.option("--corners", help="The screen's corners x,y,x,y,x,y,x,y on the sensor, instead of a pose.")
-@click.option(
-    "--orientation", type=click.IntRange(1, 8), help="EXIF orientation.  [default: 1, or 3 for a roll of 180]"
-)
-@click.option("--blur", "blur_px", type=float, help="Focus blur, standard deviation in pixels.")
-@click.option("--lcd-grid", type=click.FloatRange(0, 1), help="Depth of the panel's pixel structure.")
-@click.option(
-    "--room-light", "room_e", type=float, help="Electrons of a green pixel that sees white paper by the room's light."
-)
-@click.option("--flicker", "flicker_hz", type=float, help="Flicker of the room's light in Hz (100 or 120).")
-@click.option("--reflection", type=float, help="A lamp mirrored in the panel, against white paper.")
-@click.option("--scale", type=click.FloatRange(0.02, 4), help="Scale the sensor; rows and time shown scale with it.")
-@click.option(
-    "--keep-readout/--keep-line-delay", default=False, help="With --scale: keep the time of the whole readout."
-)
-@click.option("--cfa", type=click.Choice(["bayer", "xtrans", "rgb"]), help="Colour filter array.")
-@click.option(
-    "--tone", type=click.Choice(["srgb", "bt709", "gamma", "linear"]), help="Tone curve of developed pictures."
-)
-@click.option("--quality", type=click.IntRange(1, 100), help="JPEG quality.")
-@click.option("--subsampling", type=click.Choice(["444", "422", "420"]), help="JPEG colour subsampling.")
-@click.option("--sharpen", type=click.FloatRange(0, 5), help="Strength of sharpening.")
-@click.option("--denoise", "denoise_px", type=click.FloatRange(0, 10), help="Noise reduction, pixels.")
-@click.option("--correct/--no-correct", "correct", default=None, help="Take the lens's distortion out in the camera.")
-@click.option("--frames", "n_frames", type=click.IntRange(1), help="Frames of a clip.")
-@click.option("--frame-rate", "frame_rate_hz", type=float, help="Frames per second of a clip.")
-@click.option("--bit-rate", type=click.IntRange(1), help="Bits per second of a clip.  [default: constant quality]")
-@click.option("--shake", "shake_px", type=float, help="Hand shake, pixels.")
-@click.option(
-    "--hand", "hand_px", type=click.FloatRange(0), help="Hold the camera in a hand: pixels from frame to frame."
-)
-@click.option("--stabilised", is_flag=True, help="With --hand: frames are turned back and cropped, as phones do.")
-@click.option("--clock-error", "slot_rate_error_ppm", type=float, help="Error of the slot rate, ppm.")
-@click.option(
-    "--column-delays", help="Delays of the columns in slots: one number each, or one for the largest random delay."
-)
-@click.option("--start-slot", type=float, help="Slot of the link at which row 0 starts.  [default: random]")
-@click.option("--make", help="Camera make written to the file.")
-@click.option("--model", help="Camera model written to the file.")
-@click.option(
-    "--waveforms", type=click.Path(file_okay=False, path_type=Path), help="Also write what drives a real screen."
-)
-@click.option("--camera-name", help="Name of the camera in truth and camera profile.")
-@click.option(
-    "--camera-profile",
-    type=click.Path(dir_okay=False, path_type=Path),
-    help="Also write a camera profile (TOML) that fits the capture.",
+@options(
+    ("--preset", _PRESETS, "xs10-still", "Kind of camera."),
+    ("--screen", str, "paper-34k6", "Screen profile: a name or a TOML file."),
+    ("--picture", str, "coffee", "Picture shown: a file, or a name (see --list)."),
+    ("--payload", str, "random", "'random', 'hex:...', or a file; sent over and over."),
+    ("--text", str, None, "Send this text (a longer one as a file), for the link layer to receive."),
+    ("--uri", str, None, "Send this URI."),
+    ("--file file_path", click.Path(path_type=Path), None, "Send this file."),
+    ("--seed", click.IntRange(0), 0, "Same seed, same pixels."),
+    (
+        "--format=NAME file_format",
+        (*_STILLS, *_CODECS),
+        None,
+        f"Format of OUT, {', '.join((*_STILLS, *_CODECS))}; by its suffix where not given.",
+    ),
+    ("--w weights", str, "5", "Lit slots of ten: N, a list N,N,..., or 'dimming'."),
+    ("--dimming", ("max", "none"), "max", "Local dimming."),
+    ("--exposure exposure_s", str, None, "Exposure in seconds, or as 1/32000.  [default: the preset's]"),
+    ("--electrons", float, None, "Electrons of a green pixel that sees white, in one exposure."),
+    ("--iso", click.IntRange(1), None, "ISO written to the file; has no effect on the pixels."),
+    ("--roll", float, None, "Degrees about the line of sight; 180 for a camera upside down."),
+    ("--yaw", float, None, "Degrees about the vertical."),
+    ("--pitch", float, None, "Degrees about the horizontal."),
+    ("--distance distance_mm", float, None, "Distance of the screen in millimetres."),
+    ("--fill", float, None, "Share of the picture's width that the screen fills, instead of a distance."),
+    ("--focal focal_widths", float, None, "Focal length in picture widths."),
+    ("--distortion", str, None, "Lens distortion k1,k2,p1,p2,k3."),
+    ("--corners", str, None, "The screen's corners x,y,x,y,x,y,x,y on the sensor, instead of a pose."),
+    ("--orientation", click.IntRange(1, 8), None, "EXIF orientation.  [default: 1, or 3 for a roll of 180]"),
+    ("--blur blur_px", float, None, "Focus blur, standard deviation in pixels."),
+    ("--lcd-grid", click.FloatRange(0, 1), None, "Depth of the panel's pixel structure."),
+    ("--room-light room_e", float, None, "Electrons of a green pixel that sees white paper by the room's light."),
+    ("--flicker flicker_hz", float, None, "Flicker of the room's light in Hz (100 or 120)."),
+    ("--reflection", float, None, "A lamp mirrored in the panel, against white paper."),
+    ("--scale", click.FloatRange(0.02, 4), None, "Scale the sensor; rows and time shown scale with it."),
+    ("--keep-readout/--keep-line-delay", None, False, "With --scale: keep the time of the whole readout."),
+    ("--cfa", ("bayer", "xtrans", "rgb"), None, "Colour filter array."),
+    ("--tone", ("srgb", "bt709", "gamma", "linear"), None, "Tone curve of developed pictures."),
+    ("--quality", click.IntRange(1, 100), None, "JPEG quality."),
+    ("--subsampling", ("444", "422", "420"), None, "JPEG colour subsampling."),
+    ("--sharpen", click.FloatRange(0, 5), None, "Strength of sharpening."),
+    ("--denoise denoise_px", click.FloatRange(0, 10), None, "Noise reduction, pixels."),
+    ("--correct/--no-correct correct", None, None, "Take the lens's distortion out in the camera."),
+    ("--frames n_frames", click.IntRange(1), None, "Frames of a clip."),
+    ("--frame-rate frame_rate_hz", float, None, "Frames per second of a clip."),
+    ("--bit-rate", click.IntRange(1), None, "Bits per second of a clip.  [default: constant quality]"),
+    ("--shake shake_px", float, None, "Hand shake, pixels."),
+    ("--hand hand_px", click.FloatRange(0), None, "Hold the camera in a hand: pixels from frame to frame."),
+    ("--stabilised", None, False, "With --hand: frames are turned back and cropped, as phones do."),
+    ("--clock-error slot_rate_error_ppm", float, None, "Error of the slot rate, ppm."),
+    (
+        "--column-delays",
+        str,
+        None,
+        "Delays of the columns in slots: one number each, or one for the largest random delay.",
+    ),
+    ("--start-slot", float, None, "Slot of the link at which row 0 starts.  [default: random]"),
+    ("--make", str, None, "Camera make written to the file."),
+    ("--model", str, None, "Camera model written to the file."),
+    ("--waveforms", click.Path(file_okay=False, path_type=Path), None, "Also write what drives a real screen."),
+    ("--camera-name", str, None, "Name of the camera in truth and camera profile."),
+    (
+        "--camera-profile",
+        click.Path(dir_okay=False, path_type=Path),
+        None,
+        "Also write a camera profile (TOML) that fits the capture.",
+    ),
 )
 @click.option(
     "--list",

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from rxcli.cli.common import options
 from rxcli.errors import UsageError
 
 #: Samples that the ranges of eight-bit integers are laid out for.
@@ -17,22 +18,20 @@ CALIBRATION_SAMPLES = 12
 
 @click.command()
 @click.argument("out", type=click.Path(file_okay=False, path_type=Path))
-@click.option("--name", default="strips", show_default=True, help="Name of the model.")
-@click.option("--version", "model_version", type=click.IntRange(1), default=1, show_default=True, help="Its version.")
-@click.option("--steps", type=click.IntRange(1), default=1600, show_default=True, help="Steps of the optimiser.")
-@click.option("--frames", type=click.IntRange(1), default=640, show_default=True, help="Frames to simulate.")
-@click.option("--held-out", type=click.IntRange(0), default=12, show_default=True, help="Frames to validate on.")
-@click.option("--strip-width", type=click.IntRange(1), default=32, show_default=True, help="Channels of a strip.")
-@click.option("--column-width", type=click.IntRange(1), default=48, show_default=True, help="Channels of a column.")
-@click.option("--seed", type=click.IntRange(0), default=1, show_default=True, help="Same seed, same network.")
-@click.option(
-    "--cache", type=click.Path(file_okay=False, path_type=Path), help="Folder of the data sets.  [default: OUT/data]"
+@options(
+    ("--name", str, "strips", "Name of the model."),
+    ("--version model_version", click.IntRange(1), 1, "Its version."),
+    ("--steps", click.IntRange(1), 1600, "Steps of the optimiser."),
+    ("--frames", click.IntRange(1), 640, "Frames to simulate."),
+    ("--held-out", click.IntRange(0), 12, "Frames to validate on."),
+    ("--strip-width", click.IntRange(1), 32, "Channels of a strip."),
+    ("--column-width", click.IntRange(1), 48, "Channels of a column."),
+    ("--seed", click.IntRange(0), 1, "Same seed, same network."),
+    ("--cache", click.Path(file_okay=False, path_type=Path), None, "Folder of the data sets.  [default: OUT/data]"),
+    ("--int8/--float quantise", None, True, "Compute in eight-bit integers, or not.", {"show_default": True}),
+    ("--resume", None, False, "Go on from the checkpoint in OUT."),
+    ("-q --quiet", None, False, "No progress bars."),
 )
-@click.option(
-    "--int8/--float", "quantise", default=True, show_default=True, help="Compute in eight-bit integers, or not."
-)
-@click.option("--resume", is_flag=True, help="Go on from the checkpoint in OUT.")
-@click.option("-q", "--quiet", is_flag=True, help="No progress bars.")
 def train(
     out: Path,
     name: str,

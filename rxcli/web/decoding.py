@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError
+from rxcli.runs.processes import resident_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -123,14 +124,6 @@ class DecodingProcess:
 
 class _EndedError(Exception):
     """A limit was passed: reason and next step."""
-
-
-def resident_bytes(pid: int | None) -> int:
-    """Resident memory of a process, 0 where that cannot be told."""
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
-        return 0
 
 
 def refusal(reason: str, step: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rxcli.lab.benchmark.outline import BOUND, Found, corner_error, found_of, kind_of, rows, scene_of, search
+from rxcli.lab.benchmark.outline import BOUND, corner_error, kind_of, rows, scene_of, search
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.scenes import preset
@@ -31,7 +31,7 @@ def test_an_error_is_the_farthest_corner_in_any_order() -> None:
 
 def test_rows_count_what_was_not_found() -> None:
     kind = kind_of(preset("video-1080p"))
-    table = rows([Found(kind, BOUND / 2), Found(kind, 2 * BOUND), found_of({"kind": kind, "error": None})])
+    table = rows([{"kind": kind, "error": error} for error in (BOUND / 2, 2 * BOUND, None)])
     assert [row["frames"] for row in table] == ["other", "all"]
     assert table[-1]["n"] == 3
     assert table[-1]["within_0.3_%"] == pytest.approx(1 / 3)

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from rxcli.cli.benchmark import benchmark
 from rxcli.lab.benchmark import phones
-from rxcli.lab.benchmark.journal import Journal, run_scenes
+from rxcli.lab.benchmark.journal import Run
 
 
 def test_phones_are_as_asked_for() -> None:
@@ -88,8 +88,6 @@ def test_the_command_writes_what_it_found(tmp_path: Path) -> None:
     assert "rows per slot within 0.05 %" in result.output
     rows = json.loads((tmp_path / "phones.json").read_text())["rows"]
     assert (rows[0]["phones"], rows[0]["n"]) == ("all", 1)
-    (record,) = run_scenes(
-        "phones", phones.packets_of, 1, Journal(tmp_path / "p.jsonl"), seed=905, cae="never", quiet=True
-    )
+    (record,) = Run(seed=905, quiet=True).scenes("phones", phones.packets_of, 1, cae="never")
     assert record["rows_per_slot_hat"] == pytest.approx(record["rows_per_slot"], rel=5e-4)
     assert sum(packet["bit_errors"] == 0 for packet in record["packets"]) >= 5

@@ -9,7 +9,7 @@ import pytest
 
 from rxcli.errors import UsageError
 from rxcli.lab.benchmark import sensitivity
-from rxcli.lab.benchmark.journal import Journal
+from rxcli.lab.benchmark.journal import Run
 from rxcli.lab.benchmark.sensitivity import Number, moved, numbers
 from rxcli.receiver.channel import likelihoods, words
 from rxcli.receiver.channel.settings import SETTINGS
@@ -61,7 +61,7 @@ def test_rows_say_what_changed(monkeypatch: pytest.MonkeyPatch) -> None:
         return {"frames": [{"right": 17 if lost else 20, "surely_wrong": 0}], "cpu_s": 2.0}
 
     monkeypatch.setattr(sensitivity, "received", received)
-    rows = sensitivity.run("receiver/channel/likelihoods", 1, Journal(), seed=1, quiet=True)
+    rows = sensitivity.run("receiver/channel/likelihoods", 1, Run(seed=1, quiet=True))
     assert rows[0]["number"].endswith("_DEGREES")
     assert (rows[0]["right_0.7"], rows[0]["right_1.4"], rows[0]["changed"]) == (-3, 0, 1)
     assert all(row["changed"] == 0 for row in rows[1:])

@@ -10,6 +10,7 @@ import pytest
 from rxcli.errors import ReceiverError, UsageError
 from rxcli.lab.benchmark import speed
 from rxcli.lab.simulate.scenes import preset
+from rxcli.runs.processes import peak_memory_mb
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ def test_a_measurement_runs_in_its_own_process(small_jpeg: Path) -> None:
 
 def test_peak_memory_is_the_process_s_own(small_jpeg: Path) -> None:
     ballast = bytearray(300 << 20)
-    assert speed.peak_memory_mb() > 300
+    assert peak_memory_mb() > 300
     medium = speed.Medium("small", "video-1080p", "paper-17k3", ".jpg")
     memory = speed.memory_of(medium, small_jpeg)
     assert 0 < memory["idle_mb"] <= memory["peak_mb"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rxcli.errors import InputError
-from rxcli.lab.benchmark.journal import Journal, Task, run_tasks
+from rxcli.lab.benchmark.journal import Journal, Run, Task
 from rxcli.lab.benchmark.statistics import cluster_interval, pareto_front, power_law, wilson
 from rxcli.lab.benchmark.tables import format_table, to_csv, write_outputs
 
@@ -77,10 +77,10 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
     _double_calls.clear()
     path = tmp_path / "run" / "journal.jsonl"
     tasks: list[Task] = [{"n": n} for n in range(4)]
-    run_tasks(tasks[:3], _double, Journal(path), quiet=True)
+    Run(Journal(path), quiet=True).tasks("double", tasks[:3], _double)
     with path.open("a") as file:
         file.write('{"key": "half a li')  # as a killed process leaves it
-    records = run_tasks(tasks, _double, Journal(path), quiet=True)
+    records = Run(Journal(path), quiet=True).tasks("double", tasks, _double)
     assert [record["twice"] for record in records] == [0, 2, 4, 6]
     assert _double_calls == [0, 1, 2, 3]
     assert len(Journal(path)._records) == 4

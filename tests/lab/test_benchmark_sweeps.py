@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rxcli.lab.benchmark import sweeps, yardsticks
-from rxcli.lab.benchmark.journal import Journal
+from rxcli.lab.benchmark.journal import Journal, Run
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.protocol import encode_packet, payload_bits
@@ -85,8 +85,8 @@ def test_a_sweep_runs_resumes_and_sums(tmp_path: Path) -> None:
     point = sweeps.Point("t", "t", 1.0, "video-1080p", slot_rate_hz=17300.0, payload_symbols=11, picture="white")
     point = replace(point, receivers=("receiver", "no auto-encoder"))
     path = tmp_path / "journal.jsonl"
-    first = sweeps.run([point], 2, Journal(path), quiet=True)
-    again = sweeps.run([point], 2, Journal(path), quiet=True)
+    first = sweeps.run([point], 2, Run(Journal(path), quiet=True))
+    again = sweeps.run([point], 2, Run(Journal(path), quiet=True))
     assert [s.method for s in first] == ["receiver", "no auto-encoder", "bound", "paper"]
     assert [s.as_row() for s in again] == [s.as_row() for s in first]
     bound = first[2].score

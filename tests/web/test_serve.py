@@ -33,8 +33,9 @@ from rxcli.cli.main import run  # noqa: E402
 from rxcli.ingest import open_source  # noqa: E402
 from rxcli.options import ReceiverOptions  # noqa: E402
 from rxcli.results.aim import Aim, Light, light_of  # noqa: E402
+from rxcli.runs.processes import resident_bytes  # noqa: E402
 from rxcli.types import ColumnResult, FrameResult, Message, PacketResult, ReceivedObject  # noqa: E402
-from rxcli.web.decoding import DecodingProcess, Limits, resident_bytes, texts_of  # noqa: E402
+from rxcli.web.decoding import DecodingProcess, Limits, texts_of  # noqa: E402
 from rxcli.web.live import live_events  # noqa: E402
 from rxcli.web.server import Bounds, Server, Site  # noqa: E402
 

@@ -16,19 +16,19 @@ from tempfile import TemporaryDirectory
 import msgspec
 import numpy as np
 
-from rxcli.ingest import open_source
 from rxcli.lab.benchmark.confidence import reported_packets
 from rxcli.lab.benchmark.journal import Record, Task
 from rxcli.lab.benchmark.statistics import wilson
 from rxcli.lab.benchmark.tables import Row
+from rxcli.lab.benchmark.trial import receive_clip, truth_of
 from rxcli.lab.simulate.capture import Take, prepare
 from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
-from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
+from rxcli.lab.simulate.pictures import draw_name
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.lab.simulate.video import write_video
-from rxcli.receiver.pipeline import CaeMode, ReceiverOptions, receive
-from rxcli.results.truth import Scorer, Truth
+from rxcli.receiver.pipeline import CaeMode, ReceiverOptions
+from rxcli.results.truth import Truth
 
 #: Camera, screen, how often they are drawn, frames, and bits per second. The fastest link has too few rows per slot in
 #: 1080p.
@@ -73,9 +73,8 @@ def scene_of(seed: int) -> ClipScene:
     name, screen, _, frames, bits = _KINDS[rng.choice(len(_KINDS), p=[kind[2] for kind in _KINDS])]
     base = preset(name, screen)
     kind = str(rng.choice(DARK_KINDS)) if rng.random() < _DARK else "photo"
-    names = [*PHOTOS, *(name for name in GENERATED if name != "black")]
     size = base.screen.width_px, base.screen.height_px
-    picture = str(rng.choice(names)) if kind == "photo" else draw_dark_picture(kind, rng, *size)
+    picture = draw_name(rng) if kind == "photo" else draw_dark_picture(kind, rng, *size)
     exposure_slots = rng.choice([0.5, 1.0, 1.5]) * rng.uniform(0.8, 1.2)
     exposure_s = max(float(exposure_slots) / base.screen.slot_rate_hz, 1 / 32000)
     pose = replace(
@@ -107,13 +106,13 @@ def _encoding(rng: np.random.Generator, bits: tuple[float, float]) -> Encoding:
 
 
 @contextmanager
-def clips_of(seed: int, folder: Path | None = None) -> Iterator[tuple[list[Path], Take]]:
-    """A scene's clips as files, in a folder that goes away afterwards where none is given."""
+def clips_of(seed: int) -> Iterator[tuple[list[Path], Take]]:
+    """A scene's clips as files, in a folder that goes away afterwards."""
     clip = scene_of(seed)
     take = prepare(clip.scene, seed)
     pictures = [take.frame(n, threads=1).rgb for n in range(clip.scene.n_frames)]
-    with TemporaryDirectory() as temporary:
-        paths = [(folder or Path(temporary)) / f"{seed}-{number}.mp4" for number in range(len(clip.encodings))]
+    with TemporaryDirectory() as folder:
+        paths = [Path(folder) / f"{seed}-{number}.mp4" for number in range(len(clip.encodings))]
         for path, how in zip(paths, clip.encodings, strict=True):
             write_video(pictures, path, how.codec, clip.scene.frame_rate_hz, how.bit_rate, how.preset)
         yield paths, take
@@ -136,8 +135,7 @@ def packets_of(task: Task) -> Record:
     seed = task["seed"]
     clip = scene_of(seed)
     with clips_of(seed) as (paths, take):
-        told = take.truth("clip")
-        truth = msgspec.convert({**told, "payload": {int(k): v for k, v in told["payload"].items()}}, Truth)
+        truth = truth_of(take)
         clips = []
         for path, how in zip(paths, clip.encodings, strict=True):
             ways = {
@@ -161,16 +159,13 @@ def packets_of(task: Task) -> Record:
 
 
 def _received(path: Path, truth: Truth, options: ReceiverOptions) -> Record:
-    scorer = Scorer(truth)
-    results = [scorer.add(result) for result in receive(open_source(path), options)]
-    packets = [packet for result in results for packet in reported_packets(result, truth.w)]
-    score = scorer.score()
+    results, score = receive_clip(path, options, truth)
     return {
         "status": [result.status for result in results],
         "expected": score.expected,
         "error_free": score.error_free,
         "false": score.false,
-        "packets": packets,
+        "packets": [packet for result in results for packet in reported_packets(result, truth.w)],
     }
 
 

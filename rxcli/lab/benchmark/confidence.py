@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rxcli.lab.benchmark.journal import Record, Task
 from rxcli.lab.benchmark.statistics import wilson
 from rxcli.lab.benchmark.trial import simulate_trial
-from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
+from rxcli.lab.simulate.pictures import draw_name
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.types import FrameResult
 
@@ -99,7 +99,7 @@ def scene_of(seed: int) -> Scene:
     exposure_s = max(float(exposure_slots) / base.screen.slot_rate_hz, 1 / 32000)
     return replace(
         base,
-        picture=str(rng.choice([*PHOTOS, *(name for name in GENERATED if name != "black")])),
+        picture=draw_name(rng),
         w="dimming" if rng.random() < 0.3 else int(rng.integers(2, 9)),
         pose=replace(base.pose, fill=rng.uniform(0.8, 0.97), roll_deg=rng.normal(0, 1.0), yaw_deg=rng.normal(0, 4)),
         exposure_s=exposure_s,

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from rxcli.errors import InputError, UsageError
-from rxcli.runs.environment import ONE_THREAD, environment
+from rxcli.runs.batch import use_one_thread
+from rxcli.runs.processes import ONE_THREAD, environment
 
 Record = dict[str, Any]
 #: A task is what its work needs, as JSON values; its key says what makes it the same task in another run.
@@ -93,66 +96,59 @@ def code_fingerprint() -> str:
     return digest.hexdigest()[:12]
 
 
-def run_tasks(
-    tasks: Sequence[Task], work: Work, journal: Journal, *, jobs: int = 1, label: str = "", quiet: bool = False
-) -> list[Record]:
-    """Do those of `tasks` that the journal lacks; returns the records of all, in order.
-
-    Args:
-        tasks: JSON values each.
-        work: a function of a module, so that other processes find it.
-        journal: what is done already; it grows task by task.
-        jobs: processes; each uses one thread.
-        label: of the progress bar.
-        quiet: show no progress bar.
-    """
-    from tqdm import tqdm
-
-    code = code_fingerprint()
-    keys = [task_key({**task, "code": code}) for task in tasks]
-    missing = [(key, task) for key, task in zip(keys, tasks, strict=True) if key not in journal]
-    bar = tqdm(total=len(tasks), initial=len(tasks) - len(missing), desc=label, disable=quiet or None, leave=False)
-    with bar:
-        for key, record in _each(missing, work, jobs):
-            journal.add(key, record)
-            bar.update()
-    return [journal[key] for key in keys]
-
-
 #: Seeds of a run's scenes: this many times the run's, and on.
 SEEDS_A_RUN = 1_000_000
 
 
-def run_scenes(
-    label: str,
-    work: Work,
-    count: int,
-    journal: Journal,
-    *,
-    seed: int = 0,
-    jobs: int = 1,
-    quiet: bool = False,
-    **more: Any,
-) -> list[Record]:
-    """Do `work` on `count` random scenes, of which each task tells its own seed; returns their records, in order.
+@dataclass(frozen=True, slots=True)
+class Run:
+    """How the tasks of a benchmark are done: those that the journal lacks, in processes of one thread each."""
 
-    Args:
-        label: of the run: the same seed in another one is another task.
-        work: simulates the scene of `task["seed"]`, receives it, and says what came out.
-        count: scenes.
-        journal: what is done already.
-        seed: of the run.
-        jobs: processes.
-        quiet: show no progress bar.
-        more: what else the work needs.
-    """
-    tasks = [{"run": label, "seed": SEEDS_A_RUN * seed + number, **more} for number in range(count)]
-    return run_tasks(tasks, work, journal, jobs=jobs, label=label, quiet=quiet)
+    #: What is done already; it grows task by task.
+    journal: Journal = field(default_factory=Journal)
+    #: Of all random scenes.
+    seed: int = 0
+    #: Processes.
+    jobs: int = 1
+    #: Show no progress bar.
+    quiet: bool = False
+
+    def tasks(self, label: str, tasks: Sequence[Task], work: Work) -> list[Record]:
+        """The records of all tasks, in order.
+
+        Args:
+            label: of the progress bar.
+            tasks: JSON values each.
+            work: a function of a module, so that other processes find it.
+        """
+        from tqdm import tqdm
+
+        code = code_fingerprint()
+        keys = [task_key({**task, "code": code}) for task in tasks]
+        missing = [(key, task) for key, task in zip(keys, tasks, strict=True) if key not in self.journal]
+        n_done = len(tasks) - len(missing)
+        with tqdm(total=len(tasks), initial=n_done, desc=label, disable=self.quiet or None, leave=False) as bar:
+            for key, record in _each(missing, work, self.jobs):
+                self.journal.add(key, record)
+                bar.update()
+        return [self.journal[key] for key in keys]
+
+    def scenes(self, label: str, work: Work, count: int, **more: Any) -> list[Record]:
+        """The records of `count` random scenes, of which each task tells its own seed; in order.
+
+        Args:
+            label: of the run: the same seed in another one is another task.
+            work: simulates the scene of `task["seed"]`, receives it, and says what came out.
+            count: scenes.
+            more: what else the work needs.
+        """
+        first = SEEDS_A_RUN * self.seed
+        return self.tasks(label, [{"run": label, "seed": first + number, **more} for number in range(count)], work)
 
 
 def _each(tasks: Sequence[tuple[str, Task]], work: Work, jobs: int) -> Iterator[tuple[str, Record]]:
     if jobs <= 1 or len(tasks) <= 1:
-        with _OneThread():
+        with _one_thread():
             for key, task in tasks:
                 yield key, work(task)
         return
@@ -166,7 +162,7 @@ def _in_processes(tasks: Sequence[tuple[str, Task]], work: Work, jobs: int) -> I
     # Libraries read these when they are loaded, which in a spawned worker is later than here.
     with (
         environment(ONE_THREAD),
-        ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_use_one_thread) as pool,
+        ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=use_one_thread) as pool,
     ):
         futures = {pool.submit(work, task): key for key, task in tasks}
         try:
@@ -176,22 +172,14 @@ def _in_processes(tasks: Sequence[tuple[str, Task]], work: Work, jobs: int) -> I
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _use_one_thread() -> None:
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """OpenCV on one thread for a while, so that times mean the same on every machine."""
     import cv2
 
+    threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
-
-
-class _OneThread:
-    """OpenCV on one thread for a while, so that times mean the same on every machine."""
-
-    def __enter__(self) -> None:
-        import cv2
-
-        self._threads = cv2.getNumThreads()
-        cv2.setNumThreads(1)
-
-    def __exit__(self, *_: object) -> None:
-        import cv2
-
-        cv2.setNumThreads(self._threads)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)

@@ -6,7 +6,6 @@ payloads then come again, so that its packets, written one after the other many 
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import ReceiverError, UsageError
 from rxcli.profiles import CameraProfile, ReadoutMode, dump_profile
+from rxcli.runs.processes import package_environment, resident_bytes
 
 if TYPE_CHECKING:
     from rxcli.lab.simulate.scenes import Scene
@@ -125,7 +125,7 @@ def measure(clip: Path, frames: tuple[int, ...], out: Path) -> Memory:
                 n_lines += 1
                 packets += line.count('"payload": ')
                 if n_lines == frames[len(seen)]:
-                    seen.append(_resident_mb(process.pid))
+                    seen.append(resident_bytes(process.pid) / 2**20)
             elif process.poll() is not None:
                 raise ReceiverError(f"{clip}: ended after {n_lines} frames, {frames[-1]} were wanted", "make it anew")
             else:
@@ -135,21 +135,10 @@ def measure(clip: Path, frames: tuple[int, ...], out: Path) -> Memory:
 
 
 def _decode(clip: Path, out: Path) -> subprocess.Popen[bytes]:
-    root = str(Path(__file__).resolve().parents[3])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))}
     out.write_bytes(b"")
     command = [sys.executable, "-m", "rxcli.cli.main", "decode", str(clip), "--quiet", "--json", str(out)]
     command += ["--screen", _SCREEN, "--camera", str(_camera_path(clip.parent))]
-    return subprocess.Popen(command, env=environment)
-
-
-def _resident_mb(pid: int) -> float:
-    """Resident memory of a process; 0 where it has ended."""
-    try:
-        text = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace")
-    except OSError:
-        return 0.0
-    return next((float(line.split()[1]) / 1024 for line in text.splitlines() if line.startswith("VmRSS")), 0.0)
+    return subprocess.Popen(command, env=package_environment())
 
 
 def rows(memory: Memory) -> list[dict[str, Any]]:

@@ -11,21 +11,20 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import msgspec
 import numpy as np
 
-from rxcli.ingest import open_source
 from rxcli.lab.benchmark.confidence import reported_packets
 from rxcli.lab.benchmark.journal import Record, Task
 from rxcli.lab.benchmark.tables import Row
+from rxcli.lab.benchmark.trial import receive_clip, truth_of
 from rxcli.lab.simulate.capture import Take, prepare
-from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
+from rxcli.lab.simulate.pictures import draw_name
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.lab.simulate.video import write_video
 from rxcli.options import SKIPS
-from rxcli.receiver.pipeline import ReceiverOptions, receive
-from rxcli.results.truth import Scorer, Truth
+from rxcli.receiver.pipeline import ReceiverOptions
+from rxcli.results.truth import Truth
 
 #: Pixels from frame to frame, on average.
 SPEEDS_PX = (0.0, 2.0, 4.0, 8.0)
@@ -50,7 +49,7 @@ def scene_of(seed: int, n_frames: int) -> Scene:
     )
     return replace(
         base,
-        picture=str(rng.choice([*PHOTOS, *(name for name in GENERATED if name != "black")])),
+        picture=draw_name(rng),
         w=5 if rng.random() < 0.6 else int(rng.integers(3, 8)),
         pose=pose,
         exposure_s=exposure_s,
@@ -75,25 +74,19 @@ def _received(take: Take, bit_rate: int) -> dict[str, Record]:
     options = ReceiverOptions(
         screens=(scene.screen,), cameras=(build_camera_profile(scene, take.exposure()),), force_camera=True
     )
-    told = take.truth("clip")
-    truth = msgspec.convert({**told, "payload": {int(k): v for k, v in told["payload"].items()}}, Truth)
+    truth = truth_of(take)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "clip.mp4"
         frames = (take.frame(n, threads=1).rgb for n in range(scene.n_frames))
         write_video(frames, path, "h264", scene.frame_rate_hz, bit_rate)
         one_by_one = replace(options, skip=frozenset(SKIPS) - {"tracking"})
-        return {
-            "clip": _scored(path, options, truth),
-            "one_by_one": _scored(path, one_by_one, truth),
-        }
+        return {"clip": _scored(path, options, truth), "one_by_one": _scored(path, one_by_one, truth)}
 
 
 def _scored(path: Path, options: ReceiverOptions, truth: Truth) -> Record:
-    scorer = Scorer(truth)
-    results = [scorer.add(result) for result in receive(open_source(path), options)]
+    results, score = receive_clip(path, options, truth)
     packets = [packet for result in results for packet in reported_packets(result, truth.w)]
     sure = [packet["bit_errors"] for packet in packets if packet["confidence"] >= _SURE]
-    score = scorer.score()
     return {
         "expected": score.expected,
         "error_free": score.error_free,

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -91,18 +90,15 @@ def _row(name: str, records: Sequence[Record]) -> Row:
 
 def offenders(records: Sequence[Record]) -> list[Row]:
     """Those that gave packets, by number: the same number and seed draw them again."""
-    return list(_offenders(records))
-
-
-def _offenders(records: Sequence[Record]) -> Iterator[Row]:
-    for record in records:
-        if record["confidences"]:
-            about: dict[str, Any] = {name: round(value, 2) for name, value in record["about"].items()}
-            yield {
-                "number": record["number"],
-                "kind": record["kind"],
-                "screen": record["screen"],
-                "packets": len(record["confidences"]),
-                "surest": max(record["confidences"]),
-                "drawn": " ".join(f"{name} {value}" for name, value in about.items()),
-            }
+    return [
+        {
+            "number": record["number"],
+            "kind": record["kind"],
+            "screen": record["screen"],
+            "packets": len(record["confidences"]),
+            "surest": max(record["confidences"]),
+            "drawn": " ".join(f"{name} {round(value, 2)}" for name, value in record["about"].items()),
+        }
+        for record in records
+        if record["confidences"]
+    ]

@@ -6,7 +6,7 @@ Frames have full size, and take some seconds each.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from rxcli.lab.benchmark.journal import Record, Task
 from rxcli.lab.benchmark.tables import Row
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.optics import View
-from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
+from rxcli.lab.simulate.pictures import draw_name
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset
 from rxcli.receiver.corners import levels_of
 from rxcli.receiver.screen.find import find_screen
@@ -29,26 +29,11 @@ _DARK, _BLACK_SIDES = ("hubble", "night"), ("bars", "flower", "retina", "rocket"
 _BRIGHT = 0.3
 
 
-@dataclass(frozen=True)
-class Found:
-    """One frame."""
-
-    #: What is hard about it.
-    kind: str
-    #: Largest distance of a corner in screen widths; NaN where no screen was found.
-    error: float
-
-
 def search_record(task: Task) -> Record:
-    """Simulate one frame and look for its screen."""
+    """Simulate one frame and look for its screen; what is hard about it, and the error, None where none was found."""
     scene = scene_of(task["seed"])
     error = search(simulate_trial(scene, 1))
     return {"kind": kind_of(scene), "error": None if np.isnan(error) else error}
-
-
-def found_of(record: Record) -> Found:
-    """What `search_record` says."""
-    return Found(record["kind"], float("nan") if record["error"] is None else record["error"])
 
 
 def kind_of(scene: Scene) -> str:
@@ -70,7 +55,7 @@ def scene_of(seed: int) -> Scene:
     lamp = float(rng.choice([0.0, rng.uniform(0, 0.1)]))
     scene = replace(
         base,
-        picture=str(rng.choice([*PHOTOS, *(name for name in GENERATED if name != "black")])),
+        picture=draw_name(rng),
         w="dimming" if rng.random() < 0.3 else int(rng.integers(2, 9)),
         room=replace(base.room, light_e_per_s=light * 10 ** rng.uniform(-3, 0), lamp=lamp),
         exposure_s=exposure_s,
@@ -113,16 +98,15 @@ def search(trial: Trial) -> float:
     return float("nan") if found.corners is None else corner_error(found.corners, trial.corners)
 
 
-def rows(found: Sequence[Found]) -> list[Row]:
+def rows(records: Sequence[Record]) -> list[Row]:
     """A row for every kind of frame, and one for all."""
-    kinds = sorted({f.kind for f in found})
-    return [_row(kind, [f.error for f in found if f.kind == kind]) for kind in kinds] + [
-        _row("all", [f.error for f in found])
-    ]
+    kinds = sorted({record["kind"] for record in records})
+    found = [_row(kind, [record for record in records if record["kind"] == kind]) for kind in kinds]
+    return [*found, _row("all", records)]
 
 
-def _row(name: str, errors: Sequence[float]) -> Row:
-    error = np.array(errors)
+def _row(name: str, records: Sequence[Record]) -> Row:
+    error = np.array([record["error"] for record in records], np.float64)  # None becomes NaN
     seen = error[~np.isnan(error)]
     return {
         "frames": name,

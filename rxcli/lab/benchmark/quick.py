@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rxcli.lab.benchmark import speed, stability, sweeps
-from rxcli.lab.benchmark.journal import Journal
+from rxcli.lab.benchmark.journal import Run
+from rxcli.lab.benchmark.tables import Row
 
 #: Frames of each point, and runs whose median counts.
 _FRAMES, _REPEATS = 2, 3
@@ -16,26 +16,6 @@ _FRAMES, _REPEATS = 2, 3
 _SCENES = 20
 #: Easy ones, a hard picture, and a phone that nobody has measured.
 _MEDIA = ("jpeg-26mp", "raw-26mp", "jpeg-26mp-hard", "jpeg-12mp-unknown")
-
-Row = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Headline:
-    """The tables of a quick run."""
-
-    errors: list[Row]
-    times: list[Row]
-    checks: list[Row]
-
-    @property
-    def sections(self) -> list[tuple[str, Sequence[Row]]]:
-        """Titles and tables."""
-        return [
-            ("bit error rate, lost packets included: receiver, bound, the paper's pipeline", self.errors),
-            ("time on two threads, of the wall and of the processor, against the bare decode on one", self.times),
-            ("checks", self.checks),
-        ]
 
 
 def points() -> list[sweeps.Point]:
@@ -46,19 +26,18 @@ def points() -> list[sweeps.Point]:
     return [*paper, dim, *cameras]
 
 
-def run(folder: Path, journal: Journal, *, seed: int = 0, jobs: int = 2, quiet: bool = False) -> Headline:
-    """Measure the headline.
-
-    Args:
-        folder: of the media that are timed.
-        journal: of the trials.
-        seed: of the scenes.
-        jobs: processes for the trials.
-        quiet: no progress bars.
-    """
-    summaries = sweeps.run(points(), _FRAMES, journal, seed=seed, jobs=jobs, quiet=quiet)
-    verdict = stability.run(_SCENES, journal, seed=seed, jobs=jobs, quiet=quiet)
-    return Headline(error_rows(summaries), _time_rows(folder, seed), _check_rows(verdict))
+def run(folder: Path, how: Run) -> list[tuple[str, list[Row]]]:
+    """Measure the headline: titles and tables; the media that are timed lie in `folder`."""
+    errors = error_rows(sweeps.run(points(), _FRAMES, how))
+    verdict = stability.run(_SCENES, how)
+    return [
+        ("bit error rate, lost packets included: receiver, bound, the paper's pipeline", errors),
+        (
+            "time on two threads, of the wall and of the processor, against the bare decode on one",
+            _time_rows(folder, how.seed),
+        ),
+        ("checks", _check_rows(verdict)),
+    ]
 
 
 def error_rows(summaries: Sequence[sweeps.Summary]) -> list[Row]:

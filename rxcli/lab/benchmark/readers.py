@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from rxcli.protocol import bits_to_hex, encode_packet, payload_bits
 from rxcli.resources import data_dir
-from rxcli.runs.environment import environment
+from rxcli.runs.processes import environment, package_environment, peak_memory_mb
 
 #: What one process may take: resident memory, and time for one case on a machine of its own.
 MOST_MB, MOST_S = 1500, 60.0
@@ -304,6 +304,8 @@ class Cases:
     """
 
     def __init__(self, folder: Path, program: Program) -> None:
+        import cv2
+
         self._program = program
         #: Scratch files of this process.
         self.folder = folder / f"work-{os.getpid()}"
@@ -325,7 +327,7 @@ class Cases:
             "gyroflow": json.dumps(_GYROFLOW).encode(),
         }
         for number in (1, 2):
-            self._write_good(number)
+            cv2.imwrite(self._good(number), drawn_screen(number))
         self._whole: bytes | None = None
 
     def run(self, seed: int) -> dict[str, Any]:
@@ -343,7 +345,7 @@ class Cases:
         began, cpu = time.monotonic(), time.process_time()
         code, text = _call(self._program, arguments)
         problems = [f"{name}: {line}" for line in text.splitlines() if "internal error" in line or "Traceback" in line]
-        cpu_s, mb = time.process_time() - cpu, _peak_mb()
+        cpu_s, mb = time.process_time() - cpu, peak_memory_mb()
         if code not in (0, 1, 2, 3):
             problems.append(f"{name}: exit code {code}")
         if mb > MOST_MB:
@@ -358,11 +360,6 @@ class Cases:
         path = self.folder / name
         path.write_bytes(data)
         return str(path)
-
-    def _write_good(self, number: int) -> None:
-        import cv2
-
-        cv2.imwrite(str(self.folder / f"good{number}.png"), drawn_screen(number))
 
     def _good(self, number: int = 1) -> str:
         return str(self.folder / f"good{number}.png")
@@ -466,15 +463,6 @@ def _call(program: Program, arguments: list[str]) -> tuple[int, str]:
     return int(code), f"{out.getvalue()}\n{err.getvalue()}"
 
 
-def _peak_mb() -> float:
-    """The largest memory of this program; `getrusage` counts that of the process which has started it, too."""
-    try:
-        status = Path("/proc/self/status").read_text(encoding="ascii")
-        return int(status.split("VmHWM:")[1].split()[0]) / 1024
-    except (OSError, IndexError, ValueError):
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
 def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> Verdict:
     """Run `n` cases with seeds from `seed` on, in one process after the other.
 
@@ -492,13 +480,9 @@ def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> Verdic
 
 def _run_process(verdict: Verdict, first: int, stop: int, folder: Path, end: float) -> int:
     """Run cases in a process until it ends or must be ended; returns the seed to go on with."""
-    root = str(Path(__file__).resolve().parents[3])
-    path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     command = [sys.executable, "-c", _START, str(folder), str(first), str(stop)]
-    environment = {**os.environ, "PYTHONPATH": path, **threads}
     with tempfile.TemporaryFile() as complaints:
-        process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=complaints)
+        process = subprocess.Popen(command, env=package_environment(1), stdout=subprocess.PIPE, stderr=complaints)
         following, problem = first, None
         try:
             for line in _lines(process):
@@ -528,9 +512,7 @@ def _lines(process: subprocess.Popen[bytes]) -> Iterator[bytes | None]:
     """What the process prints, line by line; None where nothing came for too long."""
     assert process.stdout is not None
     lines: Queue[bytes] = Queue()
-    stdout = process.stdout
-    reader = Thread(target=_pass_on, args=(stdout, lines), daemon=True)
-    reader.start()
+    Thread(target=_pass_on, args=(process.stdout, lines), daemon=True).start()
     while True:
         try:
             line = lines.get(timeout=_PATIENCE * MOST_S)

@@ -21,7 +21,7 @@ from typing import Any
 import rxcli
 from rxcli.errors import UsageError
 from rxcli.lab.benchmark import screens
-from rxcli.lab.benchmark.journal import Journal, Record, Task, run_tasks
+from rxcli.lab.benchmark.journal import Record, Run, Task
 from rxcli.lab.benchmark.tables import Row
 from rxcli.lab.benchmark.trial import Trial, score_result, simulate_trial
 from rxcli.options import ReceiverOptions
@@ -192,23 +192,20 @@ def _tuple(value: Any) -> Value:
     return tuple(_tuple(item) for item in value) if isinstance(value, list) else value
 
 
-def run(room: str, pictures: int, journal: Journal, *, seed: int, jobs: int = 1, quiet: bool = False) -> list[Row]:
+def run(room: str, pictures: int, how: Run) -> list[Row]:
     """A row for every number of `room`, those on which most hangs first.
 
     Args:
         room: see `numbers`.
-        pictures: random pictures of `screens.scene_of`, half of them dark.
-        journal: what is done already.
-        seed: of the pictures.
-        jobs: processes; each simulates the pictures once.
-        quiet: show no progress bar.
+        pictures: random pictures of `screens.scene_of`, half of them dark; each process simulates them once.
+        how: it is done.
     """
     found = numbers(room)
-    shared = {"run": "sensitivity", "seed": seed, "pictures": pictures}
+    shared = {"run": "sensitivity", "seed": how.seed, "pictures": pictures}
     moves = [(number, factor) for number in found for factor in FACTORS]
     # The first number times one is the receiver as it is.
     tasks = [{**shared, "number": _told(number), "factor": factor} for number, factor in [(found[0], 1.0), *moves]]
-    unmoved, *records = run_tasks(tasks, received, journal, jobs=jobs, label="sensitivity", quiet=quiet)
+    unmoved, *records = how.tasks("sensitivity", tasks, received)
     rows = [_row(number, unmoved, records[2 * at : 2 * at + 2]) for at, number in enumerate(found)]
     return sorted(rows, key=lambda row: -row["changed"])
 

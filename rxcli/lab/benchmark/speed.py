@@ -7,7 +7,6 @@ memory of one do not touch another.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -28,7 +27,7 @@ from rxcli.options import AUTO, receiver_options
 from rxcli.profiles import ScreenProfile, dump_profile, load_profile
 from rxcli.protocol import payload_bits
 from rxcli.receiver.pipeline import receive
-from rxcli.runs.environment import THREAD_VARIABLES
+from rxcli.runs.processes import package_environment, peak_memory_mb
 from rxcli.types import Frame, FrameResult
 
 _T = TypeVar("_T")
@@ -37,11 +36,8 @@ TARGETS = {"jpeg-26mp": 1.6, "raw-26mp": 2.5, "jpeg-26mp-hard": 4.0, "jpeg-12mp-
 #: Megapixels and columns over which growth is measured.
 MEGAPIXELS = (2.0, 4.0, 8.0, 16.0, 26.0, 50.0)
 COLUMNS = (20, 50, 100, 200)
-#: Size at which columns are varied, megapixels.
-_COLUMNS_AT_MP = 26.0
+#: Megapixels of the preset's sensor, at which columns are varied.
 _XS10_MP = 26.0
-#: Sums of stages, which are no stages themselves.
-_SUMS = ("total",)
 
 
 @dataclass(frozen=True)
@@ -66,7 +62,8 @@ class Medium:
 
     def receiver(self, path: Path) -> dict[str, Any]:
         """Screen and camera, as the receiver of the file is told them."""
-        return {"screen": AUTO, "camera": []} if self.unknown else {"screen": self.screen, "camera": _camera_of(path)}
+        told = {"screen": self.screen, "camera": str(_profile_path(path))}
+        return {"screen": AUTO, "camera": []} if self.unknown else told
 
 
 MEDIA = (
@@ -160,10 +157,6 @@ def _profile_path(path: Path) -> Path:
     return path.with_name(path.stem + ".camera.toml")
 
 
-def _camera_of(path: Path) -> str:
-    return str(_profile_path(path))
-
-
 def write_capture(scene: Scene, path: Path, seed: int, bit_rate: int | None = None) -> None:
     from rxcli.lab.simulate.capture import prepare
     from rxcli.lab.simulate.tiff import write_dng
@@ -248,7 +241,7 @@ class _Reception:
         wall = 1e3 * (time.perf_counter() - start) / len(results)
         stages = {"ingest": 1e3 * self._ingest_s / len(results)}
         for name in dict.fromkeys(name for result in results for name in result.timing_ms):
-            if name not in _SUMS:
+            if name != "total":
                 stages[name] = sum(result.timing_ms.get(name, 0.0) for result in results) / len(results)
         return wall, stages, results
 
@@ -335,19 +328,6 @@ def growth_scene(megapixels: float, columns: int) -> Scene:
     return scene.scaled(factor, keep_readout=True) if factor != 1 else scene
 
 
-def peak_memory_mb() -> float:
-    """Peak resident memory of this process so far."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        # The kernel hands ru_maxrss of a parent on to its children; this figure is our own.
-        lines = status.read_text(encoding="ascii", errors="replace").splitlines()
-        return float(next(line.split()[1] for line in lines if line.startswith("VmHWM"))) / 1024
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
-
-
 _WORK = {"timing": _work_timing, "memory": _work_memory, "growth": _work_growth}
 
 
@@ -357,9 +337,7 @@ def in_process(task: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ReceiverError: it failed.
     """
-    environment = {**os.environ, **dict.fromkeys(THREAD_VARIABLES, str(task.get("threads", 1)))}
-    root = str(Path(__file__).resolve().parents[3])
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, (root, environment.get("PYTHONPATH"))))
+    environment = package_environment(task.get("threads", 1))
     command = [sys.executable, "-m", "rxcli.lab.benchmark.speed", json.dumps(task)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -411,7 +389,7 @@ def growth(axis: str, repeats: int, tick: Callable[[], None] = lambda: None) -> 
     """Measure growth over "megapixels" or "columns"; `tick` is called after every point."""
     x, ms = [], []
     for value in MEGAPIXELS if axis == "megapixels" else COLUMNS:
-        place = {"megapixels": _COLUMNS_AT_MP, "columns": 20, axis: value}
+        place = {"megapixels": _XS10_MP, "columns": 20, axis: value}
         record = in_process({"work": "growth", "repeats": repeats, "threads": 1, **place})
         x.append(float(value))
         ms.append(float(record["total_ms"]))

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from rxcli.lab.benchmark.journal import SEEDS_A_RUN, Journal, Record, Task, run_scenes
+from rxcli.lab.benchmark.journal import SEEDS_A_RUN, Record, Run, Task
 from rxcli.lab.benchmark.statistics import wilson
 from rxcli.lab.benchmark.trial import score_result, simulate_trial
 from rxcli.lab.benchmark.watch import problems_in, watched
@@ -179,11 +179,11 @@ class Verdict:
         return not self.scenes and self.within_rate
 
 
-def run(n_scenes: int, journal: Journal, *, seed: int = 0, jobs: int = 1, quiet: bool = False) -> Verdict:
+def run(n_scenes: int, how: Run) -> Verdict:
     """Receive `n_scenes` random scenes under watch."""
-    records = run_scenes("scenes", scene_record, n_scenes, journal, seed=seed, jobs=jobs, quiet=quiet)
+    records = how.scenes("scenes", scene_record, n_scenes)
     scenes: dict[str, list[int]] = {}
-    for number, record in enumerate(records, SEEDS_A_RUN * seed):
+    for number, record in enumerate(records, SEEDS_A_RUN * how.seed):
         for problem in record["problems"]:
             scenes.setdefault(problem, []).append(number)
     status = [str(record["status"]) for record in records]

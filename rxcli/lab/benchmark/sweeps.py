@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field, replace
 from math import sqrt
 from typing import Any
 
-from rxcli.lab.benchmark.journal import Journal, Record, Task, run_tasks
+from rxcli.lab.benchmark.journal import SEEDS_A_RUN, Record, Run, Task
 from rxcli.lab.benchmark.statistics import cluster_interval, pareto_front, wilson
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.benchmark.yardsticks import measure
@@ -348,12 +348,11 @@ def points_of(names: Iterable[str]) -> list[Point]:
     return [point for name in names for point in SWEEPS[name]()]
 
 
-def run(
-    points: Sequence[Point], n_frames: int, journal: Journal, *, seed: int = 0, jobs: int = 1, quiet: bool = False
-) -> list[Summary]:
+def run(points: Sequence[Point], n_frames: int, how: Run) -> list[Summary]:
     """Run every point on `n_frames` frames; one summary per point and method, receivers first."""
-    tasks = [{"point": asdict(point), "seed": 1_000_000 * seed + n} for point in points for n in range(n_frames)]
-    records = run_tasks(tasks, frame_of, journal, jobs=jobs, label="sweep", quiet=quiet)
+    seeds = range(SEEDS_A_RUN * how.seed, SEEDS_A_RUN * how.seed + n_frames)
+    tasks = [{"point": asdict(point), "seed": seed} for point in points for seed in seeds]
+    records = how.tasks("sweep", tasks, frame_of)
     summaries = []
     for number, point in enumerate(points):
         mine = records[number * n_frames : (number + 1) * n_frames]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from rxcli.lab.simulate.capture import Capture, simulate_frame
+from rxcli.ingest import open_source
+from rxcli.lab.simulate.capture import Capture, Take, simulate_frame
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.truth import build_camera_profile
@@ -50,14 +52,14 @@ class Trial:
     @cached_property
     def corners(self) -> FloatArray:
         """(4, 2) the screen's corners on the stored picture, top-left first, clockwise for a viewer."""
-        return stored_corners(self.capture)
+        scene = self.capture.scene
+        corrected = scene.isp.correct_distortion and scene.output == "developed"
+        return corners_on_picture(self.capture.exposure.view, corrected)
 
     @cached_property
     def truth(self) -> Truth:
         """What was sent."""
-        return msgspec.convert(
-            {**self.capture.truth, "payload": {int(k): v for k, v in self.capture.truth["payload"].items()}}, Truth
-        )
+        return msgspec.convert(self.capture.truth, Truth, str_keys=True)
 
     def options(self, *, known_outline: bool = True, **more: Any) -> ReceiverOptions:
         """Options of the receiver that name the screen and the camera.
@@ -89,15 +91,21 @@ def score_result(result: FrameResult, truth: Truth) -> tuple[FrameResult, Score]
     return scored, scorer.score()
 
 
+def receive_clip(path: Path, options: ReceiverOptions, truth: Truth) -> tuple[list[FrameResult], Score]:
+    """The results of a clip's frames, wrong bits filled in, and their score."""
+    scorer = Scorer(truth)
+    results = [scorer.add(result) for result in receive(open_source(path), options)]
+    return results, scorer.score()
+
+
+def truth_of(take: Take) -> Truth:
+    """What all frames of a take send."""
+    return msgspec.convert(take.truth("clip"), Truth, str_keys=True)
+
+
 def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False, threads: int = 1) -> Trial:
     """Simulate one frame of `scene`; equal seeds give equal pixels."""
     return Trial(simulate_frame(scene, np.random.default_rng(seed), oracle=oracle, threads=threads))
-
-
-def stored_corners(capture: Capture) -> FloatArray:
-    """(4, 2) corners of the screen on the stored picture: on the sensor, or where in-camera correction moves them."""
-    scene = capture.scene
-    return corners_on_picture(capture.exposure.view, scene.isp.correct_distortion and scene.output == "developed")
 
 
 def corners_on_picture(view: View, corrected: bool) -> FloatArray:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
-from rxcli.lab.simulate.pictures import GENERATED, PHOTOS, load_picture
+from rxcli.lab.simulate.pictures import draw_name, load_picture
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -172,10 +172,17 @@ def _rippling(rng: np.random.Generator, scene: _Scene) -> _Scene:
 
 def _picture(rng: np.random.Generator, width: int, height: int) -> Float32Array:
     """(height, width) a photograph or drawing, as light."""
-    names = [*PHOTOS, *(name for name in GENERATED if name != "black")]
-    rgb = load_picture(str(rng.choice(names)), width, height)
-    grey = np.asarray(rgb, np.float32).mean(axis=2) / 255
-    return np.asarray(grey[:, :: rng.choice([-1, 1])] ** np.float32(2.2), np.float32)
+    light = _light_of(load_picture(draw_name(rng), width, height))
+    return np.ascontiguousarray(light[:, :: rng.choice([-1, 1])])
+
+
+def _dark_picture(rng: np.random.Generator) -> Float32Array:
+    """(384, 683) light of a picture most of which is black."""
+    return _light_of(draw_dark_picture(str(rng.choice(DARK_KINDS)), rng, 683, 384))
+
+
+def _light_of(rgb: NDArray[np.uint8]) -> Float32Array:
+    return np.asarray((np.asarray(rgb, np.float32).mean(axis=2) / 255) ** np.float32(2.2), np.float32)
 
 
 def _on_screen(rng: np.random.Generator, picture: Float32Array, width: int, height: int) -> _Scene:
@@ -222,9 +229,7 @@ def _pwm_dark(rng: np.random.Generator, width: int, height: int) -> _Scene:
     if rng.random() < 0.5:
         dim = _picture(rng, 683, 384) * np.float32(rng.uniform(0.02, 0.2))
         return _switched(rng, _on_screen(rng, dim, width, height))
-    rgb = draw_dark_picture(str(rng.choice(DARK_KINDS)), rng, 683, 384)
-    dark = (np.asarray(rgb, np.float32).mean(axis=2) / 255) ** np.float32(2.2)
-    return _switched(rng, _on_screen(rng, dark, width, height))
+    return _switched(rng, _on_screen(rng, _dark_picture(rng), width, height))
 
 
 def _lamp(rng: np.random.Generator, width: int, height: int) -> _Scene:
@@ -300,10 +305,8 @@ def _photo(rng: np.random.Generator, width: int, height: int) -> _Scene:
 
 def _glowing(rng: np.random.Generator, width: int, height: int) -> _Scene:
     """A screen without stripes."""
-    if rng.random() < 0.3:
-        rgb = draw_dark_picture(str(rng.choice(DARK_KINDS)), rng, 683, 384)
-        return _on_screen(rng, (np.asarray(rgb, np.float32).mean(axis=2) / 255) ** np.float32(2.2), width, height)
-    return _on_screen(rng, _picture(rng, 683, 384), width, height)
+    picture = _dark_picture(rng) if rng.random() < 0.3 else _picture(rng, 683, 384)
+    return _on_screen(rng, picture, width, height)
 
 
 def _noise(rng: np.random.Generator, width: int, height: int) -> _Scene:

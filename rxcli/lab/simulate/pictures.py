@@ -27,6 +27,11 @@ PHOTOS: dict[str, str] = {
 GENERATED = ("white", "grey", "sky", "gradient", "bars", "noise", "checker", "text", "flower", "night", "black")
 
 
+def draw_name(rng: np.random.Generator) -> str:
+    """The name of a picture that shows something."""
+    return str(rng.choice([name for name in picture_names() if name != "black"]))
+
+
 def picture_names() -> tuple[str, ...]:
     """Names that `load_picture` knows."""
     return (*PHOTOS, *GENERATED)

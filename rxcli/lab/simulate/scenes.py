@@ -14,7 +14,7 @@ from rxcli.errors import UsageError
 from rxcli.lab.simulate.camera import Room
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import Lens, Pose
-from rxcli.lab.simulate.pictures import GENERATED, PHOTOS
+from rxcli.lab.simulate.pictures import draw_name
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.lab.simulate.transmitter import Dimming, LabelSource, Weights
 from rxcli.profiles import ScreenProfile, load_profile
@@ -249,7 +249,7 @@ def random_scene(rng: np.random.Generator, *, scale: float = 1.0, output: Output
     )
     scene = replace(
         base,
-        picture=str(rng.choice([*PHOTOS, *(name for name in GENERATED if name != "black")])),
+        picture=draw_name(rng),
         w="dimming" if rng.random() < 0.3 else int(rng.integers(2, 9)),
         pose=pose,
         room=replace(
