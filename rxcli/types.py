@@ -395,3 +395,8 @@ class FrameResult:
     link_notes: tuple[str, ...] = ()
     #: The process that decoded the source was ended from outside: a run that is resumed tries the source again.
     retry: bool = False
+
+    @property
+    def packets(self) -> tuple[PacketResult, ...]:
+        """Those of all columns."""
+        return tuple(packet for column in self.columns for packet in column.packets)

@@ -391,9 +391,9 @@ class _Run:
             self._summaries.append(summary)
 
     def _keep_estimate(self, result: FrameResult) -> None:
-        most = _n_packets(self._estimated) if self._estimated else 0
+        most = len(self._estimated.packets) if self._estimated else 0
         # An estimate that received nothing may be wrong, and a profile is not doubted.
-        if "line_delay_s" in result.estimated and _n_packets(result) > most:
+        if "line_delay_s" in result.estimated and len(result.packets) > most:
             self._estimated = result
 
     def _save_camera(self, path: Path) -> None:
@@ -455,10 +455,6 @@ def _baseline(options: dict[str, Any]) -> Baseline | None:
 
     asked = options["min_confidence"]
     return load_baseline(options["baseline"], MIN_CONFIDENCE if asked is None else asked, options["slower"])
-
-
-def _n_packets(result: FrameResult) -> int:
-    return sum(len(column.packets) for column in result.columns)
 
 
 def _order(names: list[str]) -> Any:

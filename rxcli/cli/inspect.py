@@ -68,7 +68,7 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
         for line in format_link(result):
             click.echo(line, err=True)
     click.echo(page)
-    received = any(column.packets for result in results for column in result.columns)
+    received = any(result.packets for result in results)
     return ExitCode.OK if received else ExitCode.NOT_RECEIVED
 
 
@@ -97,7 +97,7 @@ def _received(
     frames = _noting(decoder.open_source(path), first)
     received = list(decoder.linked(decoder.receive(frames, options)))
     results = [scorer.add(result) if scorer else result for result in received]
-    best = max(results, key=lambda result: sum(len(column.packets) for column in result.columns), default=None)
+    best = max(results, key=lambda result: len(result.packets), default=None)
     if best is None or (number is not None and number >= len(results)):
         raise InputError(f"{path}: has no frame {number or 0}", "choose a lower --frame")
     shown = best.frame if number is None else number

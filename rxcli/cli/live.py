@@ -165,7 +165,7 @@ def _writer(json_path: str | None, stack: ExitStack) -> Callable[[FrameResult], 
     def show(result: FrameResult) -> None:
         for line in format_link(result):
             click.echo(line)
-        if any(column.packets for column in result.columns):
+        if result.packets:
             _print_above(format_frame(result))
 
     if json_path is None:
@@ -243,7 +243,7 @@ class Status:
         before, self.state = self.state, self._aim.update(result, now, self._height, self._light)
         self._files = list(files)
         self.n_complete += len(result.messages) + len(result.objects)
-        self.n_packets += sum(len(column.packets) for column in result.columns)
+        self.n_packets += len(result.packets)
         self.show_if_due(now, changed=before is None or before.word != self.state.word)
 
     def show_if_due(self, now: float | None = None, changed: bool = False) -> None:

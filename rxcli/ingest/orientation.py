@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 _T = TypeVar("_T", bound=np.generic)
-Transform = Callable[[NDArray[_T]], NDArray[_T]]
 
 #: Orientation -> (quarter turns counter-clockwise, then mirrored left to right).
 _TURNS = {

@@ -157,7 +157,7 @@ class Control(ctypes.Structure):
 
 
 class BufferType(ctypes.Structure):
-    """The int that VIDIOC_STREAMON and VIDIOC_STREAMOFF take."""
+    """The int that VIDIOC_STREAMON takes."""
 
     _fields_ = [("value", _i32)]
 
@@ -175,7 +175,6 @@ QUERYBUF = _request(_BOTH, 9, Buffer)
 QBUF = _request(_BOTH, 15, Buffer)
 DQBUF = _request(_BOTH, 17, Buffer)
 STREAMON = _request(_WRITE, 18, BufferType)
-STREAMOFF = _request(_WRITE, 19, BufferType)
 S_PARM = _request(_BOTH, 22, StreamParameters)
 G_CTRL = _request(_BOTH, 27, Control)
 S_CTRL = _request(_BOTH, 28, Control)

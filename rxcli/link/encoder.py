@@ -43,11 +43,6 @@ class Sending(Protocol):
         ...
 
     @property
-    def information_bits(self) -> int:
-        """Bits with CRCs, before coding."""
-        ...
-
-    @property
     def summary(self) -> str:
         """One line for people."""
         ...
@@ -76,11 +71,6 @@ class MessageSending:
     def _buffer(self, layout: BeaconLayout) -> NDArray[np.uint8]:
         buffer: NDArray[np.uint8] = ldpc.encode(layout.code, _bits(_protect_beacon(self.body))[None])[0]
         return buffer
-
-    @property
-    def information_bits(self) -> int:
-        """Bits with the CRC, before coding."""
-        return 8 * (len(self.body) + 4)
 
     @property
     def summary(self) -> str:
@@ -157,11 +147,6 @@ class FileSending:
                 ]
             )
         return self._coded
-
-    @property
-    def information_bits(self) -> int:
-        """Bits with CRCs, before coding."""
-        return 8 * (len(self.container) + 4 * -(-len(self.container) // 1052))
 
     @property
     def summary(self) -> str:

@@ -197,7 +197,7 @@ class FileState:
         container = b"".join(self.blocks[number] for number in range(self.layout.n_blocks))[: self.layout.length]
         try:
             if zlib.crc32(container) != self.announcement.container_crc:
-                raise ContainerError("its blocks do not give the CRC-32 that was announced", wrong_hash=True)
+                raise ContainerError("its blocks do not give the CRC-32 that was announced")
             found = unpack_container(container, max_bytes)
         except ContainerError as error:
             self.failure = str(error)
@@ -251,11 +251,6 @@ class FileSearch:
         self._fresh: list[tuple[_Timeline, _Burst]] = []
         #: Sentences about what was refused.
         self.notes: list[str] = []
-
-    @property
-    def in_file(self) -> bool:
-        """Whether the latest epoch is known to send a file."""
-        return bool(self._timelines)
 
     def knows(self, epoch: int) -> bool:
         """Whether an announcement of this epoch was read."""

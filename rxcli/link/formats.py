@@ -33,10 +33,10 @@ def protect(data: bytes, object_id: int, block: int, crc_prefix: bytes = b"") ->
     return whiten(data + crc.to_bytes(CRC_BYTES, "big"), object_id, block)
 
 
-def unprotect(coded: bytes, object_id: int, block: int, crc_prefix: bytes = b"") -> bytes | None:
+def unprotect(coded: bytes, object_id: int, block: int) -> bytes | None:
     """The data of a block as `protect` made it; None where the CRC does not fit."""
     plain = whiten(coded, object_id, block)
-    return plain[:-CRC_BYTES] if has_crc(plain, crc_prefix) else None
+    return plain[:-CRC_BYTES] if has_crc(plain) else None
 
 
 def has_crc(plain: bytes, crc_prefix: bytes = b"") -> bool:
@@ -175,11 +175,7 @@ class Container:
 
 
 class ContainerError(ValueError):
-    """A container that cannot be what was sent, or lies; `wrong_hash` where only its hash does not fit."""
-
-    def __init__(self, message: str, wrong_hash: bool = False) -> None:
-        super().__init__(message)
-        self.wrong_hash = wrong_hash
+    """A container that cannot be what was sent, or lies."""
 
 
 def unpack_container(container: bytes, max_bytes: int) -> Container:
@@ -209,7 +205,7 @@ def unpack_container(container: bytes, max_bytes: int) -> Container:
         raise ContainerError(f"the file says it has {length} bytes and has {'more' if len(data) > length else 'fewer'}")
     found = hashlib.sha256(data).digest()
     if found != digest:
-        raise ContainerError("the file's SHA-256 does not fit", wrong_hash=True)
+        raise ContainerError("the file's SHA-256 does not fit")
     name = container[_CONTAINER_HEAD.size : at].decode("utf-8", "replace")
     return Container(safe_name(name), data, found.hex())
 

@@ -102,10 +102,9 @@ class Aim:
             height: of the frame, pixels.
             light: of the newest frame.
         """
-        packets = [packet for column in result.columns for packet in column.packets]
-        bits = sum(packet.payload_bits for packet in packets)
-        wrong = sum(packet.payload_bits * packet.ber_hat for packet in packets)
-        self._recent.append(_Moment(now_s, len(packets), bits, wrong))
+        bits = sum(packet.payload_bits for packet in result.packets)
+        wrong = sum(packet.payload_bits * packet.ber_hat for packet in result.packets)
+        self._recent.append(_Moment(now_s, len(result.packets), bits, wrong))
         while len(self._recent) > 2 and self._recent[0].time_s < now_s - WINDOW_S:
             self._recent.popleft()
         locked = result.status in _LOCKED

@@ -124,7 +124,7 @@ def _path(x: FloatArray, y: FloatArray) -> str:
 
 
 def _summary(frame: Frame, result: FrameResult) -> str:
-    packets = sum(len(column.packets) for column in result.columns)
+    packets = len(result.packets)
     columns = sum(bool(column.packets) for column in result.columns)
     facts = {
         "Picture": f"{frame.width} x {frame.height}",
@@ -149,13 +149,12 @@ def _summary(frame: Frame, result: FrameResult) -> str:
 
 def _steps(result: FrameResult) -> str:
     """How far reception came."""
-    packets = any(column.packets for column in result.columns)
     done = [
         ("picture read", result.status != "unreadable"),
         ("screen found", result.corners is not None),
         ("camera known", bool(result.line_delay_s)),
         ("clock found", bool(result.columns)),
-        ("packets decoded", packets),
+        ("packets decoded", bool(result.packets)),
     ]
     items, failed = [], False
     for name, good in done:
@@ -242,7 +241,7 @@ def _told(columns: Iterable[ColumnResult]) -> str:
 def _timeline(results: Sequence[FrameResult]) -> str:
     if len(results) < 2:
         return ""
-    counts = [sum(len(column.packets) for column in result.columns) for result in results]
+    counts = [len(result.packets) for result in results]
     most, step = max(max(counts), 1), _WIDTH / len(results)
     bars = []
     for number, (result, n) in enumerate(zip(results, counts, strict=True)):
@@ -502,7 +501,7 @@ def _confidence(result: FrameResult) -> str:
             cells.append(
                 f'<text x="{50 + (place + 0.5) * step:.0f}" y="{n_packets * height + 18}" text-anchor="middle">{column.column}</text>'
             )
-    found = [packet.confidence for column in result.columns for packet in column.packets]
+    found = [packet.confidence for packet in result.packets]
     told = f"{plural(len(found), 'packet')}; {sum(value >= 0.9 for value in found)} with a confidence of 0.9 or more."
     return _section(
         "Confidence",

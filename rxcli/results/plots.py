@@ -25,11 +25,6 @@ def in_time_order(
     return blind.in_time_order(profiles, frame.height), columns
 
 
-def lowest_confidence(column: ColumnResult) -> float:
-    """The lowest confidence of a column's packets, 0 where there are none."""
-    return min((packet.confidence for packet in column.packets), default=0.0)
-
-
 def column_light(profiles: RowProfiles, column: int) -> tuple[FloatArray, FloatArray]:
     """Sensor rows (n,) and mean light (n,) of one column, where it is on the screen."""
     inside = profiles.inside[column]

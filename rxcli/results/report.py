@@ -390,8 +390,7 @@ def _counts(result: FrameResult) -> str:
     if _goes_on(result):
         return "its packets end in later frames"
     with_packets = sum(bool(column.packets) for column in result.columns)
-    n_packets = sum(len(column.packets) for column in result.columns)
-    return f"{plural(n_packets, 'packet')} in {with_packets} of {plural(len(result.columns), 'column')}"
+    return f"{plural(len(result.packets), 'packet')} in {with_packets} of {plural(len(result.columns), 'column')}"
 
 
 def result_in_words(result: FrameResult) -> str:
@@ -431,13 +430,12 @@ def wrapped(text: str, width: int) -> str:
 
 
 def _is_clip(result: FrameResult) -> bool:
-    bursts = any(packet.burst is not None for column in result.columns for packet in column.packets)
-    return result.frame > 0 or bursts or _goes_on(result)
+    return result.frame > 0 or any(packet.burst is not None for packet in result.packets) or _goes_on(result)
 
 
 def _goes_on(result: FrameResult) -> bool:
     """Whether a frame of a clip was received, and all its bursts go on in the next."""
-    return result.status == "ok" and bool(result.columns) and not any(column.packets for column in result.columns)
+    return result.status == "ok" and bool(result.columns) and not result.packets
 
 
 def _rows(result: FrameResult) -> Iterator[str]:
@@ -484,12 +482,11 @@ def _confidence(value: float) -> str:
     return _cell(math.floor(value * 1e4) / 1e4 if math.isfinite(value * 1e4) else None, ".4f")
 
 
-def shorten(payload: str, digits: int = _SHOWN_DIGITS) -> str:
-    """The payload's first and last digits where it is longer than `digits`."""
-    if len(payload) <= digits:
+def shorten(payload: str) -> str:
+    """The payload's first and last digits where it has more than are shown."""
+    if len(payload) <= _SHOWN_DIGITS:
         return payload
-    tail = 4
-    return f"{payload[: digits - tail - 1]}…{payload[-tail:]}"
+    return f"{payload[: _SHOWN_DIGITS - 5]}…{payload[-4:]}"
 
 
 def format_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:

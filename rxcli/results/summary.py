@@ -65,7 +65,7 @@ class SourceSummary:
 
     def add(self, result: FrameResult) -> None:
         """Count one frame."""
-        packets = [packet for column in result.columns for packet in column.packets]
+        packets = result.packets
         self.n_frames += 1
         self.statuses[result.status] += 1
         self.n_packets += len(packets)

@@ -136,7 +136,7 @@ def _frame_of(picture: Picture) -> Frame:
     return first
 
 
-def frame_of_array(pixels: NDArray[Any], source: str = "array", index: int = 0, time_s: float = 0.0) -> Frame:
+def frame_of_array(pixels: NDArray[Any]) -> Frame:
     """A frame of grey values as a camera stores them, rows in the order of readout.
 
     Raises:
@@ -147,7 +147,7 @@ def frame_of_array(pixels: NDArray[Any], source: str = "array", index: int = 0, 
             f"a picture must be a (height, width) array of uint8 or uint16 (got {pixels.shape} of {pixels.dtype})",
             "of a colour picture take the green channel, or its luma",
         )
-    return Frame(pixels, source, index, time_s, white=float(np.iinfo(pixels.dtype).max))
+    return Frame(pixels, "array", white=float(np.iinfo(pixels.dtype).max))
 
 
 def _numbered(pictures: Iterable[Picture]) -> Iterator[Frame]:

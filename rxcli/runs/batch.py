@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
 from rxcli.outputs import OUTPUT_MARKER
-from rxcli.runs.journal import Journal as Journal
-from rxcli.runs.journal import recover as recover
 from rxcli.runs.processes import ONE_THREAD, environment
 from rxcli.types import Frame, FrameResult, FrameSoftBits
 

@@ -109,6 +109,6 @@ def test_plane_marks_the_front_and_intervals_hold_the_rate() -> None:
     low, high = row["ber95"]
     assert low < row["ber"] == 10 / 770 < high
     assert row["error_free"] == 0.8
-    record = summaries[0].outcomes[0].as_record()
+    record = asdict(summaries[0].outcomes[0])
     assert sweeps.Outcome.from_record(record) == summaries[0].outcomes[0]
     assert sweeps.Point(**asdict(summaries[0].point)) == summaries[0].point

@@ -263,7 +263,7 @@ def test_correction_in_the_camera_undoes_the_lens() -> None:
 def test_random_scenes_render_without_a_complaint() -> None:
     rng = np.random.default_rng(6)
     for _ in range(6):
-        scene = random_scene(rng, scale=0.05)
+        scene = random_scene(rng).scaled(0.05, 1.0)
         scene = scene.scaled(1.0, 0.2)
         pixels = simulate_frame(scene, rng).pixels
         assert pixels.shape == (scene.sensor.height, scene.sensor.width)

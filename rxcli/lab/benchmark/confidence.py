@@ -14,9 +14,8 @@ from rxcli.lab.benchmark.statistics import wilson
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.pictures import draw_name
 from rxcli.lab.simulate.scenes import Scene, preset
-from rxcli.types import FrameResult
+from rxcli.types import FloatArray, FrameResult
 
-FloatArray = NDArray[np.float64]
 N_BINS = 10
 _SCREENS = ("paper-8k65", "paper-17k3", "paper-34k6")
 _PRESETS = ("video-1080p", "phone-plain", "xs10-still")
@@ -29,8 +28,8 @@ _FEW_ROWS_SHARE, _FEW_ROWS, _FEW_ROWS_WIDTH_PX = 0.4, (1.5, 5.0), (100.0, 900.0)
 _LIGHT = (-1.4, 0.1)
 #: Terms of what confidences are made of: of photographs, and of clips whose picture is known.
 TERMS = (8, 3)
-#: Confidences are kept this far from 0 and 1 where their logarithm is taken.
-_EDGE = 1e-6
+#: Confidences are kept this far from 0 and 1 where their logarithm is taken; steps of Newton's method.
+_EDGE, _MOST_STEPS = 1e-6, 100
 
 
 @dataclass(frozen=True)
@@ -155,12 +154,12 @@ def reported_packets(result: FrameResult, sent_w: Sequence[int]) -> list[Record]
     ]
 
 
-def calibration(records: Sequence[Record], n_bins: int = N_BINS) -> Calibration:
-    """Bins, scores and a suggested scaling from the records of `run`."""
+def calibration(records: Sequence[Record]) -> Calibration:
+    """Bins, scores and a suggested scaling from the records of `packets_of`."""
     packets = [packet for record in records for packet in record["packets"]]
     confidence = np.array([p["confidence"] for p in packets], np.float64)
     right = np.array([p["bit_errors"] == 0 for p in packets], bool)
-    bins = bin_outcomes(confidence, right, n_bins)
+    bins = bin_outcomes(confidence, right)
     scaling = fit_scaling(confidence, right)
     n = max(len(packets), 1)
     return Calibration(
@@ -187,21 +186,20 @@ def _fitted_weights(packets: Sequence[Record], right: NDArray[np.bool_]) -> dict
     return fitted
 
 
-def bin_outcomes(confidence: FloatArray, right: NDArray[np.bool_], n_bins: int = N_BINS) -> tuple[Bin, ...]:
-    """Packets sorted into `n_bins` equal bins of confidence.
+def bin_outcomes(confidence: FloatArray, right: NDArray[np.bool_]) -> tuple[Bin, ...]:
+    """Packets sorted into `N_BINS` equal bins of confidence; one of 1 belongs to the last.
 
     Args:
         confidence: (n,) 0..1.
         right: (n,) whether the packet is error-free.
-        n_bins: number of bins; a confidence of 1 belongs to the last.
     """
-    number = np.minimum((confidence * n_bins).astype(np.int64), n_bins - 1)
-    count = np.bincount(number, minlength=n_bins)
-    hits = np.bincount(number, weights=right, minlength=n_bins)
-    total = np.bincount(number, weights=confidence, minlength=n_bins)
+    number = np.minimum((confidence * N_BINS).astype(np.int64), N_BINS - 1)
+    count = np.bincount(number, minlength=N_BINS)
+    hits = np.bincount(number, weights=right, minlength=N_BINS)
+    total = np.bincount(number, weights=confidence, minlength=N_BINS)
     return tuple(
-        Bin(i / n_bins, (i + 1) / n_bins, int(count[i]), int(hits[i]), float(total[i] / max(count[i], 1)))
-        for i in range(n_bins)
+        Bin(i / N_BINS, (i + 1) / N_BINS, int(count[i]), int(hits[i]), float(total[i] / max(count[i], 1)))
+        for i in range(N_BINS)
     )
 
 
@@ -220,9 +218,7 @@ def fit_scaling(confidence: FloatArray, right: NDArray[np.bool_]) -> Scaling | N
     return Scaling(float(offset), float(slope))
 
 
-def logistic_regression(
-    terms: FloatArray, right: NDArray[np.bool_], prior: FloatArray | None = None, iterations: int = 100
-) -> FloatArray:
+def logistic_regression(terms: FloatArray, right: NDArray[np.bool_], prior: FloatArray | None = None) -> FloatArray:
     """Weights (k,) that make the outcomes likeliest, by Newton's method.
 
     A tiny pull towards `prior` keeps them finite where the outcomes can be separated.
@@ -231,11 +227,10 @@ def logistic_regression(
         terms: (n, k).
         right: (n,) outcomes.
         prior: (k,), 0 by default.
-        iterations: steps at most.
     """
     prior = np.zeros(terms.shape[1]) if prior is None else prior
     weights = prior.copy()
-    for _ in range(iterations):
+    for _ in range(_MOST_STEPS):
         p = 1 / (1 + np.exp(-np.clip(terms @ weights, -50, 50)))
         gradient = terms.T @ (right - p) - 1e-3 * (weights - prior)
         step = np.linalg.solve((terms.T * (p * (1 - p))) @ terms + 1e-3 * np.eye(weights.size), gradient)

@@ -60,7 +60,7 @@ def packets_of(task: Task) -> Record:
     seed, number = divmod(task["seed"], SEEDS_A_RUN)
     drawn = draw(seed, number, task["camera"], task["n_frames"])
     results = list(receive(drawn.frames, drawn.options))
-    confidences = [p.confidence for r in results for c in r.columns for p in c.packets]
+    confidences = [packet.confidence for result in results for packet in result.packets]
     return {
         "number": number,
         "kind": drawn.made.kind,

@@ -82,7 +82,7 @@ def packets_of(task: Task) -> Record:
     out: dict[str, Any] = {"kind": kind, "camera": scene.camera_name, "screen": scene.screen.name}
     for name, corners in (("searched", False), ("given", True)):
         result, score = score_result(receive_frame(trial.frame, options_of(trial, corners)), trial.truth)
-        confident = [p for c in result.columns for p in c.packets if p.confidence >= CONFIDENT]
+        confident = [packet for packet in result.packets if packet.confidence >= CONFIDENT]
         out[name] = {
             "status": result.status,
             "error_free": score.error_free,

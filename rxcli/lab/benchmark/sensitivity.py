@@ -180,9 +180,8 @@ def received(task: Task) -> Record:
             except Exception as error:
                 out.append({"broke": repr(error), "right": 0, "surely_wrong": 0})
                 continue
-            packets = [packet for column in result.columns for packet in column.packets]
-            right = sum(packet.bit_errors == 0 for packet in packets)
-            sure = sum(p.bit_errors != 0 and p.confidence >= screens.CONFIDENT for p in packets)
+            right = sum(packet.bit_errors == 0 for packet in result.packets)
+            sure = sum(p.bit_errors != 0 and p.confidence >= screens.CONFIDENT for p in result.packets)
             out.append({"right": right, "surely_wrong": sure})
         cpu_s = time.process_time() - start
     return {"frames": out, "cpu_s": cpu_s}

@@ -378,7 +378,7 @@ class Growth:
     @property
     def exponent(self) -> float:
         """Of the power law nearest to the points."""
-        return power_law(self.x, self.ms)[0]
+        return power_law(self.x, self.ms)
 
     def as_rows(self) -> list[dict[str, Any]]:
         """A table."""

@@ -127,12 +127,11 @@ def scene_record(task: Task) -> Record:
     if result is None:
         return {"problems": problems, "status": "exception", "confident": 0, "wrong": 0, "packets": 0, "false": 0}
     scored, score = score_result(result, trial.truth)
-    packets = [packet for column in scored.columns for packet in column.packets]
-    confident = [packet for packet in packets if packet.confidence >= CONFIDENT]
+    confident = [packet for packet in scored.packets if packet.confidence >= CONFIDENT]
     return {
         "problems": problems,
         "status": result.status,
-        "packets": len(packets),
+        "packets": len(scored.packets),
         "false": score.false,
         "confident": len(confident),
         "wrong": sum(packet.bit_errors != 0 for packet in confident),

@@ -6,9 +6,6 @@ from collections.abc import Sequence
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
-
-FloatArray = NDArray[np.float64]
 
 #: Two-sided 95 % quantile of the normal distribution.
 Z95 = 1.959963984540054
@@ -33,8 +30,8 @@ def wilson(successes: float, trials: float, z: float = Z95) -> tuple[float, floa
     return low, high
 
 
-def power_law(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
-    """Exponent and factor of the power law `y = factor * x ** exponent` nearest to the points in logarithms.
+def power_law(x: Sequence[float], y: Sequence[float]) -> float:
+    """Exponent of the power law `y = factor * x ** exponent` nearest to the points in logarithms.
 
     Raises:
         ValueError: fewer than two different x, or a value that is not positive.
@@ -43,8 +40,7 @@ def power_law(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
     if points.min(initial=np.inf) <= 0 or np.unique(points[0]).size < 2:
         raise ValueError(f"a power law needs positive values at two or more places (got {list(x)}, {list(y)})")
     log_x, log_y = np.log(points)
-    exponent, offset = np.polyfit(log_x, log_y, 1)
-    return float(exponent), float(np.exp(offset))
+    return float(np.polyfit(log_x, log_y, 1)[0])
 
 
 def pareto_front(costs: Sequence[tuple[float, float]]) -> list[bool]:

@@ -21,7 +21,6 @@ from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import packet_slots, payload_bits
 from rxcli.receiver.pipeline import SKIPS, ReceiverOptions
 from rxcli.results.truth import Score
-from rxcli.types import FrameResult
 
 #: Names of the yardsticks among the methods.
 BOUND, PAPER = "bound", "paper"
@@ -225,13 +224,9 @@ class Outcome:
     #: Wall time by stage, milliseconds; empty for the bound.
     timing_ms: dict[str, float] = field(default_factory=dict)
 
-    def as_record(self) -> Record:
-        """As JSON values."""
-        return {"score": asdict(self.score), "reported": self.reported, "timing_ms": self.timing_ms}
-
     @classmethod
     def from_record(cls, record: Record) -> Outcome:
-        """The inverse of `as_record`."""
+        """The inverse of `asdict`."""
         return cls(Score(**record["score"]), record["reported"], record["timing_ms"])
 
 
@@ -244,7 +239,7 @@ def frame_of(task: Task) -> Record:
     outcomes = {name: _receive(trial, name) for name in point.receivers}
     outcomes[BOUND] = Outcome(yardsticks.bound, _received(yardsticks.bound))
     outcomes[PAPER] = Outcome(yardsticks.paper, _received(yardsticks.paper), {"total": yardsticks.paper_ms})
-    return {name: outcome.as_record() for name, outcome in outcomes.items()}
+    return {name: asdict(outcome) for name, outcome in outcomes.items()}
 
 
 def _received(score: Score) -> int:
@@ -255,11 +250,7 @@ def _receive(trial: Trial, name: str) -> Outcome:
     more, known = RECEIVERS[name]
     options: ReceiverOptions = trial.options(known_outline=known, **more)
     result, score = trial.receive(options)
-    return Outcome(score, _reported(result), result.timing_ms)
-
-
-def _reported(result: FrameResult) -> int:
-    return sum(len(column.packets) for column in result.columns)
+    return Outcome(score, len(result.packets), result.timing_ms)
 
 
 def _packet_clusters(scores: Sequence[Score]) -> tuple[list[float], list[float]]:

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.simulate.camera import Band, Exposure, column_light, grid_nodes
+from rxcli.lab.simulate.camera import Band, Exposure, column_light
+from rxcli.lab.simulate.optics import grid_nodes
 from rxcli.lab.simulate.shutter import overlaps
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 

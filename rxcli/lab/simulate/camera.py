@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
-from rxcli.lab.simulate.optics import View, project
+from rxcli.lab.simulate.optics import View, between_nodes, grid_nodes, project
 from rxcli.lab.simulate.sensor import Sensor, count_electrons, pick_colours, repeat_gains, to_raw
 from rxcli.lab.simulate.shutter import flicker, lit_share
 from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
@@ -252,11 +252,6 @@ class Band:
         return np.asarray(self.picture * light + self.room)
 
 
-def grid_nodes(width: int, pitch: int) -> FloatArray:
-    """Nodes that `cv2.resize` by `pitch` lays on pixel centres, with one cell to spare on either side."""
-    return np.arange(-1, -(-width // pitch) + 1, dtype=np.float64) * pitch + (pitch - 1) / 2
-
-
 def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
     """Expected light of the sensor rows `top` to `bottom`."""
     height, width = bottom - top, exposure.sensor.width
@@ -270,8 +265,6 @@ def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
 
 def _texture_places(exposure: Exposure, top: int, bottom: int) -> tuple[FloatArray, Float32Array, Float32Array]:
     """Nodes across, and for every pixel the place in the texture, interpolated between nodes."""
-    import cv2
-
     pitch = 16
     x, y = grid_nodes(exposure.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
     place = exposure.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
@@ -279,8 +272,7 @@ def _texture_places(exposure: Exposure, top: int, bottom: int) -> tuple[FloatArr
     panel_height, panel_width = exposure.drive.grey.shape[:2]
     scale = np.array([panel_width * across, panel_height * down])
     nodes = np.clip(place * scale - 0.5 + _TEXTURE_MARGIN, -1e4, 1e5).astype(np.float32)
-    full = cv2.resize(nodes, (x.size * pitch, y.size * pitch), interpolation=cv2.INTER_LINEAR)
-    inner = full[pitch : pitch + bottom - top, pitch : pitch + exposure.sensor.width]
+    inner = between_nodes(nodes, pitch, bottom - top, exposure.sensor.width)
     return grid_nodes(exposure.sensor.width, exposure.grid_pitch), inner[..., 0], inner[..., 1]
 
 
@@ -327,8 +319,6 @@ def _room_light(exposure: Exposure, top: int, bottom: int) -> Float32Array:
 
 def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     """(rows, width) share of the room's light that every pixel sees, against white paper."""
-    import cv2
-
     pitch, room, screen = 8, exposure.room, exposure.link.screen
     x, y = grid_nodes(exposure.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
     place = exposure.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
@@ -340,8 +330,7 @@ def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     panel = room.panel_reflectance + room.lamp * np.exp(-0.5 * (from_lamp**2).sum(axis=-1) / room.lamp_size**2)
     frame = room.bezel_reflectance + (room.wall_reflectance - room.bezel_reflectance) * on_wall
     seen = (panel + (frame - panel) * off_panel).astype(np.float32)
-    full = cv2.resize(seen, (x.size * pitch, y.size * pitch), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(full[pitch : pitch + bottom - top, pitch : pitch + exposure.sensor.width])
+    return between_nodes(seen, pitch, bottom - top, exposure.sensor.width)
 
 
 BandVisitor = Callable[[Band, Float32Array], None]

@@ -215,16 +215,13 @@ def _delays(scene: Scene, rng: np.random.Generator) -> FloatArray:
     return drawn * scene.column_delay_slots
 
 
-def simulate_frame(
-    scene: Scene, rng: np.random.Generator | int, *, frame: int = 0, oracle: bool = False, threads: int = 2
-) -> Capture:
-    """Simulate one frame of a scene.
+def simulate_frame(scene: Scene, rng: np.random.Generator | int, *, oracle: bool = False, threads: int = 2) -> Capture:
+    """Simulate the first frame of a scene.
 
     Args:
         scene: what to simulate.
         rng: source of randomness, or a seed; equal ones give equal pixels.
-        frame: number of the frame in the scene's clip.
         oracle: also record what the genie-aided bound needs.
         threads: bands of rows computed at the same time; the pixels do not depend on it.
     """
-    return prepare(scene, rng).frame(frame, oracle=oracle, threads=threads)
+    return prepare(scene, rng).frame(oracle=oracle, threads=threads)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from fractions import Fraction
 from pathlib import Path
 
@@ -47,4 +46,4 @@ def write_png(rgb: NDArray[np.generic], path: Path) -> None:
 
     ok, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
     assert ok, "PNG takes any picture of 8 or 16 bits"
-    path.write_bytes(io.BytesIO(data.tobytes()).getvalue())
+    path.write_bytes(data.tobytes())

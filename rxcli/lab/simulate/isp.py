@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.simulate.optics import View
+from rxcli.lab.simulate.optics import View, between_nodes, grid_nodes
 from rxcli.lab.simulate.sensor import PATTERNS, Sensor
 
 Float32Array = NDArray[np.float32]
@@ -164,29 +164,24 @@ def _reduce_noise(planes: Float32Array, isp: Isp) -> Float32Array:
 
     if isp.denoise_colour_px <= 0 and isp.denoise_px <= 0:
         return planes
-    luma = cv2.transform(planes, np.array([LUMA_BT601], np.float32))
-    colour = planes - luma[..., None]
+    grey = luma(planes)
+    colour = planes - grey[..., None]
     if isp.denoise_colour_px > 0:
         colour = cv2.blur(colour, (2 * round(isp.denoise_colour_px) + 1,) * 2)
     if isp.denoise_px > 0:
-        luma = cv2.GaussianBlur(luma, (0, 0), isp.denoise_px)
-    colour += luma[..., None]
+        grey = cv2.GaussianBlur(grey, (0, 0), isp.denoise_px)
+    colour += grey[..., None]
     return np.asarray(colour, np.float32)
 
 
 def correction_map(view: View) -> tuple[Float32Array, Float32Array]:
     """Sensor places (x, y) that the pixels of a corrected picture are taken from; each (height, width) float32."""
-    import cv2
-
     pitch = 16
-    nx, ny = -(-view.width // pitch) + 2, -(-view.height // pitch) + 2
-    x = np.arange(-1, nx - 1) * float(pitch) + (pitch - 1) / 2
-    y = np.arange(-1, ny - 1) * float(pitch) + (pitch - 1) / 2
+    x, y = grid_nodes(view.width, pitch), grid_nodes(view.height, pitch)
     matrix = view.camera_matrix
     ideal = (np.stack(np.meshgrid(x, y), axis=-1) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
     nodes = view.ideal_to_pixels(ideal).astype(np.float32)
-    full = cv2.resize(nodes, (nx * pitch, ny * pitch), interpolation=cv2.INTER_LINEAR)
-    inner = full[pitch : pitch + view.height, pitch : pitch + view.width]
+    inner = between_nodes(nodes, pitch, view.height, view.width)
     return np.ascontiguousarray(inner[..., 0]), np.ascontiguousarray(inner[..., 1])
 
 
@@ -197,8 +192,8 @@ def correct_distortion(planes: Float32Array, view: View) -> Float32Array:
     return np.asarray(cv2.remap(planes, *correction_map(view), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
 
-def luma(rgb: NDArray[Any], weights: tuple[float, float, float] = LUMA_BT601) -> Float32Array:
+def luma(rgb: NDArray[Any]) -> Float32Array:
     """(height, width) float32 luma of a picture (height, width, 3), red first."""
     import cv2
 
-    return np.asarray(cv2.transform(rgb.astype(np.float32), np.array([weights], np.float32)))
+    return np.asarray(cv2.transform(rgb.astype(np.float32), np.array([LUMA_BT601], np.float32)))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rxcli.profiles import ScreenProfile
 
 FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,20 @@ def project(matrix: FloatArray, points: FloatArray) -> FloatArray:
     """Apply a projective map (3, 3) to points (..., 2)."""
     homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
     return np.asarray(homogeneous[..., :2] / homogeneous[..., 2:])
+
+
+def grid_nodes(width: int, pitch: int) -> FloatArray:
+    """Nodes that `cv2.resize` by `pitch` lays on pixel centres, with one cell to spare on either side."""
+    return np.arange(-1, -(-width // pitch) + 1, dtype=np.float64) * pitch + (pitch - 1) / 2
+
+
+def between_nodes(nodes: Float32Array, pitch: int, height: int, width: int) -> Float32Array:
+    """(height, width[, k]) values at all pixels, from those at `grid_nodes` down and across."""
+    import cv2
+
+    size = (nodes.shape[1] * pitch, nodes.shape[0] * pitch)
+    full = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(full[pitch : pitch + height, pitch : pitch + width])
 
 
 @dataclass(frozen=True)

@@ -226,14 +226,8 @@ def preset(name: str, screen: str | ScreenProfile = "paper-34k6") -> Scene:
     return PRESETS[name](profile)
 
 
-def random_scene(rng: np.random.Generator, *, scale: float = 1.0, output: Output | None = None) -> Scene:
-    """A scene that a person might meet: any preset, screen, picture, pose, light and exposure.
-
-    Args:
-        rng: source of all choices.
-        scale: of the sensor's width; the height and so the time shown stay whole.
-        output: "raw" or "developed"; None for either.
-    """
+def random_scene(rng: np.random.Generator) -> Scene:
+    """A scene that a person might meet: any preset, screen, picture, pose, light and exposure."""
     base = preset(str(rng.choice(list(PRESETS))), str(rng.choice(["paper-8k65", "paper-17k3", "paper-34k6"])))
     exposure_slots = float(rng.choice([0.25, 0.5, 1.0, 1.5, 2.0])) * rng.uniform(0.8, 1.2)
     exposure_s = max(exposure_slots / base.screen.slot_rate_hz, 1 / 32000)
@@ -247,7 +241,7 @@ def random_scene(rng: np.random.Generator, *, scale: float = 1.0, output: Output
         shift_x=rng.normal(0, 0.02),
         shift_y=rng.normal(0, 0.02),
     )
-    scene = replace(
+    return replace(
         base,
         picture=draw_name(rng),
         w="dimming" if rng.random() < 0.3 else int(rng.integers(2, 9)),
@@ -265,6 +259,5 @@ def random_scene(rng: np.random.Generator, *, scale: float = 1.0, output: Output
         column_delay_slots=float(rng.choice([0.0, rng.uniform(0, 2)])),
         n_frames=1,
         orientation=3 if upside_down else 1,
-        output=output or ("raw" if rng.random() < 0.3 else "developed"),
+        output="raw" if rng.random() < 0.3 else "developed",
     )
-    return scene.scaled(scale, 1.0) if scale != 1.0 else scene
