@@ -75,3 +75,8 @@ class UsageError(ReceiverError):
     """A combination of options that makes no sense."""
 
     exit_code = ExitCode.USAGE
+
+
+def sentence(text: str) -> str:
+    """A message or a hint as a sentence of its own, for pages."""
+    return text[:1].upper() + text[1:].rstrip(".") + "." if text else ""

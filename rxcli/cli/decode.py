@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
@@ -143,9 +143,9 @@ def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
 def _claim(options: dict[str, Any], sources: list[Source]) -> None:
     """Refuse outputs that would destroy something, and make the folders of the taps."""
     from rxcli.outputs import claim_folder
+    from rxcli.results.truth import truth_for
 
-    truth = options["truth"]
-    truths = [_truth_of(source.name, truth) for source in sources]
+    truths = [truth_for(source.name, options["truth"]) for source in sources]
     inputs = [source.path for source in sources] + [str(path) for path in truths if path is not None]
     claim_outputs(_outputs(options), inputs, (*options["screens"], *options["cameras"]), options["force"])
     for name in ("dump_dir", "save_undistorted", "out"):
@@ -172,13 +172,6 @@ def _outputs(options: dict[str, Any]) -> Iterator[Output]:
     for name, ours in looks.items():
         if paths[name] is not None:
             yield outputs.Output("--" + name.replace("_", "-"), Path(paths[name]), ours)
-
-
-def _truth_of(name: str, truth: str | None) -> Path | None:
-    """The truth file of a source, None where it has none."""
-    from rxcli.results.truth import find_truth
-
-    return find_truth(name) if truth == "auto" else None if truth is None else Path(truth)
 
 
 def _sources(paths: tuple[str, ...]) -> list[Source]:
@@ -296,7 +289,7 @@ class _Run:
         from rxcli.runs.journal import Lines
 
         if journal is None and not self._to_stdout:
-            return _Nowhere() if self._options["quiet"] else _Table()
+            return _Writer() if self._options["quiet"] else _Table()
         lines = Lines(self._head(), self._files(), begun)
         return _JsonLines(lines, _print_line if journal is None else journal.append)
 
@@ -309,7 +302,9 @@ class _Run:
         return stack.enter_context(PayloadWriter(self._options["payloads"])).write
 
     def _decode(self, sources: list[Source], writer: _Writer, n_total: int) -> None:
+        from rxcli.link.saving import save_objects
         from rxcli.results.report import plural, result_in_words
+        from rxcli.runs.batch import with_last
 
         log.info("%s to decode, %d done before", plural(len(sources), "source"), n_total - len(sources))
         with _progress(n_total, n_total - len(sources), self._options["quiet"]) as progress:
@@ -317,9 +312,13 @@ class _Run:
                 summary, scorer = self._begin(source.name)
                 writer.begin(source.name)
                 try:
-                    for result, last in _with_last(results):
+                    for result, last in with_last(results):
                         result = scorer.add(result) if scorer else result
-                        result = self._saved(self._combined(result), summary)
+                        result = self._combined(result)
+                        if self._options["out"]:
+                            result = save_objects(
+                                result, self._options["out"], self._options["force"], summary.unwritten.append
+                            )
                         summary.add(result)
                         if self._baseline is not None:
                             self._baseline.add(result)
@@ -340,21 +339,6 @@ class _Run:
         soft = replace(result.soft_bits, epoch=self._n_photos, source=result.source)
         return self._photos.add(replace(result, soft_bits=soft))
 
-    def _saved(self, result: FrameResult, summary: SourceSummary) -> FrameResult:
-        """The result with the paths of its files, once they are written."""
-        if not self._options["out"] or not result.objects:
-            return result
-        from rxcli.link.saving import save_object
-
-        objects = []
-        for received in result.objects:
-            try:
-                objects.append(save_object(received, self._options["out"], self._options["force"]))
-            except InputError as error:
-                objects.append(received)
-                summary.unwritten.append(str(error))
-        return replace(result, objects=tuple(objects))
-
     def _decoded(self, sources: list[Source]) -> Iterator[Decoded]:
         from rxcli.runs.batch import decode_here, decode_in_processes
 
@@ -368,12 +352,12 @@ class _Run:
 
     def _begin(self, name: str) -> tuple[SourceSummary, Scorer | None]:
         from rxcli.results.summary import SourceSummary
-        from rxcli.results.truth import Scorer, find_truth, load_truth
+        from rxcli.results.truth import Scorer, load_truth, truth_for
 
         asked = self._options["min_confidence"]
         summary = SourceSummary(name) if asked is None else SourceSummary(name, min_confidence=asked)
         truth = self._options["truth"]
-        path = find_truth(name) if truth == "auto" else truth
+        path = truth_for(name, truth)
         if path is None:
             return summary, None
         try:
@@ -462,22 +446,6 @@ def _order(names: list[str]) -> Any:
     return lambda summary: places.get(summary.source, len(places))
 
 
-def _with_last(results: Iterator[FrameResult]) -> Iterator[tuple[FrameResult, bool]]:
-    """Each result, and whether it is the last one; where they break off, none is."""
-    held: FrameResult | None = None
-    try:
-        for result in results:
-            if held is not None:
-                yield held, False
-            held = result
-    except (Exception, KeyboardInterrupt):
-        if held is not None:
-            yield held, False
-        raise
-    if held is not None:
-        yield held, True
-
-
 def _plain(value: Any) -> Any:
     """An option as JSON has it."""
     if isinstance(value, (tuple, list)):
@@ -494,21 +462,15 @@ def _digest(profiles: Any) -> str:
     return hashlib.sha256(msgspec.json.encode(profiles)).hexdigest()[:16]
 
 
-class _Writer(Protocol):
-    """Takes the results of one source after the other."""
+class _Writer:
+    """Takes the results of one source after the other; this one leaves them."""
 
     def begin(self, source: str) -> None: ...
 
     def write(self, result: FrameResult, last: bool) -> None: ...
 
 
-class _Nowhere:
-    def begin(self, source: str) -> None: ...
-
-    def write(self, result: FrameResult, last: bool) -> None: ...
-
-
-class _Table(_Nowhere):
+class _Table(_Writer):
     def write(self, result: FrameResult, last: bool) -> None:
         from rxcli.results.report import format_frame, format_link
 
@@ -517,7 +479,7 @@ class _Table(_Nowhere):
         _print_text(format_frame(result) + "\n")
 
 
-class _JsonLines:
+class _JsonLines(_Writer):
     def __init__(self, lines: Lines, put: Callable[[str], None]) -> None:
         self._lines, self._put = lines, put
 

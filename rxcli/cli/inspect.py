@@ -46,7 +46,7 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
     Of a clip, the first frames are received, and one is shown in full.
     """
     from rxcli.outputs import Output, claim_own_folder, write_whole
-    from rxcli.results.cameras import camera_of
+    from rxcli.results.cameras import camera_of, screen_of
     from rxcli.results.page import MARK, inspection_page
     from rxcli.results.report import format_link
 
@@ -59,9 +59,9 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
     configured = receiver_options(options, soft_bits=True)
     results, picture = _received(path, frame, configured, truth)
     shown = next(result for result in results if result.frame == picture.index)
-    screen = next((s for s in configured.screens if s.name == shown.screen_profile), None)
+    screen, camera = screen_of(shown, configured.screens), camera_of(picture, shown, configured.cameras)
     timeline = results if len(results) > 1 else []
-    text = inspection_page(picture, shown, screen, camera_of(picture, shown, configured.cameras), timeline)
+    text = inspection_page(picture, shown, screen, camera, timeline)
     claim_own_folder("--out", folder, (page.name,), force)
     write_whole(page, text)
     for result in results:
@@ -86,10 +86,10 @@ def _received(
         InputError: the source cannot be read, or has no such frame.
     """
     from rxcli.ingest import open_source
-    from rxcli.results.truth import Scorer, find_truth, load_truth
+    from rxcli.results.truth import Scorer, load_truth, truth_for
     from rxcli.runs.batch import standard_decoder
 
-    found = find_truth(path) if truth == "auto" else truth
+    found = truth_for(path, truth)
     scorer = Scorer(load_truth(found)) if found else None
     n_frames = max(_MOST_FRAMES, (number or 0) + 1)
     first: list[Frame] = []

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from rxcli.cli.common import claim_outputs, force_argument, options, receiver_arguments, receiver_options
-from rxcli.errors import ExitCode, InputError, UsageError
+from rxcli.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from rxcli.ingest.v4l2 import CameraCounts, LiveSource
@@ -73,6 +73,7 @@ def live(device: Path, **options: Any) -> int:
     _claim(device, options)
     from rxcli.ingest.v4l2 import LiveSource
     from rxcli.link.collector import Collector
+    from rxcli.link.saving import save_objects
     from rxcli.receiver.pipeline import receive
 
     source = LiveSource(
@@ -89,28 +90,14 @@ def live(device: Path, **options: Any) -> int:
         frames = stack.enter_context(closing(_limited(source, options["n_frames"])))
         collector = Collector(configured.screens)
         for received in receive(status.watched(frames), configured):
-            result = _saved(collector.add(received), options["out"], options["force"])
+            result = collector.add(received)
+            if options["out"] is not None:
+                result = save_objects(result, options["out"], options["force"], _say)
             write(result)
             status.update(result, collector.progress)
             if options["until_complete"] and (result.messages or result.objects):
                 break
     return ExitCode.OK if status.n_packets or status.n_complete else ExitCode.NOT_RECEIVED
-
-
-def _saved(result: FrameResult, folder: Path | None, force: bool) -> FrameResult:
-    """The result with the paths of its files, once they are written."""
-    if folder is None or not result.objects:
-        return result
-    from rxcli.link.saving import save_object
-
-    objects = []
-    for received in result.objects:
-        try:
-            objects.append(save_object(received, folder, force))
-        except InputError as error:
-            _say(str(error))
-            objects.append(received)
-    return replace(result, objects=tuple(objects))
 
 
 def _claim(device: Path, options: dict[str, Any]) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from rxcli.errors import InputError
 from rxcli.link.formats import safe_name
-from rxcli.types import ReceivedObject
+from rxcli.types import FrameResult, ReceivedObject
 
 
 def save_object(received: ReceivedObject, folder: Path, force: bool = False) -> ReceivedObject:
@@ -40,6 +41,18 @@ def save_object(received: ReceivedObject, folder: Path, force: bool = False) -> 
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})", "name another folder") from None
     return replace(received, path=str(path))
+
+
+def save_objects(result: FrameResult, folder: Path, force: bool, tell: Callable[[str], None]) -> FrameResult:
+    """The result with the paths of its files, once they are written; `tell` is given why one could not be."""
+    objects = []
+    for received in result.objects:
+        try:
+            objects.append(save_object(received, folder, force))
+        except InputError as error:
+            objects.append(received)
+            tell(str(error))
+    return replace(result, objects=tuple(objects)) if objects else result
 
 
 def _put(written: Path, path: Path, force: bool) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rxcli.errors import sentence
 from rxcli.results.report import printable
 from rxcli.types import FloatArray, Frame, FrameResult
 
@@ -158,8 +159,4 @@ def split_message(result: FrameResult, light: Light | None = None) -> tuple[str,
         more = "expose longer or open the lens" if light.word == "too dark" else "expose shorter"
         reason = f"{reason} (the picture is {light.word})"
         advice = f"{more}; {advice}" if advice else more
-    return _sentence(reason), _sentence(advice)
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:] + "." if text else ""
+    return sentence(reason), sentence(advice)

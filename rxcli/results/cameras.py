@@ -1,8 +1,8 @@
-"""With which camera a frame was received."""
+"""With which screen and camera a frame was received."""
 
 from __future__ import annotations
 
-from rxcli.profiles import CameraProfile
+from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.receiver.camera import camera_profile
 from rxcli.types import Frame, FrameResult
 
@@ -13,3 +13,8 @@ def camera_of(frame: Frame, result: FrameResult, cameras: tuple[CameraProfile, .
     if named is not None or "line_delay_s" not in result.estimated:
         return named
     return camera_profile(result.estimated, "estimated", None, None, frame.width, frame.height)
+
+
+def screen_of(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> ScreenProfile | None:
+    """The screen that a frame was received of; None where none was found."""
+    return next((screen for screen in screens if screen.name == result.screen_profile), None)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rxcli.results.overlay import jpeg_address
 from rxcli.types import FloatArray, Frame
 
 if TYPE_CHECKING:
@@ -20,8 +20,6 @@ _MIN_SIZE = 96
 
 def rival_grids(frame: Frame) -> str:
     """HTML of the map of a frame's coherent strips, rival grids of columns drawn on it; empty for tiny pictures."""
-    import simplejpeg
-
     from rxcli.receiver.corners import levels_of
     from rxcli.receiver.screen.coherence import measure_coherence
     from rxcli.receiver.screen.columns import ColumnLayout, likely_grids
@@ -34,9 +32,6 @@ def rival_grids(frame: Frame) -> str:
     height = round(_WIDTH * frame.height / frame.width)
     places = [(np.arange(n) * len(axis) // n) for n, axis in ((height, coherence.y), (_WIDTH, coherence.x))]
     map_ = (20 + 215 * coherence.lit[np.ix_(*places)]).astype(np.uint8)
-    jpeg = simplejpeg.encode_jpeg(
-        np.ascontiguousarray(map_)[:, :, None], 85, colorspace="GRAY", colorsubsampling="Gray"
-    )
     scale = _WIDTH / frame.width
     lines, legend = [], []
     for number, (grid, colour) in enumerate(zip(grids, _COLOURS, strict=False)):
@@ -55,7 +50,7 @@ def rival_grids(frame: Frame) -> str:
         told = "No grid of columns stands out: strips of pixels change alike nowhere, or do not change at borders"
     return (
         "<details><summary>Where the columns may be</summary><figure>"
-        f'<div class="view"><img src="data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}" width="{_WIDTH}" '
+        f'<div class="view"><img src="{jpeg_address(map_, 85)}" width="{_WIDTH}" '
         f'height="{height}" alt="{told}."><svg viewBox="0 0 {_WIDTH} {height}" aria-hidden="true">{"".join(lines)}'
         f"</svg></div><figcaption>{told}. Bright: neighbouring strips of pixels change alike from row to row, as they "
         "do in front of a backlight however dark the picture is. Lines: borders of columns, across which they do not. "

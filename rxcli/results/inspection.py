@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,18 +127,9 @@ def _with_model(trace: Trace, rows_per_slot: float) -> Trace:
     good = known & (gain > 0)
     model = np.where(good, floor + gain * share, np.nan)
     relative = np.where(good, (trace.light - floor) / np.where(good, gain, 1), np.nan)
-    residuals = _residuals(trace.rows, relative, np.where(good, trace.share, np.nan), rows_per_slot)
-    return Trace(
-        trace.column,
-        trace.rows,
-        trace.light,
-        model,
-        np.where(good, trace.share, np.nan),
-        relative,
-        trace.borders,
-        trace.lit_spans,
-        residuals,
-    )
+    share = np.where(good, trace.share, np.nan)
+    residuals = _residuals(trace.rows, relative, share, rows_per_slot)
+    return replace(trace, model=model, share=share, relative=relative, residuals=residuals)
 
 
 def _box(values: FloatArray, size: int) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import math
 from dataclasses import dataclass
 
@@ -28,13 +29,20 @@ class Preview:
 
     def jpeg(self, quality: int = 80) -> bytes:
         """The picture as JPEG."""
-        import simplejpeg
+        return grey_jpeg(self.pixels, quality)
 
-        return bytes(
-            simplejpeg.encode_jpeg(
-                np.ascontiguousarray(self.pixels)[:, :, None], quality, colorspace="GRAY", colorsubsampling="Gray"
-            )
-        )
+
+def grey_jpeg(pixels: NDArray[np.uint8], quality: int) -> bytes:
+    """A JPEG of grey values (height, width)."""
+    import simplejpeg
+
+    plane = np.ascontiguousarray(pixels)[:, :, None]
+    return bytes(simplejpeg.encode_jpeg(plane, quality, colorspace="GRAY", colorsubsampling="Gray"))
+
+
+def jpeg_address(pixels: NDArray[np.uint8], quality: int) -> str:
+    """The same as an address that a page can hold."""
+    return f"data:image/jpeg;base64,{base64.b64encode(grey_jpeg(pixels, quality)).decode()}"
 
 
 def preview(frame: Frame, width_px: int = 1000) -> Preview:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import math
 from collections.abc import Iterable, Sequence
@@ -16,7 +15,7 @@ from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.results.aim import height_share, light_of, split_message
 from rxcli.results.grids import rival_grids
 from rxcli.results.inspection import BINS, EYE_TIMES, RANGE, Inspection, Trace, inspect_frame
-from rxcli.results.overlay import column_polygons, preview
+from rxcli.results.overlay import column_polygons, jpeg_address, preview
 from rxcli.results.report import plural, printable
 from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult
 
@@ -183,7 +182,6 @@ def _texts(result: FrameResult) -> str:
 def _photo(frame: Frame, result: FrameResult, screen: ScreenProfile | None, camera: CameraProfile | None) -> str:
     small = preview(frame, 1200)
     height, width = small.pixels.shape
-    data = base64.b64encode(small.jpeg()).decode()
     shapes = []
     polygons = column_polygons(result, frame, screen, camera)
     for number, status, points in polygons:
@@ -200,7 +198,7 @@ def _photo(frame: Frame, result: FrameResult, screen: ScreenProfile | None, came
     told = _told(result.columns) if polygons else "No columns could be outlined."
     legend = "".join(f'<li class="{kind}">{word}</li>' for kind, word in _WORDS.items()) if polygons else ""
     body = (
-        f'<figure><div class="view"><img src="data:image/jpeg;base64,{data}" width="{width}" height="{height}" '
+        f'<figure><div class="view"><img src="{jpeg_address(small.pixels, 80)}" width="{width}" height="{height}" '
         f'alt="The picture. {html.escape(told)}"><svg viewBox="0 0 {width} {height}" aria-hidden="true">'
         f"{''.join(shapes)}</svg></div><figcaption>{html.escape(told)}</figcaption></figure>"
         f'<ul class="legend">{legend}</ul>{_coherence(frame)}{rival_grids(frame)}'
@@ -211,8 +209,6 @@ def _photo(frame: Frame, result: FrameResult, screen: ScreenProfile | None, came
 
 def _coherence(frame: Frame) -> str:
     """Where the picture has stripes that neighbouring pixels share, as a small map."""
-    import simplejpeg
-
     from rxcli.receiver.corners import levels_of
     from rxcli.receiver.screen.picture import Picture, reduce
     from rxcli.receiver.screen.stripes import find_stripes
@@ -223,11 +219,10 @@ def _coherence(frame: Frame) -> str:
     plane = reduce(Picture(frame.pixels, levels["black"], levels["white"], levels.get("mosaic_period", 1)))
     striped = find_stripes(plane).striped
     big = np.kron(striped.astype(np.uint8) * 215 + 20, np.ones((4, 4), np.uint8))
-    jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(big)[:, :, None], 85, colorspace="GRAY", colorsubsampling="Gray")
     told = f"Stripes were found in {100 * float(striped.mean()):.0f} % of the picture."
     return (
         "<details><summary>Where the picture has stripes</summary><figure>"
-        f'<img src="data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}" alt="{told}" width="480">'
+        f'<img src="{jpeg_address(big, 85)}" alt="{told}" width="480">'
         f"<figcaption>{told} White: light that changes from row to row alike in neighbouring pixels, as only a "
         "flickering light does. The search for the screen begins with this map.</figcaption></figure></details>"
     )

@@ -82,6 +82,13 @@ def find_truth(capture: str | Path) -> Path | None:
     return path if path.is_file() else None
 
 
+def truth_for(capture: str | Path, asked: str | Path | None) -> Path | None:
+    """The truth of `capture` where a file is asked for, or "auto" for the one beside it; None where there is none."""
+    if asked == "auto":
+        return find_truth(capture)
+    return None if asked is None else Path(asked)
+
+
 def load_truth(path: str | Path) -> Truth:
     """Load and check a truth file.
 

@@ -19,6 +19,7 @@ from rxcli.options import ReceiverOptions, receiver_options
 from rxcli.receiver.pipeline import receive as receive_frames
 from rxcli.receiver.pipeline import receive_frame
 from rxcli.results.dump import Taps, read_taps
+from rxcli.runs.batch import with_last
 from rxcli.types import Frame, FrameResult
 
 #: A picture: a file, an array of grey values, or a frame with what is known of it.
@@ -83,13 +84,9 @@ class Receiver:
 
     def _with_messages(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
         """Results with the texts and files that they complete; the last one with what is left of others."""
-        collector, last = Collector(self.options.screens), None
-        for result in results:
-            if last is not None:
-                yield last
-            last = collector.add(result)
-        if last is not None:
-            yield collector.finish(last)
+        collector = Collector(self.options.screens)
+        for result, last in with_last(results):
+            yield collector.finish(collector.add(result)) if last else collector.add(result)
 
     def tap(self, picture: Picture) -> tuple[FrameResult, Taps | None]:
         """Receive one photograph and keep the arrays of every stage boundary; None where reception ended before.

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
 from rxcli.outputs import OUTPUT_MARKER
 from rxcli.runs.processes import ONE_THREAD, environment
-from rxcli.types import Frame, FrameResult, FrameSoftBits
+from rxcli.types import Frame, FrameResult
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -163,18 +163,13 @@ class Decoder:
         from rxcli.link.collector import Collector
 
         collector = Collector(self.link_screens)
-        before: FrameResult | None = None
-        alone: FrameSoftBits | None = None
-        for result in results:
-            if before is not None:
-                alone = None
-                yield before
-            else:
-                alone = result.soft_bits
-            before = collector.add(result)
-        if before is not None:
-            before = collector.finish(before)
-            yield replace(before, soft_bits=None if before.messages or before.objects else alone)
+        for number, (result, last) in enumerate(with_last(results)):
+            taken = collector.add(result)
+            if last:
+                taken = collector.finish(taken)
+                alone = number == 0 and not (taken.messages or taken.objects)
+                taken = replace(taken, soft_bits=result.soft_bits if alone else None)
+            yield taken
 
     def _frames(self, source: Source) -> Iterator[Frame]:
         told = False
@@ -226,6 +221,22 @@ class _Failure:
 def unreadable(source: Source, frame: int, message: str) -> FrameResult:
     """The result of a frame that could not be had."""
     return FrameResult(source=source.name, frame=frame, time_s=0.0, status="unreadable", message=message)
+
+
+def with_last(results: Iterator[FrameResult]) -> Iterator[tuple[FrameResult, bool]]:
+    """Each result, and whether it is the last one; where they break off, none is."""
+    held: FrameResult | None = None
+    try:
+        for result in results:
+            if held is not None:
+                yield held, False
+            held = result
+    except (Exception, KeyboardInterrupt):
+        if held is not None:
+            yield held, False
+        raise
+    if held is not None:
+        yield held, True
 
 
 def standard_decoder(

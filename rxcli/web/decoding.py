@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rxcli.errors import InputError
+from rxcli.errors import InputError, sentence
 from rxcli.runs.processes import resident_bytes
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
 
     from rxcli.options import ReceiverOptions
+    from rxcli.results.overlay import Preview
     from rxcli.types import Frame, FrameResult
 
 log = logging.getLogger(__name__)
@@ -128,11 +129,7 @@ class _EndedError(Exception):
 
 def refusal(reason: str, step: str) -> dict[str, Any]:
     """The answer for a file that is not received."""
-    return {"status": "unreadable", "reason": _sentence(reason), "advice": _sentence(step)}
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:].rstrip(".") + "." if text else ""
+    return {"status": "unreadable", "reason": sentence(reason), "advice": sentence(step)}
 
 
 def _work(connection: Connection, options: ReceiverOptions) -> None:
@@ -272,8 +269,13 @@ class _Gathered:
         self._packets += found[: _MAX_PACKETS - len(self._packets)]
         self.has_news = result.frame > 0 and (self.has_news or bool(texts or found))
         if self._best is None or len(found) > self._best[0]:
-            picture = _picture(result, self._frames.take(result.frame), self._options)
-            self._best = len(found), result, picture
+            self._best = len(found), result, self._picture(result)
+
+    def _picture(self, result: FrameResult) -> dict[str, Any]:
+        from rxcli.results.overlay import preview
+
+        frame = self._frames.take(result.frame)
+        return {} if frame is None else {"picture": picture_of(result, frame, preview(frame), self._options)}
 
     def answer(self) -> dict[str, Any]:
         """What is known so far."""
@@ -328,26 +330,22 @@ def packets_of(result: FrameResult) -> list[dict[str, Any]]:
     ]
 
 
-def _picture(result: FrameResult, frame: Frame | None, options: ReceiverOptions) -> dict[str, Any]:
-    """The picture as JPEG, and outlines in its pixels; empty where there is no frame."""
-    if frame is None:
-        return {}
-    from rxcli.results.cameras import camera_of
-    from rxcli.results.overlay import column_polygons, preview
+def picture_of(
+    result: FrameResult, frame: Frame, small: Preview, options: ReceiverOptions, quality: int = 80
+) -> dict[str, Any]:
+    """The small copy of a frame as JPEG, and outlines in its pixels."""
+    from rxcli.results.cameras import camera_of, screen_of
+    from rxcli.results.overlay import column_polygons
 
-    small = preview(frame)
-    screen = next((screen for screen in options.screens if screen.name == result.screen_profile), None)
-    polygons = column_polygons(result, frame, screen, camera_of(frame, result, options.cameras))
+    screen, camera = screen_of(result, options.screens), camera_of(frame, result, options.cameras)
     corners = [] if result.corners is None else (result.corners / small.step).round(1).tolist()
     return {
-        "picture": {
-            "jpeg": base64.b64encode(small.jpeg()).decode(),
-            "width": int(small.pixels.shape[1]),
-            "height": int(small.pixels.shape[0]),
-            "corners": corners,
-            "outlines": [
-                {"column": number, "status": status, "points": (points / small.step).round(1).tolist()}
-                for number, status, points in polygons
-            ],
-        }
+        "jpeg": base64.b64encode(small.jpeg(quality)).decode(),
+        "width": int(small.pixels.shape[1]),
+        "height": int(small.pixels.shape[0]),
+        "corners": corners,
+        "outlines": [
+            {"column": number, "status": status, "points": (points / small.step).round(1).tolist()}
+            for number, status, points in column_polygons(result, frame, screen, camera)
+        ],
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import logging
 import threading
 import time
@@ -94,25 +93,21 @@ def _work(connection: Connection, device: Path, settings: CameraSettings, option
     """The process's life."""
     import signal
 
-    from rxcli.errors import ReceiverError
+    from rxcli.errors import ReceiverError, sentence
     from rxcli.ingest.v4l2 import LiveSource
     from rxcli.runs.batch import use_one_thread
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     use_one_thread()
-    source = LiveSource(device, settings, on_lost=lambda reason: connection.send({"problem": _sentence(reason)}))
+    source = LiveSource(device, settings, on_lost=lambda reason: connection.send({"problem": sentence(reason)}))
     try:
         for event in live_events(source, options):
             connection.send(event)
     except ReceiverError as error:
-        connection.send({"problem": _sentence(str(error))})
+        connection.send({"problem": sentence(str(error))})
         time.sleep(_RESTART_S)
     except (BrokenPipeError, EOFError):
         return
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:] + "."
 
 
 def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any]]:
@@ -180,21 +175,9 @@ class _Watched:
 
     def picture(self, result: FrameResult, options: ReceiverOptions) -> dict[str, Any] | None:
         """The picture of a result with its outlines, in its pixels."""
-        from rxcli.results.cameras import camera_of
-        from rxcli.results.overlay import column_polygons
+        from rxcli.web.decoding import picture_of
 
         small = self._previews.get(result.frame)
         if small is None or self._frame is None:
             return None
-        screen = next((screen for screen in options.screens if screen.name == result.screen_profile), None)
-        polygons = column_polygons(result, self._frame, screen, camera_of(self._frame, result, options.cameras))
-        return {
-            "jpeg": base64.b64encode(small.jpeg(70)).decode(),
-            "width": int(small.pixels.shape[1]),
-            "height": int(small.pixels.shape[0]),
-            "corners": [] if result.corners is None else (result.corners / small.step).round(1).tolist(),
-            "outlines": [
-                {"column": number, "status": status, "points": (points / small.step).round(1).tolist()}
-                for number, status, points in polygons
-            ],
-        }
+        return picture_of(result, self._frame, small, options, quality=70)

@@ -17,8 +17,8 @@ from fake_receiver import fake_decoder
 
 from rxcli.errors import InputError, UsageError
 from rxcli.results.report import from_record, to_json_line
-from rxcli.runs.batch import Journal, Source, collect_sources, decode_here, decode_in_processes, recover, unreadable
-from rxcli.runs.journal import Head, Lines
+from rxcli.runs.batch import Source, collect_sources, decode_here, decode_in_processes, unreadable
+from rxcli.runs.journal import Head, Journal, Lines, recover
 from rxcli.types import FrameResult
 
 SUFFIXES = frozenset({".jpg", ".mp4"})
@@ -200,7 +200,8 @@ RUN = """
 import sys
 from pathlib import Path
 from fake_receiver import fake_decoder
-from rxcli.runs.batch import Journal, collect_sources, decode_here, recover
+from rxcli.runs.batch import collect_sources, decode_here
+from rxcli.runs.journal import Journal, recover
 folder, out = sys.argv[1], Path(sys.argv[2])
 done = {name for name, _ in recover(out)}
 journal = Journal(out, resume=True)
