@@ -36,11 +36,11 @@ def calibrate_bent(frames: Sequence[Frame], screen: ScreenProfile) -> ShutterCal
         return None
     value, sd = weighted_mean(*np.array(found).T)
     frame = frames[0]
-    return ShutterCalibration.from_line_delay(
-        value,
-        sd,
+    return ShutterCalibration(
         "rows",
         (frame.height, frame.width),
+        value,
+        sd,
         periods=frame.height * value * screen.slot_rate_hz,
         exposure_note="not told by data; use a lamp and --frequency",
         warnings=(_NOTE,),

@@ -84,70 +84,41 @@ class ShutterCalibration:
     """What the stripes say of the shutter."""
 
     axis: Axis
-    #: Size of the pictures.
-    width: int
-    height: int
+    #: Height and width of the pictures.
+    shape: tuple[int, ...]
+    #: Time between two rows, and its standard deviation.
     line_delay_s: float
-    #: 95 % confidence interval.
-    line_delay_interval_s: tuple[float, float]
-    readout_s: float
-    readout_interval_s: tuple[float, float]
+    line_delay_sd_s: float
     #: Most periods seen in one region.
     periods: float
-    exposure_s: float | None
-    exposure_interval_s: tuple[float, float] | None
     #: Why there is no exposure, or what it rests on.
     exposure_note: str
+    exposure_s: float | None = None
+    exposure_interval_s: tuple[float, float] | None = None
     lamps: tuple[LampReading, ...] = ()
+    #: What a user should know before trusting the figures.
     warnings: tuple[str, ...] = ()
 
-    @classmethod
-    def from_line_delay(
-        cls,
-        line_delay_s: float,
-        sd_s: float,
-        axis: Axis,
-        shape: tuple[int, ...],
-        *,
-        periods: float,
-        exposure_note: str,
-        exposure_s: float | None = None,
-        exposure_interval_s: tuple[float, float] | None = None,
-        lamps: tuple[LampReading, ...] = (),
-        warnings: tuple[str, ...] = (),
-    ) -> ShutterCalibration:
-        """Readout and 95 % intervals from a line delay and its standard deviation.
+    @property
+    def n_lines(self) -> int:
+        """Rows, or columns, that are read one after the other."""
+        return self.shape[0 if self.axis == "rows" else 1]
 
-        Args:
-            line_delay_s: time between two rows.
-            sd_s: its standard deviation.
-            axis: readout axis.
-            shape: height and width of the pictures.
-            periods: most periods seen in one region.
-            exposure_note: why there is no exposure, or what it rests on.
-            exposure_s: exposure, None where it cannot be told.
-            exposure_interval_s: its 95 % interval.
-            lamps: what was seen of every lamp.
-            warnings: what a user should know before trusting the figures.
-        """
-        height, width = shape
-        n_rows = height if axis == "rows" else width
-        low, high = line_delay_s - _Z95 * sd_s, line_delay_s + _Z95 * sd_s
-        return cls(
-            axis=axis,
-            width=width,
-            height=height,
-            line_delay_s=line_delay_s,
-            line_delay_interval_s=(low, high),
-            readout_s=line_delay_s * n_rows,
-            readout_interval_s=(low * n_rows, high * n_rows),
-            periods=periods,
-            exposure_s=exposure_s,
-            exposure_interval_s=exposure_interval_s,
-            exposure_note=exposure_note,
-            lamps=lamps,
-            warnings=warnings,
-        )
+    @property
+    def line_delay_interval_s(self) -> tuple[float, float]:
+        """95 % confidence interval."""
+        return self.line_delay_s - _Z95 * self.line_delay_sd_s, self.line_delay_s + _Z95 * self.line_delay_sd_s
+
+    @property
+    def readout_s(self) -> float:
+        """From the first line to the last."""
+        return self.line_delay_s * self.n_lines
+
+    @property
+    def readout_interval_s(self) -> tuple[float, float]:
+        """95 % confidence interval."""
+        low, high = self.line_delay_interval_s
+        return low * self.n_lines, high * self.n_lines
 
 
 def find_stripes(picture: Picture, axis: Axis | None = None) -> tuple[Axis, list[Stripes]]:
@@ -503,11 +474,11 @@ def _combine(
     )
     clearest = max(used, key=lambda lamp: lamp.stripes.explained * np.sqrt(_area(lamp.stripes)))
     exposure = estimate_exposure(clearest.stripes.fit, clearest.stripes.profile, value, exif_exposure_s, tone_known)
-    return ShutterCalibration.from_line_delay(
-        value,
-        sd,
+    return ShutterCalibration(
         axis,
         shape,
+        value,
+        sd,
         periods=max(lamp.stripes.periods for lamp in used),
         exposure_s=exposure.exposure_s,
         exposure_interval_s=exposure.interval_s,

@@ -70,11 +70,11 @@ def calibrate_slots(
         values, weights = _refine([z**2 for part in slopes for z in np.array_split(part, _GROUPS)], frequency)
         mean, sd = _mean_and_sd(values, weights)
         if sd * _Z95 <= _WIDEST * mean:
-            return ShutterCalibration.from_line_delay(
-                mean / slot_rate_hz,
-                sd / slot_rate_hz,
+            return ShutterCalibration(
                 axis,
                 pictures[0].shape,
+                mean / slot_rate_hz,
+                sd / slot_rate_hz,
                 periods=mean * pictures[0].shape[0 if axis == "rows" else 1],
                 exposure_note="not told by data; use a lamp and --frequency",
             )

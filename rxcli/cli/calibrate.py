@@ -353,19 +353,14 @@ def _mode(result: ShutterCalibration, name: str | None) -> ReadoutMode:
         )
     if name is not None and not re.fullmatch(_NAME_PATTERN, name):
         raise UsageError(f"--mode {name!r} cannot name a mode", "use letters, digits, dots, dashes and underscores")
-    return ReadoutMode(
-        name=name or f"{result.width}x{result.height}",
-        width=result.width,
-        height=result.height,
-        line_delay_s=result.line_delay_s,
-    )
+    height, width = result.shape
+    return ReadoutMode(name=name or f"{width}x{height}", width=width, height=height, line_delay_s=result.line_delay_s)
 
 
 def _shutter_lines(result: ShutterCalibration) -> Iterator[str]:
     low, high = result.readout_interval_s
-    n_lines = result.height if result.axis == "rows" else result.width
     yield (
-        f"readout     {result.readout_s * 1e3:.4f} ms over {n_lines} {result.axis} "
+        f"readout     {result.readout_s * 1e3:.4f} ms over {result.n_lines} {result.axis} "
         f"(95 %: {low * 1e3:.4f} to {high * 1e3:.4f})"
     )
     low, high = result.line_delay_interval_s
@@ -386,8 +381,8 @@ def _shutter_record(result: ShutterCalibration) -> dict[str, Any]:
         "line_delay_interval_s": list(result.line_delay_interval_s),
         "periods": result.periods,
         "axis": result.axis,
-        "width": result.width,
-        "height": result.height,
+        "width": result.shape[1],
+        "height": result.shape[0],
         "exposure_s": result.exposure_s,
         "exposure_interval_s": list(result.exposure_interval_s) if result.exposure_interval_s else None,
         "exposure_note": result.exposure_note,

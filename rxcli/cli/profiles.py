@@ -15,6 +15,7 @@ from rxcli.cli.common import (
     complete_files,
     force_argument,
     json_output,
+    options,
     write_json,
 )
 from rxcli.cli.groups import SuggestingGroup
@@ -24,15 +25,7 @@ if TYPE_CHECKING:
     from rxcli.profiles import CameraProfile, ScreenProfile
     from rxcli.types import Frame
 
-_JSON = click.option("--json", "json_path", type=click.Path(allow_dash=True), metavar="FILE|-", help="Write JSON.")
-_CAMERAS = click.option(
-    "--camera",
-    "cameras",
-    multiple=True,
-    shell_complete=complete_cameras,
-    metavar="NAME|FILE",
-    help="Cameras to choose from; may be given several times. [default: all that are known]",
-)
+_JSON = options(("--json=FILE|- json_path", click.Path(allow_dash=True), None, "Write JSON."))
 
 
 @click.group(cls=SuggestingGroup, invoke_without_command=True)
@@ -116,13 +109,24 @@ def validate(names: tuple[str, ...]) -> int:
 
 @profiles.command()
 @click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path), shell_complete=complete_files)
-@_CAMERAS
+@options(
+    (
+        "--camera=NAME|FILE cameras",
+        [str],
+        None,
+        "Cameras to choose from; may be given several times. [default: all that are known]",
+        {"shell_complete": complete_cameras},
+    )
+)
 @_JSON
 @force_argument
 def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | None, force: bool) -> int:
     """Say which camera profile each file would get, and why."""
     claim_outputs([json_output(json_path, "source", "camera", "reason")], paths, cameras, force)
-    known = _choices(cameras)
+    from rxcli.profiles import CameraProfile, known_profiles, load_profile
+
+    known = [load_profile(name, CameraProfile) for name in cameras]
+    known = known or [profile for profile, _, _ in known_profiles(CameraProfile)]
     records, codes = [], [ExitCode.OK]
     for path in paths:
         try:
@@ -159,24 +163,10 @@ def _builtins(profile: ScreenProfile | CameraProfile) -> Any:
 
 
 def _known_names() -> list[str]:
-    return [profile.name for profile in _known()]
-
-
-def _known() -> list[ScreenProfile | CameraProfile]:
     from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles
 
-    found: list[ScreenProfile | CameraProfile] = []
-    found += [profile for profile, _, _ in known_profiles(ScreenProfile)]
-    found += [profile for profile, _, _ in known_profiles(CameraProfile)]
-    return found
-
-
-def _choices(cameras: tuple[str, ...]) -> list[CameraProfile]:
-    from rxcli.profiles import CameraProfile, known_profiles, load_profile
-
-    if cameras:
-        return [load_profile(name, CameraProfile) for name in cameras]
-    return [profile for profile, _, _ in known_profiles(CameraProfile)]
+    screens, cameras = known_profiles(ScreenProfile), known_profiles(CameraProfile)
+    return [*(screen.name for screen, _, _ in screens), *(camera.name for camera, _, _ in cameras)]
 
 
 def _first_frame(path: Path) -> Frame:

@@ -26,7 +26,7 @@ _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-p
 
 #: Options that are fields of the scene by the same name.
 _SCENE_OPTIONS = (
-    *("n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm"),
+    *("picture", "dimming", "stabilised", "n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm"),
     *("blur_px", "lcd_grid", "shake_px", "hand_px", "iso", "make", "model", "camera_name"),
 )
 
@@ -53,9 +53,9 @@ _SCENE_OPTIONS = (
     ("--exposure exposure_s", str, None, "Exposure in seconds, or as 1/32000.  [default: the preset's]"),
     ("--electrons", float, None, "Electrons of a green pixel that sees white, in one exposure."),
     ("--iso", click.IntRange(1), None, "ISO written to the file; has no effect on the pixels."),
-    ("--roll", float, None, "Degrees about the line of sight; 180 for a camera upside down."),
-    ("--yaw", float, None, "Degrees about the vertical."),
-    ("--pitch", float, None, "Degrees about the horizontal."),
+    ("--roll roll_deg", float, None, "Degrees about the line of sight; 180 for a camera upside down."),
+    ("--yaw yaw_deg", float, None, "Degrees about the vertical."),
+    ("--pitch pitch_deg", float, None, "Degrees about the horizontal."),
     ("--distance distance_mm", float, None, "Distance of the screen in millimetres."),
     ("--fill", float, None, "Share of the picture's width that the screen fills, instead of a distance."),
     ("--focal focal_widths", float, None, "Focal length in picture widths."),
@@ -66,7 +66,7 @@ _SCENE_OPTIONS = (
     ("--lcd-grid", click.FloatRange(0, 1), None, "Depth of the panel's pixel structure."),
     ("--room-light room_e", float, None, "Electrons of a green pixel that sees white paper by the room's light."),
     ("--flicker flicker_hz", float, None, "Flicker of the room's light in Hz (100 or 120)."),
-    ("--reflection", float, None, "A lamp mirrored in the panel, against white paper."),
+    ("--reflection lamp", float, None, "A lamp mirrored in the panel, against white paper."),
     ("--scale", click.FloatRange(0.02, 4), None, "Scale the sensor; rows and time shown scale with it."),
     ("--keep-readout/--keep-line-delay", None, False, "With --scale: keep the time of the whole readout."),
     ("--cfa", ("bayer", "xtrans", "rgb"), None, "Colour filter array."),
@@ -75,7 +75,7 @@ _SCENE_OPTIONS = (
     ("--subsampling", ("444", "422", "420"), None, "JPEG colour subsampling."),
     ("--sharpen", click.FloatRange(0, 5), None, "Strength of sharpening."),
     ("--denoise denoise_px", click.FloatRange(0, 10), None, "Noise reduction, pixels."),
-    ("--correct/--no-correct correct", None, None, "Take the lens's distortion out in the camera."),
+    ("--correct/--no-correct correct_distortion", None, None, "Take the lens's distortion out in the camera."),
     ("--frames n_frames", click.IntRange(1), None, "Frames of a clip."),
     ("--frame-rate frame_rate_hz", float, None, "Frames per second of a clip."),
     ("--bit-rate", click.IntRange(1), None, "Bits per second of a clip.  [default: constant quality]"),
@@ -172,14 +172,14 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     from rxcli.lab.simulate.scenes import preset
 
     scene = preset(options["preset"], options["screen"])
-    scene = replace(scene, picture=options["picture"], dimming=options["dimming"], **_given(options, _SCENE_OPTIONS))
-    scene = replace(scene, stabilised=options["stabilised"])
-    scene = replace(scene, w=_weights(options["weights"]), payload=_payload(options["payload"]))
-    scene = replace(scene, labels=_labels(options))
+    sent: dict[str, Any] = {
+        "w": _weights(options["weights"]),
+        "payload": _payload(options["payload"]),
+        "labels": _labels(options),
+    }
+    scene = replace(scene, **_given(options, _SCENE_OPTIONS), **sent)
     scene = _with_light(_with_pose(scene, options), options)
-    isp = _given(options, ("tone", "quality", "subsampling", "sharpen", "denoise_px"))
-    if options["correct"] is not None:
-        isp["correct_distortion"] = options["correct"]
+    isp = _given(options, ("tone", "quality", "subsampling", "sharpen", "denoise_px", "correct_distortion"))
     sensor = _given(options, ("cfa",))
     scene = replace(scene, isp=replace(scene.isp, **isp), sensor=replace(scene.sensor, **sensor))
     if options["column_delays"] is not None:
@@ -214,13 +214,7 @@ def _with_pose(scene: Scene, options: dict[str, Any]) -> Scene:
     if options["distortion"] is not None:
         k1, k2, p1, p2, k3 = _numbers(options["distortion"], "--distortion", (5,))
         lens = replace(lens, distortion=(k1, k2, p1, p2, k3))
-    angles = {
-        "roll_deg": options["roll"],
-        "yaw_deg": options["yaw"],
-        "pitch_deg": options["pitch"],
-        "fill": options["fill"],
-    }
-    pose = replace(pose, **{name: value for name, value in angles.items() if value is not None})
+    pose = replace(pose, **_given(options, ("roll_deg", "yaw_deg", "pitch_deg", "fill")))
     if options["distance_mm"] is not None:
         pose = replace(pose, fill=lens.focal_widths * scene.screen.width_mm / options["distance_mm"])
     if pose.fill <= 0 or lens.focal_widths <= 0:
@@ -238,10 +232,10 @@ def _with_light(scene: Scene, options: dict[str, Any]) -> Scene:
         scene = replace(scene, exposure_s=_seconds(options["exposure_s"]))
     if options["electrons"] is not None:
         scene = replace(scene, light_e_per_s=options["electrons"] / scene.exposure_s)
-    room = {"flicker_hz": options["flicker_hz"], "lamp": options["reflection"]}
+    room = _given(options, ("flicker_hz", "lamp"))
     if options["room_e"] is not None:
         room["light_e_per_s"] = options["room_e"] / scene.exposure_s
-    return replace(scene, room=replace(scene.room, **{k: v for k, v in room.items() if v is not None}))
+    return replace(scene, room=replace(scene.room, **room))
 
 
 def _seconds(text: str) -> float:

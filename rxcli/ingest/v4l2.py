@@ -14,9 +14,8 @@ import select
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -217,9 +216,7 @@ class Camera:
     def __enter__(self) -> Camera:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __iter__(self) -> Iterator[Frame]:
@@ -383,8 +380,8 @@ class _Layout:
     height: int
     #: Bytes from one row to the next.
     pitch: int
-    black: float = field(default=0.0)
-    white: float = field(default=255.0)
+    black: float
+    white: float
 
     def luma(self, data: Any) -> Luma:
         """A copy (height, width) of the luma in a buffer."""

@@ -20,6 +20,10 @@ from rxcli.types import FrameResult
 MIN_CONFIDENCE = 0.5
 
 
+#: What a row tells of the score.
+_SCORED = ("expected", "error_free", "lost", "false", "extra", "wrong_w", "ber")
+
+
 @dataclass(frozen=True, slots=True)
 class Limits:
     """What every source must keep for the run to pass."""
@@ -132,7 +136,6 @@ class SourceSummary:
 
     def row(self, limits: Limits) -> dict[str, Any]:
         """The figures as plain data; None where unknown."""
-        score = self.score
         failures = self.failures(limits)
         return {
             "source": printable(self.source),
@@ -142,13 +145,7 @@ class SourceSummary:
             "packets": self.n_packets,
             "combined": self.n_combined,
             "confidence": _finite(self.confidence),
-            "expected": score.expected if score else None,
-            "error_free": score.error_free if score else None,
-            "lost": score.lost if score else None,
-            "false": score.false if score else None,
-            "extra": score.extra if score else None,
-            "wrong_w": score.wrong_w if score else None,
-            "ber": score.ber if score else None,
+            **{name: getattr(self.score, name) if self.score else None for name in _SCORED},
             "messages": self.n_messages,
             "files": self.n_objects,
             "time_ms": round(self.time_ms, 1),

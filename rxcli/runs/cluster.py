@@ -219,6 +219,8 @@ def _write(taps: list[_Tap], decoder: Decoder) -> None:
 
 
 def _await(source: Source, future: Any, address: str) -> _Outcome:
+    from concurrent.futures import CancelledError
+
     from distributed import KilledWorker
 
     try:
@@ -227,7 +229,7 @@ def _await(source: Source, future: Any, address: str) -> _Outcome:
     except KilledWorker:
         message = f"{source.name}: every worker that decoded it died; try it by itself"
         return [replace(unreadable(source, 0, message), retry=True)], []
-    except (OSError, _cancelled()) as error:
+    except (OSError, CancelledError) as error:
         raise InputError(
             f"the scheduler at {address!r} went away ({type(error).__name__})", "start it again and use --resume"
         ) from None
@@ -236,9 +238,3 @@ def _await(source: Source, future: Any, address: str) -> _Outcome:
     except Exception as error:  # what a worker raises that cannot even load the task
         reason = f"the workers of {address!r} cannot decode ({_first_line(error)})"
         raise InputError(reason, "install the same vlc-rx there") from None
-
-
-def _cancelled() -> type[BaseException]:
-    from concurrent.futures import CancelledError
-
-    return CancelledError
