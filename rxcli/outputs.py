@@ -276,6 +276,18 @@ def write_whole(path: Path, content: str | bytes) -> None:
         hidden.write_bytes(data)
 
 
+def make_parent(path: Path) -> None:
+    """Make the folder that a file is to lie in.
+
+    Raises:
+        OutputError: it cannot be made.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
 def check_replaceable(path: Path, ours: re.Pattern[bytes], option: str) -> None:
     """Refuse to replace a file that somebody else wrote, where a name is known only when it is written.
 

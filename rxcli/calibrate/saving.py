@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from rxcli.errors import UsageError
-from rxcli.outputs import unwritable, write_whole
+from rxcli.outputs import make_parent, write_whole
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode, dump_profile, load_profile
 from rxcli.types import Metadata
 
@@ -62,8 +62,5 @@ def write_profile(profile: CameraProfile, path: Path) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(path, error) from None
+    make_parent(path)
     write_whole(path, dump_profile(profile))

@@ -307,7 +307,8 @@ class _Run:
         from rxcli.runs.batch import with_last
 
         log.info("%s to decode, %d done before", plural(len(sources), "source"), n_total - len(sources))
-        with _progress(n_total, n_total - len(sources), self._options["quiet"]) as progress:
+        n_frames = 0
+        with _bar(n_total, n_total - len(sources), self._options["quiet"]) as bar:
             for source, results in self._decoded(sources):
                 summary, scorer = self._begin(source.name)
                 writer.begin(source.name)
@@ -325,11 +326,13 @@ class _Run:
                         self._keep_estimate(result)
                         self._write_payloads(result)
                         log.info("%s", result_in_words(result))
-                        with progress.paused():
+                        with bar.external_write_mode():
                             writer.write(result, last)
                 finally:
                     self._end(summary, scorer)
-                progress.finished(summary.n_frames)
+                n_frames += summary.n_frames
+                bar.set_postfix_str(f"{n_frames} frames", refresh=False)
+                bar.update()
 
     def _combined(self, result: FrameResult) -> FrameResult:
         """The result of a photograph with what it and those before it show together."""
@@ -502,36 +505,12 @@ def _print_text(text: str, err: bool = False) -> None:
     click.echo(for_terminal(text, sys.stderr if err else sys.stdout), err=err)
 
 
-class _Progress:
+def _bar(n_total: int, n_done: int, quiet: bool) -> Any:
     """A bar on stderr where people look at it: files, frames, rate, time left."""
-
-    def __init__(self, bar: Any) -> None:
-        self._bar = bar
-        self._frames = 0
-
-    @contextmanager
-    def paused(self) -> Iterator[None]:
-        """Out of the way of what is printed meanwhile."""
-        if not self._bar.disable:
-            self._bar.clear()
-        yield
-        if not self._bar.disable:
-            self._bar.refresh()
-
-    def finished(self, n_frames: int) -> None:
-        """One more source with `n_frames` frames."""
-        self._frames += n_frames
-        self._bar.set_postfix_str(f"{self._frames} frames", refresh=False)
-        self._bar.update()
-
-
-@contextmanager
-def _progress(n_total: int, n_done: int, quiet: bool) -> Iterator[_Progress]:
     from tqdm import tqdm
 
     hidden = quiet or n_total < 2 or not _is_terminal(sys.stderr)
-    with tqdm(total=n_total, initial=n_done, unit="file", disable=hidden, file=sys.stderr, leave=False) as bar:
-        yield _Progress(bar)
+    return tqdm(total=n_total, initial=n_done, unit="file", disable=hidden, file=sys.stderr, leave=False)
 
 
 def _is_terminal(stream: TextIO) -> bool:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from rxcli.link.encoder import FileSending, MessageSending
+    from rxcli.link.encoder import Sending
     from rxcli.profiles import ScreenProfile
 
 _RATES = {"1/1.5": 0, "1/2": 1, "1/3": 2}
@@ -53,7 +53,8 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
     sending = sending_of(path, options["text"], options["uri"], _RATES[options["mother"]], options["object_id"])
     n_bursts = _n_bursts(options, sending, screen)
     weights = _weights(options["weights"], n_bursts, screen.columns)
-    _check_fits(sending, weights, screen)
+    for row in weights:
+        sending.check(row, screen.payload_symbols)
     try:
         _write(sending, screen, weights, n_bursts, out, as_slots=options["slots"])
     except OSError as error:
@@ -86,26 +87,13 @@ def _readme_of(out: Path) -> Path:
     return out.with_name(out.name + ".README.txt")
 
 
-def _n_bursts(options: dict[str, Any], sending: FileSending | MessageSending, screen: ScreenProfile) -> int:
+def _n_bursts(options: dict[str, Any], sending: Sending, screen: ScreenProfile) -> int:
     burst_s = screen.packet_s * screen.repeats
     if options["bursts"] is not None:
         return int(options["bursts"])
     if options["seconds"] is not None:
         return max(1, ceil(float(options["seconds"]) / burst_s))
-    return _default_bursts(sending, screen)
-
-
-def _default_bursts(sending: FileSending | MessageSending, screen: ScreenProfile) -> int:
-    """A round of a message; of a file, everything that is coded, once."""
-    from rxcli.link.encoder import FileSending
-    from rxcli.link.layout import beacon_layout
-
-    if not isinstance(sending, FileSending):
-        return beacon_layout(len(sending.body), screen.columns, screen.payload_symbols).period
-    layout = sending.layout(screen.columns, screen.payload_symbols)
-    units = layout.n_blocks * layout.n_labels
-    data = ceil(units / (screen.columns * screen.payload_symbols))
-    return data + ceil(data / 31)
+    return sending.usual_bursts(screen.columns, screen.payload_symbols)
 
 
 def _weights(text: str, n_bursts: int, columns: int) -> NDArray[np.int64]:
@@ -138,18 +126,8 @@ def _weight_values(text: str) -> Any:
         raise InputError(f"--weights {text}: cannot be read ({error.strerror})", "name a JSON file") from None
 
 
-def _check_fits(sending: FileSending | MessageSending, weights: NDArray[np.int64], screen: ScreenProfile) -> None:
-    from rxcli.link.encoder import FileSending, check_file, check_message
-
-    for row in weights:
-        if isinstance(sending, FileSending):
-            check_file(row, screen.payload_symbols)
-        else:
-            check_message(sending, row, screen.payload_symbols)
-
-
 def _write(
-    sending: FileSending | MessageSending,
+    sending: Sending,
     screen: ScreenProfile,
     weights: NDArray[np.int64],
     n_bursts: int,
@@ -166,9 +144,7 @@ def _write(
         _write_labels(chunks, screen, n_bursts, out)
 
 
-def _label_chunks(
-    sending: FileSending | MessageSending, screen: ScreenProfile, n_bursts: int
-) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+def _label_chunks(sending: Sending, screen: ScreenProfile, n_bursts: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
     import numpy as np
 
     for first in range(0, n_bursts, _CHUNK):
@@ -225,20 +201,20 @@ def _write_slots(
 
 
 def _summary(
-    sending: FileSending | MessageSending,
+    sending: Sending,
     screen: ScreenProfile,
     weights: NDArray[np.int64],
     n_bursts: int,
     out: Path,
 ) -> str:
-    from rxcli.link.encoder import FileSending, ready_bits, visible_bits_of_burst
+    from rxcli.link.encoder import FileSending, visible_bits_of_burst
 
     burst_s = screen.packet_s * screen.repeats
     many = "s" * (n_bursts > 1)
     lines = [f"{out}: {sending.summary}; {n_bursts} burst{many} of {screen.name}, {n_bursts * burst_s:.3g} s"]
     bits = sum(visible_bits_of_burst(row, screen.payload_symbols) for row in weights) / len(weights)
     if isinstance(sending, FileSending):
-        needed = ready_bits(sending) / (bits * 31 / 32) * burst_s / _USUAL_READOUT
+        needed = sending.ready_bits / (bits * 31 / 32) * burst_s / _USUAL_READOUT
         lines.append(
             f"a camera that sees all columns for {_USUAL_READOUT:.0%} of the time needs about {needed:.1f} s, and an "
             f"announcement, which comes every {32 * burst_s:.2g} s; send on until it has come"

@@ -42,6 +42,14 @@ class Sending(Protocol):
         """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
         ...
 
+    def check(self, weights: NDArray[np.int64], payload_symbols: int) -> None:
+        """Refuse what columns of these weights (C,) cannot carry."""
+        ...
+
+    def usual_bursts(self, columns: int, payload_symbols: int) -> int:
+        """How many bursts are sent where nothing else is asked for."""
+        ...
+
     @property
     def summary(self) -> str:
         """One line for people."""
@@ -67,6 +75,24 @@ class MessageSending:
         """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
         layout = beacon_layout(len(self.body), columns, payload_symbols)
         return _labels(self._buffer(layout), layout.places[bursts % layout.period])
+
+    def check(self, weights: NDArray[np.int64], payload_symbols: int) -> None:
+        """Refuse a message that a round of bursts cannot carry with these weights (C,).
+
+        Raises:
+            UsageError: the columns' weights leave too few bits.
+        """
+        layout = beacon_layout(len(self.body), len(weights), payload_symbols)
+        bits, need = layout.period * visible_bits_of_burst(weights, payload_symbols), BEACON_NEED * layout.code.k
+        if bits < need:
+            raise UsageError(
+                f"a message of this length needs {need:.0f} bits a round, these weights send {bits}",
+                "shorten the message, brighten the columns towards w = 5, or send it as a file",
+            )
+
+    def usual_bursts(self, columns: int, payload_symbols: int) -> int:
+        """Bursts of a round, after which all comes again."""
+        return beacon_layout(len(self.body), columns, payload_symbols).period
 
     def _buffer(self, layout: BeaconLayout) -> NDArray[np.uint8]:
         buffer: NDArray[np.uint8] = ldpc.encode(layout.code, _bits(_protect_beacon(self.body))[None])[0]
@@ -125,6 +151,36 @@ class FileSending:
             packed = self._buffers(layout)[blocks[..., None], bits >> 3]
             out[~announcing] = ((packed >> (7 - (bits & 7)).astype(np.uint8)) & 1) @ _LABEL_WEIGHTS
         return out
+
+    def check(self, weights: NDArray[np.int64], payload_symbols: int) -> None:
+        """Refuse a screen whose single bursts cannot carry an announcement with these weights (C,).
+
+        Raises:
+            UsageError: the columns' weights leave too few bits.
+        """
+        bits, layout = (
+            visible_bits_of_burst(weights, payload_symbols),
+            announcement_layout(len(weights), payload_symbols),
+        )
+        need = BEACON_NEED * layout.code.k
+        if min(bits, layout.n_bits) < need:
+            n_columns = int(np.ceil(need / max(bits / len(weights), 1)))
+            raise UsageError(
+                f"a file's announcement needs {need:.0f} bits in one burst, this screen sends {bits}",
+                f"use at least {n_columns} such columns, longer packets, or brighter columns",
+            )
+
+    def usual_bursts(self, columns: int, payload_symbols: int) -> int:
+        """Bursts in which everything that is coded comes once."""
+        layout = self.layout(columns, payload_symbols)
+        data = -(-layout.n_blocks * layout.n_labels // (columns * payload_symbols))
+        return data - (-data // (ANNOUNCEMENT_PERIOD - 1))
+
+    @property
+    def ready_bits(self) -> float:
+        """Bits of information that a receiver must see before the file is complete."""
+        layout = self.layout(1, 1)
+        return READY[self.mother] * layout.code.k * layout.n_blocks
 
     def _announcement(self, burst: int, columns: int, payload_symbols: int) -> Labels:
         layout = announcement_layout(columns, payload_symbols)
@@ -208,42 +264,3 @@ def packet_slots_of(labels: Labels, weights: NDArray[np.int64]) -> NDArray[np.ui
 def visible_bits_of_burst(weights: NDArray[np.int64], payload_symbols: int) -> int:
     """Bits that one burst carries over all columns of some weights (C,)."""
     return payload_symbols * sum(bits_per_symbol(int(w)) for w in weights)
-
-
-def check_message(sending: MessageSending, weights: NDArray[np.int64], payload_symbols: int) -> None:
-    """Refuse a message that a round of bursts cannot carry.
-
-    Raises:
-        UsageError: the columns' weights leave too few bits.
-    """
-    layout = beacon_layout(len(sending.body), len(weights), payload_symbols)
-    bits = layout.period * visible_bits_of_burst(weights, payload_symbols)
-    need = BEACON_NEED * layout.code.k
-    if bits < need:
-        raise UsageError(
-            f"a message of this length needs {need:.0f} bits a round, these weights send {bits}",
-            "shorten the message, brighten the columns towards w = 5, or send it as a file",
-        )
-
-
-def ready_bits(sending: FileSending) -> float:
-    """Bits of information that a receiver must see of a file before it is complete."""
-    layout = sending.layout(1, 1)
-    return READY[sending.mother] * layout.code.k * layout.n_blocks
-
-
-def check_file(weights: NDArray[np.int64], payload_symbols: int) -> None:
-    """Refuse a screen whose single bursts cannot carry an announcement.
-
-    Raises:
-        UsageError: the columns' weights leave too few bits.
-    """
-    bits = visible_bits_of_burst(weights, payload_symbols)
-    layout = announcement_layout(len(weights), payload_symbols)
-    need = BEACON_NEED * layout.code.k
-    if min(bits, layout.n_bits) < need:
-        per_column = bits / len(weights)
-        raise UsageError(
-            f"a file's announcement needs {need:.0f} bits in one burst, this screen sends {bits}",
-            f"use at least {int(np.ceil(need / max(per_column, 1)))} such columns, longer packets, or brighter columns",
-        )

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rxcli.errors import InputError
-from rxcli.outputs import TAPS, check_replaceable, replacing, unwritable
+from rxcli.outputs import TAPS, check_replaceable, make_parent, replacing
 from rxcli.types import BurstPosteriors, Clock, FloatArray, RowProfiles, SlotSamples
 
 _Stage = TypeVar("_Stage", RowProfiles, Clock, SlotSamples, BurstPosteriors)
@@ -80,10 +80,7 @@ def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]
     """
     arrays: dict[str, Any] = {name: array for stage, value in stages.items() for name, array in _arrays(stage, value)}
     path = folder / f"{plain_name(source)}-{frame:06d}.npz"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(path, error) from None
+    make_parent(path)
     check_replaceable(path, TAPS, "--dump-dir")
     with replacing(path) as hidden:
         np.savez(hidden, **arrays)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.outputs import PICTURE, check_replaceable, encode_png, unwritable, write_whole
+from rxcli.outputs import PICTURE, check_replaceable, encode_png, make_parent, write_whole
 from rxcli.profiles import CameraProfile, match_camera
 from rxcli.receiver.screen.geometry import lens_for
 from rxcli.results.cameras import camera_of
@@ -141,10 +141,7 @@ class UndistortedWriter:
 
     def _write(self, frame: Frame, lens: Lens, subfolder: str) -> None:
         path = self.folder / subfolder / f"{Path(frame.source).name}.{frame.index:05d}.png"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise unwritable(path, error) from None
+        make_parent(path)
         check_replaceable(path, PICTURE, "--save-undistorted")
         write_whole(path, encode_png(undistorted(frame, lens)))
 

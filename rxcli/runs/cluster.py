@@ -18,7 +18,7 @@ from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, OutputError, ReceiverError, UsageError
-from rxcli.outputs import PICTURE, TAPS, check_replaceable, unwritable, write_whole
+from rxcli.outputs import PICTURE, TAPS, check_replaceable, make_parent, write_whole
 from rxcli.runs.batch import Decoded, Decoder, Source, unreadable
 from rxcli.types import FrameResult
 
@@ -210,10 +210,7 @@ def _write(taps: list[_Tap], decoder: Decoder) -> None:
         path = folder / below
         if not path.resolve().is_relative_to(folder.resolve()):
             raise OutputError(f"{path}: a worker names a file outside {option}", "look at who joins the cluster")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise unwritable(path, error) from None
+        make_parent(path)
         check_replaceable(path, looks[option], option)
         write_whole(path, data)
 

@@ -16,8 +16,6 @@ from rxcli.link import ldpc
 from rxcli.link.encoder import (
     FileSending,
     MessageSending,
-    check_file,
-    check_message,
     file_object,
     message,
     packet_slots_of,
@@ -261,10 +259,10 @@ def test_slots_are_packets_of_the_air_interface(w: int) -> None:
 
 def test_what_cannot_work_is_refused_with_what_would() -> None:
     with pytest.raises(UsageError, match="1958 bits a round"):
-        check_message(message("y" * 190), np.full(20, 1), 24)
+        message("y" * 190).check(np.full(20, 1), 24)
     with pytest.raises(UsageError, match=r"at least \d+ such columns"):
-        check_file(np.full(4, 5), 5)
-    check_file(np.full(20, 5), 5)
+        file_object("x", b"x").check(np.full(4, 5), 5)
+    file_object("x", b"x").check(np.full(20, 5), 5)
     with pytest.raises(UsageError, match="at most 199 bytes"):
         message("x" * 200)
     with pytest.raises(UsageError, match="object id"):

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from rxcli.outputs import unwritable, write_whole
+from rxcli.outputs import make_parent, write_whole
 
 Row = dict[str, Any]
 
@@ -87,10 +87,7 @@ def write_text(path: Path, text: str) -> Path:
     Raises:
         OutputError: it cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(path, error) from None
+    make_parent(path)
     write_whole(path, text)
     return path
 

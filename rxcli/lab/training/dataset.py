@@ -156,13 +156,8 @@ def sample_of(
 
 def _by_packet(slots: NDArray[np.uint8], clock: Clock) -> NDArray[np.int64]:
     """(bursts, B, packet) slots (B, N) of the grid added over the copies of each burst."""
-    length = clock.packet_slots
-    out = np.zeros((int(clock.burst.max()) + 1, slots.shape[0], length), np.int64)
-    grid = np.arange(clock.n_slots) + clock.first_slot
-    for copy, burst in enumerate(clock.burst):
-        here = grid // length == copy
-        out[burst][:, grid[here] % length] += slots[:, here]
-    return out
+    copies = clock.to_copies(slots.astype(np.int64))
+    return np.stack([copies[:, clock.burst == burst].sum(axis=1) for burst in range(int(clock.burst.max()) + 1)])
 
 
 def _payload(packet: NDArray[np.integer]) -> NDArray[np.int64]:
