@@ -158,10 +158,8 @@ class FileSending:
         Raises:
             UsageError: the columns' weights leave too few bits.
         """
-        bits, layout = (
-            visible_bits_of_burst(weights, payload_symbols),
-            announcement_layout(len(weights), payload_symbols),
-        )
+        bits = visible_bits_of_burst(weights, payload_symbols)
+        layout = announcement_layout(len(weights), payload_symbols)
         need = BEACON_NEED * layout.code.k
         if min(bits, layout.n_bits) < need:
             n_columns = int(np.ceil(need / max(bits / len(weights), 1)))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from small_frames import BOTTOM, N_COLUMNS, ROWS_PER_SLOT, TOP, W, write_frame, write_profiles
 
-from rxcli.cli.common import receiver_options
 from rxcli.cli.main import run
 from rxcli.ingest import open_source
+from rxcli.options import receiver_options
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import bits_per_symbol
 from rxcli.receiver.pipeline import receive

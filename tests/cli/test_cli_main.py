@@ -144,7 +144,7 @@ def test_the_camera_cache_is_switched_by_file_environment_and_command_line(
 ) -> None:
     used: list[Any] = []
 
-    def options(**given: Any) -> Any:
+    def options(_arguments: Any, **given: Any) -> Any:
         used.append(given["camera_cache"])
         raise UsageError("seen")
 

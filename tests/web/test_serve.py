@@ -28,10 +28,9 @@ from small_frames import N_COLUMNS, write_frame, write_profiles
 aiohttp = pytest.importorskip("aiohttp")
 pytest.importorskip("segno")
 
-from rxcli.cli.common import receiver_options  # noqa: E402
 from rxcli.cli.main import run  # noqa: E402
 from rxcli.ingest import open_source  # noqa: E402
-from rxcli.options import ReceiverOptions  # noqa: E402
+from rxcli.options import ReceiverOptions, receiver_options  # noqa: E402
 from rxcli.results.aim import Aim, Light, light_of  # noqa: E402
 from rxcli.runs.processes import resident_bytes  # noqa: E402
 from rxcli.types import ColumnResult, FrameResult, Message, PacketResult, ReceivedObject  # noqa: E402
