@@ -25,7 +25,9 @@ from rxcli.resources import data_dir, profile_dirs, read_limited
 log = logging.getLogger(__name__)
 
 PositiveInt = Annotated[int, Meta(gt=0, le=1_000_000)]
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+#: What profiles and modes may be called.
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+Name = Annotated[str, Meta(pattern=f"^{NAME.pattern}$")]
 #: Times of rows and exposures; below a nanosecond nothing is read out.
 Seconds = Annotated[float, Meta(ge=1e-9, lt=1)]
 #: People write less.
@@ -242,7 +244,7 @@ def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any
 
 def _file_of(name: str, kind: type[Any]) -> Path:
     """The file of a profile that goes by `name`, the user's first; else `name` is a path."""
-    if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name) is None:
+    if NAME.fullmatch(name) is None:
         return Path(name)
     by_name = (folder / _KINDS[kind] / f"{name}.toml" for _, folder in profile_dirs())
     return next((path for path in by_name if path.is_file()), Path(name))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import msgspec
 
 from rxcli.errors import UsageError
 from rxcli.outputs import make_parent, write_whole
-from rxcli.profiles import CameraProfile, LensModel, ReadoutMode, dump_profile, load_profile
+from rxcli.profiles import NAME, CameraProfile, LensModel, ReadoutMode, dump_profile, load_profile
 from rxcli.types import Metadata
 
 
@@ -22,7 +21,7 @@ def profile_to_extend(path: Path, metadata: Metadata | None = None) -> CameraPro
     """
     if path.exists():
         return load_profile(str(path), CameraProfile)
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", path.stem):
+    if not NAME.fullmatch(path.stem):
         raise UsageError(
             f"{path}: {path.stem!r} cannot name a profile", "use letters, digits, dots, dashes and underscores"
         )

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
     from rxcli.types import Frame, Metadata
 
-_NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]*"
 _FILE = click.Path(dir_okay=False, path_type=Path)
 _PATHS = click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
 #: Where what was found goes: the options that `_Results` takes.
@@ -145,10 +144,11 @@ class _Results:
 
 def _file_of(name: str) -> Path:
     """The user's camera profile of a name."""
-    if not re.fullmatch(_NAME_PATTERN, name):
-        raise UsageError(f"--name {name!r} cannot name a profile", "use letters, digits, dots, dashes and underscores")
+    from rxcli.profiles import NAME
     from rxcli.resources import user_dir
 
+    if not NAME.fullmatch(name):
+        raise UsageError(f"--name {name!r} cannot name a profile", "use letters, digits, dots, dashes and underscores")
     return user_dir() / "cameras" / f"{name}.toml"
 
 
@@ -344,14 +344,14 @@ def _measure_screen(
 
 def _mode(result: ShutterCalibration, name: str | None) -> ReadoutMode:
     """The readout mode that was measured."""
-    from rxcli.profiles import ReadoutMode
+    from rxcli.profiles import NAME, ReadoutMode
 
     if result.axis == "columns":
         raise UsageError(
             "the readout runs along the columns: the stored picture was rotated, and profiles hold stored rows",
             "calibrate with an unrotated picture",
         )
-    if name is not None and not re.fullmatch(_NAME_PATTERN, name):
+    if name is not None and not NAME.fullmatch(name):
         raise UsageError(f"--mode {name!r} cannot name a mode", "use letters, digits, dots, dashes and underscores")
     height, width = result.shape
     return ReadoutMode(name=name or f"{width}x{height}", width=width, height=height, line_delay_s=result.line_delay_s)

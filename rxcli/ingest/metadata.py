@@ -31,18 +31,12 @@ _EXIF_BYTES = 1 << 16
 #: Longer names of makers, models and lenses are none.
 _MOST_CHARACTERS = 200
 
-#: What a receiver can use of what files say: field -> least, most, unit. A second is thousands of slots.
+#: What a receiver can use of what files say: field -> name, least, most, unit. A second is thousands of slots.
 _BOUNDS = {
-    "exposure_s": (1e-7, 1.0, "s"),
-    "iso": (0.1, 1e8, ""),
-    "focal_length_mm": (0.01, 1e5, "mm"),
-    "focal_length_35mm": (0.01, 1e5, "mm"),
-}
-_NAMES = {
-    "exposure_s": "exposure",
-    "iso": "ISO",
-    "focal_length_mm": "focal length",
-    "focal_length_35mm": "focal length",
+    "exposure_s": ("exposure", 1e-7, 1.0, "s"),
+    "iso": ("ISO", 0.1, 1e8, ""),
+    "focal_length_mm": ("focal length", 0.01, 1e5, "mm"),
+    "focal_length_35mm": ("focal length", 0.01, 1e5, "mm"),
 }
 
 Tags = Mapping[int, Any]
@@ -97,10 +91,10 @@ def clip_metadata(tags: Mapping[str, str]) -> Metadata:
 def believed(metadata: Metadata) -> Metadata:
     """The metadata without what no receiver can use, which is named in `not_believed` instead."""
     doubts = {}
-    for name, (least, most, unit) in _BOUNDS.items():
-        value = getattr(metadata, name)
+    for field, (name, least, most, unit) in _BOUNDS.items():
+        value = getattr(metadata, field)
         if value is not None and not least <= value <= most:
-            doubts[name] = f"{_NAMES[name]} of {value:.4g} {unit}".rstrip()
+            doubts[field] = f"{name} of {value:.4g} {unit}".rstrip()
     if not doubts:
         return metadata
     unknown: dict[str, Any] = dict.fromkeys(doubts)

@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
 from rxcli.outputs import OUTPUT_MARKER
-from rxcli.runs.processes import ONE_THREAD, environment
+from rxcli.runs.processes import ONE_THREAD, environment, start_process
 from rxcli.types import Frame, FrameResult
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
-    from multiprocessing.context import SpawnContext
     from multiprocessing.process import BaseProcess
 
     from rxcli.profiles import ScreenProfile
@@ -303,13 +302,9 @@ class _Buffer:
 
 class _Pool:
     def __init__(self, sources: Sequence[Source], decoder: Decoder, n_workers: int) -> None:
-        from multiprocessing import get_context
-
         self._sources = sources
         self._decoder = decoder
         self._n_workers = n_workers
-        #: A fresh interpreter per worker: forking one that has threads can lock up.
-        self._context: SpawnContext = get_context("spawn")
         self._workers: list[_Worker] = []
         self._buffers: dict[int, _Buffer] = {}
         self._next = 0
@@ -359,12 +354,8 @@ class _Pool:
         return self._next < min(len(self._sources), self._taking + _AHEAD * self._n_workers)
 
     def _started(self) -> _Worker:
-        ours, theirs = self._context.Pipe()
-        process = self._context.Process(target=_work, args=(theirs, self._decoder, log_level()), daemon=True)
         with environment(ONE_THREAD), _signals_held():
-            process.start()
-        theirs.close()
-        self._workers.append(_Worker(process, ours))
+            self._workers.append(_Worker(*start_process(_work, self._decoder, log_level())))
         return self._workers[-1]
 
     def _assign(self, worker: _Worker, index: int) -> None:

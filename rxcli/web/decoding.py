@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, sentence
-from rxcli.runs.processes import resident_bytes
+from rxcli.runs.processes import resident_bytes, start_process
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,14 +61,7 @@ class DecodingProcess:
 
     def start(self) -> None:
         """Start the process before it is needed, so that the first picture need not wait for it."""
-        from multiprocessing import get_context
-
-        context = get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(theirs, self._options), daemon=True)
-        process.start()
-        theirs.close()
-        self._process, self._connection = process, ours
+        self._process, self._connection = start_process(_work, self._options)
 
     def close(self) -> None:
         """End the process; may be called again."""

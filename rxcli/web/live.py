@@ -11,6 +11,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rxcli.runs.processes import start_process
+
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from multiprocessing.process import BaseProcess
@@ -69,14 +71,8 @@ class LiveCamera:
 
     def _follow(self) -> None:
         """Pass on what the process sends; start it again where it dies."""
-        from multiprocessing import get_context
-
-        context = get_context("spawn")
         while self._running:
-            ours, theirs = context.Pipe(duplex=False)
-            self._process = context.Process(target=_work, args=(theirs, *self._arguments), daemon=True)
-            self._process.start()
-            theirs.close()
+            self._process, ours = start_process(_work, *self._arguments)
             try:
                 while True:
                     self._publish(ours.recv())

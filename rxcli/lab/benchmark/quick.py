@@ -20,9 +20,9 @@ _MEDIA = ("jpeg-26mp", "raw-26mp", "jpeg-26mp-hard", "jpeg-12mp-unknown")
 
 def points() -> list[sweeps.Point]:
     """The paper's three rates on its two pictures, a dim photo, a phone and a clip."""
-    paper = [point for point in sweeps.SWEEPS["rate"]() if point.slot_rate_hz <= 34600]
-    dim = replace(next(iter(sweeps.SWEEPS["picture"]())), picture="coffee", light=0.3, label="coffee x 0.3")
-    cameras = [p for p in sweeps.SWEEPS["camera"]() if p.camera in ("phone-corrected", "video-4k")]
+    paper = [point for point in sweeps.SWEEPS["rate"] if point.slot_rate_hz <= 34600]
+    dim = replace(sweeps.SWEEPS["picture"][0], picture="coffee", light=0.3, label="coffee x 0.3")
+    cameras = [p for p in sweeps.SWEEPS["camera"] if p.camera in ("phone-corrected", "video-4k")]
     return [*paper, dim, *cameras]
 
 

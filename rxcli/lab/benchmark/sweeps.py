@@ -2,12 +2,12 @@
 
 The sensors are narrowed by binning: the rows, and with them all that concerns time, stay whole; the width shrinks, and
 every pixel gathers the light of those it stands for. So error rates are near those of the whole sensor, and a sweep
-takes minutes. Times are those of the narrow frames; `rxcli.lab.benchmark.stages` measures whole ones.
+takes minutes. Times are those of the narrow frames; `rxcli.lab.benchmark.speed` measures whole ones.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from math import sqrt
 from typing import Any
@@ -72,10 +72,6 @@ class Point:
         return self.columns * payload_bits(5, self.payload_symbols) * bursts / 1e3
 
 
-def _cae(mode: str) -> dict[str, Any]:
-    return {"cae": mode}
-
-
 def _without(*skips: str) -> dict[str, Any]:
     return {"skip": frozenset(SKIPS) - set(skips)}
 
@@ -84,82 +80,72 @@ def _without(*skips: str) -> dict[str, Any]:
 RECEIVERS: dict[str, tuple[dict[str, Any], bool]] = {
     "receiver": ({}, True),
     "outline searched": ({}, False),
-    "no auto-encoder": (_cae("never"), True),
-    "auto-encoder always": (_cae("always"), True),
+    "no auto-encoder": ({"cae": "never"}, True),
+    "auto-encoder always": ({"cae": "always"}, True),
     **{f"no skip of {name}": (_without(name), True) for name in SKIPS},
     "no skip at all": (_without(*SKIPS), True),
 }
 _VARIANTS = tuple(name for name in RECEIVERS if name != "outline searched")
 
 
-def _rate_points() -> Iterable[Point]:
-    for picture in ("sky", "flower"):
-        for rate, symbols in SLOT_RATES.items():
-            point = Point("rate", f"{picture} {rate / 1e3:g} kHz", picture=picture, slot_rate_hz=rate)
-            point = replace(point, payload_symbols=symbols)
-            yield replace(point, x=point.rate_kbps)
+#: What of `Point` the slot rate of 17.3 kHz asks for.
+_MIDDLE: dict[str, Any] = {"slot_rate_hz": 17300.0, "payload_symbols": 11}
+_FLAT = Point("tilt", "none", 0.0, roll_deg=0.0, yaw_deg=0.0, pitch_deg=0.0)
 
 
-def _light_points() -> Iterable[Point]:
-    for light in (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0):
-        yield Point("light", f"x {light:g}", light, light=light)
+def _at_rate(point: Point, what: str) -> Point:
+    """The point, placed on its sweep's axis by one of its rates."""
+    return replace(point, x=getattr(point, what))
 
 
-def _exposure_points() -> Iterable[Point]:
-    for slots in (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0):
-        point = Point("exposure", f"{slots:g} slots", slots, slot_rate_hz=17300.0, payload_symbols=11)
-        yield replace(point, exposure_slots=slots)
+def _tilted(about: str, angle: float) -> Point:
+    told: dict[str, Any] = {f"{about}_deg": angle}
+    return replace(_FLAT, label=f"{about} {angle:g}", x=angle, **told)
 
 
-def _picture_points() -> Iterable[Point]:
-    for picture in ("white", "sky", "text", "chelsea", "astronaut", "coffee", "rocket", "flower", "hubble", "night"):
-        yield Point("picture", picture, picture=picture)
-
-
-def _tilt_points() -> Iterable[Point]:
-    flat = Point("tilt", "none", 0.0, roll_deg=0.0, yaw_deg=0.0, pitch_deg=0.0)
-    yield flat
-    for angle in (0.5, 1.0, 2.0, 5.0):
-        yield replace(flat, label=f"roll {angle:g}", x=angle, roll_deg=angle)
-    for angle in (15.0, 30.0):
-        yield replace(flat, label=f"yaw {angle:g}", x=angle, yaw_deg=angle)
-        yield replace(flat, label=f"pitch {angle:g}", x=angle, pitch_deg=angle)
-
-
-def _camera_points() -> Iterable[Point]:
-    for name in PRESETS:
-        yield Point("camera", name, camera=name, slot_rate_hz=17300.0, payload_symbols=11)
-
-
-def _variant_points() -> Iterable[Point]:
-    for picture, light in (("coffee", 1.0), ("coffee", 0.2), ("flower", 1.0), ("sky", 0.1)):
-        yield Point("variants", f"{picture} x {light:g}", picture=picture, light=light, receivers=_VARIANTS)
-
-
-def _search_points() -> Iterable[Point]:
-    both = ("receiver", "outline searched")
-    for name in ("video-1080p", "video-4k", "phone-plain"):
-        point = Point("search", name, camera=name, slot_rate_hz=17300.0, payload_symbols=11, receivers=both)
-        yield replace(point, binned=False)
-
-
-def _table4_points() -> Iterable[Point]:
-    for columns in (20, 100):
-        for repeats in (3, 2, 1):
-            point = Point("table4", f"{columns} columns, {repeats} x", columns=columns, repeats=repeats, picture="sky")
-            yield replace(point, x=point.free_rate_kbps)
-
-
-SWEEPS: dict[str, Callable[[], Iterable[Point]]] = {
-    "rate": _rate_points,
-    "light": _light_points,
-    "exposure": _exposure_points,
-    "picture": _picture_points,
-    "tilt": _tilt_points,
-    "camera": _camera_points,
-    "variants": _variant_points,
-    "search": _search_points,
-    "table4": _table4_points,
+#: Sweep -> its points, in order.
+SWEEPS: dict[str, tuple[Point, ...]] = {
+    "rate": tuple(
+        _at_rate(
+            Point("rate", f"{shown} {rate / 1e3:g} kHz", picture=shown, slot_rate_hz=rate, payload_symbols=symbols),
+            "rate_kbps",
+        )
+        for shown in ("sky", "flower")
+        for rate, symbols in SLOT_RATES.items()
+    ),
+    "light": tuple(
+        Point("light", f"x {light:g}", light, light=light) for light in (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0)
+    ),
+    "exposure": tuple(
+        Point("exposure", f"{slots:g} slots", slots, exposure_slots=slots, **_MIDDLE)
+        for slots in (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
+    ),
+    "picture": tuple(
+        Point("picture", shown, picture=shown)
+        for shown in ["white", "sky", "text", "chelsea", "astronaut", "coffee", "rocket", "flower", "hubble", "night"]
+    ),
+    "tilt": (
+        _FLAT,
+        *(_tilted("roll", angle) for angle in (0.5, 1.0, 2.0, 5.0)),
+        *(_tilted(about, angle) for angle in (15.0, 30.0) for about in ("yaw", "pitch")),
+    ),
+    "camera": tuple(Point("camera", name, camera=name, **_MIDDLE) for name in PRESETS),
+    "variants": tuple(
+        Point("variants", f"{shown} x {light:g}", picture=shown, light=light, receivers=_VARIANTS)
+        for shown, light in (("coffee", 1.0), ("coffee", 0.2), ("flower", 1.0), ("sky", 0.1))
+    ),
+    "search": tuple(
+        Point("search", name, camera=name, receivers=("receiver", "outline searched"), binned=False, **_MIDDLE)
+        for name in ("video-1080p", "video-4k", "phone-plain")
+    ),
+    "table4": tuple(
+        _at_rate(
+            Point("table4", f"{columns} columns, {repeats} x", columns=columns, repeats=repeats, picture="sky"),
+            "free_rate_kbps",
+        )
+        for columns in (20, 100)
+        for repeats in (3, 2, 1)
+    ),
 }
 
 
@@ -336,7 +322,7 @@ class Summary:
 
 def points_of(names: Iterable[str]) -> list[Point]:
     """The points of some sweeps, in order."""
-    return [point for name in names for point in SWEEPS[name]()]
+    return [point for name in names for point in SWEEPS[name]]
 
 
 def run(points: Sequence[Point], n_frames: int, how: Run) -> list[Summary]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
-from rxcli.lab.simulate.optics import View, between_nodes, grid_nodes, project
+from rxcli.lab.simulate.optics import CORNERS, View, between_nodes, grid_nodes, project
 from rxcli.lab.simulate.sensor import Sensor, count_electrons, pick_colours, repeat_gains, to_raw
 from rxcli.lab.simulate.shutter import flicker, lit_share
 from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
@@ -108,7 +108,7 @@ class Exposure:
     @cached_property
     def corners(self) -> FloatArray:
         """(4, 2) sensor places of the screen's corners, top-left first, clockwise for a viewer."""
-        return self.screen_to_pixels(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]))
+        return self.screen_to_pixels(CORNERS)
 
     def _motion_of_rows(self, rows: FloatArray) -> FloatArray:
         """(..., 4) how far the camera has moved when the rows are in the middle of their exposure."""
@@ -159,14 +159,9 @@ class Exposure:
 
     @cached_property
     def texture_scale(self) -> tuple[int, int]:
-        """Texture pixels per panel pixel, down and across."""
-        return texture_scale(self)
-
-
-def texture_scale(exposure: Exposure) -> tuple[int, int]:
-    """Texture pixels per panel pixel: three where its colour stripes can be resolved, one otherwise."""
-    magnification = exposure.view.pixels_per_width / exposure.drive.grey.shape[1]
-    return (3, 3) if exposure.lcd_grid > 0 and magnification > 1.2 else (1, 1)
+        """Texture pixels per panel pixel, down and across: three where its colour stripes can be resolved, else one."""
+        magnification = self.view.pixels_per_width / self.drive.grey.shape[1]
+        return (3, 3) if self.lcd_grid > 0 and magnification > 1.2 else (1, 1)
 
 
 def panel_texture(exposure: Exposure) -> Float32Array:

@@ -16,6 +16,8 @@ from rxcli.profiles import ScreenProfile
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
+#: Of the screen (u, v): top-left first, clockwise for a viewer.
+CORNERS = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ class View:
         """(3, 3) projective map from screen places (u, v) to ideal normalised camera coordinates."""
         if self.pose.corners is not None:
             ideal = self.pixels_to_ideal(np.array(self.pose.corners, np.float64))
-            return homography(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), ideal)
+            return homography(CORNERS, ideal)
         size = np.array([self.screen.width_mm, self.screen.height_mm])
         matrix = self.camera_matrix
         distance = matrix[0, 0] * size[0] / (self.pose.fill * self.width)
@@ -179,7 +181,7 @@ class View:
     @cached_property
     def corners(self) -> FloatArray:
         """(4, 2) sensor places of the screen's corners, top-left first, clockwise for a viewer."""
-        return self.screen_to_pixels(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]))
+        return self.screen_to_pixels(CORNERS)
 
     @cached_property
     def pixels_per_width(self) -> float:
