@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rxcli.errors import ReceiverError, UsageError
 from rxcli.profiles import LensModel
-from rxcli.types import FloatArray
+from rxcli.types import BoolArray, FloatArray
 
 GrayImage = NDArray[np.uint8]
 Detector = Literal["classic", "sector", "charuco"]
@@ -379,18 +379,20 @@ def _projected(fit: _Fit) -> FloatArray:
     )
 
 
-def uncovered_parts(corners: FloatArray, width: int, height: int) -> tuple[str, ...]:
-    """Names of the parts of the field that hold no corners.
+def covered_parts(corners: FloatArray, width: int, height: int) -> BoolArray:
+    """(5, 5) whether a part of the field, down and across, holds corners (n, 2), pixels.
 
-    The field is cut into 5 x 5 parts; the outer ones decide how far the distortion can be trusted.
-
-    Args:
-        corners: (n, 2) pixels.
+    The outer parts decide how far the distortion can be trusted.
     """
-    across = np.clip((corners[:, 0] + 0.5) / width * 5, 0, 4).astype(int)
-    down = np.clip((corners[:, 1] + 0.5) / height * 5, 0, 4).astype(int)
+    across, down = np.clip((corners + 0.5) / [width, height] * 5, 0, 4).astype(int).T
     covered = np.zeros((5, 5), dtype=bool)
     covered[down, across] = True
+    return covered
+
+
+def uncovered_parts(corners: FloatArray, width: int, height: int) -> tuple[str, ...]:
+    """Names of the parts of the field that hold no corners (n, 2), pixels."""
+    covered = covered_parts(corners, width, height)
     rows = ("top", "upper", "middle", "lower", "bottom")
     columns = ("left", "centre left", "centre", "centre right", "right")
     return tuple(f"{rows[y]} {columns[x]}" for y, x in np.argwhere(~covered))

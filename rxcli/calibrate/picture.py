@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rxcli.calibrate.lens import LensCalibration
+from rxcli.calibrate.lens import LensCalibration, covered_parts
 from rxcli.outputs import encode_png, write_whole
 
 #: Length of the residual that the picture draws over a tenth of its width.
@@ -51,11 +51,9 @@ def _pixel(point: np.ndarray) -> tuple[int, int]:
 
 def _shade_uncovered(canvas: np.ndarray, calibration: LensCalibration, zoom: float) -> None:
     """Grey where the 5 x 5 parts of the field hold no corner."""
-    size = np.array([calibration.model.width, calibration.model.height])
-    part = np.clip((calibration.corners + 0.5) / size * 5, 0, 4).astype(int)
     height, width = canvas.shape[:2]
-    covered = {(int(x), int(y)) for x, y in part}
-    for x, y in ((x, y) for x in range(5) for y in range(5) if (x, y) not in covered):
+    covered = covered_parts(calibration.corners, calibration.model.width, calibration.model.height)
+    for y, x in np.argwhere(~covered):
         canvas[y * height // 5 : (y + 1) * height // 5, x * width // 5 : (x + 1) * width // 5] = 225
 
 

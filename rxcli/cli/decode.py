@@ -7,7 +7,7 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -268,9 +268,7 @@ class _Run:
         path = self._options["json_path"]
         if path is None or self._to_stdout:
             return None
-        journal = Journal(Path(path), self._options["resume"])
-        stack.callback(journal.close)
-        return journal
+        return stack.enter_context(closing(Journal(Path(path), self._options["resume"])))
 
     def _files(self) -> dict[str, str]:
         return {name: path for name, path in self._paths.items() if name != STDIN}

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.profiles import CameraProfile, ScreenProfile
+from rxcli.protocol import bits_per_symbol, encode_packet, hex_to_bits
+from rxcli.receiver import camera as blind
 from rxcli.receiver import sampling
+from rxcli.receiver.decode import assemble
 from rxcli.results.overlay import outlines_of
-from rxcli.results.plots import column_light, decided_slots, in_time_order
-from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult
+from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, PacketResult, RowProfiles
 
 #: Slots over which a column's picture is taken for even, and over which one clock residual is measured.
 _PICTURE_SLOTS, _RESIDUAL_SLOTS = 40, 30
@@ -71,7 +75,7 @@ def inspect_frame(
     width_px = float(np.linalg.norm(result.corners[1] - result.corners[0])) / screen.columns
     outlines = outlines_of(result.corners, screen.columns, frame, camera, sampling.strips_per_column(width_px))
     tone = "srgb" if camera is None or camera.tone == "auto" else camera.tone
-    profiles, columns = in_time_order(frame, result, sampling.sample_rows(frame, outlines, tone))
+    profiles, columns = _in_time_order(frame, result, sampling.sample_rows(frame, outlines, tone))
     rows_per_slot = 1 / (screen.slot_rate_hz * result.line_delay_s)
     exposure_rows = (result.exposure_s or 0.0) / result.line_delay_s
     traces = []
@@ -199,3 +203,52 @@ def _on(rows: FloatArray, trace: Trace) -> FloatArray:
     if not np.isfinite(trace.share).any():
         return np.full(rows.size, np.nan)
     return np.asarray(np.interp(rows, trace.rows, trace.share, left=np.nan, right=np.nan))
+
+
+def _in_time_order(
+    frame: Frame, result: FrameResult, profiles: RowProfiles
+) -> tuple[RowProfiles, tuple[ColumnResult, ...]]:
+    """Row profiles and columns with rows counted as they were read out, not as software may have turned them."""
+    if not result.estimated.get("readout_reversed", (0.0, 0.0))[0]:
+        return profiles, result.columns
+    columns = tuple(assemble.in_stored_rows(column, frame.height) for column in result.columns)
+    return blind.in_time_order(profiles, frame.height), columns
+
+
+def column_light(profiles: RowProfiles, column: int) -> tuple[FloatArray, FloatArray]:
+    """Sensor rows (n,) and mean light (n,) of one column, where it is on the screen."""
+    inside = profiles.inside[column]
+    on_screen = inside.any(axis=0)
+    light = (profiles.light[column] * inside).sum(axis=0)[on_screen] / inside.sum(axis=0)[on_screen]
+    rows = profiles.rows.astype(np.float64) if profiles.sensor_row is None else profiles.sensor_row[column].mean(axis=0)
+    return rows[on_screen], light.astype(np.float64)
+
+
+def decided_slots(
+    column: ColumnResult, screen: ScreenProfile, rows_per_slot: float, rows: FloatArray
+) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+    """What each packet of a column says the slots were, over the copies that are visible on its sensor rows (n,).
+
+    Yields:
+        Sensor row where the first slot starts, and the slots, 0 or 1.
+    """
+    if column.w is None or rows.size == 0 or not column.packets:
+        return
+    ends = [packet.first_row for packet in column.packets[1:]] + [float(rows.max())]
+    for packet, end in zip(column.packets, ends, strict=True):
+        slots = _packet_slots_of(packet, column.w, screen)
+        if slots is None:
+            continue
+        # Behind the copies that were counted, another burst may begin of which too little is seen.
+        hidden = max(float(rows.min()) - packet.first_row, 0.0) / rows_per_slot
+        longest = min(hidden + packet.copies * slots.size, screen.repeats * slots.size)
+        n_slots = math.ceil(min((end - packet.first_row) / rows_per_slot, longest))
+        if n_slots > 0:
+            yield packet.first_row, np.resize(slots, n_slots)
+
+
+def _packet_slots_of(packet: PacketResult, w: int, screen: ScreenProfile) -> NDArray[np.uint8] | None:
+    """The slots that would send `packet`, None where it is no packet of that weight and screen."""
+    if packet.payload_bits != bits_per_symbol(w) * screen.payload_symbols:
+        return None
+    return encode_packet(hex_to_bits(packet.payload, packet.payload_bits), w)

@@ -122,7 +122,6 @@ class Server:
         self._history: deque[str] = deque(maxlen=20)
         self._idle_since: dict[int, float] = {}
         self._live: Any = None
-        self._stack = contextlib.AsyncExitStack()
         #: The port, once the server runs.
         self.port = site.port
 

@@ -16,8 +16,7 @@ from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import bits_per_symbol
 from rxcli.receiver.pipeline import receive
 from rxcli.results.cameras import camera_of
-from rxcli.results.inspection import inspect_frame
-from rxcli.results.plots import column_light, decided_slots
+from rxcli.results.inspection import column_light, decided_slots, inspect_frame
 from rxcli.runs.batch import collect_sources
 from rxcli.types import ColumnResult, PacketResult
 
