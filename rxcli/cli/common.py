@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -80,22 +81,18 @@ def complete_files(_context: click.Context, _parameter: click.Parameter, incompl
     return [CompletionItem(incomplete, type="file")]
 
 
-def complete_screens(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Names of screen profiles, then files, for the shell."""
-    return _complete_profiles("screens", incomplete)
-
-
-def complete_cameras(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Names of camera profiles, then files, for the shell."""
-    return _complete_profiles("cameras", incomplete)
-
-
-def _complete_profiles(folder: str, incomplete: str) -> list[CompletionItem]:
+def _complete_profiles(
+    folder: str, _context: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
     from rxcli.resources import profile_dirs
 
     stems = {path.stem for _, parent in profile_dirs() for path in (parent / folder).glob("*.toml")}
     names = sorted(name for name in [AUTO, *stems] if name.startswith(incomplete))
     return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+
+
+#: Names of profiles, then files, for the shell.
+complete_screens, complete_cameras = (partial(_complete_profiles, folder) for folder in ("screens", "cameras"))
 
 
 #: What `receiver_options` takes.
