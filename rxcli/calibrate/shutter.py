@@ -358,7 +358,8 @@ def calibrate_shutter(
     axis = _common_axis(found)
     seen = [(i, s) for i, (of, regions) in enumerate(found) if of == axis for s in regions]
     if not seen:
-        raise ReceiverError(f"no stripes of a blinking lamp in {_pictures(len(pictures))}", _HINT)
+        where = "the picture" if len(pictures) == 1 else f"any of {len(pictures)} pictures"
+        raise ReceiverError(f"no stripes of a blinking lamp in {where}", _HINT)
     reference = _common_line_delay([s for _, s in seen], frequencies_hz)
     lamps = [_reading(i, s, frequencies_hz, reference) for i, s in seen]
     return _combine(lamps, pictures[0].shape, axis, frequencies_hz, exif_exposure_s, tone_known)
@@ -385,10 +386,6 @@ def _placed(stripes: Stripes, x: int, y: int) -> Stripes:
     """The region of a part of a picture, in the whole, whose pixel (x, y) is the part's first."""
     left, top, right, bottom = stripes.bounds
     return replace(stripes, bounds=(left + x, top + y, right + x, bottom + y))
-
-
-def _pictures(n: int) -> str:
-    return "the picture" if n == 1 else f"any of {n} pictures"
 
 
 def _common_axis(found: list[tuple[Axis, list[Stripes]]]) -> Axis:

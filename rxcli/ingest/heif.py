@@ -72,7 +72,9 @@ def _primary_turns(data: bytes) -> Iterator[tuple[bytes, int]]:
     boxes = dict(_boxes(meta[4:]))
     properties = dict(_boxes(boxes[b"iprp"]))
     container = list(_boxes(properties[b"ipco"]))
-    for index in _associations(properties[b"ipma"]).get(_primary_item(boxes[b"pitm"]), ()):
+    pitm = boxes[b"pitm"]
+    primary = int.from_bytes(pitm[4:6] if pitm[0] == 0 else pitm[4:8])
+    for index in _associations(properties[b"ipma"]).get(primary, ()):
         name, content = container[index - 1]
         if name in (b"irot", b"imir"):
             yield name, content[0]
@@ -90,10 +92,6 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
             raise ValueError("a box ends before it starts")
         yield name, data[start:end]
         at = end
-
-
-def _primary_item(pitm: bytes) -> int:
-    return int.from_bytes(pitm[4:6] if pitm[0] == 0 else pitm[4:8])
 
 
 def _associations(ipma: bytes) -> dict[int, list[int]]:

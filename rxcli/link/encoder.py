@@ -194,12 +194,9 @@ class FileSending:
                 protect(piece, self.object_id, number, block_prefix(self.object_id, number))
                 for number, piece in enumerate(pieces)
             ]
-            self._coded = np.concatenate(
-                [
-                    np.packbits(_encode_blocks(layout, blocks[i : i + _BATCH]), axis=1)
-                    for i in range(0, len(blocks), _BATCH)
-                ]
-            )
+            batches = (blocks[i : i + _BATCH] for i in range(0, len(blocks), _BATCH))
+            coded = (ldpc.encode(layout.code, np.stack([*map(_bits, batch)]))[:, : layout.n_bits] for batch in batches)
+            self._coded = np.concatenate([np.packbits(bits, axis=1) for bits in coded])
         return self._coded
 
     @property
@@ -210,10 +207,6 @@ class FileSending:
             f"file {self.name}, container of {len(self.container)} bytes in {layout.n_blocks} "
             f"block{'s' * (layout.n_blocks > 1)}"
         )
-
-
-def _encode_blocks(layout: FileLayout, blocks: list[bytes]) -> NDArray[np.uint8]:
-    return np.asarray(ldpc.encode(layout.code, np.stack([_bits(block) for block in blocks]))[:, : layout.n_bits])
 
 
 def file_object(name: str, data: bytes, object_id: int | None = None, mother: int = 2) -> FileSending:

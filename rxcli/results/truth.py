@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from string import hexdigits
 from typing import Annotated, Any
 
 import msgspec
@@ -125,15 +126,11 @@ def _payload_problem(burst: int, row: tuple[str, ...], truth: Truth) -> str | No
     if len(row) != truth.columns:
         return f"payload of burst {burst} must have one entry per column, {truth.columns} (got {len(row)})"
     for column, (text, n_bits) in enumerate(zip(row, truth.payload_bits, strict=True)):
-        if 4 * len(text) < n_bits or not _is_hex(text):
+        if 4 * len(text) < n_bits or not set(text) <= set(hexdigits):
             return (
                 f"payload of burst {burst}, column {column}, must be hex of at least {n_bits} bits (got {text!r:.60})"
             )
     return None
-
-
-def _is_hex(text: str) -> bool:
-    return all(digit in "0123456789abcdefABCDEF" for digit in text)
 
 
 def wrong_bits(received: str, n_received: int, sent: str, n_sent: int) -> int:

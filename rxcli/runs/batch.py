@@ -92,7 +92,8 @@ def _sources_of(path: str, suffixes: frozenset[str]) -> Iterator[Source]:
         return
     files = [name for name in _walk(path) if os.path.splitext(name)[1].casefold() in suffixes]
     if not files:
-        problem = f"{path}: the folder holds no picture or clip; name files, or a folder with {_listed(suffixes)}"
+        listed = ", ".join(sorted(suffix.lstrip(".") for suffix in suffixes))
+        problem = f"{path}: the folder holds no picture or clip; name files, or a folder with {listed}"
         yield Source(path, path, problem)
     for name in files:
         yield Source(name, name)
@@ -105,10 +106,6 @@ def _walk(folder: str) -> Iterator[str]:
             folders.clear()
             continue
         yield from (os.path.join(parent, name) for name in sorted(files) if not name.startswith("."))
-
-
-def _listed(suffixes: frozenset[str]) -> str:
-    return ", ".join(sorted(suffix.lstrip(".") for suffix in suffixes))
 
 
 @dataclass(frozen=True, slots=True)

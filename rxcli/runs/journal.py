@@ -52,12 +52,8 @@ class Head:
         before: dict[str, Any] = record["options"]
         pairs: dict[str, tuple[Any, Any]] = {"version": (record.get("version"), self.version)}
         for name in sorted({*before, *self.options}):
-            pairs[_option(name)] = before.get(name), self.options.get(name)
+            pairs["--" + name.replace("_", "-")] = before.get(name), self.options.get(name)
         return [f"{name} was {_shown(old)}, is {_shown(new)}" for name, (old, new) in pairs.items() if old != new]
-
-
-def _option(name: str) -> str:
-    return "--" + name.replace("_", "-")
 
 
 def _shown(value: object) -> str:

@@ -52,7 +52,7 @@ def test_damaged_pngs_can_have_right_checksums(cases: readers.Cases) -> None:
 
 
 def test_what_goes_wrong_is_a_problem_with_its_seed(cases: readers.Cases, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(readers, "_peak_mb", lambda: 100.0)  # This process has run other tests.
+    monkeypatch.setattr(readers, "peak_memory_mb", lambda: 100.0)  # This process has run other tests.
     assert cases.run(1)["problems"] == []
     monkeypatch.setattr(readers, "_call", lambda *_: (1, "vlc-rx: internal error (IndexError: 5)"))
     record = cases.run(7)
@@ -116,5 +116,5 @@ def test_few_rows_are_no_reason_for_an_error(height: int, tmp_path: Path, capsys
 def test_a_screen_profile_that_tells_nothing_of_its_columns_breaks_nothing(
     cases: readers.Cases, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(readers, "_peak_mb", lambda: 100.0)
+    monkeypatch.setattr(readers, "peak_memory_mb", lambda: 100.0)
     assert cases.run(7522000672)["problems"] == []

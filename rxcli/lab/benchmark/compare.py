@@ -240,20 +240,16 @@ def rows(found: Sequence[Comparison]) -> list[Row]:
 
 def _row(name: str, found: Sequence[Comparison]) -> Row:
     this, other = (sum(getattr(one, side).cpu_s for one in found) for side in ("this", "other"))
-    packets = (_n_packets(one.this.records) for one in found)
+    columns = (column for one in found for record in one.this.records for column in record.get("columns", ()))
     return {
         "files": name,
         "n": len(found),
         "same": sum(one.difference is None for one in found),
-        "packets": sum(packets),
+        "packets": sum(len(column["packets"]) for column in columns),
         "cpu_s": this,
         "other_cpu_s": other,
         "cpu_ratio": this / other if other else None,
     }
-
-
-def _n_packets(records: Sequence[Any]) -> int:
-    return sum(len(column["packets"]) for record in records for column in record.get("columns", ()))
 
 
 def differing(found: Sequence[Comparison]) -> list[Row]:

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -203,14 +203,10 @@ def run(room: str, pictures: int, how: Run) -> list[Row]:
     shared = {"run": "sensitivity", "seed": how.seed, "pictures": pictures}
     moves = [(number, factor) for number in found for factor in FACTORS]
     # The first number times one is the receiver as it is.
-    tasks = [{**shared, "number": _told(number), "factor": factor} for number, factor in [(found[0], 1.0), *moves]]
+    tasks = [{**shared, "number": asdict(number), "factor": factor} for number, factor in [(found[0], 1.0), *moves]]
     unmoved, *records = how.tasks("sensitivity", tasks, received)
     rows = [_row(number, unmoved, records[2 * at : 2 * at + 2]) for at, number in enumerate(found)]
     return sorted(rows, key=lambda row: -row["changed"])
-
-
-def _told(number: Number) -> Record:
-    return {"module": number.module, "name": number.name, "line": number.line, "value": number.value}
 
 
 def _row(number: Number, unmoved: Record, records: Sequence[Record]) -> Row:

@@ -45,11 +45,7 @@ def power_law(x: Sequence[float], y: Sequence[float]) -> float:
 
 def pareto_front(costs: Sequence[tuple[float, float]]) -> list[bool]:
     """Whether each point is on the front: no other one is as good in both costs and better in one."""
-    return [not any(_dominates(other, point) for other in costs) for point in costs]
-
-
-def _dominates(other: tuple[float, float], point: tuple[float, float]) -> bool:
-    return other[0] <= point[0] and other[1] <= point[1] and other != point
+    return [not any(a <= x and b <= y and (a, b) != (x, y) for a, b in costs) for x, y in costs]
 
 
 def cluster_interval(

@@ -22,13 +22,10 @@ def format_table(rows: Sequence[Row]) -> str:
     cells = [names, *([format_value(row.get(name)) for name in names] for row in rows)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
     numeric = [all(isinstance(row.get(name), (int, float, type(None))) for row in rows) for name in names]
-    lines = ["  ".join(_pad(cell, w, n) for cell, w, n in zip(line, widths, numeric, strict=True)) for line in cells]
+    pads = [str.rjust if right else str.ljust for right in numeric]
+    lines = ["  ".join(pad(cell, w) for pad, cell, w in zip(pads, line, widths, strict=True)) for line in cells]
     lines.insert(1, "  ".join("-" * width for width in widths))
     return "\n".join(line.rstrip() for line in lines)
-
-
-def _pad(cell: str, width: int, right: bool) -> str:
-    return cell.rjust(width) if right else cell.ljust(width)
 
 
 def format_value(value: Any) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import wraps
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -60,11 +61,7 @@ def watched() -> Iterator[list[str]]:
         finally:
             for module, name, function in originals:
                 setattr(module, name, function)
-            found += [f"{w.category.__name__}: {w.message} ({_place(w)})" for w in caught]
-
-
-def _place(warning: warnings.WarningMessage) -> str:
-    return f"{warning.filename.rpartition('/')[2]}:{warning.lineno}"
+            found += [f"{w.category.__name__}: {w.message} ({Path(w.filename).name}:{w.lineno})" for w in caught]
 
 
 def _public(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:

@@ -94,9 +94,10 @@ def column_waves(
 
     mode = camera.mode_for(frame.width, frame.height)
     assert mode is not None, "the camera must have a mode for the picture's size"
-    lens = lens_for(camera.lens, frame.width, frame.height) if camera.lens else None
-    picture = undistorted(frame, lens or _straight(frame))
-    plane = corners if lens is None or lens.corrected else undistort_points(corners, lens)
+    straight = Lens(np.eye(3), np.zeros(5), corrected=True)
+    lens = lens_for(camera.lens, frame.width, frame.height) if camera.lens else straight
+    picture = undistorted(frame, lens)
+    plane = corners if lens.corrected else undistort_points(corners, lens)
     top_left, top_right, bottom_right, bottom_left = plane
     width = max(round(float(np.linalg.norm(top_right - top_left))), screen.columns)
     height = max(round(float(np.linalg.norm(bottom_left - top_left))), 2)
@@ -109,10 +110,6 @@ def column_waves(
     sensor_rows = float(abs(bottom_left[1] + bottom_right[1] - top_left[1] - top_right[1])) / 2
     rows_per_slot = height / max(sensor_rows, 1.0) / (mode.line_delay_s * screen.slot_rate_hz)
     return waves[:, ::-1] if upside_down else waves, rows_per_slot
-
-
-def _straight(frame: Frame) -> Lens:
-    return Lens(np.eye(3), np.zeros(5), corrected=True)
 
 
 def threshold(waves: FloatArray, rows_per_slot: float) -> NDArray[np.bool_]:
