@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -107,6 +108,4 @@ def _cleaned(soft: FrameSoftBits) -> FrameSoftBits:
     """Bursts that show anything, within limits."""
     llr = np.clip(np.nan_to_num(soft.llr, nan=0.0, posinf=MAX_LLR, neginf=-MAX_LLR), -MAX_LLR, MAX_LLR)
     shown = llr.any(axis=(1, 2, 3))
-    return FrameSoftBits(
-        soft.burst[shown], llr[shown].astype(np.float32), soft.epoch, soft.source, soft.frame, soft.time_s
-    )
+    return replace(soft, burst=soft.burst[shown], llr=llr[shown].astype(np.float32))

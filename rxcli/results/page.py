@@ -108,6 +108,11 @@ def _svg(height: float, body: str, told: str, width: float = _WIDTH, kind: str =
     )
 
 
+def _drawing(title: str, height: float, body: str, told: str, caption: str) -> str:
+    """A section with a wide drawing; `told` says in words what it shows, before the caption."""
+    return _section(title, f'<div class="wide">{_svg(height, body, told)}</div>', f"{told} {caption}")
+
+
 def _path(x: FloatArray, y: FloatArray) -> str:
     """Points as a path that breaks where they are NaN."""
     known = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
@@ -251,12 +256,10 @@ def _timeline(results: Sequence[FrameResult]) -> str:
     ends = f'<text x="0" y="124">{results[0].time_s:.2f} s</text><text x="{_WIDTH}" y="124" text-anchor="end">{results[-1].time_s:.2f} s</text>'
     lost = sum(result.status not in ("ok", "partial") for result in results)
     told = f"{plural(len(results), 'frame')}, {sum(counts)} packets, {lost} frames without reception."
-    return _section(
-        "The clip",
-        f'<div class="wide">{_svg(128, "".join(bars) + ends, told)}</div>',
-        f"{told} Height: packets that ended in a frame, {most} at most. The line below is green where the frame "
-        "was received.",
+    caption = (
+        f"Height: packets that ended in a frame, {most} at most. The line below is green where the frame was received."
     )
+    return _drawing("The clip", 128, "".join(bars) + ends, told, caption)
 
 
 def _packets(result: FrameResult) -> str:
@@ -432,10 +435,12 @@ def _residuals(known: Inspection) -> str:
     )
     spread = float(np.sqrt(np.mean(late**2)))
     told = f"Clock residuals of {len(points)} places: {spread:.3f} slots root mean square."
-    return _section(
+    return _drawing(
         "Is the clock right?",
-        f'<div class="wide">{_svg(204, axis + dots, told)}</div>',
-        f"{told} Each dot: how much later than expected, in slots, the light of one column is around a row. Dots on the "
+        204,
+        axis + dots,
+        told,
+        "Each dot: how much later than expected, in slots, the light of one column is around a row. Dots on the "
         "line mean that line delay, lens and clock fit; a slope means another line delay, a bow another lens.",
     )
 
@@ -459,11 +464,8 @@ def _crosstalk(known: Inspection) -> str:
             bars.append(f'<text x="{50 + (number + 0.5) * step:.0f}" y="146" text-anchor="middle">{number}</text>')
     told = f"A neighbour's light is {100 * float(np.nanmean(beside)):.0f} % of a column's own on average, {100 * most:.0f} % at most."
     axis = f'<text x="46" y="16" text-anchor="end">{100 * most:.0f} %</text><path class="axis" d="M50 130H{_WIDTH}"/>'
-    return _section(
-        "Light of neighbours",
-        f'<div class="wide">{_svg(152, axis + "".join(bars), told)}</div>',
-        f"{told} Blue: how much of a column's light follows the slots of the column to its left; orange: to its right.",
-    )
+    caption = "Blue: how much of a column's light follows the slots of the column to its left; orange: to its right."
+    return _drawing("Light of neighbours", 152, axis + "".join(bars), told, caption)
 
 
 # -- the rest ----------------------------------------------------------------------------------------------------------
@@ -498,11 +500,8 @@ def _confidence(result: FrameResult) -> str:
             )
     found = [packet.confidence for packet in result.packets]
     told = f"{plural(len(found), 'packet')}; {sum(value >= 0.9 for value in found)} with a confidence of 0.9 or more."
-    return _section(
-        "Confidence",
-        f'<div class="wide">{_svg(n_packets * height + 24, "".join(cells), told)}</div>',
-        f"{told} Columns across, packets downwards; numbers are percent.",
-    )
+    caption = "Columns across, packets downwards; numbers are percent."
+    return _drawing("Confidence", n_packets * height + 24, "".join(cells), told, caption)
 
 
 def _encoder(result: FrameResult) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -183,21 +182,3 @@ def _packet(index: NDArray[np.int64], w: int) -> PacketResult:
 
 def _result(columns: list[ColumnResult]) -> FrameResult:
     return FrameResult(SOURCE, 0, 0.0, "ok", columns=tuple(columns))
-
-
-@dataclass(frozen=True)
-class Yardsticks:
-    """Scores of both yardsticks, and the wall time of the paper's pipeline."""
-
-    bound: Score
-    paper: Score
-    paper_ms: float
-
-
-def measure(trial: Trial) -> Yardsticks:
-    """Both yardsticks on one trial."""
-    from time import perf_counter
-
-    start = perf_counter()
-    paper = paper_score(trial)
-    return Yardsticks(bound_score(trial), paper, 1e3 * (perf_counter() - start))
