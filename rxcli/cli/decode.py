@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import shutil
@@ -278,7 +279,8 @@ class _Run:
         from rxcli import __version__
         from rxcli.runs.journal import Head
 
-        options = {name: _plain(value) for name, value in self._options.items() if name not in _NO_MATTER}
+        given = {name: value for name, value in self._options.items() if name not in _NO_MATTER}
+        options = json.loads(json.dumps(given, default=str))
         configured = self._decoder.options
         return Head(__version__, options | {"profiles": _digest((configured.screens, configured.cameras))})
 
@@ -445,13 +447,6 @@ def _baseline(options: dict[str, Any]) -> Baseline | None:
 def _order(names: list[str]) -> Any:
     places = {name: place for place, name in enumerate(names)}
     return lambda summary: places.get(summary.source, len(places))
-
-
-def _plain(value: Any) -> Any:
-    """An option as JSON has it."""
-    if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
-    return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)
 
 
 def _digest(profiles: Any) -> str:

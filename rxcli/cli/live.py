@@ -52,7 +52,7 @@ class Exposure(click.ParamType[float]):
     ("--height", click.IntRange(1), None, "Rows. [default: the largest that is fast enough]"),
     ("--fps", click.FloatRange(0, min_open=True), None, "Frames a second. [default: the camera's most]"),
     ("--format=FOURCC pixel_format", str, None, "GREY, Y10, Y12, Y16, NV12, YUYV, UYVY or MJPG."),
-    ("--exposure", Exposure(), None, "Seconds, or 1/8000. [default: as short as the camera can]"),
+    ("--exposure exposure_s", Exposure(), None, "Seconds, or 1/8000. [default: as short as the camera can]"),
     ("--gain", int, None, "In the camera's own units. [default: as it is]"),
     ("--wait", None, False, "Wait for a camera that is missing, busy or unplugged."),
     ("--list list_only", None, False, "Show the camera's modes and leave."),
@@ -117,15 +117,8 @@ def _settings(options: dict[str, Any]) -> Any:
     name = options["pixel_format"] and options["pixel_format"].upper()
     if name is not None and name not in PIXEL_FORMATS:
         raise UsageError(f"--format {options['pixel_format']} is not known", f"known are {', '.join(PIXEL_FORMATS)}")
-    return CameraSettings(
-        width=options["width"],
-        height=options["height"],
-        fps=options["fps"],
-        pixel_format=name,
-        exposure_s=options["exposure"],
-        gain=options["gain"],
-        wait=options["wait"],
-    )
+    same = {field: options[field] for field in ("width", "height", "fps", "exposure_s", "gain", "wait")}
+    return CameraSettings(pixel_format=name, **same)
 
 
 def _show_modes(device: Path) -> int:
