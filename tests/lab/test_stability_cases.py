@@ -90,7 +90,7 @@ def test_the_watch_names_the_stage(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_random_scenes_are_counted() -> None:
     records = [stability.scene_record({"seed": seed}) for seed in (3, 4)]
     assert all(record["problems"] == [] for record in records)
-    verdict = stability.Verdict({}, 2, 40, 400, 30, {"ok": 2})
+    verdict = stability.Verdict({}, 2, 400, 30, {"ok": 2})
     assert not verdict.within_rate
     assert not verdict.stable
     assert replace(verdict, wrong=2).stable

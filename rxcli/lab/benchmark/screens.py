@@ -7,6 +7,7 @@ its profile, phones without one.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -103,14 +104,10 @@ def shift_of(result: FrameResult, trial: Trial) -> int:
         for column, payload in enumerate(burst)
         if len(payload) > 2
     }
-    votes: dict[int, int] = {}
-    for column in result.columns:
-        for packet in column.packets:
-            for payload, own in sent:
-                if payload == packet.payload:
-                    votes[column.column - own] = votes.get(column.column - own, 0) + 1
-    best = max(votes, key=lambda shift: votes[shift], default=0)
-    return best if votes.get(best, 0) >= _SHIFTED and votes[best] > votes.get(0, 0) else 0
+    received = ((column.column, packet.payload) for column in result.columns for packet in column.packets)
+    votes = Counter(column - own for column, payload in received for this, own in sent if this == payload)
+    best = max(votes, key=votes.__getitem__, default=0)
+    return best if votes[best] >= _SHIFTED and votes[best] > votes[0] else 0
 
 
 def rows(records: Sequence[Record]) -> list[Row]:

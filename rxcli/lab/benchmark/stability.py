@@ -157,7 +157,6 @@ class Verdict:
     #: Problem -> seeds of the random scenes that show it.
     scenes: dict[str, list[int]]
     n_scenes: int
-    packets: int
     confident: int
     wrong: int
     status: dict[str, int]
@@ -189,7 +188,6 @@ def run(n_scenes: int, how: Run) -> Verdict:
     return Verdict(
         scenes=scenes,
         n_scenes=n_scenes,
-        packets=sum(record["packets"] for record in records),
         confident=sum(record["confident"] for record in records),
         wrong=sum(record["wrong"] for record in records),
         status={name: status.count(name) for name in sorted(set(status))},
