@@ -30,6 +30,8 @@ _DARK_SHARE = 0.3
 #: Rows apart at which light may still be alike, as so many slots have, in averaged rows; and share of the strips by
 #: which that is measured.
 _LAGS, _BRIGHT_SHARE = 40, 0.2
+#: Strips that are compared at a time with those near them.
+_PAIRS_AT_ONCE = 64
 _TINY = 1e-6
 
 
@@ -193,13 +195,24 @@ def _smooth(values: Float32Array, strips: int, windows: int = 1) -> Float32Array
 
 def _pairs(scaled: Float32Array, widest: int) -> Float32Array:
     """(W, S, widest + 1) coherence by strip and distance."""
-    n_windows, rows, n = scaled.shape
+    n = scaled.shape[2]
     widest = min(widest, n - 1)
-    every = np.matmul(scaled.transpose(0, 2, 1), scaled) / np.float32(rows)
-    padded = np.concatenate([every, np.zeros((n_windows, n, widest), np.float32)], axis=2)
+    # Strips some way apart are not asked for: strips are taken as many at a time as are.
+    size = n if n < 2 * widest + 2 else max(widest, _PAIRS_AT_ONCE)
+    parts = [_pairs_of(scaled, start, min(start + size, n), widest) for start in range(0, n, size)]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+
+
+def _pairs_of(scaled: Float32Array, start: int, end: int, widest: int) -> Float32Array:
+    """(W, end - start, widest + 1) coherence of some strips with those to their right, by distance."""
+    n_windows, rows, n = scaled.shape
+    last = min(end + widest, n)
+    every = np.zeros((n_windows, end - start, end - start + widest), np.float32)
+    np.matmul(scaled[:, :, start:end].transpose(0, 2, 1), scaled[:, :, start:last], out=every[:, :, : last - start])
+    every /= np.float32(rows)
     # Row i of the band begins at the diagonal: one row further is one place further along.
-    window, row, along = padded.strides
+    window, row, along = every.strides
     band = np.lib.stride_tricks.as_strided(
-        padded, (n_windows, n, widest + 1), (window, row + along, along), writeable=False
+        every, (n_windows, end - start, widest + 1), (window, row + along, along), writeable=False
     )
     return np.ascontiguousarray(band)

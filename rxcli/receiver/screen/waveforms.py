@@ -8,6 +8,7 @@ strips' light the right grid explains, and how much less with its borders half a
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +31,10 @@ LARGEST_STEP = np.array([0.1, 0.3, 0.3, 0.04, 0.04, 0.02])
 _REACH = 100.0
 #: Places of the borders at which light is explained, columns.
 _PHASES = 4
+#: Columns from which on a picture is worked on in blocks, columns of a block, and how far beyond it strips are asked
+#: for waveforms, columns: further ones tell nothing of them.
+_MANY_COLUMNS, _BLOCK_COLUMNS, _BESIDE_COLUMNS = 40, 12, 3
+_ALL = slice(None)
 _TINY = np.float32(1e-6)
 #: Logarithm of the least share of a column: smaller numbers, and their products, would take many times the time.
 LEAST_SHARE = np.float32(-30)
@@ -143,12 +148,64 @@ class _Predicted:
         turned, asked = waves.transpose(0, 2, 1), light.halves[1 - known]
         return cls(np.matmul(waves, turned), np.matmul(asked, turned), _dot(asked, asked))
 
+    def of_strips(self, strips: slice) -> _Predicted:
+        """What is said of some of the strips."""
+        return _Predicted(self.waves, self.strips[:, strips], self.power[:, strips])
 
-def explained_light(strips: StripLight, share: Float32Array) -> float:
-    """How much of the strips' light the other strips' waveforms explain, nats, with (W, S, K) shares of the columns."""
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """Neighbouring strips of a picture and those around them, which tell their columns' waveforms."""
+
+    strips: StripLight
+    #: (W, S) columns at the strips, counted from any whole one in each window.
+    u: FloatArray
+    #: First strip, an even one, and the one after the last, of those that the block is for; and their number before it.
+    first: int
+    last: int
+    offset: int
+
+    @property
+    def halves(self) -> tuple[slice, slice]:
+        """The even and the odd strips that the block is for."""
+        even, odd = (slice((self.first + 1 - half) // 2, (self.last + 1 - half) // 2) for half in (0, 1))
+        return even, odd
+
+    @property
+    def asked(self) -> slice:
+        """Its strips' places in the picture."""
+        return slice(self.offset, self.offset + self.last - self.first)
+
+
+def _blocks(strips: StripLight, u: FloatArray) -> Iterator[_Block]:
+    """The strips of a picture with columns (W, S), in blocks where there are many columns.
+
+    A column's waveform is told by the strips next to it, so that a block's cost is that of its own columns.
+    """
+    n = u.shape[1]
+    n_columns = float(np.ptp(u.mean(axis=0)))
+    if not _MANY_COLUMNS < n_columns < n:
+        yield _Block(strips, u, 0, n, 0)
+        return
+    size, beside = (2 * int(np.ceil(columns * n / n_columns / 2)) for columns in (_BLOCK_COLUMNS, _BESIDE_COLUMNS))
+    for start in range(0, n, size):
+        end, first, last = min(start + size, n), max(start - beside, 0), min(start + size + beside, n)
+        own = u[:, first:last]
+        counted = own - np.floor(own.min(axis=1, keepdims=True))
+        yield _Block(strips.between(first, last), counted, start - first, end - first, start)
+
+
+def explained_light(strips: StripLight, share: Float32Array, of: tuple[slice, slice] = (_ALL, _ALL)) -> float:
+    """How much of the strips' light the other strips' waveforms explain, nats.
+
+    Args:
+        strips: of the picture.
+        share: (W, S, K) shares of the columns in every strip's light.
+        of: those of the even and of the odd strips that are asked for.
+    """
     total = 0.0
     for known, asked in ((0, 1), (1, 0)):
-        predicted, own = _Predicted.of(strips, share, known), share[:, asked::2]
+        predicted, own = _Predicted.of(strips, share, known).of_strips(of[asked]), share[:, asked::2][:, of[asked]]
         power = _dot(np.matmul(own, predicted.waves), own) * predicted.power + _TINY
         alike = np.maximum(_dot(own, predicted.strips), 0) ** 2 / power
         total -= 0.5 * strips.n_rows * float(np.log1p(-np.minimum(alike, np.float32(0.999))).sum())
@@ -157,11 +214,13 @@ def explained_light(strips: StripLight, share: Float32Array) -> float:
 
 def predicted_light(strips: StripLight, u: FloatArray) -> Float32Array:
     """(W, S, rows) products of every strip's changes with what the other strips' waveforms predict."""
-    share, _ = _mixes(u, strips.sigma)
     out = np.empty((*u.shape, strips.halves[0].shape[2]), np.float32)
-    for known, asked in ((0, 1), (1, 0)):
-        waves = _waveforms(strips.halves[known], share[:, known::2], strips.weights[known])
-        out[:, asked::2] = np.matmul(share[:, asked::2], waves) * strips.halves[asked]
+    for block in _blocks(strips, u):
+        own, there = block.strips, out[:, block.asked]
+        share, _ = _mixes(block.u, strips.sigma)
+        for known, asked in ((0, 1), (1, 0)):
+            waves, of = _waveforms(own.halves[known], share[:, known::2], own.weights[known]), block.halves[asked]
+            np.multiply(np.matmul(share[:, asked::2][:, of], waves), own.halves[asked][:, of], out=there[:, asked::2])
     return out
 
 
@@ -169,7 +228,11 @@ def with_light(strips: StripLight, grid: Grid) -> Grid:
     """A grid, its borders moved to where they explain most of the light, with how much that is; see `Grid`."""
     u = columns_at(grid.numbers, strips.x, strips.y)
     places = np.arange(_PHASES) / _PHASES
-    light = np.array([explained_light(strips, _mixes(u + place, strips.sigma)[0]) for place in places.tolist()])
+    light = np.zeros(_PHASES)
+    for block in _blocks(strips, u):
+        for number, place in enumerate(places.tolist()):
+            share, _ = _mixes(block.u + place, strips.sigma)
+            light[number] += explained_light(block.strips, share, block.halves)
     wave = complex((light * np.exp(-2j * np.pi * places)).sum()) * 2 / _PHASES
     moved = grid.shifted(float(np.angle(wave)) / (2 * np.pi))
     return replace(moved, explained=float(light.mean()) + abs(wave), contrast=2 * abs(wave))
@@ -183,11 +246,24 @@ def refine_by_waveforms(strips: StripLight, grid: Grid, rounds: int = _ROUNDS) -
         grid: right to some tenths of a column.
         rounds: steps that it may take.
     """
-    best, prior = with_light(strips, grid), grid_prior(grid.bent)
-    numbers = best.numbers
+    best = with_light(strips, grid)
+    refined = with_light(strips, moved_by_waveforms(strips, best, rounds))
+    return refined if refined.likelihood > best.likelihood else best
+
+
+def moved_by_waveforms(strips: StripLight, grid: Grid, rounds: int = _ROUNDS, settled: float = _SETTLED) -> Grid:
+    """The grid moved until its columns' waveforms say no more of where the strips lie; how much light it explains then
+    is not asked.
+
+    Args:
+        strips: of the picture.
+        grid: right to some tenths of a column.
+        rounds: steps that it may take.
+        settled: movement of the strips, columns on average, below which nothing more is to be expected.
+    """
+    numbers, prior = grid.numbers, grid_prior(grid.bent)
     for _ in range(rounds):
-        mixes = _mixes(columns_at(numbers, strips.x, strips.y), strips.sigma)
-        off, weight = (values.ravel() for values in strip_offsets(strips, *mixes))
+        off, weight = (values.ravel() for values in _offsets(strips, columns_at(numbers, strips.x, strips.y)))
         if not weight.any():
             break  # A black picture: nothing says where the borders are.
         flat = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
@@ -196,10 +272,18 @@ def refine_by_waveforms(strips: StripLight, grid: Grid, rounds: int = _ROUNDS) -
         damped = normal + np.diag(prior + 1e-3 * np.diag(normal))
         step = np.clip(_LONGER * np.linalg.solve(damped, gradient), -LARGEST_STEP, LARGEST_STEP)
         numbers = numbers + step
-        if step @ normal @ step < _SETTLED**2 * weight.sum():
+        if step @ normal @ step < settled**2 * weight.sum():
             break
-    refined = with_light(strips, replace(best, numbers=numbers))
-    return refined if refined.likelihood > best.likelihood else best
+    return replace(grid, numbers=numbers)
+
+
+def _offsets(strips: StripLight, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """As `strip_offsets`, with columns (W, S) at the strips."""
+    off, weight = np.empty(u.shape), np.empty(u.shape)
+    for block in _blocks(strips, u):
+        own = strip_offsets(block.strips, *_mixes(block.u, strips.sigma))
+        off[:, block.asked], weight[:, block.asked] = (values[:, block.first : block.last] for values in own)
+    return off, weight
 
 
 def strip_offsets(strips: StripLight, share: Float32Array, apart: Float32Array) -> tuple[FloatArray, FloatArray]:

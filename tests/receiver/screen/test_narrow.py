@@ -5,13 +5,15 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen import geometry, narrow, waveforms
 from rxcli.receiver.screen.coherence import measure_coherence
 from rxcli.receiver.screen.columns import ColumnLayout, ColumnSearch, find_columns
-from rxcli.receiver.screen.grid import grid_between
+from rxcli.receiver.screen.grid import Grid, grid_between
 from rxcli.receiver.screen.narrow import shows_narrow_columns
+from rxcli.receiver.screen.waveforms import StripLight, predicted_light, refine_by_waveforms, with_light
 from rxcli.types import FloatArray
 
 HEIGHT, WIDTH, ROWS_PER_SLOT, COLUMNS = 1120, 1680, 5.0, 100
@@ -76,3 +78,45 @@ def test_a_picture_without_a_screen_shows_no_narrow_columns() -> None:
     luma = np.random.default_rng(2).normal(60, 8, (HEIGHT, WIDTH)).clip(0, 255).astype(np.uint8)
     assert not find_columns(luma, WIDE, NARROW).numberings
     assert not find_columns(luma, NARROW).numberings
+
+
+def test_what_blocks_of_columns_explain_is_what_all_columns_explain(monkeypatch: pytest.MonkeyPatch) -> None:
+    coherence = measure_coherence(drawn(), n_strips=1000, reach=0.02)
+    strips = StripLight.of(coherence, NARROW.sigma, None)
+    grid = grid_between(CORNERS, COLUMNS, (WIDTH, HEIGHT), None)
+    near = grid.shifted(0.1)
+    in_blocks = predicted_light(strips, grid.columns_at(np.stack(np.meshgrid(coherence.x, coherence.y), axis=-1)))
+    parts, moved = with_light(strips, grid), refine_by_waveforms(strips, near)
+    monkeypatch.setattr(waveforms, "_MANY_COLUMNS", 1000)
+    at_once = predicted_light(strips, grid.columns_at(np.stack(np.meshgrid(coherence.x, coherence.y), axis=-1)))
+    whole, moved_at_once = with_light(strips, grid), refine_by_waveforms(strips, near)
+    assert np.corrcoef(in_blocks.ravel(), at_once.ravel())[0, 1] > 0.9995
+    assert parts.explained == pytest.approx(whole.explained, rel=2e-3)
+    assert parts.contrast == pytest.approx(whole.contrast, rel=1e-2)
+    np.testing.assert_allclose(moved.numbers, moved_at_once.numbers, atol=0.02)
+
+
+def test_strips_are_compared_with_those_near_them() -> None:
+    coherence = measure_coherence(drawn(), n_strips=700, reach=0.02)
+    assert coherence.widest * 10 < coherence.x.size
+    changes = coherence.changes
+    for apart in (0, 1, coherence.widest):
+        n = coherence.x.size - apart
+        product = (changes[:, :, :n] * changes[:, :, apart:]).mean(axis=1)
+        np.testing.assert_allclose(coherence.pairs[:, :n, apart], product, atol=2e-5)
+        assert not coherence.pairs[:, n:, apart].any()
+
+
+def test_a_grid_that_is_none_is_not_followed_through_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    noise = np.random.default_rng(4).normal(60, 8, (HEIGHT, WIDTH)).clip(0, 255).astype(np.uint8)
+    asked: list[int] = []
+    original = narrow.with_light
+
+    def counted(strips: StripLight, grid: Grid) -> Grid:
+        asked.append(strips.x.shape[1])
+        return original(strips, grid)
+
+    monkeypatch.setattr(narrow, "with_light", counted)
+    coherence, _, grids = narrow.find_narrow_columns(noise, NARROW.sigma)
+    assert not grids
+    assert max(asked) < 0.7 * coherence.x.size
