@@ -7,12 +7,14 @@ and waveforms correct it before it goes on.
 
 from __future__ import annotations
 
+from itertools import count
+
 import numpy as np
 
 from rxcli.receiver.screen.coherence import Coherence, Pixels, measure_coherence
 from rxcli.receiver.screen.comb import FIFTH, Comb, find_combs
 from rxcli.receiver.screen.grid import Grid, strip_places
-from rxcli.receiver.screen.waveforms import StripLight, moved_by_waveforms, refine_by_waveforms, with_light
+from rxcli.receiver.screen.waveforms import StripLight, moved_by_waveforms, with_light
 from rxcli.types import Lens
 
 #: Strips across the picture, and the largest distance at which they are compared, picture widths.
@@ -26,6 +28,8 @@ _NEAR, _FAR, _WIDE_ALIKE = 0.004, 0.018, 0.45
 #: A grid's contrast, a share of what it explains: right ones of simulated pictures have 0.06 and more in any part of
 #: the picture, wrong ones 0.06 by chance in a fifth of it, 0.04 in more and 0.03 in all of it.
 _CONTRAST = 0.04
+#: In so many parts, one further than the other, a grid's contrast is asked before it is followed on.
+_ASKED = 2
 #: A grid that is followed moves with every step, so that it need settle no better than this, columns.
 _SETTLED = 0.01
 #: Strips with light, a share, without which there is nothing to follow.
@@ -92,16 +96,18 @@ def _followed(strips: StripLight, grid: Grid, first: int, last: int) -> Grid | N
     """A grid of a part of the strips, followed from there to both ends; None where it turns out to be none."""
     n = strips.x.shape[1]
     thinned = strips.thinned(_EVERY)
-    while True:
+    for step in count():
         part = thinned.between(first, last)
-        grid = with_light(part, moved_by_waveforms(part, grid, _SETTLED))
-        if _is_none(grid):
-            return None
+        grid = moved_by_waveforms(part, grid, _SETTLED)
+        if step < _ASKED:
+            grid = with_light(part, grid)
+            if _is_none(grid):
+                return None
         if last - first >= n:
             break
         more = (_FURTHER - 1) * (last - first) / 2
         first, last = 2 * int(max(first - more, 0) / 2), min(int(last + more) + 2, n)
-    grid = refine_by_waveforms(strips, grid)
+    grid = with_light(strips, moved_by_waveforms(strips, grid))
     return None if _is_none(grid) else grid
 
 

@@ -15,12 +15,14 @@ import numpy as np
 from rxcli.receiver.screen.grid import Grid, columns_at
 from rxcli.receiver.screen.sides import Side
 from rxcli.receiver.screen.waveforms import StripLight, predicted_light
-from rxcli.types import FloatArray
+from rxcli.types import Float32Array, FloatArray
 
 #: Places along the screen at which light is asked for, and how far beyond its ends, screen heights.
 _BINS, _BEYOND = 320, 0.6
 #: Share of the strips, the least alike, that are taken to be without light.
 _DARK_SHARE = 0.1
+#: Strips of so much of a column are taken together.
+_PART = 0.5
 #: Places with less than this share of the strips that others have count in proportion.
 _FEW_STRIPS = 0.5
 #: Light counts from this share of what the lit rows have.
@@ -119,12 +121,12 @@ def find_rows(
         row: a picture row in the middle of the light, about.
         sides: top and bottom, where stripes begin and end, taken where they show well; none: nothing is known of them.
     """
-    plane = Plane.through(grid, n_columns, aspect, row)
+    plane, light_of = Plane.through(grid, n_columns, aspect, row), _PartLight.of(strips, grid, n_columns)
     for _ in range(_ROUNDS):
-        top, bottom = lit_range(*light_along(strips, plane, n_columns))
+        top, bottom = lit_range(*light_along(light_of, plane))
         middle = plane.pixels(np.array([[n_columns / 2, (top + bottom) / 2]]))[0, 1]
         plane = Plane.through(grid, n_columns, aspect, float(middle))
-    top, bottom = lit_range(*light_along(strips, plane, n_columns))
+    top, bottom = lit_range(*light_along(light_of, plane))
     light = np.array([[top, top], [bottom, bottom]])
     shown = _shown_sides(plane, n_columns, sides, light)
     return tuple(Rows(plane, ends, n_columns) for ends in _possible_ends(light, shown))
@@ -196,26 +198,50 @@ def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:
     return float(v[0] + (start - 0.5) * step), float(v[0] + (end - 0.5) * step)
 
 
-def light_along(strips: StripLight, plane: Plane, n_columns: int) -> tuple[FloatArray, FloatArray]:
-    """How much light the columns have along the screen.
+@dataclass(frozen=True, slots=True)
+class _PartLight:
+    """How alike the strips of a screen are to what their neighbours predict, beyond what strips without light are.
 
-    Returns:
-        (n,) v, and how alike the strips of the screen are to what their neighbours predict there, beyond what strips
-        without light are.
+    Strips of a part of a column lie at the same place along the screen, and are taken together.
     """
-    u = columns_at(plane.grid.numbers, strips.x, strips.y)
-    alike, inside = predicted_light(strips, u), (u > 0) & (u < n_columns)
-    mean = alike.mean(axis=(0, 2))
-    dark = np.sort(mean)[: max(round(_DARK_SHARE * mean.size), 1)].mean()
+
+    #: (P, rows), and how many strips each is the sum of.
+    light: Float32Array
+    n_together: int
+    #: (P,) offsets of the parts from the picture's middle, and half the height of their rows, picture widths.
+    x: FloatArray
+    y: FloatArray
+    half_height: float
+
+    @classmethod
+    def of(cls, strips: StripLight, grid: Grid, n_columns: int) -> _PartLight:
+        """The light of the strips that lie on the columns of a grid."""
+        u = columns_at(grid.numbers, strips.x, strips.y)
+        alike = predicted_light(strips, u)
+        mean = alike.mean(axis=(0, 2))
+        dark = np.sort(mean)[: max(round(_DARK_SHARE * mean.size), 1)].mean()
+        n_windows, n_strips, n_rows = alike.shape
+        n = max(int(_PART * n_strips / max(float(np.ptp(u.mean(axis=0))), 1.0)), 1)
+        whole = n_strips // n * n
+        total = alike[:, :whole].reshape(n_windows, -1, n, n_rows).sum(axis=2)
+        u, x, y = (values[:, :whole].reshape(n_windows, -1, n).mean(axis=2) for values in (u, strips.x, strips.y))
+        inside = (u > 0) & (u < n_columns)
+        light = (total - np.float32(n * max(dark, 0.0)))[inside]
+        return cls(np.asarray(light, np.float32), n, x[inside], y[inside], strips.half_height)
+
+
+def light_along(parts: _PartLight, plane: Plane) -> tuple[FloatArray, FloatArray]:
+    """How much light the columns have along the screen: (n,) v, and the light there."""
     # A strip's rows of one window lie evenly along the screen.
-    ends = np.stack([plane.along_flat(strips.x, strips.y + side * strips.half_height) for side in (-1, 1)], axis=-1)
-    share = (np.arange(alike.shape[2]) + 0.5) / alike.shape[2]
-    v = (ends[..., :1] + np.diff(ends) * share)[inside]
+    ends = np.stack([plane.along_flat(parts.x, parts.y + side * parts.half_height) for side in (-1, 1)], axis=-1)
+    n_rows = parts.light.shape[1]
+    share = (np.arange(n_rows) + 0.5) / n_rows
+    v = ends[..., :1] + np.diff(ends) * share
     edges = np.linspace(-_BEYOND, 1 + _BEYOND, _BINS + 1)
     place = np.floor((v.ravel() - edges[0]) / (edges[1] - edges[0])).astype(np.int64)
     good = (place >= 0) & (place < _BINS)
-    light = (alike[inside].ravel() - np.float32(max(dark, 0.0)))[good]
-    total, count = np.bincount(place[good], light, _BINS), np.bincount(place[good], minlength=_BINS)
+    total = np.bincount(place[good], parts.light.ravel()[good], _BINS)
+    count = parts.n_together * np.bincount(place[good], minlength=_BINS)
     # At the ends of the picture a few strips alone say little.
     enough = _FEW_STRIPS * float(np.median(count[count > 0])) if count.any() else 1.0
     return (edges[1:] + edges[:-1]) / 2, np.asarray(total / np.maximum(count, enough))
