@@ -98,7 +98,7 @@ def _followed(strips: StripLight, grid: Grid, first: int, last: int) -> Grid | N
     thinned = strips.thinned(_EVERY)
     for step in count():
         part = thinned.between(first, last)
-        grid = moved_by_waveforms(part, grid, _SETTLED)
+        grid = moved_by_waveforms(part, grid, settled=_SETTLED)
         if step < _ASKED:
             grid = with_light(part, grid)
             if _is_none(grid):
