@@ -99,6 +99,8 @@ class Outline:
     fills: bool = False
     #: Corners that it has with other rows, likeliest first.
     other_rows: tuple[FloatArray, ...] = ()
+    #: Columns whose borders were found on it, many of them; None: not asked, or few, of which many may have been taken.
+    n_columns: int | None = None
 
     @property
     def is_counted_from_left(self) -> bool:
@@ -114,6 +116,12 @@ class Outline:
             "inferred_sides": self.inferred,
             "column_offset": self.column_offset,
         }
+
+
+def with_columns(context: FrameContext, outline: Outline) -> FrameContext:
+    """A frame with its camera and the screens that have the columns of an outline."""
+    alike = tuple(screen for screen in context.screens if screen.columns == outline.n_columns)
+    return replace(context, screens=alike) if alike and len(alike) < len(context.screens) else context
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +197,7 @@ def possible_outlines(
                 all_layouts = [layouts[n] for n in sorted(layouts)]
                 columns = find_columns(frame.pixels, *all_layouts, mosaic_period=period, lens=lens, lines=sides.lines)
                 layout = columns.layout
-            found = _joined(sides, columns.numberings, layout.n_columns)
+            found = _joined(sides, columns.numberings, layout)
             # Sides that no grid bears out may be a column off like any others.
             unsure = [replace(one, log_odds=0.0) for one in found if not columns.numberings or one.family < 0]
             if unsure:
@@ -225,7 +233,8 @@ def _by_sides(
     for part in _PARTS:
         for layout in layouts:
             if sides_agree(frame.pixels, sides.corners, layout, mosaic_period=period, lens=lens, part=part):
-                own = Outline(sides.corners, inferred=sides.inferred)
+                n_columns = layout.n_columns if layout.is_narrow else None
+                own = Outline(sides.corners, inferred=sides.inferred, n_columns=n_columns)
                 return _with_shifts(frame, [own], sides, layout, period, lens)
     return []
 
@@ -281,7 +290,7 @@ def _without_hopeless(outlines: list[Outline]) -> list[Outline]:
     return outlines[:1] if clear else outlines
 
 
-def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: int) -> list[Outline]:
+def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], layout: ColumnLayout) -> list[Outline]:
     """Outlines by the sides and by grids, likeliest first."""
     by_sides = None if sides.corners is None else Outline(sides.corners, inferred=sides.inferred)
     if not numberings:
@@ -297,10 +306,12 @@ def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], n_columns: i
             fills=numbering.fills,
             by_grid_alone=alone,
             family=families.setdefault(numbering.grid.numbers[1:].tobytes(), len(families)),
+            n_columns=layout.n_columns if layout.is_narrow else None,
         )
-        if by_sides and _agree(by_sides.corners, numbering, n_columns):
+        if by_sides and _agree(by_sides.corners, numbering, layout.n_columns):
             agreed = True
-            own = replace(by_sides, log_odds=own.log_odds + _bonus(by_sides), family=own.family)
+            odds = own.log_odds + _bonus(by_sides)
+            own = replace(by_sides, log_odds=odds, family=own.family, n_columns=own.n_columns)
         outlines.append(own)
     if by_sides and not agreed:
         outlines.append(replace(by_sides, log_odds=_CONTRADICTED, family=-1))
@@ -345,6 +356,8 @@ def _by_packets(
     if isinstance(context, Failure):
         best = _likeliest([one for one in candidates if not one.by_grid_alone])
         return Located(best, context) if best else None
+    if len({one.n_columns for one in candidates}) == 1:
+        context = with_columns(context, candidates[0])
     candidates, packets, looked_at = _with_likely_rows(context, candidates)
     if max(packets.values()) < _SOME_PACKETS:
         if context.camera.remembered:

@@ -21,7 +21,7 @@ from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.outline import locate
+from rxcli.receiver.outline import locate, with_columns
 from rxcli.receiver.reception import Reception, headerless, slot_margin, soft_bits
 from rxcli.receiver.screen_choice import quick_look, quick_sampler
 from rxcli.receiver.single_light import with_data
@@ -103,6 +103,7 @@ def _receive_still(
     context = located.context or likely_camera(frame, corners, options, timer)
     if isinstance(context, Failure):
         return failed(result, context)
+    context = with_columns(context, outline)
     # Sampling: pixels to row profiles; sync: row profiles to a clock.
     acquisition = with_data(context, quick_sampler(context), quick_look(context))
     if isinstance(acquisition, Failure):
