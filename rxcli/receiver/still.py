@@ -39,9 +39,8 @@ _MIXED_ROWS, _USUAL_MIX = (0.0, 1.0, 1.7, 2.4, 3.0), 1
 #: looked at again, at last by the auto-encoder, and symbols of less log probability are weighed as words. Where the
 #: gate comes from: docs/auto_encoder.md. Of 2699 packets of simulated frames an initial pass leaves half so sure.
 _DOUBTFUL, _DOUBTFUL_WORD = 0.985, -1e-2
-#: A column none of whose packets has symbols of at least this mean log probability is beyond repair: on the coarse grid,
-#: and from the fine one on. Of 350 such columns of simulated frames further looks and a second opinion made two
-#: error-free.
+#: A column none of whose packets has symbols of at least this mean log probability is beyond repair: on the coarse
+#: grid, and from the fine one on. Of 350 such columns of simulated frames further looks made two error-free.
 _BEYOND_REPAIR_COARSE, _BEYOND_REPAIR = -1.0, -0.8
 #: Of symbols in doubt, so many words are weighed, down to so many nats below the best; not where even that is less
 #: likely than this, a log probability: there is nothing to choose from.

@@ -73,8 +73,7 @@ def _combs_of_parts(coherence: Coherence, sigma: float) -> list[tuple[Comb, int,
     size = 2 * round(_SHARE * n / 2)
     found = []
     for start in np.linspace(0, n - size, _PARTS).tolist():
-        first = 2 * round(start / 2)
-        first = min(first, n - size)
+        first = 2 * min(round(start / 2), (n - size) // 2)
         combs = find_combs(coherence.between(first, first + size), sigma, 1, FIFTH)
         found += [(comb, first, first + size) for comb in combs]
     return sorted(found, key=lambda one: -one[0].score)[:_FOLLOWED]

@@ -120,3 +120,12 @@ def test_a_grid_that_is_none_is_not_followed_through_the_picture(monkeypatch: py
     coherence, _, grids = narrow.find_narrow_columns(noise, NARROW.sigma)
     assert not grids
     assert max(asked) < 0.7 * coherence.x.size
+
+
+def test_any_number_of_strips_is_searched() -> None:
+    picture = drawn()
+    for width in (WIDTH, WIDTH - 2, WIDTH - 15):
+        coherence, _, grids = narrow.find_narrow_columns(np.ascontiguousarray(picture[:, :width]), NARROW.sigma)
+        assert len(grids) == 1
+        parts = narrow._combs_of_parts(coherence, NARROW.sigma)
+        assert all(first % 2 == 0 and last <= coherence.x.size for _, first, last in parts)
