@@ -287,7 +287,8 @@ def _seen_again(
     """What is seen with some columns looked at again, and the (C, 2) timing of all, 0 for the others."""
     samples, model = _view(acquisition, reception, columns, samples_per_slot)
     lit = reception.clock.on_grid(reception.posteriors.lit)
-    likelihoods = channel.slot_likelihoods(samples, reception.clock, model, lit, columns)
+    asked = samples_per_slot == _COARSE
+    likelihoods = channel.slot_likelihoods(samples, reception.clock, model, lit, columns, timing=asked)
     timing = np.zeros((lit.shape[0], 2))
     timing[columns] = likelihoods.timing
     return _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr), timing
@@ -401,7 +402,7 @@ def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: 
     samples, model = _view(acquisition, reception, np.arange(reception.snr.shape[0]), denoise.SAMPLES_PER_SLOT)
     scene = denoise.remove_row_noise(reception.scene_of(samples, model))
     asked = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
-    likelihoods = channel.slot_likelihoods(asked, reception.clock, model, scene.lit, columns)
+    likelihoods = channel.slot_likelihoods(asked, reception.clock, model, scene.lit, columns, timing=False)
     cleaned = replace(reception, cleaned=(scene.samples, model))
     return _with_metrics(cleaned, columns, likelihoods.metrics, likelihoods.snr)
 

@@ -13,7 +13,7 @@ from rxcli.receiver.camera.curvature import BEND_PRECISION, BEND_SCALE
 from rxcli.receiver.camera.estimates import BlindEstimate
 from rxcli.receiver.camera.reading import Packets, Reading, read_slots
 from rxcli.receiver.camera.settings import SETTINGS
-from rxcli.receiver.camera.strips import Correction, Strips
+from rxcli.receiver.camera.strips import Correction, Strips, halved
 from rxcli.receiver.camera.structure import repeat_evidence
 from rxcli.receiver.camera.views import BLOCK_ROWS, View, Views, slot_time
 from rxcli.receiver.camera.waves import (
@@ -79,7 +79,7 @@ def refine(
             does not; optics and demosaicing add to it.
         sure: whether the stripes are bent without doubt.
     """
-    view = views.at(reading.rows_per_slot, reading.is_reversed)
+    view = Views(halved(views.strips)).at(reading.rows_per_slot, reading.is_reversed)
     least = exposure_of_length(reading.packets[0].packet_slots)
     for _ in range(SETTINGS.most_readings):
         timing, corrected = _fit_timing(view, reading, least, sure)
@@ -108,7 +108,7 @@ def refine(
             curvature=view.curvature(found),
             curvature_sd=sd[2:],
             corrected=corrected,
-            log_evidence=_log_evidence(timing, packets),
+            log_evidence=_log_evidence(timing, packets, packets is reading.packets[0]),
             explained=timing.explained,
             least_exposure_slots=exposure_of_length(packets.packet_slots),
             side_curvature=view.strips.side_curvature,
@@ -128,10 +128,11 @@ def _moved(view: View, reading: Reading, timing: _Timing) -> float:
     return float(np.abs(after - before)[:, ::BLOCK_ROWS].max())
 
 
-def _log_evidence(timing: _Timing, packets: Packets) -> float:
-    """Log-likelihood ratio of the slots being packets, at the levels that fit them as such."""
-    grid = packets.grid
-    slots = decide(timing.waves, timing.exposure_slots, grid, Slots(timing.slots.lit, packets.w))
+def _log_evidence(timing: _Timing, packets: Packets, decided: bool) -> float:
+    """Log-likelihood ratio of the slots being packets, at levels that fit them as such; they may be `decided` so."""
+    grid, slots = packets.grid, timing.slots
+    if not decided:
+        slots = decide(timing.waves, timing.exposure_slots, grid, Slots(slots.lit, packets.w))
     position = (np.arange(slots.lit.shape[1]) + grid.first_slot) % grid.packet_slots
     packets_llr = packet_llr(timing.waves, timing.exposure_slots, grid, slots)
     return packets_llr + repeat_evidence(slots.lit > 0.5, position, grid.packet_slots)

@@ -55,8 +55,9 @@ def lit_probability(
     # State before slot k: its first n - 1 bits; state after it, from the other side, mirrored: its last n - 1.
     states = n_patterns // 2
     turned = np.array([int(format(s, f"0{n_bits - 1}b")[::-1], 2) for s in range(states)])
-    patterns = np.arange(n_patterns)
-    joint = ahead[..., patterns >> 1] * back[..., turned[patterns & (states - 1)]] * weight
+    by_states = ahead[..., None] * weight.reshape(*weight.shape[:2], states, 2)
+    joint = by_states.reshape(*weight.shape[:2], 2, states) * back[..., None, turned]
+    joint = joint.reshape(weight.shape)
     total = joint.sum(axis=2)
     log_evidence = np.log(scales[:n_columns]).sum(axis=1, dtype=np.float64) + top.sum(axis=(1, 2), dtype=np.float64)
     return np.asarray((joint @ middle) / np.maximum(total, np.float32(1e-30)), np.float32), log_evidence

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.patterns import by_pattern
-from rxcli.receiver.channel.picture import Prediction, by_slot, predict_picture
+from rxcli.receiver.channel.picture import Prediction, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
@@ -45,6 +45,7 @@ def slot_likelihoods(
     lit: Float32Array,
     columns: NDArray[np.int64],
     thorough: bool = True,
+    timing: bool = True,
 ) -> SlotLikelihoods:
     """Log-likelihood of every slot pattern at every slot, given the present idea of all slots.
 
@@ -56,8 +57,9 @@ def slot_likelihoods(
         columns: which columns the samples are of; the result has these alone.
         thorough: predict the picture from each side too, and on all scales; else from both sides together, on the
             middle scales, which is several times quicker and enough for a plain picture.
+        timing: ask how late the columns' clocks are; 0 where not.
     """
-    expected, light = model.expected(lit, clock, columns, slope=True), model.over_black(samples)
+    expected, light = model.expected(lit, clock, columns, slope=timing), model.over_black(samples)
 
     def of_part(part: NDArray[np.int64]) -> SlotLikelihoods:
         return _likelihoods(light[part], samples.valid[part], expected.of(part), model, thorough)
@@ -84,17 +86,21 @@ def _likelihoods(
     scales = SETTINGS.picture_scales if thorough else SETTINGS.first_scales
     predictions = predict_picture(light, expected.whole, valid, model, scales, one_sided=thorough)
     metrics = _pattern_metrics(light, valid, predictions, expected, model)
-    timing = _timing(light, valid, predictions[0], expected, model)
+    asked = expected.slope is not None
+    timing = _timing(light, valid, predictions[0], expected, model) if asked else np.zeros((len(light), 2))
     return SlotLikelihoods(metrics, _slot_snr(valid, predictions[0], expected.own, model), timing)
 
 
 def _slot_snr(valid: Float32Array, prediction: Prediction, own: Float32Array, model: ObservationModel) -> Float32Array:
-    """(C, N) squared contrast over variance of a slot, as far as strips and samples are independent."""
-    contrast = prediction.picture * own
-    noise = model.noise.through(prediction.picture, prediction.variance, own)
+    """(C, N) squared contrast over variance of a slot, as far as strips and samples are independent.
+
+    A slot's middle tells it: the picture hardly changes within.
+    """
     q = model.exposure.samples_per_slot
-    ratio = (contrast * contrast / noise * valid).sum(axis=1) * np.float32(SETTINGS.slot_information / q)
-    return by_slot(ratio, q)
+    picture, variance, observed = (each[..., q // 2 :: q] for each in (prediction.picture, prediction.variance, valid))
+    contrast = picture * own
+    ratio = contrast * contrast / model.noise.through(picture, variance, own) * observed
+    return np.asarray(ratio.sum(axis=1) * np.float32(SETTINGS.slot_information))
 
 
 def _timing(
@@ -120,12 +126,15 @@ def _pattern_metrics(
 ) -> FloatArray:
     """Mixture log-likelihoods summed over strips and the samples of a metric; (C, N + memory, patterns)."""
     weight = np.float32(SETTINGS.slot_information / model.exposure.samples_per_slot) * valid
+    shot = [np.float32(model.noise.slope) * prediction.picture for prediction in predictions]
+    whole, floor = np.empty_like(light), np.float32(model.noise.floor)
 
     def log_likelihood(levels: Float32Array) -> Float32Array:
-        whole = expected.others + expected.own * levels
-        density = np.zeros_like(light)
-        for prediction in predictions:
-            density += _density(light, whole, prediction, model)
+        np.multiply(expected.own, levels, out=whole)
+        np.add(whole, expected.others, out=whole)
+        density = _density(light, whole, predictions[0], shot[0], floor)
+        for prediction, own_shot in zip(predictions[1:], shot[1:], strict=True):
+            density += _density(light, whole, prediction, own_shot, floor)
         np.log(np.maximum(density, _LEAST_DENSITY, out=density), out=density)
         density *= weight
         return np.asarray(density.sum(axis=1))
@@ -133,13 +142,19 @@ def _pattern_metrics(
     return by_pattern(model.exposure, light.shape[2], log_likelihood)
 
 
-def _density(light: Float32Array, whole: Float32Array, prediction: Prediction, model: ObservationModel) -> Float32Array:
-    """Student-t density of the light, up to a constant.
+def _density(
+    light: Float32Array, whole: Float32Array, prediction: Prediction, shot: Float32Array, floor: np.float32
+) -> Float32Array:
+    """Student-t density of the light, up to a constant, with the variance that `NoiseModel.through` tells.
 
     With four degrees of freedom, variance v and residual r it is v^2 / (v + r^2 / 4)^2.5: a root, and no logarithm.
     """
-    variance = model.noise.through(prediction.picture, prediction.variance, whole)
-    wide = light - prediction.picture * whole
+    variance = prediction.variance * whole
+    variance += shot
+    variance *= whole
+    variance += floor
+    wide = prediction.picture * whole
+    np.subtract(light, wide, out=wide)
     np.square(wide, out=wide)
     wide *= np.float32(1 / _DEGREES)
     wide += variance

@@ -14,12 +14,14 @@ from rxcli.receiver.screen.grid import Grid
 from rxcli.receiver.screen.narrow import find_narrow_columns, shows_narrow_columns
 from rxcli.receiver.screen.numbering import Numbering, possible_numberings
 from rxcli.receiver.screen.sides import Side
-from rxcli.receiver.screen.waveforms import StripLight, refine_by_waveforms, with_light
+from rxcli.receiver.screen.waveforms import StripLight, improved, with_light
 from rxcli.types import FloatArray, Lens
 
 #: Combs that are looked at, by one of so many windows, and the best that are refined, unless they explain less than
-#: this share of the first one; and steps that those near the best are refined by all windows then.
-_COMBS, _EVERY, _FITTED, _HOPELESS, _LAST_ROUNDS = 12, 2, 4, 0.8, 3
+#: this share of the first one.
+_COMBS, _EVERY, _FITTED, _HOPELESS = 12, 2, 4, 0.8
+#: Steps that these take by some windows, at most, and those near the best then by all.
+_FIRST_STEPS, _LAST_STEPS = 4, 6
 #: By how much less a grid may explain, a share, that it is still a rival.
 _RIVAL = 0.05
 #: The same if columns are of unlike drive; and contrast, a share of what is explained, from which on they are not.
@@ -122,9 +124,8 @@ def likely_grids(coherence: Coherence, strips: StripLight, lens: Lens | None) ->
     if not any(grid.contrast > _AT_FIRST_SIGHT * least * grid.explained for grid in combs):
         return []
     hopeful = _near_the_best(_with_likely_by_drive(thinned, combs, _refined(thinned, combs)), 2 * _RIVAL)
-    refined = sorted(
-        (refine_by_waveforms(strips, grid, _LAST_ROUNDS) for grid in hopeful), key=lambda one: -one.likelihood
-    )
+    refined = [improved(strips, grid, _LAST_STEPS) for grid in hopeful]
+    refined.sort(key=lambda one: -one.likelihood)
     distinct: list[Grid] = []
     for grid in _near_the_best(refined, _RIVAL):
         new = not any(_apart(grid, known) < _SAME for known in distinct)
@@ -140,8 +141,14 @@ def _refined(strips: StripLight, combs: list[Grid]) -> dict[int, Grid]:
         if len(refined) == _FITTED or (refined and grid.likelihood < _HOPELESS * refined[0].likelihood):
             break
         if not any(_apart(grid, known) < _WITHIN_REACH for known in refined.values()):
-            refined[number] = refine_by_waveforms(strips, grid)
+            refined[number] = _improved(strips, grid)
     return refined
+
+
+def _improved(strips: StripLight, comb: Grid) -> Grid:
+    """A comb's grid some steps further, where it is better then."""
+    grid = improved(strips, comb, _FIRST_STEPS)
+    return grid if grid.likelihood > comb.likelihood else comb
 
 
 def _near_the_best(grids: list[Grid], less: float) -> list[Grid]:
@@ -157,7 +164,7 @@ def _with_likely_by_drive(strips: StripLight, combs: list[Grid], fitted: dict[in
         return refined
     light = np.array([explained_with_drive(strips, comb) for comb in combs])
     best = int(light.argmax())
-    grid = fitted[best] if best in fitted else refine_by_waveforms(strips, combs[best])
+    grid = fitted[best] if best in fitted else _improved(strips, combs[best])
     if grid.likelihood < (1 - _RIVAL_BY_DRIVE) * refined[0].likelihood or _apart(grid, refined[0]) < _SAME:
         return refined
     others = [one for one in refined if _apart(grid, one) >= _SAME]
@@ -168,7 +175,7 @@ def _with_likely_by_drive(strips: StripLight, combs: list[Grid], fitted: dict[in
 
 def _bent(strips: StripLight, grid: Grid) -> Grid:
     """The grid with an unknown lens, where that explains much more: such lenses are rare."""
-    bent = refine_by_waveforms(strips, replace(grid, bent=True))
+    bent = improved(strips, replace(grid, bent=True), _LAST_STEPS)
     return bent if bent.likelihood > (1 + _BENT_GAIN) * grid.likelihood else grid
 
 

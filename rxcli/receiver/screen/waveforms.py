@@ -251,6 +251,11 @@ def refine_by_waveforms(strips: StripLight, grid: Grid, rounds: int = _ROUNDS) -
     return refined if refined.likelihood > best.likelihood else best
 
 
+def improved(strips: StripLight, grid: Grid, rounds: int) -> Grid:
+    """A grid some steps nearer to the one that explains the strips' light best, with how much that is; see `Grid`."""
+    return with_light(strips, moved_by_waveforms(strips, grid, rounds))
+
+
 def moved_by_waveforms(strips: StripLight, grid: Grid, rounds: int = _ROUNDS, settled: float = _SETTLED) -> Grid:
     """The grid moved until its columns' waveforms say no more of where the strips lie; how much light it explains then
     is not asked.

@@ -109,9 +109,12 @@ def _row_positions(profiles: RowProfiles, borders: FloatArray) -> FloatArray:
     few = np.arange(0, borders.shape[1] + _SMOOTH_SAMPLES, _SMOOTH_SAMPLES)
     at_few = borders[:, :1] + few * (borders[:, -1:] - borders[:, :1]) / max(borders.shape[1] - 1, 1)
     at_few = np.broadcast_to(at_few, (profiles.light.shape[0], few.size)).repeat(n_strips, axis=0)
-    further = n_rows * (np.diff(strips, axis=1) if n_rows > 1 else np.ones_like(strips))
-    index = np.concatenate([[0.5 - n_rows], np.arange(n_rows) + 0.5, [2 * n_rows - 0.5]])
-    rows = np.concatenate([strips[:, :1] - further[:, :1], strips, strips[:, -1:] + further[:, -1:]], axis=1)
+    # So do some of the rows.
+    index = np.unique(np.append(np.arange(0, n_rows, _SMOOTH_SAMPLES), n_rows - 1))
+    known = strips[:, index].astype(np.float64)
+    first, last = (strips[:, [1]] - strips[:, [0]], strips[:, [-1]] - strips[:, [-2]]) if n_rows > 1 else (1.0, 1.0)
+    rows = np.concatenate([known[:, :1] - n_rows * first, known, known[:, -1:] + n_rows * last], axis=1)
+    index = np.concatenate([[-n_rows], index, [2 * n_rows - 1]]) + 0.5
     found = np.stack([np.interp(at, strip, index) for at, strip in zip(at_few, rows, strict=True)])
     between = np.arange(_SMOOTH_SAMPLES) / _SMOOTH_SAMPLES
     every = found[:, :-1, None] + np.diff(found, axis=1)[:, :, None] * between
