@@ -16,8 +16,6 @@ BEND_SCALE = np.array([0.3, 0.6, 1.5e-3, 1.5e-3])
 #: (4, 4) inverse covariance of the coefficients before the picture was seen.
 BEND_PRECISION: FloatArray = np.diag(BEND_SCALE**-2 * [1, 0, 1, 1])
 BEND_PRECISION[:2, :2] += SETTINGS.bend_back_sd**-2
-#: Steps to the best bend, and what a step must gain, nats, so that there is another.
-_MOST_STEPS, _LEAST_GAIN = 8, 0.01
 
 
 def reversed_curvature(curvature: FloatArray) -> FloatArray:
@@ -106,23 +104,16 @@ class _Lags:
 
 def _lag_correlations(strips: Strips, level: Float32Array, distance: int) -> _Lags:
     """Of strips `distance` apart, by their levelled light (M, R)."""
-    length = (level.shape[1] - 2 * SETTINGS.bend_lags) // SETTINGS.bend_windows
-    middles = SETTINGS.bend_lags + length * np.arange(SETTINGS.bend_windows) + length // 2
+    most, n_windows = SETTINGS.bend_lags, SETTINGS.bend_windows
+    length = (level.shape[1] - 2 * most) // n_windows
+    middles = most + length * np.arange(n_windows) + length // 2
     terms = curvature_terms(strips.x[:, middles], strips.rows[middles], strips.width, strips.height)
 
     def windows(light: Float32Array, lag: int) -> Float32Array:
-        first = SETTINGS.bend_lags - lag
-        return light[:, first : first + SETTINGS.bend_windows * length].reshape(
-            len(light), SETTINGS.bend_windows, length
-        )
+        return light[:, most - lag :][:, : n_windows * length].reshape(len(light), n_windows, length)
 
     left, right = windows(level[:-distance], 0), level[distance:]
-    out = np.stack(
-        [
-            np.einsum("pwr,pwr->pw", left, windows(right, lag))
-            for lag in range(-SETTINGS.bend_lags, SETTINGS.bend_lags + 1)
-        ]
-    )
+    out = np.stack([np.einsum("pwr,pwr->pw", left, windows(right, lag)) for lag in range(-most, most + 1)])
     return _Lags(out, terms[:, distance:] - terms[:, :-distance])
 
 
@@ -138,7 +129,7 @@ def _climb(curvature: FloatArray, lags: _Lags, weight: float) -> tuple[FloatArra
     """The bend that is most likely, by Newton's method, never downhill; and its likeness."""
     best, (score, gradient, hessian) = curvature, _likeness(curvature, lags, weight)
     step = 1.0
-    for _ in range(_MOST_STEPS):
+    for _ in range(SETTINGS.bend_steps):
         trial = best + step * np.linalg.solve(hessian, gradient)
         there = _likeness(trial, lags, weight)
         if there[0] <= score:
@@ -146,7 +137,7 @@ def _climb(curvature: FloatArray, lags: _Lags, weight: float) -> tuple[FloatArra
             continue
         gained = there[0] - score
         best, (score, gradient, hessian) = trial, there
-        if gained < _LEAST_GAIN:
+        if gained < SETTINGS.bend_least_gain_nats:
             break
     return best, score
 
