@@ -14,7 +14,7 @@ from rxcli.receiver.screen.grid import Grid
 from rxcli.receiver.screen.narrow import find_narrow_columns, shows_narrow_columns
 from rxcli.receiver.screen.numbering import Numbering, possible_numberings
 from rxcli.receiver.screen.sides import Side
-from rxcli.receiver.screen.waveforms import StripLight, improved, with_light
+from rxcli.receiver.screen.waveforms import StripLight, refine_by_waveforms, with_light
 from rxcli.types import FloatArray, Lens
 
 #: Combs that are looked at, by one of so many windows, and the best that are refined, unless they explain less than
@@ -124,7 +124,7 @@ def likely_grids(coherence: Coherence, strips: StripLight, lens: Lens | None) ->
     if not any(grid.contrast > _AT_FIRST_SIGHT * least * grid.explained for grid in combs):
         return []
     hopeful = _near_the_best(_with_likely_by_drive(thinned, combs, _refined(thinned, combs)), 2 * _RIVAL)
-    refined = [improved(strips, grid, _LAST_STEPS) for grid in hopeful]
+    refined = [refine_by_waveforms(strips, grid, _LAST_STEPS) for grid in hopeful]
     refined.sort(key=lambda one: -one.likelihood)
     distinct: list[Grid] = []
     for grid in _near_the_best(refined, _RIVAL):
@@ -147,7 +147,7 @@ def _refined(strips: StripLight, combs: list[Grid]) -> dict[int, Grid]:
 
 def _improved(strips: StripLight, comb: Grid) -> Grid:
     """A comb's grid some steps further, where it is better then."""
-    grid = improved(strips, comb, _FIRST_STEPS)
+    grid = refine_by_waveforms(strips, comb, _FIRST_STEPS)
     return grid if grid.likelihood > comb.likelihood else comb
 
 
@@ -175,7 +175,7 @@ def _with_likely_by_drive(strips: StripLight, combs: list[Grid], fitted: dict[in
 
 def _bent(strips: StripLight, grid: Grid) -> Grid:
     """The grid with an unknown lens, where that explains much more: such lenses are rare."""
-    bent = improved(strips, replace(grid, bent=True), _LAST_STEPS)
+    bent = refine_by_waveforms(strips, replace(grid, bent=True), _LAST_STEPS)
     return bent if bent.likelihood > (1 + _BENT_GAIN) * grid.likelihood else grid
 
 

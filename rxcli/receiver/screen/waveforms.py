@@ -239,20 +239,13 @@ def with_light(strips: StripLight, grid: Grid) -> Grid:
 
 
 def refine_by_waveforms(strips: StripLight, grid: Grid, rounds: int = _ROUNDS) -> Grid:
-    """The grid that explains the strips' light best as mixes of their columns' waveforms.
+    """The grid that explains the strips' light best as mixes of their columns' waveforms, and how much; see `Grid`.
 
     Args:
         strips: of the picture.
         grid: right to some tenths of a column.
         rounds: steps that it may take.
     """
-    best = with_light(strips, grid)
-    refined = with_light(strips, moved_by_waveforms(strips, best, rounds))
-    return refined if refined.likelihood > best.likelihood else best
-
-
-def improved(strips: StripLight, grid: Grid, rounds: int) -> Grid:
-    """A grid some steps nearer to the one that explains the strips' light best, with how much that is; see `Grid`."""
     return with_light(strips, moved_by_waveforms(strips, grid, rounds))
 
 
