@@ -222,11 +222,11 @@ def _initial_pass(acquisition: Acquisition) -> Reception:
     model = _light_model(acquisition, samples)
     contrast = sync.contrast(samples.light, samples.valid, _COARSE, model.noise.sigma)
     first = channel.first_metrics(*contrast, model.exposure)
-    clock = _in_bursts(acquisition, clock, detect.slot_llr(first))
+    clock = _in_bursts(acquisition, clock, first)
     lit = clock.on_grid(_first_decision(channel.by_burst(first, clock), model.exposure.isi_memory))
     columns = np.arange(samples.light.shape[0])
     likelihoods = channel.slot_likelihoods(samples, clock, model, lit, columns, thorough=False)
-    clock = _in_bursts(acquisition, clock, detect.slot_llr(likelihoods.metrics))
+    clock = _in_bursts(acquisition, clock, likelihoods.metrics)
     clock = sync.corrected(clock, likelihoods.timing)
     posteriors = _detect(likelihoods.metrics, clock)
     return Reception(clock, samples, posteriors, likelihoods.snr, model, likelihoods.metrics)
@@ -272,7 +272,7 @@ def doubtful_columns(reception: Reception, beyond_repair: float = -np.inf) -> ND
 def _coarse(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
     """All strips, the picture on all scales; after it the bursts are told apart anew and the clock is corrected."""
     after, timing = _seen_again(acquisition, reception, columns, _COARSE)
-    after = _with_bursts_of(acquisition, after, detect.slot_llr(after.metrics))
+    after = _with_bursts_of(acquisition, after, after.metrics)
     return replace(after, clock=sync.corrected(after.clock, timing))
 
 
@@ -423,15 +423,16 @@ def _denoiser() -> denoise.Denoiser:
     return denoise.load_denoiser()
 
 
-def _in_bursts(acquisition: Acquisition, clock: Clock, log_odds: Float32Array) -> Clock:
+def _in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> Clock:
+    """The clock with its copies in bursts as they were given, or as metrics (C, N + memory, patterns) tell them."""
     if acquisition.burst is not None:
         return replace(clock, burst=acquisition.burst)
-    return sync.assign_bursts(clock, log_odds, acquisition.repeats)
+    return sync.assign_bursts(clock, detect.slot_llr(metrics), acquisition.repeats)
 
 
-def _with_bursts_of(acquisition: Acquisition, reception: Reception, log_odds: Float32Array) -> Reception:
-    """Bursts told apart by log-odds that no copy has lent to another; symbols detected anew where that moves them."""
-    clock = _in_bursts(acquisition, reception.clock, log_odds)
+def _with_bursts_of(acquisition: Acquisition, reception: Reception, metrics: FloatArray) -> Reception:
+    """Bursts told apart by metrics that no copy has lent to another; symbols detected anew where that moves them."""
+    clock = _in_bursts(acquisition, reception.clock, metrics)
     if np.array_equal(clock.burst, reception.clock.burst):
         return reception
     return replace(reception, clock=clock, posteriors=_detect(reception.metrics, clock))

@@ -23,11 +23,11 @@ _PRESETS = ("video-1080p", "phone-plain", "xs10-still")
 _WIDTH_PX = (100.0, 320.0)
 #: Share of the frames with few rows a slot, how many, and widths of those: small pictures anyway.
 _FEW_ROWS_SHARE, _FEW_ROWS, _FEW_ROWS_WIDTH_PX = 0.4, (1.5, 5.0), (100.0, 900.0)
-#: Share of the frames with a hundred columns, and widths of those; five times the packets of others.
-_NARROW_SHARE, _NARROW_SCREEN, _NARROW_WIDTH_PX = 0.05, "wide-100", (1500.0, 5000.0)
+#: Share of the frames with a hundred columns, in whole pictures, as their screen is searched.
+_NARROW_SHARE, _NARROW_SCREEN = 0.05, "wide-100"
 #: Powers of ten of the light against that of the preset: clean at one end, hopeless at the other, most about where
 #: packets begin to fail.
-_LIGHT, _NARROW_LIGHT = (-1.4, 0.1), (-0.7, 0.3)
+_LIGHT, _NARROW_LIGHT = (-1.4, 0.1), (-0.5, 0.4)
 #: Terms of what confidences are made of: of photographs, and of clips whose picture is known.
 TERMS = (8, 3)
 #: Confidences are kept this far from 0 and 1 where their logarithm is taken; steps of Newton's method.
@@ -92,7 +92,7 @@ def scene_of(seed: int) -> Scene:
     """A small, quick scene of random quality: from clean to hopeless."""
     rng = np.random.default_rng([seed, 5])
     has_narrow_columns = np.random.default_rng([seed, 6]).random() < _NARROW_SHARE
-    base, light = (_narrow(rng), _NARROW_LIGHT) if has_narrow_columns else (_wide(rng), _LIGHT)
+    base, light = (preset(_PRESETS[-1], _NARROW_SCREEN), _NARROW_LIGHT) if has_narrow_columns else (_wide(rng), _LIGHT)
     exposure_slots = rng.choice([0.5, 1.0, 1.5, 2.0]) * rng.uniform(0.8, 1.2)
     exposure_s = max(float(exposure_slots) / base.screen.slot_rate_hz, 1 / 32000)
     return replace(
@@ -118,12 +118,6 @@ def _wide(rng: np.random.Generator) -> Scene:
     rows = np.exp(rng.uniform(*np.log(_FEW_ROWS))) / base.rows_per_slot if few_rows else 1.0
     width_px = rng.uniform(*(_FEW_ROWS_WIDTH_PX if few_rows else _WIDTH_PX))
     return base.scaled(width_px / base.sensor.width, float(min(rows, 1.0)), keep_readout=True)
-
-
-def _narrow(rng: np.random.Generator) -> Scene:
-    """A screen of a hundred columns, as wide as they are in whole pictures and narrower."""
-    base = preset(_PRESETS[-1], _NARROW_SCREEN)
-    return base.scaled(rng.uniform(*_NARROW_WIDTH_PX) / base.sensor.width, 1.0, keep_readout=True)
 
 
 def packets_of(task: Task) -> Record:
