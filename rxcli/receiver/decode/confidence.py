@@ -181,7 +181,8 @@ def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
     log_odds = np.asarray(confidence_features @ np.array(model.weights))
     posterior, average = confidence_features[..., 1], confidence_features[..., 4]
     plain = (average > np.log(model.most_average) - _SAME) & (posterior < model.most_log_odds)
-    return np.asarray(np.where(plain, np.minimum(log_odds, posterior), log_odds))
+    # Packets more likely wrong than right were never too sure.
+    return np.asarray(np.where(plain, np.minimum(log_odds, np.maximum(posterior, 0.0)), log_odds))
 
 
 def _log_odds(log_prob: FloatArray) -> FloatArray:
