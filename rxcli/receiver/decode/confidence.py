@@ -18,6 +18,8 @@ from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, In
 
 #: What slots say against a packet is taken to be at least this, nats, so that its logarithm exists.
 _AGAINST_AT_LEAST = 0.5
+#: Features that differ by less are equal, but for their digits.
+_SAME = 1e-4
 #: Doubt that is left in the surest packet, and at most in any, nats: what a log-odds can hold.
 _LEAST_DOUBT, _MOST_DOUBT = 1e-9, 500.0
 
@@ -170,8 +172,17 @@ def confidence(confidence_features: FloatArray) -> FloatArray:
 
 
 def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
-    """Log-odds (...) of packets being error-free, from their evidence (..., 8)."""
-    return np.asarray(confidence_features @ np.array(confidence_model().photographs.weights))
+    """Log-odds (...) of packets being error-free, from their evidence (..., 8).
+
+    Small noisy columns are surer than their posterior, as strips err less together there than it is tempered for. Where
+    slots stand out as far as counts it is not noise that leaves a symbol in doubt: there the posterior is not exceeded.
+    """
+    model = confidence_model().photographs
+    log_odds = np.asarray(confidence_features @ np.array(model.weights))
+    posterior, average = confidence_features[..., 1], confidence_features[..., 4]
+    plain = (average > np.log(model.most_average) - _SAME) & (posterior < model.most_log_odds)
+    # Packets more likely wrong than right were never too sure.
+    return np.asarray(np.where(plain, np.minimum(log_odds, np.maximum(posterior, 0.0)), log_odds))
 
 
 def _log_odds(log_prob: FloatArray) -> FloatArray:

@@ -220,6 +220,22 @@ def test_the_more_strips_a_column_has_the_less_its_posterior_counts() -> None:
     assert 1 > found[0] > found[1] > found[2] > found[3] > 0.9
 
 
+def test_where_slots_stand_out_a_symbol_in_doubt_leaves_the_packet_in_doubt() -> None:
+    """What errs then is not noise, and confidence does not exceed the posterior."""
+    w = [5]
+
+    def found(margin: float, probability: float) -> float:
+        sure, slot_margin = posteriors_of(w, indices(w), probability), np.full((1, 1, PACKET), margin, np.float32)
+        features = confidence.confidence_features(sure, slot_margin, np.zeros(1, bool), 2)
+        return float(confidence.confidence(features).squeeze())
+
+    n_symbols = indices(w).shape[-1]
+    doubtful = 0.99**n_symbols
+    assert found(40.0, 0.99) == pytest.approx(doubtful, abs=1e-6)
+    assert found(8.0, 0.99) > doubtful
+    assert found(40.0, 0.999999) > 0.99
+
+
 def test_a_header_that_is_contradicted_stands_for_no_packet() -> None:
     posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.9999)
     posteriors = replace(posteriors, header_llr=np.array([[-20.0, 40.0]]))
