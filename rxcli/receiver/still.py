@@ -18,7 +18,6 @@ from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import detect
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
 from rxcli.receiver.reception import (
-    HOPELESS_WEIGHT,
     Reception,
     best_packet,
     complete_packets,
@@ -28,6 +27,7 @@ from rxcli.receiver.reception import (
     packet_llr,
     word_log_prob,
 )
+from rxcli.receiver.settings import SETTINGS
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
@@ -386,7 +386,7 @@ def _words_weighed(
     """Metrics of some columns with the likeliest words of every symbol in doubt weighed as a whole."""
     clock = reception.clock
     bursts = channel.by_burst(metrics, clock)
-    candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
+    candidates = detect.plausible_weights(bursts, SETTINGS.hopeless_weight_nats)
     posteriors, doubtful = detect.detect_with_words(bursts, candidates, _DOUBTFUL_WORD, _WORDS)
     asked = doubtful.log_prob[:, 0] > _HOPELESS_WORD
     places, words, log_prob = doubtful.places[asked], doubtful.words[asked], doubtful.log_prob[asked]
@@ -440,7 +440,7 @@ def _with_bursts_of(acquisition: Acquisition, reception: Reception, metrics: Flo
 
 def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:
     bursts = channel.by_burst(metrics, clock)
-    return detect.detect(bursts, detect.plausible_weights(bursts, HOPELESS_WEIGHT))
+    return detect.detect(bursts, detect.plausible_weights(bursts, SETTINGS.hopeless_weight_nats))
 
 
 def _light_model(acquisition: Acquisition, samples: SlotSamples) -> channel.ObservationModel:
