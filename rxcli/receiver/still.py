@@ -270,9 +270,8 @@ def doubtful_columns(reception: Reception, beyond_repair: float = -np.inf) -> ND
 
 
 def _coarse(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """All strips, the picture on all scales; after it the bursts are told apart anew and the clock is corrected."""
+    """All strips, the picture on all scales; the clock is corrected after it."""
     after, timing = _seen_again(acquisition, reception, columns, _COARSE)
-    after = _with_bursts_of(acquisition, after, after.metrics)
     return replace(after, clock=sync.corrected(after.clock, timing))
 
 
@@ -428,14 +427,6 @@ def _in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> C
     if acquisition.burst is not None:
         return replace(clock, burst=acquisition.burst)
     return sync.assign_bursts(clock, detect.slot_llr(metrics), acquisition.repeats)
-
-
-def _with_bursts_of(acquisition: Acquisition, reception: Reception, metrics: FloatArray) -> Reception:
-    """Bursts told apart by metrics that no copy has lent to another; symbols detected anew where that moves them."""
-    clock = _in_bursts(acquisition, reception.clock, metrics)
-    if np.array_equal(clock.burst, reception.clock.burst):
-        return reception
-    return replace(reception, clock=clock, posteriors=_detect(reception.metrics, clock))
 
 
 def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:
