@@ -42,9 +42,8 @@ _DOUBTFUL, _DOUBTFUL_WORD = 0.985, -1e-2
 #: A column none of whose packets has symbols of at least this mean log probability is beyond repair: on the coarse
 #: grid, and from the fine one on. Of 350 such columns of simulated frames further looks made two error-free.
 _BEYOND_REPAIR_COARSE, _BEYOND_REPAIR = -1.0, -0.8
-#: Of symbols in doubt, so many words are weighed, down to so many nats below the best; not where even that is less
-#: likely than this, a log probability: there is nothing to choose from.
-_WORDS, _WORD_MARGIN, _HOPELESS_WORD = 4, 5.0, -1.4
+#: Words of a symbol in doubt that are weighed.
+_WORDS = 4
 #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least sure,
 #: have their words weighed alone.
 _MOST_SHOWN = 58_000
@@ -387,12 +386,9 @@ def _words_weighed(
     bursts = channel.by_burst(metrics, clock)
     candidates = detect.plausible_weights(bursts, SETTINGS.hopeless_weight_nats)
     posteriors, doubtful = detect.detect_with_words(bursts, candidates, _DOUBTFUL_WORD, _WORDS)
-    asked = doubtful.log_prob[:, 0] > _HOPELESS_WORD
-    places, words, log_prob = doubtful.places[asked], doubtful.words[asked], doubtful.log_prob[asked]
     samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
     lit = clock.on_grid(reception.posteriors.with_columns(columns, posteriors).lit)
-    likely = log_prob > log_prob[:, :1] - _WORD_MARGIN
-    corrections = channel.word_corrections(samples, clock, scene.model, lit, columns, places, words, likely)
+    corrections = channel.word_corrections(samples, clock, scene.model, lit, columns, doubtful.places, doubtful.words)
     return metrics + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
 
 
