@@ -39,9 +39,9 @@ _MIXED_ROWS, _USUAL_MIX = (0.0, 1.0, 1.7, 2.4, 3.0), 1
 #: looked at again, at last by the auto-encoder, and symbols of less log probability are weighed as words. Where the
 #: gate comes from: docs/auto_encoder.md. Of 2699 packets of simulated frames an initial pass leaves half so sure.
 _DOUBTFUL, _DOUBTFUL_WORD = 0.985, -1e-2
-#: A column none of whose packets has symbols of at least this mean log probability is beyond repair: on the coarse
-#: grid, and from the fine one on. Of 350 such columns of simulated frames further looks made two error-free.
-_BEYOND_REPAIR_COARSE, _BEYOND_REPAIR = -1.0, -0.8
+#: A column none of whose packets has symbols of at least this mean log probability on the fine grid is beyond repair:
+#: of 350 such columns of simulated frames further looks made two error-free. Before, it may have a wrong weight.
+_BEYOND_REPAIR = -0.8
 #: Words of a symbol in doubt that are weighed.
 _WORDS = 4
 #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least sure,
@@ -407,7 +407,7 @@ def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: 
 #: of a lower mean log probability, see `_BEYOND_REPAIR`, are left.
 _PASSES = (
     (_coarse, -np.inf),
-    (_fine, _BEYOND_REPAIR_COARSE),
+    (_fine, -np.inf),
     (_fine, _BEYOND_REPAIR),
     (_without_row_noise, _BEYOND_REPAIR),
 )
