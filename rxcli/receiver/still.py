@@ -42,8 +42,9 @@ _DOUBTFUL, _DOUBTFUL_WORD = 0.985, -1e-2
 #: A column none of whose packets has symbols of at least this mean log probability on the fine grid is beyond repair:
 #: of 350 such columns of simulated frames further looks made two error-free. Before, it may have a wrong weight.
 _BEYOND_REPAIR = -0.8
-#: Words of a symbol in doubt that are weighed.
-_WORDS = 4
+#: Words of a symbol in doubt that are weighed; none where even the best is less likely than this, a log probability:
+#: there is nothing to choose from.
+_WORDS, _HOPELESS_WORD = 4, -1.4
 #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least sure,
 #: have their words weighed alone.
 _MOST_SHOWN = 58_000
@@ -388,7 +389,9 @@ def _words_weighed(
     posteriors, doubtful = detect.detect_with_words(bursts, candidates, _DOUBTFUL_WORD, _WORDS)
     samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
     lit = clock.on_grid(reception.posteriors.with_columns(columns, posteriors).lit)
-    corrections = channel.word_corrections(samples, clock, scene.model, lit, columns, doubtful.places, doubtful.words)
+    asked = doubtful.log_prob[:, 0] > _HOPELESS_WORD
+    places, words = doubtful.places[asked], doubtful.words[asked]
+    corrections = channel.word_corrections(samples, clock, scene.model, lit, columns, places, words)
     return metrics + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
 
 
