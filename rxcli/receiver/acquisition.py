@@ -14,10 +14,8 @@ from rxcli.receiver import camera as blind
 from rxcli.receiver import sampling, sync
 from rxcli.receiver.context import FrameContext
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.types import Clock, FloatArray, IntArray, RowProfiles
-
-#: Of so many strips a column an initial pass reads pairs; what tells screens by their columns needs some.
-_MANY_STRIPS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +107,7 @@ def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False
     frame, camera = context.frame, context.camera
     quick = quick and sampling.is_coded(frame) and camera.blind_estimate is None
     n_strips = n_strips_of(context.corners, n_columns)
-    is_binned = quick and n_strips >= _MANY_STRIPS and n_strips % 2 == 0
+    is_binned = quick and n_strips >= sync_settings.many_strips and n_strips % 2 == 0
 
     def read(
         columns: slice, noise: tuple[float, float] | None, n_strips: int = n_strips, quick: bool = False

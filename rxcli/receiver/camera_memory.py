@@ -16,18 +16,12 @@ import numpy as np
 
 from rxcli.receiver import camera as blind
 from rxcli.receiver.context import DEFAULT_TONE, Camera
+from rxcli.receiver.settings import SETTINGS
 from rxcli.types import Frame
 
-#: Estimates of a camera are of one camera where line delays differ by less than so many standard deviations, or than
-#: this share: the screen's own clock may be so far off.
-_ALIKE_SD, _ALIKE_SHARE = 5.0, 2e-4
 #: Values that are averaged over pictures, weighed by their variances.
 _AVERAGED = ("line_delay_s", "k1", "k2", "p1", "p2", "tone_exponent")
-#: No variance is taken to be less than this share of what one picture says, whatever was averaged: errors are alike.
-_MOST_PICTURES = 16
 _FORMAT = 1
-#: Rows that a camera without any exposure is taken to be exposed for.
-_EXPOSED_ROWS = 5.0
 
 
 class RememberedCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -49,7 +43,7 @@ class RememberedCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return Camera(
             profile=None,
             line_delay_s=line_delay_s,
-            exposure_s=exposure_s or _EXPOSED_ROWS * line_delay_s,
+            exposure_s=exposure_s or SETTINGS.exposed_rows * line_delay_s,
             lens=blind.lens_of_summary(self.estimated, self.width, self.height),
             tone="linear" if blind.is_linear(self.estimated.get("tone_exponent")) else DEFAULT_TONE,
             reversed=bool(self.estimated["readout_reversed"][0]),
@@ -123,7 +117,9 @@ def _one_camera(before: RememberedCamera, fresh: RememberedCamera) -> bool:
     if any(before.estimated.get(name) != fresh.estimated.get(name) for name in names):
         return False
     (one, one_sd), (other, other_sd) = before.estimated["line_delay_s"], fresh.estimated["line_delay_s"]
-    return abs(one - other) < max(_ALIKE_SD * float(np.hypot(one_sd, other_sd)), _ALIKE_SHARE * other)
+    return abs(one - other) < max(
+        SETTINGS.same_camera_sds * float(np.hypot(one_sd, other_sd)), SETTINGS.same_camera_share * other
+    )
 
 
 def _averaged(before: RememberedCamera, fresh: RememberedCamera) -> RememberedCamera:
@@ -134,6 +130,6 @@ def _averaged(before: RememberedCamera, fresh: RememberedCamera) -> RememberedCa
     for name in _AVERAGED:
         if name in before.estimated and name in fresh.estimated:
             (one, one_sd), (other, other_sd) = before.estimated[name], fresh.estimated[name]
-            sd = max(float(np.hypot(weight[0] * one_sd, weight[1] * other_sd)), other_sd / _MOST_PICTURES**0.5)
+            sd = max(float(np.hypot(weight[0] * one_sd, weight[1] * other_sd)), other_sd / SETTINGS.most_pictures**0.5)
             estimated[name] = (float(weight @ [one, other]), sd)
     return msgspec.structs.replace(fresh, pictures=before.pictures + 1, estimated=estimated)

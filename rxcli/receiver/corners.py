@@ -9,16 +9,11 @@ import numpy as np
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.settings import SETTINGS
 from rxcli.types import FloatArray, Frame
 
 #: Orientations in which the readout runs along the columns' width.
 _PORTRAIT = (5, 6, 7, 8)
-#: Of an outline that is given, or of the picture, so much must be shared by both.
-_LEAST_SHARE = 0.002
-#: Fewer rows than those that the waves of an unknown camera are sought on tell nothing.
-_LEAST_ROWS = 24
-#: An outline so many times as large as the picture shows it less than one column.
-_LARGEST = 50.0
 
 
 def unreadable_orientation(frame: Frame) -> Failure | None:
@@ -39,7 +34,7 @@ def outside_the_picture(corners: FloatArray, frame: Frame) -> Failure | None:
 
     size = f"{frame.width} x {frame.height} pixels"
     hint = "give them in stored pixels, from 0,0 at its top left"
-    if (np.ptp(corners, axis=0) > _LARGEST * np.array([frame.width, frame.height])).any():
+    if (np.ptp(corners, axis=0) > SETTINGS.largest_outline * np.array([frame.width, frame.height])).any():
         return Failure(
             "no_screen", f"the corners that were given lie far outside the picture, which has {size}; {hint}"
         )
@@ -47,18 +42,20 @@ def outside_the_picture(corners: FloatArray, frame: Frame) -> Failure | None:
     picture = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]], np.float32)
     outline = np.asarray(corners, np.float32)
     shared, part = cv2.intersectConvexConvex(outline, picture)
-    if shared <= max(_LEAST_SHARE * min(cv2.contourArea(outline), frame.width * frame.height), 1.0):
+    if shared <= max(SETTINGS.least_shared * min(cv2.contourArea(outline), frame.width * frame.height), 1.0):
         return Failure("no_screen", f"the corners that were given lie outside the picture, which has {size}; {hint}")
     n_rows = int(np.ptp(np.asarray(part)[..., 1]))
-    if n_rows < _LEAST_ROWS:
-        reason = f"the corners that were given leave {n_rows} rows of the picture, and {_LEAST_ROWS} are the least"
+    if n_rows < SETTINGS.least_rows:
+        reason = (
+            f"the corners that were given leave {n_rows} rows of the picture, and {SETTINGS.least_rows} are the least"
+        )
         return Failure("no_screen", f"{reason}; {hint}")
     return None
 
 
 def may_fill(frame: Frame) -> bool:
     """Whether a part of a screen that fills the picture could be received at all."""
-    return min(frame.width, frame.height) >= _LEAST_ROWS
+    return min(frame.width, frame.height) >= SETTINGS.least_rows
 
 
 def whole_picture(frame: Frame) -> FloatArray:

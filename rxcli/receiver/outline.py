@@ -29,6 +29,7 @@ from rxcli.receiver.reception import column_llr
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.sides import LEFT, RIGHT, SIDE_NAMES
 from rxcli.receiver.screen_choice import quick_look
+from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
 from rxcli.receiver.unknown_camera import likely_camera
 from rxcli.types import FloatArray, Frame, Lens
@@ -37,42 +38,6 @@ if TYPE_CHECKING:
     from rxcli.receiver.screen.columns import ColumnLayout, ColumnSearch
     from rxcli.receiver.screen.find import ScreenSearch
     from rxcli.receiver.screen.numbering import Numbering
-
-#: Shares of the rows, one of so many, by which sides are held against the columns' borders.
-_PARTS = (3, 1)
-#: Sides agree with a grid where columns differ less than this on average and anywhere, columns.
-_AGREE, _AGREE_ANYWHERE = 0.12, 0.45
-#: Support of left and right together from which these two tell that no column is missing between them.
-_BOTH_SHOW = 0.3
-#: Log-odds down to which another first column is a rival; and strips that a column needs to be asked for light.
-_RIVAL_SHIFT, _STRIPS_A_COLUMN = -7.0, 6.0
-#: Log-odds of an outline by sides that contradict the grid; what sides that agree with a numbering add to it; what
-#: sides add that were found for top or bottom less. Where left or right is missing, the other one's line says all.
-_CONTRADICTED, _CONFIRMED, _INFERRED = -3.0, 4.0, 1.0
-#: Lines of text may have been taken for the screen's sides where packets prefer sides that contradict a grid, or where
-#: no grid shows: how sure their columns' numbers are at most.
-_TRUST_IN_SIDES_ALONE = 0.85
-#: What tells a grid from others counts so much: strips err together.
-_LIKELIHOOD_COUNTS = 0.01
-#: Log-odds by which an outline must lead so that packets are not asked.
-_CLEAR = 6.0
-#: What packets say counts so much: the light model is surer than it should be. At most so many outlines are received.
-_PACKETS_COUNT, _MOST_LOOKS = 0.08, 6
-#: Outlines whose packets differ by less than this, nats, show the same; the certainty from which one is likely, and
-#: that from which its columns' numbers are said to be the screen's.
-_SAME_PACKETS, _LIKELY, _SURE = 40.0, 0.5, 0.9
-#: Where no numbering is likely, columns are counted from the left of what is seen, if that is less likely than the
-#: likeliest by no more than this, log-odds.
-_MAY_BE = 3.0
-#: Packets by which other rows must show more, nats.
-_BETTER_ROWS = 10.0
-#: Columns that look less like packets than this have no light, nats.
-_NO_LIGHT = 25.0
-#: Headers without symbols count so much.
-_HEADERS_ALONE = 0.1
-#: Packets that must show at a first look where nothing but the grid says that there is a screen, nats; and from which
-#: on other outlines are looked at with the screen that shows them alone.
-_SOME_PACKETS, _PLAIN_PACKETS = 10.0, 200.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +70,7 @@ class Outline:
     @property
     def is_counted_from_left(self) -> bool:
         """Whether no side is in view that tells which column is the first."""
-        return self.fills and self.column_offset is None and self.certainty < _LIKELY
+        return self.fills and self.column_offset is None and self.certainty < SETTINGS.likely_certainty
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -202,7 +167,7 @@ def possible_outlines(
             unsure = [replace(one, log_odds=0.0) for one in found if not columns.numberings or one.family < 0]
             if unsure:
                 shifted = _with_shifts(frame, unsure, sides, layout, period, lens)
-                less = _CONTRADICTED if columns.numberings else 0.0
+                less = SETTINGS.contradicted_log_odds if columns.numberings else 0.0
                 rest = [one for one in found if one.family >= 0] if columns.numberings else []
                 trust = _trust_in_sides(columns)
                 found = rest + [replace(one, log_odds=one.log_odds + less, trust=trust) for one in shifted]
@@ -212,7 +177,7 @@ def possible_outlines(
 
 def _trust_in_sides(columns: ColumnSearch) -> float:
     """How sure the columns' numbers can be between sides that no grid of columns bears out."""
-    return 1.0 if columns.coherence is None else _TRUST_IN_SIDES_ALONE  # None: nobody asked.
+    return 1.0 if columns.coherence is None else SETTINGS.trust_in_sides_alone  # None: nobody asked.
 
 
 def _as_viewed(outline: Outline, orientation: int) -> Outline:
@@ -230,7 +195,7 @@ def _by_sides(
     if sides.corners is None:
         return []
     # A part of the rows tells most of the time.
-    for part in _PARTS:
+    for part in SETTINGS.row_parts:
         for layout in layouts:
             if sides_agree(frame.pixels, sides.corners, layout, mosaic_period=period, lens=lens, part=part):
                 n_columns = layout.n_columns if layout.is_narrow else None
@@ -242,7 +207,7 @@ def _by_sides(
 def _both_show(sides: ScreenSearch) -> bool:
     """Whether left and right were seen both: then columns that fit between them are all there are."""
     shown = sum(sides.lines[number].support for number in (LEFT, RIGHT))
-    return shown >= _BOTH_SHOW and not {"left", "right"} & set(sides.inferred)
+    return shown >= SETTINGS.both_show and not {"left", "right"} & set(sides.inferred)
 
 
 def _with_shifts(
@@ -261,14 +226,14 @@ def _with_shifts(
 
     own = outlines[0]
     grid = grid_between(own.corners, layout.n_columns, (frame.width, frame.height), lens)
-    n_strips = max(N_STRIPS, round(_STRIPS_A_COLUMN * frame.width / grid.pitch_px))
+    n_strips = max(N_STRIPS, round(SETTINGS.strips_a_column * frame.width / grid.pitch_px))
     coherence = measure_coherence(frame.pixels, mosaic_period=period, n_strips=n_strips)
     strips = StripLight.of(coherence, layout.sigma, lens)
     start = first_columns(light_profile(strips, grid), grid, layout.n_columns, sides.lines, layout.aspect)
     shifted = [
         _moved(replace(own, fills=start.fills), int(first), float(odds), layout.n_columns, lens)
         for first, odds in zip(start.first, start.log_odds, strict=True)
-        if odds > _RIVAL_SHIFT
+        if odds > SETTINGS.rival_shift
     ]
     return _without_hopeless(shifted)
 
@@ -286,7 +251,7 @@ def _moved(own: Outline, columns: int, log_odds: float, n_columns: int, lens: Le
 def _without_hopeless(outlines: list[Outline]) -> list[Outline]:
     """Outlines, likeliest first; the first alone where it is beyond doubt."""
     outlines = sorted(outlines, key=lambda one: -one.log_odds)
-    clear = len(outlines) == 1 or outlines[1].log_odds < outlines[0].log_odds - _CLEAR
+    clear = len(outlines) == 1 or outlines[1].log_odds < outlines[0].log_odds - SETTINGS.clear_log_odds
     return outlines[:1] if clear else outlines
 
 
@@ -314,7 +279,7 @@ def _joined(sides: ScreenSearch, numberings: tuple[Numbering, ...], layout: Colu
             own = replace(by_sides, log_odds=odds, family=own.family, n_columns=own.n_columns)
         outlines.append(own)
     if by_sides and not agreed:
-        outlines.append(replace(by_sides, log_odds=_CONTRADICTED, family=-1))
+        outlines.append(replace(by_sides, log_odds=SETTINGS.contradicted_log_odds, family=-1))
     return _without_hopeless(outlines)
 
 
@@ -322,14 +287,14 @@ def _bonus(by_sides: Outline) -> float:
     """Log-odds that sides add to the numbering that they agree with."""
     if {"left", "right"} & set(by_sides.inferred):
         return 0.0
-    return _INFERRED if by_sides.inferred else _CONFIRMED
+    return SETTINGS.inferred_log_odds if by_sides.inferred else SETTINGS.confirmed_log_odds
 
 
 def _odds_of(numbering: Numbering, numberings: tuple[Numbering, ...]) -> float:
     """Log-odds of a numbering, grids that explain less counting less."""
     less = max(one.grid.likelihood for one in numberings) - numbering.grid.likelihood
     by_drive = numbering.grid.drive_odds
-    return numbering.log_odds + (-_LIKELIHOOD_COUNTS * less if by_drive is None else by_drive)
+    return numbering.log_odds + (-SETTINGS.likelihood_counts * less if by_drive is None else by_drive)
 
 
 def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:
@@ -337,7 +302,7 @@ def _agree(corners: FloatArray, numbering: Numbering, n_columns: int) -> bool:
     u, v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0.1, 0.9, 5), indexing="ij")
     points = geometry.screen_to_picture(np.stack([u, v], axis=-1), corners, numbering.grid.lens)
     apart = np.abs(numbering.grid.columns_at(points) - n_columns * u)
-    return bool(apart.mean() < _AGREE and apart.max() < _AGREE_ANYWHERE)
+    return bool(apart.mean() < SETTINGS.sides_agree and apart.max() < SETTINGS.sides_agree_anywhere)
 
 
 def _by_packets(
@@ -359,15 +324,15 @@ def _by_packets(
     if len({one.n_columns for one in candidates}) == 1:
         context = with_columns(context, candidates[0])
     candidates, packets, looked_at = _with_likely_rows(context, candidates)
-    if max(packets.values()) < _SOME_PACKETS:
+    if max(packets.values()) < SETTINGS.some_packets:
         if context.camera.remembered:
             return _by_packets(frame, candidates, replace(options, camera_cache=None), timer)
         best = _likeliest([one for one in candidates if not one.by_grid_alone])
     else:
         # Without a column more or less the same packets are seen: those of a family have theirs in common.
-        lost = {family: max(max(packets.values()) - own - _SAME_PACKETS, 0) for family, own in packets.items()}
+        lost = {family: max(max(packets.values()) - own - SETTINGS.same_packets, 0) for family, own in packets.items()}
         least = max(lost.values())
-        odds = [one.log_odds - _PACKETS_COUNT * lost.get(one.family, least) for one in candidates]
+        odds = [one.log_odds - SETTINGS.packets_count * lost.get(one.family, least) for one in candidates]
         best = _likeliest([replace(one, log_odds=score) for one, score in zip(candidates, odds, strict=True)])
     if best is None:
         return None
@@ -387,13 +352,15 @@ def _with_likely_rows(
         families.setdefault(one.family, one)
     corners = {family: (one.corners, *one.other_rows) for family, one in families.items()}
     # Every family has a first look, then the likeliest ones with other rows.
-    looks = [(family, rows) for rows in range(_MOST_LOOKS) for family in families if rows < len(corners[family])]
+    looks = [
+        (family, rows) for rows in range(SETTINGS.most_looks) for family in families if rows < len(corners[family])
+    ]
     looks.sort(key=lambda look: look[1] > 0)
     packets: dict[int, float] = {}
     rows_of: dict[int, int] = {}
     looked_at: list[FrameContext] = []
     screens = context.screens
-    for family, rows in looks[:_MOST_LOOKS]:
+    for family, rows in looks[: SETTINGS.most_looks]:
         there = corners[family][rows]
         if there is not context.corners or screens is not context.screens:
             there_context = replace(context, corners=there, screens=screens)
@@ -401,9 +368,9 @@ def _with_likely_rows(
             there_context = context
         looked_at.append(there_context)
         shown = _packets(there_context)
-        if shown > packets.get(family, -1.0) + (_BETTER_ROWS if rows else 0):
+        if shown > packets.get(family, -1.0) + (SETTINGS.better_rows if rows else 0):
             packets[family], rows_of[family] = shown, rows
-        if shown > _PLAIN_PACKETS:
+        if shown > SETTINGS.plain_packets:
             # Whatever the outline, the screen sends at one rate.
             screens = _screens_shown(there_context)
     moved = [
@@ -427,10 +394,14 @@ def _likeliest(candidates: list[Outline]) -> Outline | None:
     share = np.exp(odds - odds.max())
     best = candidates[int(share.argmax())]
     certainty = min(float(1 / share.sum()), best.trust)
-    if certainty >= _SURE:
+    if certainty >= SETTINGS.sure_certainty:
         return replace(best, certainty=certainty)
-    if best.fills and certainty < _LIKELY:
-        alike = [one for one in candidates if one.family == best.family and one.log_odds > best.log_odds - _MAY_BE]
+    if best.fills and certainty < SETTINGS.likely_certainty:
+        alike = [
+            one
+            for one in candidates
+            if one.family == best.family and one.log_odds > best.log_odds - SETTINGS.may_be_log_odds
+        ]
         best = max(alike, key=_leftmost)
     return replace(best, certainty=certainty, column_offset=None)
 
@@ -471,4 +442,6 @@ def _packets(context: FrameContext) -> float:
         headers = reception.posteriors.header_llr.sum(axis=0)
         by_column = column_llr(reception) + np.maximum(headers, 0)
     # Where light is weak or a frame shows little more than a packet, headers come through before symbols do.
-    return float(np.maximum(by_column - _NO_LIGHT, 0).sum() + _HEADERS_ALONE * max(headers.sum(), 0.0))
+    return float(
+        np.maximum(by_column - SETTINGS.no_light_nats, 0).sum() + SETTINGS.headers_alone * max(headers.sum(), 0.0)
+    )

@@ -14,17 +14,8 @@ from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.decode.soft_bits import of_observed, still_soft_bits
 from rxcli.receiver.decode.steady import is_steady
+from rxcli.receiver.settings import SETTINGS
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, SlotSamples
-
-#: A column whose symbols have this log probability whatever slots say is not looked at again.
-_BEYOND_DOUBT = -1e-3
-#: A column whose slots stand out less than this has no light to speak of.
-_DARK_SNR_DB = -3.0
-#: Weights that a quick look finds this much less likely than the best are dropped, nats.
-HOPELESS_WEIGHT = 20.0
-#: A column whose slots are so much likelier packets than any slots, nats, has packets whether its header shows or not:
-#: on wrong clocks columns show 74 at most.
-_PACKETS_WITHOUT_HEADER = 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +84,7 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
     if not out.all() and shows_steady_light(reception):
         return np.ones_like(out)
     if out.any():
-        out &= column_llr(reception) < _PACKETS_WITHOUT_HEADER
+        out &= column_llr(reception) < SETTINGS.packets_without_header
     return out
 
 
@@ -107,13 +98,15 @@ def shows_steady_light(reception: Reception) -> bool:
 
 def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
     """(C,) whether a column has too little light for the light model to make anything of it."""
-    n_observed, n_lit = ((snr > least).sum(axis=1) for least in (0.0, 10 ** (_DARK_SNR_DB / 10)))
+    n_observed, n_lit = ((snr > least).sum(axis=1) for least in (0.0, 10 ** (SETTINGS.dark_snr_db / 10)))
     return np.asarray((2 * n_lit < n_observed) | (n_observed == 0))
 
 
 def in_doubt(reception: Reception, certain: float) -> NDArray[np.bool_]:
     """(C,) whether a packet that could be reported has less than the confidence `certain`."""
-    doubtful = (packet_confidence(reception) < certain) & (reception.posteriors.log_prob.min(axis=2) < _BEYOND_DOUBT)
+    doubtful = (packet_confidence(reception) < certain) & (
+        reception.posteriors.log_prob.min(axis=2) < SETTINGS.beyond_doubt_log_prob
+    )
     return np.asarray((doubtful & complete_packets(reception)).any(axis=0))
 
 

@@ -13,13 +13,9 @@ from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sam
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.reception import packet_llr
+from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
 from rxcli.types import Clock, RowProfiles
-
-#: A header peak less than this times the strongest rival is no clock.
-_MIN_PEAK_RATIO = 1.6
-#: A clock whose slots look so much like packets, and so much more than on any other, nats, needs no further look.
-_PLAIN_STRUCTURE = 60.0
 
 
 def quick_look(context: FrameContext) -> Acquisition | Failure:
@@ -49,7 +45,9 @@ def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Fail
         different = told_apart_by_clock(context.screens)
         rates = {(s.slot_rate_hz, s.packet_slots): s for s in reversed(different)}
         clocks = {rate: found for rate, screen in rates.items() if (found := _clocks_of(context, screen, pooled))}
-        clocks = {rate: found for rate, found in clocks.items() if found[0].header_peak_ratio >= _MIN_PEAK_RATIO}
+        clocks = {
+            rate: found for rate, found in clocks.items() if found[0].header_peak_ratio >= SETTINGS.min_peak_ratio
+        }
         if not clocks:
             return Failure("no_signal", _why_no_signal(context))
         structure = {rate: _structure(pooled, found[0]) for rate, found in clocks.items()} if len(clocks) > 1 else {}
@@ -118,7 +116,7 @@ def _structure(profiles: RowProfiles, clock: Clock) -> float:
 def _is_plain(structure: Sequence[float]) -> bool:
     """Whether one clock's slots look like packets beyond doubt, or there is but one clock."""
     best = sorted(structure, reverse=True)
-    return len(best) < 2 or (best[0] > _PLAIN_STRUCTURE and best[0] - best[1] > _PLAIN_STRUCTURE)
+    return len(best) < 2 or (best[0] > SETTINGS.plain_structure and best[0] - best[1] > SETTINGS.plain_structure)
 
 
 def _packets(context: FrameContext, acquisition: Acquisition) -> float:

@@ -14,17 +14,10 @@ from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.steady import is_alike, periodic_share
 from rxcli.receiver.reception import column_llr, shows_steady_light
+from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
 from rxcli.types import BoolArray, RowProfiles
 
-#: Samples a slot on which columns are compared, and by how many slots they may be apart: slats may slant.
-_SAMPLES_PER_SLOT, _REACH_SLOTS = 2, 10
-#: One column, all strips together, whose slots are so much likelier packets than any slots, nats, sends packets; of
-#: light without data no column shows more than none. Each clock that is tried may add a few by chance.
-_PACKETS = 20.0
-#: Rows over which light is smoothed where no clock is known, the longest period of switching then, rows, and the share
-#: of the light that it explains.
-_ROWS, _MOST_PERIOD_ROWS, _SWITCHED = 2, 100, 0.7
 _NEXT = "point the camera at the screen that sends, or check that it does"
 STEADY_LIGHT = (
     f"this light is switched on and off steadily (PWM), as lamps and dimmed screens do, and carries no data; {_NEXT}"
@@ -52,11 +45,14 @@ def _headers(context: FrameContext) -> float:
 def _is_switched(profiles: RowProfiles, headers: float) -> bool:
     """Whether one period explains the light of all columns on their rows, of which no clock is known."""
     light, inside = profiles.light, profiles.inside.astype(np.float32)
-    value, weight = sync.contrast(light, inside, _ROWS, noise_of(profiles))
+    value, weight = sync.contrast(light, inside, SETTINGS.smooth_rows, noise_of(profiles))
     level = value * (weight > 0)
     if not is_alike(value, weight, headers):
         return False
-    return periodic_share(level - level.mean(axis=1, keepdims=True), 2 * _MOST_PERIOD_ROWS) > _SWITCHED
+    return (
+        periodic_share(level - level.mean(axis=1, keepdims=True), 2 * SETTINGS.most_period_rows)
+        > SETTINGS.switched_share
+    )
 
 
 def _without_data(acquisition: Acquisition) -> Failure | None:
@@ -66,13 +62,13 @@ def _without_data(acquisition: Acquisition) -> Failure | None:
     the same in all columns still shows headers, equal copies and words of the codebook there.
     """
     binned = acquisition.binned()
-    samples = sync.sample_slots(binned.profiles, binned.clock, _SAMPLES_PER_SLOT)
-    contrast = sync.contrast(samples.light, samples.valid, _SAMPLES_PER_SLOT, noise_of(binned.profiles))
+    samples = sync.sample_slots(binned.profiles, binned.clock, SETTINGS.light_samples)
+    contrast = sync.contrast(samples.light, samples.valid, SETTINGS.light_samples, noise_of(binned.profiles))
     headers = PREAMBLE_SLOTS / binned.screen.packet_slots
-    if not is_alike(*contrast, headers, _REACH_SLOTS * _SAMPLES_PER_SLOT):
+    if not is_alike(*contrast, headers, SETTINGS.apart_slots * SETTINGS.light_samples):
         return None
     reception = initial_pass(_as_one_column(binned))
-    if float(column_llr(reception).max()) > _PACKETS and not bool(
+    if float(column_llr(reception).max()) > SETTINGS.some_packets and not bool(
         np.any(assemble.without_header(reception.posteriors.header_llr))
     ):
         return None

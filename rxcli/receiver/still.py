@@ -18,7 +18,6 @@ from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import detect
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
 from rxcli.receiver.reception import (
-    HOPELESS_WEIGHT,
     Reception,
     best_packet,
     complete_packets,
@@ -28,6 +27,7 @@ from rxcli.receiver.reception import (
     packet_llr,
     word_log_prob,
 )
+from rxcli.receiver.settings import SETTINGS
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 #: Samples a slot: of first looks, and of those at columns that are still in doubt.
@@ -39,12 +39,12 @@ _MIXED_ROWS, _USUAL_MIX = (0.0, 1.0, 1.7, 2.4, 3.0), 1
 #: looked at again, at last by the auto-encoder, and symbols of less log probability are weighed as words. Where the
 #: gate comes from: docs/auto_encoder.md. Of 2699 packets of simulated frames an initial pass leaves half so sure.
 _DOUBTFUL, _DOUBTFUL_WORD = 0.985, -1e-2
-#: A column none of whose packets has symbols of at least this mean log probability is beyond repair: on the coarse
-#: grid, and from the fine one on. Of 350 such columns of simulated frames further looks made two error-free.
-_BEYOND_REPAIR_COARSE, _BEYOND_REPAIR = -1.0, -0.8
-#: Of symbols in doubt, so many words are weighed, down to so many nats below the best; not where even that is less
-#: likely than this, a log probability: there is nothing to choose from.
-_WORDS, _WORD_MARGIN, _HOPELESS_WORD = 4, 5.0, -1.4
+#: A column none of whose packets has symbols of at least this mean log probability on the fine grid is beyond repair:
+#: of 350 such columns of simulated frames further looks made two error-free. Before, it may have a wrong weight.
+_BEYOND_REPAIR = -0.8
+#: Words of a symbol in doubt that are weighed; none where even the best is less likely than this, a log probability:
+#: there is nothing to choose from.
+_WORDS, _HOPELESS_WORD = 4, -1.4
 #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least sure,
 #: have their words weighed alone.
 _MOST_SHOWN = 58_000
@@ -270,9 +270,8 @@ def doubtful_columns(reception: Reception, beyond_repair: float = -np.inf) -> ND
 
 
 def _coarse(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """All strips, the picture on all scales; after it the bursts are told apart anew and the clock is corrected."""
+    """All strips, the picture on all scales; the clock is corrected after it."""
     after, timing = _seen_again(acquisition, reception, columns, _COARSE)
-    after = _with_bursts_of(acquisition, after, after.metrics)
     return replace(after, clock=sync.corrected(after.clock, timing))
 
 
@@ -386,14 +385,13 @@ def _words_weighed(
     """Metrics of some columns with the likeliest words of every symbol in doubt weighed as a whole."""
     clock = reception.clock
     bursts = channel.by_burst(metrics, clock)
-    candidates = detect.plausible_weights(bursts, HOPELESS_WEIGHT)
+    candidates = detect.plausible_weights(bursts, SETTINGS.hopeless_weight_nats)
     posteriors, doubtful = detect.detect_with_words(bursts, candidates, _DOUBTFUL_WORD, _WORDS)
-    asked = doubtful.log_prob[:, 0] > _HOPELESS_WORD
-    places, words, log_prob = doubtful.places[asked], doubtful.words[asked], doubtful.log_prob[asked]
     samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
     lit = clock.on_grid(reception.posteriors.with_columns(columns, posteriors).lit)
-    likely = log_prob > log_prob[:, :1] - _WORD_MARGIN
-    corrections = channel.word_corrections(samples, clock, scene.model, lit, columns, places, words, likely)
+    asked = doubtful.log_prob[:, 0] > _HOPELESS_WORD
+    places, words = doubtful.places[asked], doubtful.words[asked]
+    corrections = channel.word_corrections(samples, clock, scene.model, lit, columns, places, words)
     return metrics + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
 
 
@@ -412,7 +410,7 @@ def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: 
 #: of a lower mean log probability, see `_BEYOND_REPAIR`, are left.
 _PASSES = (
     (_coarse, -np.inf),
-    (_fine, _BEYOND_REPAIR_COARSE),
+    (_fine, -np.inf),
     (_fine, _BEYOND_REPAIR),
     (_without_row_noise, _BEYOND_REPAIR),
 )
@@ -430,17 +428,9 @@ def _in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> C
     return sync.assign_bursts(clock, detect.slot_llr(metrics), acquisition.repeats)
 
 
-def _with_bursts_of(acquisition: Acquisition, reception: Reception, metrics: FloatArray) -> Reception:
-    """Bursts told apart by metrics that no copy has lent to another; symbols detected anew where that moves them."""
-    clock = _in_bursts(acquisition, reception.clock, metrics)
-    if np.array_equal(clock.burst, reception.clock.burst):
-        return reception
-    return replace(reception, clock=clock, posteriors=_detect(reception.metrics, clock))
-
-
 def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:
     bursts = channel.by_burst(metrics, clock)
-    return detect.detect(bursts, detect.plausible_weights(bursts, HOPELESS_WEIGHT))
+    return detect.detect(bursts, detect.plausible_weights(bursts, SETTINGS.hopeless_weight_nats))
 
 
 def _light_model(acquisition: Acquisition, samples: SlotSamples) -> channel.ObservationModel:

@@ -16,29 +16,10 @@ from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, ref
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.reception import Reception, packet_llr
 from rxcli.receiver.screen_choice import quick_look
+from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.still import decode_alike, decode_likeliest, initial_pass
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
 
-#: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
-_MATTERS_SLOTS = 0.05
-_MOST_INITIAL_REFITS = 3
-#: Slots, as probabilities, that differ by no more than this on average tell the same camera.
-_SLOTS_ALIKE = 0.02
-#: What is received with a refitted camera shows packets as well as before from this share of the evidence on.
-_KEPT_EVIDENCE = 0.9
-#: Headers and packets, all columns together, that an estimate with rivals must show, nats: wrong ones have next to none
-#: of one or of the other.
-_PACKETS_AT_LEAST = 80.0
-#: From so many on it is right but for the length of its packets: wrong ones reach 103. Periods this close are one, as
-#: far as an initial pass goes.
-_PLAIN_PACKETS, _SAME_PERIOD = 200.0, 5e-3
-#: Packets that an estimate must show under which none is received, nats: wrong ones show less than 10, right ones 80.
-_PACKETS_IF_NONE_RECEIVED = 30.0
-#: Packets that a camera must show to be remembered, and to be kept when it was, nats. Relative standard deviation of
-#: the line delay of one that is remembered, and of one that no further picture need improve.
-_PACKETS_TO_REMEMBER, _TOLD, _PRECISE = 200.0, 2e-3, 4e-4
-#: Symbols' mean log probability counts so many times beside the headers: half a packet has headers, but no symbols.
-_SAY_OF_SYMBOLS = 40.0
 _NO_HEADERS = (
     "there are stripes but no packet header where it should be; the screen may show less than one packet (move "
     "closer), the picture may be merged from several exposures (switch HDR off), or the screen is none of those tried"
@@ -75,9 +56,9 @@ def likely_camera(
         if plain is not None and not _may_be_of_shorter_packets(candidate, plain):
             continue
         packets, symbols = _initial_evidence(candidate)
-        if packets > _PACKETS_AT_LEAST and packets + symbols > most:
+        if packets > SETTINGS.headers_and_packets and packets + symbols > most:
             best, most = candidate, packets + symbols
-        if packets > _PLAIN_PACKETS and plain is None:
+        if packets > SETTINGS.plain_packets and plain is None:
             plain = candidate
     return best or Failure("no_signal", found.reason or _NO_HEADERS, found.estimated)
 
@@ -93,7 +74,7 @@ def _of_different_clocks(candidates: list[FrameContext]) -> list[FrameContext]:
 
 def _same_clock(one: FrameContext, other: FrameContext) -> bool:
     delays = [_line_delay_slots(context) for context in (one, other)]
-    return abs(np.log(delays[0] / delays[1])) < _SAME_PERIOD and one.camera.reversed == other.camera.reversed
+    return abs(np.log(delays[0] / delays[1])) < SETTINGS.same_period and one.camera.reversed == other.camera.reversed
 
 
 def _line_delay_slots(context: FrameContext) -> float:
@@ -123,12 +104,12 @@ def _evidence_of(acquisition: Acquisition | Failure, timer: Timer) -> tuple[floa
     with timer("detect"):
         reception = initial_pass(acquisition)
         packets = float(reception.posteriors.header_llr.sum()) + packet_llr(reception)
-    return packets, _SAY_OF_SYMBOLS * float(reception.posteriors.log_prob.mean())
+    return packets, SETTINGS.say_of_symbols * float(reception.posteriors.log_prob.mean())
 
 
 def shows_packets(context: FrameContext) -> bool:
     """Whether packets show with a camera beyond doubt."""
-    return _initial_evidence(context)[0] > _PLAIN_PACKETS
+    return _initial_evidence(context)[0] > SETTINGS.plain_packets
 
 
 def receive_unknown(context: FrameContext, acquisition: Acquisition, skip: frozenset[str]) -> Received:
@@ -144,11 +125,11 @@ def receive_unknown(context: FrameContext, acquisition: Acquisition, skip: froze
 
 def _with_settled_clock(received: Received) -> Received:
     """The camera that the slots of an initial pass tell, until that moves the clock no more."""
-    for _ in range(_MOST_INITIAL_REFITS):
+    for _ in range(SETTINGS.most_initial_refits):
         with received.context.timer("blind"):
             camera, moved_slots = refitted_camera(*_decided(received))
         received = _with_camera(received, camera)
-        if moved_slots < _MATTERS_SLOTS:
+        if moved_slots < SETTINGS.matters_slots:
             break
         before, again = received, _received_again(received, initial_pass)
         if again is None:
@@ -162,7 +143,7 @@ def _with_settled_clock(received: Received) -> Received:
 def _slots_changed(before: Received, after: Received) -> bool:
     """Whether slots were decided otherwise than before, so that they may tell another camera."""
     lit = [one.reception.clock.on_grid(one.reception.posteriors.lit) for one in (before, after)]
-    return lit[0].shape != lit[1].shape or float(np.abs(lit[0] - lit[1]).mean()) > _SLOTS_ALIKE
+    return lit[0].shape != lit[1].shape or float(np.abs(lit[0] - lit[1]).mean()) > SETTINGS.same_slots
 
 
 def with_refitted_camera(received: Received, skip: frozenset[str], slots_changed: bool = True) -> Received:
@@ -178,7 +159,7 @@ def with_refitted_camera(received: Received, skip: frozenset[str], slots_changed
         with received.context.timer("blind"):
             camera, moved_slots = refitted_camera(*_decided(received))
         received = _with_camera(received, camera)
-        again = _received_again(received, decoded) if moved_slots > _MATTERS_SLOTS else None
+        again = _received_again(received, decoded) if moved_slots > SETTINGS.matters_slots else None
         received = again or received
     with received.context.timer("blind"):
         linear = linear_camera(*_decided(received))
@@ -208,19 +189,19 @@ def _received_again(before: Received, receive: Callable[[Acquisition], Reception
         return None
     with context.timer("detect"):
         reception = receive(acquisition)
-    kept = packet_llr(reception) >= _KEPT_EVIDENCE * packet_llr(before.reception)
+    kept = packet_llr(reception) >= SETTINGS.kept_evidence * packet_llr(before.reception)
     return Received(context, acquisition, reception) if kept else None
 
 
 def fits(reception: Reception) -> bool:
     """Whether packets show with a remembered camera, of which nothing in the picture was asked."""
-    return packet_llr(reception) >= _PACKETS_TO_REMEMBER
+    return packet_llr(reception) >= SETTINGS.plain_packets
 
 
 def with_screen(context: FrameContext, acquisition: Acquisition) -> FrameContext:
     """A frame with a remembered camera once its screen is found; that camera is refitted where it is not precise."""
     line_delay_s, sd = context.camera.estimated["line_delay_s"]
-    if sd > _PRECISE * line_delay_s:
+    if sd > SETTINGS.precise_sd * line_delay_s:
         return refittable(context, acquisition)
     rows_per_slot = 1 / (line_delay_s * acquisition.screen.slot_rate_hz)
     told = {"rows_per_slot": (rows_per_slot, rows_per_slot * sd / line_delay_s), **context.camera.estimated}
@@ -233,13 +214,13 @@ def remember_estimate(received: Received, folder: Path | None) -> None:
     if camera.blind_estimate is None or folder is None:
         return
     line_delay_s, sd = camera.estimated["line_delay_s"]
-    if sd < _TOLD * line_delay_s and packet_llr(received.reception) >= _PACKETS_TO_REMEMBER:
+    if sd < SETTINGS.told_sd * line_delay_s and packet_llr(received.reception) >= SETTINGS.plain_packets:
         remember(folder, received.context.frame, camera)
 
 
 def without_estimate(result: FrameResult, camera: Camera, reception: Reception) -> FrameResult:
     """A result without packets, the camera's estimate taken out where neither packets nor edges bear it out."""
-    if camera.blind_estimate is None or packet_llr(reception) >= _PACKETS_IF_NONE_RECEIVED:
+    if camera.blind_estimate is None or packet_llr(reception) >= SETTINGS.some_packets:
         return result
     estimate, strips = camera.blind_estimate
     if blind.by_edges(strips, [estimate]):

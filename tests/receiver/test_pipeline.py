@@ -504,7 +504,7 @@ def test_where_clocks_leave_doubt_packets_tell_the_screen(screen: str, monkeypat
     taken = capture(screen, "phone-plain", "sky", 30.0, 1)
     right = load_profile(screen, ScreenProfile)
     assert screen_chosen(taken) == screen
-    monkeypatch.setattr(screen_choice, "_MIN_PEAK_RATIO", 0.0)
+    monkeypatch.setattr(screen_choice, "SETTINGS", replace(screen_choice.SETTINGS, min_peak_ratio=0.0))
     misled = lambda _, clock: -20.0 if clock.packet_slots == right.packet_slots else -3.0  # noqa: E731
     monkeypatch.setattr(screen_choice, "_structure", misled)
     assert screen_chosen(taken) == screen

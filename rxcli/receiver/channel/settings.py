@@ -36,10 +36,6 @@ class ChannelSettings:
     picture_kinds: tuple[tuple[float, float], ...] = ((0.06, 0.7), (0.25, 2.0), (0.7, 3.0))
     #: Slots on either side that a word is weighed with.
     around_slots: int = 3
-    #: Variance of the mean of two adjacent samples against that of one: samples are interpolated between rows.
-    pair_noise: float = 0.75
-    #: Most that a word may be less likely than the best, nats.
-    word_nats: float = 12.0
 
     #: A row's own light is told by one strip in so many: strips of a column err alike.
     row_strips: int = 2

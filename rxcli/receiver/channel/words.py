@@ -39,7 +39,6 @@ def word_corrections(
     columns: NDArray[np.int64],
     places: NDArray[np.int64],
     words: NDArray[np.uint8],
-    likely: NDArray[np.bool_],
 ) -> Float32Array:
     """What to add to the log-likelihood ratio of every slot, so that words count as the light as a whole has them.
 
@@ -51,7 +50,6 @@ def word_corrections(
         columns: which columns the samples are of.
         places: (J, 3) burst, place in `columns` and number of each symbol in doubt.
         words: (J, K, 10) its likeliest words, best first.
-        likely: (J, K) which of them to weigh; the first always.
 
     Returns:
         (len(columns), N); 0 for symbols that are not in doubt.
@@ -61,13 +59,13 @@ def word_corrections(
     if symbol.size == 0:
         return out
     halves = _halves(samples, clock, model, lit, columns)
-    item, word = np.nonzero(likely[symbol])
-    levels = _word_levels(lit[columns[places[symbol[item], 1]]], start[item], words[symbol[item], word], model)
-    observed = _process_likelihood(halves, places[symbol[item], 1], start[item], levels, model)
-    score = np.zeros(likely.shape)
-    np.add.at(score, (symbol[item], word), observed)
+    n_words = words.shape[1]
+    column, begin = np.repeat(places[symbol, 1], n_words), np.repeat(start, n_words)
+    levels = _word_levels(lit[columns[column]], begin, words[symbol].reshape(-1, SLOTS_PER_SYMBOL), model)
+    score = np.zeros(words.shape[:2])
+    np.add.at(score, symbol, _process_likelihood(halves, column, begin, levels, model).reshape(-1, n_words))
     # Both halves of a slot together count as any other number of samples would.
-    slots = _as_slots(SETTINGS.slot_information / 2 * score, words, likely)
+    slots = _as_slots(SETTINGS.slot_information / 2 * score, words)
     _share_among_copies(out, slots, symbol, places[symbol, 1], start)
     return out
 
@@ -143,7 +141,8 @@ def _process_likelihood(
     # From here on time comes first: (W, R, S).
     mean, observed = halves.mean[index], halves.observed[index] & ((at >= 0) & (at < n)).T[:, :, None]
     gain = (halves.others[index] + model.crosstalk.own[..., 0] * levels.T[:, :, None]) * mean
-    noise = np.float32(SETTINGS.pair_noise) * model.noise.variance(gain)
+    # Two adjacent samples are interpolated between the same rows.
+    noise = model.noise.variance(gain)
     residual = np.where(observed, halves.light[index] - gain, np.float32(0))
     gain = np.where(observed, gain, np.float32(0))
     kinds = _innovations(residual, gain, noise, SETTINGS.picture_kinds)
@@ -187,11 +186,9 @@ def _innovations(
     return total
 
 
-def _as_slots(score: FloatArray, words: NDArray[np.uint8], likely: NDArray[np.bool_]) -> FloatArray:
+def _as_slots(score: FloatArray, words: NDArray[np.uint8]) -> FloatArray:
     """(J, 10) least corrections of single slots that add up to what words (J, K) score against the first of them."""
-    score = score - np.where(likely, score, -np.inf).max(axis=1, keepdims=True)
-    score = np.maximum(score, -SETTINGS.word_nats)
-    wanted = (score[:, 1:] - score[:, :1]) * likely[:, 1:]
-    apart = (words[:, 1:].astype(np.float64) - words[:, :1]) * likely[:, 1:, None]
+    wanted = score[:, 1:] - score[:, :1]
+    apart = words[:, 1:].astype(np.float64) - words[:, :1]
     across = apart @ apart.transpose(0, 2, 1) + _LEAST_NORM * np.eye(apart.shape[1])
     return np.asarray((np.linalg.solve(across, wanted[..., None]).transpose(0, 2, 1) @ apart)[:, 0])

@@ -12,7 +12,7 @@ from rxcli.receiver import channel
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble, detect
-from rxcli.receiver.reception import HOPELESS_WEIGHT
+from rxcli.receiver.settings import SETTINGS as receiver_settings
 from rxcli.receiver.sync.tracking import Bursts, of_one_memory
 from rxcli.types import Float32Array, FloatArray, IntArray
 
@@ -146,7 +146,7 @@ def _settled_weights(before: NDArray[np.bool_], metrics: FloatArray, wanted: NDA
     weights = before.copy()
     unknown = columns[~weights[columns].any(axis=1)]
     if unknown.size:
-        weights[unknown] = detect.plausible_weights(metrics[bursts][:, unknown], HOPELESS_WEIGHT)
+        weights[unknown] = detect.plausible_weights(metrics[bursts][:, unknown], receiver_settings.hopeless_weight_nats)
     several = columns[weights[columns].sum(axis=1) > 1]
     if several.size:
         confidence_features = detect.weight_log_evidence(metrics[bursts][:, several], weights[several])

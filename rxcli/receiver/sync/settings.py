@@ -9,7 +9,8 @@ from dataclasses import dataclass
 class SyncSettings:
     """Each with its unit and the reason for it."""
 
-    #: Strips of a column of which the search needs but half, and samples a slot while the clock is sought.
+    #: Strips of a column of which the search, and an initial pass, need but half, and samples a slot while the clock is
+    #: sought.
     many_strips: int = 4
     search_samples: int = 4
     #: Contrast that half-convinces, over the noise of a sample.

@@ -1,0 +1,121 @@
+"""Numbers of policy of the wiring: which screen, which camera, whether packets show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class WiringSettings:
+    """Each with its unit and the reason for it."""
+
+    #: Shares of the rows, one of so many, by which sides are held against the columns' borders.
+    row_parts: tuple[int, int] = (3, 1)
+    #: Sides agree with a grid where columns differ less than this on average and anywhere, columns.
+    sides_agree: float = 0.12
+    sides_agree_anywhere: float = 0.45
+    #: Support of left and right together from which these two tell that no column is missing between them.
+    both_show: float = 0.3
+    #: Log-odds down to which another first column is a rival; and strips that a column needs to be asked for light.
+    rival_shift: float = -7.0
+    strips_a_column: float = 6.0
+    #: Log-odds of an outline by sides that contradict the grid; what sides that agree with a numbering add to it; what
+    #: sides add that were found for top or bottom less. Where left or right is missing, the other one's line says all.
+    contradicted_log_odds: float = -3.0
+    confirmed_log_odds: float = 4.0
+    inferred_log_odds: float = 1.0
+    #: Lines of text may have been taken for the screen's sides where packets prefer sides that contradict a grid, or
+    #: where no grid shows: how sure their columns' numbers are at most.
+    trust_in_sides_alone: float = 0.85
+    #: What tells a grid from others counts so much: strips err together.
+    likelihood_counts: float = 0.01
+    #: Log-odds by which an outline must lead so that packets are not asked.
+    clear_log_odds: float = 6.0
+    #: What packets say counts so much: the light model is surer than it should be. At most so many outlines are
+    #: received.
+    packets_count: float = 0.08
+    most_looks: int = 6
+    #: Outlines whose packets differ by less than this, nats, show the same; the certainty from which one is likely, and
+    #: that from which its columns' numbers are said to be the screen's.
+    same_packets: float = 40.0
+    likely_certainty: float = 0.5
+    sure_certainty: float = 0.9
+    #: Where no numbering is likely, columns are counted from the left of what is seen, if that is less likely than the
+    #: likeliest by no more than this, log-odds.
+    may_be_log_odds: float = 3.0
+    #: Packets by which other rows must show more, nats.
+    better_rows: float = 10.0
+    #: Columns that look less like packets than this have no light, nats.
+    no_light_nats: float = 25.0
+    #: Headers without symbols count so much.
+    headers_alone: float = 0.1
+
+    #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
+    matters_slots: float = 0.05
+    most_initial_refits: int = 3
+    #: Slots, as probabilities, that differ by no more than this on average tell the same camera.
+    same_slots: float = 0.02
+    #: What is received with a refitted camera shows packets as well as before from this share of the evidence on.
+    kept_evidence: float = 0.9
+    #: Headers and packets, all columns together, that an estimate with rivals must show, nats: wrong ones have next to
+    #: none of one or of the other.
+    headers_and_packets: float = 80.0
+    #: Packets, all columns together, which show plainly, nats: with a wrong camera they reach 103. It is right then but
+    #: for their length, is remembered, and other outlines are looked at with the screen that shows them alone.
+    plain_packets: float = 200.0
+    #: Periods this close, relative, are one, as far as an initial pass goes.
+    same_period: float = 5e-3
+    #: Packets at which there may be some, nats: in a column of light without data, or all together where nothing but a
+    #: grid says that there is a screen, or where none is received and an estimated camera is to be told. Wrong ones
+    #: show less than 10, right ones 80.
+    some_packets: float = 20.0
+    #: Relative standard deviation of the line delay of a camera that is remembered, and of one that no further picture
+    #: need improve.
+    told_sd: float = 2e-3
+    precise_sd: float = 4e-4
+    #: Symbols' mean log probability counts so many times beside the headers: half a packet has headers, but no symbols.
+    say_of_symbols: float = 40.0
+
+    #: Samples a slot on which columns are compared, and by how many slots they may be apart: slats may slant.
+    light_samples: int = 2
+    apart_slots: int = 10
+    #: Rows over which light is smoothed where no clock is known, the longest period of switching then, rows, and the
+    #: share of the light that it explains.
+    smooth_rows: int = 2
+    most_period_rows: int = 100
+    switched_share: float = 0.7
+
+    #: A column whose symbols have this log probability whatever slots say is not looked at again.
+    beyond_doubt_log_prob: float = -1e-3
+    #: A column whose slots stand out less than this has no light to speak of.
+    dark_snr_db: float = -3.0
+    #: Weights that a quick look finds this much less likely than the best are dropped, nats.
+    hopeless_weight_nats: float = 20.0
+    #: A column whose slots are so much likelier packets than any slots, nats, has packets whether its header shows or
+    #: not: on wrong clocks columns show 74 at most.
+    packets_without_header: float = 100.0
+
+    #: A header peak less than this times the strongest rival is no clock.
+    min_peak_ratio: float = 1.6
+    #: A clock whose slots look so much like packets, and so much more than on any other, nats, needs no further look.
+    plain_structure: float = 60.0
+
+    #: Estimates of a camera are of one camera where line delays differ by less than so many standard deviations, or
+    #: than this share: the screen's own clock may be so far off.
+    same_camera_sds: float = 5.0
+    same_camera_share: float = 2e-4
+    #: No variance is taken to be less than this share of what one picture says, whatever was averaged: errors are
+    #: alike.
+    most_pictures: int = 16
+    #: Rows that a camera without any exposure is taken to be exposed for.
+    exposed_rows: float = 5.0
+
+    #: Of an outline that is given, or of the picture, so much must be shared by both.
+    least_shared: float = 0.002
+    #: Fewer rows than those that the waves of an unknown camera are sought on tell nothing.
+    least_rows: int = 24
+    #: An outline so many times as large as the picture shows it less than one column.
+    largest_outline: float = 50.0
+
+
+SETTINGS = WiringSettings()
