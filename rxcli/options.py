@@ -11,7 +11,7 @@ import numpy as np
 
 from rxcli.errors import UsageError
 from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles, load_profile, shipped_profiles
-from rxcli.types import LEAST_CONFIDENCE, FloatArray
+from rxcli.types import FloatArray
 
 if TYPE_CHECKING:
     from rxcli.receiver.channel.denoise import Denoiser
@@ -38,7 +38,7 @@ class ReceiverOptions:
     corners: FloatArray | None = None
     cae: CaeMode = "auto"
     #: Packets below this confidence are not reported.
-    min_confidence: float = LEAST_CONFIDENCE
+    min_confidence: float = 0.0
     #: Shortcuts in use.
     skip: frozenset[str] = field(default_factory=lambda: frozenset(SKIPS))
     #: Pass over frames of a clip all of whose bursts are certain already.
@@ -62,7 +62,7 @@ def receiver_options(
     corners: Any = None,
     *,
     cae: CaeMode = "auto",
-    min_confidence: float = LEAST_CONFIDENCE,
+    min_confidence: float = 0.0,
     no_skip: Sequence[str] = (),
     stop_when_certain: bool = False,
     denoiser: Denoiser | None = None,
@@ -80,7 +80,7 @@ def receiver_options(
         cameras: likewise; an empty sequence: estimate every camera from its picture.
         corners: (4, 2) stored pixels, top-left first, clockwise as a viewer sees the screen; None: find them.
         cae: when the auto-encoder runs.
-        min_confidence: packets below it are not reported; 0: all that were seen whole.
+        min_confidence: packets below it are not reported.
         no_skip: shortcuts to switch off, of `SKIPS`.
         stop_when_certain: pass over frames of a clip all of whose packets are certain already.
         denoiser: in place of the shipped auto-encoder.

@@ -234,10 +234,6 @@ FrameStatus = Literal["ok", "partial", "no_screen", "no_signal", "unreadable"]
 ColumnStatus = Literal["ok", "weak", "dark", "no_packet"]
 
 
-#: Packets that are more likely wrong than nine to one are not reported unless that is asked for.
-LEAST_CONFIDENCE = 0.1
-
-
 @dataclass(frozen=True, slots=True)
 class PacketResult:
     """One packet of one column."""

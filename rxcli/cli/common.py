@@ -124,7 +124,7 @@ receiver_arguments = options(
         "--min-confidence",
         click.FloatRange(0, 1),
         None,
-        "Report only packets of at least this confidence; 0 for all. [default: 0.1]",
+        "Report only packets of at least this confidence. [default: all]",
     ),
     (
         "--no-skip=NAME",

@@ -126,7 +126,6 @@ def options_for(clip: ClipScene, take: Take, *, corners: bool, cae: CaeMode = "a
         force_camera=clip.camera_told,
         corners=exposure.corners if corners else None,
         cae=cae,
-        min_confidence=0.0,
     )
 
 

@@ -125,7 +125,7 @@ def packets_of(task: Task) -> Record:
     trial = simulate_trial(scene_of(task["seed"]), task["seed"])
     # How well narrow columns are found is part of how well their packets are received.
     known_outline = trial.capture.scene.screen.name != _NARROW_SCREEN
-    result, score = trial.receive(trial.options(cae=task["cae"], min_confidence=0.0, known_outline=known_outline))
+    result, score = trial.receive(trial.options(cae=task["cae"], known_outline=known_outline))
     scene = trial.capture.scene
     about = {
         "screen": scene.screen.name,

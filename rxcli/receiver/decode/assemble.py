@@ -11,7 +11,6 @@ from rxcli.protocol import PREAMBLE_SLOTS, bits_per_symbol, indices_to_bits
 from rxcli.receiver.decode.confidence import BurstInClip, Doubts, clip_doubts, confidence_features, doubts_of
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import (
-    LEAST_CONFIDENCE,
     BoolArray,
     BurstPosteriors,
     Clock,
@@ -66,6 +65,9 @@ def column_results(
         for column, echo in enumerate(echoing)
     ]
     held_back = np.where(whole & doubts.reported(0.0) & ~reported, doubts.confidence, 0.0).max(axis=0)
+    shown = reported & [not why for why in against]
+    if not (doubts.confidence[shown] >= SETTINGS.surest_packet).any():
+        reported = np.zeros_like(reported)  # Light without data: what looks like a packet or two is chance.
     packets = [_Packets.of(burst, clock, posteriors, shown, doubts) for burst, shown in enumerate(n_observed)]
     return tuple(
         _column_result(
@@ -96,9 +98,8 @@ def _why_headerless(samples: SlotSamples, column: int) -> str:
 
 
 def _held_back(confidence: float, min_confidence: float) -> str | None:
-    """What to say of a column whose surest packet is not sure enough to be reported; None where there is none that is
-    worth a word."""
-    if not LEAST_CONFIDENCE <= confidence < min_confidence:
+    """What to say of a column whose surest packet is not sure enough to be reported; None where there is none."""
+    if not 0 < confidence < min_confidence:
         return None
     return f"its packet has a confidence of {confidence:.4f}, below --min-confidence {min_confidence:g}"
 

@@ -11,6 +11,8 @@ class DecodeSettings:
 
     #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
     most_ber_hat: float = 0.1
+    #: A photograph none of whose packets reaches this confidence shows none.
+    surest_packet: float = 0.1
     #: A column with a packet below this confidence is weak.
     weak_confidence: float = 0.5
     #: A weight is reported, and its soft bits count, from this probability on.

@@ -167,19 +167,27 @@ def test_status_follows_the_confidence(probability: float, status: str | None) -
         assert packet.ber_hat <= 0.2
 
 
-def test_a_packet_of_low_confidence_is_weak() -> None:
+def test_a_packet_of_low_confidence_is_weak_and_counts_beside_a_surer_one_alone() -> None:
+    """Where no packet of a photograph is likely what looks like packets is chance."""
     posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.95)
-    posteriors = replace(posteriors, log_prob=np.full((1, 2, N_SYMBOLS), np.log(0.1)))
-    (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
-    assert first.status == "weak"
-    assert 0 < first.packets[0].confidence < 0.5
+    log_prob = np.log(np.stack([np.full((1, N_SYMBOLS), 0.1), np.full((1, N_SYMBOLS), 0.999)], axis=1))
+
+    def found(log_prob: NDArray[np.float64]) -> tuple[ColumnResult, ...]:
+        doubted = replace(posteriors, log_prob=log_prob)
+        return results_of(clock_of(120, 0, [0, 0, 0]), doubted, snr(120), samples_of(120), 0)
+
+    first, second = found(log_prob)
+    assert (first.status, second.status) == ("weak", "ok")
+    assert 0 < first.packets[0].confidence < 0.1
+    assert [column.packets for column in found(log_prob[:, [0, 0]])] == [(), ()]
 
 
 def test_confidence_grows_with_the_log_probability_and_stays_below_one() -> None:
     confidences = []
     for log_prob in (-800.0, -10.0, -1.0, -0.1, -1e-3, -1e-12, 0.0):
         posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.999)
-        posteriors = replace(posteriors, log_prob=np.full((1, 2, N_SYMBOLS), log_prob / N_SYMBOLS))
+        of_columns = np.array([log_prob, -1e-3]) / N_SYMBOLS  # beside a sure packet, without which none is reported
+        posteriors = replace(posteriors, log_prob=np.tile(of_columns[:, None], (1, 1, N_SYMBOLS)))
         (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
         confidences.append(first.packets[0].confidence)
     assert confidences == sorted(confidences)
