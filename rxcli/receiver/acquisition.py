@@ -102,10 +102,10 @@ def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False
     """Row profiles of a screen of `n_columns` columns, in the order of time.
 
     With `quick`, columns of developed pictures are read pixel by pixel only when they are asked for, see
-    `ColumnSampler.in_depth`; those of unknown cameras were, when the camera was estimated.
+    `ColumnSampler.in_depth`.
     """
     frame, camera = context.frame, context.camera
-    quick = quick and sampling.is_coded(frame) and camera.blind_estimate is None
+    quick = quick and sampling.is_coded(frame)
     n_strips = n_strips_of(context.corners, n_columns)
     is_binned = quick and n_strips >= sync_settings.many_strips and n_strips % 2 == 0
 
