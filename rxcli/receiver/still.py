@@ -254,7 +254,7 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
         if number not in tried:
             width = float(np.hypot(clock.exposure_slots, _MIXED_ROWS[number] / clock.rows_per_slot))
             reception = initial_pass(replace(acquisition, clock=replace(clock, exposure_slots=width)))
-            tried[number] = packet_llr(reception), reception
+            tried[number] = float(reception.posteriors.log_evidence.sum()), reception
         return tried[number][0]
 
     best = min(_USUAL_MIX, len(_MIXED_ROWS) - 1)

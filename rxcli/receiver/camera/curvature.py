@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,25 +46,19 @@ def estimate_curvature(strips: Strips) -> tuple[FloatArray, float]:
     Returns:
         (4,) k1 k2 p1 p2 for a focal length of one width; and how much better it fits than none, nats.
     """
-    distances = strip_distances(strips)
-    if not distances:
-        return np.zeros(4), 0.0
-    level = levelled(strips.light, strips.inside, SETTINGS.bend_level_rows, strips.noise)[0]
-    pairs = [_lag_correlations(strips, level, distance) for distance in distances]
-    total = sum(float(one.correlation[SETTINGS.bend_lags].sum()) for one in pairs)
-    if total <= 0:
+    lags = [_lag_correlations(strips, distance) for distance in strip_distances(strips)]
+    total = sum(float(correlation[SETTINGS.bend_lags].sum()) for correlation, _ in lags)
+    if not lags or total <= 0:
         return np.zeros(4), 0.0
     # The sum of correlations is worth about this many nats: rows times strips, many of which say the same.
     weight = 4000.0 / total
     k1, share = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.4, 0.4, 25), [0.0, 0.8, 1.8]))
     guesses = np.stack([k1, -share * k1, 0 * k1, 0 * k1], axis=1)
-    along = pairs[-1].at_lag(np.tensordot(guesses, pairs[-1].terms, 1))[0].sum(axis=(1, 2))
+    correlation, terms = lags[-1]
+    along = _at_lag(correlation, np.tensordot(guesses, terms, 1))[0].sum(axis=(1, 2))
     scores = weight * along - 0.5 * ((guesses @ BEND_PRECISION) * guesses).sum(axis=1)
-    every = _Lags(
-        np.concatenate([one.correlation for one in pairs], axis=1), np.concatenate([one.terms for one in pairs], axis=1)
-    )
-    found, likeness = _climb(guesses[int(np.argmax(scores))], every, weight)
-    return found, likeness - _likeness(np.zeros(4), every, weight)[0]
+    found = _climb(guesses[int(np.argmax(scores))], lags, weight)
+    return found, _likeness(found, lags, weight) - _likeness(np.zeros(4), lags, weight)
 
 
 def strip_distances(strips: Strips) -> list[int]:
@@ -76,70 +70,69 @@ def strip_distances(strips: Strips) -> list[int]:
     return sorted(step for step in steps if step < n_strips)
 
 
-@dataclass(frozen=True, slots=True)
-class _Lags:
-    """How alike pairs of strips are at every lag."""
+def _lag_correlations(strips: Strips, distance: int) -> tuple[Float32Array, FloatArray]:
+    """Correlation of strips `distance` apart by lag, strip and window of rows; and what lag a unit of bend makes.
 
-    #: (lags, pairs, windows) correlation by lag, pair and window of rows.
-    correlation: Float32Array
-    #: (4, pairs, windows) rows of lag that a unit of bend makes.
-    terms: FloatArray
-
-    def at_lag(self, lag: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Correlation at fractional lags (..., pairs, windows) with first and second derivative.
-
-        By a Catmull-Rom cubic.
-        """
-        n_lags, size = self.correlation.shape[0], self.correlation[0].size
-        place = np.clip(lag + (n_lags - 1) / 2, 1, n_lags - 2.001)
-        low = place.astype(np.int64)
-        f = place - low
-        index = low * size + np.arange(size).reshape(self.correlation.shape[1:])
-        flat = self.correlation.ravel()
-        a, b, c, d = (flat.take(index + k * size).astype(np.float64) for k in (-1, 0, 1, 2))
-        linear, square, cubic = (c - a) / 2, a - 2.5 * b + 2 * c - 0.5 * d, 1.5 * (b - c) + 0.5 * (d - a)
-        value = b + f * (linear + f * (square + f * cubic))
-        return value, linear + f * (2 * square + 3 * f * cubic), a - 2 * b + c
+    Returns:
+        (lags, strips, windows) float32; (4, strips, windows) float64 rows.
+    """
+    n_rows = strips.light.shape[1]
+    level = levelled(strips.light, strips.inside, SETTINGS.bend_level_rows, strips.noise)[0]
+    borders = np.linspace(SETTINGS.bend_lags, n_rows - SETTINGS.bend_lags, SETTINGS.bend_windows + 1).astype(int)
+    middles = (borders[1:] + borders[:-1]) // 2
+    rows, x = strips.rows[middles], strips.x[:, middles]
+    terms = curvature_terms(x, rows, strips.width, strips.height)
+    left, right = level[:-distance], level[distance:]
+    inner = left[:, SETTINGS.bend_lags : n_rows - SETTINGS.bend_lags]
+    out = np.empty((2 * SETTINGS.bend_lags + 1, left.shape[0], SETTINGS.bend_windows), np.float32)
+    for number, lag in enumerate(range(-SETTINGS.bend_lags, SETTINGS.bend_lags + 1)):
+        product = inner * right[:, SETTINGS.bend_lags - lag : n_rows - SETTINGS.bend_lags - lag]
+        out[number] = np.add.reduceat(product, borders[:-1] - SETTINGS.bend_lags, axis=1)
+    return out, terms[:, distance:] - terms[:, :-distance]
 
 
-def _lag_correlations(strips: Strips, level: Float32Array, distance: int) -> _Lags:
-    """Of strips `distance` apart, by their levelled light (M, R)."""
-    most, n_windows = SETTINGS.bend_lags, SETTINGS.bend_windows
-    length = (level.shape[1] - 2 * most) // n_windows
-    middles = most + length * np.arange(n_windows) + length // 2
-    terms = curvature_terms(strips.x[:, middles], strips.rows[middles], strips.width, strips.height)
+def _at_lag(correlation: Float32Array, lag: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Correlation (lags, strips, windows) at fractional lags (..., strips, windows) with first and second derivative.
 
-    def windows(light: Float32Array, lag: int) -> Float32Array:
-        return light[:, most - lag :][:, : n_windows * length].reshape(len(light), n_windows, length)
-
-    left, right = windows(level[:-distance], 0), level[distance:]
-    out = np.stack([np.einsum("pwr,pwr->pw", left, windows(right, lag)) for lag in range(-most, most + 1)])
-    return _Lags(out, terms[:, distance:] - terms[:, :-distance])
-
-
-def _likeness(curvature: FloatArray, lags: _Lags, weight: float) -> tuple[float, FloatArray, FloatArray]:
-    """How well a bend fits, nats, with the prior of `BEND_PRECISION`; its gradient (4,), and (4, 4) minus its slope."""
-    value, slope, bend = lags.at_lag(np.tensordot(curvature, lags.terms, 1))
-    flat, prior = lags.terms.reshape(4, -1), BEND_PRECISION @ curvature
-    hessian = BEND_PRECISION + weight * (flat * np.maximum(-bend, 0).ravel()) @ flat.T
-    return weight * float(value.sum()) - 0.5 * float(curvature @ prior), weight * flat @ slope.ravel() - prior, hessian
+    By a Catmull-Rom cubic.
+    """
+    place = np.clip(lag + (correlation.shape[0] - 1) / 2, 1, correlation.shape[0] - 2.001)
+    low = place.astype(np.int64)
+    f = place - low
+    size = correlation[0].size
+    index = low * size + np.arange(size).reshape(correlation.shape[1:])
+    flat = correlation.ravel()
+    a, b, c, d = (flat.take(index + k * size).astype(np.float64) for k in (-1, 0, 1, 2))
+    linear, square, cubic = (c - a) / 2, a - 2.5 * b + 2 * c - 0.5 * d, 1.5 * (b - c) + 0.5 * (d - a)
+    value = b + f * (linear + f * (square + f * cubic))
+    return value, linear + f * (2 * square + 3 * f * cubic), a - 2 * b + c
 
 
-def _climb(curvature: FloatArray, lags: _Lags, weight: float) -> tuple[FloatArray, float]:
-    """The bend that is most likely, by Newton's method, never downhill; and its likeness."""
-    best, (score, gradient, hessian) = curvature, _likeness(curvature, lags, weight)
+def _likeness(curvature: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float) -> float:
+    total = sum(float(_at_lag(c, np.tensordot(curvature, terms, 1))[0].sum()) for c, terms in lags)
+    return weight * total - 0.5 * float(curvature @ BEND_PRECISION @ curvature)
+
+
+def _climb(
+    curvature: FloatArray, lags: list[tuple[Float32Array, FloatArray]], weight: float, steps: int = 8
+) -> FloatArray:
+    """Newton's method on the likeness, with the prior of `BEND_PRECISION`; never downhill."""
+    best, score = curvature, _likeness(curvature, lags, weight)
     step = 1.0
-    for _ in range(SETTINGS.bend_steps):
+    for _ in range(steps):
+        gradient, hessian = -BEND_PRECISION @ best, BEND_PRECISION.copy()
+        for correlation, terms in lags:
+            _, slope, curvature = _at_lag(correlation, np.tensordot(best, terms, 1))
+            flat = terms.reshape(4, -1)
+            gradient = gradient + weight * flat @ slope.ravel()
+            hessian = hessian + weight * (flat * np.maximum(-curvature, 0).ravel()) @ flat.T
         trial = best + step * np.linalg.solve(hessian, gradient)
-        there = _likeness(trial, lags, weight)
-        if there[0] <= score:
+        trial_score = _likeness(trial, lags, weight)
+        if trial_score > score:
+            best, score = trial, trial_score
+        else:
             step /= 2
-            continue
-        gained = there[0] - score
-        best, (score, gradient, hessian) = trial, there
-        if gained < SETTINGS.bend_least_gain_nats:
-            break
-    return best, score
+    return best
 
 
 def straightened(strips: Strips, curvature: FloatArray) -> Strips:

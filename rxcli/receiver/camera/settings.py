@@ -154,9 +154,6 @@ class CameraSettings:
     bend_lags: int = 24
     bend_windows: int = 20
     bend_level_rows: int = 100
-    #: Steps to the best bend, and what one must gain, nats, so that there is another.
-    bend_steps: int = 8
-    bend_least_gain_nats: float = 0.01
 
     #: Rows over which the edges' power is levelled.
     edge_level_rows: int = 41
