@@ -1,4 +1,4 @@
-"""Numbers of policy of the wiring: which screen, which camera, whether packets show."""
+"""Numbers of policy of the wiring: which screen, which camera, whether packets show; and of a still's passes."""
 
 from __future__ import annotations
 
@@ -67,7 +67,8 @@ class WiringSettings:
     same_period: float = 5e-3
     #: Packets at which there may be some, nats: in a column of light without data, or all together where nothing but a
     #: grid says that there is a screen, or where none is received and an estimated camera is to be told. Wrong ones
-    #: show less than 10, right ones 80.
+    #: show less than 10, right ones 80. And headers and packets under which an initial pass leaves no hope of any: of
+    #: 120 hard pictures that show packets, none had less than 74.
     some_packets: float = 20.0
     #: Relative standard deviation of the line delay of a camera that is remembered, and of one that no further picture
     #: need improve.
@@ -97,7 +98,8 @@ class WiringSettings:
 
     #: A header peak less than this times the strongest rival is no clock.
     min_peak_ratio: float = 1.6
-    #: A clock whose slots look so much like packets, and so much more than on any other, nats, needs no further look.
+    #: A clock whose slots look so much like packets, and so much more than on any other, nats, needs no further look;
+    #: of two clocks it is the one.
     plain_structure: float = 60.0
 
     #: Estimates of a camera are of one camera where line delays differ by less than so many standard deviations, or
@@ -118,4 +120,41 @@ class WiringSettings:
     largest_outline: float = 50.0
 
 
-SETTINGS = WiringSettings()
+@dataclass(frozen=True, slots=True)
+class StillSettings:
+    """Each with its unit and the reason for it."""
+
+    #: Samples a slot: of first looks, and of those at columns that are still in doubt.
+    coarse_samples: int = 2
+    fine_samples: int = 4
+    #: Below so many rows a slot it shows that developing mixes rows; as how wide a box of rows, is tried from the usual
+    #: one of these on.
+    few_rows: float = 4.0
+    mixed_rows: tuple[float, ...] = (0.0, 1.0, 1.7, 2.4, 3.0)
+    usual_mix: int = 1
+    #: A column with a packet of less confidence, whose symbols are not `beyond_doubt_log_prob`, is looked at again, at
+    #: last by the auto-encoder, and symbols of less log probability are weighed as words. Where the gate comes from:
+    #: docs/auto_encoder.md. Of 2699 packets of simulated frames an initial pass leaves half so sure.
+    doubtful: float = 0.985
+    doubtful_word_log_prob: float = -1e-2
+    #: A column none of whose packets has symbols of at least this mean log probability on the fine grid is beyond
+    #: repair: of 350 such columns of simulated frames further looks made two error-free. Before, it may have a wrong
+    #: weight.
+    beyond_repair_log_prob: float = -0.8
+    #: Words of a symbol in doubt that are weighed; none where even the best has less log probability: there is nothing
+    #: to choose from.
+    words_weighed: int = 4
+    hopeless_word_log_prob: float = -1.4
+    #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least
+    #: sure, have their words weighed alone.
+    most_shown: int = 58_000
+    #: Bursts are doubted where less than this share of the columns has packets of such a confidence, and where they are
+    #: not so much likelier than others by how alike copies are, nats.
+    clear_columns: float = 0.9
+    clear_confidence: float = 0.9
+    plain_bursts: float = 300.0
+    #: How alike copies are is half told by the packets' evidence.
+    say_of_copies: float = 0.5
+
+
+SETTINGS, STILL = WiringSettings(), StillSettings()

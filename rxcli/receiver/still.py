@@ -27,37 +27,8 @@ from rxcli.receiver.reception import (
     packet_llr,
     word_log_prob,
 )
-from rxcli.receiver.settings import SETTINGS
+from rxcli.receiver.settings import SETTINGS, STILL
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
-
-#: Samples a slot: of first looks, and of those at columns that are still in doubt.
-_COARSE, _FINE = 2, 4
-#: Below so many rows a slot it shows that developing mixes rows; as how wide a box of rows, is tried.
-_FEW_ROWS = 4.0
-_MIXED_ROWS, _USUAL_MIX = (0.0, 1.0, 1.7, 2.4, 3.0), 1
-#: A column with a packet of less confidence, whose symbols do not have this log probability whatever slots say, is
-#: looked at again, at last by the auto-encoder, and symbols of less log probability are weighed as words. Where the
-#: gate comes from: docs/auto_encoder.md. Of 2699 packets of simulated frames an initial pass leaves half so sure.
-_DOUBTFUL, _DOUBTFUL_WORD = 0.985, -1e-2
-#: A column none of whose packets has symbols of at least this mean log probability on the fine grid is beyond repair:
-#: of 350 such columns of simulated frames further looks made two error-free. Before, it may have a wrong weight.
-_BEYOND_REPAIR = -0.8
-#: Words of a symbol in doubt that are weighed; none where even the best is less likely than this, a log probability:
-#: there is nothing to choose from.
-_WORDS, _HOPELESS_WORD = 4, -1.4
-#: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least sure,
-#: have their words weighed alone.
-_MOST_SHOWN = 58_000
-#: Bursts are doubted where less than this share of the columns has packets of such a confidence, and where they are
-#: not so much likelier than others by how alike copies are, nats.
-_CLEAR_COLUMNS, _CLEAR, _PLAIN_BURSTS = 0.9, 0.9, 300.0
-#: How alike copies are is half told by the packets' evidence.
-_SAY_OF_COPIES = 0.5
-#: Headers and packets, all columns together, under which an initial pass leaves no hope of packets, nats: of 120 hard
-#: pictures that show any, none had less than 74.
-_NO_PACKETS = 20.0
-#: Of two clocks the one whose slots are so much likelier packets on an initial pass, nats, is it.
-_PLAIN_CLOCK = 60.0
 
 
 def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Reception:
@@ -78,7 +49,7 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
     if len(either) > 1:
         return _likelier_clock(either, skip)
     weighed = [first]
-    likeliest = _with_likeliest_bursts(acquisition, first, weighed, _SAY_OF_COPIES)
+    likeliest = _with_likeliest_bursts(acquisition, first, weighed, STILL.say_of_copies)
     reception = decode(
         _in_bursts_of(acquisition, likeliest) if likeliest is not first else acquisition, skip, likeliest
     )
@@ -96,8 +67,10 @@ def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Receptio
 
 
 def _may_show_packets(first: Reception) -> bool:
-    """Whether an initial pass leaves hope of packets."""
-    return packet_llr(first) + max(float(first.posteriors.header_llr.sum()), 0.0) > _NO_PACKETS
+    """Whether an initial pass leaves hope of packets; one that is in no doubt is hope enough."""
+    if (packet_confidence(first)[complete_packets(first)] > STILL.doubtful).any():
+        return True
+    return packet_llr(first) + max(float(first.posteriors.header_llr.sum()), 0.0) > SETTINGS.some_packets
 
 
 def _with_either_clock(acquisition: Acquisition) -> list[Acquisition]:
@@ -133,10 +106,10 @@ def _with_likeliest_bursts(
         say_of_copies = 0.0
     else:
         confidence = np.where(complete, packet_confidence(reception), 0.0).max(axis=0)
-        if not confidence.any() or (confidence > _CLEAR).mean() >= _CLEAR_COLUMNS:
+        if not confidence.any() or (confidence > STILL.clear_confidence).mean() >= STILL.clear_columns:
             return reception
     possible = sync.possible_bursts(reception.clock, detect.slot_llr(reception.metrics), acquisition.repeats)
-    plain = len(possible) == 1 or possible[0][1] - possible[1][1] > _PLAIN_BURSTS
+    plain = len(possible) == 1 or possible[0][1] - possible[1][1] > STILL.plain_bursts
     if complete.any() and plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
         return reception
     # How far rows are mixed does not depend on the bursts.
@@ -149,7 +122,9 @@ def _with_likeliest_bursts(
             known = initial_pass(replace(acquisition, clock=exposed, burst=clock.burst))
             weighed.append(known)
         passes.append(known)
-        scores.append(packet_llr(known) + say_of_copies * likeness)
+        # Bursts that leave no packet whole give nothing: they must be plainly likelier.
+        gain = SETTINGS.plain_structure if complete_packets(known).any() else 0.0
+        scores.append(packet_llr(known) + say_of_copies * likeness + gain)
     return passes[int(np.argmax(scores))]
 
 
@@ -166,7 +141,7 @@ def _same_bursts(one: Reception, other: Reception) -> bool:
 def _likelier_clock(either: Sequence[Acquisition], skip: frozenset[str]) -> Reception:
     """What is decoded on the likelier of two clocks; a further look tells where an initial pass does not plainly."""
     evidence = [packet_llr(first_pass(one)) for one in either]
-    if abs(evidence[0] - evidence[1]) < _PLAIN_CLOCK:
+    if abs(evidence[0] - evidence[1]) < SETTINGS.plain_structure:
         evidence = [packet_llr(_refined_once(one, first_pass(one))) for one in either]
     return decode_likeliest(either[int(np.argmax(evidence))], skip)
 
@@ -174,7 +149,7 @@ def _likelier_clock(either: Sequence[Acquisition], skip: frozenset[str]) -> Rece
 def _refined_once(acquisition: Acquisition, first: Reception) -> Reception:
     """An initial pass and a look at all scales of every column that has light."""
     lit = np.flatnonzero(~dark_columns(first.snr))
-    return _seen_again(acquisition, first, lit, _COARSE)[0] if lit.size else first
+    return _seen_again(acquisition, first, lit, STILL.coarse_samples)[0] if lit.size else first
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
@@ -200,7 +175,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
 
 def first_pass(acquisition: Acquisition) -> Reception:
     """The initial pass; with few rows a slot that with the likeliest mix of rows."""
-    if acquisition.clock.rows_per_slot >= _FEW_ROWS:
+    if acquisition.clock.rows_per_slot >= STILL.few_rows:
         return initial_pass(acquisition)
     if "first" not in acquisition.kept:
         acquisition.kept["first"] = _likeliest_row_mix(acquisition)
@@ -218,9 +193,9 @@ def initial_pass(acquisition: Acquisition) -> Reception:
 
 def _initial_pass(acquisition: Acquisition) -> Reception:
     clock = acquisition.clock
-    samples = sync.sample_slots(acquisition.profiles, clock, _COARSE)
+    samples = sync.sample_slots(acquisition.profiles, clock, STILL.coarse_samples)
     model = _light_model(acquisition, samples)
-    contrast = sync.contrast(samples.light, samples.valid, _COARSE, model.noise.sigma)
+    contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
     first = channel.first_metrics(*contrast, model.exposure)
     clock = _in_bursts(acquisition, clock, first)
     lit = clock.on_grid(_first_decision(channel.by_burst(first, clock), model.exposure.isi_memory))
@@ -249,15 +224,15 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
     tried: dict[int, tuple[float, Reception]] = {}
 
     def likelihood(number: int) -> float:
-        if not 0 <= number < len(_MIXED_ROWS):
+        if not 0 <= number < len(STILL.mixed_rows):
             return -np.inf
         if number not in tried:
-            width = float(np.hypot(clock.exposure_slots, _MIXED_ROWS[number] / clock.rows_per_slot))
+            width = float(np.hypot(clock.exposure_slots, STILL.mixed_rows[number] / clock.rows_per_slot))
             reception = initial_pass(replace(acquisition, clock=replace(clock, exposure_slots=width)))
             tried[number] = float(reception.posteriors.log_evidence.sum()), reception
         return tried[number][0]
 
-    best = min(_USUAL_MIX, len(_MIXED_ROWS) - 1)
+    best = min(STILL.usual_mix, len(STILL.mixed_rows) - 1)
     step = 1 if likelihood(best + 1) > likelihood(best) else -1
     while likelihood(best + step) > likelihood(best):
         best += step
@@ -266,18 +241,18 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
 
 def doubtful_columns(reception: Reception, beyond_repair: float = -np.inf) -> NDArray[np.int64]:
     """Columns that get a second opinion: in doubt, but not beyond repair."""
-    return np.flatnonzero(in_doubt(reception, _DOUBTFUL) & (best_packet(reception) > beyond_repair))
+    return np.flatnonzero(in_doubt(reception, STILL.doubtful) & (best_packet(reception) > beyond_repair))
 
 
 def _coarse(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
     """All strips, the picture on all scales; the clock is corrected after it."""
-    after, timing = _seen_again(acquisition, reception, columns, _COARSE)
+    after, timing = _seen_again(acquisition, reception, columns, STILL.coarse_samples)
     return replace(after, clock=sync.corrected(after.clock, timing))
 
 
 def _fine(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
     """The same with more samples a slot."""
-    return _seen_again(acquisition, reception, columns, _FINE)[0]
+    return _seen_again(acquisition, reception, columns, STILL.fine_samples)[0]
 
 
 def _seen_again(
@@ -286,7 +261,7 @@ def _seen_again(
     """What is seen with some columns looked at again, and the (C, 2) timing of all, 0 for the others."""
     samples, model = _view(acquisition, reception, columns, samples_per_slot)
     lit = reception.clock.on_grid(reception.posteriors.lit)
-    asked = samples_per_slot == _COARSE
+    asked = samples_per_slot == STILL.coarse_samples
     likelihoods = channel.slot_likelihoods(samples, reception.clock, model, lit, columns, timing=asked)
     timing = np.zeros((lit.shape[0], 2))
     timing[columns] = likelihoods.timing
@@ -339,7 +314,7 @@ def apply_autoencoder(
         columns = np.arange(reception.snr.shape[0])
         reception = _without_row_noise(acquisition.in_depth(columns), reception, columns)
     else:
-        columns = doubtful_columns(reception, _BEYOND_REPAIR)
+        columns = doubtful_columns(reception, STILL.beyond_repair_log_prob)
     if columns.size == 0 or reception.cleaned is None:
         return reception, frozenset(), None
     shown = columns if always else _worth_showing(reception, columns)
@@ -375,7 +350,7 @@ def _worth_showing(reception: Reception, columns: NDArray[np.int64]) -> NDArray[
     """Those of `columns` that the network is shown: the surest, and no more than its time allows."""
     assert reception.cleaned is not None
     n_strips = reception.cleaned[0].light.shape[1]
-    most = max(_MOST_SHOWN // (n_strips * reception.clock.n_slots), 1)
+    most = max(STILL.most_shown // (n_strips * reception.clock.n_slots), 1)
     return np.sort(columns[np.argsort(-best_packet(reception)[columns], kind="stable")[:most]])
 
 
@@ -386,10 +361,12 @@ def _words_weighed(
     clock = reception.clock
     bursts = channel.by_burst(metrics, clock)
     candidates = detect.plausible_weights(bursts, SETTINGS.hopeless_weight_nats)
-    posteriors, doubtful = detect.detect_with_words(bursts, candidates, _DOUBTFUL_WORD, _WORDS)
+    posteriors, doubtful = detect.detect_with_words(
+        bursts, candidates, STILL.doubtful_word_log_prob, STILL.words_weighed
+    )
     samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
     lit = clock.on_grid(reception.posteriors.with_columns(columns, posteriors).lit)
-    asked = doubtful.log_prob[:, 0] > _HOPELESS_WORD
+    asked = doubtful.log_prob[:, 0] > STILL.hopeless_word_log_prob
     places, words = doubtful.places[asked], doubtful.words[asked]
     corrections = channel.word_corrections(samples, clock, scene.model, lit, columns, places, words)
     return metrics + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
@@ -407,12 +384,12 @@ def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: 
 
 #: Looks at columns in doubt, after the initial pass and before the auto-encoder. Each sees more of the light than the
 #: one before and takes its place: kept only where words are likelier then, they lose 1 to 3 % of the packets. Columns
-#: of a lower mean log probability, see `_BEYOND_REPAIR`, are left.
+#: of a lower mean log probability, see `StillSettings`, are left.
 _PASSES = (
     (_coarse, -np.inf),
     (_fine, -np.inf),
-    (_fine, _BEYOND_REPAIR),
-    (_without_row_noise, _BEYOND_REPAIR),
+    (_fine, STILL.beyond_repair_log_prob),
+    (_without_row_noise, STILL.beyond_repair_log_prob),
 )
 
 

@@ -32,7 +32,7 @@ from rxcli.errors import ProfileError
 from rxcli.numerics import box_sums
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, slot_patterns
 from rxcli.receiver.channel.model import Expected, ObservationModel
-from rxcli.receiver.channel.picture import predict_picture
+from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.resources import data_dir
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
@@ -131,11 +131,14 @@ def _explain(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Explained:
     light = model.over_black(scene.samples)[columns]
     expected = model.expected(scene.lit, scene.clock, columns)
     whole = expected.whole
-    (prediction,) = predict_picture(light, whole, valid, model, SETTINGS.picture_scales, one_sided=False)
-    noise = model.noise.through(prediction.picture, prediction.variance, whole)
+    q = scene.samples.samples_per_slot
+    sums = PictureSums.of(*(by_place(each, q) for each in (light, whole, valid)))
+    prediction = predict_picture(sums, model.noise.floor, SETTINGS.picture_scales, one_sided=False)
+    picture = in_time(prediction.at_samples(q))
+    noise = model.noise.through(picture, np.repeat(prediction.variance[0], q, axis=-1), whole)
     scale = np.asarray(valid / np.sqrt(noise), np.float32)
-    residual = (light - prediction.picture * whole) * scale
-    return _Explained(light, expected, scale, prediction.picture * expected.own * scale, residual)
+    residual = (light - picture * whole) * scale
+    return _Explained(light, expected, scale, picture * expected.own * scale, residual)
 
 
 def _row_light(residual: Float32Array, scale: Float32Array) -> Float32Array:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.patterns import by_pattern
-from rxcli.receiver.channel.picture import Prediction, predict_picture
+from rxcli.receiver.channel.picture import PER_SLOT, PictureSums, Prediction, by_place, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
@@ -62,7 +62,7 @@ def slot_likelihoods(
     expected, light = model.expected(lit, clock, columns, slope=timing), model.over_black(samples)
 
     def of_part(part: NDArray[np.int64]) -> SlotLikelihoods:
-        return _likelihoods(light[part], samples.valid[part], expected.of(part), model, thorough)
+        return _likelihoods(_Part.of(light[part], samples.valid[part], expected.of(part), model), thorough)
 
     n_parts = int(np.clip(round(samples.light.size / _SAMPLES_AT_A_TIME), 1, columns.size))
     if n_parts == 1:
@@ -80,82 +80,90 @@ def slot_likelihoods(
     )
 
 
-def _likelihoods(
-    light: Float32Array, valid: Float32Array, expected: Expected, model: ObservationModel, thorough: bool
-) -> SlotLikelihoods:
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Samples of some columns, those at one place in all slots side by side: (Q, C, S, N) float32 or broadcasting."""
+
+    light: Float32Array
+    valid: Float32Array
+    #: Light expected per unit of picture: of the columns beside, of the column itself where it is lit, and of all by
+    #: the present idea of the slots.
+    others: Float32Array
+    own: Float32Array
+    whole: Float32Array
+    #: Change of the whole by a slot of time; None where it was not asked for.
+    slope: Float32Array | None
+    model: ObservationModel
+
+    @staticmethod
+    def of(light: Float32Array, valid: Float32Array, expected: Expected, model: ObservationModel) -> _Part:
+        """Of samples in order of time, (C, S, n)."""
+        q = model.exposure.samples_per_slot
+        light, valid, others, shape = (by_place(each, q) for each in (light, valid, expected.others, expected.shape))
+        slope = None if expected.slope is None else by_place(expected.slope, q)
+        return _Part(light, valid, others, expected.own, others + expected.own * shape, slope, model)
+
+
+def _likelihoods(part: _Part, thorough: bool) -> SlotLikelihoods:
     scales = SETTINGS.picture_scales if thorough else SETTINGS.first_scales
-    predictions = predict_picture(light, expected.whole, valid, model, scales, one_sided=thorough)
-    metrics = _pattern_metrics(light, valid, predictions, expected, model)
-    asked = expected.slope is not None
-    timing = _timing(light, valid, predictions[0], expected, model) if asked else np.zeros((len(light), 2))
-    return SlotLikelihoods(metrics, _slot_snr(valid, predictions[0], expected.own, model), timing)
+    sums = PictureSums.of(part.light, part.whole, part.valid)
+    prediction = predict_picture(sums, part.model.noise.floor, scales, one_sided=thorough)
+    timing = np.zeros((part.light.shape[1], 2)) if part.slope is None else _timing(part, prediction)
+    return SlotLikelihoods(_pattern_metrics(part, prediction), _slot_snr(part, prediction), timing)
 
 
-def _slot_snr(valid: Float32Array, prediction: Prediction, own: Float32Array, model: ObservationModel) -> Float32Array:
+def _slot_snr(part: _Part, prediction: Prediction) -> Float32Array:
     """(C, N) squared contrast over variance of a slot, as far as strips and samples are independent.
 
     A slot's middle tells it: the picture hardly changes within.
     """
-    q = model.exposure.samples_per_slot
-    picture, variance, observed = (each[..., q // 2 :: q] for each in (prediction.picture, prediction.variance, valid))
-    contrast = picture * own
-    ratio = contrast * contrast / model.noise.through(picture, variance, own) * observed
+    picture = prediction.picture[0, 1]
+    contrast = picture * part.own
+    noise = part.model.noise.through(picture, prediction.variance[0], part.own)
+    ratio = contrast * contrast / noise * part.valid[len(part.valid) // 2]
     return np.asarray(ratio.sum(axis=1) * np.float32(SETTINGS.slot_information))
 
 
-def _timing(
-    light: Float32Array, valid: Float32Array, prediction: Prediction, expected: Expected, model: ObservationModel
-) -> FloatArray:
+def _timing(part: _Part, prediction: Prediction) -> FloatArray:
     """(C, 2) numerator and denominator of each column's lateness: one Gauss-Newton step, samples weighted robustly."""
-    assert expected.slope is not None
-    whole = expected.whole
-    change = prediction.picture * expected.slope
-    residual = light - prediction.picture * whole
-    variance = model.noise.through(prediction.picture, prediction.variance, whole)
-    weight = valid / (variance + residual * residual / np.float32(_DEGREES))
-    numerator = (weight * residual * change).sum(axis=(1, 2), dtype=np.float64)
-    return np.stack([numerator, (weight * change * change).sum(axis=(1, 2), dtype=np.float64)], axis=1)
+    assert part.slope is not None
+    picture = prediction.at_samples(len(part.light))
+    change = picture * part.slope
+    residual = part.light - picture * part.whole
+    variance = part.model.noise.through(picture, prediction.variance[0], part.whole)
+    weight = part.valid / (variance + residual * residual / np.float32(_DEGREES))
+    of_columns = (0, 2, 3)
+    numerator = (weight * residual * change).sum(axis=of_columns, dtype=np.float64)
+    return np.stack([numerator, (weight * change * change).sum(axis=of_columns, dtype=np.float64)], axis=1)
 
 
-def _pattern_metrics(
-    light: Float32Array,
-    valid: Float32Array,
-    predictions: list[Prediction],
-    expected: Expected,
-    model: ObservationModel,
-) -> FloatArray:
+def _pattern_metrics(part: _Part, prediction: Prediction) -> FloatArray:
     """Mixture log-likelihoods summed over strips and the samples of a metric; (C, N + memory, patterns)."""
-    weight = np.float32(SETTINGS.slot_information / model.exposure.samples_per_slot) * valid
-    shot = [np.float32(model.noise.slope) * prediction.picture for prediction in predictions]
-    whole, floor = np.empty_like(light), np.float32(model.noise.floor)
+    exposure, noise = part.model.exposure, part.model.noise
+    weight = np.float32(SETTINGS.slot_information / exposure.samples_per_slot) * part.valid
+    floor, shot = np.float32(noise.floor), np.float32(noise.slope) * prediction.picture
 
-    def log_likelihood(levels: Float32Array) -> Float32Array:
-        np.multiply(expected.own, levels, out=whole)
-        np.add(whole, expected.others, out=whole)
-        density = _density(light, whole, predictions[0], shot[0], floor)
-        for prediction, own_shot in zip(predictions[1:], shot[1:], strict=True):
-            density += _density(light, whole, prediction, own_shot, floor)
+    def log_likelihood(place: int, level: float) -> Float32Array:
+        half = place * PER_SLOT // exposure.samples_per_slot
+        whole = part.own * np.float32(level) + part.others[place]
+        # As `NoiseModel.through` has it.
+        variance = prediction.variance * whole
+        variance += shot[:, half]
+        variance *= whole
+        variance += floor
+        density = _density(part.light[place] - prediction.picture[:, half] * whole, variance).sum(axis=0)
         np.log(np.maximum(density, _LEAST_DENSITY, out=density), out=density)
-        density *= weight
-        return np.asarray(density.sum(axis=1))
+        return np.asarray(np.einsum("csn,csn->cn", density, weight[place]))
 
-    return by_pattern(model.exposure, light.shape[2], log_likelihood)
+    return by_pattern(exposure, log_likelihood)
 
 
-def _density(
-    light: Float32Array, whole: Float32Array, prediction: Prediction, shot: Float32Array, floor: np.float32
-) -> Float32Array:
-    """Student-t density of the light, up to a constant, with the variance that `NoiseModel.through` tells.
+def _density(residual: Float32Array, variance: Float32Array) -> Float32Array:
+    """Student-t density of residuals, up to a constant; the arrays are worked in.
 
     With four degrees of freedom, variance v and residual r it is v^2 / (v + r^2 / 4)^2.5: a root, and no logarithm.
     """
-    variance = prediction.variance * whole
-    variance += shot
-    variance *= whole
-    variance += floor
-    wide = prediction.picture * whole
-    np.subtract(light, wide, out=wide)
-    np.square(wide, out=wide)
+    wide = np.square(residual, out=residual)
     wide *= np.float32(1 / _DEGREES)
     wide += variance
     variance /= wide

@@ -19,11 +19,10 @@ class ChannelSettings:
     first_llr: float = 8.0
     first_strips: float = 3.0
 
-    #: Slots over which the picture is predicted, fine texture to plain sky; a first pass takes those that suit most.
-    picture_scales: tuple[float, ...] = (0.3, 0.8, 2.5, 6.0)
-    first_scales: tuple[float, ...] = (0.6, 2.5)
-    #: Samples closer than so many slots say nothing of a sample's picture: they show the same slot.
-    hole_slots: float = 0.7
+    #: Slots on a side from which the picture is predicted, fine texture to plain sky; a first pass takes those that
+    #: suit most.
+    picture_scales: tuple[int, ...] = (1, 2, 5, 12)
+    first_scales: tuple[int, ...] = (2, 5)
     #: Slots over which the error of a prediction is averaged, and bounds of its variance, relative to the picture's
     #: square: the least keeps a plain picture from being sure beyond what crosstalk is known to.
     error_slots: int = 28

@@ -49,11 +49,11 @@ WHOLE_PICTURE = CombRange(
 #: A fifth of a picture's width, which is some times as high: there pitches hardly change, and turns tell more. Turned
 #: by a column from window to window borders look as if they were not.
 FIFTH = CombRange(
-    np.arange(14.0, 46.0, 0.5),
-    0.5,
-    np.linspace(-0.1, 0.1, 17),
+    np.arange(14.0, 46.0, 0.25),
+    0.25,
+    np.linspace(-0.1, 0.1, 33),
     np.linspace(-0.03, 0.03, 3),
-    np.linspace(-0.05, 0.05, 5),
+    np.linspace(-0.05, 0.05, 7),
 )
 
 

@@ -11,6 +11,8 @@ from row_profiles import Link, Shot, random_link, row_profiles, sigma_of, slot_o
 
 from rxcli.protocol import slot_patterns
 from rxcli.receiver import channel, sync
+from rxcli.receiver.channel.patterns import by_pattern
+from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.channel.words import _innovations
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
 from rxcli.types import Clock, SlotSamples
@@ -290,6 +292,39 @@ def test_metrics_of_independent_slots() -> None:
         assert metrics.shape == (2, 30 + isi_memory, 2 << isi_memory)
         newest = slot_patterns(isi_memory)[:, -1] == 1
         np.testing.assert_allclose((metrics[..., newest] - metrics[..., ~newest])[:, :30].max(axis=2), llr, rtol=1e-5)
+
+
+@pytest.mark.parametrize("exposure_slots", [0.4, 1.0, 1.8, 2.3, 3.4])
+@pytest.mark.parametrize("q", [2, 4])
+def test_patterns_add_up_what_their_samples_say(exposure_slots: float, q: int) -> None:
+    """Levels that are not asked for are told by a polynomial, which a square is."""
+    exposure = Exposure.of(exposure_slots, q)
+    isi_memory, n = exposure.isi_memory, 12 * q
+    light = np.random.default_rng(3).random((2, n)).astype(np.float32)
+    levels = slot_patterns(isi_memory) @ exposure.taps.T
+    expected = np.zeros((2, 12 + isi_memory, len(levels)))
+    for i in range(n):
+        metric, sample = divmod(i + isi_memory * q // 2, q)
+        expected[:, metric] -= (light[:, i, None] - levels[:, sample]) ** 2
+    said = by_pattern(exposure, lambda place, level: -np.square(light[:, place::q] - np.float32(level)))
+    np.testing.assert_allclose(said, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("q", [2, 4])
+def test_a_slot_says_nothing_of_its_own_picture(q: int) -> None:
+    rng, slot = np.random.default_rng(5), 20
+    light, expected = (rng.uniform(0.5, 1.0, (1, 2, 40 * q)).astype(np.float32) for _ in range(2))
+    other = light.copy()
+    other[..., slot * q : (slot + 1) * q] *= 2
+
+    def predicted(light: NDArray[np.float32]) -> NDArray[np.float32]:
+        sums = PictureSums.of(*(by_place(each, q) for each in (light, expected, np.ones_like(light))))
+        return predict_picture(sums, 1e-4, (1, 2, 5), one_sided=True).picture
+
+    np.testing.assert_array_equal(in_time(by_place(light, q)), light)
+    before, after = predicted(light), predicted(other)
+    np.testing.assert_array_equal(before[..., slot], after[..., slot])
+    assert not np.array_equal(before[..., slot + 1], after[..., slot + 1])
 
 
 @pytest.mark.parametrize("isi_memory", [1, 3])
