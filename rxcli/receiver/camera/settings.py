@@ -154,6 +154,8 @@ class CameraSettings:
     bend_lags: int = 24
     bend_windows: int = 20
     bend_level_rows: int = 100
+    #: Climbing ends where a step gains less, nats.
+    least_gain: float = 0.01
 
     #: Rows over which the edges' power is levelled.
     edge_level_rows: int = 41

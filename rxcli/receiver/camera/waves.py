@@ -213,13 +213,16 @@ def _trust(waves: Waves) -> Float32Array:
 def _pattern_metric(
     waves: Waves, gain: Float32Array, offset: Float32Array, power: Float32Array, pattern: FloatArray
 ) -> Float32Array:
-    """(C, N, patterns) log-likelihood of every slot's samples at given levels and noise, up to a constant."""
+    """(patterns, C, N) log-likelihood of every slot's samples at given levels and noise, up to a constant."""
     scale = _trust(waves) * np.float32(SETTINGS.sample_information / 2) / power
-    shape = (waves.value.shape[0], -1, SAMPLES)
-    value, gain, scale = ((waves.value - offset).reshape(shape), gain.reshape(shape), scale.reshape(shape))
-    light = pattern.astype(np.float32)
-    square = (value * value * scale).sum(axis=2, keepdims=True)
-    return np.asarray(2 * (value * gain * scale) @ light.T - (gain * gain * scale) @ (light * light).T - square)
+    shape = (waves.value.shape[0], -1)
+    value, light = waves.value - offset, pattern.astype(np.float32)
+    gain_scale = gain * scale
+    square, expected, both = (
+        one.reshape(-1, SAMPLES).T for one in (value * value * scale, gain * gain_scale, 2 * value * gain_scale)
+    )
+    metric = light @ both - (light * light) @ expected - square.sum(axis=0)
+    return np.asarray(metric.reshape(light.shape[0], *shape))
 
 
 def _levels(waves: Waves, lit: Float32Array, exposure_slots: float) -> tuple[Float32Array, Float32Array, Float32Array]:
