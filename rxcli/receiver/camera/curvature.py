@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.receiver.camera.settings import SETTINGS
-from rxcli.receiver.camera.strips import Strips, halved, levelled
+from rxcli.receiver.camera.strips import Strips, levelled
 from rxcli.types import Float32Array, FloatArray
 
 #: Scale of the coefficients k1 k2 p1 p2 for a focal length of one picture width, as a camera may have them.
@@ -47,7 +47,6 @@ def estimate_curvature(strips: Strips) -> tuple[FloatArray, float]:
     Returns:
         (4,) k1 k2 p1 p2 for a focal length of one width; and how much better it fits than none, nats.
     """
-    strips = halved(strips)
     level = levelled(strips.light, strips.inside, SETTINGS.bend_level_rows, strips.noise)[0]
     lags = [_lag_correlations(strips, level, distance) for distance in strip_distances(strips)]
     total = sum(float(correlation[SETTINGS.bend_lags].sum()) for correlation, _ in lags)

@@ -10,7 +10,7 @@ class CameraSettings:
     """Each with its unit and the reason for it."""
 
     #: Strips that a column keeps while its camera is unknown.
-    most_strips: int = 4
+    most_strips: int = 2
     #: Sides are straight up to so many standard deviations, where these are small enough to tell; bowed from so many
     #: on.
     straight_sds: float = 1.5

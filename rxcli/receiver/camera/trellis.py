@@ -8,7 +8,7 @@ import numpy as np
 
 from rxcli.protocol import slot_patterns
 from rxcli.receiver.light import exposure_shares
-from rxcli.types import Float32Array, FloatArray, IntArray
+from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Slots that are walked together, and those before them from which their first state is told.
 _BLOCK, _LEAD = 48, 16
@@ -45,13 +45,7 @@ def lit_probability(
     n_patterns, n_columns, _ = metric.shape
     n_bits = n_patterns.bit_length() - 1
     pattern = np.arange(n_patterns)
-    is_lit = (pattern >> n_bits // 2) & 1 > 0
-    prior = np.asarray(np.logaddexp(0, log_odds), np.float32)
-    weight = np.asarray(metric, np.float32) - prior
-    weight[is_lit] += np.asarray(log_odds, np.float32)
-    top = weight.max(axis=0)
-    weight -= top
-    np.exp(np.maximum(weight, np.float32(-60), out=weight), out=weight)
+    weight, top = _weights(metric, log_odds)
     # The way back is the way forth of the mirrored sequence: both are walked together.
     back = weight[_mirrored(n_bits), :, ::-1]
     walked, scales = _walk(np.concatenate([weight, back], axis=1))
@@ -59,9 +53,34 @@ def lit_probability(
     after = _mirrored(n_bits - 1)[pattern & (n_patterns // 2 - 1)]
     weight *= walked[pattern >> 1, :n_columns]
     weight *= walked[after, n_columns:, ::-1]
-    log_evidence = np.log(scales[:n_columns]).sum(axis=1, dtype=np.float64) + top.sum(axis=1, dtype=np.float64)
-    lit = weight[is_lit].sum(axis=0) / np.maximum(weight.sum(axis=0), np.float32(1e-30))
-    return np.asarray(lit, np.float32), log_evidence
+    lit = weight[_lit_in_the_middle(n_patterns)].sum(axis=0) / np.maximum(weight.sum(axis=0), np.float32(1e-30))
+    return np.asarray(lit, np.float32), _summed(scales[:n_columns], top)
+
+
+def log_evidence(metric: FloatArray | Float32Array, log_odds: FloatArray | Float32Array) -> FloatArray:
+    """(C,) the evidence of the light alone, see `lit_probability`: it needs no way back."""
+    weight, top = _weights(metric, log_odds)
+    return _summed(_walk(weight)[1], top)
+
+
+def _weights(
+    metric: FloatArray | Float32Array, log_odds: FloatArray | Float32Array
+) -> tuple[Float32Array, Float32Array]:
+    """(patterns, C, N) likelihood of patterns with their prior over that of the likeliest, and that one's logarithm."""
+    weight = np.asarray(metric, np.float32) - np.asarray(np.logaddexp(0, log_odds), np.float32)
+    weight[_lit_in_the_middle(len(weight))] += np.asarray(log_odds, np.float32)
+    top = weight.max(axis=0)
+    weight -= top
+    return np.exp(np.maximum(weight, np.float32(-60), out=weight), out=weight), top
+
+
+def _lit_in_the_middle(n_patterns: int) -> BoolArray:
+    """(patterns,) those whose middle slot is lit."""
+    return np.asarray((np.arange(n_patterns) >> (n_patterns.bit_length() - 1) // 2) & 1 > 0)
+
+
+def _summed(scales: Float32Array, top: Float32Array) -> FloatArray:
+    return np.asarray(np.log(scales).sum(axis=1, dtype=np.float64) + top.sum(axis=1, dtype=np.float64))
 
 
 @lru_cache(maxsize=8)
