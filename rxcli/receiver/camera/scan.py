@@ -43,11 +43,11 @@ class _Octave:
     def line_at(self, rows_per_slot: FloatArray) -> FloatArray:
         """Nats by which edges keep to grids of slots."""
         places = SETTINGS.line_fine * self.columns.shape[1] * self.rows / rows_per_slot
-        return np.interp(places, np.arange(self.line.size), self.line)
+        return np.asarray(np.interp(places, np.arange(self.line.size), self.line))
 
     def repeats_at(self, lags: FloatArray) -> FloatArray:
         """Surprise of the autocorrelation at some lags, rows."""
-        return np.interp(lags / self.rows, np.arange(self.repeats.size), self.repeats, right=0.0)
+        return np.asarray(np.interp(lags / self.rows, np.arange(self.repeats.size), self.repeats, right=0.0))
 
     def line_near(self, rows_per_slot: float, slots: float) -> float:
         """The most of `line_at` within so many slots over the whole picture."""
