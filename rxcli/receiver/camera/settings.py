@@ -130,7 +130,7 @@ class CameraSettings:
 
     refit_steps: int = 6
     #: The fit ends when no row moves by more slots than the first; exposure and rows are fitted anew after the second.
-    refit_converged_slots: float = 0.005
+    refit_converged_slots: float = 0.02
     rows_anew_slots: float = 0.1
     #: Slots over which the picture is taken as constant.
     picture_slots: float = 25.0
