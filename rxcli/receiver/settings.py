@@ -51,7 +51,7 @@ class WiringSettings:
     headers_alone: float = 0.1
 
     #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
-    matters_slots: float = 0.05
+    matters_slots: float = 0.15
     most_initial_refits: int = 3
     #: Slots, as probabilities, that differ by no more than this on average tell the same camera.
     same_slots: float = 0.02

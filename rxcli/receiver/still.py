@@ -82,16 +82,6 @@ def _with_either_clock(acquisition: Acquisition) -> list[Acquisition]:
     return either
 
 
-def decode_alike(acquisition: Acquisition, skip: frozenset[str], before: Reception) -> Reception:
-    """What is decoded on a clock next to the one before: with columns spread in time as there, and with its bursts."""
-    clocks = [clock for clock in (acquisition.clock, acquisition.rival) if clock is not None]
-    alike = [clock for clock in clocks if clock.delay_slots.any() == before.clock.delay_slots.any()]
-    clock = (alike or clocks)[0]
-    if clock.n_copies != before.clock.n_copies or clock.packet_slots != before.clock.packet_slots:
-        return decode_likeliest(acquisition, skip)
-    return decode(replace(acquisition, clock=clock, rival=None, burst=before.clock.burst), skip)
-
-
 def _with_likeliest_bursts(
     acquisition: Acquisition, reception: Reception, weighed: list[Reception], say_of_copies: float = 0.0
 ) -> Reception:
@@ -174,9 +164,10 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
 
 
 def first_pass(acquisition: Acquisition) -> Reception:
-    """The initial pass; with few rows a slot that with the likeliest mix of rows."""
-    if acquisition.clock.rows_per_slot >= STILL.few_rows:
-        return initial_pass(acquisition)
+    """The initial pass; with few rows a slot and columns in doubt that with the likeliest mix of rows."""
+    initial = initial_pass(acquisition) if "initial" in acquisition.kept else None
+    if acquisition.clock.rows_per_slot >= STILL.few_rows or (initial and not doubtful_columns(initial).size):
+        return initial or initial_pass(acquisition)
     if "first" not in acquisition.kept:
         acquisition.kept["first"] = _likeliest_row_mix(acquisition)
     kept: Reception = acquisition.kept["first"]
@@ -220,7 +211,7 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
     They tell on a slot of few rows: one of 1.5 rows that is exposed for 0.4 slots is seen as if for 1.2 and more. From
     the usual mix on, the next ones are tried for as long as they are likelier.
     """
-    acquisition, clock = acquisition.binned(), acquisition.clock
+    binned, clock = acquisition.binned(), acquisition.clock
     tried: dict[int, tuple[float, Reception]] = {}
 
     def likelihood(number: int) -> float:
@@ -228,7 +219,8 @@ def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
             return -np.inf
         if number not in tried:
             width = float(np.hypot(clock.exposure_slots, STILL.mixed_rows[number] / clock.rows_per_slot))
-            reception = initial_pass(replace(acquisition, clock=replace(clock, exposure_slots=width)))
+            mixed = replace(binned, clock=replace(clock, exposure_slots=width)) if number else acquisition
+            reception = initial_pass(mixed)
             tried[number] = float(reception.posteriors.log_evidence.sum()), reception
         return tried[number][0]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,8 @@ def estimate_curvature(strips: Strips) -> tuple[FloatArray, float]:
     Returns:
         (4,) k1 k2 p1 p2 for a focal length of one width; and how much better it fits than none, nats.
     """
-    lags = [_lag_correlations(strips, distance) for distance in strip_distances(strips)]
+    level = levelled(strips.light, strips.inside, SETTINGS.bend_level_rows, strips.noise)[0]
+    lags = [_lag_correlations(strips, level, distance) for distance in strip_distances(strips)]
     total = sum(float(correlation[SETTINGS.bend_lags].sum()) for correlation, _ in lags)
     if not lags or total <= 0:
         return np.zeros(4), 0.0
@@ -70,24 +72,21 @@ def strip_distances(strips: Strips) -> list[int]:
     return sorted(step for step in steps if step < n_strips)
 
 
-def _lag_correlations(strips: Strips, distance: int) -> tuple[Float32Array, FloatArray]:
-    """Correlation of strips `distance` apart by lag, strip and window of rows; and what lag a unit of bend makes.
+def _lag_correlations(strips: Strips, level: Float32Array, distance: int) -> tuple[Float32Array, FloatArray]:
+    """Correlation of levelled strips `distance` apart by lag, strip and window of rows; what lag a unit of bend makes.
 
     Returns:
         (lags, strips, windows) float32; (4, strips, windows) float64 rows.
     """
-    n_rows = strips.light.shape[1]
-    level = levelled(strips.light, strips.inside, SETTINGS.bend_level_rows, strips.noise)[0]
-    borders = np.linspace(SETTINGS.bend_lags, n_rows - SETTINGS.bend_lags, SETTINGS.bend_windows + 1).astype(int)
+    n_rows, most = strips.light.shape[1], SETTINGS.bend_lags
+    borders = np.linspace(most, n_rows - most, SETTINGS.bend_windows + 1).astype(int)
     middles = (borders[1:] + borders[:-1]) // 2
-    rows, x = strips.rows[middles], strips.x[:, middles]
-    terms = curvature_terms(x, rows, strips.width, strips.height)
+    terms = curvature_terms(strips.x[:, middles], strips.rows[middles], strips.width, strips.height)
     left, right = level[:-distance], level[distance:]
-    inner = left[:, SETTINGS.bend_lags : n_rows - SETTINGS.bend_lags]
-    out = np.empty((2 * SETTINGS.bend_lags + 1, left.shape[0], SETTINGS.bend_windows), np.float32)
-    for number, lag in enumerate(range(-SETTINGS.bend_lags, SETTINGS.bend_lags + 1)):
-        product = inner * right[:, SETTINGS.bend_lags - lag : n_rows - SETTINGS.bend_lags - lag]
-        out[number] = np.add.reduceat(product, borders[:-1] - SETTINGS.bend_lags, axis=1)
+    out = np.empty((2 * most + 1, left.shape[0], SETTINGS.bend_windows), np.float32)
+    for number, (first, end) in enumerate(pairwise(borders.tolist())):
+        later = np.lib.stride_tricks.sliding_window_view(right[:, first - most : end + most], end - first, axis=1)
+        out[::-1, :, number] = np.einsum("skr,sr->ks", later, left[:, first:end])
     return out, terms[:, distance:] - terms[:, :-distance]
 
 
@@ -129,7 +128,9 @@ def _climb(
         trial = best + step * np.linalg.solve(hessian, gradient)
         trial_score = _likeness(trial, lags, weight)
         if trial_score > score:
-            best, score = trial, trial_score
+            gain, best, score = trial_score - score, trial, trial_score
+            if gain < SETTINGS.least_gain:
+                break
         else:
             step /= 2
     return best

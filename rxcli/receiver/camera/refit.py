@@ -13,7 +13,7 @@ import numpy as np
 from rxcli.receiver.camera.estimates import BlindEstimate
 from rxcli.receiver.camera.rows import fit_rows
 from rxcli.receiver.camera.settings import SETTINGS
-from rxcli.receiver.camera.strips import Correction, Strips, halved
+from rxcli.receiver.camera.strips import Correction, Strips
 from rxcli.receiver.camera.timing import (
     FLAT,
     curvature_chi_square,
@@ -54,7 +54,7 @@ def refit(strips: Strips, estimate: BlindEstimate, clock: Clock, lit: Float32Arr
         clock: on which the slots stand.
         lit: (C, N) probability that each slot of the clock's grid is lit; C columns of the strips.
     """
-    view = Views(halved(strips)).at(estimate.rows_per_slot, estimate.reversed)
+    view = Views(strips).at(estimate.rows_per_slot, estimate.reversed)
     ordered, curvature = view.strips, view.curvature(estimate.curvature)
     first = np.concatenate([[clock.row0, clock.rows_per_slot], curvature if estimate.corrected else np.zeros(4)])
     shutter = estimate.least_exposure_slots

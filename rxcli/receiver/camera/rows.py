@@ -13,10 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.numerics import local_mean
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips
-from rxcli.receiver.camera.waves import column_shares, local_moments, residual_of
+from rxcli.receiver.camera.waves import Surroundings, column_shares, residual_of
 from rxcli.receiver.light import SlotLight
 from rxcli.types import Float32Array, FloatArray, IntArray
 
@@ -74,12 +73,13 @@ def fit_rows(
     """
     tried = (shutter_slots,) if shutter_slots else [share * exposure_slots for share in SETTINGS.shutter_shares]
     rows, fits = _SensorRows.of(strips, time, values), []
+    around = Surroundings.of(strips.light, strips.inside, window)
     for shutter in tried:
         table, _ = rows.seen(strips, values, lit, shutter)
         light = np.stack([rows.read(_mixed(table, part)) for part in np.eye(_KERNEL.size)])
         kernel = _KERNEL
         for _ in range(SETTINGS.kernel_rounds):
-            kernel, misfit = _fit_kernel(strips, light, kernel, window)
+            kernel, misfit = _fit_kernel(strips, around, light, kernel)
         fits.append((misfit, RowModel(shutter, kernel)))
     return min(fits, key=lambda fit: fit[0])[1]
 
@@ -146,16 +146,15 @@ def _mixed(table: Float32Array, kernel: FloatArray) -> Float32Array:
     return np.asarray(out, np.float32)
 
 
-def _fit_kernel(strips: Strips, parts: Float32Array, kernel: FloatArray, window: int) -> tuple[FloatArray, float]:
+def _fit_kernel(
+    strips: Strips, around: Surroundings, parts: Float32Array, kernel: FloatArray
+) -> tuple[FloatArray, float]:
     """The kernel by least squares, with gains and levels of another one; and the share of the light that it leaves."""
-    inside = strips.inside
     wave = np.tensordot(kernel.astype(np.float32), parts, 1)
-    near = local_moments(strips.light, wave, inside, window)
-    _, spread = residual_of(strips, near, near.gain, wave, window)
-    weight = inside / np.sqrt(spread)
-    basis = np.stack(
-        [((part - local_mean(part * inside, window) / near.share) * near.gain * weight).ravel() for part in parts]
-    )
+    near = around.moments(wave)
+    _, spread = residual_of(strips, near, near.gain, wave, around.window)
+    weight = strips.inside / np.sqrt(spread)
+    basis = np.stack([((part - around.mean_of(part)) * near.gain * weight).ravel() for part in parts])
     target = ((strips.light - near.value) * weight).ravel()
     information, pull = (basis @ basis.T).astype(np.float64), (basis @ target).astype(np.float64)
     prior = SETTINGS.samples_as_one / SETTINGS.kernel_sd**2

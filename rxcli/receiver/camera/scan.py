@@ -40,17 +40,20 @@ class _Octave:
     line: FloatArray
     line_uncapped: FloatArray
 
-    def line_at(self, rows_per_slot: float) -> float:
-        """Nats by which edges keep to a grid of slots."""
-        return float(np.interp(self._line_place(rows_per_slot), np.arange(self.line.size), self.line))
+    def line_at(self, rows_per_slot: FloatArray) -> FloatArray:
+        """Nats by which edges keep to grids of slots."""
+        places = SETTINGS.line_fine * self.columns.shape[1] * self.rows / rows_per_slot
+        return np.asarray(np.interp(places, np.arange(self.line.size), self.line))
+
+    def repeats_at(self, lags: FloatArray) -> FloatArray:
+        """Surprise of the autocorrelation at some lags, rows."""
+        return np.asarray(np.interp(lags / self.rows, np.arange(self.repeats.size), self.repeats, right=0.0))
 
     def line_near(self, rows_per_slot: float, slots: float) -> float:
         """The most of `line_at` within so many slots over the whole picture."""
-        middle, reach = self._line_place(rows_per_slot), SETTINGS.line_fine * slots
+        middle = SETTINGS.line_fine * self.columns.shape[1] * self.rows / rows_per_slot
+        reach = SETTINGS.line_fine * slots
         return float(self.line[max(int(middle - reach), 0) : int(middle + reach) + 2].max(initial=0.0))
-
-    def _line_place(self, rows_per_slot: float) -> float:
-        return float(SETTINGS.line_fine * self.columns.shape[1] * self.rows / rows_per_slot)
 
 
 def _octaves(strips: Strips) -> list[_Octave]:
@@ -325,16 +328,7 @@ def _fine_clock(hypothesis: Hypothesis, octave: _Octave) -> Hypothesis:
     tried = hypothesis.rows_per_slot * (1 + step * np.arange(-8, 9))
     responses, n_places = _header_responses(_running_mean_sum(octave), tried / octave.rows)
     score, place = _comb(-responses if hypothesis.reversed else responses, n_places, hypothesis.packet_slots)
-    score += [
-        SETTINGS.say_of_rest
-        * (_repeats_at(octave, rows_per_slot, hypothesis.packet_slots) + octave.line_at(rows_per_slot))
-        for rows_per_slot in tried.tolist()
-    ]
+    score += SETTINGS.say_of_rest * (octave.repeats_at(tried * hypothesis.packet_slots) + octave.line_at(tried))
     best = int(score.argmax())
     start = (float(place[best]) / SAMPLES - SLOTS_PER_SYMBOL) * float(tried[best])
     return replace(hypothesis, rows_per_slot=float(tried[best]), start_row=start)
-
-
-def _repeats_at(octave: _Octave, rows_per_slot: float, packet_slots: int) -> float:
-    lag = rows_per_slot * packet_slots / octave.rows
-    return float(np.interp(lag, np.arange(octave.repeats.size), octave.repeats, right=0.0))

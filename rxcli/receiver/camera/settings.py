@@ -10,7 +10,7 @@ class CameraSettings:
     """Each with its unit and the reason for it."""
 
     #: Strips that a column keeps while its camera is unknown.
-    most_strips: int = 4
+    most_strips: int = 2
     #: Sides are straight up to so many standard deviations, where these are small enough to tell; bowed from so many
     #: on.
     straight_sds: float = 1.5
@@ -130,7 +130,7 @@ class CameraSettings:
 
     refit_steps: int = 6
     #: The fit ends when no row moves by more slots than the first; exposure and rows are fitted anew after the second.
-    refit_converged_slots: float = 0.005
+    refit_converged_slots: float = 0.02
     rows_anew_slots: float = 0.1
     #: Slots over which the picture is taken as constant.
     picture_slots: float = 25.0
@@ -154,6 +154,8 @@ class CameraSettings:
     bend_lags: int = 24
     bend_windows: int = 20
     bend_level_rows: int = 100
+    #: Climbing ends where a step gains less, nats.
+    least_gain: float = 0.01
 
     #: Rows over which the edges' power is levelled.
     edge_level_rows: int = 41

@@ -109,21 +109,6 @@ def strips_of(
     )
 
 
-def halved(strips: Strips) -> Strips:
-    """The strips of every column pooled in pairs, where it has an even number; what fits all light needs no more."""
-    per_column = strips.light.shape[0] // strips.n_columns
-    if per_column % 2:
-        return strips
-
-    def mean(values: FloatArray | Float32Array) -> FloatArray | Float32Array:
-        return (values[::2] + values[1::2]) / values.dtype.type(2)
-
-    inside = np.minimum(strips.inside[::2], strips.inside[1::2])
-    light = np.asarray(mean(strips.light) * inside, np.float32)
-    x = np.asarray(mean(strips.x), np.float64)
-    return replace(strips, light=light, inside=inside, x=x, noise=strips.noise.over(2))
-
-
 def in_readout_order(strips: Strips) -> Strips:
     """The strips of a picture whose rows run against the readout, in readout order; its own inverse."""
     return replace(

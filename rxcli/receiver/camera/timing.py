@@ -13,19 +13,19 @@ from rxcli.receiver.camera.curvature import BEND_PRECISION, BEND_SCALE
 from rxcli.receiver.camera.estimates import BlindEstimate
 from rxcli.receiver.camera.reading import Packets, Reading, read_slots
 from rxcli.receiver.camera.settings import SETTINGS
-from rxcli.receiver.camera.strips import Correction, Strips, halved
+from rxcli.receiver.camera.strips import Correction, Strips
 from rxcli.receiver.camera.structure import repeat_evidence
 from rxcli.receiver.camera.views import BLOCK_ROWS, View, Views, slot_time
 from rxcli.receiver.camera.waves import (
     Grid,
     Moments,
     Slots,
+    Surroundings,
     Waves,
     column_shares,
     column_waves,
     decide,
     exposure_of_known,
-    local_moments,
     packet_llr,
     residual_of,
 )
@@ -79,7 +79,7 @@ def refine(
             does not; optics and demosaicing add to it.
         sure: whether the stripes are bent without doubt.
     """
-    view = Views(halved(views.strips)).at(reading.rows_per_slot, reading.is_reversed)
+    view = views.at(reading.rows_per_slot, reading.is_reversed)
     least = exposure_of_length(reading.packets[0].packet_slots)
     for _ in range(SETTINGS.most_readings):
         timing, corrected = _fit_timing(view, reading, least, sure)
@@ -237,7 +237,7 @@ def gauss_newton(
     pitch = float(strips.rows[1] - strips.rows[0])
     window = max(round(local_slots * values[1] / pitch), 1)
     inside = strips.inside
-    near = local_moments(strips.light, wave, inside, window)
+    near = Surroundings.of(strips.light, inside, window).moments(wave)
     gain = near.gain
     for _ in range(2):
         residual, spread = residual_of(strips, near, gain, wave, window)

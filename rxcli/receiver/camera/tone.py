@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rxcli.numerics import local_mean
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips
-from rxcli.receiver.camera.waves import local_moments, residual_of
+from rxcli.receiver.camera.waves import Surroundings, residual_of
 from rxcli.types import Float32Array, FloatArray
 
 #: Exponent that makes light of values, as nearly as a power of them does, by the tone curve.
@@ -33,12 +32,13 @@ def tone_exponent(strips: Strips, wave: Float32Array, window: int) -> tuple[floa
     if strips.tone is None:
         return None
     inside = strips.inside
-    near = local_moments(strips.light, wave, inside, window)
+    around = Surroundings.of(strips.light, inside, window)
+    near = around.moments(wave)
     _, spread = residual_of(strips, near, near.gain, wave, window)
     weight = inside / spread
 
     def about(values: Float32Array) -> Float32Array:
-        centred: Float32Array = (values - local_mean(values * inside, window) / near.share) * near.gain
+        centred: Float32Array = (values - around.mean_of(values)) * near.gain
         return centred
 
     def by_column(values: Float32Array) -> FloatArray:

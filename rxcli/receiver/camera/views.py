@@ -101,10 +101,10 @@ def slot_time(strips: Strips, terms: FloatArray, values: FloatArray) -> Float32A
     """(M, R) slot position of every strip's row; the bend is interpolated between the blocks' borders."""
     n = strips.rows.size
     start, rows_per_slot = values[:2]
-    moved = np.tensordot(values[2:], terms, 1)
-    index = np.arange(n)
-    low = index // BLOCK_ROWS
-    width = np.minimum((low + 1) * BLOCK_ROWS, n - 1) - low * BLOCK_ROWS
-    f = (index - low * BLOCK_ROWS) / np.maximum(width, 1)
-    bent = moved[:, low] + (moved[:, low + 1] - moved[:, low]) * f
-    return np.asarray((strips.rows + bent - start) / rows_per_slot, np.float32)
+    moved = (np.tensordot(values[2:], terms, 1) / rows_per_slot).astype(np.float32)[..., None]
+    rows = np.minimum(np.arange(moved.shape[1]) * BLOCK_ROWS, n - 1)
+    along = np.arange(BLOCK_ROWS) / np.maximum(np.diff(rows), 1)[:, None]
+    bent = moved[:, :-1] + np.diff(moved, axis=1) * along.astype(np.float32)
+    out: Float32Array = bent.reshape(len(bent), -1)[:, :n]
+    out += ((strips.rows - start) / rows_per_slot).astype(np.float32)
+    return out

@@ -12,7 +12,7 @@ from rxcli.numerics import local_mean
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import SAMPLES, Strips
-from rxcli.receiver.camera.trellis import lit_probability, pattern_light
+from rxcli.receiver.camera.trellis import lit_probability, log_evidence, pattern_light
 from rxcli.receiver.camera.views import View
 from rxcli.receiver.light import SlotLight, light_of_columns
 from rxcli.types import Float32Array, FloatArray
@@ -163,8 +163,8 @@ def packet_llr(waves: Waves, exposure_slots: float, grid: Grid, slots: Slots) ->
     n = slots.lit.shape[1]
     gain, offset, residual = _levels(waves, slots.lit, exposure_slots)
     metric = _pattern_metric(waves, gain, offset, _power(waves, residual), pattern_light(exposure_slots, SAMPLES))
-    _, known = lit_probability(metric, grid.log_odds(slots.w, n))
-    _, free = lit_probability(metric, _duty_log_odds(slots.w)[:, None] + np.zeros(n))
+    known = log_evidence(metric, grid.log_odds(slots.w, n))
+    free = log_evidence(metric, _duty_log_odds(slots.w)[:, None] + np.zeros(n))
     # A column may be too dark to say anything.
     return float(np.logaddexp(known - free, 0.0).sum() - slots.w.size * np.log(2.0))
 
@@ -213,13 +213,16 @@ def _trust(waves: Waves) -> Float32Array:
 def _pattern_metric(
     waves: Waves, gain: Float32Array, offset: Float32Array, power: Float32Array, pattern: FloatArray
 ) -> Float32Array:
-    """(C, N, patterns) log-likelihood of every slot's samples at given levels and noise, up to a constant."""
+    """(patterns, C, N) log-likelihood of every slot's samples at given levels and noise, up to a constant."""
     scale = _trust(waves) * np.float32(SETTINGS.sample_information / 2) / power
-    shape = (waves.value.shape[0], -1, SAMPLES)
-    value, gain, scale = ((waves.value - offset).reshape(shape), gain.reshape(shape), scale.reshape(shape))
-    light = pattern.astype(np.float32)
-    square = (value * value * scale).sum(axis=2, keepdims=True)
-    return np.asarray(2 * (value * gain * scale) @ light.T - (gain * gain * scale) @ (light * light).T - square)
+    shape = (waves.value.shape[0], -1)
+    value, light = waves.value - offset, pattern.astype(np.float32)
+    gain_scale = gain * scale
+    square, expected, both = (
+        one.reshape(-1, SAMPLES).T for one in (value * value * scale, gain * gain_scale, 2 * value * gain_scale)
+    )
+    metric = light @ both - (light * light) @ expected - square.sum(axis=0)
+    return np.asarray(metric.reshape(light.shape[0], *shape))
 
 
 def _levels(waves: Waves, lit: Float32Array, exposure_slots: float) -> tuple[Float32Array, Float32Array, Float32Array]:
@@ -229,7 +232,7 @@ def _levels(waves: Waves, lit: Float32Array, exposure_slots: float) -> tuple[Flo
     unsure = SlotLight(lit * (1 - lit), 0.0).seen(centres, exposure_slots)
     unsure /= np.float32(max(exposure_slots, 1.0))
     weight = waves.weight
-    near = local_moments(waves.value, wave, weight, SETTINGS.level_slots * SAMPLES, unsure)
+    near = Surroundings.of(waves.value, weight, SETTINGS.level_slots * SAMPLES).moments(wave, unsure)
     both, power = near.covariance, near.variance
     total = weight.sum(axis=1, keepdims=True) + np.float32(1e-6)
     overall = (both * weight).sum(axis=1, keepdims=True) / ((power * weight).sum(axis=1, keepdims=True) + 0.01 * total)
@@ -257,15 +260,33 @@ class Moments:
         return np.asarray(np.maximum(self.covariance, 0) / (self.variance + np.float32(0.02)))
 
 
-def local_moments(
-    value: Float32Array, wave: Float32Array, weight: Float32Array, window: int, unsure: Float32Array | float = 0.0
-) -> Moments:
-    """Moments over `window` samples along the last axis; `unsure` is the variance of the wave itself."""
-    share = local_mean(weight, window) + np.float32(1e-3)
-    mean_value, mean_wave = local_mean(value * weight, window) / share, local_mean(wave * weight, window) / share
-    covariance = local_mean(value * wave * weight, window) / share - mean_value * mean_wave
-    variance = local_mean((wave * wave + unsure) * weight, window) / share - mean_wave * mean_wave
-    return Moments(share, mean_value, mean_wave, covariance, variance)
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """Light with what is around every sample of it, whatever wave should explain it."""
+
+    value: Float32Array
+    weight: Float32Array
+    #: Samples of the window along the last axis.
+    window: int
+    #: Share of the window that counts, and mean of the light there.
+    share: Float32Array
+    mean: Float32Array
+
+    @staticmethod
+    def of(value: Float32Array, weight: Float32Array, window: int) -> Surroundings:
+        share = local_mean(weight, window) + np.float32(1e-3)
+        return Surroundings(value, weight, window, share, local_mean(value * weight, window) / share)
+
+    def mean_of(self, values: Float32Array) -> Float32Array:
+        """Mean of other values of the same samples."""
+        return np.asarray(local_mean(values * self.weight, self.window) / self.share)
+
+    def moments(self, wave: Float32Array, unsure: Float32Array | float = 0.0) -> Moments:
+        """Moments of the light and a wave; `unsure` is the variance of the wave itself."""
+        mean_wave = self.mean_of(wave)
+        covariance = self.mean_of(self.value * wave) - self.mean * mean_wave
+        variance = self.mean_of(wave * wave + unsure) - mean_wave * mean_wave
+        return Moments(self.share, self.mean, mean_wave, covariance, variance)
 
 
 def residual_of(
@@ -279,9 +300,9 @@ def residual_of(
 
 def exposure_of_known(waves: Waves, lit: Float32Array, near: float | None) -> tuple[float, float]:
     """Exposure by the blur of slots (C, N) that are known, near one or any; and its standard deviation."""
-    known = fitted(lit, waves.value.shape[1] // SAMPLES)
+    known = SlotLight(fitted(lit, waves.value.shape[1] // SAMPLES), 0.0)
     tried = _EXPOSURES if near is None else near * _AROUND_EXPOSURE
-    return _least(tried, np.log([_misfit(waves, exposure, known) for exposure in tried]), waves)
+    return _least(tried, np.log(_misfits(waves, known, tried.tolist())), waves)
 
 
 def _least(tried: FloatArray, errors: FloatArray, waves: Waves) -> tuple[float, float]:
@@ -296,12 +317,15 @@ def _least(tried: FloatArray, errors: FloatArray, waves: Waves) -> tuple[float, 
     return exposure, float(np.clip(np.sqrt(1 / (curvature * independent)), 0.02, 0.5))
 
 
-def _misfit(waves: Waves, exposure_slots: float, lit: Float32Array) -> float:
-    """Weighted square of what the slots through this exposure leave of the waves, as a share."""
+def _misfits(waves: Waves, known: SlotLight, exposures: list[float]) -> list[float]:
+    """Weighted square of what the slots through each exposure leave of the waves, as a share."""
+    around = Surroundings.of(waves.value, waves.weight, SETTINGS.local_slots * SAMPLES)
     centres = (np.arange(waves.value.shape[1])[None] + 0.5) / SAMPLES
-    wave = SlotLight(lit, 0.0).seen(centres, exposure_slots)
-    weight = waves.weight
-    near = local_moments(waves.value, wave, weight, SETTINGS.local_slots * SAMPLES)
-    residual = waves.value - near.value - near.gain * (wave - near.wave)
-    total = float((weight * (waves.value - near.value) ** 2).sum())
-    return float((weight * residual * residual).sum()) / max(total, 1e-9)
+    value, out = waves.value - around.mean, []
+    total = max(float((waves.weight * value * value).sum()), 1e-9)
+    for exposure in exposures:
+        wave = known.seen(centres, exposure)
+        near = around.moments(wave)
+        residual = value - near.gain * (wave - near.wave)
+        out.append(float((waves.weight * residual * residual).sum()) / total)
+    return out

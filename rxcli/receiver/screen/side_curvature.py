@@ -21,8 +21,9 @@ _GUESSES = (0.0, -0.14, 0.14, -0.28, 0.28)
 _TRIED = np.linspace(-0.075, 0.075, 16)
 #: Share of the four sides, added up, that must lie on the arcs.
 _LEAST_SUPPORT = 0.25
-#: The same, from which on no other guess is made: half of what is found along all sides lies on one arc then.
-_SETTLED = 2.0
+#: The same, from which on no other guess is made, where the best is not at the end of those tried around this one: of
+#: sides that are bowed otherwise the nearest ones tried fit best.
+_SETTLED = 0.5
 #: Sides that must say something, and the places, as a number and as a share of all, by which one does.
 _LEAST_SIDES, _LEAST_PLACES, _LEAST_SHARE = 2, 6, 0.1
 #: Squared distance of a corner from the picture's middle, widths, up to which a lens has an inverse; the shortest side,
@@ -61,12 +62,13 @@ def measure_side_curvature(
     if not _have_sides(corners, picture):
         return None
     size = width_of(corners)
-    support, k1, steps = 0.0, 0.0, list[Steps]()
+    best = 0.0, 0.0, list[Steps]()
     for initial in _GUESSES:
         found = _best_around(picture, corners, initial, size)
-        support, k1, steps = max((support, k1, steps), found, key=lambda one: one[0])
-        if support > _SETTLED:
+        best = max(best, found, key=lambda one: one[0])
+        if best is found and found[0] > _SETTLED and abs(found[1] - initial) < _TRIED[-1]:
             break
+    support, k1, steps = best
     return _by_least_squares(picture, corners, k1, steps, size) if support >= _LEAST_SUPPORT else None
 
 

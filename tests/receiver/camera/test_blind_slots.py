@@ -37,7 +37,7 @@ def test_probabilities_are_those_of_all_sequences(n_bits: int) -> None:
         lit += weight[:, None] * middle
         total += weight
         count += prior
-    found, log_evidence = lit_probability(metric, log_odds)
+    found, log_evidence = lit_probability(np.moveaxis(metric, 2, 0), log_odds)
     np.testing.assert_allclose(found, lit / total[:, None], atol=1e-6)
     # The slots beyond the ends are any.
     np.testing.assert_allclose(log_evidence, np.log(total / count), rtol=1e-5)
