@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure, FrameContext, 
 from rxcli.receiver.reception import Reception, packet_llr
 from rxcli.receiver.screen_choice import quick_look
 from rxcli.receiver.settings import SETTINGS
-from rxcli.receiver.still import decode_likeliest, initial_pass
+from rxcli.receiver.still import decode_alike, decode_likeliest, initial_pass
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
 
 _NO_HEADERS = (
@@ -121,11 +122,14 @@ def receive_unknown(context: FrameContext, acquisition: Acquisition, skip: froze
     received = replace(settled, reception=reception)
     if not _slots_changed(settled, received):
         return received
-    # What was decoded at last tells the camera best; to receive it all again with that shows no more packets.
     with context.timer("blind"):
-        camera, _ = refitted_camera(*_decided(received))
+        camera, moved_slots = refitted_camera(*_decided(received))
     doubted = camera.tone == DEFAULT_TONE and blind.is_linear(camera.estimated.get("tone_exponent"))
-    return _with_camera(received, camera.without_tone() if doubted else camera)
+    received = _with_camera(received, camera.without_tone() if doubted else camera)
+    # Where packets showed plainly at first, to decode again with what was decoded shows no more of them.
+    if fits(settled.reception) or moved_slots < SETTINGS.matters_slots[1]:
+        return received
+    return _received_again(received, lambda one: decode_alike(one, skip, reception)) or received
 
 
 def _with_settled_clock(received: Received) -> Received:
@@ -134,7 +138,7 @@ def _with_settled_clock(received: Received) -> Received:
         with received.context.timer("blind"):
             camera, moved_slots = refitted_camera(*_decided(received))
         received = _with_camera(received, camera)
-        if moved_slots < SETTINGS.matters_slots:
+        if moved_slots < SETTINGS.matters_slots[not fits(received.reception)]:
             break
         before, again = received, _received_again(received)
         if again is None:
@@ -171,14 +175,14 @@ def _with_camera(received: Received, camera: Camera) -> Received:
     return replace(received, context=replace(received.context, camera=camera))
 
 
-def _received_again(before: Received) -> Received | None:
-    """What an initial pass shows with a refitted camera; None where packets show less than in the one before."""
+def _received_again(before: Received, receive: Callable[[Acquisition], Reception] = initial_pass) -> Received | None:
+    """What is received with a refitted camera; None where packets show less than in what was received before."""
     context = before.context
     acquisition = quick_look(context)
     if isinstance(acquisition, Failure):
         return None
     with context.timer("detect"):
-        reception = initial_pass(acquisition)
+        reception = receive(acquisition)
     kept = packet_llr(reception) >= SETTINGS.kept_evidence * packet_llr(before.reception)
     return Received(context, acquisition, reception) if kept else None
 

@@ -87,8 +87,8 @@ def estimate_camera(
         if _is_plausible(likely) and shows_packets(likely):
             return BlindSearch(likely, rivals=_worth_reading([one for one in estimates if one is not likely]))
     asked = readings[:1] if estimates else []
-    if periods != "outstanding" and _best(readings) < SETTINGS.nothing_read_nats:
-        readings = readings + _read_others(views, _clocks(every_clock, straight, curves, lengths), readings, lengths)
+    if _best(readings) < SETTINGS.nothing_read_nats:
+        readings = readings + _read_others(views, _clocks(every_clock, straight, curves, lengths), lengths)
     readings = _with_neighbours(views, sorted(readings, key=_by_evidence), lengths)
     if _best(readings) < SETTINGS.hopeless_nats and not _keeps_to_edges(views, readings[:1]):
         return BlindSearch(None, why_not(strips))
@@ -111,24 +111,11 @@ def _is_plausible(estimate: BlindEstimate) -> bool:
     return estimate.log_evidence >= SETTINGS.least_evidence and estimate.explained >= SETTINGS.least_explained
 
 
-def _read_others(
-    views: Views, found: list[BentHypothesis], readings: list[Reading], lengths: list[int]
-) -> list[Reading]:
-    """Readings of the likeliest clocks, and of those that stand out, without those that were read."""
+def _read_others(views: Views, found: list[BentHypothesis], lengths: list[int]) -> list[Reading]:
+    """Readings of the likeliest clocks, and of those that stand out."""
     outstanding = sorted(found, key=lambda pair: -pair[0].salience)
     either = [pair for both in zip(found, outstanding, strict=True) for pair in both]
-    others = distinct(either, on_one_curvature(same_slots), SETTINGS.readings)
-    n_rows = views.strips.rows.size
-
-    def was_read(clock: Hypothesis, curvature: FloatArray) -> bool:
-        return any(
-            abs(one.values[1] - clock.rows_per_slot) * n_rows < clock.rows_per_slot**2
-            and one.is_reversed == clock.reversed
-            and one.values[2:].any() == curvature.any()
-            for one in readings
-        )
-
-    return _read_until_sure(views, [pair for pair in others if not was_read(*pair)], lengths)
+    return _read_until_sure(views, distinct(either, on_one_curvature(same_slots), SETTINGS.readings), lengths)
 
 
 def _with_neighbours(views: Views, readings: list[Reading], lengths: list[int]) -> list[Reading]:

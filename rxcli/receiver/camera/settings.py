@@ -101,11 +101,10 @@ class CameraSettings:
     #: Slots that are wrong are wrong in neighbouring columns alike: the spread between columns says this much too
     #: little.
     understated_spread: float = 3.0
-    #: Rounds of slots and clock, at most, and at least with all of the clock free; those before which the exposure is
-    #: estimated.
+    #: Rounds of slots and clock, at most and at least; those before which the exposure is estimated.
     refine_steps: int = 8
-    least_steps: int = 2
-    exposure_steps: tuple[int, int] = (0, 1)
+    least_steps: int = 3
+    exposure_steps: tuple[int, int] = (0, 2)
     #: Steps in which the clock alone moves, where no bend is known: slots that are wrong yet would bend it.
     rigid_steps: int = 2
     #: Steps that are this share of the one before, or more, are extrapolated, up to so many times.
@@ -121,7 +120,7 @@ class CameraSettings:
     #: where they are less likely by no more than this, nats.
     another_length_nats: float = 60.0
     #: The descent ends when no row moves by more slots than this.
-    converged_slots: float = 0.1
+    converged_slots: float = 0.03
     #: Share of what a row leaves that is its own; and the least of the mean spread that is left anywhere.
     own_row_share: float = 1e-3
     least_spread: float = 0.2

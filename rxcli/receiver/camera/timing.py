@@ -171,7 +171,6 @@ def _descend(
     strips, terms = view.strips, view.terms
     exposure, exposure_sd = exposure_slots, 0.0
     change, factor, period = np.zeros(6), 1.0, float(values[1])
-    rigid = 0 if n_free == 2 or values[2:].any() else SETTINGS.rigid_steps
     for step in range(SETTINGS.refine_steps):
         time = slot_time(strips, terms, values)
         waves = column_waves(view, time)
@@ -179,7 +178,7 @@ def _descend(
             exposure, exposure_sd = exposure_of_known(waves, slots.lit, exposure if step else None)
             exposure, exposure_sd = (exposure, exposure_sd) if exposure > exposure_slots else (exposure_slots, 0.0)
         slots = decide(waves, exposure, grid, slots)
-        free = n_free if step >= rigid else 2
+        free = n_free if step >= SETTINGS.rigid_steps or values[2:].any() else 2
         observed = seen_by_strips(strips, time, slots.lit, exposure)
         before, (change, covariance, explained) = (
             change,
@@ -191,7 +190,7 @@ def _descend(
         if not (0.5 < following[1] / period < 2.0 and moved < grid.packet_slots):
             break  # no step of a clock that was read: nothing here looks like slots
         values = following
-        if moved < SETTINGS.converged_slots and step >= rigid + SETTINGS.least_steps - 1:
+        if moved < SETTINGS.converged_slots and step >= SETTINGS.least_steps - 1:
             break
     return _Timing(values, covariance, exposure, exposure_sd, explained, slots, waves)
 
