@@ -90,7 +90,7 @@ def estimate_camera(
     if _best(readings) < SETTINGS.nothing_read_nats:
         readings = readings + _read_others(views, _clocks(every_clock, straight, curves, lengths), lengths)
     readings = _with_neighbours(views, sorted(readings, key=_by_evidence), lengths)
-    if _best(readings) < SETTINGS.hopeless_nats and not _keeps_to_edges(views, readings[:1]):
+    if _best(readings) < SETTINGS.hopeless_nats and not (readings and _keeps_to_edges(views, readings[0])):
         return BlindSearch(None, why_not(strips))
     for reading in _worth_refining(readings):
         estimates += [] if any(reading is one for one in asked) else refined(reading)
@@ -131,12 +131,10 @@ def _with_neighbours(views: Views, readings: list[Reading], lengths: list[int]) 
     return sorted(readings + around, key=_by_evidence)
 
 
-def _keeps_to_edges(views: Views, readings: list[Reading]) -> bool:
-    """Whether edges keep to the clock of one of the readings beyond doubt, whatever its slots say."""
-    views_of = [(one, views.at(one.rows_per_slot, one.is_reversed)) for one in readings]
-    return any(
-        edge_nats(views.strips, float(one.values[1]), view.curvature(one.values[2:])) > 0 for one, view in views_of
-    )
+def _keeps_to_edges(views: Views, reading: Reading) -> bool:
+    """Whether edges keep to the clock of a reading beyond doubt, whatever its slots say."""
+    curvature = views.at(reading.rows_per_slot, reading.is_reversed).curvature(reading.values[2:])
+    return edge_nats(views.strips, float(reading.values[1]), curvature) > 0
 
 
 def _clocks(

@@ -119,7 +119,7 @@ class CameraSettings:
     #: Packets of another length, which may be as plausible where less than two packets are in view, are estimates too
     #: where they are less likely by no more than this, nats.
     another_length_nats: float = 60.0
-    #: The descent ends when no row moves by more slots than this.
+    #: The descent, and the refit, end when no row moves by more slots than this.
     converged_slots: float = 0.03
     #: Share of what a row leaves that is its own; and the least of the mean spread that is left anywhere.
     own_row_share: float = 1e-3
@@ -128,8 +128,7 @@ class CameraSettings:
     gain_sd: float = 0.5
 
     refit_steps: int = 6
-    #: The fit ends when no row moves by more slots than the first; exposure and rows are fitted anew after the second.
-    refit_converged_slots: float = 0.02
+    #: Exposure and rows are fitted anew after so many slots.
     rows_anew_slots: float = 0.1
     #: Slots over which the picture is taken as constant.
     picture_slots: float = 25.0
