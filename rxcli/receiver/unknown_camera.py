@@ -13,7 +13,7 @@ from rxcli.receiver import camera as blind
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera_memory import recall, remember
 from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, refittable, refitted_camera
-from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure, FrameContext, Timer
+from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.reception import Reception, packet_llr
 from rxcli.receiver.screen_choice import quick_look
 from rxcli.receiver.settings import SETTINGS
@@ -116,20 +116,30 @@ def receive_unknown(context: FrameContext, acquisition: Acquisition, skip: froze
     """What is received of a frame whose camera was estimated, and the camera as decoded slots tell it."""
     with context.timer("detect"):
         first = Received(context, acquisition, initial_pass(acquisition))
-    settled = _as_light(_with_settled_clock(first))
+    settled = _with_settled_clock(first)
     with context.timer("detect"):
         reception = decode_likeliest(settled.acquisition, skip)
     received = replace(settled, reception=reception)
-    if not _slots_changed(settled, received):
-        return received
-    with context.timer("blind"):
+    if _slots_changed(settled, received):
+        received = _with_told_camera(received, skip, again=not fits(settled.reception))
+    return _as_light(received, skip)
+
+
+def _with_told_camera(received: Received, skip: frozenset[str], *, again: bool) -> Received:
+    """The camera that decoded slots tell, and what is decoded `again` with it where that moves the clock.
+
+    Where packets showed plainly on an initial pass, to decode again shows no more of them.
+    """
+    with received.context.timer("blind"):
         camera, moved_slots = refitted_camera(*_decided(received))
-    doubted = camera.tone == DEFAULT_TONE and blind.is_linear(camera.estimated.get("tone_exponent"))
-    received = _with_camera(received, camera.without_tone() if doubted else camera)
-    # Where packets showed plainly at first, to decode again with what was decoded shows no more of them.
-    if fits(settled.reception) or moved_slots < SETTINGS.matters_slots[1]:
+    received = _with_camera(received, camera)
+    if not again or moved_slots < SETTINGS.matters_slots[1]:
         return received
-    return _received_again(received, lambda one: decode_alike(one, skip, reception)) or received
+    return _decoded_again(received, skip) or received
+
+
+def _decoded_again(received: Received, skip: frozenset[str]) -> Received | None:
+    return _received_again(received, lambda acquisition: decode_alike(acquisition, skip, received.reception))
 
 
 def _with_settled_clock(received: Received) -> Received:
@@ -155,14 +165,16 @@ def _slots_changed(before: Received, after: Received) -> bool:
     return lit[0].shape != lit[1].shape or float(np.abs(lit[0] - lit[1]).mean()) > SETTINGS.same_slots
 
 
-def _as_light(received: Received) -> Received:
+def _as_light(received: Received, skip: frozenset[str]) -> Received:
     """Values that seem to be light as such, where packets show as well then."""
     with received.context.timer("blind"):
         linear = linear_camera(*_decided(received))
     if linear.tone == received.context.camera.tone:
         return _with_camera(received, linear)
-    again = _received_again(_with_camera(received, linear))
-    return again or _with_camera(received, received.context.camera.without_tone())
+    again = _decoded_again(_with_camera(received, linear), skip)
+    if again is None:
+        return _with_camera(received, received.context.camera.without_tone())
+    return _with_told_camera(again, skip, again=False)
 
 
 def _decided(received: Received) -> tuple[FrameContext, Acquisition, Clock, Float32Array]:
