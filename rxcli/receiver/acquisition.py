@@ -98,11 +98,6 @@ def n_strips_of(corners: FloatArray, n_columns: int) -> int:
     return sampling.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
 
 
-def quick_strips(n_strips: int) -> int:
-    """Strips of a column that a quick look reads, of so many that there are."""
-    return n_strips // 2 if n_strips >= sync_settings.many_strips and n_strips % 2 == 0 else n_strips
-
-
 def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False) -> ColumnSampler:
     """Row profiles of a screen of `n_columns` columns, in the order of time.
 
@@ -112,7 +107,7 @@ def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False
     frame, camera = context.frame, context.camera
     quick = quick and sampling.is_coded(frame)
     n_strips = n_strips_of(context.corners, n_columns)
-    is_binned = quick and quick_strips(n_strips) < n_strips
+    is_binned = quick and n_strips >= sync_settings.many_strips and n_strips % 2 == 0
 
     def read(
         columns: slice, noise: tuple[float, float] | None, n_strips: int = n_strips, quick: bool = False

@@ -10,10 +10,9 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ReadoutMode, ScreenProfile, match_camera
 from rxcli.receiver import camera as blind
-from rxcli.receiver.acquisition import Acquisition, n_strips_of, quick_strips
+from rxcli.receiver.acquisition import Acquisition, n_strips_of
 from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure, FrameContext, Timer
 from rxcli.receiver.corners import levels_of
-from rxcli.receiver.sampling import is_coded
 from rxcli.receiver.screen import geometry
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, Lens
 
@@ -176,11 +175,9 @@ def _straightened_strips(
     """Strips of a picture whose camera is not known, along sides that show some distortion."""
     lens = blind.curving_lens(blind.side_curvature_of(sides), frame.width, frame.height)
     n_strips = n_strips_of(corners, n_columns)
-    quick = is_coded(frame)
-    n_strips = quick_strips(n_strips) if quick else n_strips
     outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
     centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
-    profiles = timer.rows.sample(frame, outlines, tone, quick=quick)
+    profiles = timer.rows.sample(frame, outlines, tone)
     mosaic = frame.mosaic is not None
     undone = None if mosaic or frame.linear else tone
     return blind.strips_of(profiles, centre_x, frame.width, frame.height, light_spread, sides, mosaic, undone)

@@ -50,8 +50,9 @@ class WiringSettings:
     #: Headers without symbols count so much.
     headers_alone: float = 0.1
 
-    #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with.
-    matters_slots: float = 0.15
+    #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with: where
+    #: packets show plainly, and where they do not.
+    matters_slots: tuple[float, float] = (0.15, 0.05)
     most_initial_refits: int = 3
     #: Slots, as probabilities, that differ by no more than this on average tell the same camera.
     same_slots: float = 0.02

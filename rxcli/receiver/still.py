@@ -82,6 +82,16 @@ def _with_either_clock(acquisition: Acquisition) -> list[Acquisition]:
     return either
 
 
+def decode_alike(acquisition: Acquisition, skip: frozenset[str], before: Reception) -> Reception:
+    """What is decoded on a clock next to the one before: with columns spread in time as there, and with its bursts."""
+    clocks = [clock for clock in (acquisition.clock, acquisition.rival) if clock is not None]
+    alike = [clock for clock in clocks if clock.delay_slots.any() == before.clock.delay_slots.any()]
+    clock = (alike or clocks)[0]
+    if clock.n_copies != before.clock.n_copies or clock.packet_slots != before.clock.packet_slots:
+        return decode_likeliest(acquisition, skip)
+    return decode(replace(acquisition, clock=clock, rival=None, burst=before.clock.burst), skip)
+
+
 def _with_likeliest_bursts(
     acquisition: Acquisition, reception: Reception, weighed: list[Reception], say_of_copies: float = 0.0
 ) -> Reception:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,11 +13,11 @@ from rxcli.receiver import camera as blind
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera_memory import recall, remember
 from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, refittable, refitted_camera
-from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure, FrameContext, Timer
+from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.reception import Reception, packet_llr
 from rxcli.receiver.screen_choice import quick_look
 from rxcli.receiver.settings import SETTINGS
-from rxcli.receiver.still import decode_likeliest, initial_pass
+from rxcli.receiver.still import decode_alike, decode_likeliest, initial_pass
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, FrameResult
 
 _NO_HEADERS = (
@@ -115,17 +116,30 @@ def receive_unknown(context: FrameContext, acquisition: Acquisition, skip: froze
     """What is received of a frame whose camera was estimated, and the camera as decoded slots tell it."""
     with context.timer("detect"):
         first = Received(context, acquisition, initial_pass(acquisition))
-    settled = _as_light(_with_settled_clock(first))
+    settled = _with_settled_clock(first)
     with context.timer("detect"):
         reception = decode_likeliest(settled.acquisition, skip)
     received = replace(settled, reception=reception)
-    if not _slots_changed(settled, received):
+    if _slots_changed(settled, received):
+        received = _with_told_camera(received, skip, again=not fits(settled.reception))
+    return _as_light(received, skip)
+
+
+def _with_told_camera(received: Received, skip: frozenset[str], *, again: bool) -> Received:
+    """The camera that decoded slots tell, and what is decoded `again` with it where that moves the clock.
+
+    Where packets showed plainly on an initial pass, to decode again shows no more of them.
+    """
+    with received.context.timer("blind"):
+        camera, moved_slots = refitted_camera(*_decided(received))
+    received = _with_camera(received, camera)
+    if not again or moved_slots < SETTINGS.matters_slots[1]:
         return received
-    # What was decoded at last tells the camera best; to receive it all again with that shows no more packets.
-    with context.timer("blind"):
-        camera, _ = refitted_camera(*_decided(received))
-    doubted = camera.tone == DEFAULT_TONE and blind.is_linear(camera.estimated.get("tone_exponent"))
-    return _with_camera(received, camera.without_tone() if doubted else camera)
+    return _decoded_again(received, skip) or received
+
+
+def _decoded_again(received: Received, skip: frozenset[str]) -> Received | None:
+    return _received_again(received, lambda acquisition: decode_alike(acquisition, skip, received.reception))
 
 
 def _with_settled_clock(received: Received) -> Received:
@@ -134,7 +148,7 @@ def _with_settled_clock(received: Received) -> Received:
         with received.context.timer("blind"):
             camera, moved_slots = refitted_camera(*_decided(received))
         received = _with_camera(received, camera)
-        if moved_slots < SETTINGS.matters_slots:
+        if moved_slots < SETTINGS.matters_slots[not fits(received.reception)]:
             break
         before, again = received, _received_again(received)
         if again is None:
@@ -151,14 +165,16 @@ def _slots_changed(before: Received, after: Received) -> bool:
     return lit[0].shape != lit[1].shape or float(np.abs(lit[0] - lit[1]).mean()) > SETTINGS.same_slots
 
 
-def _as_light(received: Received) -> Received:
+def _as_light(received: Received, skip: frozenset[str]) -> Received:
     """Values that seem to be light as such, where packets show as well then."""
     with received.context.timer("blind"):
         linear = linear_camera(*_decided(received))
     if linear.tone == received.context.camera.tone:
         return _with_camera(received, linear)
-    again = _received_again(_with_camera(received, linear))
-    return again or _with_camera(received, received.context.camera.without_tone())
+    again = _decoded_again(_with_camera(received, linear), skip)
+    if again is None:
+        return _with_camera(received, received.context.camera.without_tone())
+    return _with_told_camera(again, skip, again=False)
 
 
 def _decided(received: Received) -> tuple[FrameContext, Acquisition, Clock, Float32Array]:
@@ -171,14 +187,14 @@ def _with_camera(received: Received, camera: Camera) -> Received:
     return replace(received, context=replace(received.context, camera=camera))
 
 
-def _received_again(before: Received) -> Received | None:
-    """What an initial pass shows with a refitted camera; None where packets show less than in the one before."""
+def _received_again(before: Received, receive: Callable[[Acquisition], Reception] = initial_pass) -> Received | None:
+    """What is received with a refitted camera; None where packets show less than in what was received before."""
     context = before.context
     acquisition = quick_look(context)
     if isinstance(acquisition, Failure):
         return None
     with context.timer("detect"):
-        reception = initial_pass(acquisition)
+        reception = receive(acquisition)
     kept = packet_llr(reception) >= SETTINGS.kept_evidence * packet_llr(before.reception)
     return Received(context, acquisition, reception) if kept else None
 

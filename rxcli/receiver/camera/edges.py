@@ -37,15 +37,16 @@ def line_evidence(strips: Strips, rows_per_slot: float, curvature: FloatArray) -
     return float(np.abs(turned.sum()) ** 2 / max(float((power * power).sum()), 1e-30))
 
 
-def by_edges(strips: Strips, estimates: list[BlindEstimate]) -> BlindEstimate | None:
-    """The estimate whose period the edges keep to beyond doubt, None without one.
+def edge_nats(strips: Strips, rows_per_slot: float, curvature: FloatArray) -> float:
+    """The same where it is beyond doubt, else 0.
 
-    A period twice as long, to which they keep too, has it as its harmonic.
+    A period twice as long, to which edges keep too, has it as its harmonic.
     """
-    best, most = None, SETTINGS.line_beyond_doubt_nats
-    for estimate in estimates:
-        curvature = estimate.curvature * estimate.corrected
-        nats, double = (line_evidence(strips, n * estimate.rows_per_slot, curvature) for n in (1, 2))
-        if nats > most and double < SETTINGS.line_beyond_doubt_nats:
-            best, most = estimate, nats
-    return best
+    nats, double = (line_evidence(strips, n * rows_per_slot, curvature) for n in (1, 2))
+    return nats if nats > SETTINGS.line_beyond_doubt_nats > double else 0.0
+
+
+def by_edges(strips: Strips, estimates: list[BlindEstimate]) -> BlindEstimate | None:
+    """The estimate whose period the edges keep to beyond doubt, None without one."""
+    nats = [edge_nats(strips, one.rows_per_slot, one.curvature * one.corrected) for one in estimates]
+    return estimates[int(np.argmax(nats))] if any(nats) else None

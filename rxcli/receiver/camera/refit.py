@@ -113,6 +113,6 @@ def _fit(
         before, time = time, slot_time(strips, terms, values)
         step = float(np.abs(time - before)[:, ::BLOCK_ROWS].max())
         moved += step
-        if step < SETTINGS.refit_converged_slots:
+        if step < SETTINGS.converged_slots:
             break
     return _Fit(values, covariance, exposure, exposure_sd, explained_first, explained, observed[0], window)

@@ -11,7 +11,7 @@ import numpy as np
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.camera.advice import why_not
 from rxcli.receiver.camera.curvature import estimate_curvature, straightened
-from rxcli.receiver.camera.edges import by_edges
+from rxcli.receiver.camera.edges import by_edges, edge_nats
 from rxcli.receiver.camera.estimates import BentHypothesis, BlindEstimate, Hypothesis, distinct, on_one_curvature
 from rxcli.receiver.camera.reading import Reading, read, read_slots
 from rxcli.receiver.camera.scan import every_clock, same_slots, short_list
@@ -87,7 +87,12 @@ def estimate_camera(
         if _is_plausible(likely) and shows_packets(likely):
             return BlindSearch(likely, rivals=_worth_reading([one for one in estimates if one is not likely]))
     asked = readings[:1] if estimates else []
-    for reading in _worth_refining(_more_readings(views, straight, curves, lengths, readings)):
+    if _best(readings) < SETTINGS.nothing_read_nats:
+        readings = readings + _read_others(views, _clocks(every_clock, straight, curves, lengths), lengths)
+    readings = _with_neighbours(views, sorted(readings, key=_by_evidence), lengths)
+    if _best(readings) < SETTINGS.hopeless_nats and not (readings and _keeps_to_edges(views, readings[0])):
+        return BlindSearch(None, why_not(strips))
+    for reading in _worth_refining(readings):
         estimates += [] if any(reading is one for one in asked) else refined(reading)
     rows_per_slot = estimates[0].rows_per_slot if estimates else 1.0
     estimates.sort(key=lambda estimate: -_plausibility(estimate, strips, rows_per_slot))
@@ -106,22 +111,30 @@ def _is_plausible(estimate: BlindEstimate) -> bool:
     return estimate.log_evidence >= SETTINGS.least_evidence and estimate.explained >= SETTINGS.least_explained
 
 
-def _more_readings(
-    views: Views, straight: list[Strips], curves: list[FloatArray], lengths: list[int], readings: list[Reading]
-) -> list[Reading]:
-    """The readings, best first, with those of further clocks where they are not of the right one for sure."""
-    if _best(readings) < SETTINGS.nothing_read_nats:
-        found = _clocks(every_clock, straight, curves, lengths)
-        outstanding = sorted(found, key=lambda pair: -pair[0].salience)
-        either = [pair for both in zip(found, outstanding, strict=True) for pair in both]
-        readings = readings + _read_until_sure(
-            views, distinct(either, on_one_curvature(same_slots), SETTINGS.readings), lengths
-        )
-    if SETTINGS.hopeless_nats < _best(readings) < SETTINGS.read_surely_nats:
-        readings = readings + _read_around(
-            views, sorted(readings, key=_by_evidence)[: SETTINGS.readings_around], lengths
-        )
-    return sorted(readings, key=_by_evidence)
+def _read_others(views: Views, found: list[BentHypothesis], lengths: list[int]) -> list[Reading]:
+    """Readings of the likeliest clocks, and of those that stand out."""
+    outstanding = sorted(found, key=lambda pair: -pair[0].salience)
+    either = [pair for both in zip(found, outstanding, strict=True) for pair in both]
+    return _read_until_sure(views, distinct(either, on_one_curvature(same_slots), SETTINGS.readings), lengths)
+
+
+def _with_neighbours(views: Views, readings: list[Reading], lengths: list[int]) -> list[Reading]:
+    """The readings, best first, with those of clocks near the best where that is not of the right one for sure."""
+    if not SETTINGS.hopeless_nats < _best(readings) < SETTINGS.read_surely_nats:
+        return readings
+    best, n_rows = readings[0], float(views.strips.rows[-1] - views.strips.rows[0])
+    around = []
+    for off in SETTINGS.around_slots:
+        values = best.values.copy()
+        values[1] *= 1 + off * values[1] / n_rows
+        around.append(read_slots(views, best.rows_per_slot, best.is_reversed, values, lengths))
+    return sorted(readings + around, key=_by_evidence)
+
+
+def _keeps_to_edges(views: Views, reading: Reading) -> bool:
+    """Whether edges keep to the clock of a reading beyond doubt, whatever its slots say."""
+    curvature = views.at(reading.rows_per_slot, reading.is_reversed).curvature(reading.values[2:])
+    return edge_nats(views.strips, float(reading.values[1]), curvature) > 0
 
 
 def _clocks(
@@ -142,18 +155,6 @@ def _read_until_sure(views: Views, clocks: list[BentHypothesis], lengths: list[i
         out.append(read(views, clock, curvature, lengths))
         if out[-1].log_evidence > SETTINGS.read_surely_nats:
             break
-    return out
-
-
-def _read_around(views: Views, readings: list[Reading], lengths: list[int]) -> list[Reading]:
-    """Readings of clocks that are somewhat longer or shorter."""
-    out = []
-    for reading in readings:
-        n_rows = float(views.strips.rows[-1] - views.strips.rows[0])
-        for off in SETTINGS.around_slots:
-            values = reading.values.copy()
-            values[1] *= 1 + off * values[1] / n_rows
-            out.append(read_slots(views, reading.rows_per_slot, reading.is_reversed, values, lengths))
     return out
 
 

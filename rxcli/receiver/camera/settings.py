@@ -74,10 +74,9 @@ class CameraSettings:
     #: below which not even its neighbours are.
     nothing_read_nats: float = 150.0
     hopeless_nats: float = 50.0
-    #: Clocks of the short list, or of all periods, that are read; of how many of them the neighbours are read too, and
-    #: by how many slots those are off by the end of the picture.
+    #: Clocks of the short list, or of all periods, that are read; and by how many slots neighbours of the best, which
+    #: are read too, are off by the end of the picture.
     readings: int = 4
-    readings_around: int = 2
     around_slots: tuple[float, ...] = (-1.2, -0.6, 0.6, 1.2)
     #: What doubling the length of a packet costs, nats.
     longer_packet_nats: float = 3.0
@@ -120,7 +119,7 @@ class CameraSettings:
     #: Packets of another length, which may be as plausible where less than two packets are in view, are estimates too
     #: where they are less likely by no more than this, nats.
     another_length_nats: float = 60.0
-    #: The descent ends when no row moves by more slots than this.
+    #: The descent, and the refit, end when no row moves by more slots than this.
     converged_slots: float = 0.03
     #: Share of what a row leaves that is its own; and the least of the mean spread that is left anywhere.
     own_row_share: float = 1e-3
@@ -129,8 +128,7 @@ class CameraSettings:
     gain_sd: float = 0.5
 
     refit_steps: int = 6
-    #: The fit ends when no row moves by more slots than the first; exposure and rows are fitted anew after the second.
-    refit_converged_slots: float = 0.02
+    #: Exposure and rows are fitted anew after so many slots.
     rows_anew_slots: float = 0.1
     #: Slots over which the picture is taken as constant.
     picture_slots: float = 25.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rxcli.protocol import encode_packet, payload_bits
-from rxcli.receiver.camera.trellis import lit_probability, pattern_light
+from rxcli.receiver.camera.trellis import lit_probability, log_evidence, pattern_light
 from rxcli.receiver.camera.waves import (
     SAMPLES,
     Grid,
@@ -37,10 +37,11 @@ def test_probabilities_are_those_of_all_sequences(n_bits: int) -> None:
         lit += weight[:, None] * middle
         total += weight
         count += prior
-    found, log_evidence = lit_probability(np.moveaxis(metric, 2, 0), log_odds)
+    found, evidence = lit_probability(np.moveaxis(metric, 2, 0), log_odds)
     np.testing.assert_allclose(found, lit / total[:, None], atol=1e-6)
     # The slots beyond the ends are any.
-    np.testing.assert_allclose(log_evidence, np.log(total / count), rtol=1e-5)
+    np.testing.assert_allclose(evidence, np.log(total / count), rtol=1e-5)
+    np.testing.assert_allclose(log_evidence(np.moveaxis(metric, 2, 0), log_odds), evidence, rtol=1e-6)
 
 
 def test_patterns_see_the_share_of_every_slot() -> None:
