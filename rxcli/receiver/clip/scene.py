@@ -44,6 +44,8 @@ class TrackedScreen:
         self._texture = ScreenTexture(frame, pose.corners, lens)
         #: Frames whose picture did not tell where the screen is, and outlines in a row that were where the first was.
         self._n_untold = self._n_still = 0
+        #: Looks in a row that found it where it was, and frames since the last one.
+        self._n_rested = self._n_unlooked = 0
         self._still_outline: FloatArray | None = None
         #: Where its outline was when looked at last, and how far it moves from frame to frame since.
         self._looked: FloatArray | None = None
@@ -106,8 +108,9 @@ class TrackedScreen:
         """Whether a screen found at the corners may not have moved at all."""
         return bool(np.abs(corners - self.corners).max() < SETTINGS.still_outline * np.ptp(self.corners[:, 0]))
 
-    def follow(self, frame: Frame) -> bool:
+    def _follow(self, frame: Frame) -> bool:
         """Find where the screen is in a frame, by the picture on it; returns whether that is certain."""
+        self._n_unlooked = 0
         found = self._texture.find(frame)
         confirmed = found.fits
         if not found.tells:
@@ -119,8 +122,10 @@ class TrackedScreen:
             return False
         if (found.tells or self._rests) and _is_still(found.corners - self.corners, found.sd_px):
             found = replace(found, corners=self.corners)
+            self._n_rested += 1
         else:
             self._move(frame, found)
+            self._n_rested = 0
         self._texture.learn(frame, found)
         return True
 
@@ -200,15 +205,31 @@ class TrackedScreen:
     def view(self, frame: Frame, time: tracking.LinkTime, thorough: bool, timer: Timer) -> View | None:
         """A frame by what is known; None where that does not fit.
 
+        A screen that rests is looked for now and then: had it moved, the picture would not fit as it did.
+
         Args:
             frame: taken with the same camera as those before.
             time: the link's time.
             thorough: False where it is enough to measure a faded frame roughly, for it will be measured again.
             timer: time is counted there.
         """
-        last = self.last
-        if last is None:
+        if self.last is None:
             return None
+        self._n_unlooked += 1
+        rests = self._n_rested >= SETTINGS.still_looks and self._n_updates >= SETTINGS.first_updates
+        if rests and self._n_unlooked < SETTINGS.look_every:
+            view = self._view(frame, self.last, time, SETTINGS.rest_misfit, thorough, timer)
+            if view is not None:
+                return view
+        with timer("geometry"):
+            if not self._follow(frame):
+                return None
+        return self._view(frame, self.last, time, SETTINGS.misfit, thorough, timer)
+
+    def _view(
+        self, frame: Frame, last: View, time: tracking.LinkTime, most_misfit: float, thorough: bool, timer: Timer
+    ) -> View | None:
+        """A frame, the screen being where it is thought to be."""
         with timer("sampling"):
             light, pose = self.strips(frame), self.pose
             picture = self._picture.placed(pose.placement)
@@ -219,7 +240,7 @@ class TrackedScreen:
             if clock is None:
                 return None
         with timer("detect"):
-            refined = self._refined(picture, pose.rows, light, flat, clock, last.isi_memory, thorough)
+            refined = self._refined(picture, pose.rows, light, flat, clock, last.isi_memory, most_misfit, thorough)
             if refined is None:
                 return None
             flat, clock, positions, likelihoods = refined
@@ -245,6 +266,7 @@ class TrackedScreen:
         flat: known_picture.ColumnLight,
         clock: Clock,
         isi_memory: int,
+        most_misfit: float,
         thorough: bool,
         known: Float32Array | None = None,
     ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, SlotLikelihoods] | None:
@@ -276,12 +298,11 @@ class TrackedScreen:
             positions = known_picture.row_positions(rows, clock)
             fit = known_picture.fit_response(flat, known_picture.exposures(lit, positions, exposure_slots))
         expected = fit.response.expected(lit, positions, exposure_slots)
-        flat, ratio = picture.judge(flat, expected, SETTINGS.frame_share, clock.rows_per_slot)
-        if ratio > SETTINGS.misfit:
+        judged = picture.judge(flat, expected, most_misfit, SETTINGS.frame_share, clock.rows_per_slot)
+        if judged is None:
             return None
-        response = fit.response
-        found = known_picture.slot_likelihoods(flat, positions, clock, isi_memory, response, expected, lit)
-        return flat, clock, positions, found
+        found = known_picture.slot_likelihoods(judged, positions, clock, isi_memory, fit.response, expected, lit)
+        return judged, clock, positions, found
 
     def _clock(
         self, frame: Frame, flat: known_picture.ColumnLight, old: Clock, time: tracking.LinkTime
@@ -408,8 +429,9 @@ class TrackedScreen:
         assert view.pose is not None
         picture = self._picture.without(own).placed(view.pose.placement)
         flat = picture.solve(view.light)
+        clock = view.bursts.clock
         refined = self._refined(
-            picture, view.pose.rows, view.light, flat, view.bursts.clock, view.isi_memory, thorough=True, known=known
+            picture, view.pose.rows, view.light, flat, clock, view.isi_memory, SETTINGS.misfit, thorough=True, known=known
         )
         if refined is not None:
             burst = view.bursts.clock.burst
