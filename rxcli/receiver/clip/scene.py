@@ -41,6 +41,7 @@ class TrackedScreen:
         #: The frame that was received last.
         self.last: View | None = None
         self._lens, self._named = lens, named
+        self._first_middles = geometry.column_middles(pose.corners, pose.map.inside.shape[0], lens)
         self._texture = ScreenTexture(frame, pose.corners, lens)
         #: Frames whose picture did not tell where the screen is, and outlines in a row that were where the first was.
         self._n_untold = self._n_still = 0
@@ -193,12 +194,17 @@ class TrackedScreen:
     def _move(self, frame: Frame, found: Registration) -> None:
         n_columns, n_strips, _ = self._first_pose.map.inside.shape
         corners = found.corners
-        outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, self._lens)
+        outlines = geometry.column_outlines(
+            corners, n_columns, n_strips, frame.width, frame.height, self._lens, quick=True
+        )
         sd = float(np.sqrt(np.diag(found.covariance)[1::2].max()))
         outlines = replace(outlines, inside=_less_ends(outlines.inside, SETTINGS.least_end + sd))
         strips = tracked.moved_map(self._first_pose.map, outlines)
-        placement = _placement(self._first_pose, corners, strips, self._lens)
-        self.pose = Pose(corners, strips, placement, self._first_pose.map)
+        middles = geometry.column_middles(corners, n_columns, self._lens)
+        picture_row = geometry.rows_elsewhere(strips.rows, middles, self._first_middles)
+        picture_row -= np.float32(self._first_pose.map.first_row)
+        placement = known_picture.Placement(picture_row, strips.inside)
+        self.pose = Pose(corners, strips, placement, self._first_pose.map, middles)
 
     # -- a frame ------------------------------------------------------------------------------------------------
 
@@ -287,8 +293,8 @@ class TrackedScreen:
             clock = _retimed(clock, rows, fit)
             positions = known_picture.row_positions(rows, clock)
         if self._n_updates < SETTINGS.few_updates or (thorough and fit.response.centre < SETTINGS.faded):
-            expected = fit.response.expected(lit, positions, exposure_slots)
-            flat = picture.solve_again(light, expected, clock.rows_per_slot)
+            expected = known_picture.expected_light(lit, positions, exposure_slots, isi_memory, fit.response)
+            flat = picture.solve_again(light, expected.light, clock.rows_per_slot)
             fit = known_picture.fit_response(flat, slots)
         if thorough and fit.response.centre < SETTINGS.faded:
             flat = known_picture.equalized(flat, slots)
@@ -297,12 +303,11 @@ class TrackedScreen:
             clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)
             positions = known_picture.row_positions(rows, clock)
             fit = known_picture.fit_response(flat, known_picture.exposures(lit, positions, exposure_slots))
-        expected = fit.response.expected(lit, positions, exposure_slots)
-        judged = picture.judge(flat, expected, most_misfit, SETTINGS.frame_share, clock.rows_per_slot)
+        expected = known_picture.expected_light(lit, positions, exposure_slots, isi_memory, fit.response)
+        judged = picture.judge(flat, expected.light, most_misfit, SETTINGS.frame_share, clock.rows_per_slot)
         if judged is None:
             return None
-        found = known_picture.slot_likelihoods(judged, positions, clock, isi_memory, fit.response, expected, lit)
-        return judged, clock, positions, found
+        return judged, clock, positions, known_picture.slot_likelihoods(judged, expected, clock, isi_memory)
 
     def _clock(
         self, frame: Frame, flat: known_picture.ColumnLight, old: Clock, time: tracking.LinkTime
@@ -379,9 +384,16 @@ class TrackedScreen:
         positions = known_picture.row_positions(view.pose.rows, clock)
         slots = known_picture.exposed(lit, positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
-        look = known_picture.Look(view.light, slots, trust, view.pose.placement)
+        look = known_picture.Look(view.light, slots, trust, view.pose.placement, self._frame_rows(view.pose))
         self._picture.learn(look, forget=forget)
         return look
+
+    def _frame_rows(self, pose: Pose) -> Float32Array | None:
+        """(C, P) row of a frame that shows each row of the picture; None where that is where the first one did."""
+        if pose.middles is None:
+            return None
+        rows = geometry.rows_elsewhere(self._first_pose.rows, self._first_middles, pose.middles)
+        return rows - np.float32(pose.map.first_row)
 
     def can_measure_again(self, view: View) -> bool:
         """Whether a frame's strips are those of this screen."""
@@ -429,10 +441,8 @@ class TrackedScreen:
         assert view.pose is not None
         picture = self._picture.without(own).placed(view.pose.placement)
         flat = picture.solve(view.light)
-        clock = view.bursts.clock
-        refined = self._refined(
-            picture, view.pose.rows, view.light, flat, clock, view.isi_memory, SETTINGS.misfit, thorough=True, known=known
-        )
+        clock, rows, most = view.bursts.clock, view.pose.rows, SETTINGS.misfit
+        refined = self._refined(picture, rows, view.light, flat, clock, view.isi_memory, most, True, known)
         if refined is not None:
             burst = view.bursts.clock.burst
             view.flat, clock, _, found = refined
@@ -519,15 +529,3 @@ def _is_still(moved: FloatArray, sd_px: float) -> bool:
         shift < max(SETTINGS.still_px, SETTINGS.still_sds * sd_px / 2)
         and each < max(SETTINGS.still_px, SETTINGS.still_sds * sd_px)
     )
-
-
-def _placement(
-    first: Pose, corners: FloatArray, strips: tracked.StripMap, lens: Lens | None
-) -> known_picture.Placement:
-    """Where the picture of a screen lies that is elsewhere now."""
-    n_columns = strips.inside.shape[0]
-    before, after = (geometry.column_middles(c, n_columns, lens) for c in (first.corners, corners))
-    first_row, row = first.map.first_row, strips.first_row
-    picture_row = geometry.rows_elsewhere(strips.rows, after, before) - np.float32(first_row)
-    frame_row = geometry.rows_elsewhere(first.rows, before, after) - np.float32(row)
-    return known_picture.Placement(picture_row, frame_row, strips.inside)

@@ -44,8 +44,6 @@ class Placement:
 
     #: (C, R) row of the picture that each row of the frame shows.
     picture_row: Float32Array
-    #: (C, P) row of the frame that shows each row of the picture.
-    frame_row: Float32Array
     #: (C, S, R) bool: the strip is on the screen there.
     inside: BoolArray
 
@@ -59,8 +57,10 @@ class Look:
     #: (C, R) exposure-averaged slots, 0..1, and how far each is trusted.
     slots: Float32Array
     trust: Float32Array
-    #: Where the frame shows the picture; None for where the first one did.
+    #: Where the frame shows the picture, and (C, P) its row that shows each row of the picture; None for where the first
+    #: one did.
     placement: Placement | None = None
+    frame_row: Float32Array | None = None
     #: (R,) the rows that are meant; None for all.
     rows: BoolArray | None = None
 
@@ -150,9 +150,9 @@ class KnownPicture:
         if look.rows is not None:
             weighted *= look.rows
         lit, observed = weighted * (look.light - self._black_level), weighted * expected
-        if placement is None:
+        row = look.frame_row
+        if row is None:
             return lit, observed
-        row = placement.frame_row
         return _resampled(lit, row, beyond=True), _resampled(observed, row, beyond=True)
 
     def solve(self, light: Float32Array) -> ColumnLight:
@@ -221,7 +221,8 @@ class KnownPicture:
         """
         error = np.square(observed.value - expected) * observed.precision
         # And one row that errs as foreseen, for columns of which nothing is seen.
-        ratio = (error.sum(axis=1) + 1) / ((observed.precision > 0).sum(axis=1) + 1)
+        n_seen = np.count_nonzero(observed.precision, axis=1).astype(np.float32)
+        ratio = (error.sum(axis=1) + 1) / (n_seen + 1)
         if np.median(ratio) > most:
             return None
         self._excess *= 1 + np.float32(share) * (ratio - 1)
@@ -233,7 +234,7 @@ class KnownPicture:
         """Precisions by what was found of the columns' noise; 0 where next to nothing is seen."""
         tempered = precision / (self._excess[:, None] + np.float32(SETTINGS.common_error**2) * precision)
         tempered[precision <= 1e-3] = 0
-        return tempered
+        return np.asarray(tempered, np.float32)
 
     def picture(self) -> tuple[Float32Array, Float32Array]:
         """The picture and its relative variance, (C, S, R) each."""
@@ -294,7 +295,7 @@ def _alike(error: Float32Array, precision: Float32Array, rows_per_slot: float) -
     shape = len(error), error.shape[1] // n, n
     weight = precision[:, : shape[1] * n].reshape(shape)
     total = np.einsum("csr,csr->cs", weight, error[:, : shape[1] * n].reshape(shape))
-    foreseen = weight.sum(axis=2)
+    foreseen = np.einsum("csr->cs", weight)
     told = foreseen > SETTINGS.told_precision
     # Means, not medians: with medians a clip of 4 surely wrong packets of 91 has 19 of 102.
     squared = np.sum(np.square(total) / np.maximum(foreseen, SETTINGS.told_precision), axis=1, where=told)
