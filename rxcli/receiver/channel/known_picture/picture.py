@@ -57,8 +57,8 @@ class Look:
     #: (C, R) exposure-averaged slots, 0..1, and how far each is trusted.
     slots: Float32Array
     trust: Float32Array
-    #: Where the frame shows the picture, and (C, P) its row that shows each row of the picture; None for where the first
-    #: one did.
+    #: Where the frame shows the picture, and (C, P) its row that shows each row of the picture; None where it is
+    #: where the first one did.
     placement: Placement | None = None
     frame_row: Float32Array | None = None
     #: (R,) the rows that are meant; None for all.
