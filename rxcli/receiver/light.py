@@ -59,7 +59,9 @@ class NoiseModel:
         return out
 
 
-def exposure_shares(centre: FloatArray, slots: NDArray[np.integer] | FloatArray, exposure_slots: float) -> FloatArray:
+def exposure_shares(
+    centre: FloatArray | Float32Array, slots: NDArray[np.integer] | FloatArray | Float32Array, exposure_slots: float
+) -> FloatArray:
     """Share of an exposure that falls into each slot.
 
     Args:

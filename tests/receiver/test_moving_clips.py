@@ -20,6 +20,7 @@ from rxcli.lab.simulate.video import write_video
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver.pipeline import receive
+from rxcli.receiver.screen.registration import ScreenTexture
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Frame, FrameResult
 
@@ -115,6 +116,20 @@ def test_corners_are_those_of_each_frame(shaky: Clip) -> None:
     found = np.array([result.corners for result in results])
     assert np.abs(np.diff(sent, axis=0)).max() > 3
     assert np.sqrt(np.square(found - sent).mean()) < 2.0
+
+
+def test_a_screen_at_rest_is_looked_for_now_and_then_until_it_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    clip, moved_at, moved_px, looks = filmed(scene_in_hand(0.0, 26)), 20, 4, []
+    find = ScreenTexture.find
+    monkeypatch.setattr(ScreenTexture, "find", lambda self, frame: (looks.append(frame.index), find(self, frame))[1])
+    bumped = (replace(f, pixels=np.roll(f.pixels, moved_px * (f.index >= moved_at), axis=1)) for f in clip[0])
+    results, score = received(clip, tuple(bumped))
+    assert score.error_free >= received(clip)[1].error_free - 1
+    corners = np.array([result.corners for result in results])
+    assert corners[-1, :, 0] - corners[moved_at - 1, :, 0] == pytest.approx(moved_px, abs=0.5)
+    assert np.ptp(corners[moved_at + 1 :], axis=0).max() < 0.5
+    assert len({*range(14, moved_at)} & {*looks}) <= 2
+    assert moved_at in looks
 
 
 def test_a_picture_without_texture_is_followed_by_its_outline() -> None:

@@ -452,9 +452,10 @@ def test_errors_that_rows_have_in_common_count_as_one(together: int) -> None:
     noise = np.repeat(rng.normal(0, 0.1, (8, 1000 // together)), together, axis=1).astype(np.float32)
     slots = np.repeat(rng.integers(0, 2, (8, 200)), 5, axis=1).astype(np.float32)
     seen = ColumnLight(slots + noise, np.full((8, 1000), 50, np.float32), slots)
-    judged, _ = known.judge(seen, slots, 0.0, 5.0)
-    # Five rows that err together tell what one does, 1 / 0.1^2; of others half counts, as foreseen, and a little more.
-    expected = 100 / 5 if together == 5 else 50 / 0.9
+    judged = known.judge(seen, slots, 40.0, 0.0, 5.0)
+    assert judged is not None
+    # Each row tells 1 / 0.1^2, whatever was foreseen; five that err together tell what one does.
+    expected = 100 / together
     assert np.median(judged.precision) == pytest.approx(expected, rel=0.1)
 
 

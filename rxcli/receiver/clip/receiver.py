@@ -503,11 +503,9 @@ class _Clip:
         scene = self._scene
         if scene is None or self._link is None or self._taken_with != _taken_with(frame):
             return None
-        with timer("geometry"):
-            if not scene.follow(frame):
-                return None
-            self._corners = scene.corners
-        return scene.view(frame, self._link.time, self._n_held != SETTINGS.frames_held_long, timer)
+        view = scene.view(frame, self._link.time, self._n_held != SETTINGS.frames_held_long, timer)
+        self._corners = scene.corners
+        return view
 
     # -- bursts ---------------------------------------------------------------------------------------------------
 

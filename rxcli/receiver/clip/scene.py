@@ -41,9 +41,12 @@ class TrackedScreen:
         #: The frame that was received last.
         self.last: View | None = None
         self._lens, self._named = lens, named
+        self._first_middles = geometry.column_middles(pose.corners, pose.map.inside.shape[0], lens)
         self._texture = ScreenTexture(frame, pose.corners, lens)
         #: Frames whose picture did not tell where the screen is, and outlines in a row that were where the first was.
         self._n_untold = self._n_still = 0
+        #: Looks in a row that found it where it was, and frames since the last one.
+        self._n_rested = self._n_unlooked = 0
         self._still_outline: FloatArray | None = None
         #: Where its outline was when looked at last, and how far it moves from frame to frame since.
         self._looked: FloatArray | None = None
@@ -106,8 +109,9 @@ class TrackedScreen:
         """Whether a screen found at the corners may not have moved at all."""
         return bool(np.abs(corners - self.corners).max() < SETTINGS.still_outline * np.ptp(self.corners[:, 0]))
 
-    def follow(self, frame: Frame) -> bool:
+    def _follow(self, frame: Frame) -> bool:
         """Find where the screen is in a frame, by the picture on it; returns whether that is certain."""
+        self._n_unlooked = 0
         found = self._texture.find(frame)
         confirmed = found.fits
         if not found.tells:
@@ -119,8 +123,10 @@ class TrackedScreen:
             return False
         if (found.tells or self._rests) and _is_still(found.corners - self.corners, found.sd_px):
             found = replace(found, corners=self.corners)
+            self._n_rested += 1
         else:
             self._move(frame, found)
+            self._n_rested = 0
         self._texture.learn(frame, found)
         return True
 
@@ -188,17 +194,24 @@ class TrackedScreen:
     def _move(self, frame: Frame, found: Registration) -> None:
         n_columns, n_strips, _ = self._first_pose.map.inside.shape
         corners = found.corners
-        outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, self._lens)
+        outlines = geometry.column_outlines(
+            corners, n_columns, n_strips, frame.width, frame.height, self._lens, quick=True
+        )
         sd = float(np.sqrt(np.diag(found.covariance)[1::2].max()))
         outlines = replace(outlines, inside=_less_ends(outlines.inside, SETTINGS.least_end + sd))
         strips = tracked.moved_map(self._first_pose.map, outlines)
-        placement = _placement(self._first_pose, corners, strips, self._lens)
-        self.pose = Pose(corners, strips, placement, self._first_pose.map)
+        middles = geometry.column_middles(corners, n_columns, self._lens)
+        picture_row = geometry.rows_elsewhere(strips.rows, middles, self._first_middles)
+        picture_row -= np.float32(self._first_pose.map.first_row)
+        placement = known_picture.Placement(picture_row, strips.inside)
+        self.pose = Pose(corners, strips, placement, self._first_pose.map, middles)
 
     # -- a frame ------------------------------------------------------------------------------------------------
 
     def view(self, frame: Frame, time: tracking.LinkTime, thorough: bool, timer: Timer) -> View | None:
         """A frame by what is known; None where that does not fit.
+
+        A screen that rests is looked for now and then: had it moved, the picture would not fit as it did.
 
         Args:
             frame: taken with the same camera as those before.
@@ -206,9 +219,23 @@ class TrackedScreen:
             thorough: False where it is enough to measure a faded frame roughly, for it will be measured again.
             timer: time is counted there.
         """
-        last = self.last
-        if last is None:
+        if self.last is None:
             return None
+        self._n_unlooked += 1
+        rests = self._n_rested >= SETTINGS.still_looks and self._n_updates >= SETTINGS.first_updates
+        if rests and self._n_unlooked < SETTINGS.look_every:
+            view = self._view(frame, self.last, time, SETTINGS.rest_misfit, thorough, timer)
+            if view is not None:
+                return view
+        with timer("geometry"):
+            if not self._follow(frame):
+                return None
+        return self._view(frame, self.last, time, SETTINGS.misfit, thorough, timer)
+
+    def _view(
+        self, frame: Frame, last: View, time: tracking.LinkTime, most_misfit: float, thorough: bool, timer: Timer
+    ) -> View | None:
+        """A frame, the screen being where it is thought to be."""
         with timer("sampling"):
             light, pose = self.strips(frame), self.pose
             picture = self._picture.placed(pose.placement)
@@ -219,7 +246,7 @@ class TrackedScreen:
             if clock is None:
                 return None
         with timer("detect"):
-            refined = self._refined(picture, pose.rows, light, flat, clock, last.isi_memory, thorough)
+            refined = self._refined(picture, pose.rows, light, flat, clock, last.isi_memory, most_misfit, thorough)
             if refined is None:
                 return None
             flat, clock, positions, likelihoods = refined
@@ -245,6 +272,7 @@ class TrackedScreen:
         flat: known_picture.ColumnLight,
         clock: Clock,
         isi_memory: int,
+        most_misfit: float,
         thorough: bool,
         known: Float32Array | None = None,
     ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, SlotLikelihoods] | None:
@@ -265,8 +293,8 @@ class TrackedScreen:
             clock = _retimed(clock, rows, fit)
             positions = known_picture.row_positions(rows, clock)
         if self._n_updates < SETTINGS.few_updates or (thorough and fit.response.centre < SETTINGS.faded):
-            expected = fit.response.expected(lit, positions, exposure_slots)
-            flat = picture.solve_again(light, expected, clock.rows_per_slot)
+            expected = known_picture.expected_light(lit, positions, exposure_slots, isi_memory, fit.response)
+            flat = picture.solve_again(light, expected.light, clock.rows_per_slot)
             fit = known_picture.fit_response(flat, slots)
         if thorough and fit.response.centre < SETTINGS.faded:
             flat = known_picture.equalized(flat, slots)
@@ -275,13 +303,11 @@ class TrackedScreen:
             clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)
             positions = known_picture.row_positions(rows, clock)
             fit = known_picture.fit_response(flat, known_picture.exposures(lit, positions, exposure_slots))
-        expected = fit.response.expected(lit, positions, exposure_slots)
-        flat, ratio = picture.judge(flat, expected, SETTINGS.frame_share, clock.rows_per_slot)
-        if ratio > SETTINGS.misfit:
+        expected = known_picture.expected_light(lit, positions, exposure_slots, isi_memory, fit.response)
+        judged = picture.judge(flat, expected.light, most_misfit, SETTINGS.frame_share, clock.rows_per_slot)
+        if judged is None:
             return None
-        response = fit.response
-        found = known_picture.slot_likelihoods(flat, positions, clock, isi_memory, response, expected, lit)
-        return flat, clock, positions, found
+        return judged, clock, positions, known_picture.slot_likelihoods(judged, expected, clock, isi_memory)
 
     def _clock(
         self, frame: Frame, flat: known_picture.ColumnLight, old: Clock, time: tracking.LinkTime
@@ -358,9 +384,16 @@ class TrackedScreen:
         positions = known_picture.row_positions(view.pose.rows, clock)
         slots = known_picture.exposed(lit, positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
-        look = known_picture.Look(view.light, slots, trust, view.pose.placement)
+        look = known_picture.Look(view.light, slots, trust, view.pose.placement, self._frame_rows(view.pose))
         self._picture.learn(look, forget=forget)
         return look
+
+    def _frame_rows(self, pose: Pose) -> Float32Array | None:
+        """(C, P) row of a frame that shows each row of the picture; None where that is where the first one did."""
+        if pose.middles is None:
+            return None
+        rows = geometry.rows_elsewhere(self._first_pose.rows, self._first_middles, pose.middles)
+        return rows - np.float32(pose.map.first_row)
 
     def can_measure_again(self, view: View) -> bool:
         """Whether a frame's strips are those of this screen."""
@@ -408,9 +441,8 @@ class TrackedScreen:
         assert view.pose is not None
         picture = self._picture.without(own).placed(view.pose.placement)
         flat = picture.solve(view.light)
-        refined = self._refined(
-            picture, view.pose.rows, view.light, flat, view.bursts.clock, view.isi_memory, thorough=True, known=known
-        )
+        clock, rows, most = view.bursts.clock, view.pose.rows, SETTINGS.misfit
+        refined = self._refined(picture, rows, view.light, flat, clock, view.isi_memory, most, True, known)
         if refined is not None:
             burst = view.bursts.clock.burst
             view.flat, clock, _, found = refined
@@ -497,15 +529,3 @@ def _is_still(moved: FloatArray, sd_px: float) -> bool:
         shift < max(SETTINGS.still_px, SETTINGS.still_sds * sd_px / 2)
         and each < max(SETTINGS.still_px, SETTINGS.still_sds * sd_px)
     )
-
-
-def _placement(
-    first: Pose, corners: FloatArray, strips: tracked.StripMap, lens: Lens | None
-) -> known_picture.Placement:
-    """Where the picture of a screen lies that is elsewhere now."""
-    n_columns = strips.inside.shape[0]
-    before, after = (geometry.column_middles(c, n_columns, lens) for c in (first.corners, corners))
-    first_row, row = first.map.first_row, strips.first_row
-    picture_row = geometry.rows_elsewhere(strips.rows, after, before) - np.float32(first_row)
-    frame_row = geometry.rows_elsewhere(first.rows, before, after) - np.float32(row)
-    return known_picture.Placement(picture_row, frame_row, strips.inside)

@@ -47,6 +47,7 @@ class ClipSettings:
     few_updates: int = 4
     #: Columns decided worse than this many times the foreseen variance do not fit what is known.
     misfit: float = 40.0
+    rest_misfit: float = 1.5
     #: Slots of lateness that are put right, contrast of headers, against full, below which nothing is known any more,
     #: and contrast of a frame below which compression has taken much of it.
     late_slots: float = 0.03

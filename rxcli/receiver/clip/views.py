@@ -23,6 +23,8 @@ class Pose:
     placement: Placement | None = None
     #: The strips on whose rows that picture is known; None for these.
     known_on: tracked.StripMap | None = None
+    #: (C, n) rows of the same points down every column as of the screen the picture is known of; None where that is it.
+    middles: FloatArray | None = None
 
     @property
     def home(self) -> tracked.StripMap:

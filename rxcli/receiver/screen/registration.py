@@ -56,6 +56,8 @@ _SOME_ROWS = 2
 #: Every so manieth row of cells tells whether a screen stands still; how far, in screen sizes, it and its corners may
 #: seem to have moved; and the share of the textures' correlation that must be left.
 _FEW_ROWS, _STILL_SHIFT, _STILL_CORNERS, _STILL_CORRELATION = 4, 0.0003, 0.0008, 0.97
+#: Cells across that a screen was at most from where it was expected, for the next to be looked for on fine cells alone.
+_FORESEEN_CELLS = 2.0
 #: Beyond how many standard deviations a cell is an outlier: a hand, a reflection.
 _OUTLIER = 2.5
 #: How far a frame may be from where it is expected, screen sizes: shift, affine modes, perspective modes.
@@ -144,9 +146,8 @@ class _Known:
 
 @dataclass(frozen=True, slots=True)
 class _AllKnown:
-    """What is known of the texture: of coarse cells, of fine ones, of these on some rows, and on a few."""
+    """What is known of the texture: of all cells, on some rows, and on a few."""
 
-    coarse: _Known
     fine: _Known
     some: _Known
     few: _Known
@@ -213,12 +214,15 @@ class ScreenTexture:
         #: Frames so far, and what they taught of the texture; None where it has to be worked out anew.
         self._n_frames = 0
         self._known_so_far: _AllKnown | None = None
+        self._coarse_so_far: _Known | None = None
         across, down = _COARSE_CELLS
         self._coarse_places = _Places.of(_middles(self._u, across), _middles(self._v, down))
         self._places = _Places.of(self._u, self._v)
         self._some_places, self._few_places = (_Places.of(self._u, self._v[::n]) for n in (_SOME_ROWS, _FEW_ROWS))
         #: Correlation of the textures when the screen was found last, all of them looked at.
         self._correlation = 1.0
+        #: How far the screen was from where it was expected, at most of its corners.
+        self._surprise_px = float("inf")
         self._read_last: tuple[Frame, _Texture] | None = None
         self._value: Float32Array = np.zeros((n_v, n_u), np.float32)
         self._weight: Float32Array = np.zeros((n_v, n_u), np.float32)
@@ -234,7 +238,27 @@ class ScreenTexture:
         if still is not None:
             return still
         expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
-        plane, _, _ = self._fit(_coarser(texture), known.coarse, (expected, expected), _COARSE_ITERATIONS)
+        found = self._near(texture, known.some, expected) or self._anywhere(texture, known, expected)
+        self._surprise_px = float(np.abs(found.corners - self._lens_of(expected)).max())
+        return found
+
+    def _near(self, texture: _Texture, some: _Known, expected: FloatArray) -> Registration | None:
+        """Where the screen is, if the last frame was about where it was expected and the textures agree as they did."""
+        if self._surprise_px > _FORESEEN_CELLS * self._cell_x or self._n_frames <= _FIRST_FRAMES:
+            return None
+        before = self._correlation
+        found = self._found(texture, some, (expected, expected), _FINE_ITERATIONS)
+        alike = found.correlation > max(_STILL_CORRELATION * before, _LEAST_CORRELATION)
+        if alike and found.tells:
+            return found
+        self._correlation = before
+        return None
+
+    def _anywhere(self, texture: _Texture, known: _AllKnown, expected: FloatArray) -> Registration:
+        """Where the screen is, on coarse cells first."""
+        if self._coarse_so_far is None:
+            self._coarse_so_far = self._known_coarsely()
+        plane, _, _ = self._fit(_coarser(texture), self._coarse_so_far, (expected, expected), _COARSE_ITERATIONS)
         if self._n_frames > _FIRST_FRAMES:
             found = self._found(texture, known.some, (plane, expected), _FINE_ITERATIONS)
             if found.tells:
@@ -282,7 +306,7 @@ class ScreenTexture:
         self._n_frames += 1
         if self._n_frames > _FIRST_FRAMES and self._n_frames % _LEARN_EVERY:
             return
-        self._known_so_far = None
+        self._known_so_far = self._coarse_so_far = None
         value, weight = self._read(self._texture_of(frame), self._plane, self._places)
         total = self._weight + weight
         self._value += (value - self._value) * (weight / np.maximum(total, np.float32(1e-6)))
@@ -290,14 +314,16 @@ class ScreenTexture:
 
     def _known(self) -> _AllKnown:
         """The texture so far."""
+        fine = _known(_Texture(self._value, self._weight, 1, 1), 1.0, self._places)
+        some, few = fine.every(_SOME_ROWS, self._some_places), fine.every(_FEW_ROWS, self._few_places)
+        return _AllKnown(fine, some, few)
+
+    def _known_coarsely(self) -> _Known:
+        """The texture so far, of coarse cells."""
         across, down = _COARSE_CELLS
-        texture = _Texture(self._value, self._weight, 1, 1)
         # Blurred means of so many cells have so much less noise.
         fewer = across * down * (1 + 4 * np.pi * _COARSE_BLUR**2) / 2
-        fine = _known(texture, 1.0, self._places)
-        coarse = _known(_coarser(texture), fewer, self._coarse_places)
-        some, few = fine.every(_SOME_ROWS, self._some_places), fine.every(_FEW_ROWS, self._few_places)
-        return _AllKnown(coarse, fine, some, few)
+        return _known(_coarser(_Texture(self._value, self._weight, 1, 1)), fewer, self._coarse_places)
 
     def _texture_of(self, frame: Frame) -> _Texture:
         """The texture of a frame; of the one that was asked for last, without reading it again."""

@@ -10,9 +10,6 @@ from rxcli.receiver.channel.known_picture.settings import SETTINGS
 from rxcli.receiver.light import SlotLight, exposure_shares, taken
 from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
-#: Slots beyond the grid that a position may reach.
-_BEYOND_SLOTS = 8
-
 
 def exposed(slots: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
     """Mean of the slots over the exposure, (C, R).
@@ -63,36 +60,69 @@ class Response:
     side: float = 0.0
     offset: float = 0.0
 
-    def expected(self, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
-        """(C, R) light that slots give; arguments as for `exposed`."""
-        groups = alike_columns(positions)
-        return np.concatenate(
-            [self._of_rows(lit[g], at, exposure_slots) for g, at in zip(groups, positions, strict=True)]
-        )
 
-    def _of_rows(self, lit: Float32Array, centre: FloatArray, exposure_slots: float) -> Float32Array:
-        """(C, R) light that slots give to rows at `centre` (R,)."""
-        reach = exposure_slots / 2 + (SETTINGS.side_slots if self.side else 0)
-        slots = np.floor(centre - reach).astype(np.intp)[:, None] + np.arange(int(np.ceil(2 * reach)) + 1)
-        share = shares_of_slots(centre, slots, exposure_slots, self)
-        beyond = _BEYOND_SLOTS
-        padded = np.pad(lit, ((0, 0), (beyond, beyond)), constant_values=np.float32(0.5))
-        slots = np.clip(slots + beyond, 0, padded.shape[1] - 1)
-        out = np.full((lit.shape[0], centre.size), self.offset, np.float32)
-        for place in range(slots.shape[1]):
-            out += share[:, place] * padded.take(slots[:, place], axis=1)
-        return out
+@dataclass(frozen=True, slots=True)
+class SlotView:
+    """What rows see of the slots around them, columns being alike."""
+
+    #: (R,) metric that each row belongs to.
+    metric: IntArray
+    #: (memory + 3, R) share of each of the slots metric - memory - 1 .. metric + 1 in a row's light: of those that the
+    #: metric is about, and of one to each side that a blur reaches.
+    share: Float32Array
+
+    @classmethod
+    def of(cls, centre: FloatArray, exposure_slots: float, isi_memory: int, response: Response) -> SlotView:
+        """Of rows whose exposure's centre is at `centre` (R,), slots."""
+        metric = np.floor(centre + isi_memory / 2).astype(np.int64)
+        place = (centre - metric).astype(np.float32)
+        slots = np.arange(-isi_memory - 1, 2, dtype=np.float32)[:, None]
+        share = response.centre * exposure_shares(place, slots, exposure_slots)
+        if response.side:
+            share += response.side * exposure_shares(place - np.float32(SETTINGS.side_slots), slots, exposure_slots)
+            share += response.side * exposure_shares(place + np.float32(SETTINGS.side_slots), slots, exposure_slots)
+        return cls(metric, np.asarray(share, np.float32))
+
+    def light(self, lit: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """(C, R) each: light of the slots `lit` (C, N) that the metrics are about, and of those beside them."""
+        n_slots, reach = lit.shape[1], len(self.share)
+        padded = np.full((len(lit), n_slots + 2 * reach), 0.5, np.float32)
+        padded[:, reach : reach + n_slots] = lit
+        first = np.clip(self.metric + 2, 0, n_slots + reach)
+        parts = [padded.take(first + place, axis=1) * share for place, share in enumerate(self.share)]
+        return sum(parts[2:-1], parts[1]), parts[0] + parts[-1]
 
 
-def alike_columns(positions: FloatArray) -> list[slice]:
-    """The columns that each row of `positions`, (C, R) or (1, R), is for."""
-    return [slice(None)] if len(positions) == 1 else [slice(c, c + 1) for c in range(len(positions))]
+@dataclass(frozen=True, slots=True)
+class ExpectedLight:
+    """What slots give by a response."""
+
+    #: (C, R) of all of it, and of what the metrics of a row are not about.
+    light: Float32Array
+    beside: Float32Array
+    #: The columns that are alike, and what their rows see.
+    views: list[tuple[slice, SlotView]]
 
 
-def shares_of_slots(centre: FloatArray, slots: IntArray, exposure_slots: float, response: Response) -> Float32Array:
-    """(R, n) share of each of the `slots` (R, n) in what a row at `centre` (R,) sees."""
-    share = response.centre * exposure_shares(centre[:, None], slots, exposure_slots)
-    if response.side:
-        share += response.side * exposure_shares((centre - SETTINGS.side_slots)[:, None], slots, exposure_slots)
-        share += response.side * exposure_shares((centre + SETTINGS.side_slots)[:, None], slots, exposure_slots)
-    return np.asarray(share, np.float32)
+def expected_light(
+    lit: Float32Array, positions: FloatArray, exposure_slots: float, isi_memory: int, response: Response
+) -> ExpectedLight:
+    """Light that slots give to rows.
+
+    Args:
+        lit: (C, N) probability that each slot is lit; half lit beyond.
+        positions: (C, R) or (1, R) exposure's centre in slots.
+        exposure_slots: exposure in slots.
+        isi_memory: slots of memory that metrics have.
+        response: what becomes of the exposed slots.
+    """
+    n_columns = len(lit) if len(positions) == 1 else 1
+    groups = [slice(first, first + n_columns) for first in range(0, len(lit), n_columns)]
+    views = [
+        (group, SlotView.of(centre, exposure_slots, isi_memory, response))
+        for group, centre in zip(groups, positions, strict=True)
+    ]
+    lights = [view.light(lit[group]) for group, view in views]
+    own, beside = (np.concatenate(parts) for parts in zip(*lights, strict=True))
+    beside += np.float32(response.offset)
+    return ExpectedLight(own + beside, beside, views)

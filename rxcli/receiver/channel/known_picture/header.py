@@ -26,8 +26,8 @@ def first_decision(observed: ColumnLight, positions: FloatArray, clock: Clock) -
     step = positions[:, -1:] - positions[:, :1]
     rows = (middles - positions[:, :1]) * ((positions.shape[1] - 1) / step) + 0.5
     reach = 0.35 * clock.rows_per_slot
-    llr = read_between(total, rows + reach) - read_between(total, rows - reach)
-    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * llr), np.float32)
+    before, after = np.split(read_between(total, np.concatenate([rows - reach, rows + reach], axis=1)), 2, axis=1)
+    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * (after - before)), np.float32)
 
 
 def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) -> float:

@@ -44,8 +44,6 @@ class Placement:
 
     #: (C, R) row of the picture that each row of the frame shows.
     picture_row: Float32Array
-    #: (C, P) row of the frame that shows each row of the picture.
-    frame_row: Float32Array
     #: (C, S, R) bool: the strip is on the screen there.
     inside: BoolArray
 
@@ -59,8 +57,10 @@ class Look:
     #: (C, R) exposure-averaged slots, 0..1, and how far each is trusted.
     slots: Float32Array
     trust: Float32Array
-    #: Where the frame shows the picture; None for where the first one did.
+    #: Where the frame shows the picture, and (C, P) its row that shows each row of the picture; None where it is
+    #: where the first one did.
     placement: Placement | None = None
+    frame_row: Float32Array | None = None
     #: (R,) the rows that are meant; None for all.
     rows: BoolArray | None = None
 
@@ -92,6 +92,8 @@ class KnownPicture:
         self._of_one: Float32Array | None = None
         #: The picture and its relative variance as they were made of what is known; None where that changed since.
         self._made: tuple[Float32Array, Float32Array] | None = None
+        #: Where it was asked for last, and the picture there.
+        self._placed: tuple[Placement, KnownPicture] | None = None
         #: (C,) variance of the columns' light over what was foreseen.
         self._excess = np.ones(inside.shape[0], np.float32)
 
@@ -102,11 +104,16 @@ class KnownPicture:
         """
         if placement is None:
             return self
+        if self._placed is None or self._placed[0] is not placement:
+            self._placed = placement, self._moved(placement)
+        return self._placed[1]
+
+    def _moved(self, placement: Placement) -> KnownPicture:
         other = copy(self)
         picture, error = (_resampled(values, placement.picture_row, beyond=False) for values in self.picture())
         other._made = picture, error
         other._inside = placement.inside.astype(np.float32)
-        other._system = other._of_one = None
+        other._system = other._of_one = other._placed = None
         return other
 
     def learn(self, look: Look, *, forget: bool = True) -> None:
@@ -115,7 +122,7 @@ class KnownPicture:
         keep = np.float32(SETTINGS.memory_share if forget else 1.0)
         self._light = self._light * keep + lit
         self._observed = self._observed * keep + observed
-        self._system = self._made = None
+        self._system = self._made = self._placed = None
 
     def without(self, looks: Sequence[Look]) -> KnownPicture:
         """What is known but for some looks, that were learned with nothing forgotten since.
@@ -126,7 +133,8 @@ class KnownPicture:
         for look in looks:
             lit, observed = self._update_of(look)
             other._light, other._observed = other._light - lit, np.maximum(other._observed - observed, 0)
-        other._system, other._made, other._excess = None, None, self._excess.copy()
+        other._system = other._made = other._placed = None
+        other._excess = self._excess.copy()
         return other
 
     def _update_of(self, look: Look) -> tuple[Float32Array, Float32Array]:
@@ -142,9 +150,9 @@ class KnownPicture:
         if look.rows is not None:
             weighted *= look.rows
         lit, observed = weighted * (look.light - self._black_level), weighted * expected
-        if placement is None:
+        row = look.frame_row
+        if row is None:
             return lit, observed
-        row = placement.frame_row
         return _resampled(lit, row, beyond=True), _resampled(observed, row, beyond=True)
 
     def solve(self, light: Float32Array) -> ColumnLight:
@@ -194,38 +202,39 @@ class KnownPicture:
         shrunk = _solve(system, right)
         precision = np.maximum(system.precision - prior, 0)
         value = shrunk + (shrunk - np.float32(0.5)) * (prior / np.maximum(precision, np.float32(1e-3)))
-        return ColumnLight(value, self._tempered(value, precision), shrunk)
+        return ColumnLight(value, self._tempered(precision), shrunk)
 
     def judge(
-        self, observed: ColumnLight, expected: Float32Array, share: float, rows_per_slot: float
-    ) -> tuple[ColumnLight, float]:
+        self, observed: ColumnLight, expected: Float32Array, most: float, share: float, rows_per_slot: float
+    ) -> ColumnLight | None:
         """Compare columns with what was decided; they are trusted accordingly, now and, in part, from now on.
 
         Args:
             observed: as `solve` gave it.
             expected: (C, R) what the decided slots give.
+            most: squared error over the variance foreseen, median over the columns, of a frame that fits.
             share: weight of this frame against those before, 0..1.
             rows_per_slot: rows per slot.
 
         Returns:
-            The light with its precision put right; and the median over the columns of the squared error over the
-            variance foreseen.
+            The light with its precision put right; None, and nothing is learned of it, where the frame does not fit.
         """
         error = np.square(observed.value - expected) * observed.precision
-        seen = np.maximum((observed.precision > 0).sum(axis=1), 1)
-        ratio = error.sum(axis=1) / seen / np.float32(SETTINGS.row_information)
-        now = np.clip(self._excess * ratio, 0.25, 100.0)
-        self._excess += np.float32(share) * (now - self._excess)
+        # And one row that errs as foreseen, for columns of which nothing is seen.
+        n_seen = np.count_nonzero(observed.precision, axis=1).astype(np.float32)
+        ratio = (error.sum(axis=1) + 1) / (n_seen + 1)
+        if np.median(ratio) > most:
+            return None
+        self._excess *= 1 + np.float32(share) * (ratio - 1)
         precision = observed.precision / np.maximum(ratio, 0.5)[:, None]
         precision /= _alike(observed.value - expected, precision, rows_per_slot)[:, None]
-        return ColumnLight(observed.value, precision, observed.shrunk), float(np.median(ratio))
+        return ColumnLight(observed.value, precision, observed.shrunk)
 
-    def _tempered(self, value: Float32Array, precision: Float32Array) -> Float32Array:
-        variance = self._excess[:, None] / np.maximum(precision, np.float32(1e-6))
-        variance += np.float32(SETTINGS.common_error**2)
-        beyond = np.maximum(np.abs(value - np.float32(0.5)) - np.float32(0.5 + SETTINGS.beyond_light), 0)
-        variance += 4 * beyond * beyond
-        return np.where(precision > 1e-3, np.float32(SETTINGS.row_information) / variance, np.float32(0))
+    def _tempered(self, precision: Float32Array) -> Float32Array:
+        """Precisions by what was found of the columns' noise; 0 where next to nothing is seen."""
+        tempered = precision / (self._excess[:, None] + np.float32(SETTINGS.common_error**2) * precision)
+        tempered[precision <= 1e-3] = 0
+        return np.asarray(tempered, np.float32)
 
     def picture(self) -> tuple[Float32Array, Float32Array]:
         """The picture and its relative variance, (C, S, R) each."""
@@ -286,7 +295,7 @@ def _alike(error: Float32Array, precision: Float32Array, rows_per_slot: float) -
     shape = len(error), error.shape[1] // n, n
     weight = precision[:, : shape[1] * n].reshape(shape)
     total = np.einsum("csr,csr->cs", weight, error[:, : shape[1] * n].reshape(shape))
-    foreseen = weight.sum(axis=2)
+    foreseen = np.einsum("csr->cs", weight)
     told = foreseen > SETTINGS.told_precision
     # Means, not medians: with medians a clip of 4 surely wrong packets of 91 has 19 of 102.
     squared = np.sum(np.square(total) / np.maximum(foreseen, SETTINGS.told_precision), axis=1, where=told)

@@ -33,8 +33,6 @@ class KnownPictureSettings:
     seen_error: float = 0.03
     #: A slot's light is at 0.5 with this precision before anything is seen.
     prior_precision: float = 4.0
-    #: Rows of a slot err alike; their log-likelihoods count this much.
-    row_information: float = 0.5
     #: Error of a column's light, in parts of full light, that no pooling removes.
     common_error: float = 0.04
     #: Slots around, in each direction, over which a strip's error is averaged, and those of them left out as its own.
@@ -45,8 +43,6 @@ class KnownPictureSettings:
     told_precision: float = 0.5
     like_others_slots: float = 20.0
     least_alike_error: float = 0.9
-    #: A column's light further than this beyond dark or lit is not to be trusted.
-    beyond_light: float = 0.15
 
     #: What is possible of a response in the middle, at a side, and of its offset; and how much less is likelier.
     response_bounds: tuple[tuple[float, float], ...] = ((0.3, 1.3), (-0.1, 0.35), (-0.2, 0.2))
