@@ -293,7 +293,7 @@ def test_rows_against_the_readout_are_turned_and_back() -> None:
 
 
 CAPTURES = [
-    ("phone_coffee_8k65", "paper-8k65", 20, 18),
+    ("phone_coffee_8k65", "paper-8k65", 20, 17),
     ("phone_astronaut_17k3", "paper-17k3", 20, 15),
     ("phone_motorcycle_17k3_near", "paper-17k3", 20, 19),
 ]
