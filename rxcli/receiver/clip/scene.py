@@ -279,11 +279,9 @@ class TrackedScreen:
         """Clock, response and noise put right by a first decision slot by slot; then positions and likelihoods.
 
         Not `thorough` is enough of faded frames that will be measured again.
-        None where the headers are not where the clock has them: another scene, or something in front of the screen.
+        None where the light does not fit what was decided: another scene, or something in front of the screen.
         """
         positions, exposure_slots = known_picture.row_positions(rows, clock), clock.exposure_slots
-        if known_picture.header_contrast(flat, positions, clock) < SETTINGS.least_header:
-            return None
         for _ in range(SETTINGS.retimings):
             lit = known_picture.first_decision(flat, positions, clock) if known is None else known
             slots = known_picture.exposures(lit, positions, exposure_slots)
@@ -312,15 +310,30 @@ class TrackedScreen:
     def _clock(
         self, frame: Frame, flat: known_picture.ColumnLight, old: Clock, time: tracking.LinkTime
     ) -> Clock | None:
-        """The clock of the frame: from its headers where they are about as foretold, else as foretold."""
+        """The clock of the frame: from its headers where they are about as foretold, else as foretold.
+
+        None where headers do not show: another scene, or something in front of the screen.
+        """
         rows = self.rows
         n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
         predicted = time.clock_at(frame.index, frame.time_s, old, n_slots, float(rows[0]) - 0.5)
         contrast = self._header(flat, predicted) if predicted is not None else 0.0
         if predicted is not None and contrast < SETTINGS.plain_header:
             predicted, contrast = self._shifted(flat, predicted, contrast)
-        if contrast > SETTINGS.good_header:
-            return predicted
+        if contrast <= SETTINGS.good_header:
+            predicted, contrast = self._searched(flat, old, time, predicted, contrast)
+        return predicted if contrast >= SETTINGS.least_header else None
+
+    def _searched(
+        self,
+        flat: known_picture.ColumnLight,
+        old: Clock,
+        time: tracking.LinkTime,
+        predicted: Clock | None,
+        contrast: float,
+    ) -> tuple[Clock | None, float]:
+        """The clock by its headers, wherever they are, if they show better there than the contrast of the predicted."""
+        rows = self.rows
         profiles = RowProfiles(
             light=flat.shrunk[:, None],
             inside=np.asarray(self.pose.map.inside.any(axis=1, keepdims=True)),
@@ -332,11 +345,12 @@ class TrackedScreen:
         )
         found = sync.find_clock(profiles, old.rows_per_slot, old.exposure_slots, old.packet_slots, 0.03)
         if found is None:
-            return predicted
+            return predicted, contrast
         found = replace(found, delay_slots=old.delay_slots)
         if predicted is not None and _apart(found, predicted) > time.sure_slots:
-            return predicted
-        return found if self._header(flat, found) > contrast + SETTINGS.better_header else predicted
+            return predicted, contrast
+        here = self._header(flat, found)
+        return (found, here) if here > contrast + SETTINGS.better_header else (predicted, contrast)
 
     def _shifted(self, flat: known_picture.ColumnLight, clock: Clock, contrast: float) -> tuple[Clock, float]:
         """The clock, shifted to where its headers show plainly better, and their contrast.
@@ -442,6 +456,8 @@ class TrackedScreen:
         picture = self._picture.without(own).placed(view.pose.placement)
         flat = picture.solve(view.light)
         clock, rows, most = view.bursts.clock, view.pose.rows, SETTINGS.misfit
+        if known_picture.header_contrast(flat, known_picture.row_positions(rows, clock), clock) < SETTINGS.least_header:
+            return
         refined = self._refined(picture, rows, view.light, flat, clock, view.isi_memory, most, True, known)
         if refined is not None:
             burst = view.bursts.clock.burst

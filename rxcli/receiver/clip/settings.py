@@ -89,7 +89,7 @@ class ClipSettings:
     like_doubt: float = 0.65
     #: Pixels of which one is compared with the frame before; least change from row to row, grey levels of 255, and
     #: share of it that a frame shown twice differs from itself.
-    same_step: int = 7
+    same_step: int = 15
     same_contrast: float = 3.0
     same_share: float = 0.25
     #: Frames in a row that may be received like photographs before the picture is learned anew.
@@ -100,6 +100,8 @@ class ClipSettings:
     readout_slack: float = 1.1
     #: Frames that find their clock together where each shows little.
     frames_together: int = 8
+    #: Frames that are reported together where nobody asks for results promptly.
+    reports_together: int = 4
     #: Frames that may wait until it is clear which copies begin a burst.
     most_waiting: int = 8
 
