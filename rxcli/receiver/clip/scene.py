@@ -14,7 +14,7 @@ from rxcli.receiver.channel import SlotLikelihoods, known_picture
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import Pose, View
 from rxcli.receiver.context import Camera, FrameContext, Timer
-from rxcli.receiver.light import Crosstalk, NoiseModel
+from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.sampling import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
@@ -107,7 +107,7 @@ class TrackedScreen:
 
     def is_at(self, corners: FloatArray) -> bool:
         """Whether a screen found at the corners may not have moved at all."""
-        return bool(np.abs(corners - self.corners).max() < SETTINGS.still_outline * np.ptp(self.corners[:, 0]))
+        return bool(np.abs(corners - self.corners).max() < SETTINGS.same_outline * np.ptp(self.corners[:, 0]))
 
     def _follow(self, frame: Frame) -> bool:
         """Find where the screen is in a frame, by the picture on it; returns whether that is certain."""
@@ -286,7 +286,7 @@ class TrackedScreen:
             lit = known_picture.first_decision(flat, positions, clock) if known is None else known
             slots = known_picture.exposures(lit, positions, exposure_slots)
             fit = known_picture.fit_response(flat, slots)
-            if abs(fit.drift) <= SETTINGS.drift_slots:
+            if abs(fit.drift) <= SETTINGS.late_slots:
                 break
             clock = _retimed(clock, rows, fit)
             positions = known_picture.row_positions(rows, clock)
@@ -365,7 +365,7 @@ class TrackedScreen:
                 if here < most:
                     break
                 best, most = shifted, here
-        plain = most > max(contrast + SETTINGS.plainly_better, SETTINGS.plain_header)
+        plain = most > max(contrast + SETTINGS.better_header, SETTINGS.plain_header)
         return (best, most) if plain else (clock, contrast)
 
     def _header(self, flat: known_picture.ColumnLight, clock: Clock) -> float:
@@ -396,7 +396,7 @@ class TrackedScreen:
         self._n_updates += 1
         clock = view.bursts.clock
         positions = known_picture.row_positions(view.pose.rows, clock)
-        slots = known_picture.exposed(lit, positions, clock.exposure_slots)
+        slots = SlotLight(lit).seen(positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
         look = known_picture.Look(view.light, slots, trust, view.pose.placement, self._frame_rows(view.pose))
         self._picture.learn(look, forget=forget)

@@ -226,7 +226,7 @@ class KnownPicture:
         if np.median(ratio) > most:
             return None
         self._excess *= 1 + np.float32(share) * (ratio - 1)
-        precision = observed.precision / np.maximum(ratio, 0.5)[:, None]
+        precision = observed.precision / ratio[:, None]
         precision /= _alike(observed.value - expected, precision, rows_per_slot)[:, None]
         return ColumnLight(observed.value, precision, observed.shrunk)
 
