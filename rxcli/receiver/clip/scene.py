@@ -194,13 +194,10 @@ class TrackedScreen:
     def _move(self, frame: Frame, found: Registration) -> None:
         n_columns, n_strips, _ = self._first_pose.map.inside.shape
         corners = found.corners
-        outlines = geometry.column_outlines(
-            corners, n_columns, n_strips, frame.width, frame.height, self._lens, quick=True
-        )
+        outlines, middles = geometry.quick_outlines(corners, n_columns, n_strips, frame.width, frame.height, self._lens)
         sd = float(np.sqrt(np.diag(found.covariance)[1::2].max()))
         outlines = replace(outlines, inside=_less_ends(outlines.inside, SETTINGS.least_end + sd))
         strips = tracked.moved_map(self._first_pose.map, outlines)
-        middles = geometry.column_middles(corners, n_columns, self._lens)
         picture_row = geometry.rows_elsewhere(strips.rows, middles, self._first_middles)
         picture_row -= np.float32(self._first_pose.map.first_row)
         placement = known_picture.Placement(picture_row, strips.inside)

@@ -238,17 +238,16 @@ class ScreenTexture:
         if still is not None:
             return still
         expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
-        found = self._near(texture, known, expected) or self._anywhere(texture, known, expected)
+        found = self._near(texture, known.some, expected) or self._anywhere(texture, known, expected)
         self._surprise_px = float(np.abs(found.corners - self._lens_of(expected)).max())
         return found
 
-    def _near(self, texture: _Texture, known: _AllKnown, expected: FloatArray) -> Registration | None:
+    def _near(self, texture: _Texture, some: _Known, expected: FloatArray) -> Registration | None:
         """Where the screen is, if the last frame was about where it was expected and the textures agree as they did."""
         if self._surprise_px > _FORESEEN_CELLS * self._cell_x or self._n_frames <= _FIRST_FRAMES:
             return None
         before = self._correlation
-        plane, _, _ = self._fit(texture, known.few, (expected, expected), 1)
-        found = self._found(texture, known.some, (plane, expected), _FINE_ITERATIONS - 1)
+        found = self._found(texture, some, (expected, expected), _FINE_ITERATIONS)
         alike = found.correlation > max(_STILL_CORRELATION * before, _LEAST_CORRELATION)
         if alike and found.tells:
             return found
