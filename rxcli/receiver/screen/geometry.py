@@ -156,7 +156,7 @@ def quick_outlines(
 ) -> tuple[Outlines, FloatArray]:
     """As `column_outlines` and `column_middles`, from the columns' borders alone.
 
-    Strips lie evenly between the borders: off by hundredths of a pixel, a few tenths at the upper and lower ends.
+    Strips lie evenly between the borders: off by hundredths of a strip.
     Arguments as for `column_outlines`.
     """
     u, v = np.linspace(0, 1, n_columns + 1), np.linspace(-_OVERHANG, 1 + _OVERHANG, _MIDDLE_POINTS)
