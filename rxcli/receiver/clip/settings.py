@@ -55,7 +55,7 @@ class ClipSettings:
     #: Slots of lateness that are put right, of the clock and of its drift from halfway down to the last row: rows that
     #: are instants drift by 0.02 at most, those that a camera has stretched to hold a picture still by 0.1 to 0.4. How
     #: often such rows are timed anew.
-    late_slots: float = 0.04
+    late_slots: float = 0.03
     retimings: int = 4
     #: Share of a frame's noise, and of its rows per slot, in what is expected of the next.
     frame_share: float = 0.2
