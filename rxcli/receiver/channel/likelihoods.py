@@ -31,7 +31,7 @@ class SlotLikelihoods:
 
     #: (C, N + memory, patterns) float64: log-likelihood of every pattern of slots n - memory .. n.
     metrics: FloatArray
-    #: (C, N) float32: (lit minus dark) squared over the noise's variance, of a slot.
+    #: (C, N) float32: (lit minus dark) squared over the noise's variance, of a slot; (C, 1) where all are taken alike.
     snr: Float32Array
     #: (C, 2) float64: correlation of the residual with its change by the clock, and that change's power; their ratio is
     #: how many slots the column's clock is late. Empty where the clock was put right before.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -298,10 +298,11 @@ class _Clip:
         return done + self._finish()
 
     def _finish(self) -> list[FrameResult]:
+        if self._link is not None:
+            self._settle_bursts()
         if self._n_held:
-            self._settle()
             self._receive_first_again(at_last=True)
-        done = self._settle()
+        done = self._ready(at_last=True)
         done += [self._report(waiting, None) for waiting in self._waiting]
         self._waiting.clear()
         return done
@@ -601,11 +602,6 @@ class _Clip:
         copies = clock.to_copies(llr).transpose(1, 0, 2) * (view.bursts.shown > 0)
         self._link.phase.take(view.bursts.first_copy, np.asarray(copies, np.float64))
 
-    def _settle(self) -> list[FrameResult]:
-        if self._link is not None:
-            self._settle_bursts()
-        return self._ready()
-
     def _settle_bursts(self) -> None:
         """Enter all frames that waited for the phase of the bursts."""
         for waiting in self._waiting:
@@ -683,21 +679,30 @@ class _Clip:
 
     # -- results ---------------------------------------------------------------------------------------------------
 
-    def _ready(self) -> list[FrameResult]:
-        """Results of the frames whose bursts all ended, oldest first."""
-        done: list[FrameResult] = []
-        if self._n_held:
-            return done
-        while self._waiting:
-            first = self._waiting[0]
-            if first.view is not None:
-                if first.numbers is None or len(self._waiting) < 2:
-                    break
-                if self._waiting[1].view is not None and self._waiting[1].numbers is None:
-                    break
-            self._waiting.popleft()
+    def _ready(self, at_last: bool = False) -> list[FrameResult]:
+        """Results of the frames whose bursts all ended, oldest first: of some together, for that takes less time each,
+        unless it is `at_last` or results are wanted promptly."""
+        n_ended = 0 if self._n_held else self._n_ended()
+        if n_ended < (1 if at_last or self._options.prompt else SETTINGS.reports_together):
+            return []
+        seen = [w for w in islice(self._waiting, n_ended) if w.view is not None]
+        self._bursts.detect_stale(*seen)
+        done = []
+        for _ in range(n_ended):
+            first = self._waiting.popleft()
             done.append(self._report(first, self._waiting[0] if self._waiting else None))
         return done
+
+    def _n_ended(self) -> int:
+        """How many of the frames that wait, from the oldest on, can be reported."""
+        for place, first in enumerate(self._waiting):
+            if first.view is not None:
+                following = self._waiting[place + 1] if place + 1 < len(self._waiting) else None
+                if following is None or first.numbers is None:
+                    return place
+                if following.view is not None and following.numbers is None:
+                    return place
+        return len(self._waiting)
 
     def _report(self, waiting: Waiting, following: Waiting | None) -> FrameResult:
         view, bursts = waiting.view, self._bursts

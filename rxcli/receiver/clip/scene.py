@@ -14,7 +14,7 @@ from rxcli.receiver.channel import SlotLikelihoods, known_picture
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import Pose, View
 from rxcli.receiver.context import Camera, FrameContext, Timer
-from rxcli.receiver.light import Crosstalk, NoiseModel
+from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.sampling import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
@@ -107,7 +107,7 @@ class TrackedScreen:
 
     def is_at(self, corners: FloatArray) -> bool:
         """Whether a screen found at the corners may not have moved at all."""
-        return bool(np.abs(corners - self.corners).max() < SETTINGS.still_outline * np.ptp(self.corners[:, 0]))
+        return bool(np.abs(corners - self.corners).max() < SETTINGS.same_outline * np.ptp(self.corners[:, 0]))
 
     def _follow(self, frame: Frame) -> bool:
         """Find where the screen is in a frame, by the picture on it; returns whether that is certain."""
@@ -194,13 +194,10 @@ class TrackedScreen:
     def _move(self, frame: Frame, found: Registration) -> None:
         n_columns, n_strips, _ = self._first_pose.map.inside.shape
         corners = found.corners
-        outlines = geometry.column_outlines(
-            corners, n_columns, n_strips, frame.width, frame.height, self._lens, quick=True
-        )
+        outlines, middles = geometry.quick_outlines(corners, n_columns, n_strips, frame.width, frame.height, self._lens)
         sd = float(np.sqrt(np.diag(found.covariance)[1::2].max()))
         outlines = replace(outlines, inside=_less_ends(outlines.inside, SETTINGS.least_end + sd))
         strips = tracked.moved_map(self._first_pose.map, outlines)
-        middles = geometry.column_middles(corners, n_columns, self._lens)
         picture_row = geometry.rows_elsewhere(strips.rows, middles, self._first_middles)
         picture_row -= np.float32(self._first_pose.map.first_row)
         placement = known_picture.Placement(picture_row, strips.inside)
@@ -279,16 +276,14 @@ class TrackedScreen:
         """Clock, response and noise put right by a first decision slot by slot; then positions and likelihoods.
 
         Not `thorough` is enough of faded frames that will be measured again.
-        None where the headers are not where the clock has them: another scene, or something in front of the screen.
+        None where the light does not fit what was decided: another scene, or something in front of the screen.
         """
         positions, exposure_slots = known_picture.row_positions(rows, clock), clock.exposure_slots
-        if known_picture.header_contrast(flat, positions, clock) < SETTINGS.least_header:
-            return None
         for _ in range(SETTINGS.retimings):
             lit = known_picture.first_decision(flat, positions, clock) if known is None else known
             slots = known_picture.exposures(lit, positions, exposure_slots)
             fit = known_picture.fit_response(flat, slots)
-            if abs(fit.drift) <= SETTINGS.drift_slots:
+            if abs(fit.drift) <= SETTINGS.late_slots:
                 break
             clock = _retimed(clock, rows, fit)
             positions = known_picture.row_positions(rows, clock)
@@ -312,15 +307,30 @@ class TrackedScreen:
     def _clock(
         self, frame: Frame, flat: known_picture.ColumnLight, old: Clock, time: tracking.LinkTime
     ) -> Clock | None:
-        """The clock of the frame: from its headers where they are about as foretold, else as foretold."""
+        """The clock of the frame: from its headers where they are about as foretold, else as foretold.
+
+        None where headers do not show: another scene, or something in front of the screen.
+        """
         rows = self.rows
         n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
         predicted = time.clock_at(frame.index, frame.time_s, old, n_slots, float(rows[0]) - 0.5)
         contrast = self._header(flat, predicted) if predicted is not None else 0.0
         if predicted is not None and contrast < SETTINGS.plain_header:
             predicted, contrast = self._shifted(flat, predicted, contrast)
-        if contrast > SETTINGS.good_header:
-            return predicted
+        if contrast <= SETTINGS.good_header:
+            predicted, contrast = self._searched(flat, old, time, predicted, contrast)
+        return predicted if contrast >= SETTINGS.least_header else None
+
+    def _searched(
+        self,
+        flat: known_picture.ColumnLight,
+        old: Clock,
+        time: tracking.LinkTime,
+        predicted: Clock | None,
+        contrast: float,
+    ) -> tuple[Clock | None, float]:
+        """The clock by its headers, wherever they are, if they show better there than the contrast of the predicted."""
+        rows = self.rows
         profiles = RowProfiles(
             light=flat.shrunk[:, None],
             inside=np.asarray(self.pose.map.inside.any(axis=1, keepdims=True)),
@@ -332,11 +342,12 @@ class TrackedScreen:
         )
         found = sync.find_clock(profiles, old.rows_per_slot, old.exposure_slots, old.packet_slots, 0.03)
         if found is None:
-            return predicted
+            return predicted, contrast
         found = replace(found, delay_slots=old.delay_slots)
         if predicted is not None and _apart(found, predicted) > time.sure_slots:
-            return predicted
-        return found if self._header(flat, found) > contrast + SETTINGS.better_header else predicted
+            return predicted, contrast
+        here = self._header(flat, found)
+        return (found, here) if here > contrast + SETTINGS.better_header else (predicted, contrast)
 
     def _shifted(self, flat: known_picture.ColumnLight, clock: Clock, contrast: float) -> tuple[Clock, float]:
         """The clock, shifted to where its headers show plainly better, and their contrast.
@@ -351,7 +362,7 @@ class TrackedScreen:
                 if here < most:
                     break
                 best, most = shifted, here
-        plain = most > max(contrast + SETTINGS.plainly_better, SETTINGS.plain_header)
+        plain = most > max(contrast + SETTINGS.better_header, SETTINGS.plain_header)
         return (best, most) if plain else (clock, contrast)
 
     def _header(self, flat: known_picture.ColumnLight, clock: Clock) -> float:
@@ -382,7 +393,7 @@ class TrackedScreen:
         self._n_updates += 1
         clock = view.bursts.clock
         positions = known_picture.row_positions(view.pose.rows, clock)
-        slots = known_picture.exposed(lit, positions, clock.exposure_slots)
+        slots = SlotLight(lit).seen(positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
         look = known_picture.Look(view.light, slots, trust, view.pose.placement, self._frame_rows(view.pose))
         self._picture.learn(look, forget=forget)
@@ -442,6 +453,8 @@ class TrackedScreen:
         picture = self._picture.without(own).placed(view.pose.placement)
         flat = picture.solve(view.light)
         clock, rows, most = view.bursts.clock, view.pose.rows, SETTINGS.misfit
+        if known_picture.header_contrast(flat, known_picture.row_positions(rows, clock), clock) < SETTINGS.least_header:
+            return
         refined = self._refined(picture, rows, view.light, flat, clock, view.isi_memory, most, True, known)
         if refined is not None:
             burst = view.bursts.clock.burst

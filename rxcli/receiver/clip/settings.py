@@ -31,10 +31,9 @@ class ClipSettings:
     #: How often a still outline is looked for where the picture does not tell, and looks that make it still.
     look_every: int = 8
     still_looks: int = 3
-    #: In screen widths: how far an outline may be from where the screen was to be there still; how far from the first
-    #: that was; and how far it may move from one frame to the next to be found.
-    still_outline: float = 0.004
-    same_outline: float = 0.006
+    #: In screen widths: how far an outline may be from where the screen was to be there still, and how far it may move
+    #: from one frame to the next to be found.
+    same_outline: float = 0.005
     outline_reach: float = 0.02
     #: How much of its shape an outline may lose or win between two looks, in screen widths.
     bent_outline: float = 0.012
@@ -45,30 +44,29 @@ class ClipSettings:
     update_every: int = 6
     #: Frames of which the picture is known so little that strips are compared with what is expected of them.
     few_updates: int = 4
-    #: Columns decided worse than this many times the foreseen variance do not fit what is known.
+    #: Columns decided worse than this many times the foreseen variance do not fit what is known; and of a screen
+    #: that is taken to rest: while it does 0.8 to 1.3 times, 2 pixels away 2 times and more.
     misfit: float = 40.0
     rest_misfit: float = 1.5
-    #: Slots of lateness that are put right, contrast of headers, against full, below which nothing is known any more,
-    #: and contrast of a frame below which compression has taken much of it.
-    late_slots: float = 0.03
+    #: Contrast of headers, against full, below which nothing is known any more, and contrast of a frame below which
+    #: compression has taken much of it.
     least_header: float = 0.3
     faded: float = 0.85
-    #: Slots that a clock may drift from halfway down to the last row: rows that are instants drift by 0.02 at most,
-    #: those that a camera has stretched to hold a picture still by 0.1 to 0.4. How often such rows are timed anew.
-    drift_slots: float = 0.05
+    #: Slots of lateness that are put right, of the clock and of its drift from halfway down to the last row: rows that
+    #: are instants drift by 0.02 at most, those that a camera has stretched to hold a picture still by 0.1 to 0.4. How
+    #: often such rows are timed anew.
+    late_slots: float = 0.03
     retimings: int = 4
     #: Share of a frame's noise, and of its rows per slot, in what is expected of the next.
     frame_share: float = 0.2
     #: Contrast of its headers at which the foretold clock is not doubted.
     good_header: float = 0.6
-    #: Contrast of its headers from which a foretold clock needs no shift; step and number of shifts tried, slots; and
-    #: how much better headers must show for one.
+    #: Contrast of its headers from which a foretold clock needs no shift; and step and number of shifts tried, slots.
     plain_header: float = 0.8
     header_shift: float = 0.3
     most_shifts: int = 5
-    plainly_better: float = 0.1
     #: How much better its headers must show for a clock to be taken instead of the foretold one.
-    better_header: float = 0.05
+    better_header: float = 0.1
     #: Variance of a strip's light, at least: that of a starved clip's dark parts is none.
     least_noise: float = 1e-7
 
@@ -89,7 +87,7 @@ class ClipSettings:
     like_doubt: float = 0.65
     #: Pixels of which one is compared with the frame before; least change from row to row, grey levels of 255, and
     #: share of it that a frame shown twice differs from itself.
-    same_step: int = 7
+    same_step: int = 15
     same_contrast: float = 3.0
     same_share: float = 0.25
     #: Frames in a row that may be received like photographs before the picture is learned anew.
@@ -100,6 +98,8 @@ class ClipSettings:
     readout_slack: float = 1.1
     #: Frames that find their clock together where each shows little.
     frames_together: int = 8
+    #: Frames that are reported together where nobody asks for results promptly.
+    reports_together: int = 4
     #: Frames that may wait until it is clear which copies begin a burst.
     most_waiting: int = 8
 

@@ -46,7 +46,7 @@ class View:
     bursts: FrameBursts
     isi_memory: int
     height: int
-    #: (C, N) squared contrast over variance of every slot.
+    #: (C, N) squared contrast over variance of every slot; (C, 1) of a tracked frame.
     snr: Float32Array
     #: Columns that the auto-encoder changed.
     denoised: frozenset[int] = field(default_factory=frozenset)

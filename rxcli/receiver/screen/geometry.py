@@ -132,8 +132,6 @@ def column_outlines(
     height: int,
     lens: Lens | None = None,
     columns: slice | None = None,
-    *,
-    quick: bool = False,
 ) -> Outlines:
     """Outlines of `n_columns` columns of `n_strips` strips on a picture of `width` x `height`.
 
@@ -145,15 +143,33 @@ def column_outlines(
         height: rows.
         lens: lens model of the picture.
         columns: which of them to outline, with a start and a stop; all by default.
-        quick: project the columns' borders alone, strips evenly between them: off by hundredths of a pixel.
     """
     first_column, n_outlined = (0, n_columns) if columns is None else (columns.start, columns.stop - columns.start)
-    finer = n_strips if quick else 1
-    n_edges = n_strips // finer
-    u = np.linspace(0, 1, n_columns * n_edges + 1)[first_column * n_edges :][: n_outlined * n_edges + 1]
-    v = np.linspace(-_OVERHANG, 1 + _OVERHANG, _MIDDLE_POINTS if quick else _OUTLINE_POINTS)
+    u = np.linspace(0, 1, n_columns * n_strips + 1)[first_column * n_strips :][: n_outlined * n_strips + 1]
+    v = np.linspace(-_OVERHANG, 1 + _OVERHANG, _OUTLINE_POINTS)
     points = screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens)
-    first, last = _row_range(corners, height)
+    return _outlined(points, v, n_strips, 1, _row_range(corners, height), width, lens)
+
+
+def quick_outlines(
+    corners: FloatArray, n_columns: int, n_strips: int, width: int, height: int, lens: Lens | None
+) -> tuple[Outlines, FloatArray]:
+    """As `column_outlines` and `column_middles`, from the columns' borders alone.
+
+    Strips lie evenly between the borders: off by hundredths of a strip.
+    Arguments as for `column_outlines`.
+    """
+    u, v = np.linspace(0, 1, n_columns + 1), np.linspace(-_OVERHANG, 1 + _OVERHANG, _MIDDLE_POINTS)
+    points = screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens)
+    outlines = _outlined(points, v, n_strips, n_strips, _row_range(corners, height), width, lens)
+    return outlines, (points[1:, :, 1] + points[:-1, :, 1]) / 2
+
+
+def _outlined(
+    points: FloatArray, v: FloatArray, n_strips: int, finer: int, ends: tuple[int, int], width: int, lens: Lens | None
+) -> Outlines:
+    """Outlines of strips whose edges, or every so manieth, go through points (n, v, 2); `ends` are their rows."""
+    first, last = ends
     rows = np.arange(first, last + 1)
     knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
     knot_x, knot_v = (_finer(values, finer) for values in _edges_at(points, v, knots))
@@ -163,7 +179,7 @@ def column_outlines(
     if knot_x.min() < 0 or knot_x.max() > width - 1:
         in_picture = (edges_x >= 0) & (edges_x <= width - 1)
         inside &= in_picture[1:] & in_picture[:-1]
-    shape = (n_outlined, n_strips, rows.size)
+    shape = (-1, n_strips, rows.size)
     sensor_row = None
     if lens is not None and lens.corrected:
         sensor_row = _between_knots(_sensor_rows(knot_x, knots, lens), knots, rows).reshape(shape)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -405,21 +405,18 @@ def _texture_of(frame: Frame, cell_x: int, cell_y: int) -> _Texture:
     n_y, n_x = frame.height // cell_y, frame.width // cell_x
     pixels: NDArray[Any] = frame.pixels[: n_y * cell_y, : n_x * cell_x]
     wide = np.uint16 if pixels.dtype == np.uint8 else np.uint32
-    cells = np.add.reduce(pixels.reshape(n_y, cell_y, -1), axis=1, dtype=wide)
+    sums = np.add.reduce(pixels.reshape(n_y, cell_y, -1), axis=1, dtype=wide)
     if wide is np.uint32:
-        cells = cells.astype(np.float32)
-    cells = cv2.resize(cells, (n_x, n_y), interpolation=cv2.INTER_AREA).astype(np.float32)
-    gain = 1 / (frame.white - frame.black)
-    cells *= np.float32(gain / cell_y)
-    cells -= np.float32(frame.black * gain)
-    coded = np.clip(cells, np.float32(0), np.float32(1), out=cells)
-    tone = 1.0 if frame.linear else _TONE
-    light = np.asarray(cv2.pow(coded, tone))
+        sums = sums.astype(np.float32)
+    sums = np.asarray(cv2.resize(sums, (n_x, n_y), interpolation=cv2.INTER_AREA))
+    levels = cell_y, frame.black, frame.white, frame.linear
+    if wide is np.uint32:
+        light, noise = _light_and_noise(sums, *levels)
+    else:
+        light, noise = (table.take(sums) for table in _light_and_noise_of_sums(*levels))
     mean = cv2.boxFilter(light, -1, (_NEIGHBOURS, 1), borderType=cv2.BORDER_REPLICATE)
     # A strip of the screen that is dark shows the room's light; its texture is nobody's.
     lit = np.maximum(mean - _darkest(mean), np.float32(1e-4))
-    noise = np.asarray(cv2.pow(np.maximum(coded, np.float32(_DARKEST)), tone - 1))
-    noise *= np.float32(tone * _CELL_NOISE / _STRIPE_NOISE)
     noise /= lit
     noise *= noise
     noise += np.float32(1)
@@ -427,6 +424,24 @@ def _texture_of(frame: Frame, cell_x: int, cell_y: int) -> _Texture:
     light /= lit
     value = np.clip(light, np.float32(-1), np.float32(1), out=light)
     return _Texture(value, np.reciprocal(noise, out=noise), cell_x, cell_y)
+
+
+@lru_cache(maxsize=4)
+def _light_and_noise_of_sums(
+    cell_y: int, black: float, white: float, linear: bool
+) -> tuple[Float32Array, Float32Array]:
+    """Light and noise of every sum that so many pixels of eight bits can have."""
+    return _light_and_noise(np.arange(255 * cell_y + 1, dtype=np.float32), cell_y, black, white, linear)
+
+
+def _light_and_noise(
+    sums: Float32Array, cell_y: int, black: float, white: float, linear: bool
+) -> tuple[Float32Array, Float32Array]:
+    """Light of sums of so many pixels, and what a cell of that light errs by, in parts of what stripes leave."""
+    coded = np.clip((sums / np.float32(cell_y) - np.float32(black)) / np.float32(white - black), 0, 1)
+    tone = np.float32(1.0 if linear else _TONE)
+    steep = np.maximum(coded, np.float32(_DARKEST)) ** (tone - np.float32(1))
+    return coded**tone, steep * np.float32(tone * _CELL_NOISE / _STRIPE_NOISE)
 
 
 def _darkest(mean: Float32Array) -> np.float32:

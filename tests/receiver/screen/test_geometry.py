@@ -226,6 +226,18 @@ def test_row_map_of_a_picture_corrected_in_the_camera(order: tuple[int, ...]) ->
     np.testing.assert_array_equal(found.edges_x, straight.edges_x)
 
 
+@pytest.mark.parametrize("of", [None, lens()])
+def test_quick_outlines_are_off_by_hundredths_of_a_strip(of: Lens | None) -> None:
+    exact = geometry.column_outlines(PERSPECTIVE, 20, 4, WIDTH, HEIGHT, of)
+    quick, middles = geometry.quick_outlines(PERSPECTIVE, 20, 4, WIDTH, HEIGHT, of)
+    inside = exact.inside.reshape(80, -1)
+    off = (np.abs(quick.edges_x - exact.edges_x)[1:] / np.diff(exact.edges_x, axis=0))[inside]
+    assert off.mean() < 0.01
+    assert off.max() < 0.05
+    assert (quick.inside != exact.inside).mean() < 0.001
+    np.testing.assert_allclose(middles, geometry.column_middles(PERSPECTIVE, 20, of), atol=0.5)
+
+
 @settings(max_examples=40)
 @given(st.lists(st.floats(-900, 900), min_size=8, max_size=8), st.sampled_from([None, lens(), lens(corrected=True)]))
 def test_corners_outside_the_picture(moves: list[float], of: Lens | None) -> None:

@@ -9,7 +9,7 @@ once: no crosstalk is left, strips are pooled by what they tell, and every colum
 it, `header` where headers show, and `metrics` makes of it all the likelihoods of slots that detection needs.
 """
 
-from rxcli.receiver.channel.known_picture.exposure import expected_light, exposed, row_positions, trusted
+from rxcli.receiver.channel.known_picture.exposure import expected_light, row_positions, trusted
 from rxcli.receiver.channel.known_picture.header import dark_light, first_decision, header_contrast, header_dark
 from rxcli.receiver.channel.known_picture.metrics import slot_likelihoods
 from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Look, Placement
@@ -24,7 +24,6 @@ __all__ = [
     "dark_light",
     "equalized",
     "expected_light",
-    "exposed",
     "exposures",
     "first_decision",
     "fit_response",

@@ -11,19 +11,8 @@ from rxcli.receiver.light import SlotLight, exposure_shares, taken
 from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 
-def exposed(slots: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
-    """Mean of the slots over the exposure, (C, R).
-
-    Args:
-        slots: (C, N) values; half lit beyond.
-        positions: (C, R) or (1, R) exposure's centre in slots.
-        exposure_slots: exposure in slots.
-    """
-    return SlotLight(slots).seen(positions, exposure_slots)
-
-
 def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
-    """(C, R) 0..1 how far rows can be learned from whose slots are lit with probability `lit`; see `exposed`."""
+    """(C, R) 0..1 how far rows can be learned from whose slots are lit with probability `lit`; see `SlotLight`."""
     doubt = lit * (1 - lit)
     each: IntArray = np.arange(len(lit))
     if len(positions) == 1:  # columns without doubt are alike
@@ -31,7 +20,7 @@ def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> 
         each = np.zeros(len(lit), np.int64)
         each[unsure] = 1 + np.arange(unsure.size)
         doubt = np.concatenate([np.zeros_like(doubt[:1]), doubt[unsure]])
-    trust = np.clip(1 - 8 * exposed(doubt, positions, exposure_slots), 0, 1)
+    trust = np.clip(1 - 8 * SlotLight(doubt).seen(positions, exposure_slots), 0, 1)
     return np.asarray(trust[each], np.float32)
 
 

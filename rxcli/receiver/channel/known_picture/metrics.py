@@ -29,8 +29,8 @@ def slot_likelihoods(observed: ColumnLight, expected: ExpectedLight, clock: Cloc
         for group, view in expected.views
     ]
     # Squared contrast over variance of a slot is the precision of the rows around.
-    mean = np.median(observed.precision[:, :: SETTINGS.snr_every_row], axis=1) * np.float32(clock.rows_per_slot)
-    snr = np.repeat(mean[:, None], clock.n_slots, axis=1).astype(np.float32)
+    some = np.sort(observed.precision[:, :: SETTINGS.snr_every_row], axis=1)
+    snr = some[:, some.shape[1] // 2, None] * np.float32(clock.rows_per_slot)
     return SlotLikelihoods(np.concatenate(parts), snr)
 
 

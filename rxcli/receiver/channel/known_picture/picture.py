@@ -226,7 +226,7 @@ class KnownPicture:
         if np.median(ratio) > most:
             return None
         self._excess *= 1 + np.float32(share) * (ratio - 1)
-        precision = observed.precision / np.maximum(ratio, 0.5)[:, None]
+        precision = observed.precision / ratio[:, None]
         precision /= _alike(observed.value - expected, precision, rows_per_slot)[:, None]
         return ColumnLight(observed.value, precision, observed.shrunk)
 
@@ -338,21 +338,21 @@ def _factored(
     """
     n, _ = middle.shape
     diagonal, first, second = middle.copy(), np.zeros_like(middle), np.zeros_like(middle)
+    # Of A^-1 the diagonal, and less the band beside it; two more rows, which stay 0, for the ends.
+    inverse, near = np.zeros((2, n + 2, middle.shape[1]), np.float32)
+    eliminated = beside.copy()
     for i in range(n):
         if i >= 1:
-            diagonal[i] -= first[i - 1] ** 2 * diagonal[i - 1]
+            diagonal[i] -= first[i - 1] * eliminated[i - 1]
+            eliminated[i] -= second[i - 1] * eliminated[i - 1]
         if i >= 2:
-            diagonal[i] -= second[i - 2] ** 2 * diagonal[i - 2]
-        first[i] = beside[i]
-        if i >= 1:
-            first[i] -= second[i - 1] * first[i - 1] * diagonal[i - 1]
-        first[i] /= diagonal[i]
-        second[i] = beyond[i] / diagonal[i]
-    inverse, near = np.zeros((n + 2, middle.shape[1]), np.float32), np.zeros((n + 2, middle.shape[1]), np.float32)
+            diagonal[i] -= second[i - 2] * beyond[i - 2]
+        inverse[i] = 1 / diagonal[i]
+        first[i], second[i] = eliminated[i] * inverse[i], beyond[i] * inverse[i]
     for i in range(n - 1, -1, -1):
-        far = -first[i] * near[i + 1] - second[i] * inverse[i + 2]
-        near[i] = -first[i] * inverse[i + 1] - second[i] * near[i + 1]
-        inverse[i] = 1 / diagonal[i] - first[i] * near[i] - second[i] * far
+        far = first[i] * near[i + 1] - second[i] * inverse[i + 2]
+        near[i] = first[i] * inverse[i + 1] - second[i] * near[i + 1]
+        inverse[i] += first[i] * near[i] - second[i] * far
     return diagonal, first, second, np.asarray(1 / inverse[:n], np.float32)
 
 

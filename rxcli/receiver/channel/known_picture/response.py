@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.receiver.channel.known_picture.exposure import Response, exposed
+from rxcli.receiver.channel.known_picture.exposure import Response
 from rxcli.receiver.channel.known_picture.picture import ColumnLight
 from rxcli.receiver.channel.known_picture.settings import SETTINGS
+from rxcli.receiver.light import SlotLight
 from rxcli.types import Float32Array, FloatArray, IntArray
 
 #: Rows of columns, about, from which a response is measured, more would tell no more; and the golden ratio, whose
@@ -42,7 +43,7 @@ def exposures(lit: Float32Array, positions: FloatArray, exposure_slots: float) -
     # Evenly spread, but not evenly spaced: the rows must not fall on the same part of every slot.
     rows = ((step + (step * _GOLDEN if every > 1 else 0) % 1) * every).astype(np.intp)
     some, side = positions[:, rows], SETTINGS.side_slots
-    seen = exposed(lit, np.concatenate([some - side, some, some + side], axis=1), exposure_slots)
+    seen = SlotLight(lit).seen(np.concatenate([some - side, some, some + side], axis=1), exposure_slots)
     before, here, after = np.split(seen, 3, axis=1)
     return Exposures(rows, here, before + after, (after - before) * np.float32(0.5 / side))
 
