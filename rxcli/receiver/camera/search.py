@@ -172,15 +172,15 @@ def stripes_are_curved(strips: Strips) -> bool:
 
 
 def _worth_reading(estimates: list[BlindEstimate]) -> tuple[BlindEstimate, ...]:
-    """Estimates whose slots explain light."""
-    return tuple(estimate for estimate in estimates if estimate.explained >= SETTINGS.least_explained)
+    """Estimates whose slots explain light, and look more like packets than slots of any kind."""
+    return tuple(one for one in estimates if one.explained >= SETTINGS.least_explained and one.log_evidence > 0)
 
 
 def _worth_refining(readings: list[Reading]) -> list[Reading]:
     """The best reading, and where it is neither beyond doubt nor hopeless others of other slots that come close."""
     if not readings or readings[0].log_evidence < SETTINGS.hopeless_nats:
         return readings[:1]
-    least = SETTINGS.close_evidence * readings[0].log_evidence
+    least = max(SETTINGS.close_evidence * readings[0].log_evidence, SETTINGS.hopeless_nats)
     close = [one for one in readings if one.log_evidence >= least]
     return (
         distinct(
