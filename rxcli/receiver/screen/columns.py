@@ -22,7 +22,7 @@ from rxcli.types import FloatArray, Lens
 #: this share of the first one.
 _COMBS, _EVERY, _FITTED, _HOPELESS = 12, 2, 4, 0.8
 #: Steps that these take by some windows, at most, and those near the best then by all.
-_STEPS = 6
+_FIRST_STEPS, _LAST_STEPS = 4, 6
 #: By how much less a grid may explain, a share, that it is still a rival.
 _RIVAL = 0.05
 #: Contrast, a share of what is explained, from which on columns are not of unlike drive.
@@ -124,7 +124,7 @@ def likely_grids(coherence: Coherence, strips: StripLight, lens: Lens | None) ->
     if not any(grid.contrast > _AT_FIRST_SIGHT * least * grid.explained for grid in combs):
         return []
     hopeful = _near_the_best(_with_likely_by_drive(thinned, combs, _refined(thinned, combs)), 2 * _RIVAL)
-    refined = [refine_by_waveforms(strips, grid, _STEPS) for grid in hopeful]
+    refined = [refine_by_waveforms(strips, grid, _LAST_STEPS) for grid in hopeful]
     refined.sort(key=lambda one: -one.likelihood)
     distinct: list[Grid] = []
     for grid in _near_the_best(refined, _RIVAL):
@@ -147,7 +147,7 @@ def _refined(strips: StripLight, combs: list[Grid]) -> dict[int, Grid]:
 
 def _improved(strips: StripLight, comb: Grid) -> Grid:
     """A comb's grid some steps further, where it is better then."""
-    grid = refine_by_waveforms(strips, comb, _STEPS)
+    grid = refine_by_waveforms(strips, comb, _FIRST_STEPS)
     return grid if grid.likelihood > comb.likelihood else comb
 
 
@@ -175,7 +175,7 @@ def _with_likely_by_drive(strips: StripLight, combs: list[Grid], fitted: dict[in
 
 def _bent(strips: StripLight, grid: Grid) -> Grid:
     """The grid with an unknown lens, where that explains much more: such lenses are rare."""
-    bent = refine_by_waveforms(strips, replace(grid, bent=True), _STEPS)
+    bent = refine_by_waveforms(strips, replace(grid, bent=True), _LAST_STEPS)
     return bent if bent.likelihood > (1 + _BENT_GAIN) * grid.likelihood else grid
 
 
