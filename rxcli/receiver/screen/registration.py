@@ -440,7 +440,7 @@ def _light_and_noise(
 ) -> tuple[Float32Array, Float32Array]:
     """Light of sums of so many pixels, and what a cell of that light errs by, in parts of what stripes leave."""
     coded = np.clip((sums / np.float32(cell_y) - np.float32(black)) / np.float32(white - black), 0, 1)
-    tone = np.float32(1.0 if linear else _TONE)
+    tone = np.float32(1.0 if linear else TONE)
     steep = np.maximum(coded, np.float32(_DARKEST)) ** (tone - np.float32(1))
     return coded**tone, steep * np.float32(tone * _CELL_NOISE / _STRIPE_NOISE)
 
