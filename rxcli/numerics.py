@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.types import Float32Array, FloatArray
 
+#: Keeps what is divided by, or inverted, from zero: far below any light, weight or variance that says anything.
+TINY = 1e-12
 #: Change of a header's slots, lit 1 and dark -1, at its borders.
 _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
 

@@ -221,7 +221,7 @@ def _with_shifts(
         return outlines
     from rxcli.receiver.screen.coherence import N_STRIPS, measure_coherence
     from rxcli.receiver.screen.grid import grid_between
-    from rxcli.receiver.screen.numbering import first_columns, light_profile
+    from rxcli.receiver.screen.numbering import LEAST_ODDS, first_columns, light_profile
     from rxcli.receiver.screen.waveforms import StripLight
 
     own = outlines[0]
@@ -233,7 +233,7 @@ def _with_shifts(
     shifted = [
         _moved(replace(own, fills=start.fills), int(first), float(odds), layout.n_columns, lens)
         for first, odds in zip(start.first, start.log_odds, strict=True)
-        if odds > SETTINGS.rival_shift
+        if odds > LEAST_ODDS
     ]
     return _without_hopeless(shifted)
 

@@ -16,8 +16,7 @@ class WiringSettings:
     sides_agree_anywhere: float = 0.45
     #: Support of left and right together from which these two tell that no column is missing between them.
     both_show: float = 0.3
-    #: Log-odds down to which another first column is a rival; and strips that a column needs to be asked for light.
-    rival_shift: float = -7.0
+    #: Strips that a column needs to be asked for light.
     strips_a_column: float = 6.0
     #: Log-odds of an outline by sides that contradict the grid; what sides that agree with a numbering add to it; what
     #: sides add that were found for top or bottom less. Where left or right is missing, the other one's line says all.

@@ -68,7 +68,7 @@ def column_results(
     shown = reported & [not why for why in against]
     if not (doubts.confidence[shown] >= SETTINGS.surest_packet).any():
         reported = np.zeros_like(reported)  # Light without data: what looks like a packet or two is chance.
-    packets = [_Packets.of(burst, clock, posteriors, shown, doubts) for burst, shown in enumerate(n_observed)]
+    packets = [_Packets.of(burst, clock, posteriors, counted, doubts) for burst, counted in enumerate(n_observed)]
     return tuple(
         _column_result(
             column,

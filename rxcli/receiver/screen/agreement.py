@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.coherence import Pixels, strip_changes
 from rxcli.receiver.screen.columns import ColumnLayout
-from rxcli.receiver.screen.comb import likeness
+from rxcli.receiver.screen.comb import APART, likeness
 from rxcli.types import Float32Array, FloatArray, Lens
 
-#: Distance of the strips, columns; and parts of the screen.
-_APART, _PARTS = 0.72, 4
-#: Height of the comb over what it would be without noise, and over chance; how far its phase may be off, columns.
-_LEAST_HEIGHT, _LEAST_SCORE, _MOST_OFF = 0.1, 6.0, 0.06
+#: Parts of the screen.
+_PARTS = 4
+#: Height of the comb over what it would be without noise, and over chance, were neighbouring pairs and rows
+#: independent; how far its phase may be off, columns.
+_LEAST_HEIGHT, _LEAST_SCORE, _MOST_OFF = 0.1, 9.0, 0.06
 #: Height over chance from which a part of the screen says anything, and how far the phase may be off there, columns.
-_SAYS, _MOST_OFF_IN_PART = 3.0, 0.15
-#: Neighbouring pairs overlap, and neighbouring rows: so much less do they tell.
-_OVERLAP = 2.2
+_SAYS, _MOST_OFF_IN_PART = 4.5, 0.15
 
 
 def sides_agree(
@@ -52,7 +52,7 @@ def sides_agree(
     seen = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ inverse.T
     u, v = n_columns * seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2]
     width = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
-    apart = max(1, round(_APART * width / float(x[1] - x[0])))
+    apart = max(1, round(APART * width / float(x[1] - x[0])))
     pairs = np.mean(scaled[:, :, apart:] * scaled[:, :, :-apart], axis=1)
     ui, uj = u[:, :-apart], u[:, apart:]
     inside = (np.minimum(ui, uj) > 0) & (np.maximum(ui, uj) < n_columns) & (np.abs(v[:, apart:] - 0.5) < 0.5)
@@ -64,7 +64,7 @@ def sides_agree(
 def _agree(pairs: Float32Array, middle: FloatArray, part: FloatArray, sigma: float, n_rows: int) -> bool:
     """Whether pairs are least alike at the borders: over the whole screen, and in each part that says anything."""
     tables = likeness(sigma)
-    step = int(tables.step(np.array(_APART)))
+    step = int(tables.step(np.array(APART)))
     depth = float(tables.harmonic[step] / tables.mean[step])
     combs, full, counts = np.zeros(_PARTS, np.complex128), np.zeros(_PARTS), np.zeros(_PARTS)
     for number in range(_PARTS):
@@ -72,7 +72,7 @@ def _agree(pairs: Float32Array, middle: FloatArray, part: FloatArray, sigma: flo
         if values.size:
             combs[number] = 2 * ((values - values.mean()) * np.exp(2j * np.pi * middle[part == number])).sum() / depth
             full[number], counts[number] = values.sum(), values.size
-    chance = np.sqrt(2 * _OVERLAP * counts / n_rows) / abs(depth) + 1e-9
+    chance = np.sqrt(2 * counts / n_rows) / abs(depth) + TINY
     total, noise = complex(combs.sum()), float(np.sqrt((chance**2).sum()))
     off = np.abs(np.angle(combs)) / (2 * np.pi)
     return bool(

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import TINY
 from rxcli.types import Float32Array, FloatArray
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 #: Strips that a picture is cut into, about, and windows of rows.
 N_STRIPS, _WINDOWS = 250, 16
-#: Rows over which light is averaged, and over which its mean is taken off. Slots have 3 to 20 rows.
-_SHORT_ROWS, _LONG_ROWS = 6, 49
-#: The same below so many rows of a picture, whose slots have fewer rows.
-_LOW_ROWS, _LOW_SHORT_ROWS, _LOW_LONG_ROWS = 1500, 3, 25
+#: Rows over which light is averaged, and below so many rows of a picture, whose slots have fewer rows; its mean over
+#: eight times as many is taken off. Slots have 3 to 20 rows.
+_SHORT_ROWS, _LOW_SHORT_ROWS, _LOW_ROWS = 6, 3, 1500
 #: Changes beyond so many standard deviations are edges of the picture.
 _CLIP = 2.5
 #: Share of the strips, the least coherent, that are taken to be without light.
@@ -32,7 +32,6 @@ _DARK_SHARE = 0.3
 _LAGS, _BRIGHT_SHARE = 40, 0.2
 #: Strips that are compared at a time with those near them.
 _PAIRS_AT_ONCE = 64
-_TINY = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +100,7 @@ def measure_coherence(
     quiet, lit = _without_row_noise(scaled)
     n_rows = _independent_rows(quiet, lit)
     pairs = _pairs(quiet, int(np.ceil(reach * width / float(x[1] - x[0]))))
-    step = (_LOW_SHORT_ROWS if height < _LOW_ROWS else _SHORT_ROWS) // 2
+    step = _short_rows(height) // 2
     at = starts[:, None] + step * (np.arange(scaled.shape[1], dtype=np.float64) - (scaled.shape[1] - 1) / 2)
     return Coherence(pairs, lit, quiet, at, level, x, starts, n_rows, width, height)
 
@@ -122,14 +121,13 @@ def strip_changes(
         (S,) and (W,) middles of strips and windows.
     """
     height, width = pixels.shape
-    low = height < _LOW_ROWS
-    short, long = (_LOW_SHORT_ROWS, _LOW_LONG_ROWS) if low else (_SHORT_ROWS, _LONG_ROWS)
+    short = _short_rows(height)
     strip_px = mosaic_period * max(1, round(width / n_strips / mosaic_period))
     step = short // 2
     rows = height // _WINDOWS // part
     starts = (np.arange(_WINDOWS) * height + (height - rows * _WINDOWS) // 2) // _WINDOWS
     light = [_light(pixels[start : start + rows], strip_px) for start in starts.tolist()]
-    scaled = _scaled(np.stack([_changes(one, short, long)[::step] for one in light]))
+    scaled = _scaled(np.stack([_changes(one, short)[::step] for one in light]))
     level = np.stack([one.mean(axis=0) for one in light]) / np.float32(strip_px)
     x = (np.arange(scaled.shape[2]) + 0.5) * strip_px - 0.5
     return scaled, np.asarray(level, np.float32), x, starts + (rows - 1) / 2
@@ -146,18 +144,22 @@ def _light(rows: Pixels, strip_px: int) -> Float32Array:
     return np.asarray(cv2.reduce(whole, 1, cv2.REDUCE_SUM, dtype=depth).reshape(-1, n), np.float32)
 
 
-def _changes(light: Float32Array, short: int, long: int) -> Float32Array:
+def _short_rows(height: int) -> int:
+    return _LOW_SHORT_ROWS if height < _LOW_ROWS else _SHORT_ROWS
+
+
+def _changes(light: Float32Array, short: int) -> Float32Array:
     """(rows, strips) means over a few rows, less those over many."""
     import cv2
 
-    return np.asarray(cv2.blur(light, (1, short)) - cv2.blur(light, (1, long)), np.float32)
+    return np.asarray(cv2.blur(light, (1, short)) - cv2.blur(light, (1, 8 * short + 1)), np.float32)
 
 
 def _scaled(changes: Float32Array) -> Float32Array:
     """(W, rows, S) with every strip of every window clipped and scaled to a mean square of one."""
-    rms = np.sqrt(np.mean(changes * changes, axis=1, keepdims=True)) + _TINY
+    rms = np.sqrt(np.mean(changes * changes, axis=1, keepdims=True)) + TINY
     clipped = np.clip(changes / rms, -_CLIP, _CLIP)
-    clipped /= np.sqrt(np.mean(clipped * clipped, axis=1, keepdims=True)) + _TINY
+    clipped /= np.sqrt(np.mean(clipped * clipped, axis=1, keepdims=True)) + TINY
     return np.asarray(clipped, np.float32)
 
 
@@ -165,7 +167,7 @@ def _without_row_noise(scaled: Float32Array) -> tuple[Float32Array, Float32Array
     """The changes less what the least coherent strips have in common, and (W, S) how coherent neighbours are then."""
     low = np.argsort(_smooth(_neighbours(scaled), 5), axis=1)[:, : max(int(_DARK_SHARE * scaled.shape[2]), 1)]
     noise = np.stack([window[:, strips].mean(axis=1) for window, strips in zip(scaled, low, strict=True)])
-    power = np.maximum(np.mean(noise * noise, axis=1), _TINY)
+    power = np.maximum(np.mean(noise * noise, axis=1), TINY)
     share = np.mean(scaled * noise[..., None], axis=1) / power[:, None]
     quiet = scaled - noise[..., None] * share[:, None]
     lit = np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1)
@@ -176,7 +178,7 @@ def _independent_rows(quiet: Float32Array, lit: Float32Array) -> float:
     """Rows of a window that count as independent: two strips' chance coherence has a variance of one over these."""
     bright = np.argsort(-lit.mean(axis=0))[: max(int(_BRIGHT_SHARE * lit.shape[1]), 1)]
     strips, rows = quiet[:, :, bright], quiet.shape[1]
-    power = float(np.mean(strips * strips)) + _TINY
+    power = float(np.mean(strips * strips)) + TINY
     alike = [float(np.mean(strips[:, lag:] * strips[:, :-lag])) / power for lag in range(1, min(_LAGS, rows // 2))]
     return float(rows / (1 + 2 * float(np.sum(np.square(alike)))))
 

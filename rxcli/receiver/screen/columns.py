@@ -13,6 +13,7 @@ from rxcli.receiver.screen.drive import explained_with_drive
 from rxcli.receiver.screen.grid import Grid
 from rxcli.receiver.screen.narrow import find_narrow_columns, shows_narrow_columns
 from rxcli.receiver.screen.numbering import Numbering, possible_numberings
+from rxcli.receiver.screen.picture import MIN_SIZE
 from rxcli.receiver.screen.sides import Side
 from rxcli.receiver.screen.waveforms import StripLight, refine_by_waveforms, with_light
 from rxcli.types import FloatArray, Lens
@@ -24,8 +25,8 @@ _COMBS, _EVERY, _FITTED, _HOPELESS = 12, 2, 4, 0.8
 _FIRST_STEPS, _LAST_STEPS = 4, 6
 #: By how much less a grid may explain, a share, that it is still a rival.
 _RIVAL = 0.05
-#: The same if columns are of unlike drive; and contrast, a share of what is explained, from which on they are not.
-_RIVAL_BY_DRIVE, _PLAIN_CONTRAST = 0.12, 0.27
+#: Contrast, a share of what is explained, from which on columns are not of unlike drive.
+_PLAIN_CONTRAST = 0.27
 #: Log-odds that drives make the difference, and what each nat adds that is explained more then than by the other grid.
 _UNLIKE_DRIVE, _DRIVE_COUNTS = -3.0, 0.025
 #: Contrast of a grid, a share of what it explains, from which there may be columns, for one independent row: by chance
@@ -39,7 +40,6 @@ _LEAST_IN_STRIP = 0.05
 _BENT_GAIN = 0.01
 #: Grids that differ less than this over the picture, columns, are one; combs that differ less from a grid lead to it.
 _SAME, _WITHIN_REACH = 0.25, 0.4
-_MIN_SIZE = 96
 #: Columns from which on a screen's are narrow.
 _MANY_COLUMNS = 50
 
@@ -90,7 +90,7 @@ def find_columns(
     """
     wide, narrow = (next((one for one in layouts if one.is_narrow is many), None) for many in (False, True))
     either = wide or narrow or ColumnLayout()
-    if min(pixels.shape) < _MIN_SIZE:
+    if min(pixels.shape) < MIN_SIZE:
         return ColumnSearch(None, (), either)
     coherence = measure_coherence(pixels, mosaic_period=mosaic_period)
     if narrow is not None and shows_narrow_columns(coherence):
@@ -165,7 +165,7 @@ def _with_likely_by_drive(strips: StripLight, combs: list[Grid], fitted: dict[in
     light = np.array([explained_with_drive(strips, comb) for comb in combs])
     best = int(light.argmax())
     grid = fitted[best] if best in fitted else _improved(strips, combs[best])
-    if grid.likelihood < (1 - _RIVAL_BY_DRIVE) * refined[0].likelihood or _apart(grid, refined[0]) < _SAME:
+    if grid.likelihood < (1 - 2 * _RIVAL) * refined[0].likelihood or _apart(grid, refined[0]) < _SAME:
         return refined
     others = [one for one in refined if _apart(grid, one) >= _SAME]
     nearer = [_apart(comb, refined[0]) < _apart(comb, grid) for comb in combs]

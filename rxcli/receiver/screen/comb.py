@@ -15,15 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import TINY
 from rxcli.receiver.screen.coherence import Coherence
 from rxcli.types import Float32Array, FloatArray
 
 #: Distance of the pairs that show the comb best, columns.
-_APART = 0.72
+APART = 0.72
+#: Largest distance of two places whose likeness is known, columns.
+_FURTHEST = 1.6
 #: Combs that differ less than this in pitch and as much elsewhere are one.
 _SAME_PITCH, _SAME_SHAPE = 0.7, 0.8
-#: Pairs of one distance overlap, so that their noise is alike by this much more than were they independent.
-_OVERLAP = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,17 +65,16 @@ class Likeness:
     #: (distances,) mean and first harmonic over the phase, which is 0 at a border.
     mean: Float32Array
     harmonic: Float32Array
-    furthest: float
 
     def step(self, distance: FloatArray) -> NDArray[np.int64]:
         """Place in the tables over distances."""
-        return (np.abs(distance) * ((self.mean.size - 1) / self.furthest) + 0.5).astype(np.int64)
+        return (np.abs(distance) * ((self.mean.size - 1) / _FURTHEST) + 0.5).astype(np.int64)
 
 
 @lru_cache(maxsize=4)
-def likeness(sigma: float, phases: int = 128, distances: int = 161, furthest: float = 1.6) -> Likeness:
+def likeness(sigma: float, phases: int = 128, distances: int = 161) -> Likeness:
     """Tables for a light spread of `sigma` column pitches."""
-    middle, distance = np.arange(phases) / phases, np.linspace(0, furthest, distances)
+    middle, distance = np.arange(phases) / phases, np.linspace(0, _FURTHEST, distances)
     centres = np.arange(-6, 8) + 0.5
 
     def cosine(mid: NDArray[Any], apart: NDArray[Any]) -> FloatArray:
@@ -89,7 +89,6 @@ def likeness(sigma: float, phases: int = 128, distances: int = 161, furthest: fl
     return Likeness(
         mean=table.mean(axis=0).astype(np.float32),
         harmonic=harmonic.astype(np.float32),
-        furthest=furthest,
     )
 
 
@@ -100,7 +99,7 @@ class Comb:
     X and Y are pixels from the picture's middle over its width.
     """
 
-    #: Height over the standard deviation that it would have by chance.
+    #: Height over the standard deviation that it would have by chance, were all pairs independent.
     score: float
     #: Columns a picture's width.
     pitch: float
@@ -126,7 +125,7 @@ def find_combs(coherence: Coherence, sigma: float, most: int = 4, tried: CombRan
     """
     found: list[Comb] = []
     strip = coherence.strip_px / coherence.width
-    apart = np.clip(np.round(_APART / (tried.pitches * strip)), 1, coherence.widest).astype(np.int64)
+    apart = np.clip(np.round(APART / (tried.pitches * strip)), 1, coherence.widest).astype(np.int64)
     for distance in np.unique(apart):
         found += _combs_at(coherence, sigma, int(distance), replace(tried, pitches=tried.pitches[apart == distance]))
     chosen: list[Comb] = []
@@ -153,7 +152,7 @@ def _combs_at(coherence: Coherence, sigma: float, distance: int, tried: CombRang
     # The comb is weighed by its own height, so that pitches of unlike distances can be compared.
     mean, harmonic = tables.mean[step].mean(), tables.harmonic[step]
     rest = share * pairs - mean * both
-    chance = np.sqrt(_OVERLAP * float(both.sum()) / (2 * coherence.n_rows)) + 1e-9
+    chance = np.sqrt(float(both.sum()) / (2 * coherence.n_rows)) + TINY
     sums = _fourier(rest, middle, y, tried) / chance * np.sign(harmonic[0])
     height = np.abs(sums)
     out = []

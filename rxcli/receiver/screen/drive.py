@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_prior, grid_slopes
 from rxcli.receiver.screen.waveforms import LARGEST_STEP, LEAST_SHARE, StripLight, explained_light, strip_offsets
 from rxcli.types import Float32Array, FloatArray
 
-#: Steps; standard deviation of the logarithm of a column's drive, its largest value, and how much longer its steps are.
-_ROUNDS, _DRIVE_SD, _MOST, _LONGER = 2, 1.0, 4.0, 1.5
-#: Steps of the grid come out too short, as waveforms follow it.
-_GRID_LONGER = 2.5
+#: Steps, and how much longer they are made: waveforms follow the grid; standard deviation of the logarithm of a
+#: column's drive.
+_ROUNDS, _LONGER, _DRIVE_SD = 2, 2.0, 1.0
 
 
 def explained_with_drive(strips: StripLight, grid: Grid) -> float:
@@ -34,7 +34,7 @@ def explained_with_drive(strips: StripLight, grid: Grid) -> float:
         slopes = grid_slopes(numbers, strips.x, strips.y)
         step, change = _solved(off, weight, slopes, u - first, prior, numbers, drive, strips.sigma)
         numbers = numbers + step
-        drive = np.clip(drive + _LONGER * change, -_MOST, _MOST)
+        drive = drive + _LONGER * change
         u = columns_at(numbers, strips.x, strips.y)
     return explained_light(strips, _mixes(u - first, strips.sigma, drive)[0])
 
@@ -93,7 +93,7 @@ def _solved(
     eliminated = np.matmul(both, inverse)
     reduced = normal - np.matmul(eliminated, both.transpose(0, 2, 1)).sum(axis=0)
     gradient = gradient - np.matmul(eliminated, asked[..., None]).sum(axis=0)[:, 0]
-    damped = reduced + np.diag(prior + 1e-3 * np.diag(normal) + 1e-9)
-    step = np.clip(_GRID_LONGER * np.linalg.solve(damped, gradient), -LARGEST_STEP, LARGEST_STEP)
+    damped = reduced + np.diag(prior + 1e-3 * np.diag(normal) + TINY)
+    step = np.clip(_LONGER * np.linalg.solve(damped, gradient), -LARGEST_STEP, LARGEST_STEP)
     left_over = asked - step @ both
     return step, np.matmul(inverse, left_over[..., None])[..., 0]

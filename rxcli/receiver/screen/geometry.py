@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import TINY
 from rxcli.profiles import LensModel
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray, Lens, Outlines
 
@@ -234,7 +235,7 @@ def _interpolated(places: FloatArray | IntArray, known: FloatArray, *values: Flo
         return np.take_along_axis(of, index, axis=1)
 
     before = taken(known, left)
-    part = np.clip((places - before) / np.maximum(taken(known, right) - before, 1e-12), 0, 1)
+    part = np.clip((places - before) / np.maximum(taken(known, right) - before, TINY), 0, 1)
     lows = [taken(of, left) for of in values]
     return [low + (taken(of, right) - low) * part for low, of in zip(lows, values, strict=True)]
 

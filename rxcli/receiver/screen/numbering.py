@@ -11,14 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.receiver.screen.coherence import Coherence
 from rxcli.receiver.screen.grid import Grid, columns_at
 from rxcli.receiver.screen.rows import find_rows
-from rxcli.receiver.screen.sides import BOTTOM, LEFT, RIGHT, TOP, Side
+from rxcli.receiver.screen.sides import BOTTOM, LEFT, RIGHT, SHOWS, TOP, Side
 from rxcli.receiver.screen.still_light import StillSteps, still_steps
 from rxcli.receiver.screen.waveforms import StripLight, predicted_light
 from rxcli.types import BoolArray, FloatArray, IntArray
 
+#: Log-odds against the likeliest first column down to which another is possible.
+LEAST_ODDS = -7.0
 #: Parts of a column that are asked for light.
 _PARTS = 8
 #: Significance of light off the screen and on it, as scales of exponential distributions; the log-odds that a part
@@ -32,18 +35,17 @@ _OUTSIDE, _LARGER = -4.0, -3.0
 #: The light's middle is the screen's, but for this, screen widths.
 _LIGHT_SD = 0.175
 #: Films with bars beside them begin and end sharply, lie in the screen's middle to this, columns, and take these shares
-#: of its width: log-odds that this adds, where top and bottom are the screen's and where they do not show, of so many
-#: columns.
-_USUAL_COLUMNS, _IN_MIDDLE, _BARS, _FILM, _PERHAPS_A_FILM = 20, 0.2, (0.53, 0.95), 3.5, 2.0
-#: Support from which top and bottom show, and how far their distance may be off that of a screen's, a share.
-_SHOWS, _AS_HIGH = 0.35, 0.05
-#: How well a border is known, columns, and by how much less as far beyond the light as this is wide.
-_BORDER_SD, _FURTHER_SD = 0.08, 0.35
+#: of its width: log-odds that this adds where top and bottom are the screen's, or do not show, of so many columns.
+_USUAL_COLUMNS, _IN_MIDDLE, _BARS, _FILM = 20, 0.2, (0.53, 0.95), 3.5
+#: How far the distance of top and bottom may be off that of a screen's, a share.
+_AS_HIGH = 0.05
+#: How well a border is known, columns.
+_BORDER_SD = 0.08
 #: So much of the picture, columns, must lie beyond light that ends in it.
 _IN_VIEW = 0.4
-#: Support from which a line where stripes begin counts, how near it lies to a border then, columns, and the log-odds
-#: that it, or light that begins on a border, adds there; and what both add.
-_LINE_SHOWS, _NEAR_BORDER, _ON_BORDER, _BOTH_SIGNS = 0.2, 0.1, 2.0, 1.0
+#: How near to a border a line where stripes begin lies, columns, and the log-odds that it, or light that begins on a
+#: border, adds there.
+_NEAR_BORDER, _ON_BORDER = 0.1, 2.0
 #: Light on one side of a border, log-odds, from which it begins there, and the share of it that may lie beyond.
 _BEGINS, _BEYOND = 2.0, 0.3
 
@@ -69,7 +71,6 @@ def possible_numberings(
     grid: Grid,
     n_columns: int,
     aspect: float,
-    least: float = -7.0,
     lines: Sequence[Side] = (),
 ) -> list[Numbering]:
     """The columns that may be the screen's first, likeliest first.
@@ -81,15 +82,14 @@ def possible_numberings(
         n_columns: columns of the screen.
         aspect: width over height of the screen.
         lines: top, right, bottom, left, where stripes begin; none: nothing is known of them.
-        least: log-odds against the likeliest down to which they are given.
     """
     light = light_profile(strips, grid)
     start = first_columns(light, grid, n_columns, lines, aspect)
-    likely: IntArray = np.flatnonzero(start.log_odds > least)
+    likely: IntArray = np.flatnonzero(start.log_odds > LEAST_ODDS)
     chosen = likely[np.argsort(-start.log_odds[likely], kind="stable")]
     best = int(start.first[chosen[0]])
     # All have their rows in common, so that packets can tell them apart.
-    middle = float((light.by_window * coherence.y).sum() / max(light.by_window.sum(), 1e-9))
+    middle = float((light.by_window * coherence.y).sum() / max(light.by_window.sum(), TINY))
     rows = find_rows(strips, grid.shifted(best), n_columns, aspect, middle, tuple(lines[::2]))
     out = []
     for i in chosen:
@@ -134,10 +134,10 @@ def light_profile(strips: StripLight, grid: Grid) -> LightProfile:
     count = np.bincount(part, minlength=n)
     total = np.bincount(part, alike.sum(axis=2).ravel(), n)
     power = np.bincount(part, (alike * alike).sum(axis=2).ravel(), n)
-    share = total / np.sqrt(np.maximum(power * count * alike.shape[2], 1e-9))
+    share = total / np.sqrt(np.maximum(power * count * alike.shape[2], TINY))
     shown = count > 0
     light = np.maximum(share, 0.0) * np.sqrt(count * strips.n_rows)
-    off = np.exp(-light / _OFF_SCALE) / _OFF_SCALE + 1e-12
+    off = np.exp(-light / _OFF_SCALE) / _OFF_SCALE + TINY
     lit = np.exp(-light / _LIT_SCALE) / _LIT_SCALE
     odds = _PART_COUNTS * np.log(np.exp(-_DARK_PART) + (1 - np.exp(-_DARK_PART)) * lit / off)
     by_window = np.maximum(alike.mean(axis=(1, 2)), 0.0)
@@ -180,10 +180,10 @@ def first_columns(
         off = (begin + end_of_light) / 2 - start - n_columns / 2
         score = _light_within(light, start, end) + _hidden(hidden, reaches) - 0.5 * (off / (_LIGHT_SD * n_columns)) ** 2
         score += film[1] * (abs(film[0] - start - n_columns / 2) < _IN_MIDDLE)
-        score += _still_edges(light, (start, end), (begin, end_of_light))
+        score += _still_edges(light, (start, end))
         for border, side, number in ((start, 1, LEFT), (end, -1, RIGHT)):
             signs = (_begins(light, border, side), _is_on(lying[number], border))
-            score += _ON_BORDER * any(signs) + _BOTH_SIGNS * all(signs)
+            score += _ON_BORDER * sum(signs)
         scores.append(score)
     return FirstColumns(first, np.array(scores) - max(scores), all(reaches))
 
@@ -191,8 +191,8 @@ def first_columns(
 def _hidden(columns: tuple[float, float], reaches: tuple[bool, bool]) -> float:
     """Log-odds of columns left and right of the picture, by whether light reaches to its ends."""
     if all(reaches):
-        return max(_OUTSIDE * max(sum(columns) - 0.3, 0.0), _LARGER)
-    odds = [_OUTSIDE * max(count - 0.3, 0.0) for count in columns]
+        return max(_OUTSIDE * sum(columns), _LARGER)
+    odds = [_OUTSIDE * count for count in columns]
     return sum(max(one, _LARGER) if to_the_end else one for one, to_the_end in zip(odds, reaches, strict=True))
 
 
@@ -212,17 +212,14 @@ def _begins(light: LightProfile, border: int, side: int) -> bool:
     return bool(seen and inside > _BEGINS and outside < _BEYOND * inside)
 
 
-def _still_edges(light: LightProfile, borders: tuple[int, int], ends: tuple[float, float]) -> float:
+def _still_edges(light: LightProfile, borders: tuple[int, int]) -> float:
     """Log-odds of the steps of still light on two borders; of light that begins there the own step says no more."""
-    lit = max(ends[1] - ends[0], 1.0)
-    places, deviations = [], []
-    for border, side, end in zip(borders, (1, -1), ends, strict=True):
+    places = []
+    for border, side in zip(borders, (1, -1), strict=True):
         off = side * (light.place - border)
         is_lit = light.log_odds[(off > 1 / _PARTS) & (off < 0.5)].sum() > _BEGINS
         places.append(np.nan if is_lit else float(border))
-        beyond = max(side * (end - border), 0.0) / lit
-        deviations.append(_BORDER_SD + _FURTHER_SD * beyond**2)
-    return light.still.on_borders((places[0], places[1]), (deviations[0], deviations[1]))
+    return light.still.on_borders((places[0], places[1]), _BORDER_SD)
 
 
 def _film(light: LightProfile, grid: Grid, n_columns: int, aspect: float, lines: Sequence[Side]) -> tuple[float, float]:
@@ -233,8 +230,8 @@ def _film(light: LightProfile, grid: Grid, n_columns: int, aspect: float, lines:
     middle = (ends[0] + ends[1]) / 2
     # The more columns there are the less likely it lies in their middle by chance.
     by_chance = float(np.log(n_columns / _USUAL_COLUMNS))
-    if not lines or min(lines[number].support for number in (TOP, BOTTOM)) < _SHOWS:
-        return middle, _PERHAPS_A_FILM + by_chance
+    if not lines or min(lines[number].support for number in (TOP, BOTTOM)) < SHOWS:
+        return middle, _FILM + by_chance
     x = grid.width / 2
     height = (lines[BOTTOM].at(x) - lines[TOP].at(x)) / grid.pitch_px * aspect / n_columns
     return middle, (_FILM + by_chance) * (abs(height - 1) < _AS_HIGH)
@@ -242,11 +239,11 @@ def _film(light: LightProfile, grid: Grid, n_columns: int, aspect: float, lines:
 
 def _columns_of_line(grid: Grid, lines: Sequence[Side], number: int) -> FloatArray | None:
     """Columns on which the line where stripes begin on a side lies, at some places; None where it does not show."""
-    if not lines or lines[number].support < _LINE_SHOWS:
+    if not lines or lines[number].support < SHOWS:
         return None
     line = lines[number]
-    y = line.middle + line.half * np.linspace(-0.8, 0.8, 5)
-    return grid.columns_at(np.stack([line.at(y), y], axis=-1))
+    y, x = line.some_places
+    return grid.columns_at(np.stack([x, y], axis=-1))
 
 
 def _is_on(columns: FloatArray | None, border: int) -> bool:

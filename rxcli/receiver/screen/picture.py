@@ -11,16 +11,18 @@ from rxcli.types import BoolArray, Float32Array
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
+#: Smallest picture that is searched, pixels each way.
+MIN_SIZE = 96
 #: Rows of the reduced plane, and strips that its rows are summed into, about.
 _ROWS, _STRIPS = 1040, 340
-#: Columns of the finer plane that is read around the left and right sides, about.
-_FINE_COLUMNS = 1040
 #: Picture pixels between the two changes of a product: further than demosaicing, denoising and coding spread noise.
 _APART_PX = 7
+#: Linear light below which a picture is dark: noise is not stretched further there.
+_DARK = 0.002
 #: Light below which a picture shows nothing, and share of its width in which a lens correction leaves wedges.
 _NOTHING, _WEDGE_DEPTH = 0.008, 0.05
-#: Exponent of the tone curve that is taken off where an edge is placed; any of the usual ones will do for that.
-_TONE = 2.2
+#: Exponent of the tone curve that is taken off where an edge or texture is placed; any of the usual ones will do.
+TONE = 2.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +56,7 @@ class Picture:
         if not self.developed:
             return (values.astype(np.float32) - np.float32(self.black)) * scale
         coded = (np.arange(256, dtype=np.float32) - np.float32(self.black)) * scale
-        return np.asarray(cv2.LUT(values, np.maximum(coded, 0) ** np.float32(_TONE)), np.float32).reshape(values.shape)
+        return np.asarray(cv2.LUT(values, np.maximum(coded, 0) ** np.float32(TONE)), np.float32).reshape(values.shape)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +103,8 @@ def row_step(picture: Picture) -> int:
 
 
 def fine_step(picture: Picture) -> int:
-    """Pixels of one column of the finer plane."""
-    return picture.period * max(1, round(picture.width / _FINE_COLUMNS / picture.period))
+    """Pixels of one column of the finer plane, which is read around the left and right sides: a third of a strip."""
+    return picture.period * max(1, round(picture.width / (3 * _STRIPS) / picture.period))
 
 
 def finer(picture: Picture, plane: Plane, first: int, last: int) -> tuple[Float32Array, BoolArray | None]:
@@ -123,8 +125,7 @@ def _averaged(picture: Picture, first: int, last: int, fx: int, fy: int) -> Floa
     light -= np.float32(picture.black)
     light *= np.float32(1 / (picture.white - picture.black))
     if not picture.developed:
-        # The offset keeps the noise of the dark from being stretched without bound.
-        light = np.sqrt(np.maximum(light, 0) + np.float32(0.002))
+        light = np.sqrt(np.maximum(light, 0) + np.float32(_DARK))
     return np.asarray(light, np.float32)
 
 
@@ -135,8 +136,6 @@ def _wedge(light: Float32Array) -> BoolArray | None:
     mask = np.zeros(light.shape, np.uint8)
     for turns in range(4):
         turned, marked = np.rot90(light, turns), np.rot90(mask, turns)
-        if np.mean(turned[:, 0] <= _NOTHING) < 0.05:
-            continue
         depth = max(int(_WEDGE_DEPTH * turned.shape[1]), 2)
         run = np.logical_and.accumulate(turned[:, :depth] <= _NOTHING, axis=1).sum(axis=1)
         # A dark slot of the screen is a long run too, but its neighbours are short.

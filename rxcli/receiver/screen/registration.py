@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import TINY
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen.picture import TONE
 from rxcli.types import Float32Array, FloatArray, Frame, Lens
 
-#: Width of a screen over its height.
-_ASPECT = 16 / 9
 #: Cells across and down the screen that its texture is known by, about.
 _CELLS_ACROSS, _CELLS_DOWN = 360, 110
 #: Share of the screen's size beyond its sides that belongs to the texture: its sides tell where it is.
@@ -41,8 +41,8 @@ _CELL_NOISE, _STRIPE_NOISE = 0.004, 0.08
 _UNEVEN_ROWS = 0.1
 #: How much more than its expected noise a change of the texture must be; cells around over which that is judged.
 _ABOVE_NOISE, _LOCAL_CELLS = 1.3, 15
-#: Exponent of the tone curve; value below which it is taken to be as steep as there.
-_TONE, _DARKEST = 2.2, 0.03
+#: Value below which the tone curve is taken to be as steep as there.
+_DARKEST = 0.03
 #: Percentage of the cells that are darker than what a dark column is taken to show.
 _DARK_PERCENT = 8.0
 #: Cells of a coarse cell across and down, smoothing of the coarse texture in such cells, and iterations.
@@ -63,8 +63,9 @@ _OUTLIER = 2.5
 #: How far a frame may be from where it is expected, screen sizes: shift, affine modes, perspective modes.
 #: A screen's size is its width, or what its height makes it on pixels that are no squares.
 _SHIFT_SD, _AFFINE_SD, _PERSPECTIVE_SD = 0.008, 0.0027, 0.0004
-#: Neighbouring cells err alike: the information of so many counts once.
-_ALIKE_CELLS = 4.0
+#: Information below which there is no texture, 1 over pixels squared. Neighbouring cells err alike: that of so many
+#: counts once.
+_LEAST_INFORMATION, _ALIKE_CELLS = 1e-9, 4.0
 #: Parts of the screen, across and down, of which each may err in its own way; and how well an outline that is found in
 #: a frame is known, screen sizes.
 _PARTS, _OUTLINE_SD = (20, 6), 0.002
@@ -309,7 +310,7 @@ class ScreenTexture:
         self._known_so_far = self._coarse_so_far = None
         value, weight = self._read(self._texture_of(frame), self._plane, self._places)
         total = self._weight + weight
-        self._value += (value - self._value) * (weight / np.maximum(total, np.float32(1e-6)))
+        self._value += (value - self._value) * (weight / np.maximum(total, np.float32(TINY)))
         self._weight = np.minimum(total, np.float32(_MOST_WEIGHT))
 
     def _known(self) -> _AllKnown:
@@ -352,7 +353,7 @@ class ScreenTexture:
             weight *= known.trust
             error = known.value - value
             squared = error * error
-            variance = max(float(np.vdot(weight, squared)) / max(float(weight.sum()), 1e-6), 1e-6)
+            variance = max(float(np.vdot(weight, squared)) / max(float(weight.sum()), TINY), TINY)
             squared *= np.float32(1 / (_OUTLIER**2 * variance))
             squared += np.float32(1)
             weight /= squared
@@ -361,7 +362,7 @@ class ScreenTexture:
             error *= weight
             scores = _scores_of_parts(known, error, per_pixel)
             # The prior counts against as much information as the parts' scatter leaves.
-            scale = max(float(np.square(scores).sum() / max(np.trace(normal), 1e-12)), 1e-9)
+            scale = max(float(np.square(scores).sum() / max(np.trace(normal), TINY)), TINY)
             total = normal / scale + prior
             slope = scores.sum(axis=0) / scale + prior @ (expected - plane).ravel()
             step = np.linalg.solve(total, slope)
@@ -370,7 +371,7 @@ class ScreenTexture:
                 break
         of_known = weight * known.value
         power = float(np.vdot(of_known, known.value)) * float(np.vdot(weight * value, value))
-        correlation = float(np.vdot(of_known, value)) / max(power, 1e-18) ** 0.5
+        correlation = float(np.vdot(of_known, value)) / max(power, TINY**2) ** 0.5
         return plane, _sandwich(normal, scores, variance, prior), correlation
 
     def _read(self, texture: _Texture, plane: FloatArray, places: _Places) -> tuple[Float32Array, Float32Array]:
@@ -439,7 +440,7 @@ def _light_and_noise(
 ) -> tuple[Float32Array, Float32Array]:
     """Light of sums of so many pixels, and what a cell of that light errs by, in parts of what stripes leave."""
     coded = np.clip((sums / np.float32(cell_y) - np.float32(black)) / np.float32(white - black), 0, 1)
-    tone = np.float32(1.0 if linear else _TONE)
+    tone = np.float32(1.0 if linear else TONE)
     steep = np.maximum(coded, np.float32(_DARKEST)) ** (tone - np.float32(1))
     return coded**tone, steep * np.float32(tone * _CELL_NOISE / _STRIPE_NOISE)
 
@@ -463,7 +464,7 @@ def _coarser(texture: _Texture) -> _Texture:
     coarse = [cv2.resize(values, (n_x, n_y), interpolation=cv2.INTER_AREA) for values in both]
     weight, value = (cv2.GaussianBlur(values, (0, 0), _COARSE_BLUR) for values in coarse)
     return _Texture(
-        np.asarray(value / np.maximum(weight, np.float32(1e-6))),
+        np.asarray(value / np.maximum(weight, np.float32(TINY))),
         np.asarray(weight),
         texture.cell_x * across,
         texture.cell_y * down,
@@ -513,12 +514,12 @@ def _known(texture: _Texture, fewer: float, places: _Places) -> _Known:
     along_v[1:-1] = (value[2:] - value[:-2]) * np.float32(0.5)
     noise = np.float32(0.5 * _STRIPE_NOISE**2 / fewer)
     uneven = np.float32(_UNEVEN_ROWS) * around(value * value * weight)
-    total = np.maximum(around(weight), np.float32(1e-3))
-    n = total / np.maximum(around((weight > 0).astype(np.float32)), np.float32(1e-6))
+    total = np.maximum(around(weight), np.float32(TINY))
+    n = total / np.maximum(around((weight > 0).astype(np.float32)), np.float32(TINY))
     for change, more, step in ((along_u, np.float32(0), u[1] - u[0]), (along_v, uneven / total, v[1] - v[0])):
         power = around(change * change * weight) / total
-        least = np.float32(_ABOVE_NOISE) * (noise + more) / np.maximum(n, np.float32(1e-3))
-        change *= np.maximum(1 - least / np.maximum(power, np.float32(1e-12)), 0) / np.float32(step)
+        least = np.float32(_ABOVE_NOISE) * (noise + more) / np.maximum(n, np.float32(TINY))
+        change *= np.maximum(1 - least / np.maximum(power, np.float32(TINY)), 0) / np.float32(step)
     products = along[[0, 0, 1]] * along[[0, 1, 1]]
     return _Known(value, along, products, weight / (weight + np.float32(1.0)), places)
 
@@ -558,16 +559,16 @@ def _scores_of_parts(known: _Known, weighted: Float32Array, per_pixel: FloatArra
 def _sandwich(normal: FloatArray, scores: FloatArray, variance: float, prior: FloatArray) -> FloatArray:
     """(8, 8) covariance of a fit: by the scatter of its parts, not below that of even noise of a `variance`, and no
     larger than the prior allows."""
-    bread = np.linalg.inv(normal + (1e-6 * np.trace(normal) + 1e-9) * np.eye(8))
+    bread = np.linalg.inv(normal + (1e-6 * np.trace(normal) + _LEAST_INFORMATION) * np.eye(8))
     spread = scores - scores.mean(axis=0)
-    noise = _ALIKE_CELLS * variance * (normal + 1e-9 * np.eye(8))
+    noise = _ALIKE_CELLS * variance * (normal + _LEAST_INFORMATION * np.eye(8))
     covariance = bread @ (spread.T @ spread + noise) @ bread + 1e-4 * np.eye(8)
     return np.asarray(np.linalg.inv(np.linalg.inv(covariance) + prior))
 
 
 def _size(corners: FloatArray) -> float:
     """Size of a screen (4, 2), pixels: its width, or what a screen as high is wide where that is more."""
-    return float(max(np.ptp(corners[:, 0]), np.ptp(corners[:, 1]) * _ASPECT))
+    return float(max(np.ptp(corners[:, 0]), np.ptp(corners[:, 1]) * 16 / 9))
 
 
 def _information(size: float) -> FloatArray:

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.receiver.screen.grid import Grid, columns_at
-from rxcli.receiver.screen.sides import Side
+from rxcli.receiver.screen.sides import SHOWS, Side
 from rxcli.receiver.screen.waveforms import StripLight, predicted_light
 from rxcli.types import Float32Array, FloatArray
 
@@ -21,19 +22,16 @@ from rxcli.types import Float32Array, FloatArray
 _BINS, _BEYOND = 320, 0.6
 #: Share of the strips, the least alike, that are taken to be without light.
 _DARK_SHARE = 0.1
-#: Strips of so much of a column are taken together.
-_PART = 0.5
 #: Places with less than this share of the strips that others have count in proportion.
 _FEW_STRIPS = 0.5
 #: Light counts from this share of what the lit rows have.
 _LIT_SHARE = 0.18
-#: Bars take no more than this, screen heights; and so many more rows are kept than have light.
-_BARS, _MORE, _COVERED = 0.45, 0.03, 0.1
+#: Bars take no more than this, screen heights.
+_BARS = 0.45
 #: Sides are no further apart than the screen's height and this share of it.
 _WHOLE = 0.035
-#: Support from which top and bottom show well; how far they may be slanted against the columns, and the least distance
-#: of the two and most light that they leave out, screen heights.
-_SHOWS, _SLANTED, _LEAST_HEIGHT, _LEFT_OUT = 0.35, 0.06, 0.3, 0.08
+#: How far sides may be slanted against the columns, and lie from the ends of the light, screen heights.
+_SLANTED, _NEAR = 0.06, 0.08
 _ROUNDS = 2
 
 
@@ -87,7 +85,7 @@ def _middle_of(grid: Grid, n_columns: int, row: float) -> FloatArray:
     x = grid.width / 2.0
     for _ in range(8):
         u = grid.columns_at(np.array([[x, row], [x + 1, row]]))
-        x += (n_columns / 2 - float(u[0])) / max(float(u[1] - u[0]), 1e-6)
+        x += (n_columns / 2 - float(u[0])) / max(float(u[1] - u[0]), TINY)
         x = float(np.clip(x, -2 * grid.width, 3 * grid.width))
     return np.array([x, row])
 
@@ -141,18 +139,16 @@ def _possible_ends(light: FloatArray, shown: FloatArray) -> list[FloatArray]:
     """
     sees = np.isfinite(shown).all(axis=1)
     less = 1 - float(np.diff(light.mean(axis=1))[0])
-    more = float(np.clip(less / 2, 0, _MORE)) * np.array([[-1.0], [1.0]])
-    tight = np.where(np.isfinite(shown), shown, light + more)
+    tight = np.where(np.isfinite(shown), shown, light)
     if sees.all():
         return [tight]
+    # A little more than the screen costs less than rows that are left out.
+    whole = [light + less / 2 * np.array([[-1.0], [1.0]])]
     if not sees.any() and less < _WHOLE:
-        return [light + less / 2 * np.array([[-1.0], [1.0]])]
+        return whole
     anchored = [tight[0] + np.array([[0.0], [1.0]]), tight[1] + np.array([[-1.0], [0.0]])]
     if sees.any():
-        return [tight, anchored[int(sees.argmax())]]
-    # A little more than the screen costs less than rows that are left out.
-    around = min(less, _COVERED) if less < _BARS else less / 2
-    whole = [light + around * np.array([[-1.0], [1.0]])]
+        return [anchored[int(sees.argmax())], tight]
     if less < 2 * _WHOLE:
         return whole
     return [*whole, tight, *anchored] if less < _BARS else [*whole, *anchored, tight]
@@ -164,12 +160,8 @@ def _shown_sides(plane: Plane, n_columns: int, sides: Sequence[Side], light: Flo
     if not sides:
         return ends
     meets = np.array([[_meets(plane, side, u) for u in (0.0, float(n_columns))] for side in sides])
-    shows = np.array([side.support >= _SHOWS for side in sides]) & (np.abs(np.diff(meets, axis=1)[:, 0]) < _SLANTED)
-    middle, lit = meets.mean(axis=1), light.mean(axis=1)
-    both = shows.all() and _LEAST_HEIGHT < middle[1] - middle[0] < 1 + _WHOLE
-    if both and lit[1] - lit[0] < middle[1] - middle[0] + _LEFT_OUT and middle[0] < lit.mean() < middle[1]:
-        return meets
-    near = shows & (np.abs(middle - lit) < _LEFT_OUT)
+    shows = np.array([side.support >= SHOWS for side in sides]) & (np.abs(np.diff(meets, axis=1)[:, 0]) < _SLANTED)
+    near = shows & (np.abs(meets.mean(axis=1) - light.mean(axis=1)) < _NEAR)
     ends[near] = meets[near]
     return ends
 
@@ -187,7 +179,7 @@ def _meets(plane: Plane, side: Side, u: float) -> float:
 def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:
     """From where to where there is light, no more than a screen's height, 1."""
     step = float(v[1] - v[0])
-    full = max(float(np.percentile(light[light != 0], 75)), 1e-6) if light.any() else 1e-6
+    full = max(float(np.percentile(light[light != 0], 75)), TINY) if light.any() else TINY
     gain = np.concatenate([[0.0], np.cumsum(np.minimum(light, full) - _LIT_SHARE * full)])
     n = min(round(1 / step), light.size)
     end = int((gain - np.minimum.accumulate(gain)).argmax())
@@ -202,7 +194,7 @@ def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:
 class _PartLight:
     """How alike the strips of a screen are to what their neighbours predict, beyond what strips without light are.
 
-    Strips of a part of a column lie at the same place along the screen, and are taken together.
+    The strips of a column lie at the same place along the screen, and are taken together.
     """
 
     #: (P, rows), and how many strips each is the sum of.
@@ -221,7 +213,7 @@ class _PartLight:
         mean = alike.mean(axis=(0, 2))
         dark = np.sort(mean)[: max(round(_DARK_SHARE * mean.size), 1)].mean()
         n_windows, n_strips, n_rows = alike.shape
-        n = max(int(_PART * n_strips / max(float(np.ptp(u.mean(axis=0))), 1.0)), 1)
+        n = max(int(n_strips / max(float(np.ptp(u.mean(axis=0))), 1.0)), 1)
         whole = n_strips // n * n
         total = alike[:, :whole].reshape(n_windows, -1, n, n_rows).sum(axis=2)
         u, x, y = (values[:, :whole].reshape(n_windows, -1, n).mean(axis=2) for values in (u, strips.x, strips.y))

@@ -11,25 +11,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
-#: Places a column at which a step is looked for; how much on either side is compared, and what is left out between.
-_PLACES, _BESIDE, _GAP = 16, 0.3, 0.04
-#: Strips on either side, at least, and values of a pixel below which a picture is black: nothing was taken there.
-_FEWEST_STRIPS, _BLACK = 2, 0.25
-#: Windows with less than this share of the light may lie above or below the screen.
-_WITH_LIGHT = 0.25
+#: Places a column at which a step is looked for, and how much on either side is compared.
+_PLACES, _BESIDE = 16, 0.3
+#: Strips on either side, at least.
+_FEWEST_STRIPS = 2
 #: Windows, at least; and places over which the spread of the steps is smoothed, columns.
 _FEWEST_WINDOWS, _SMOOTH = 4, 0.6
 #: Other steps are higher than this, columns apart.
 _ALONE = 0.25
-#: Probability that edges show, and each of them then; scale of their heights, exponential, standard deviations.
-_SHOW, _EACH_SHOWS, _EDGE_SCALE = 0.6, 0.85, 6.0
-#: Other steps that stand out, a column; mean and standard deviation of their heights, by chance; and which share of
-#: them is in the picture, with its scale.
-_OTHERS, _CHANCE_MEAN, _CHANCE_SD, _IN_PICTURE, _PICTURE_SCALE = 1.6, 1.5, 0.6, 0.05, 3.0
-#: The most that one edge says, log-odds.
-_MOST = 4.5
+#: Probability that edges show, and each of them then; scale of the heights of edges, exponential, standard deviations.
+_SHOWS, _EDGE_SCALE = 0.8, 6.0
+#: Of other steps that stand out there is one a column: mean and standard deviation of their heights, by chance; and the
+#: share of edges in the picture.
+_CHANCE_MEAN, _CHANCE_SD, _IN_PICTURE = 1.5, 0.6, 0.05
 #: A picture in the picture is lighter than what is beside it, by percentiles of the level across the columns; it begins
 #: at this share of the way. Its edge is sharp where, this far beyond it, no more than this share is left, columns.
 _DARKER, _LIGHTER, _BEGINS, _BEYOND, _SHARE, _NEAR = 5, 75, 0.25, 0.45, 0.12, 0.5
@@ -49,25 +46,21 @@ class StillSteps:
     peak: FloatArray
     peak_significance: FloatArray
 
-    def on_borders(self, borders: tuple[float, float], deviations: tuple[float, float]) -> float:
+    def on_borders(self, borders: tuple[float, float], deviation: float) -> float:
         """Log-odds that the screen's left and right edge lie there, known to some columns; 0: nothing can be said."""
-        (left, rises), (right, falls) = (self._on(*one) for one in zip(borders, deviations, strict=True))
-        if min(left, right) > 1 and rises == falls:
-            # A panel is lighter than what is on either side of it, or darker.
-            left, right = max(left, right), 0.0
-        shown = np.prod([1 - _EACH_SHOWS + _EACH_SHOWS * ratio for ratio in (left, right) if ratio >= 0])
-        return float(np.log(1 - _SHOW + _SHOW * shown))
+        ratios = [self._on(border, deviation) for border in borders]
+        shown = np.prod([1 - _SHOWS + _SHOWS * ratio for ratio in ratios if ratio is not None])
+        return float(np.log(1 - _SHOWS + _SHOWS * shown))
 
-    def _on(self, border: float, deviation: float) -> tuple[float, bool]:
-        """How much likelier a step there is an edge than not, and whether it rises; -1: nothing can be said."""
+    def _on(self, border: float, deviation: float) -> float | None:
+        """How much likelier a step there is an edge than not; None: nothing can be said."""
         known = np.abs(self.place - border) <= 2 * deviation
         if not np.isfinite(self.significance[known]).any() or not self.peak.size:
-            return -1.0, True
+            return None
         off, size = (self.peak - border) / deviation, np.abs(self.peak_significance)
         density = np.exp(-0.5 * off**2) / (np.sqrt(2 * np.pi) * deviation)
         ratio = density * np.exp(-size / _EDGE_SCALE) / _EDGE_SCALE / _other_steps(size)
-        best = int(ratio.argmax())
-        return min(float(ratio[best]), float(np.exp(_MOST))), bool(self.peak_significance[best] > 0)
+        return float(ratio.max())
 
     @property
     def sharp_ends(self) -> tuple[float, float] | None:
@@ -89,15 +82,15 @@ class StillSteps:
         outside, inside = best - side * beyond, best + side * beyond
         if not (0 <= outside < self.place.size and 0 <= inside < self.place.size):
             return None
-        left = (self.level[outside] - dark) / max(self.level[inside] - dark, 1e-6)
+        left = (self.level[outside] - dark) / max(self.level[inside] - dark, TINY)
         return float(self.place[best]) if np.isfinite(left) and left < _SHARE else None
 
 
 def _other_steps(size: FloatArray) -> FloatArray:
     """How many steps of such a height there are in a column, per standard deviation, that are no edge of the screen."""
     by_chance = np.exp(-0.5 * ((size - _CHANCE_MEAN) / _CHANCE_SD) ** 2) / (np.sqrt(2 * np.pi) * _CHANCE_SD)
-    in_picture = np.exp(-size / _PICTURE_SCALE) / _PICTURE_SCALE
-    return np.asarray(_OTHERS * ((1 - _IN_PICTURE) * by_chance + _IN_PICTURE * in_picture) + 1e-30)
+    in_picture = np.exp(-size / _EDGE_SCALE) / _EDGE_SCALE
+    return np.asarray(by_chance + _IN_PICTURE * in_picture + TINY)
 
 
 def still_steps(level: Float32Array, u: FloatArray, by_window: FloatArray) -> StillSteps:
@@ -110,7 +103,7 @@ def still_steps(level: Float32Array, u: FloatArray, by_window: FloatArray) -> St
     """
     first, last = int(np.floor(u.min())) - 1, int(np.ceil(u.max())) + 1
     place = first + np.arange((last - first) * _PLACES + 1) / _PLACES
-    lit = np.flatnonzero(by_window >= _WITH_LIGHT * by_window.max(initial=0.0))
+    lit = np.flatnonzero(by_window > 0)
     if lit.size < _FEWEST_WINDOWS:
         nothing = np.full(place.size, np.nan)
         return StillSteps(place, nothing, nothing, nothing, np.zeros(0), np.zeros(0))
@@ -125,8 +118,7 @@ def still_steps(level: Float32Array, u: FloatArray, by_window: FloatArray) -> St
 
 def _steps(level: Float32Array, u: FloatArray, place: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(P,) light of places, and how much more there is to the right of them than to the left; NaN where unknown."""
-    shown = level > _BLACK
-    shown[1:-1] &= (level[2:] > _BLACK) & (level[:-2] > _BLACK)
+    shown = level > 0
     total = np.concatenate([[0.0], np.cumsum(np.where(shown, level, 0.0))])
     count = np.concatenate([[0], np.cumsum(shown)])
 
@@ -135,8 +127,8 @@ def _steps(level: Float32Array, u: FloatArray, place: FloatArray) -> tuple[Float
         n = count[j] - count[i]
         return np.where(n >= fewest, (total[j] - total[i]) / np.maximum(n, 1), np.nan)
 
-    right = mean(place + _GAP, place + _GAP + _BESIDE, _FEWEST_STRIPS)
-    left = mean(place - _GAP - _BESIDE, place - _GAP, _FEWEST_STRIPS)
+    right = mean(place, place + _BESIDE, _FEWEST_STRIPS)
+    left = mean(place - _BESIDE, place, _FEWEST_STRIPS)
     return mean(place - _BESIDE / 3, place + _BESIDE / 3, 1), right - left
 
 
@@ -150,7 +142,7 @@ def _over_windows(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     deviation = np.sqrt((spread**2).sum(axis=0) / np.maximum(count * (count - 1.0), 1))
     box = np.ones(2 * round(_SMOOTH * _PLACES / 2) + 1)
     weight = np.convolve(enough.astype(np.float64), box, "same")
-    smooth = np.convolve(np.where(enough, deviation, 0.0), box, "same") / np.maximum(weight, 1) + 1e-6
+    smooth = np.convolve(np.where(enough, deviation, 0.0), box, "same") / np.maximum(weight, 1) + TINY
     return np.where(enough, mean, np.nan), smooth
 
 

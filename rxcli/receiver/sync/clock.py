@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import folded, header_correlation
+from rxcli.numerics import TINY, folded, header_correlation
 from rxcli.protocol import EXTREMES_SLOTS, HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
@@ -74,9 +74,9 @@ def resample(
     first, stop = _shown_rows(profiles.inside.reshape(light.shape))
     positions = _row_positions(profiles, borders)
     widths = np.diff(positions, axis=-1)
-    valid = (positions[:, :-1] >= first[:, None]) & (positions[:, 1:] <= stop[:, None]) & (widths > 1e-6)
+    valid = (positions[:, :-1] >= first[:, None]) & (positions[:, 1:] <= stop[:, None]) & (widths > TINY)
     mean = _integrate(light, positions)
-    mean /= np.maximum(widths, 1e-6)
+    mean /= np.maximum(widths, TINY)
     mean *= valid
     shape = (*profiles.light.shape[:2], n_samples)
     return mean.astype(np.float32).reshape(shape), valid.astype(np.float32).reshape(shape)
@@ -296,7 +296,7 @@ def _rival(score: FloatArray, best: int, samples_per_slot: int, further: int = 0
     period = score.size
     distance = np.abs((np.arange(period) - best + period // 2) % period - period // 2)
     away = score[distance > SLOTS_PER_SYMBOL * samples_per_slot // 4 + further]
-    return max(float(away.max(initial=0.0)), 1e-12)
+    return max(float(away.max(initial=0.0)), TINY)
 
 
 def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> tuple[float, float, FloatArray]:
