@@ -42,20 +42,28 @@ def _first(headers: float) -> Reception:
 
 
 @pytest.mark.parametrize(
-    ("headers", "of_rival", "skip", "looked"),
+    ("headers", "of_rival", "confidence", "skip", "looked"),
     [
-        (5.0, None, frozenset(SKIPS), False),
-        (90.0, None, frozenset(SKIPS), True),
-        (5.0, 90.0, frozenset(SKIPS), True),
-        (5.0, 5.0, frozenset(SKIPS), False),
-        (5.0, None, frozenset(SKIPS) - {"no_packets"}, True),
+        (5.0, None, 0.1, frozenset(SKIPS), False),
+        (90.0, None, 0.1, frozenset(SKIPS), True),
+        (5.0, 90.0, 0.1, frozenset(SKIPS), True),
+        (5.0, 5.0, 0.1, frozenset(SKIPS), False),
+        (5.0, None, 0.99, frozenset(SKIPS), True),
+        (5.0, None, 0.1, frozenset(SKIPS) - {"no_packets"}, True),
     ],
 )
 def test_only_what_may_show_packets_is_looked_at_in_depth(
-    headers: float, of_rival: float | None, skip: frozenset[str], looked: bool, monkeypatch: pytest.MonkeyPatch
+    headers: float,
+    of_rival: float | None,
+    confidence: float,
+    skip: frozenset[str],
+    looked: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rival = None if of_rival is None else replace(CLOCK, row0=4.0)
     acquisition = Acquisition(None, None, CLOCK, rival)  # type: ignore[arg-type]
+    monkeypatch.setattr(still, "complete_packets", lambda one: np.ones((1, 3), bool))
+    monkeypatch.setattr(still, "packet_confidence", lambda one: np.full((1, 3), confidence))
     monkeypatch.setattr(still, "first_pass", lambda one: _first(headers if one.clock is CLOCK else of_rival or 0.0))
     seen: list[str] = []
     monkeypatch.setattr(still, "decode", lambda *rest: (seen.append("decode"), rest[2])[1])

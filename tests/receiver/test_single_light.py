@@ -61,7 +61,8 @@ def test_a_screen_that_says_the_same_in_all_columns_is_received(screen: str) -> 
     result, score = trial.receive(trial.options())
     assert result.status == "ok"
     assert score.error_free >= 18
-    assert len({column.packets[0].payload for column in result.columns}) <= 2
+    # Two may be wrong, each in its own way.
+    assert len({column.packets[0].payload for column in result.columns}) <= 3
 
 
 def test_columns_are_alike_that_show_one_light() -> None:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import TINY
 from rxcli.receiver.screen.onsets import agreeing, row_trust
 from rxcli.receiver.screen.picture import Picture, Pixels, row_step
 from rxcli.receiver.screen.pose import INDEPENDENT, Places, Rectangle, fit_pose
@@ -24,35 +23,42 @@ from rxcli.receiver.screen.sides import (
     INWARD,
     LEFT,
     RIGHT,
-    SIDE_SD,
     TOP,
     Side,
     across,
     corners_of,
-    ends,
     outermost_line,
     width_of,
 )
-from rxcli.receiver.screen.stripes import LAG, OUTSIDE_COST
+from rxcli.receiver.screen.stripes import LAG
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
-#: Half of the window over which a step is measured, screen widths and pixels; and how far outside of the guess pixels
-#: are read, such halves, and twice as far inside.
-_HALF_STEP, _LEAST_HALF_STEP, _OUT = 0.0013, 3, 7
-#: Distance from a line at which support ends, such halves.
-_TOLERANCE = 0.5
+#: How far outside and inside of the guess pixels are read, screen widths.
+_OUT, _IN = 0.009, 0.018
 #: Strips along top and bottom, and their width in pixels, about.
 _STRIPS, _STRIP_PX = 160, 6
 #: Rows that are read along left and right, about, and rows of one band.
 _ROWS, _BAND_ROWS = 1000, 12
-#: A step counts from this many standard deviations on, and this share of the largest.
-_SIGMAS, _LEAST_SHARE = 5.0, 0.11
-#: Largest deviation of a slope from the pose.
-_SKEW = 0.005
-#: Least supporters of a side, as a number, and share of its length that they span.
-SUPPORTERS, _SPAN = 6, 0.3
-#: How well the guess knows the corners, and the pose the sides, screen widths.
-_CORNER_SD, _POSE_SD = 0.01, 0.001
+#: Half of the window over which a step is measured, screen widths and pixels.
+_HALF_STEP, _LEAST_HALF_STEP = 0.0013, 3
+#: Where the light inside that pixels are compared with begins, screen widths.
+_INSIDE = 0.0025
+#: A step counts from this many standard deviations on, this share of the largest, and this much light.
+_SIGMAS, _LEAST_SHARE, _LEAST_LIGHT = 5.0, 0.11, 0.0008
+#: Share of a full step that must be significant: bands are joined until it is. And bands that remain, at least.
+_JOINED_SHARE, _LEAST_BANDS = 0.3, 10
+#: Distance from a line at which support ends, screen widths, pixels, and periods of a mosaic.
+_TOLERANCE, _LEAST_TOLERANCE, _PERIODS = 0.0005, 1.2, 0.4
+#: Cost of a place outside a line, of a row-wise and of an upright side: a slot's end must not win over the edge.
+_OUTSIDE_COST = {True: 4.5, False: 1.0}
+#: Largest deviation of a slope from the guess, and from the pose.
+_SKEW, _SMALL_SKEW = 0.007, 0.003
+#: Least supporters of a side, as a number, share of its places, and share of its length that they span.
+_SUPPORTERS, _SUPPORT, _SPAN = 6, 0.03, 0.3
+#: Share of a side's places that makes it sure at once.
+_SURE = 0.6
+#: How well the guess knows the corners, a guessed side its place, and the pose the sides, screen widths.
+_CORNER_SD, _GUESS_SD, _POSE_SD = 0.01, 0.002, 0.001
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +86,23 @@ def refine(
     corners = corners_of(initial, picture.width, picture.height)
     size = width_of(corners)
     steps = [steps_of(picture, initial, side, size) for side in range(4)]
+    depths = [INWARD[side] * (s.place - initial[side].at(s.t)) for side, s in enumerate(steps)]
+    expected = rectangle.project(pose)
+    supporters = [_supporters(steps[side], depths[side], side, 1.6 * steps[side].sd, _SKEW, 2.0) for side in range(4)]
+    # A slot's end can look like an edge: a side that shows on a part of its length follows from the others at first.
+    sure = [
+        mask if mask.sum() > _SURE * mask.size or not initial[side].support else np.zeros_like(mask)
+        for side, mask in enumerate(supporters)
+    ]
+    places = [_places(steps[side], sure[side], initial[side], size) for side in range(4)]
+    pose = fit_pose(places, expected, _CORNER_SD * size, pose, rectangle, 4)
     depths = _depths(steps, pose, rectangle)
-    # Nearer to the right pose, more of the steps are told apart.
-    for _ in range(2):
-        supporters = [_supporters(own, depth, side) for side, own, depth in zip(range(4), steps, depths, strict=True)]
-        places = [_places(*one, size) for one in zip(steps, supporters, initial, strict=True)]
-        pose = fit_pose(places, rectangle.project(pose), _CORNER_SD * size, pose, rectangle)
-        depths = _depths(steps, pose, rectangle)
+    for side, tolerance in enumerate(1.2 * s.sd for s in steps):
+        nearer = _supporters(steps[side], depths[side], side, tolerance, _SMALL_SKEW, 1.2)
+        supporters[side] = nearer if nearer.any() else sure[side]
+    places = [_places(steps[side], supporters[side], initial[side], size) for side in range(4)]
+    pose = fit_pose(places, expected, _CORNER_SD * size, pose, rectangle, 3)
+    depths = _depths(steps, pose, rectangle)
     own = [_deviation(steps[side], supporters[side], depths[side], side, _POSE_SD * size) for side in range(4)]
     return _meet(pose, own, rectangle), [float(mask.mean()) if mask.size else 0.0 for mask in supporters]
 
@@ -97,7 +113,7 @@ def _depths(steps: list[Steps], pose: FloatArray, rectangle: Rectangle) -> list[
     return [INWARD[side] * (s.place - rectangle.side_at(corners, pose[-1], side, s.t)) for side, s in enumerate(steps)]
 
 
-def _supporters(steps: Steps, depth: FloatArray, side: int) -> BoolArray:
+def _supporters(steps: Steps, depth: FloatArray, side: int, tolerance: float, skew: float, window: float) -> BoolArray:
     """(K,) the steps that lie on the side."""
     none = np.zeros(steps.t.size, np.bool_)
     line = outermost_line(
@@ -105,17 +121,17 @@ def _supporters(steps: Steps, depth: FloatArray, side: int) -> BoolArray:
         depth,
         steps.weight,
         steps.found,
-        steps.sd,
+        tolerance,
         slope=0.0,
-        spread=_SKEW,
-        outside_cost=OUTSIDE_COST,
+        spread=skew,
+        outside_cost=_OUTSIDE_COST[across(side)],
     )
     if line is None:
         return none
     beyond = depth - line.start - line.slope * steps.t
     # Late steps pull a line inwards, nothing pulls it outwards.
-    on_it = steps.found & (beyond > -2 * steps.sd) & (beyond < steps.sd)
-    enough = on_it.sum() >= SUPPORTERS
+    on_it = steps.found & (beyond > -1.5 * window * steps.sd) & (beyond < window * steps.sd)
+    enough = on_it.sum() >= max(_SUPPORTERS, _SUPPORT * steps.t.size)
     return on_it if enough and np.ptp(steps.t[on_it]) >= _SPAN * np.ptp(steps.t) else none
 
 
@@ -125,8 +141,8 @@ def _places(steps: Steps, supporters: BoolArray, initial: Side, size: float) -> 
         return Places(steps.t[supporters], steps.place[supporters], steps.sd)
     if not initial.support:
         return None
-    t, place = initial.some_places
-    return Places(t, place, SIDE_SD * size)
+    t = initial.middle + initial.half * np.linspace(-0.8, 0.8, 5)
+    return Places(t, initial.at(t), _GUESS_SD * size)
 
 
 def _deviation(
@@ -171,10 +187,10 @@ def steps_of(picture: Picture, initial: list[Side], side: int, size: float) -> S
         size: the screen's width, pixels.
     """
     half = max(_LEAST_HALF_STEP, int(_HALF_STEP * size), picture.period)
-    out, inward = _OUT * half, 2 * _OUT * half
+    out, inward = max(int(_OUT * size), 3 * half), max(int(_IN * size), 6 * half)
     read = _across if across(side) else _upright
     t, centre, light, threshold, inside = read(picture, initial, side, size, out, inward, half)
-    sd = _TOLERANCE * half
+    sd = max(_LEAST_TOLERANCE, _TOLERANCE * size, _PERIODS * picture.period)
     if not t.size:
         return Steps(t, t, t > 0, t, sd)
     if picture.period > 1:
@@ -183,7 +199,7 @@ def steps_of(picture: Picture, initial: list[Side], side: int, size: float) -> S
     place = centre + INWARD[side] * (position - out)
     # Where the picture ends before the screen does, the first step is any.
     found &= inside[:, out // 2]
-    found &= agreeing(place, 3 * sd)
+    found &= agreeing(place, max(4.0, 3 * sd))
     weight = row_trust(place, found, sd) if across(side) else found.astype(np.float64)
     return Steps(t, place, found, weight, sd)
 
@@ -201,8 +217,9 @@ _Read = tuple[FloatArray, FloatArray, Float32Array, FloatArray, BoolArray]
 
 def _ends(initial: list[Side], side: int, size: float, limit: int) -> tuple[float, float]:
     """From where to where a side goes, a little inside its neighbours and inside the picture."""
-    first, last = ends(initial, side, initial[side].at(limit / 2), size)
-    return max(first, 0.0), min(last, limit - 1.0)
+    before, after = (initial[LEFT], initial[RIGHT]) if across(side) else (initial[TOP], initial[BOTTOM])
+    middle = initial[side].at(limit / 2)
+    return max(before.at(middle) + 0.004 * size, 0.0), min(after.at(middle) - 0.004 * size, limit - 1.0)
 
 
 def _across(picture: Picture, initial: list[Side], side: int, size: float, out: int, inward: int, half: int) -> _Read:
@@ -210,7 +227,7 @@ def _across(picture: Picture, initial: list[Side], side: int, size: float, out: 
     strip = picture.period * max(1, round(_STRIP_PX / picture.period))
     first, last = _ends(initial, side, size, picture.width)
     n = min(_STRIPS, int((last - first) / strip))
-    if n < SUPPORTERS:
+    if n < _SUPPORTERS:
         return _nothing(out + inward)
     left = np.round(np.linspace(first, last - strip, n)).astype(np.int64)
     t: FloatArray = left.astype(np.float64) + (strip - 1) / 2
@@ -220,7 +237,7 @@ def _across(picture: Picture, initial: list[Side], side: int, size: float, out: 
     mean = np.full(strip, 1 / strip, np.float32)
     light = (picture.linear(block.reshape(-1, strip)) @ mean).reshape(n, -1)[:, :: INWARD[side]]
     noise = float(np.median(light[:, : out // 2].std(axis=1)))
-    threshold = np.maximum(_LEAST_SHARE * np.ptp(light, axis=1), _SIGMAS * noise * (2 / half) ** 0.5)
+    threshold = np.maximum(_LEAST_SHARE * np.ptp(light, axis=1), max(_SIGMAS * noise * (2 / half) ** 0.5, _LEAST_LIGHT))
     inside = _in_picture(centre, side, out, inward, picture.height)
     return t, centre.astype(np.float64), light, threshold, inside
 
@@ -231,7 +248,7 @@ def _upright(picture: Picture, initial: list[Side], side: int, size: float, out:
     step = picture.period * max(1, round((last - first) / _ROWS / picture.period))
     lag = max(1, round(LAG * row_step(picture) / step))
     n = int((last - first) / step - lag) // _BAND_ROWS
-    if n < SUPPORTERS:
+    if n < _SUPPORTERS:
         return _nothing(out + inward)
     top = int(first) + step * _BAND_ROWS * np.arange(n)
     t: FloatArray = top.astype(np.float64) + step * (_BAND_ROWS + lag - 1) / 2
@@ -240,19 +257,18 @@ def _upright(picture: Picture, initial: list[Side], side: int, size: float, out:
     light = picture.linear(_cut(picture.pixels, top, left, (_BAND_ROWS + lag, out + inward), step))
     change = light[:, lag:] - light[:, :-lag]
     change = change if INWARD[side] > 0 else np.ascontiguousarray(change[:, :, ::-1])
-    within = change[:, :, out + 2 * half :].mean(axis=2)
+    within = change[:, :, out + int(_INSIDE * size) :].mean(axis=2)
     common, power = (within[:, None] @ change)[:, 0], (within**2).sum(axis=1)
-    noise = float(np.median((change[:, :, : max(out // 3, 2)] ** 2).mean(axis=(1, 2)))) + TINY
+    noise = float(np.median((change[:, :, : max(out // 3, 2)] ** 2).mean(axis=(1, 2)))) + 1e-7
     # A step over `half` places has this variance where n rows of the mean power are joined: 4 noise / (half n power).
-    # Bands are joined until a third of a full step is significant.
-    rows = 4 * noise * (3 * _SIGMAS) ** 2 / half / max(float((within**2).mean()), TINY)
-    joined = int(np.clip(rows / _BAND_ROWS, 1, max(n // SUPPORTERS, 1)))
+    rows = 4 * noise * (_SIGMAS / _JOINED_SHARE) ** 2 / half / max(float((within**2).mean()), 1e-12)
+    joined = int(np.clip(rows / _BAND_ROWS, 1, max(n // _LEAST_BANDS, 1)))
     common, t, middle = _joined(common, joined), _joined(t, joined), _joined(centre, joined)
-    power = np.maximum(_joined(power, joined), TINY)
+    power = np.maximum(_joined(power, joined), 1e-12)
     threshold = np.maximum(_SIGMAS * np.sqrt(4 * noise / half / (power * joined)), _LEAST_SHARE)
     inside = _in_picture(centre, side, out, inward, picture.width)
     share = (common / power[:, None]).astype(np.float32)
-    return t, middle, share, threshold, _joined(inside, joined) == 1
+    return t, middle, share, threshold, _joined(inside, joined) > 0.99
 
 
 def _joined(values: NDArray[Any], n: int) -> FloatArray:
@@ -317,5 +333,5 @@ def _first_step(
     near = np.clip(peak + np.arange(-half, half + 1), 0, n - 1)
     weight = np.maximum(np.take_along_axis(growth, near, axis=1), 0)
     # Growth number i lies between the places i + half - 1 and i + half.
-    place = (weight * near).sum(axis=1) / np.maximum(weight.sum(axis=1), TINY) + half - 0.5
+    place = (weight * near).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-12) + half - 0.5
     return np.asarray(place), np.asarray(grows.any(axis=1), np.bool_)

@@ -26,28 +26,27 @@ import numpy as np
 
 from rxcli.receiver.screen.edges import refine
 from rxcli.receiver.screen.onsets import Reach, fit_side
-from rxcli.receiver.screen.picture import MIN_SIZE, Picture, Pixels, Plane, reduce
+from rxcli.receiver.screen.picture import Picture, Pixels, Plane, reduce
 from rxcli.receiver.screen.pose import Places, Rectangle, fit_pose, misfit, pose_of
 from rxcli.receiver.screen.side_curvature import measure_side_curvature
-from rxcli.receiver.screen.sides import INWARD, SIDE_NAMES, SIDE_SD, Side, corners_of, extent, from_top_left, straight
+from rxcli.receiver.screen.sides import INWARD, SIDE_NAMES, Side, corners_of, extent, from_top_left, straight
 from rxcli.receiver.screen.stripes import Stripes, coarse_sides, find_stripes
 from rxcli.types import FloatArray
 
 __all__ = ["ScreenSearch", "find_screen", "measure_side_curvature", "track_screen"]
 
+#: Least share of a side's segments that must agree on a line.
+_MIN_SUPPORT = 0.06
+#: How well a side is known from the reduced picture, screen widths.
+_SIDE_SD = 0.002
 #: A side with this support is one of the screen's, or there is no screen.
 _CLEAR_SUPPORT = 0.6
 #: Misfit of four sides from which one is suspected to be another edge; what its support counts then; least margin.
 _CONTRADICTION, _TRUST, _SUSPICION = 6.0, 12.0, 3.0
 #: Least score of a screen; photographs without one stay below 0.15.
 _MIN_SCORE = 0.25
-#: How far outside of the coarse outline sides are looked for, at least, screen widths.
-_REACH = 0.025
-#: Least height of a screen, picture heights; how many times as long as the opposite side a side is, and its aspect is
-#: as it should be, at most.
-_LEAST_HEIGHT, _KEYSTONE, _SHAPE = 0.12, 1.6, 1.09
-#: Light that is as good as none, and share of a picture that is as good as all of it.
-_NOTHING, _ALL = 0.004, 0.995
+#: Smallest picture that is searched, pixels each way.
+_MIN_SIZE = 96
 _GIVE_CORNERS = (
     "take the whole screen into view, straight from the front; if the picture does show a screen that sends, give its "
     "place with --corners"
@@ -103,8 +102,8 @@ def find_screen(
     if initial is None:
         return ScreenSearch(None, 0.0, _NO_STRIPES, _MAKE_STRIPES)
     size = extent(initial, plane.height)
-    out = max(_REACH * size, 1.5 * plane.cell_rows * plane.fy)
-    return _search(picture, plane, stripes, initial, out, size, aspect)
+    out = max(0.025 * size, 1.5 * plane.cell_rows * plane.fy)
+    return _search(picture, plane, stripes, initial, Reach(out, max(0.09 * size, 3 * out), size), aspect)
 
 
 def track_screen(
@@ -136,34 +135,31 @@ def track_screen(
     stripes = find_stripes(plane)
     initial = [straight(previous, side) for side in range(4)]
     size = float(np.linalg.norm(previous[1] - previous[0]))
-    return _search(picture, plane, stripes, initial, reach * size, size, aspect)
+    return _search(picture, plane, stripes, initial, Reach(reach * size, 3 * reach * size, size), aspect)
 
 
 def _unusable(pixels: Pixels, black: float, white: float) -> tuple[str, str] | None:
     """Why a picture cannot show a screen at all, and what to do; None where it can."""
     height, width = pixels.shape
-    if min(height, width) < MIN_SIZE:
-        size = f"the picture has {width} x {height} pixels, a screen needs at least {MIN_SIZE} each way"
+    if min(height, width) < _MIN_SIZE:
+        size = f"the picture has {width} x {height} pixels, a screen needs at least {_MIN_SIZE} each way"
         return size, "use the picture in its full size, not a thumbnail or a messenger's copy"
     sample = (pixels[:: max(1, height // 64), :: max(1, width // 64)] - np.float32(black)) / (white - black)
-    if np.mean(sample < _NOTHING) > _ALL:
+    if np.mean(sample >= 0.004) < 0.005:
         return "the picture is black", "expose longer, raise ISO, or show a brighter picture on the screen"
-    if np.mean(sample > 1 - _NOTHING) > _ALL:
+    if np.mean(sample > 0.98) > 0.99:
         return "the picture is saturated", "expose shorter, or lower ISO"
     return None
 
 
 def _search(
-    picture: Picture, plane: Plane, stripes: Stripes, initial: list[Side], out: float, size: float, aspect: float
+    picture: Picture, plane: Plane, stripes: Stripes, initial: list[Side], reach: Reach, aspect: float
 ) -> ScreenSearch:
-    """Fit the four sides near a guess; where they bound a screen, infer those that do not show, and refine all.
-
-    Places are looked for `out` pixels outside of the guess of a screen of width `size`, and four times as far inside.
-    """
-    if not _LEAST_HEIGHT * plane.height < size < 4 * plane.width:
+    """Fit the four sides near a guess; where they bound a screen, infer those that do not show, and refine all."""
+    if not 0.02 * plane.width < reach.size < 4 * plane.width:
         return ScreenSearch(None, 0.0, _NO_SHAPE)
-    reach = Reach(out, 4 * out, size)
     sides = [fit_side(picture, plane, stripes, initial, side, reach) for side in range(4)]
+    sides = [side if side.support >= _MIN_SUPPORT else replace(side, support=0.0) for side in sides]
     return replace(_outlined(picture, plane, stripes, initial, reach, aspect, sides), lines=tuple(sides))
 
 
@@ -214,7 +210,7 @@ def _agreed(
     if not missing and cost > _CONTRADICTION:
         others = [_pose_without(sides, [number], expected, start, rectangle, size) for number in range(4)]
         costs = [
-            left + side.support * (_TRUST + _inside(side, number, other, rectangle) / (SIDE_SD * size))
+            left + side.support * (_TRUST + _inside(side, number, other, rectangle) / (_SIDE_SD * size))
             for number, (side, (other, left)) in enumerate(zip(sides, others, strict=True))
         ]
         number = int(np.argmin(costs))
@@ -241,8 +237,9 @@ def _pose_without(
     """The pose of a screen from the sides that are not missing, and how badly it fits them."""
     places: list[Places | None] = []
     for number, side in enumerate(sides):
-        places.append(None if number in missing else Places(*side.some_places, SIDE_SD * size))
-    pose = fit_pose(places, expected, size, start, rectangle)
+        t = side.middle + side.half * np.linspace(-0.8, 0.8, 5)
+        places.append(None if number in missing else Places(t, side.at(t), _SIDE_SD * size))
+    pose = fit_pose(places, expected, 0.3 * size, start, rectangle, 6)
     return pose, misfit(places, pose, rectangle)
 
 
@@ -252,11 +249,6 @@ def _inside(side: Side, number: int, pose: FloatArray, rectangle: Rectangle) -> 
     return max(INWARD[number] * (expected.at(side.middle) - side.at(side.middle)), 0.0)
 
 
-def _alike(one: float, other: float, times: float) -> bool:
-    """Whether neither is more than so many times the other."""
-    return other < times * one and one < times * other
-
-
 def _implausible(corners: FloatArray, plane: Plane, aspect: float) -> tuple[str, str] | None:
     """Why four corners cannot be a screen's, and what to do; None where they can."""
     edges = np.roll(corners, -1, axis=0) - corners
@@ -264,14 +256,14 @@ def _implausible(corners: FloatArray, plane: Plane, aspect: float) -> tuple[str,
     turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
     top, right, bottom, left = np.linalg.norm(edges, axis=1)
     ratio = (top + bottom) / (left + right) / aspect
-    if not ((turns > 0).all() and _alike(top, bottom, _KEYSTONE) and _alike(left, right, _KEYSTONE)):
+    if not (turns > 0).all() or not (0.6 < top / bottom < 1.6 and 0.6 < left / right < 1.6):
         return _NO_SHAPE, _GIVE_CORNERS
-    if _alike(ratio * aspect**2, 1.0, _SHAPE):
+    if 0.8 < ratio * aspect**2 < 1.25:
         return "the screen stands upright in the picture, so its columns lie along the rows", _LANDSCAPE
-    if not _alike(ratio, 1.0, _SHAPE):
+    if not 0.92 < ratio < 1.09:
         shape = f"the striped area is {ratio * aspect:.2f} times as wide as high, the screen {aspect:.2f} times"
         return shape, _GIVE_CORNERS
-    if (left + right) / 2 < _LEAST_HEIGHT * plane.height:
+    if (left + right) / 2 < 0.12 * plane.height:
         fill = f"the screen fills only {(left + right) / 2 / plane.height:.0%} of the picture's height"
         return fill, "move closer, or zoom with the lens"
     return None

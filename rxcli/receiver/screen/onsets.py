@@ -8,22 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import TINY
 from rxcli.receiver.screen.picture import Picture, Plane, apart, fine_step, finer
-from rxcli.receiver.screen.sides import INWARD, LEFT, TOP, Side, across, ends, outermost_line
+from rxcli.receiver.screen.sides import BOTTOM, INWARD, LEFT, RIGHT, TOP, Side, across, outermost_line
 from rxcli.receiver.screen.stripes import LAG, MAX_SKEW, OUTSIDE_COST, Stripes, products
 from rxcli.types import BoolArray, FloatArray
 
-#: Rows of one band for the left and right sides.
-_BAND_ROWS = 26
+#: Bands of rows for the left and right sides, at most, and rows of one band, at least.
+_BANDS, _BAND_ROWS = 40, 26
+#: Of more strips than these every second is looked at.
+_MANY_STRIPS = 240
 #: Strips that begin on one and the same row may show a slot's end; together they count as this share of the side.
 _ROW_TRUST = 0.05
 #: Rows in which a blurred edge comes to its full strength.
 _AHEAD = 8
 #: Times that the window of a side is moved outwards while stripes go on there.
 _MOVES_OUT = 4
-#: Energy begins at this share of what is inside, and from so many standard deviations on.
-_LEAST_SHARE, _SIGMAS = 0.05, 4.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,10 +69,11 @@ class _Window:
         return self.origin + self.step * (self.index[:, 0] + self.sign * depth)
 
 
-def _between(initial: list[Side], side: int, t: FloatArray, size: float) -> BoolArray:
-    """(K,) places along a side that lie between the neighbouring sides of a screen `size` pixels wide."""
-    first, last = ends(initial, side, initial[side].at(float(t.mean())), size)
-    return np.asarray((t > first) & (t < last), np.bool_)
+def between(initial: list[Side], side: int, t: FloatArray, margin: float) -> BoolArray:
+    """(K,) places along a side that lie between the neighbouring sides, by a margin."""
+    before, after = (initial[LEFT], initial[RIGHT]) if across(side) else (initial[TOP], initial[BOTTOM])
+    middle = initial[side].at(float(t.mean()))
+    return np.asarray((t > before.at(middle) + margin) & (t < after.at(middle) - margin), np.bool_)
 
 
 def fit_side(picture: Picture, plane: Plane, stripes: Stripes, initial: list[Side], side: int, reach: Reach) -> Side:
@@ -83,11 +83,11 @@ def fit_side(picture: Picture, plane: Plane, stripes: Stripes, initial: list[Sid
             onsets = _strip_onsets(plane, stripes, initial, side, reach)
         else:
             onsets = _band_onsets(picture, plane, initial, side, reach)
-        if not onsets.t.size or onsets.earlier.mean() < _LEAST_SHARE:
+        if not onsets.t.size or onsets.earlier.mean() < 0.1:
             break
-        initial = [old.moved(-reach.out * INWARD[side]) if i == side else old for i, old in enumerate(initial)]
+        initial = [old.moved(-0.8 * reach.out * INWARD[side]) if i == side else old for i, old in enumerate(initial)]
     sign = INWARD[side]
-    tolerance = 2 * onsets.step
+    tolerance = max(1.5 * onsets.step, (0.0012 if across(side) else 0.002) * reach.size)
     # Where the picture ends before the screen does, a line must pass well outside.
     depth: FloatArray = sign * onsets.place - np.where(onsets.usable, 0, 3 * tolerance)
     weight: FloatArray = onsets.usable.astype(np.float64)
@@ -105,7 +105,7 @@ def fit_side(picture: Picture, plane: Plane, stripes: Stripes, initial: list[Sid
 
 def row_trust(place: FloatArray, usable: BoolArray, step: float) -> FloatArray:
     """(K,) weight of every strip: many that begin on one row are one observation, a slot's end perhaps."""
-    row = np.floor(place / step).astype(np.int64)
+    row = np.round(place / step - 0.25).astype(np.int64)
     row -= row.min(initial=0)
     count = np.convolve(np.bincount(row[usable], minlength=int(row.max(initial=0)) + 1), np.ones(3), "same")
     return np.where(usable, np.minimum(1.0, _ROW_TRUST * row.size / np.maximum(count[row], 1)), 0.0)
@@ -137,16 +137,19 @@ def _bend(
         degree = 2 if covered >= 6 and near.sum() >= 10 else 1
         powers = along[near, None] ** np.arange(degree, -1, -1)
         weighted = powers * weight[near, None]
-        fit = np.linalg.solve(weighted.T @ powers + TINY * np.eye(degree + 1), weighted.T @ depth[near])
+        fit = np.linalg.solve(weighted.T @ powers + 1e-9 * np.eye(degree + 1), weighted.T @ depth[near])
     return Side(sign * fit, middle, half, float((weight * near).mean() ** 0.5 if across_side else near.mean()))
 
 
-def _window(initial: list[Side], side: int, t: FloatArray, origin: float, step: float, reach: Reach) -> _Window:
-    """The window of a side on the (K,) segments at `t`."""
-    centre = np.round((initial[side].at(t) - origin) / step).astype(np.int64)
+def _window(
+    initial: list[Side], side: int, t: FloatArray, origin: float, step: float, reach: Reach, margin: float
+) -> tuple[_Window, BoolArray]:
+    """The window of a side and the (K,) segments of `t` that lie between the neighbouring sides."""
+    inside = between(initial, side, t, margin)
+    centre = np.round((initial[side].at(t[inside]) - origin) / step).astype(np.int64)
     outer = max(int(reach.out / step), 2)
     index = centre[:, None] + INWARD[side] * np.arange(-outer, max(int(reach.inward / step), 8))
-    return _Window(t, index, outer, origin, step, INWARD[side])
+    return _Window(t[inside], index, outer, origin, step, INWARD[side]), inside
 
 
 def _strip_onsets(plane: Plane, stripes: Stripes, initial: list[Side], side: int, reach: Reach) -> _Onsets:
@@ -156,23 +159,22 @@ def _strip_onsets(plane: Plane, stripes: Stripes, initial: list[Side], side: int
     # The lit screen is brighter than its bezel, so light grows inwards; from a bright wall to the bezel it shrinks.
     energies = stripes.growing if side == TOP else stripes.shrinking
     rows, n = energies.shape
-    strips = np.arange(0, n, 2)
+    strips = np.arange(0, n, 2 if n > _MANY_STRIPS else 1)
     t = (strips.astype(np.float64) + (1 + plane.apart) / 2) * plane.fx - 0.5
     # A change spans the lag; from outside, the lit row comes last at the top and first at the bottom.
     origin = plane.fy * ((LAG - 0.5) if side == TOP else 0.5)
-    inside = _between(initial, side, t, reach.size)
-    if not inside.any():
+    window, inside = _window(initial, side, t, origin, plane.fy, reach, 0.004 * reach.size)
+    if not window.t.size:
         return _no_onsets(plane.fy)
-    window = _window(initial, side, t[inside], origin, plane.fy, reach)
     first, last = _span(window.index, rows)
     smooth = cv2.blur(energies[first:last], (3, 1))
     valid = (window.index >= 0) & (window.index < rows)
     energy = np.where(valid, smooth[np.clip(window.index, first, last - 1) - first, strips[inside][:, None]], 0)
-    level = np.maximum(max(8 * stripes.noise, 16 * stripes.floor), _LEAST_SHARE * _plateau(energy, window.outer))
+    level = np.maximum(max(8 * stripes.noise, 16 * stripes.floor, 2e-5), 0.06 * _plateau(energy, window.outer))
     active = energy > level[:, None]
     depth = _half_way(energy, active.argmax(axis=1))
     place = window.place(depth.astype(np.float64))
-    observed = active.any(axis=1) & agreeing(place, 2 * plane.fy)
+    observed = active.any(axis=1) & agreeing(place, 2.5 * plane.fy)
     usable = observed & (depth > valid.argmax(axis=1) + 1)
     return _Onsets(window.t, place, observed, usable, observed & ~usable & valid[:, 0], plane.fy)
 
@@ -180,7 +182,7 @@ def _strip_onsets(plane: Plane, stripes: Stripes, initial: list[Side], side: int
 def _plateau(energy: FloatArray, outer: int) -> FloatArray:
     """(K,) what a tenth of the places inside exceed."""
     inside = energy[:, outer:]
-    rank = (inside.shape[1] - 1) * 9 // 10
+    rank = int(0.9 * (inside.shape[1] - 1))
     return np.asarray(np.partition(inside, rank, axis=1)[:, rank])
 
 
@@ -188,7 +190,7 @@ def _half_way(energy: FloatArray, start: NDArray[np.int64]) -> NDArray[np.int64]
     """(K,) first place from `start` on where a change has half its later strength: the middle of a blurred edge."""
     ahead = start[:, None] + np.arange(_AHEAD)
     step = np.take_along_axis(energy, np.minimum(ahead, energy.shape[1] - 1), axis=1)
-    return np.asarray(start + (4 * step >= step.max(axis=1, keepdims=True)).argmax(axis=1), np.int64)
+    return np.asarray(start + (step >= 0.25 * step.max(axis=1, keepdims=True)).argmax(axis=1), np.int64)
 
 
 def agreeing(place: FloatArray, tolerance: float) -> BoolArray:
@@ -204,12 +206,12 @@ def _band_onsets(picture: Picture, plane: Plane, initial: list[Side], side: int,
     """Left and right: where the energy of bands of rows begins and stays."""
     fx = fine_step(picture)
     n_rows, steps = plane.light.shape[0] - LAG, apart(fx)
-    n_bands = max(n_rows // _BAND_ROWS, 1)
+    n_bands = int(np.clip(n_rows // _BAND_ROWS, 1, _BANDS))
     rows = n_rows // n_bands
     y = (np.arange(rows * n_bands) + (LAG - 1) / 2) * float(plane.fy)
     # A product needs light on both its columns: the outermost one says where light begins.
     origin = -0.5 if side == LEFT else fx * (steps + 1) - 0.5
-    window = _window(initial, side, y, origin, fx, reach)
+    window, _ = _window(initial, side, y, origin, fx, reach, -np.inf)
     n_columns = picture.width // fx - steps
     if window.index.max() < 0 or window.index.min() >= n_columns:
         return _no_onsets(fx)
@@ -223,7 +225,7 @@ def _band_onsets(picture: Picture, plane: Plane, initial: list[Side], side: int,
     t = y.reshape(n_bands, rows).mean(axis=1)
     index = window.index.reshape(n_bands, rows, -1).mean(axis=1)
     bands = _Window(t, index, window.outer, origin, fx, window.sign)
-    return _lasting_steps(energy, spread / rows, spread > 0, bands, _between(initial, side, t, reach.size))
+    return _lasting_steps(energy, spread / rows, spread > 0, bands, between(initial, side, t, 0.004 * reach.size))
 
 
 def _lasting_steps(
@@ -233,10 +235,10 @@ def _lasting_steps(
     box = 5
     n = energy.shape[1]
     plateau = _plateau(energy, window.outer)
-    energy = energy - _row_noise(energy[:, : window.outer], plateau / 3)[:, None]
+    energy = energy - _row_noise(energy[:, : window.outer], 0.3 * plateau)[:, None]
     ahead, ahead_variance = _ahead(energy, box), _ahead(variance, box)
-    least = _LEAST_SHARE * plateau[:, None]
-    rising = (ahead[:, :n] > least) & (ahead[:, :n] > _SIGMAS * np.sqrt(np.maximum(ahead_variance[:, :n], 0) / box))
+    least = np.maximum(0.05 * plateau, 2e-5)[:, None]
+    rising = (ahead[:, :n] > least) & (ahead[:, :n] > 4.5 * np.sqrt(np.maximum(ahead_variance[:, :n], 0) / box))
     k, start = np.arange(len(energy)), rising.argmax(axis=1)
     level = ahead[k, start + box]
     active = (energy > level[:, None] / 2) & (np.arange(n) >= start[:, None]) & (level > 0)[:, None]

@@ -12,21 +12,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.receiver.screen.sides import SIDE_SD, across
+from rxcli.receiver.screen.sides import across
 from rxcli.types import FloatArray
 
-#: What is usual: tilt and yaw of some degrees, a focal length of 1.6 picture widths, and next to no distortion; the
-#: screen's place, size and roll are any. And the weight of that against a step: these make up for one another.
-_USUAL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.log(1.6), 0.0])
-_USUAL_SD = np.array([np.deg2rad(5), np.deg2rad(5), np.inf, np.inf, np.inf, np.inf, 0.5, 0.03])
-_DAMPING = 4 * np.diag(_USUAL_SD**-2.0)
+#: Typical tilt and yaw (rad), log of the focal length in picture widths with its spread, and distortion.
+_TURN_SD = np.deg2rad(5)
+_LOG_FOCAL, _LOG_FOCAL_SD = float(np.log(1.6)), 0.5
+_DISTORTION_SD = 0.03
 #: Neighbouring places of a side err together: this many count as one observation each, more add nothing.
 INDEPENDENT = 30
-#: Step by which slopes are taken.
+_N, _TILT, _YAW, _FOCAL, _DISTORTION = 8, 0, 1, 6, 7
 _EPSILON = 1e-6
-#: Iterations, at most; largest step of one in any of the eight; a step that moves no corner by this much is the last,
-#: pixels.
-_STEPS, _LARGEST_STEP, _SMALLEST_MOVE = 6, 0.25, 0.1
+#: Weight against a step of what the sides say little of: turn, focal length and distortion make up for one another.
+_DAMPING = np.diag([1 / 0.05, 1 / 0.05, 0.0, 0.0, 0.0, 0.0, 1 / 0.15, 1 / 0.01]) ** 2
+#: Largest step of one iteration in any of the eight; a step that moves no corner by this much is the last, pixels.
+_LARGEST_STEP, _SMALLEST_MOVE = 0.25, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Rectangle:
 
     def project(self, pose: FloatArray) -> FloatArray:
         """(..., 4, 2) corners of (..., 8) poses, pixels, before distortion."""
-        tilt, yaw, roll, right, down, width, focal, _ = (pose[..., i, None] for i in range(pose.shape[-1]))
+        tilt, yaw, roll, right, down, width, focal, _ = (pose[..., i, None] for i in range(_N))
         x = np.array([-0.5, 0.5, 0.5, -0.5])
         y = np.array([-0.5, -0.5, 0.5, 0.5]) / self.aspect
         x, y = x * np.cos(roll) - y * np.sin(roll), x * np.sin(roll) + y * np.cos(roll)
@@ -78,7 +78,10 @@ class Rectangle:
 
 def _prior(pose: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals of a pose against what is usual, and their slopes."""
-    return (pose - _USUAL) / _USUAL_SD, np.diag(1 / _USUAL_SD)
+    index = [_TILT, _YAW, _FOCAL, _DISTORTION]
+    sd = np.array([_TURN_SD, _TURN_SD, _LOG_FOCAL_SD, _DISTORTION_SD])
+    residual = (pose[index] - [0.0, 0.0, _LOG_FOCAL, 0.0]) / sd
+    return residual, np.eye(_N)[index] / sd[:, None]
 
 
 def pose_of(corners: FloatArray, rectangle: Rectangle) -> FloatArray:
@@ -87,8 +90,8 @@ def pose_of(corners: FloatArray, rectangle: Rectangle) -> FloatArray:
     offset = (corners.mean(axis=0) - rectangle.middle) / rectangle.width
     size = float(np.linalg.norm(edge)) / 2
     width = np.log(size / rectangle.width)
-    start = np.array([0.0, 0.0, np.arctan2(edge[1], edge[0]), *offset, width, *_USUAL[-2:]])
-    return fit_pose([None] * 4, corners, SIDE_SD * size, start, rectangle)
+    start = np.array([0.0, 0.0, np.arctan2(edge[1], edge[0]), *offset, width, _LOG_FOCAL, 0.0])
+    return fit_pose([None] * 4, corners, 0.004 * size, start, rectangle, 4)
 
 
 def misfit(places: list[Places | None], pose: FloatArray, rectangle: Rectangle) -> float:
@@ -97,13 +100,13 @@ def misfit(places: list[Places | None], pose: FloatArray, rectangle: Rectangle) 
     corners = rectangle.project(pose)
     for side, observed in enumerate(places):
         if observed is not None:
-            left = observed.place - rectangle.side_at(corners, pose[-1], side, observed.t)
+            left = observed.place - rectangle.side_at(corners, pose[_DISTORTION], side, observed.t)
             total += float((left**2).mean()) * min(observed.t.size, INDEPENDENT) / observed.sd**2
     return total
 
 
 def fit_pose(
-    places: list[Places | None], corners: FloatArray, sd: float, start: FloatArray, rectangle: Rectangle
+    places: list[Places | None], corners: FloatArray, sd: float, start: FloatArray, rectangle: Rectangle, steps: int
 ) -> FloatArray:
     """The likeliest pose, by Gauss-Newton.
 
@@ -113,18 +116,19 @@ def fit_pose(
         sd: how well that is known, pixels.
         start: (8,) first guess.
         rectangle: picture and screen.
+        steps: iterations, at most.
     """
     pose = start
-    for _ in range(_STEPS):
+    for _ in range(steps):
         residual, slopes = _prior(pose)
         normal, gradient = slopes.T @ slopes, slopes.T @ residual
-        poses = np.vstack([pose, pose + _EPSILON * np.eye(pose.size)])
+        poses = np.vstack([pose, pose + _EPSILON * np.eye(_N)])
         projected = rectangle.project(poses)
-        terms = [(projected.reshape(len(poses), -1), corners.ravel(), sd**-2.0)]
+        terms = [(projected.reshape(_N + 1, -1), corners.ravel(), sd**-2.0)]
         for side, seen in enumerate(places):
             if seen is not None:
                 weight = seen.sd**-2.0 / (1 + seen.t.size / INDEPENDENT)
-                terms.append((rectangle.side_at(projected, poses[:, -1], side, seen.t), seen.place, weight))
+                terms.append((rectangle.side_at(projected, poses[:, _DISTORTION], side, seen.t), seen.place, weight))
         for model, observed, weight in terms:
             slopes = (model[1:] - model[0]) / _EPSILON
             normal = normal + weight * (slopes @ slopes.T)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rxcli.receiver.screen.edges import SUPPORTERS, Steps, steps_of
+from rxcli.receiver.screen.edges import Steps, steps_of
 from rxcli.receiver.screen.picture import Picture, Pixels
 from rxcli.receiver.screen.pose import INDEPENDENT
 from rxcli.receiver.screen.sides import BOTTOM, LEFT, RIGHT, TOP, Side, across, from_top_left, width_of
@@ -24,8 +24,8 @@ _LEAST_SUPPORT = 0.25
 #: The same, from which on no other guess is made, where the best is not at the end of those tried around this one: of
 #: sides that are bowed otherwise the nearest ones tried fit best.
 _SETTLED = 0.5
-#: Share of its places by which a side says something.
-_LEAST_SHARE = 0.1
+#: Sides that must say something, and the places, as a number and as a share of all, by which one does.
+_LEAST_SIDES, _LEAST_PLACES, _LEAST_SHARE = 2, 6, 0.1
 #: Squared distance of a corner from the picture's middle, widths, up to which a lens has an inverse; the shortest side,
 #: pixels; and how far a side may lean.
 _FURTHEST, _SHORTEST_PX, _LEANING = 0.8, 32.0, 0.5
@@ -150,7 +150,7 @@ def _by_least_squares(
         now, next_one = _arcs(picture, corners, np.array([k1, k1 + _STEP]))
         said = [_said_by(*one, size) for one in zip(steps, now, next_one, strict=True)]
         precision, pull = np.array([one for one in said if one]).reshape(-1, 2).T
-        if precision.size < 2:
+        if precision.size < _LEAST_SIDES:
             return None
         total = float(precision.sum()) + _SD**-2
         change = (float(pull.sum()) - k1 * _SD**-2) / total
@@ -163,7 +163,7 @@ def _said_by(observed: Steps, arc: Side, next_arc: Side, size: float) -> tuple[f
     """What one side says of the coefficient, its offset and turn aside: precision, and that times the change."""
     left = observed.place - arc.at(observed.t)
     on_it = observed.found & (np.abs(left) < _TOLERANCES * observed.sd)
-    if on_it.sum() < max(SUPPORTERS, _LEAST_SHARE * on_it.size):
+    if on_it.sum() < max(_LEAST_PLACES, _LEAST_SHARE * on_it.size):
         return None
     t, left = observed.t[on_it], left[on_it]
     bow = (next_arc.at(t) - arc.at(t)) / _STEP

@@ -18,12 +18,8 @@ TOP, RIGHT, BOTTOM, LEFT = range(4)
 INWARD = (1, -1, -1, 1)
 TURN = (1, 1, -1, -1)
 SIDE_NAMES = ("top", "right", "bottom", "left")
-#: How well a side is known from the reduced picture, screen widths.
-SIDE_SD = 0.002
 #: Support from which a side shows well.
 SHOWS = 0.35
-#: So much of a side, next to its neighbours, is left out, screen widths.
-_MARGIN = 0.004
 #: Pairs of places through which lines are tried.
 _TRIES = 140
 #: Pairs that are closer than this share of the side say little of its slope.
@@ -90,12 +86,6 @@ def straight(corners: FloatArray, side: int) -> Side:
     (ta, pa), (tb, pb) = (a, b) if across(side) else (a[::-1], b[::-1])
     half = (tb - ta) / 2 if tb != ta else 1.0
     return Side(np.array([(pb - pa) / 2, (pa + pb) / 2]), float((ta + tb) / 2), float(half), 1.0)
-
-
-def ends(sides: list[Side], side: int, at: float, size: float) -> tuple[float, float]:
-    """From where to where a side goes, a little inside its neighbours; these at a place `at` across the side."""
-    before, after = (sides[LEFT], sides[RIGHT]) if across(side) else (sides[TOP], sides[BOTTOM])
-    return before.at(at) + _MARGIN * size, after.at(at) - _MARGIN * size
 
 
 def extent(sides: list[Side], height: int) -> float:

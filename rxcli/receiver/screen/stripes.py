@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.numerics import TINY
 from rxcli.receiver.screen.picture import Plane
 from rxcli.receiver.screen.sides import BOTTOM, INWARD, TOP, TURN, Line, Side, across, outermost_line
 from rxcli.types import BoolArray, Float32Array, FloatArray
@@ -21,7 +20,7 @@ _MAX_SLOPE, MAX_SKEW = 0.25, 0.13
 OUTSIDE_COST = 6.0
 #: In an area of stripes, changes down the rows have at least this many times the energy of those along them.
 _LYING = 1.6
-#: Least share: of a picture, and of its largest area, with stripes; of the energy of strong ones.
+#: Least share of the picture with stripes.
 _MIN_STRIPED = 0.02
 
 
@@ -82,15 +81,15 @@ def find_stripes(plane: Plane) -> Stripes:
     strong = float(np.percentile(smooth, 92))
     # Row noise is alike along a row: what even the stillest tenth of a row of cells has, within its limits.
     still = np.maximum(np.percentile(smooth, 10, axis=1), 0)
-    floor = float(np.percentile(still, 10))
+    floor = min(float(np.percentile(still, 10)), 0.1 * strong)
     smooth = smooth - np.minimum(still, 3 * floor)[:, None].astype(np.float32)
     noise = float(np.sqrt(max(np.percentile(spread, 10), 0) / 3))
     significant = smooth > 1.5 * np.sqrt(spread / (plane.cell_rows * _CELL_STRIPS))
-    threshold = max(_MIN_STRIPED * strong, floor, 1e-4)
+    threshold = max(0.02 * strong, floor, 1e-4)
     along = plane.light[:, 1:] - plane.light[:, :-1]
     upright = _area((along[LAG:] * along[:-LAG])[inner], *shape)
     # What a cell lacks altogether its neighbours cannot lend it.
-    own = cells > threshold / 3
+    own = cells > 0.3 * threshold
     striped = _large_areas((smooth > threshold) & significant & own, cells, upright)
     cell_px = np.array([_CELL_STRIPS * plane.fx, plane.cell_rows * plane.fy], np.float64)
     return Stripes(growing, product - growing, striped, cell_px, floor, noise)
@@ -101,8 +100,8 @@ def _balance(cells: Float32Array, growing: Float32Array) -> Float32Array:
     import cv2
 
     both, up = cv2.blur(cells, (9, 5)), cv2.blur(growing, (9, 5))
-    one_sided = np.abs(2 * up - both) / np.maximum(both, TINY)
-    return np.asarray(np.clip(3 * (1 - one_sided), 0, 1), np.float32)
+    one_sided = np.abs(2 * up - both) / np.maximum(both, 1e-9)
+    return np.asarray(np.clip((0.9 - one_sided) / 0.3, 0, 1), np.float32)
 
 
 def _large_areas(mask: BoolArray, lying: Float32Array, upright: Float32Array) -> BoolArray:
@@ -112,7 +111,7 @@ def _large_areas(mask: BoolArray, lying: Float32Array, upright: Float32Array) ->
     _, label = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     count = np.bincount(label.ravel())
     down, along = (np.bincount(label.ravel(), energy.ravel(), count.size) for energy in (lying, upright))
-    good = (count >= max(12, _MIN_STRIPED * count[1:].max(initial=0))) & (down > _LYING * along)
+    good = (count >= max(12, 0.03 * count[1:].max(initial=0))) & (down > _LYING * along)
     good[0] = False
     return np.asarray(good[label], np.bool_)
 

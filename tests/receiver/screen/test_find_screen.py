@@ -126,11 +126,11 @@ def test_three_sides_tell_where_the_fourth_is_and_contradict_a_wrong_one() -> No
         t = np.linspace(*ends, 12)
         places.append(Places(t, straight(corners, side).at(t), 1.5))
     start = pose_of(corners + 15.0, rectangle)
-    found = fit_pose([*places[:3], None], corners, 300.0, start, rectangle)
+    found = fit_pose([*places[:3], None], corners, 300.0, start, rectangle, 12)
     assert np.abs(rectangle.project(found) - corners).max() < 0.01 * WIDTH
     assert places[3] is not None
     wrong: list[Places | None] = [*places[:3], Places(places[3].t, places[3].place + 0.05 * WIDTH, 1.5)]
-    costs = [misfit(p, fit_pose(p, corners, 300.0, start, rectangle), rectangle) for p in (places, wrong)]
+    costs = [misfit(p, fit_pose(p, corners, 300.0, start, rectangle, 12), rectangle) for p in (places, wrong)]
     assert costs[1] > costs[0] + 20
 
 
