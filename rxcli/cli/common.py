@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 AUTO = "auto"
-_SHARE = click.FloatRange(0, 1)
 
 
 def options(*rows: tuple[Any, ...]) -> Callable[[_F], _F]:

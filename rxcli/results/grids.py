@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 #: Width of the map, pixels; grids that are drawn, and their colours.
 _WIDTH, _MOST = 640, 3
 _COLOURS = ("#ffd43b", "#4dabf7", "#ff8787")
-_MIN_SIZE = 96
 
 
 def rival_grids(frame: Frame) -> str:
@@ -23,9 +22,10 @@ def rival_grids(frame: Frame) -> str:
     from rxcli.receiver.corners import levels_of
     from rxcli.receiver.screen.coherence import measure_coherence
     from rxcli.receiver.screen.columns import ColumnLayout, likely_grids
+    from rxcli.receiver.screen.picture import MIN_SIZE
     from rxcli.receiver.screen.waveforms import StripLight
 
-    if min(frame.width, frame.height) < _MIN_SIZE:
+    if min(frame.width, frame.height) < MIN_SIZE:
         return ""
     coherence = measure_coherence(frame.pixels, mosaic_period=int(levels_of(frame).get("mosaic_period", 1)))
     grids = likely_grids(coherence, StripLight.of(coherence, ColumnLayout().sigma, None), None)[:_MOST]

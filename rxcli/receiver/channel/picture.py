@@ -10,6 +10,7 @@ from rxcli.numerics import box_sums
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Float32Array
 
+#: Keeps a power from zero where no light is seen.
 _TINY = np.float32(1e-9)
 #: The picture is predicted so many times a slot: exposures that overlap a sample's own say too little against it.
 PER_SLOT = 2

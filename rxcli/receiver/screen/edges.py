@@ -141,8 +141,7 @@ def _places(steps: Steps, supporters: BoolArray, initial: Side, size: float) -> 
         return Places(steps.t[supporters], steps.place[supporters], steps.sd)
     if not initial.support:
         return None
-    t = initial.middle + initial.half * np.linspace(-0.8, 0.8, 5)
-    return Places(t, initial.at(t), _GUESS_SD * size)
+    return Places(*initial.some_places, _GUESS_SD * size)
 
 
 def _deviation(

@@ -26,7 +26,7 @@ import numpy as np
 
 from rxcli.receiver.screen.edges import refine
 from rxcli.receiver.screen.onsets import Reach, fit_side
-from rxcli.receiver.screen.picture import Picture, Pixels, Plane, reduce
+from rxcli.receiver.screen.picture import MIN_SIZE, Picture, Pixels, Plane, reduce
 from rxcli.receiver.screen.pose import Places, Rectangle, fit_pose, misfit, pose_of
 from rxcli.receiver.screen.side_curvature import measure_side_curvature
 from rxcli.receiver.screen.sides import INWARD, SIDE_NAMES, Side, corners_of, extent, from_top_left, straight
@@ -45,8 +45,6 @@ _CLEAR_SUPPORT = 0.6
 _CONTRADICTION, _TRUST, _SUSPICION = 6.0, 12.0, 3.0
 #: Least score of a screen; photographs without one stay below 0.15.
 _MIN_SCORE = 0.25
-#: Smallest picture that is searched, pixels each way.
-_MIN_SIZE = 96
 _GIVE_CORNERS = (
     "take the whole screen into view, straight from the front; if the picture does show a screen that sends, give its "
     "place with --corners"
@@ -141,8 +139,8 @@ def track_screen(
 def _unusable(pixels: Pixels, black: float, white: float) -> tuple[str, str] | None:
     """Why a picture cannot show a screen at all, and what to do; None where it can."""
     height, width = pixels.shape
-    if min(height, width) < _MIN_SIZE:
-        size = f"the picture has {width} x {height} pixels, a screen needs at least {_MIN_SIZE} each way"
+    if min(height, width) < MIN_SIZE:
+        size = f"the picture has {width} x {height} pixels, a screen needs at least {MIN_SIZE} each way"
         return size, "use the picture in its full size, not a thumbnail or a messenger's copy"
     sample = (pixels[:: max(1, height // 64), :: max(1, width // 64)] - np.float32(black)) / (white - black)
     if np.mean(sample >= 0.004) < 0.005:
@@ -235,10 +233,9 @@ def _pose_without(
     size: float,
 ) -> tuple[FloatArray, float]:
     """The pose of a screen from the sides that are not missing, and how badly it fits them."""
-    places: list[Places | None] = []
-    for number, side in enumerate(sides):
-        t = side.middle + side.half * np.linspace(-0.8, 0.8, 5)
-        places.append(None if number in missing else Places(t, side.at(t), _SIDE_SD * size))
+    places = [
+        None if number in missing else Places(*side.some_places, _SIDE_SD * size) for number, side in enumerate(sides)
+    ]
     pose = fit_pose(places, expected, 0.3 * size, start, rectangle, 6)
     return pose, misfit(places, pose, rectangle)
 

@@ -29,6 +29,8 @@ from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.picture import TONE
 from rxcli.types import Float32Array, FloatArray, Frame, Lens
 
+#: Width of a screen over its height.
+_ASPECT = 16 / 9
 #: Cells across and down the screen that its texture is known by, about.
 _CELLS_ACROSS, _CELLS_DOWN = 360, 110
 #: Share of the screen's size beyond its sides that belongs to the texture: its sides tell where it is.
@@ -568,7 +570,7 @@ def _sandwich(normal: FloatArray, scores: FloatArray, variance: float, prior: Fl
 
 def _size(corners: FloatArray) -> float:
     """Size of a screen (4, 2), pixels: its width, or what a screen as high is wide where that is more."""
-    return float(max(np.ptp(corners[:, 0]), np.ptp(corners[:, 1]) * 16 / 9))
+    return float(max(np.ptp(corners[:, 0]), np.ptp(corners[:, 1]) * _ASPECT))
 
 
 def _information(size: float) -> FloatArray:
