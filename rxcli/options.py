@@ -52,8 +52,6 @@ class ReceiverOptions:
     dump_dir: Path | None = None
     #: Whether results carry the payload's soft bits, for the link layer.
     soft_bits: bool = False
-    #: Folder where estimated cameras are remembered; None: every picture's camera is estimated anew.
-    camera_cache: Path | None = None
 
 
 def receiver_options(
@@ -68,7 +66,6 @@ def receiver_options(
     denoiser: Denoiser | None = None,
     dump_dir: str | Path | None = None,
     soft_bits: bool = False,
-    camera_cache: str | Path | None = None,
 ) -> ReceiverOptions:
     """The receiver's options from names, files or profiles.
 
@@ -86,7 +83,6 @@ def receiver_options(
         denoiser: in place of the shipped auto-encoder.
         dump_dir: folder for the arrays of every stage boundary.
         soft_bits: whether results carry the payload's soft bits, for the link layer.
-        camera_cache: folder where estimated cameras are remembered; None: every picture's is estimated anew.
 
     Raises:
         ProfileError: a profile is missing or malformed.
@@ -107,7 +103,6 @@ def receiver_options(
         # Absolute, for workers may stand in other folders.
         dump_dir=None if dump_dir is None else Path(dump_dir).absolute(),
         soft_bits=soft_bits,
-        camera_cache=None if camera_cache is None else Path(camera_cache).absolute(),
     )
 
 

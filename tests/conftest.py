@@ -18,8 +18,6 @@ _SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 def pytest_configure() -> None:
     """Be heard, though a shell makes what it runs in the background deaf to Ctrl-C; and use no settings of the user."""
     os.environ["VLC_RX_HOME"] = os.path.join(os.devnull, "none")
-    # Nothing of a user's cache has a say, and none is written.
-    os.environ["VLC_RX_NO_CAMERA_CACHE"] = "1"
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -158,13 +158,6 @@ def receiver_options(given: dict[str, Any], **more: Any) -> ReceiverOptions:
     return options_of(**told, **more)
 
 
-def camera_cache_folder() -> Path:
-    """Where estimated cameras are remembered: in the user's cache folder."""
-    from platformdirs import user_cache_path
-
-    return user_cache_path("vlc-rx") / "cameras"
-
-
 def claim_outputs(
     outputs: Iterable[Output | None],
     inputs: Iterable[str | Path] = (),

@@ -7,14 +7,11 @@ from typing import Any
 
 from rxcli.errors import ProfileError
 
-#: Whether estimated cameras are remembered.
-_CACHE = "cache"
 #: Key of the file -> parameter of the commands, and what its value may be.
 _KEYS: dict[str, tuple[str, type | tuple[type, ...]]] = {
     "screen": ("screens", (str, list)),
     "camera": ("cameras", (str, list)),
     "workers": ("workers", int),
-    _CACHE: ("no_camera_cache", (bool, str)),
 }
 
 
@@ -34,21 +31,10 @@ def option_defaults(commands: list[str]) -> dict[str, dict[str, Any]]:
         name, kinds = _KEYS.get(key, ("", str))
         if not name:
             raise ProfileError(f"{path}: unknown key {key!r}", f"known are {', '.join(_KEYS)}")
-        if key == _CACHE:
-            defaults[name] = not _switch(value, path)
-            continue
         if not isinstance(value, kinds) or isinstance(value, bool):
             raise ProfileError(f"{path}: {key} has a value of the wrong kind ({value!r})", "correct the file")
         defaults[name] = [value] if name.endswith("s") and isinstance(value, str) else value
     return dict.fromkeys(commands, defaults)
-
-
-def _switch(value: Any, path: Path) -> bool:
-    """What `on` and `off`, or TOML's own words, say."""
-    states = {True: True, False: False, "on": True, "off": False}
-    if isinstance(value, (bool, str)) and value in states:
-        return states[value]
-    raise ProfileError(f"{path}: {_CACHE} must be on or off (got {value!r})", f'write {_CACHE} = "off"')
 
 
 def _read(path: Path) -> dict[str, Any]:

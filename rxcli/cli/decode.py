@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from rxcli.cli.common import (
-    camera_cache_folder,
     claim_outputs,
     complete_files,
     force_argument,
@@ -88,13 +87,6 @@ STDIN = "-"
     ("--stop-when-certain", None, False, "Pass over frames of a clip all of whose packets are certain already."),
     ("--out", _FOLDER, None, "Write files that came whole into this folder, under their own names."),
     ("--payloads", _FILE, None, "Write one row a packet (CSV): where it is from, bits, hex, confidence."),
-    (
-        "--no-camera-cache/--camera-cache",
-        None,
-        False,
-        "Estimate unknown cameras anew, and remember none (see vlc-rx profiles forget). [env: VLC_RX_NO_CAMERA_CACHE]",
-        {"envvar": "VLC_RX_NO_CAMERA_CACHE"},
-    ),
     ("--quiet", None, False, "No table, no summary, no progress."),
 )
 @force_argument
@@ -104,9 +96,8 @@ def decode(paths: tuple[str, ...], **options: Any) -> int:
     log.info("paths: %s", ", ".join(paths))
     from rxcli.runs.batch import standard_decoder
 
-    cache = None if options["no_camera_cache"] else camera_cache_folder()
     more = {name: options[name] for name in ("dump_dir", "stop_when_certain")}
-    configured = receiver_options(options, **more, camera_cache=cache, soft_bits=True)
+    configured = receiver_options(options, **more, soft_bits=True)
     tap, after = None, None
     if options["save_undistorted"]:
         from rxcli.results.undistort import UndistortedWriter

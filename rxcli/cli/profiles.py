@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rxcli.cli.common import (
-    camera_cache_folder,
     claim_outputs,
     complete_cameras,
     complete_files,
@@ -140,20 +139,6 @@ def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | No
         for record in records:
             click.echo(f"{record['source']}: {record['camera'] or 'no profile'} ({record['reason']})")
     return worst(codes)
-
-
-@profiles.command()
-def forget() -> None:
-    """Forget the cameras that earlier runs estimated and remembered."""
-    from rxcli.receiver.camera_memory import forget as forget_cameras
-
-    folder = camera_cache_folder()
-    try:
-        count = forget_cameras(folder)
-    except OSError as error:
-        reason = f"{folder}: cannot be cleared ({error.strerror or error})"
-        raise InputError(reason, "remove the folder yourself") from None
-    click.echo(f"{count} remembered camera{'s' * (count != 1)} forgotten ({folder})")
 
 
 def _builtins(profile: ScreenProfile | CameraProfile) -> Any:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ReadoutMode, ScreenProfile, match_camera
 from rxcli.receiver import camera as blind
@@ -50,10 +48,6 @@ def known_lens(frame: Frame, options: ReceiverOptions) -> Lens | None:
     """The lens of a camera that a profile tells; None where none does."""
     known = _camera_of(frame, options)
     return known.lens if isinstance(known, Camera) else None
-
-
-#: What sides show that are straight, see `Strips.correction`.
-_STRAIGHT_SIDES = (0.0, 0.01)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,37 +188,6 @@ def _estimated_camera(estimate: blind.BlindEstimate, strips: blind.Strips, rate:
         estimated=blind.summary(estimate, rate),
         blind_estimate=(estimate, strips),
     )
-
-
-def refittable(context: FrameContext, acquisition: Acquisition) -> FrameContext:
-    """A frame with a remembered camera, as one whose camera was estimated from it, so that its slots improve that."""
-    camera, screen = context.camera, acquisition.screen
-    told = camera.estimated
-    corrected = bool(told.get("distortion_corrected", (0.0, 0.0))[0])
-    sides = _STRAIGHT_SIDES if corrected else told.get("k1")
-    strips = _straightened_strips(
-        context.frame, context.corners, screen.columns, screen.light_spread, sides, context.timer, camera.tone
-    )
-    line_delay_s, sd = told["line_delay_s"]
-    rows_per_slot = 1 / (line_delay_s * screen.slot_rate_hz)
-    curvature = np.array([told.get(name, (0.0, 0.0)) for name in ("k1", "k2", "p1", "p2")]) * corrected
-    least_exposure_slots = (context.frame.metadata.exposure_s or 0.0) * screen.slot_rate_hz
-    estimate = blind.BlindEstimate(
-        rows_per_slot=rows_per_slot,
-        rows_per_slot_sd=rows_per_slot * sd / line_delay_s,
-        packet_slots=screen.packet_slots,
-        reversed=camera.reversed,
-        exposure_slots=camera.exposure_s * screen.slot_rate_hz,
-        exposure_slots_sd=0.0,
-        curvature=curvature[:, 0],
-        curvature_sd=curvature[:, 1],
-        corrected=corrected,
-        log_evidence=np.inf,
-        explained=1.0,
-        least_exposure_slots=least_exposure_slots,
-        side_curvature=strips.side_curvature,
-    )
-    return replace(context, camera=replace(camera, blind_estimate=(estimate, strips)))
 
 
 def refitted_camera(

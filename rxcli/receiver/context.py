@@ -63,8 +63,6 @@ class Camera:
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
     #: The estimate and the strips it is of, for `refitted_camera`; None for a camera from a profile.
     blind_estimate: tuple[blind.BlindEstimate, blind.Strips] | None = None
-    #: Whether it is remembered from other pictures.
-    remembered: bool = False
 
     @property
     def facts(self) -> dict[str, Any]:

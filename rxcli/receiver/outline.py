@@ -325,8 +325,6 @@ def _by_packets(
         context = with_columns(context, candidates[0])
     candidates, packets, looked_at = _with_likely_rows(context, candidates)
     if max(packets.values()) < SETTINGS.some_packets:
-        if context.camera.remembered:
-            return _by_packets(frame, candidates, replace(options, camera_cache=None), timer)
         best = _likeliest([one for one in candidates if not one.by_grid_alone])
     else:
         # Without a column more or less the same packets are seen: those of a family have theirs in common.

@@ -10,7 +10,6 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 from rxcli.numerics import one_blas_thread
@@ -26,14 +25,7 @@ from rxcli.receiver.reception import Reception, headerless, slot_margin, soft_bi
 from rxcli.receiver.screen_choice import quick_look, quick_sampler
 from rxcli.receiver.single_light import with_data
 from rxcli.receiver.still import apply_autoencoder, decode_likeliest
-from rxcli.receiver.unknown_camera import (
-    fits,
-    likely_camera,
-    receive_unknown,
-    remember_estimate,
-    with_screen,
-    without_estimate,
-)
+from rxcli.receiver.unknown_camera import likely_camera, receive_unknown, without_estimate
 from rxcli.results.dump import dump_stages
 from rxcli.types import FloatArray, Frame, FrameResult
 
@@ -77,7 +69,7 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     """Receive one frame as a photograph."""
     timer = Timer()
     with one_blas_thread():
-        result = _receive_still(frame, options, timer, options.camera_cache)
+        result = _receive_still(frame, options, timer)
     return replace(result, message=_with_tried(result, options.screens), timing_ms=timer.total())
 
 
@@ -88,10 +80,7 @@ def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str 
     return f"{result.message}; only the screen {screens[0].name} was tried, --screen auto tries all"
 
 
-def _receive_still(
-    frame: Frame, options: ReceiverOptions, timer: Timer, remembering: Path | None = None
-) -> FrameResult:
-    """Receive one frame; what its camera is estimated to be is remembered in a folder."""
+def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
     # Screen: where the columns are.
     located = locate(frame, options, timer)
@@ -107,22 +96,14 @@ def _receive_still(
     # Sampling: pixels to row profiles; sync: row profiles to a clock.
     acquisition = with_data(context, quick_sampler(context), quick_look(context))
     if isinstance(acquisition, Failure):
-        if context.camera.remembered:
-            return _receive_still(frame, replace(options, camera_cache=None), timer, remembering)
         return failed(replace(result, **context.camera.facts), acquisition)
     # Channel and decode, in turn: slot metrics to symbols, and what they say of the picture.
-    remembered = context.camera.remembered
-    if remembered:
-        context = with_screen(context, acquisition)
     if context.camera.blind_estimate is None:
         with timer("detect"):
             reception = decode_likeliest(acquisition, options.skip)
     else:
         received = receive_unknown(context, acquisition, options.skip)
-        remember_estimate(received, remembering)
         context, acquisition, reception = received.context, received.acquisition, received.reception
-    if remembered and not fits(reception):
-        return _receive_still(frame, replace(options, camera_cache=None), timer, remembering)
     with timer("detect"):
         no_header = headerless(reception)
     with timer("denoise"):

@@ -61,7 +61,7 @@ class WiringSettings:
     #: none of one or of the other.
     headers_and_packets: float = 80.0
     #: Packets, all columns together, which show plainly, nats: with a wrong camera they reach 103. It is right then but
-    #: for their length, is remembered, and other outlines are looked at with the screen that shows them alone.
+    #: for their length, and other outlines are looked at with the screen that shows them alone.
     plain_packets: float = 200.0
     #: Periods this close, relative, are one, as far as an initial pass goes.
     same_period: float = 5e-3
@@ -70,10 +70,6 @@ class WiringSettings:
     #: show less than 10, right ones 80. And headers and packets under which an initial pass leaves no hope of any: of
     #: 120 hard pictures that show packets, none had less than 74.
     some_packets: float = 20.0
-    #: Relative standard deviation of the line delay of a camera that is remembered, and of one that no further picture
-    #: need improve.
-    told_sd: float = 2e-3
-    precise_sd: float = 4e-4
     #: Symbols' mean log probability counts so many times beside the headers: half a packet has headers, but no symbols.
     say_of_symbols: float = 40.0
 
@@ -101,16 +97,6 @@ class WiringSettings:
     #: A clock whose slots look so much like packets, and so much more than on any other, nats, needs no further look;
     #: of two clocks it is the one.
     plain_structure: float = 60.0
-
-    #: Estimates of a camera are of one camera where line delays differ by less than so many standard deviations, or
-    #: than this share: the screen's own clock may be so far off.
-    same_camera_sds: float = 5.0
-    same_camera_share: float = 2e-4
-    #: No variance is taken to be less than this share of what one picture says, whatever was averaged: errors are
-    #: alike.
-    most_pictures: int = 16
-    #: Rows that a camera without any exposure is taken to be exposed for.
-    exposed_rows: float = 5.0
 
     #: Of an outline that is given, or of the picture, so much must be shared by both.
     least_shared: float = 0.002

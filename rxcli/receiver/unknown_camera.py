@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import camera as blind
 from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.camera_memory import recall, remember
-from rxcli.receiver.cameras import find_cameras, has_profile, linear_camera, refittable, refitted_camera
+from rxcli.receiver.cameras import find_cameras, linear_camera, refitted_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.reception import Reception, packet_llr
 from rxcli.receiver.screen_choice import quick_look
@@ -44,9 +42,6 @@ def likely_camera(
     which headers, packets and symbols show best is it, and without packets none, unless the first is beyond doubt.
     For `periods` see `camera.estimate_camera`.
     """
-    remembered = None if options.force_camera else recall(options.camera_cache, frame)
-    if remembered is not None and not has_profile(frame, options):
-        return FrameContext(frame, corners, remembered.camera(frame), options.screens, timer)
     found = find_cameras(frame, corners, options, timer, shows_packets, periods=periods)
     if found.first is not None and not found.rivals:
         return found.first
@@ -121,7 +116,7 @@ def receive_unknown(context: FrameContext, acquisition: Acquisition, skip: froze
         reception = decode_likeliest(settled.acquisition, skip)
     received = replace(settled, reception=reception)
     if _slots_changed(settled, received):
-        received = _with_told_camera(received, skip, again=not fits(settled.reception))
+        received = _with_told_camera(received, skip, again=not packets_are_plain(settled.reception))
     return _as_light(received, skip)
 
 
@@ -148,7 +143,7 @@ def _with_settled_clock(received: Received) -> Received:
         with received.context.timer("blind"):
             camera, moved_slots = refitted_camera(*_decided(received))
         received = _with_camera(received, camera)
-        if moved_slots < SETTINGS.matters_slots[not fits(received.reception)]:
+        if moved_slots < SETTINGS.matters_slots[not packets_are_plain(received.reception)]:
             break
         before, again = received, _received_again(received)
         if again is None:
@@ -199,29 +194,9 @@ def _received_again(before: Received, receive: Callable[[Acquisition], Reception
     return Received(context, acquisition, reception) if kept else None
 
 
-def fits(reception: Reception) -> bool:
-    """Whether packets show with a remembered camera, of which nothing in the picture was asked."""
+def packets_are_plain(reception: Reception) -> bool:
+    """Whether packets show beyond doubt."""
     return packet_llr(reception) >= SETTINGS.plain_packets
-
-
-def with_screen(context: FrameContext, acquisition: Acquisition) -> FrameContext:
-    """A frame with a remembered camera once its screen is found; that camera is refitted where it is not precise."""
-    line_delay_s, sd = context.camera.estimated["line_delay_s"]
-    if sd > SETTINGS.precise_sd * line_delay_s:
-        return refittable(context, acquisition)
-    rows_per_slot = 1 / (line_delay_s * acquisition.screen.slot_rate_hz)
-    told = {"rows_per_slot": (rows_per_slot, rows_per_slot * sd / line_delay_s), **context.camera.estimated}
-    return replace(context, camera=replace(context.camera, estimated=told))
-
-
-def remember_estimate(received: Received, folder: Path | None) -> None:
-    """Keep an estimated camera for other pictures, where it is beyond doubt."""
-    camera = received.context.camera
-    if camera.blind_estimate is None or folder is None:
-        return
-    line_delay_s, sd = camera.estimated["line_delay_s"]
-    if sd < SETTINGS.told_sd * line_delay_s and packet_llr(received.reception) >= SETTINGS.plain_packets:
-        remember(folder, received.context.frame, camera)
 
 
 def without_estimate(result: FrameResult, camera: Camera, reception: Reception) -> FrameResult:

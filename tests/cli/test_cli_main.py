@@ -9,7 +9,6 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import click
 import pytest
@@ -18,7 +17,7 @@ from rxcli import __version__
 from rxcli.cli import main as cli_main
 from rxcli.cli.main import run
 from rxcli.cli.terminal import coloured
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import InputError
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 COMMAND = [sys.executable, "-m", "rxcli.cli.main"]
@@ -133,39 +132,10 @@ def test_defaults_from_the_environment_and_a_file(
     assert run([*picture, "--camera", "xs10"]) == 3
     (tmp_path / "config.toml").write_text('kamera = "x"\n')
     assert run(picture) == 2
-    assert "config.toml: unknown key 'kamera'; known are screen, camera, workers, cache" in capsys.readouterr().err
+    assert "config.toml: unknown key 'kamera'; known are screen, camera, workers" in capsys.readouterr().err
     (tmp_path / "config.toml").write_text('workers = "x"\n')
     assert run(picture) == 2
     assert "workers has a value of the wrong kind ('x')" in capsys.readouterr().err
-
-
-def test_the_camera_cache_is_switched_by_file_environment_and_command_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    used: list[Any] = []
-
-    def options(_arguments: Any, **given: Any) -> Any:
-        used.append(given["camera_cache"])
-        raise UsageError("seen")
-
-    monkeypatch.setattr("rxcli.cli.decode.receiver_options", options)
-    monkeypatch.setenv("VLC_RX_HOME", str(tmp_path))
-    monkeypatch.delenv("VLC_RX_NO_CAMERA_CACHE")
-    for text, on in (("", True), ('cache = "on"', True), ('cache = "off"', False), ("cache = false", False)):
-        (tmp_path / "config.toml").write_text(text)
-        assert run(["decode", "a.jpg"]) == 2
-        assert (used[-1] is not None) == on, text
-    monkeypatch.setenv("VLC_RX_NO_CAMERA_CACHE", "0")
-    run(["decode", "a.jpg"])
-    assert used[-1] is not None  # the environment before the file
-    run(["decode", "a.jpg", "--no-camera-cache"])
-    assert used[-1] is None
-    n_used = len(used)
-    (tmp_path / "config.toml").write_text('cache = "sometimes"')
-    capsys.readouterr()
-    assert run(["decode", "a.jpg"]) == 2
-    assert "cache must be on or off (got 'sometimes')" in capsys.readouterr().err
-    assert len(used) == n_used
 
 
 def test_completion_names_profiles_and_files(tmp_path: Path) -> None:

@@ -334,9 +334,8 @@ class Cases:
         """Run one case; what came of it."""
         rng = random.Random(seed)
         kind = rng.choices(list(_KINDS), list(_KINDS.values()))[0]
-        # Nobody's own profiles, settings and remembered cameras.
-        nobodys = {"VLC_RX_HOME": str(self._home), "XDG_CACHE_HOME": str(self.folder / "cache")}
-        with environment(nobodys):
+        # Nobody's own profiles and settings.
+        with environment({"VLC_RX_HOME": str(self._home)}):
             (self._home / "config.toml").unlink(missing_ok=True)
             name, arguments = self._file(rng) if kind == "file" else (kind, getattr(self, f"_{kind}")(rng))
             return self._outcome(seed, name, arguments)

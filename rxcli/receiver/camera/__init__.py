@@ -29,7 +29,6 @@ from rxcli.receiver.camera.camera import (
     curving_lens,
     in_time_order,
     lens_of,
-    lens_of_summary,
     summary,
     summary_of_rows,
 )
@@ -59,7 +58,6 @@ __all__ = [
     "in_time_order",
     "is_linear",
     "lens_of",
-    "lens_of_summary",
     "likely_columns",
     "refit",
     "side_curvature_of",

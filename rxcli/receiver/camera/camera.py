@@ -64,14 +64,6 @@ def summary(estimate: BlindEstimate, slot_rate_hz: float) -> dict[str, tuple[flo
     return out
 
 
-def lens_of_summary(estimated: dict[str, tuple[float, float]], width: int, height: int) -> Lens | None:
-    """The lens model of a picture from what was estimated, see `summary`; None where no lens was."""
-    if "k1" not in estimated:
-        return None
-    coefficients = np.array([*_coefficients(estimated), 0.0])
-    return Lens(_one_width(width, height), coefficients, corrected=bool(estimated["distortion_corrected"][0]))
-
-
 def _coefficients(estimated: dict[str, tuple[float, float]]) -> tuple[float, ...]:
     """k1 k2 p1 p2 of what was estimated."""
     return tuple(estimated.get(name, (0.0, 0.0))[0] for name in ("k1", "k2", "p1", "p2"))

@@ -30,16 +30,9 @@ from rxcli.receiver.outline import Located, locate
 from rxcli.receiver.reception import Reception, complete_packets, shows_steady_light
 from rxcli.receiver.screen_choice import acquire
 from rxcli.receiver.single_light import STEADY_LIGHT, with_data
-from rxcli.receiver.still import apply_autoencoder, decode, decode_likeliest, doubtful_columns, initial_pass
+from rxcli.receiver.still import apply_autoencoder, decode, doubtful_columns, initial_pass
 from rxcli.receiver.sync import tracking
-from rxcli.receiver.unknown_camera import (
-    Received,
-    fits,
-    likely_camera,
-    receive_unknown,
-    remember_estimate,
-    with_screen,
-)
+from rxcli.receiver.unknown_camera import Received, likely_camera, packets_are_plain, receive_unknown
 from rxcli.results.dump import dump_stages
 from rxcli.types import BoolArray, FloatArray, Frame, FrameResult, FrameSoftBits, IntArray
 
@@ -390,37 +383,16 @@ class _Clip:
         """The frame's clock; and where its camera was estimated, the camera that its slots tell, from then on."""
         sampler = sample_columns(context, context.n_columns)
         acquisition = with_data(context, sampler, self._predicted(context) or acquire(context, sampler))
-        camera, cache = context.camera, self._options.camera_cache
-        if camera.remembered:
-            return self._with_remembered_camera(context, acquisition)
         if isinstance(acquisition, Failure):
             return acquisition
-        if camera.blind_estimate is None or self._start is not None:
+        if context.camera.blind_estimate is None or self._start is not None:
             return _Settled(context, acquisition)
         received = receive_unknown(context, acquisition, self._options.skip)
-        remember_estimate(received, cache)
         return self._settled(received)
-
-    def _with_remembered_camera(self, context: FrameContext, acquisition: Acquisition | Failure) -> _Settled | Failure:
-        """With a camera known from other files; without what they said where it does not fit this one."""
-        timer, skip = context.timer, self._options.skip
-        if not isinstance(acquisition, Failure):
-            context = with_screen(context, acquisition)
-            if context.camera.blind_estimate is not None:
-                received = receive_unknown(context, acquisition, skip)
-            else:
-                with timer("detect"):
-                    received = Received(context, acquisition, decode_likeliest(acquisition, skip))
-            if fits(received.reception):
-                remember_estimate(received, self._options.camera_cache)
-                return self._settled(received)
-        anew = replace(self._options, camera_cache=None)
-        found = likely_camera(context.frame, context.corners, anew, timer)
-        return found if isinstance(found, Failure) else self._with_settled_camera(found)
 
     def _settled(self, received: Received) -> _Settled:
         """What was received, its camera being known from now on."""
-        camera = replace(received.context.camera, blind_estimate=None, remembered=False)
+        camera = replace(received.context.camera, blind_estimate=None)
         context = replace(received.context, camera=camera)
         self._context = context
         return _Settled(context, received.acquisition, received.reception)
@@ -434,7 +406,7 @@ class _Clip:
         if tried or not has_profile(context.frame, self._options) or _shows_packets(reception, SETTINGS.unlike_doubt):
             return None
         before = self._options, self._context
-        self._options = replace(self._options, cameras=(), force_camera=False, camera_cache=None)
+        self._options = replace(self._options, cameras=(), force_camera=False)
         other = likely_camera(context.frame, context.corners, self._options, context.timer)
         found = other if isinstance(other, Failure) else self._with_settled_camera(other)
         if isinstance(found, Failure) or not _shows_packets(
@@ -771,7 +743,7 @@ def _doubt_of(reception: Reception) -> float:
 def _shows_packets(reception: Reception, doubt: float) -> bool:
     """Whether a camera explains a frame: less than a share of the columns is in `doubt` where packets are whole, and
     the slots look like packets where none is."""
-    return _doubt_of(reception) < doubt if complete_packets(reception).any() else fits(reception)
+    return _doubt_of(reception) < doubt if complete_packets(reception).any() else packets_are_plain(reception)
 
 
 def _taken_with(frame: Frame) -> tuple[object, ...]:
