@@ -9,6 +9,7 @@ import errno
 import os
 import stat
 from pathlib import Path
+from typing import Any
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -51,3 +52,14 @@ def user_dir() -> Path:
 def profile_dirs() -> list[tuple[str, Path]]:
     """Folders that hold `cameras/` and `screens/`, with what each is called; of two of one name the first wins."""
     return [("user", user_dir()), ("shipped", data_dir("calibration"))]
+
+
+def onnx_runtime() -> Any:
+    """The module `onnxruntime`, imported so that it reports nothing to its maker and writes no device id.
+
+    It reads the variable once, when it is loaded (its Privacy.md, "Disabling Telemetry").
+    """
+    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+    import onnxruntime
+
+    return onnxruntime

@@ -9,7 +9,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rxcli.errors import InputError
-from rxcli.ingest.sniff import HEAD_BYTES, KNOWN_SUFFIXES, Kind, check_file, is_raw_tiff, read_bytes, sniff
+from rxcli.ingest.sniff import (
+    HEAD_BYTES,
+    KNOWN_SUFFIXES,
+    Kind,
+    check_file,
+    check_no_list,
+    is_raw_tiff,
+    read_bytes,
+    sniff,
+)
 from rxcli.types import Frame
 
 __all__ = ["KNOWN_SUFFIXES", "open_source"]
@@ -36,7 +45,9 @@ def open_source(path: str | Path) -> Iterator[Frame]:
 
 
 def _kind(path: Path) -> Kind | None:
-    kind = sniff(read_bytes(path, HEAD_BYTES), path.suffix.lower())
+    head = read_bytes(path, HEAD_BYTES)
+    check_no_list(path, head)
+    kind = sniff(head, path.suffix.lower())
     return "raw" if kind == "tiff" and is_raw_tiff(path) else kind
 
 

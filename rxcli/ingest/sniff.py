@@ -31,6 +31,8 @@ MAX_PIXELS = 400_000_000
 #: What a reader may hold at a time: the file's bytes, its samples, and the luma made of them.
 MAX_BYTES = 1_250_000_000
 
+#: Starts of playlists (HLS, FFmpeg's concat, DASH), whatever their names.
+_LIST_MAGIC = (b"#EXTM3U", b"ffconcat", b"<MPD")
 _TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _RAW_MAGIC = (b"FUJIFILMCCD-RAW", b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FOVb", b"\0MRM", b"II\x1a\0\0\0HEAPCCDR")
 _SUBFILE_TYPE, _PHOTOMETRIC, _MAKE, _DNG_VERSION = 0x00FE, 0x0106, 0x010F, 0xC612
@@ -87,6 +89,16 @@ def read_bytes(path: Path, size: int = -1) -> bytes:
 def sniff(head: bytes, suffix: str) -> Kind | None:
     """The kind of a file that starts with `head`; None where neither bytes nor `suffix` tell."""
     return _by_magic(head) or _by_suffix(suffix)
+
+
+def check_no_list(path: Path, head: bytes) -> None:
+    """Refuse a playlist: what it names may be anybody's file, or in the network.
+
+    Raises:
+        InputError: `head`, the first bytes of a file, are those of a list.
+    """
+    if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(_LIST_MAGIC):
+        raise InputError(f"{path}: is a list of other files, which are not opened", "name the clips themselves")
 
 
 def is_raw_tiff(path: Path) -> bool:

@@ -6,6 +6,7 @@ go to simplejpeg in a few threads here (2.3 to 2.6 times faster). Some frames ar
 
 from __future__ import annotations
 
+import errno
 import os
 from collections import deque
 from collections.abc import Generator, Iterator
@@ -39,6 +40,11 @@ _BYTES_A_PIXEL = 1.5 * (10 + _DECODER_THREADS)
 _TS_SYNC = 0x47
 #: Times of a clip that are believed: a claim of more would be years.
 _MOST_S = 1e6
+#: FFmpeg opens this one file and nothing that it names: no other protocol, and containers only, no lists of files.
+_FILES_ONLY = {
+    "protocol_whitelist": "file",
+    "format_whitelist": "mov,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,mjpeg,asf,flv",
+}
 
 
 @dataclass(slots=True)
@@ -90,7 +96,8 @@ def _read(path: Path) -> Generator[Frame, None, None]:
 
     progress = _Progress()
     try:
-        container = av.open(str(path))
+        # Without a protocol, FFmpeg takes what stands before a colon for one.
+        container = av.open(f"file:{os.path.abspath(path)}", options=_FILES_ONLY)
     except (av.error.FFmpegError, ValueError, UnicodeError, OSError) as error:
         raise InputError(*_open_failure(path, error)) from None
     with container:
@@ -300,4 +307,6 @@ def _stated_end_s(container: Any, stream: Any) -> float:
 def _open_failure(path: Path, error: Exception) -> tuple[str, str]:
     if "Invalid data" in str(error):
         return f"{path}: no clip, or its index is missing because it is cut", "copy the file from the camera again"
+    if getattr(error, "errno", None) == errno.EINVAL:  # not on the list of containers
+        return f"{path}: no container of a clip that is read", "save it as MP4, MOV, MKV or AVI"
     return f"{path}: cannot be opened as a clip ({reason_of(error)})", "copy the file from the camera again"

@@ -25,6 +25,7 @@ from rxcli.receiver.channel.denoise import (
     Contract,
     ModelCard,
 )
+from rxcli.resources import onnx_runtime
 
 _OPSET = 17
 #: Largest difference from torch that an exported network may show.
@@ -130,6 +131,7 @@ def quantise(file: Path, samples: Sequence[Sample]) -> None:
         file: ONNX file.
         samples: typical inputs.
     """
+    onnx_runtime()
     from onnxruntime import quantization
 
     log = logging.getLogger()
@@ -152,8 +154,7 @@ def quantise(file: Path, samples: Sequence[Sample]) -> None:
 
 def parity(network: StripNetwork, file: Path, seed: int = 0) -> float:
     """Largest difference between torch and ONNX Runtime on random inputs of other sizes than exported with."""
-    import onnxruntime
-
+    onnxruntime = onnx_runtime()
     rng = np.random.default_rng(seed)
     strips = rng.standard_normal((3, 5, N_STRIP_FEATURES, 83), np.float32)
     columns = rng.standard_normal((3, N_COLUMN_FEATURES, 83), np.float32)

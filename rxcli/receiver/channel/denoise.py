@@ -34,7 +34,7 @@ from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, slot_patter
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
-from rxcli.resources import data_dir
+from rxcli.resources import data_dir, onnx_runtime
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
 #: The model that is used unless another is named.
@@ -380,8 +380,7 @@ class OnnxDenoiser:
 
     @cached_property
     def _session(self) -> Any:
-        import onnxruntime
-
+        onnxruntime = onnx_runtime()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self._threads
         options.inter_op_num_threads = 1
