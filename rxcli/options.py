@@ -36,6 +36,8 @@ class ReceiverOptions:
     force_camera: bool = False
     #: (4, 2) image pixels, top-left first, clockwise as a viewer sees the screen; None: find them.
     corners: FloatArray | None = None
+    #: The picture is mirrored: columns count from its right. Nothing is turned back; `corners` are as they are seen.
+    mirrored: bool = False
     cae: CaeMode = "auto"
     #: Packets below this confidence are not reported.
     min_confidence: float = 0.0
@@ -59,6 +61,7 @@ def receiver_options(
     cameras: CameraProfile | str | Sequence[CameraProfile | str] = AUTO,
     corners: Any = None,
     *,
+    mirrored: bool = False,
     cae: CaeMode = "auto",
     min_confidence: float = 0.0,
     no_skip: Sequence[str] = (),
@@ -76,6 +79,7 @@ def receiver_options(
         screens: profile, name of one, TOML file, or several of these; "auto": all shipped ones and the user's own.
         cameras: likewise; an empty sequence: estimate every camera from its picture.
         corners: (4, 2) stored pixels, top-left first, clockwise as a viewer sees the screen; None: find them.
+        mirrored: count columns from the right of the picture, as front cameras may show them.
         cae: when the auto-encoder runs.
         min_confidence: packets below it are not reported.
         no_skip: shortcuts to switch off, of `SKIPS`.
@@ -95,6 +99,7 @@ def receiver_options(
         cameras=_profiles(cameras, CameraProfile),
         force_camera=len(named) == 1 and named[0] != AUTO,
         corners=None if corners is None else _checked_corners(corners),
+        mirrored=mirrored,
         cae=cae,
         min_confidence=min_confidence,
         skip=frozenset(SKIPS) - set(no_skip),

@@ -7,12 +7,16 @@ stored picture, which is never rotated. The time of a sensor row is the start of
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+import re
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+#: EXIF orientations that mirror the picture.
+_MIRRORED = (2, 4, 5, 7)
+_FRONT = re.compile(r"\b(front|facetime|selfie)\b", re.IGNORECASE)
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
@@ -34,6 +38,11 @@ class Metadata:
     orientation: int = 1
     #: What the file says and no camera does, in words; it is None above.
     not_believed: tuple[str, ...] = ()
+
+    @property
+    def names_front_camera(self) -> bool:
+        """Whether the file comes from a front camera, whose pictures are often mirrored."""
+        return self.orientation in _MIRRORED or bool(_FRONT.search(f"{self.model} {self.lens}"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,6 +378,9 @@ class FrameResult:
     inferred_sides: tuple[str, ...] = ()
     #: The screen's column that column 0 of the result is; None where columns are counted from the left of what is seen.
     column_offset: int | None = 0
+    #: Whether the picture is mirrored, and columns count from its right: on request, or because a text or a file can
+    #: only be read so. None: it may be, for the file names a front camera.
+    mirrored: bool | None = False
     camera_profile: str | None = None
     line_delay_s: float | None = None
     exposure_s: float | None = None
@@ -396,3 +408,14 @@ class FrameResult:
     def packets(self) -> tuple[PacketResult, ...]:
         """Those of all columns."""
         return tuple(packet for column in self.columns for packet in column.packets)
+
+    def with_columns_mirrored(self) -> FrameResult:
+        """The result with its columns, corners and soft bits counted from the other side."""
+        soft = self.soft_bits
+        return replace(
+            self,
+            corners=None if self.corners is None else self.corners[[1, 0, 3, 2]],
+            columns=tuple(replace(c, column=len(self.columns) - 1 - c.column) for c in reversed(self.columns)),
+            soft_bits=None if soft is None else replace(soft, llr=soft.llr[:, :, ::-1]),
+            mirrored=not self.mirrored,
+        )

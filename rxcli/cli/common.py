@@ -118,6 +118,7 @@ receiver_arguments = options(
         "The screen's corners in stored pixels, top-left first, clockwise as a viewer sees the screen.",
         {"nargs": 4, "metavar": "x,y x,y x,y x,y"},
     ),
+    ("--mirrored", None, False, "The picture is mirrored, as of some front cameras: count columns from its right."),
     ("--cae", ("auto", "always", "never"), "auto", "When the auto-encoder runs."),
     (
         "--min-confidence",
@@ -134,7 +135,7 @@ receiver_arguments = options(
         {"callback": _check_skip},
     ),
 )
-_RECEIVER = ("screens", "cameras", "corners", "cae", "min_confidence", "no_skip")
+_RECEIVER = ("screens", "cameras", "corners", "mirrored", "cae", "min_confidence", "no_skip")
 #: For every command that writes files which may be somebody's.
 force_argument = options(
     ("--force", None, False, "Replace files that are there already and were not written by the same option."),

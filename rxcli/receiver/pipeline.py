@@ -57,7 +57,8 @@ def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[Frame
             return
         from rxcli.receiver.clip import receive_clip
 
-        yield from receive_clip(chain((first, second), source), options)
+        for result in receive_clip(chain((first, second), source), options):
+            yield result.with_columns_mirrored() if options.mirrored else result
 
 
 def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
@@ -70,7 +71,10 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     timer = Timer()
     with one_blas_thread():
         result = _receive_still(frame, options, timer)
-    return replace(result, message=_with_tried(result, options.screens), timing_ms=timer.total())
+    result = replace(result, message=_with_tried(result, options.screens), timing_ms=timer.total())
+    if options.mirrored:
+        return result.with_columns_mirrored()
+    return replace(result, mirrored=None if frame.metadata.names_front_camera else False)
 
 
 def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str | None:

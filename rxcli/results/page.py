@@ -16,7 +16,7 @@ from rxcli.results.aim import height_share, light_of, split_message
 from rxcli.results.grids import rival_grids
 from rxcli.results.inspection import BINS, EYE_TIMES, RANGE, Inspection, Trace, inspect_frame
 from rxcli.results.overlay import column_polygons, jpeg_address, preview
-from rxcli.results.report import plural, printable
+from rxcli.results.report import mirror_note, plural, printable
 from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult
 
 #: Told by the first lines of a page that this program wrote.
@@ -145,6 +145,7 @@ def _summary(frame: Frame, result: FrameResult) -> str:
     body = f"<p>{html.escape(printable(result.source))}</p>\n{_steps(result)}\n"
     if packets:
         body += f"<p>{plural(packets, 'packet')} from {columns} of {plural(len(result.columns), 'column')}.</p>\n"
+    body += f"<p>{mirror_note(result)}</p>\n" if mirror_note(result) else ""
     if result.message:
         reason, advice = split_message(result)
         body += f"<p>{html.escape(reason)}</p>\n" + (f"<p class='advice'>{html.escape(advice)}</p>\n" if advice else "")

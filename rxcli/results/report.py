@@ -169,7 +169,24 @@ def _numbering(result: FrameResult) -> dict[str, Any]:
         out["column_certainty"] = _rounded(result.column_certainty, 4)
     if result.column_offset is None:
         out["column_offset"] = None
+    if result.mirrored is not False:
+        out["mirrored"] = result.mirrored
     return out
+
+
+def mirror_note(result: FrameResult, option: str = "") -> str:
+    """A sentence on which side columns are counted from, where it is not the left; else empty.
+
+    Args:
+        result: of a frame.
+        option: what counts them from the other side, where the reader can do it.
+    """
+    if result.mirrored:
+        return "The picture is mirrored: columns are counted from its right."
+    if result.mirrored is None and result.packets:
+        more = f" ({option})" if option else ""
+        return f"Taken with a front camera. If the picture is mirrored, columns count from its right{more}."
+    return ""
 
 
 def _corners(result: FrameResult) -> list[list[float | None]] | None:
@@ -261,6 +278,7 @@ def from_record(record: dict[str, Any]) -> FrameResult:
             inferred_sides=tuple(str(side) for side in record["screen"].get("inferred_sides", ())),
             column_certainty=float(record["screen"].get("column_certainty", 1.0)),
             column_offset=record["screen"].get("column_offset", 0),
+            mirrored=record["screen"].get("mirrored", False),
             camera_profile=_unless_none(_text, camera["profile"]),
             line_delay_s=_unless_none(_number, camera["line_delay_s"]),
             exposure_s=_unless_none(_number, camera["exposure_s"]),
@@ -361,6 +379,9 @@ _HEADER = "    col  status     w  snr dB  confidence  copies  errors  payload"
 def format_frame(result: FrameResult) -> str:
     """A heading and one row per packet; columns without packets are put together where they tell the same."""
     lines = [format_heading(result)]
+    note = mirror_note(result, "--mirrored")
+    if note:
+        lines.append(f"  {note}")
     if result.message:
         lines.append(f"  {printable(result.message.removeprefix(result.source + ': '))}")
     rows = list(_rows(result))

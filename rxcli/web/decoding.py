@@ -276,7 +276,7 @@ class _Gathered:
         if self._best is None:
             return refusal("it holds no picture", "send another file")
         from rxcli.results.aim import split_message
-        from rxcli.results.report import to_record
+        from rxcli.results.report import mirror_note, to_record
 
         _, result, picture = self._best
         packets = self._packets
@@ -286,6 +286,7 @@ class _Gathered:
             "status": result.status if not packets or result.status != "unreadable" else "partial",
             "reason": reason,
             "advice": advice,
+            "mirrored": mirror_note(result),
             "texts": list(self._texts),
             "packets": list(packets),
             "n_frames": self._n_frames,
