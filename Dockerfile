@@ -10,11 +10,11 @@ COPY rxcli rxcli
 COPY calibration calibration
 COPY models models
 COPY sample_frames sample_frames
-RUN pip wheel --no-cache-dir --wheel-dir /wheels '.[heic,web]'
+RUN pip wheel --no-cache-dir --wheel-dir /wheels '.[web]'
 
 FROM python:3.12-slim
 RUN --mount=type=bind,from=build,source=/wheels,target=/wheels \
-    pip install --no-cache-dir --no-index --find-links /wheels 'vlc-rx[heic,web]' \
+    pip install --no-cache-dir --no-index --find-links /wheels 'vlc-rx[web]' \
     && useradd --create-home receiver
 USER receiver
 WORKDIR /data

@@ -6,6 +6,7 @@ for input that cannot be read, for wrong configuration, and for wrong usage; `rx
 
 from __future__ import annotations
 
+import re
 from enum import IntEnum
 
 
@@ -30,6 +31,22 @@ _PRECEDENCE = (
 def worst(codes: list[ExitCode]) -> ExitCode:
     """The exit code of a run in which each of `codes` occurred."""
     return next((code for code in _PRECEDENCE if code in codes), ExitCode.OK)
+
+
+#: What only a reader with a command line can do.
+_COMMAND = re.compile(r"--[a-z]|\bpip |vlc-rx ")
+
+
+def without_commands(text: str) -> str:
+    """A message for readers without a command line: parentheses and clauses about options and commands left out."""
+    text = re.sub(r" \([^()]*\)", lambda found: "" if _COMMAND.search(found[0]) else found[0], text)
+    clauses = re.split(r"(; |, or )", text)
+    kept = [
+        (joint, clause)
+        for joint, clause in zip(["", *clauses[1::2]], clauses[::2], strict=True)
+        if not _COMMAND.search(clause)
+    ]
+    return "".join(joint * (n > 0) + clause for n, (joint, clause) in enumerate(kept))
 
 
 class Terminated(BaseException):

@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 
-from rxcli.errors import ExitCode, InputError, ProfileError, ReceiverError, UsageError, worst
+from rxcli.errors import ExitCode, InputError, ProfileError, ReceiverError, UsageError, without_commands, worst
 from rxcli.resources import data_dir
 
 
@@ -38,6 +38,23 @@ def test_an_error_is_one_line_with_its_next_step(kind: type[ReceiverError], code
     assert str(kind("a.jpg: no picture")) == "a.jpg: no picture"
     assert error.exit_code == code
     assert isinstance(error, ReceiverError)
+
+
+@pytest.mark.parametrize(
+    ("text", "fits"),
+    [
+        ("it is dark; expose longer", "it is dark; expose longer"),
+        ("another one (--screen auto tries all), or its place wrong (--corners)", "another one, or its place wrong"),
+        (
+            "too slow (at 3 kHz); go nearer; if it sends, give its place with --corners",
+            "too slow (at 3 kHz); go nearer",
+        ),
+        ("run `pip install x`, or save as JPEG", "save as JPEG"),
+        ("run vlc-rx calibrate shutter", ""),
+    ],
+)
+def test_a_page_speaks_of_no_commands(text: str, fits: str) -> None:
+    assert without_commands(text) == fits
 
 
 @pytest.mark.parametrize("kind", [InputError, ProfileError, UsageError])

@@ -73,7 +73,7 @@ def _import() -> Any:
         import lensfunpy
     except ImportError:
         raise UsageError(
-            "the lensfun database needs the package lensfunpy", "install it with: pip install 'vlc-rx[lensfun]'"
+            "the lensfun database needs the package lensfunpy", "install it with: pip install '.[lensfun]'"
         ) from None
     return lensfunpy
 

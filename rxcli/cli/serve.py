@@ -54,7 +54,7 @@ def _check_extra() -> None:
 
     missing = [name for name in ("aiohttp", "segno") if find_spec(name) is None]
     if missing:
-        raise UsageError(f"the page needs the package {missing[0]}", "pip install 'vlc-rx[web]'")
+        raise UsageError(f"the page needs the package {missing[0]}", "pip install '.[web]'")
 
 
 def _site(device: Path | None, options: dict[str, Any]) -> Site:

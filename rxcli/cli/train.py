@@ -54,7 +54,7 @@ def train(
     """
     for package in ("torch", "onnx", "matplotlib"):
         if find_spec(package) is None:
-            raise UsageError(f"training needs {package}, which is not installed", "run: pip install 'vlc-rx[train]'")
+            raise UsageError(f"training needs {package}, which is not installed", "run: pip install '.[train]'")
     from rxcli.outputs import claim_folder
 
     claim_folder("OUT", out)

@@ -34,7 +34,7 @@ def read_heif(data: bytes, path: Path) -> tuple[Luma, Metadata]:
     try:
         import pillow_heif
     except ImportError:
-        raise InputError(f"{path}: HEIC needs an extra", "run `pip install 'vlc-rx[heic]'`, or save as JPEG") from None
+        raise InputError(f"{path}: HEIC needs an extra", "run `pip install '.[web]'`, or save as JPEG") from None
     try:
         file = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
         width, height = file.size

@@ -12,6 +12,10 @@ from rxcli.receiver.screen import geometry
 from rxcli.receiver.settings import SETTINGS
 from rxcli.types import FloatArray, Frame
 
+_TOO_SLOW = (
+    "the screen may be another one than those known (vlc-rx profiles lists them); else use a faster slot rate or "
+    "shorter packets"
+)
 #: Orientations in which the readout runs along the columns' width.
 _PORTRAIT = (5, 6, 7, 8)
 
@@ -93,7 +97,7 @@ def too_small(context: FrameContext, screen: ScreenProfile) -> str | None:
     needed = screen.packet_s / (camera.line_delay_s * frame.height)
     if fill >= needed:
         return None
-    advice = "move closer" if needed < 1 else "use a faster slot rate or shorter packets"
+    advice = "move closer" if needed < 1 else _TOO_SLOW
     return (
         f"the screen fills {np.floor(100 * fill):.0f} % of the height: one packet at {screen.slot_rate_hz / 1e3:g} kHz "
         f"needs {np.ceil(100 * needed):.0f} % with this camera; {advice}"

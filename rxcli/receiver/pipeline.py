@@ -81,7 +81,7 @@ def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str 
     """Why nothing was received, and where a single screen was tried, that it may be the wrong one."""
     if result.status != "no_signal" or result.message is None or len(screens) != 1:
         return result.message
-    return f"{result.message}; only the screen {screens[0].name} was tried, --screen auto tries all"
+    return f"{result.message}; only the screen {screens[0].name} was tried (--screen auto tries all)"
 
 
 def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:

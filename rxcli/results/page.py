@@ -508,7 +508,7 @@ def _confidence(result: FrameResult) -> str:
 def _encoder(result: FrameResult) -> str:
     changed = [column.column for column in result.columns if column.denoised]
     if result.denoiser is None:
-        return _section("Auto-encoder", "<p>It did not run: no column was in doubt, or it was switched off.</p>")
+        return ""
     rows = "".join(
         f"<tr><th scope='row'>{html.escape(str(key).replace('_', ' '))}</th><td>{html.escape(_short(value))}</td></tr>"
         for key, value in result.denoiser.items()

@@ -71,7 +71,7 @@ def _connect(address: str, connect_s: float) -> Client:
     try:
         from distributed import Client
     except ImportError:
-        raise UsageError("--cluster needs the package distributed", "pip install 'vlc-rx[cluster]'") from None
+        raise UsageError("--cluster needs the package distributed", "pip install '.[cluster]'") from None
     end_s = time.monotonic() + connect_s
     problem = _problem_at(address, connect_s)
     if problem is not None:

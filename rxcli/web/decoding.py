@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rxcli.errors import InputError, sentence
+from rxcli.errors import InputError, sentence, without_commands
 from rxcli.runs.processes import resident_bytes, start_process
 
 if TYPE_CHECKING:
@@ -122,7 +122,11 @@ class _EndedError(Exception):
 
 def refusal(reason: str, step: str) -> dict[str, Any]:
     """The answer for a file that is not received."""
-    return {"status": "unreadable", "reason": sentence(reason), "advice": sentence(step)}
+    return {
+        "status": "unreadable",
+        "reason": sentence(without_commands(reason)),
+        "advice": sentence(without_commands(step)),
+    }
 
 
 def _work(connection: Connection, options: ReceiverOptions) -> None:
@@ -195,8 +199,10 @@ def answer_for(
 
 
 def _without(result: FrameResult, path: Path) -> FrameResult:
-    """The result, with a message that does not tell where the upload lies."""
-    return replace(result, message=result.message.replace(f"{path}: ", "")) if result.message else result
+    """The result, with a message that fits the page, and does not tell where the upload lies."""
+    return (
+        replace(result, message=without_commands(result.message.replace(f"{path}: ", ""))) if result.message else result
+    )
 
 
 def _check_pixels(path: Path) -> None:
@@ -281,7 +287,10 @@ class _Gathered:
         _, result, picture = self._best
         packets = self._packets
         reason, advice = ("", "") if packets else split_message(result)
-        columns = [{"column": c.column, "status": c.status, "message": c.message} for c in result.columns]
+        columns = [
+            {"column": c.column, "status": c.status, "message": c.message and without_commands(c.message)}
+            for c in result.columns
+        ]
         return {
             "status": result.status if not packets or result.status != "unreadable" else "partial",
             "reason": reason,

@@ -11,6 +11,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rxcli.errors import without_commands
 from rxcli.runs.processes import start_process
 
 if TYPE_CHECKING:
@@ -123,7 +124,8 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
     packets: deque[dict[str, Any]] = deque(maxlen=_HISTORY)
     texts: list[dict[str, Any]] = []
     last_s = 0.0
-    for result in decoder.results(Source("camera", "camera")):
+    for received in decoder.results(Source("camera", "camera")):
+        result = replace(received, message=received.message and without_commands(received.message))
         now_s = time.monotonic()
         state = aim.update(result, now_s, watched.height, watched.light)
         found = packets_of(result)

@@ -204,7 +204,7 @@ def test_advice_where_the_wrong_screen_was_named(tmp_path: Path, capsys: pytest.
     samples = Path(__file__).resolve().parents[2] / "sample_frames"
     named = ["--screen", "paper-34k6", "--camera", str(samples / "xs10-small.toml")]
     assert run(["decode", str(samples / "xtrans_sky_17k3.dng"), *named]) == 1
-    assert "only the screen paper-34k6 was tried, --screen auto tries all" in capsys.readouterr().out
+    assert "only the screen paper-34k6 was tried (--screen auto tries all)" in capsys.readouterr().out
 
 
 def test_an_address_is_not_fetched(capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,6 +89,7 @@ def test_a_failure_says_how_far_it_came_and_the_next_step(tmp_path: Path) -> Non
     assert "<h2>No screen found</h2>" in page
     assert '<li class="failed"><span aria-hidden="true">✗</span> screen found' in page
     assert "Expose longer, raise ISO" in page
+    assert "Auto-encoder" not in page
 
 
 def test_a_clip_has_a_timeline(tmp_path: Path) -> None:

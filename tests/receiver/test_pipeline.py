@@ -296,6 +296,10 @@ def test_a_screen_too_small_says_how_much_it_needs() -> None:
     assert result.status == "no_signal"
     assert result.message is not None
     assert "the screen fills 25 % of the height: one packet at 8.65 kHz needs 34 % with this camera" in result.message
+    quick = msgspec.structs.replace(camera, modes=(msgspec.structs.replace(mode, line_delay_s=line_delay / 4),))
+    result = received(frame_of(taken, pixels), replace(options, cameras=(quick,)))
+    assert result.message is not None
+    assert result.message.index("the screen may be another one") < result.message.index("a faster slot rate")
 
 
 def without_signal(kind: str, taken: Capture) -> NDArray[np.uint8]:

@@ -34,7 +34,7 @@ from rxcli.options import ReceiverOptions, receiver_options  # noqa: E402
 from rxcli.results.aim import Aim, Light, light_of  # noqa: E402
 from rxcli.runs.processes import resident_bytes  # noqa: E402
 from rxcli.types import ColumnResult, FrameResult, Message, PacketResult, ReceivedObject  # noqa: E402
-from rxcli.web.decoding import DecodingProcess, Limits, texts_of  # noqa: E402
+from rxcli.web.decoding import DecodingProcess, Limits, answer_for, texts_of  # noqa: E402
 from rxcli.web.live import live_events  # noqa: E402
 from rxcli.web.server import Bounds, Server, Site  # noqa: E402
 
@@ -100,6 +100,14 @@ def test_a_bad_file_gives_a_reason_without_a_path(options: ReceiverOptions) -> N
             assert answer["advice"]
 
     serving(Site(options, port=0), work)
+
+
+def test_the_page_speaks_of_no_options_of_a_command_line(tmp_path: Path) -> None:
+    stripes = np.random.default_rng(1).integers(90, 99, (600, 1), np.uint8).repeat(800, axis=1)
+    cv2.imwrite(str(tmp_path / "a.png"), stripes)
+    answer = answer_for(tmp_path / "a.png", "a.png", receiver_options())
+    assert answer["advice"]
+    assert "--" not in json.dumps(answer)
 
 
 def test_a_clip_is_answered_by_and_by() -> None:

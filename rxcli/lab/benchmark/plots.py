@@ -23,7 +23,7 @@ def available() -> bool:
     """Whether plots can be drawn; says how to get them where not."""
     if find_spec("matplotlib") is not None:
         return True
-    log.warning("no plots: matplotlib is not installed (pip install 'vlc-rx[plot]')")
+    log.warning("no plots: matplotlib is not installed (pip install '.[plot]')")
     return False
 
 

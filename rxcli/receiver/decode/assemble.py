@@ -101,7 +101,7 @@ def _held_back(confidence: float, min_confidence: float) -> str | None:
     """What to say of a column whose surest packet is not sure enough to be reported; None where there is none."""
     if not 0 < confidence < min_confidence:
         return None
-    return f"its packet has a confidence of {confidence:.4f}, below --min-confidence {min_confidence:g}"
+    return f"its packet has a confidence of {confidence:.4f}, below the {min_confidence:g} asked for (--min-confidence)"
 
 
 def clip_results(
