@@ -80,9 +80,31 @@ class Output:
     ours: re.Pattern[bytes]
     #: Whether its folder is made where there is none.
     makes_folder: bool = False
+    #: The way on where an earlier output of the same sort is kept as well; None: it is replaced.
+    way_on: str | None = None
 
     def __str__(self) -> str:
         return f"{self.option} {self.path}"
+
+
+class Taken:
+    """Files that a run reads or writes, known by their names, links followed, and by what lies there."""
+
+    def __init__(self) -> None:
+        self._by: dict[object, str] = {}
+
+    def add(self, path: Path, whose: str) -> None:
+        """Take a file for the rest of the run; `whose` says by what, as in "is an input"."""
+        for key in self._keys(path):
+            self._by.setdefault(key, whose)
+
+    def by(self, path: Path) -> str | None:
+        """What a file is taken by; None where it is free."""
+        return next((self._by[key] for key in self._keys(path) if key in self._by), None)
+
+    @staticmethod
+    def _keys(path: Path) -> list[object]:
+        return [key for key in (_identity(path), path.resolve()) if key is not None]
 
 
 def claim(
@@ -90,7 +112,7 @@ def claim(
     inputs: Iterable[str | Path] = (),
     profiles: Iterable[str | Path] = (),
     force: bool = False,
-) -> None:
+) -> Taken:
     """Refuse outputs that would destroy something or cannot be written; what is there is not touched.
 
     Args:
@@ -99,28 +121,31 @@ def claim(
         profiles: profile files that it reads.
         force: replace files that others wrote, though never an input or a profile of this run.
 
+    Returns:
+        All files of the run, for outputs whose names are known only when they are written.
+
     Raises:
         UsageError: two outputs are one file; or an output is an input, a profile, a folder, in no folder, in one that
             cannot be written, or a file that does not look like an earlier output of the same sort.
         OutputError: the disk is full.
     """
-    taken: dict[object, str] = {}
+    taken = Taken()
     for kind, paths in (("an input", inputs), ("a profile that is read", profiles)):
-        for path in paths:
-            identity = _identity(Path(path))
-            if identity is not None:
-                taken.setdefault(identity, kind)
+        for path in map(Path, paths):
+            if _identity(path) is not None:
+                taken.add(path, kind)
     for output in outputs:
-        identity = _place(output)
+        _check_place(output)
         if _is_stream(output.path):
             continue
-        if identity in taken:
-            reason = taken[identity]
-            raise UsageError(f"{output}: the same file is {reason}", "name another file")
-        taken[identity] = f"written by {output.option}"
+        whose = taken.by(output.path)
+        if whose is not None:
+            raise UsageError(f"{output}: the same file is {whose}", "name another file")
+        taken.add(output.path, f"written by {output.option}")
         if not force:
             _check_ours(output)
         _check_writable(output)
+    return taken
 
 
 def claim_folder(option: str, folder: Path) -> None:
@@ -197,8 +222,8 @@ def _identity(path: Path) -> object | None:
     return (info.st_dev, info.st_ino)
 
 
-def _place(output: Output) -> object:
-    """The identity of an output, by its name where there is no such file yet."""
+def _check_place(output: Output) -> None:
+    """Refuse a folder, and a name in no folder."""
     path = output.path
     try:
         if path.is_dir():
@@ -207,7 +232,6 @@ def _place(output: Output) -> object:
             raise UsageError(f"{output}: there is no such folder", "make it, or name another")
     except (OSError, ValueError, RuntimeError) as error:
         raise UsageError(f"{output}: {_reason(error)}", "name another file") from None
-    return _identity(path) or path.resolve()
 
 
 def _is_stream(path: Path) -> bool:
@@ -229,7 +253,10 @@ def _check_ours(output: Output) -> None:
         return
     except OSError as error:
         raise UsageError(f"{output}: cannot be looked at ({_reason(error)})", "name another file") from None
-    if look and not output.ours.search(look):
+    ours = not look or output.ours.search(look)
+    if look and ours and output.way_on is not None:
+        raise UsageError(f"{output}: holds the results of an earlier run", output.way_on)
+    if not ours:
         raise UsageError(
             f"{output}: there is such a file, and it is no earlier output of this option",
             "name another file, or replace it with --force",

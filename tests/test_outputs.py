@@ -78,7 +78,7 @@ def test_one_file_twice_and_folders_are_refused(
 
 @pytest.mark.parametrize(
     ("option", "name"),
-    [("--json", "o.jsonl"), ("--junit", "o.xml"), ("--summary", "o.csv"), ("--summary", "o.parquet")],
+    [("--junit", "o.xml"), ("--payloads", "o.csv"), ("--summary", "o.csv"), ("--summary", "o.parquet")],
 )
 def test_a_file_of_somebody_else_needs_force_and_one_of_ours_does_not(
     option: str, name: str, tmp_path: Path, names: list[str], capsys: pytest.CaptureFixture[str]

@@ -14,7 +14,7 @@ from click.shell_completion import CompletionItem
 
 if TYPE_CHECKING:
     from rxcli.options import ReceiverOptions
-    from rxcli.outputs import Output
+    from rxcli.outputs import Output, Taken
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 AUTO = "auto"
@@ -164,7 +164,7 @@ def claim_outputs(
     inputs: Iterable[str | Path] = (),
     profiles: Iterable[str | Path | None] = (),
     force: bool = False,
-) -> None:
+) -> Taken:
     """Refuse outputs that would destroy something, before anything is opened (see `rxcli.outputs.claim`).
 
     Args:
@@ -179,7 +179,7 @@ def claim_outputs(
     from rxcli.outputs import claim
 
     named = [path for path in profiles if path is not None and path != AUTO]
-    claim([output for output in outputs if output is not None], inputs, named, force)
+    return claim([output for output in outputs if output is not None], inputs, named, force)
 
 
 def json_output(path: str | None, *keys: str) -> Output | None:

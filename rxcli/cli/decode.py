@@ -26,7 +26,7 @@ from rxcli.cli.common import (
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
-    from rxcli.outputs import Output
+    from rxcli.outputs import Output, Taken
     from rxcli.results.baseline import Baseline
     from rxcli.results.summary import SourceSummary
     from rxcli.results.truth import Scorer
@@ -106,9 +106,9 @@ def decode(paths: tuple[str, ...], **options: Any) -> int:
         tap = UndistortedWriter(folder, configured.cameras, configured.force_camera)
         after = tap.finish
     sources = _sources(paths)
-    _claim(options, sources)
+    taken = _claim(options, sources)
     with _stdin_as_file(sources) as sources:
-        return _Run(standard_decoder(configured, tap, after), options).run(sources)
+        return _Run(standard_decoder(configured, tap, after), options, taken).run(sources)
 
 
 def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
@@ -132,17 +132,23 @@ def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
         check_summary_path(options["summary"])
 
 
-def _claim(options: dict[str, Any], sources: list[Source]) -> None:
-    """Refuse outputs that would destroy something, and make the folders of the taps."""
+def _claim(options: dict[str, Any], sources: list[Source]) -> Taken:
+    """Refuse outputs that would destroy something, and make the folders of the taps; returns the files of the run."""
     from rxcli.outputs import claim_folder
     from rxcli.results.truth import truth_for
 
     truths = [truth_for(source.name, options["truth"]) for source in sources]
     inputs = [source.path for source in sources] + [str(path) for path in truths if path is not None]
-    claim_outputs(_outputs(options), inputs, (*options["screens"], *options["cameras"]), options["force"])
+    taken = claim_outputs(_outputs(options), inputs, (*options["screens"], *options["cameras"]), options["force"])
     for name in ("dump_dir", "save_undistorted", "out"):
         if options[name] is not None:
             claim_folder("--" + name.replace("_", "-"), options[name])
+    for name in ("dump_dir", "save_undistorted"):
+        both = options[name] and options["out"]
+        if both and options["out"].resolve().is_relative_to(options[name].resolve()):
+            option = "--" + name.replace("_", "-")
+            raise UsageError(f"--out {options['out']}: {option} writes there", "name a folder for received files alone")
+    return taken
 
 
 def _outputs(options: dict[str, Any]) -> Iterator[Output]:
@@ -152,9 +158,8 @@ def _outputs(options: dict[str, Any]) -> Iterator[Output]:
     summary = options["summary"]
     is_table = summary is not None and summary.suffix.casefold() == ".csv"
     looks = {
-        "json": outputs.ANYTHING
-        if options["resume"]
-        else outputs.JOURNAL,  # resuming looks closer, and knows half lines
+        # Resuming looks closer, and knows half lines.
+        "json": outputs.ANYTHING if options["resume"] else outputs.JOURNAL,
         "junit": outputs.JUNIT,
         "summary": outputs.CSV_SUMMARY if is_table else outputs.PARQUET_SUMMARY,
         "save_camera": outputs.ESTIMATED_CAMERA,
@@ -163,7 +168,9 @@ def _outputs(options: dict[str, Any]) -> Iterator[Output]:
     paths = {**options, "json": None if options["json_path"] == "-" else options["json_path"]}
     for name, ours in looks.items():
         if paths[name] is not None:
-            yield outputs.Output("--" + name.replace("_", "-"), Path(paths[name]), ours)
+            kept = name == "json" and not options["resume"]
+            way_on = "go on with it by --resume, replace it with --force, or name another file" if kept else None
+            yield outputs.Output("--" + name.replace("_", "-"), Path(paths[name]), ours, way_on=way_on)
 
 
 def _sources(paths: tuple[str, ...]) -> list[Source]:
@@ -197,12 +204,13 @@ def _stdin_as_file(sources: list[Source]) -> Iterator[list[Source]]:
 class _Run:
     """One run over many sources: where results go, and what is kept for the summary."""
 
-    def __init__(self, decoder: Decoder, options: dict[str, Any]) -> None:
+    def __init__(self, decoder: Decoder, options: dict[str, Any], taken: Taken) -> None:
         from rxcli.link.collector import Collector
         from rxcli.results.summary import Limits
 
         self._decoder = decoder
         self._options = options
+        self._taken = taken
         self._baseline = _baseline(options)
         self._limits = Limits(options["max_ber"], options["min_packets"], options["min_packet_confidence"])
         self._summaries: list[SourceSummary] = []
@@ -309,7 +317,11 @@ class _Run:
                         result = self._combined(result)
                         if self._options["out"]:
                             result = save_objects(
-                                result, self._options["out"], self._options["force"], summary.unwritten.append
+                                result,
+                                self._options["out"],
+                                self._options["force"],
+                                summary.unwritten.append,
+                                self._taken,
                             )
                         summary.add(result)
                         if self._baseline is not None:

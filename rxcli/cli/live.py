@@ -19,6 +19,7 @@ from rxcli.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
     from rxcli.ingest.v4l2 import CameraCounts, LiveSource
+    from rxcli.outputs import Taken
     from rxcli.results.aim import Aim, AimState, Light
     from rxcli.types import Frame, FrameResult, ObjectProgress
 
@@ -70,7 +71,7 @@ def live(device: Path, **options: Any) -> int:
     if options["list_only"]:
         return _show_modes(device)
     configured = replace(receiver_options(options, soft_bits=True), prompt=True)
-    _claim(device, options)
+    taken = _claim(device, options)
     from rxcli.ingest.v4l2 import LiveSource
     from rxcli.link.collector import Collector
     from rxcli.link.saving import save_objects
@@ -92,7 +93,7 @@ def live(device: Path, **options: Any) -> int:
         for received in receive(status.watched(frames), configured):
             result = collector.add(received)
             if options["out"] is not None:
-                result = save_objects(result, options["out"], options["force"], _say)
+                result = save_objects(result, options["out"], options["force"], _say, taken)
             write(result)
             status.update(result, collector.progress)
             if options["until_complete"] and (result.messages or result.objects):
@@ -100,15 +101,17 @@ def live(device: Path, **options: Any) -> int:
     return ExitCode.OK if status.n_packets or status.n_complete else ExitCode.NOT_RECEIVED
 
 
-def _claim(device: Path, options: dict[str, Any]) -> None:
-    """Refuse to write over what is no earlier output."""
+def _claim(device: Path, options: dict[str, Any]) -> Taken:
+    """Refuse to write over what is there; returns the files of the run."""
     from rxcli.outputs import JOURNAL, Output, claim_folder
 
     if options["out"] is not None:
         claim_folder("--out", options["out"])
+    output = None
     if options["json_path"] not in (None, "-"):
-        output = Output("--json", Path(options["json_path"]), JOURNAL)
-        claim_outputs([output], (device,), (*options["screens"], *options["cameras"]), options["force"])
+        way_on = "name another file, or replace it with --force"
+        output = Output("--json", Path(options["json_path"]), JOURNAL, way_on=way_on)
+    return claim_outputs([output], (device,), (*options["screens"], *options["cameras"]), options["force"])
 
 
 def _settings(options: dict[str, Any]) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import os
 import resource
@@ -12,7 +13,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,10 @@ import pytest
 from small_frames import write_frame, write_profiles
 
 from rxcli.cli.main import run
+from rxcli.ingest import open_source
+from rxcli.runs.batch import Decoder
 from rxcli.runs.journal import Journal
+from rxcli.types import FrameResult, ReceivedObject
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 COMMAND = [sys.executable, "-m", "rxcli.cli.main"]
@@ -79,12 +83,58 @@ def test_two_runs_do_not_write_one_journal(tmp_path: Path, folder: Path, decode:
     whole = out.read_bytes()
     with out.open("ab") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        for resume in ([], ["--resume"]):
-            code, said = decode(folder, "--json", out, "--summary", tmp_path / "s.csv", *resume)
+        for way in ("--force", "--resume"):
+            code, said = decode(folder, "--json", out, "--summary", tmp_path / "s.csv", way)
             assert code == 2
             assert f"{out}: another run is writing this file" in said
     assert out.read_bytes() == whole
     assert not (tmp_path / "s.csv").exists()
+
+
+def test_a_journal_is_replaced_with_force_alone(tmp_path: Path, folder: Path, decode: Decode) -> None:
+    out = tmp_path / "o.jsonl"
+    assert decode(folder, "--json", out)[0] == 0
+    whole = out.read_bytes()
+    code, said = decode(folder / "0.png", "--json", out)
+    assert code == 2
+    assert "holds the results of an earlier run; go on with it by --resume, replace it with --force" in said
+    assert out.read_bytes() == whole
+    assert decode(folder / "0.png", "--json", out, "--force")[0] == 0
+    assert len(records(out)) == 1
+
+
+def test_a_received_file_replaces_nothing_of_its_run(
+    tmp_path: Path, folder: Path, decode: Decode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sender chooses names; --force is for files of earlier runs."""
+    names = ("0.png", "s.csv", "j.jsonl", "0.truth.json", "twice.txt", "old.txt")
+    sent = {name: b"sent as " + name.encode() for name in names}
+
+    def receive(frames: Any, _options: Any) -> Iterator[FrameResult]:
+        for frame in frames:
+            files = [(name, data + frame.source.encode() * (name == "twice.txt")) for name, data in sent.items()]
+            objects = [ReceivedObject(n, d, len(d), hashlib.sha256(d).hexdigest(), 1, 1, "", 0, 0.0) for n, d in files]
+            yield FrameResult(frame.source, 0, 0.0, "ok", objects=tuple(objects))
+
+    def decoder(options: Any, *_: Any) -> Decoder:
+        return Decoder(options, open_source, receive)
+
+    monkeypatch.setattr("rxcli.runs.batch.standard_decoder", decoder)
+    (folder / "old.txt").write_text("of another run")
+    before = {name: (folder / name).read_bytes() for name in ("0.png", "0.truth.json")}
+    outputs = ("--json", folder / "j.jsonl", "--summary", folder / "s.csv", "--truth", "auto", "--out", folder)
+    more = ("--junit", tmp_path / "j.xml", "--force")
+    code, said = decode(folder / "0.png", folder / "1.png", *outputs, *more)
+    assert code == 1
+    assert {name: (folder / name).read_bytes() for name in before} == before
+    assert (folder / "s.csv").read_text().startswith("source,exit_code,frames")
+    assert len(records(folder / "j.jsonl")) == 2
+    assert (folder / "twice.txt").read_bytes().endswith(b"0.png")
+    assert (folder / "old.txt").read_bytes() == b"sent as old.txt"
+    assert "0.png is an input; 0.png (13 bytes) was not written" in (tmp_path / "j.xml").read_text()
+    code, said = decode(folder / "0.png", "--dump-dir", folder, "--out", folder)
+    assert code == 2
+    assert "--dump-dir writes there" in said
 
 
 def test_resuming_with_other_options_or_changed_files_is_refused(tmp_path: Path, folder: Path, decode: Decode) -> None:
