@@ -61,8 +61,6 @@ class Acquisition:
     screen: ScreenProfile
     sampler: ColumnSampler
     clock: Clock
-    #: Another that it may be: of columns which are not spread in time, where they seem to be.
-    rival: Clock | None = None
     #: The screen, and others that differ from it in how often a packet is sent; the copies are to tell.
     variants: tuple[ScreenProfile, ...] = ()
     #: (n_copies,) burst of every copy; None where the light is to tell.

@@ -317,7 +317,7 @@ def _by_packets(
     if known is not None:
         context = replace(known, frame=frame, timer=timer)
     else:
-        context = _context_of_any(frame, candidates, options, timer)
+        context = likely_camera(frame, candidates[0].corners, options, timer)
     if isinstance(context, Failure):
         best = _likeliest([one for one in candidates if not one.by_grid_alone])
         return Located(best, context) if best else None
@@ -408,25 +408,6 @@ def _leftmost(outline: Outline) -> float:
     """How far right, for a viewer, an outline begins: of those that leave no light out the furthest begins in view."""
     along = outline.corners[1] - outline.corners[0]
     return float(outline.corners[0] @ along / np.linalg.norm(along))
-
-
-def _context_of_any(
-    frame: Frame, candidates: list[Outline], options: ReceiverOptions, timer: Timer
-) -> FrameContext | Failure:
-    """The camera by the first candidate that shows one.
-
-    It hardly depends on which columns are whose, so one candidate of a family speaks for all.
-    """
-    families: dict[int, Outline] = {}
-    for candidate in candidates:
-        families.setdefault(candidate.family, candidate)
-    # Rows are the same moments wherever the columns are: what stands out by itself is looked for with all of them,
-    # before the first is searched widely.
-    for one in families.values():
-        found = likely_camera(frame, one.corners, options, timer, periods="outstanding")
-        if not isinstance(found, Failure):
-            return found
-    return likely_camera(frame, candidates[0].corners, options, timer, periods="others")
 
 
 def _packets(context: FrameContext) -> float:

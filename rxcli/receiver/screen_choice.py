@@ -44,13 +44,11 @@ def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Fail
         pooled = sync.pooled_strips(sampler.binned())
         different = told_apart_by_clock(context.screens)
         rates = {(s.slot_rate_hz, s.packet_slots): s for s in reversed(different)}
-        clocks = {rate: found for rate, screen in rates.items() if (found := _clocks_of(context, screen, pooled))}
-        clocks = {
-            rate: found for rate, found in clocks.items() if found[0].header_peak_ratio >= SETTINGS.min_peak_ratio
-        }
+        clocks = {rate: found for rate, screen in rates.items() if (found := _clock_of(context, screen, pooled))}
+        clocks = {rate: found for rate, found in clocks.items() if found.header_peak_ratio >= SETTINGS.min_peak_ratio}
         if not clocks:
             return Failure("no_signal", _why_no_signal(context))
-        structure = {rate: _structure(pooled, found[0]) for rate, found in clocks.items()} if len(clocks) > 1 else {}
+        structure = {rate: _structure(pooled, found) for rate, found in clocks.items()} if len(clocks) > 1 else {}
     first: dict[tuple[float, int], Acquisition] = {}
     if _is_plain(list(structure.values())):
         rate = max(clocks, key=lambda rate: structure.get(rate, 0.0))
@@ -70,7 +68,7 @@ def acquire(context: FrameContext, sampler: ColumnSampler) -> Acquisition | Fail
     for screen in alike[len(acquisitions) :]:
         finer = sample_columns(context, screen.columns, quick=sampler.read is not None)
         with context.timer("clock"):
-            found = _clocks_of(context, screen, sync.pooled_strips(finer.binned()))
+            found = _clock_of(context, screen, sync.pooled_strips(finer.binned()))
         if found:
             acquisitions.append(_acquired(context, screen, finer, found))
     if not acquisitions:
@@ -99,11 +97,8 @@ def variants_of(screen: ScreenProfile, screens: Sequence[ScreenProfile]) -> tupl
     return tuple(others[repeats] for repeats in sorted(others, reverse=True))
 
 
-def _acquired(
-    context: FrameContext, screen: ScreenProfile, sampler: ColumnSampler, clocks: tuple[Clock, ...]
-) -> Acquisition:
-    rival = clocks[1] if len(clocks) > 1 else None
-    return Acquisition(screen, sampler, clocks[0], rival, variants_of(screen, context.screens))
+def _acquired(context: FrameContext, screen: ScreenProfile, sampler: ColumnSampler, clock: Clock) -> Acquisition:
+    return Acquisition(screen, sampler, clock, variants_of(screen, context.screens))
 
 
 def _structure(profiles: RowProfiles, clock: Clock) -> float:
@@ -140,10 +135,10 @@ def _with_likely_columns(acquisitions: list[Acquisition]) -> Acquisition:
     return next(acquisition for acquisition in acquisitions if acquisition.screen is likely)
 
 
-def _clocks_of(context: FrameContext, screen: ScreenProfile, profiles: RowProfiles) -> tuple[Clock, ...]:
+def _clock_of(context: FrameContext, screen: ScreenProfile, profiles: RowProfiles) -> Clock | None:
     rows_per_slot = 1 / (screen.slot_rate_hz * context.camera.line_delay_s)
     exposure_slots = context.camera.exposure_s * screen.slot_rate_hz
-    return sync.find_clocks(profiles, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(profiles))
+    return sync.find_clock(profiles, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(profiles))
 
 
 def _why_no_signal(context: FrameContext) -> str:

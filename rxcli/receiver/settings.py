@@ -49,29 +49,15 @@ class WiringSettings:
     #: Headers without symbols count so much.
     headers_alone: float = 0.1
 
-    #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with: where
-    #: packets show plainly, and where they do not.
-    matters_slots: tuple[float, float] = (0.15, 0.05)
     most_initial_refits: int = 3
-    #: Slots, as probabilities, that differ by no more than this on average tell the same camera.
-    same_slots: float = 0.02
-    #: What is received with a refitted camera shows packets as well as before from this share of the evidence on.
-    kept_evidence: float = 0.9
-    #: Headers and packets, all columns together, that an estimate with rivals must show, nats: wrong ones have next to
-    #: none of one or of the other.
-    headers_and_packets: float = 80.0
     #: Packets, all columns together, which show plainly, nats: with a wrong camera they reach 103. It is right then but
     #: for their length, and other outlines are looked at with the screen that shows them alone.
     plain_packets: float = 200.0
-    #: Periods this close, relative, are one, as far as an initial pass goes.
-    same_period: float = 5e-3
     #: Packets at which there may be some, nats: in a column of light without data, or all together where nothing but a
     #: grid says that there is a screen, or where none is received and an estimated camera is to be told. Wrong ones
     #: show less than 10, right ones 80. And headers and packets under which an initial pass leaves no hope of any: of
     #: 120 hard pictures that show packets, none had less than 74.
     some_packets: float = 20.0
-    #: Symbols' mean log probability counts so many times beside the headers: half a packet has headers, but no symbols.
-    say_of_symbols: float = 40.0
 
     #: Samples a slot on which columns are compared, and by how many slots they may be apart: slats may slant.
     light_samples: int = 2
@@ -113,11 +99,8 @@ class StillSettings:
     #: Samples a slot: of first looks, and of those at columns that are still in doubt.
     coarse_samples: int = 2
     fine_samples: int = 4
-    #: Below so many rows a slot it shows that developing mixes rows; as how wide a box of rows, is tried from the usual
-    #: one of these on.
-    few_rows: float = 4.0
-    mixed_rows: tuple[float, ...] = (0.0, 1.0, 1.7, 2.4, 3.0)
-    usual_mix: int = 1
+    #: Rows that developing a picture mixes, as the width of a box: with few rows per slot it widens the exposure.
+    mixed_rows: float = 1.0
     #: A column with a packet of less confidence, whose symbols are not `beyond_doubt_log_prob`, is looked at again, at
     #: last by the auto-encoder, and symbols of less log probability are weighed as words. Where the gate comes from:
     #: docs/auto_encoder.md. Of 2699 packets of simulated frames an initial pass leaves half so sure.
@@ -139,8 +122,8 @@ class StillSettings:
     clear_columns: float = 0.9
     clear_confidence: float = 0.9
     plain_bursts: float = 300.0
-    #: How alike copies are is half told by the packets' evidence.
-    say_of_copies: float = 0.5
+    #: Weight of the copies' similarity: half of it is in the packets' evidence already.
+    copies_weight: float = 0.5
 
 
 SETTINGS, STILL = WiringSettings(), StillSettings()

@@ -79,7 +79,7 @@ def _as_one_column(acquisition: Acquisition) -> Acquisition:
     """The same with every column a strip of one."""
     sampler = ColumnSampler(_columns_as_strips(acquisition.profiles), is_binned=True)
     clock = replace(acquisition.clock, delay_slots=np.zeros(1))
-    return replace(acquisition, sampler=sampler, clock=clock, rival=None)
+    return replace(acquisition, sampler=sampler, clock=clock)
 
 
 def _columns_as_strips(profiles: RowProfiles) -> RowProfiles:

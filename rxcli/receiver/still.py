@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -32,38 +31,17 @@ from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSa
 
 
 def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Reception:
-    """What is decoded on the clock, and with the bursts, by which slots are packets most.
-
-    Bursts are told apart by how alike copies are. Where symbols stay in doubt that may be why: copies of two packets,
-    taken for one, decode to neither. So they are weighed on the initial pass, and once more by what was decoded, which
-    tells copies better.
+    """Decode with the bursts whose initial pass looks most like packets.
 
     Args:
-        acquisition: the clock, perhaps another that it may be, and the row profiles.
+        acquisition: the clock and the row profiles.
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
     """
-    first = first_pass(acquisition)
-    either = _with_either_clock(acquisition)
-    if "no_packets" in skip and not any(_may_show_packets(first_pass(one)) for one in either):
+    first = initial_pass(acquisition)
+    if "no_packets" in skip and not _may_show_packets(first):
         return replace(first, skipped={"no_packets": first.snr.shape[0]})
-    if len(either) > 1:
-        return _likelier_clock(either, skip)
-    weighed = [first]
-    likeliest = _with_likeliest_bursts(acquisition, first, weighed, STILL.say_of_copies)
-    reception = decode(
-        _in_bursts_of(acquisition, likeliest) if likeliest is not first else acquisition, skip, likeliest
-    )
-    if len(weighed) > 1 and _same_bursts(reception, likeliest):
-        return reception
-    other = _with_likeliest_bursts(acquisition, reception, weighed)
-    if _same_bursts(other, reception):
-        return reception
-    # To receive everything again takes as long as it did: a further look at either tells whether it is worth it.
-    same, rival = (_in_bursts_of(acquisition, one) for one in (reception, other))
-    own = next((one for one in weighed if _same_bursts(one, reception)), None) or initial_pass(same)
-    if packet_llr(_refined_once(same, own)) >= packet_llr(_refined_once(rival, other)):
-        return reception
-    return max(reception, decode(rival, skip, other), key=packet_llr)
+    likeliest = _with_likeliest_bursts(acquisition, first)
+    return decode(_in_bursts_of(acquisition, likeliest) if likeliest is not first else acquisition, skip, likeliest)
 
 
 def _may_show_packets(first: Reception) -> bool:
@@ -73,83 +51,33 @@ def _may_show_packets(first: Reception) -> bool:
     return packet_llr(first) + max(float(first.posteriors.header_llr.sum()), 0.0) > SETTINGS.some_packets
 
 
-def _with_either_clock(acquisition: Acquisition) -> list[Acquisition]:
-    """The acquisition as one of its clock alone, and as one of its rival where there is one."""
-    if acquisition.rival is None:
-        return [acquisition]
-    either = [replace(acquisition, clock=clock, rival=None) for clock in (acquisition.clock, acquisition.rival)]
-    either[0].kept.update(acquisition.kept)
-    return either
-
-
-def decode_alike(acquisition: Acquisition, skip: frozenset[str], before: Reception) -> Reception:
-    """What is decoded on a clock next to the one before: with columns spread in time as there, and with its bursts."""
-    clocks = [clock for clock in (acquisition.clock, acquisition.rival) if clock is not None]
-    alike = [clock for clock in clocks if clock.delay_slots.any() == before.clock.delay_slots.any()]
-    clock = (alike or clocks)[0]
-    if clock.n_copies != before.clock.n_copies or clock.packet_slots != before.clock.packet_slots:
-        return decode_likeliest(acquisition, skip)
-    return decode(replace(acquisition, clock=clock, rival=None, burst=before.clock.burst), skip)
-
-
-def _with_likeliest_bursts(
-    acquisition: Acquisition, reception: Reception, weighed: list[Reception], say_of_copies: float = 0.0
-) -> Reception:
-    """Of initial passes with the bursts that there may be, that of the likeliest; where there is no doubt, `reception`.
-
-    Passes that were `weighed` before are not made again; new ones are added there. How alike copies are, by themselves,
-    counts as said: where they were decoded as copies of one another they say nothing new.
-    """
-    complete = complete_packets(reception)
-    if not complete.any():
-        # Told apart like this copies leave no packet whole: what they say of one another is asked of packets alone.
-        say_of_copies = 0.0
-    else:
-        confidence = np.where(complete, packet_confidence(reception), 0.0).max(axis=0)
+def _with_likeliest_bursts(acquisition: Acquisition, first: Reception) -> Reception:
+    """Choose between the initial pass and passes with other bursts; the initial pass where there is no doubt."""
+    complete = complete_packets(first)
+    # Bursts that leave no packet complete do not depend on how similar copies are.
+    copies_weight = STILL.copies_weight if complete.any() else 0.0
+    if complete.any():
+        confidence = np.where(complete, packet_confidence(first), 0.0).max(axis=0)
         if not confidence.any() or (confidence > STILL.clear_confidence).mean() >= STILL.clear_columns:
-            return reception
-    possible = sync.possible_bursts(reception.clock, detect.slot_llr(reception.metrics), acquisition.repeats)
+            return first
+    possible = sync.possible_bursts(first.clock, detect.slot_llr(first.metrics), acquisition.repeats)
     plain = len(possible) == 1 or possible[0][1] - possible[1][1] > STILL.plain_bursts
-    if complete.any() and plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
-        return reception
-    # How far rows are mixed does not depend on the bursts.
-    clocks = [replace(clock, exposure_slots=reception.clock.exposure_slots) for clock, _ in possible]
+    if complete.any() and plain and np.array_equal(possible[0][0].burst, first.clock.burst):
+        return first
     passes, scores = [], []
-    for clock, (_, likeness) in zip(clocks, possible, strict=True):
-        known = next((one for one in weighed if np.array_equal(one.clock.burst, clock.burst)), None)
-        if known is None:
-            exposed = replace(acquisition.clock, exposure_slots=clock.exposure_slots)
-            known = initial_pass(replace(acquisition, clock=exposed, burst=clock.burst))
-            weighed.append(known)
-        passes.append(known)
+    for clock, similarity in possible:
+        same = np.array_equal(clock.burst, first.clock.burst)
+        reception = first if same else initial_pass(replace(acquisition, burst=clock.burst))
+        passes.append(reception)
         # Bursts that leave no packet whole give nothing: they must be plainly likelier.
-        gain = SETTINGS.plain_structure if complete_packets(known).any() else 0.0
-        scores.append(packet_llr(known) + say_of_copies * likeness + gain)
+        gain = SETTINGS.plain_structure if complete_packets(reception).any() else 0.0
+        scores.append(packet_llr(reception) + copies_weight * similarity + gain)
     return passes[int(np.argmax(scores))]
 
 
 def _in_bursts_of(acquisition: Acquisition, reception: Reception) -> Acquisition:
-    """The acquisition with the bursts, and the exposure, of what was received."""
-    clock = replace(acquisition.clock, exposure_slots=reception.clock.exposure_slots)
-    return replace(acquisition, clock=clock, burst=reception.clock.burst)
-
-
-def _same_bursts(one: Reception, other: Reception) -> bool:
-    return np.array_equal(one.clock.burst, other.clock.burst)
-
-
-def _likelier_clock(either: Sequence[Acquisition], skip: frozenset[str]) -> Reception:
-    """What is decoded on the likelier of two clocks; a further look tells where an initial pass does not plainly."""
-    evidence = [packet_llr(first_pass(one)) for one in either]
-    if abs(evidence[0] - evidence[1]) < SETTINGS.plain_structure:
-        evidence = [packet_llr(_refined_once(one, first_pass(one))) for one in either]
-    return decode_likeliest(either[int(np.argmax(evidence))], skip)
-
-
-def _refined_once(acquisition: Acquisition, first: Reception) -> Reception:
-    """An initial pass and a look at all scales of every column that has light."""
-    lit = np.flatnonzero(~dark_columns(first.snr))
-    return _seen_again(acquisition, first, lit, STILL.coarse_samples)[0] if lit.size else first
+    """The acquisition with the bursts of what was received."""
+    return replace(acquisition, burst=reception.clock.burst)
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
@@ -160,7 +88,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
         first: what the initial pass showed, where there was one.
     """
-    reception = first or first_pass(acquisition)
+    reception = first or initial_pass(acquisition)
     asked = doubtful_columns(reception) if "certain_columns" in skip else np.arange(reception.snr.shape[0])
     lit = asked[~dark_columns(reception.snr)[asked]] if "dark_columns" in skip else asked
     skipped = {"certain_columns": reception.snr.shape[0] - asked.size, "dark_columns": asked.size - lit.size}
@@ -173,17 +101,6 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
     return replace(reception, skipped={name: count for name, count in skipped.items() if count})
 
 
-def first_pass(acquisition: Acquisition) -> Reception:
-    """The initial pass; with few rows a slot and columns in doubt that with the likeliest mix of rows."""
-    initial = initial_pass(acquisition) if "initial" in acquisition.kept else None
-    if acquisition.clock.rows_per_slot >= STILL.few_rows or (initial and not doubtful_columns(initial).size):
-        return initial or initial_pass(acquisition)
-    if "first" not in acquisition.kept:
-        acquisition.kept["first"] = _likeliest_row_mix(acquisition)
-    kept: Reception = acquisition.kept["first"]
-    return kept
-
-
 def initial_pass(acquisition: Acquisition) -> Reception:
     """One pass over the strips pooled in pairs, from the first guess; made once for an acquisition."""
     if "initial" not in acquisition.kept:
@@ -194,8 +111,11 @@ def initial_pass(acquisition: Acquisition) -> Reception:
 
 def _initial_pass(acquisition: Acquisition) -> Reception:
     clock = acquisition.clock
+    # Demosaicing and denoising mix neighbouring rows: with few rows per slot this widens the effective exposure.
+    exposure_slots = float(np.hypot(clock.exposure_slots, STILL.mixed_rows / clock.rows_per_slot))
+    clock = replace(clock, exposure_slots=exposure_slots)
     samples = sync.sample_slots(acquisition.profiles, clock, STILL.coarse_samples)
-    model = _light_model(acquisition, samples)
+    model = _light_model(acquisition, clock, samples)
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
     first = channel.first_metrics(*contrast, model.exposure)
     clock = _in_bursts(acquisition, clock, first)
@@ -213,32 +133,6 @@ def _first_decision(metrics: FloatArray, isi_memory: int) -> Float32Array:
     if isi_memory == 1:
         return detect.first_decision_of(metrics)
     return detect.detect(metrics, detect.plausible_weights(metrics, 0.0)).lit
-
-
-def _likeliest_row_mix(acquisition: Acquisition) -> Reception:
-    """The quick look with the exposure widened by the rows that demosaicing and denoising mixed, as the light has it.
-
-    They tell on a slot of few rows: one of 1.5 rows that is exposed for 0.4 slots is seen as if for 1.2 and more. From
-    the usual mix on, the next ones are tried for as long as they are likelier.
-    """
-    binned, clock = acquisition.binned(), acquisition.clock
-    tried: dict[int, tuple[float, Reception]] = {}
-
-    def likelihood(number: int) -> float:
-        if not 0 <= number < len(STILL.mixed_rows):
-            return -np.inf
-        if number not in tried:
-            width = float(np.hypot(clock.exposure_slots, STILL.mixed_rows[number] / clock.rows_per_slot))
-            mixed = replace(binned, clock=replace(clock, exposure_slots=width)) if number else acquisition
-            reception = initial_pass(mixed)
-            tried[number] = float(reception.posteriors.log_evidence.sum()), reception
-        return tried[number][0]
-
-    best = min(STILL.usual_mix, len(STILL.mixed_rows) - 1)
-    step = 1 if likelihood(best + 1) > likelihood(best) else -1
-    while likelihood(best + step) > likelihood(best):
-        best += step
-    return tried[best][1]
 
 
 def doubtful_columns(reception: Reception, beyond_repair: float = -np.inf) -> NDArray[np.int64]:
@@ -412,8 +306,8 @@ def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:
     return detect.detect(bursts, detect.plausible_weights(bursts, SETTINGS.hopeless_weight_nats))
 
 
-def _light_model(acquisition: Acquisition, samples: SlotSamples) -> channel.ObservationModel:
-    clock, profiles = acquisition.clock, acquisition.profiles
+def _light_model(acquisition: Acquisition, clock: Clock, samples: SlotSamples) -> channel.ObservationModel:
+    profiles = acquisition.profiles
     rows = _rows_per_sample(clock, samples.samples_per_slot)
     black_level = channel.estimate_black_level(samples, clock)
     sigma = channel.estimate_sigma(samples, black_level, 0.5 * noise_of(profiles) / rows**0.5)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -42,34 +40,27 @@ def _first(headers: float) -> Reception:
 
 
 @pytest.mark.parametrize(
-    ("headers", "of_rival", "confidence", "skip", "looked"),
+    ("headers", "confidence", "skip", "looked"),
     [
-        (5.0, None, 0.1, frozenset(SKIPS), False),
-        (90.0, None, 0.1, frozenset(SKIPS), True),
-        (5.0, 90.0, 0.1, frozenset(SKIPS), True),
-        (5.0, 5.0, 0.1, frozenset(SKIPS), False),
-        (5.0, None, 0.99, frozenset(SKIPS), True),
-        (5.0, None, 0.1, frozenset(SKIPS) - {"no_packets"}, True),
+        (5.0, 0.1, frozenset(SKIPS), False),
+        (90.0, 0.1, frozenset(SKIPS), True),
+        (5.0, 0.99, frozenset(SKIPS), True),
+        (5.0, 0.1, frozenset(SKIPS) - {"no_packets"}, True),
     ],
 )
 def test_only_what_may_show_packets_is_looked_at_in_depth(
     headers: float,
-    of_rival: float | None,
     confidence: float,
     skip: frozenset[str],
     looked: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    rival = None if of_rival is None else replace(CLOCK, row0=4.0)
-    acquisition = Acquisition(None, None, CLOCK, rival)  # type: ignore[arg-type]
+    acquisition = Acquisition(None, None, CLOCK)  # type: ignore[arg-type]
     monkeypatch.setattr(still, "complete_packets", lambda one: np.ones((1, 3), bool))
     monkeypatch.setattr(still, "packet_confidence", lambda one: np.full((1, 3), confidence))
-    monkeypatch.setattr(still, "first_pass", lambda one: _first(headers if one.clock is CLOCK else of_rival or 0.0))
+    monkeypatch.setattr(still, "initial_pass", lambda one: _first(headers))
     seen: list[str] = []
     monkeypatch.setattr(still, "decode", lambda *rest: (seen.append("decode"), rest[2])[1])
-    monkeypatch.setattr(
-        still, "_likelier_clock", lambda either, _: (seen.append("clocks"), still.first_pass(either[0]))[1]
-    )
     monkeypatch.setattr(still, "_with_likeliest_bursts", lambda _, reception, *rest: reception)
     reception = still.decode_likeliest(acquisition, skip)
     assert bool(seen) == looked

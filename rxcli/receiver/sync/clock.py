@@ -200,17 +200,7 @@ def _header_correlation(values: NDArray[np.floating], samples_per_slot: int) -> 
 def find_clock(
     profiles: RowProfiles, rows_per_slot: float, exposure_slots: float, packet_slots: int, sigma: float
 ) -> Clock | None:
-    """The likeliest of `find_clocks`, None where there is none."""
-    return next(iter(find_clocks(profiles, rows_per_slot, exposure_slots, packet_slots, sigma)), None)
-
-
-def find_clocks(
-    profiles: RowProfiles, rows_per_slot: float, exposure_slots: float, packet_slots: int, sigma: float
-) -> tuple[Clock, ...]:
-    """Clocks of a picture whose rows per slot are known, bursts still unknown; none where too little is seen.
-
-    Mostly it is one. Where columns seem to be spread in time, which columns that show next to nothing do as well, the
-    second one is that of columns which are not.
+    """Find the clock of a picture whose rows per slot are known, bursts still unknown; None where too little is seen.
 
     Args:
         profiles: row profiles of the screen.
@@ -223,44 +213,39 @@ def find_clocks(
     step = rows_per_slot / SETTINGS.search_samples
     n = int((bottom - top) / step)
     if n < SLOTS_PER_SYMBOL * SETTINGS.search_samples:
-        return ()
+        return None
     light, valid = resample(profiles, top, step, n)
     pooled, weight = contrast(light, valid, SETTINGS.search_samples, sigma / np.sqrt(max(step, 1.0)))
     response = header_response(pooled, weight, SETTINGS.search_samples)
     power = folded(np.maximum(response, 0) ** 2, packet_slots * SETTINGS.search_samples)
     start, header_peak_ratio = header_comb(power, SETTINGS.search_samples)
     if not np.isfinite(start):
-        return ()
+        return None
     delays = _delays(pooled, weight, start, packet_slots)
-    starts = [(start, delays)]
     many_delays = np.count_nonzero(delays) > delays.size * SETTINGS.many_columns
     if header_peak_ratio < SETTINGS.sure_lead or many_delays:
         staggered_start, staggered_ratio, staggered_delays = _staggered_comb(
             pooled, weight, packet_slots * SETTINGS.search_samples
         )
         if staggered_ratio > header_peak_ratio or many_delays:
-            starts = [(staggered_start, staggered_delays), (start, np.zeros_like(delays))]
+            start, delays = staggered_start, staggered_delays
             header_peak_ratio = max(header_peak_ratio, staggered_ratio)
-
-    def clock_from(start: float, delays: FloatArray) -> Clock:
-        row0 = top + start * step
-        before = int(np.ceil((row0 - top) / rows_per_slot))
-        n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))
-        first_slot = -before % packet_slots
-        n_copies = -(-(first_slot + n_slots) // packet_slots)
-        return Clock(
-            rows_per_slot=rows_per_slot,
-            exposure_slots=exposure_slots,
-            packet_slots=packet_slots,
-            row0=row0 - before * rows_per_slot,
-            n_slots=n_slots,
-            first_slot=first_slot,
-            burst=np.zeros(n_copies, np.int64),
-            delay_slots=delays,
-            header_peak_ratio=header_peak_ratio,
-        )
-
-    return tuple(clock_from(*found) for found in starts)
+    row0 = top + start * step
+    before = int(np.ceil((row0 - top) / rows_per_slot))
+    n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))
+    first_slot = -before % packet_slots
+    n_copies = -(-(first_slot + n_slots) // packet_slots)
+    return Clock(
+        rows_per_slot=rows_per_slot,
+        exposure_slots=exposure_slots,
+        packet_slots=packet_slots,
+        row0=row0 - before * rows_per_slot,
+        n_slots=n_slots,
+        first_slot=first_slot,
+        burst=np.zeros(n_copies, np.int64),
+        delay_slots=delays,
+        header_peak_ratio=header_peak_ratio,
+    )
 
 
 def _row_span(profiles: RowProfiles) -> tuple[float, float]:
