@@ -49,7 +49,6 @@ class WiringSettings:
     #: Headers without symbols count so much.
     headers_alone: float = 0.1
 
-    most_initial_refits: int = 3
     #: Packets, all columns together, which show plainly, nats: with a wrong camera they reach 103. It is right then but
     #: for their length, and other outlines are looked at with the screen that shows them alone.
     plain_packets: float = 200.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.receiver import outline as outlines
-from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
+from rxcli.receiver.context import Camera, FrameContext, Timer
 from rxcli.receiver.outline import Located, Outline, locate, possible_outlines
 from rxcli.receiver.pipeline import receive
 from rxcli.receiver.screen import columns, find, geometry
@@ -186,8 +186,7 @@ def camera_of(frame: Frame, corners: FloatArray) -> FrameContext:
 def test_the_camera_is_asked_once_and_handed_on(packets: float, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, asked = Frame(np.zeros((200, 300), np.uint8), "drawn"), []
 
-    def likely(frame: Frame, corners: FloatArray, *_: object, periods: str) -> FrameContext:
-        assert periods == "outstanding"
+    def likely(frame: Frame, corners: FloatArray, *_: object) -> FrameContext:
         asked.append(corners)
         return camera_of(frame, corners)
 
@@ -202,23 +201,6 @@ def test_the_camera_is_asked_once_and_handed_on(packets: float, monkeypatch: pyt
     assert located.context.corners is located.outline.corners
     # What the packets do not tell stays in doubt, with packets or without.
     assert located.outline.certainty == pytest.approx(1 / np.exp(-np.arange(4.0)).sum())
-
-
-def test_a_camera_that_shows_under_no_first_column_is_not_asked_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-
-    def none(*_: object, periods: str) -> Failure:
-        asked.append(periods)
-        return Failure("no_signal", "no camera")
-
-    candidates = [replace(Outline(moved(k)), log_odds=-float(k), family=k // 3) for k in range(6)]
-    monkeypatch.setattr(outlines, "possible_outlines", lambda *_, **__: (candidates, ""))
-    monkeypatch.setattr(outlines, "likely_camera", none)
-    located = locate(Frame(np.zeros((200, 300), np.uint8), "drawn"), OPTIONS, Timer())
-    assert isinstance(located, Located)
-    assert isinstance(located.context, Failure)
-    # A search of one family short, of the other, then one of all periods.
-    assert asked == ["outstanding", "outstanding", "others"]
 
 
 def test_once_a_screen_shows_plainly_other_outlines_are_looked_at_with_it_alone(
