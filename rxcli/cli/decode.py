@@ -87,7 +87,7 @@ STDIN = "-"
     ("--stop-when-certain", None, False, "Pass over frames of a clip all of whose packets are certain already."),
     ("--out", _FOLDER, None, "Write files that came whole into this folder, under their own names."),
     ("--payloads", _FILE, None, "Write one row a packet (CSV): where it is from, bits, hex, confidence."),
-    ("--quiet", None, False, "No table, no summary, no progress."),
+    ("--quiet", None, False, "No table, no summary, no progress; only why a file failed."),
 )
 @force_argument
 def decode(paths: tuple[str, ...], **options: Any) -> int:
@@ -245,6 +245,7 @@ class _Run:
                 with suppress(OSError):
                     self._conclude(sources)  # what it cannot write is told; why the run ended says more
                 raise
+        self._add_missing()
         return worst([*self._conclude(sources), exit_code(self._summaries, self._limits)])
 
     def _recover(self) -> set[str]:
@@ -256,6 +257,8 @@ class _Run:
             summary, scorer = self._begin(name)
             for result in results:
                 summary.add(scorer.add(result) if scorer else result)
+                if self._baseline is not None:
+                    self._baseline.add(result)
                 self._write_payloads(result)
             self._end(summary, scorer)
             done.add(name)
@@ -376,9 +379,17 @@ class _Run:
 
     def _end(self, summary: SourceSummary, scorer: Scorer | None) -> None:
         if summary.n_frames:  # none: interrupted before the first
-            summary.score = scorer.score() if scorer else None
+            if scorer is not None:
+                summary.score, summary.faults = scorer.score(), scorer.faults()
             summary.regressions = self._baseline.regressions(summary.source) if self._baseline else []
             self._summaries.append(summary)
+
+    def _add_missing(self) -> None:
+        """Sources that the baseline names and that this run did not have."""
+        from rxcli.results.summary import SourceSummary
+
+        for name in self._baseline.missing() if self._baseline else ():
+            self._summaries.append(SourceSummary(name, regressions=["in the baseline, and not in this run"]))
 
     def _keep_estimate(self, result: FrameResult) -> None:
         most = len(self._estimated.packets) if self._estimated else 0
@@ -427,10 +438,15 @@ class _Run:
         return codes
 
     def _print_summary(self) -> None:
-        from rxcli.results.report import LEGEND
+        from rxcli.results.report import LEGEND, printable
         from rxcli.results.summary import format_summary
 
-        if self._summaries and not self._options["quiet"]:
+        if self._options["quiet"]:
+            for summary in self._summaries:
+                for _, reason in summary.failures(self._limits):
+                    name = "" if reason.startswith(f"{summary.source}: ") else f"{summary.source}: "
+                    click.echo(f"vlc-rx: {printable(name + reason)}", err=True)
+        elif self._summaries:
             if self._options["json_path"] is None and any(summary.n_packets for summary in self._summaries):
                 _print_text(LEGEND + "\n")
             _print_text(format_summary(self._summaries, self._limits), err=self._to_stdout)

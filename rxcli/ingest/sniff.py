@@ -55,6 +55,9 @@ def check_file(path: Path) -> Kind | None:
             address = str(path).replace(":/", "://", 1)
             reason = f"{address}: is an address, and nothing is fetched from the network"
             raise InputError(reason, "download it first, and name the file") from None
+        if path.is_symlink():
+            reason = f"{path}: is a link to {os.readlink(path)}, which is not there"
+            raise InputError(reason, "name the file itself, or mend the link") from None
         raise InputError(f"{path}: no such file", "check the name") from None
     except (OSError, ValueError) as error:
         raise InputError(

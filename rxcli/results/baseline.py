@@ -48,6 +48,10 @@ class Baseline:
         total = result.timing_ms.get("total", 0.0)
         run.time_ms += total if total == total else 0.0
 
+    def missing(self) -> list[str]:
+        """Sources of the earlier run that this one had nothing of."""
+        return sorted(self.earlier.keys() - self.now.keys())
+
     def regressions(self, source: str) -> list[str]:
         """In what a source is worse than in the earlier run; empty where it is not, or was not in that run."""
         before, now = self.earlier.get(_key(source)), self.now.get(_key(source), Run())

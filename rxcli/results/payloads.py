@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from rxcli.outputs import unwritable
-from rxcli.results.report import csv_cell, printable
+from rxcli.results.report import csv_cell, printable_name
 from rxcli.types import FrameResult
 
 _NAMES = ("source", "frame", "column", "burst", "bits", "hex", "confidence")
@@ -47,7 +47,7 @@ class PayloadWriter:
         """Write the packets of a frame."""
         self._write(
             (
-                csv_cell(printable(result.source)),
+                csv_cell(printable_name(result.source)),
                 result.frame,
                 column.column,
                 "" if packet.burst is None else packet.burst,

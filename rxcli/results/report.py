@@ -366,9 +366,22 @@ def csv_cell(value: Any) -> Any:
 
 
 def printable(text: str) -> str:
-    """`text` as any terminal takes it: bytes of a file name that are no UTF-8, and line ends, become marks."""
-    text = text.encode(errors="surrogateescape").decode(errors="replace")
-    return "".join(character if character.isprintable() else "�" for character in text)
+    """`text` in one line that any terminal takes: other characters are escaped, `\\xff` is a byte that is no UTF-8."""
+    return "".join(character if character.isprintable() else _escape(character) for character in text)
+
+
+def _escape(character: str) -> str:
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:  # a byte of a file name (PEP 383)
+        return f"\\x{code - 0xDC00:02x}"
+    return {"\n": "\\n", "\r": "\\r", "\t": "\\t"}.get(character) or (
+        f"\\u{code:04x}" if code < 1 << 16 else f"\\U{code:08x}"
+    )
+
+
+def printable_name(name: str) -> str:
+    """The name of a file as `printable`, with backslashes doubled, so that it can be told what the name was."""
+    return printable(name.replace("\\", "\\\\"))
 
 
 #: What makes a spreadsheet compute a cell.
@@ -392,7 +405,7 @@ def format_frame(result: FrameResult) -> str:
 
 def format_heading(result: FrameResult) -> str:
     """Source, screen, camera, status and counts in one line."""
-    parts = [printable(result.source)]
+    parts = [printable_name(result.source)]
     if _is_clip(result):
         parts.append(f"frame {result.frame} at {result.time_s:.3f} s")
     parts.append(result.status)
@@ -416,7 +429,7 @@ def _counts(result: FrameResult) -> str:
 
 def result_in_words(result: FrameResult) -> str:
     """What was done for a frame, in one line: screen, camera, time by stage, what was left out."""
-    parts = [f"{printable(result.source)} frame {result.frame}: {result.status}"]
+    parts = [f"{printable_name(result.source)} frame {result.frame}: {result.status}"]
     if result.corners is not None:
         parts.append("screen at " + " ".join(f"{x:.0f},{y:.0f}" for x, y in result.corners))
     if result.line_delay_s:

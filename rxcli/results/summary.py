@@ -12,13 +12,14 @@ from typing import Any
 
 from rxcli.errors import ExitCode, UsageError, worst
 from rxcli.outputs import replacing, write_whole
-from rxcli.results.report import csv_cell, format_progress, format_table, plural, printable
-from rxcli.results.truth import Score
+from rxcli.results.report import csv_cell, format_progress, format_table, plural, printable, printable_name
+from rxcli.results.truth import EXPECTED_LENGTHS, Fault, Score
 from rxcli.types import FrameResult
 
 #: Packets of less are as likely wrong as right: they are shown, but they do not make an input a success.
 MIN_CONFIDENCE = 0.5
-
+#: Packets that one sentence names.
+_MAX_NAMED = 6
 
 #: What a row tells of the score.
 _SCORED = ("expected", "error_free", "lost", "false", "extra", "wrong_w", "ber")
@@ -62,6 +63,8 @@ class SourceSummary:
     unwritten: list[str] = field(default_factory=list)
     #: None where no truth is known.
     score: Score | None = None
+    #: Expected packets that did not come as they were sent.
+    faults: list[Fault] = field(default_factory=list)
     #: Why truth that was asked for is not there.
     truth_problem: str | None = None
     #: In what it is worse than an earlier run.
@@ -103,7 +106,9 @@ class SourceSummary:
     def failures(self, limits: Limits) -> list[tuple[ExitCode, str]]:
         """Why this source does not pass: exit codes with reasons; empty where it does."""
         found: list[tuple[ExitCode, str]] = []
-        if self.statuses["unreadable"]:
+        if not self.n_frames:
+            pass
+        elif self.statuses["unreadable"]:
             found.append((ExitCode.UNREADABLE, self.reason))
         elif not self.n_packets and not self.n_messages and not self.n_objects:
             found.append((ExitCode.NOT_RECEIVED, f"no packet: {self.reason}" if self.reason else "no packet"))
@@ -117,7 +122,7 @@ class SourceSummary:
         found += [(ExitCode.NOT_RECEIVED, problem) for problem in (*self.regressions, *self.unwritten)]
         if self.truth_problem:
             found.append((ExitCode.UNREADABLE, self.truth_problem))
-        if limits.max_ber is not None:
+        if limits.max_ber is not None and self.n_frames:
             found += self._ber_failures(limits.max_ber)
         return found
 
@@ -128,17 +133,23 @@ class SourceSummary:
         return f"{plural(self.n_packets, 'packet')}{of_them}; {asked} {'was' if asked == 1 else 'were'} asked for"
 
     def _ber_failures(self, max_ber: float) -> list[tuple[ExitCode, str]]:
-        if self.score is None or self.score.ber is None:
+        if self.score is None:
             return [(ExitCode.NOT_RECEIVED, "no truth to hold the bit error rate against")]
-        if self.score.ber > max_ber:
-            return [(ExitCode.NOT_RECEIVED, f"bit error rate {self.score.ber:.3g} is above {max_ber:.3g}")]
-        return []
+        if self.score.ber is None:
+            reason = f"no bit error rate: the truth shows no burst for {EXPECTED_LENGTHS:g} packet lengths"
+            return [(ExitCode.NOT_RECEIVED, reason)]
+        if self.score.ber <= max_ber:
+            return []
+        named = ", ".join(map(str, self.faults[:_MAX_NAMED]))
+        more = f" and {len(self.faults) - _MAX_NAMED} more" if len(self.faults) > _MAX_NAMED else ""
+        reason = f"bit error rate {self.score.ber:.3g} is above {max_ber:.3g}: {named}{more}"
+        return [(ExitCode.NOT_RECEIVED, reason)]
 
     def row(self, limits: Limits) -> dict[str, Any]:
         """The figures as plain data; None where unknown."""
         failures = self.failures(limits)
         return {
-            "source": printable(self.source),
+            "source": printable_name(self.source),
             "exit_code": int(worst([code for code, _ in failures])),
             "frames": self.n_frames,
             "frames_failed": self.n_frames - self.statuses["ok"] - self.statuses["partial"],
@@ -265,13 +276,16 @@ def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) 
     n_failures = n_errors = 0
     for summary in summaries:
         seconds = f"{summary.time_ms / 1e3:.3f}"
-        case = ElementTree.SubElement(suite, "testcase", classname="decode", name=_xml(summary.source), time=seconds)
+        case = ElementTree.SubElement(
+            suite, "testcase", classname="decode", name=printable_name(summary.source), time=seconds
+        )
         failures = summary.failures(limits)
         if failures:  # one a case, as the readers of these files expect it: the worst, with all reasons
             code = worst([code for code, _ in failures])
             kind = "error" if code is ExitCode.UNREADABLE else "failure"
             reasons = "; ".join(dict.fromkeys(reason for _, reason in failures))
-            ElementTree.SubElement(case, kind, message=_xml(reasons), type=code.name.lower())
+            element = ElementTree.SubElement(case, kind, message=printable(reasons), type=code.name.lower())
+            element.text = "\n".join(map(str, summary.faults)) or None
         n_errors += case.find("error") is not None
         n_failures += case.find("error") is None and case.find("failure") is not None
     suite.set("errors", str(n_errors))
@@ -281,8 +295,3 @@ def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) 
     root.append(suite)
     ElementTree.indent(root)
     write_whole(path, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
-
-
-def _xml(text: str) -> str:
-    """`text` without the characters that XML cannot hold."""
-    return printable(text)

@@ -183,6 +183,20 @@ class Score:
         return Score(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(Score)))
 
 
+@dataclass(frozen=True, slots=True, order=True)
+class Fault:
+    """An expected packet that did not come as it was sent."""
+
+    column: int
+    burst: int
+    #: None: lost.
+    wrong_bits: int | None
+
+    def __str__(self) -> str:
+        what = "lost" if self.wrong_bits is None else f"{self.wrong_bits} wrong bits"
+        return f"column {self.column} burst {self.burst} ({what})"
+
+
 class Scorer:
     """Scores the frames of one source as they come.
 
@@ -226,6 +240,12 @@ class Scorer:
             key = (burst, column)
             self._fewest[key] = min(self._fewest.get(key, errors[burst]), errors[burst])
         return replace(packet, bit_errors=errors[burst])
+
+    def faults(self) -> list[Fault]:
+        """Expected packets of the frames so far that were lost or have wrong bits."""
+        expected = [(c, b) for c in range(self._truth.columns) for b in sorted(self._truth.expected_bursts)]
+        found = (Fault(column, burst, self._fewest.get((burst, column))) for column, burst in expected)
+        return [fault for fault in found if fault.wrong_bits != 0]
 
     def score(self) -> Score:
         """The score over the frames so far."""

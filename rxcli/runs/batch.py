@@ -90,17 +90,22 @@ def _sources_of(path: str, suffixes: frozenset[str]) -> Iterator[Source]:
     if path == "-" or not os.path.isdir(path):
         yield Source(path, path)
         return
-    files = [name for name in _walk(path) if os.path.splitext(name)[1].casefold() in suffixes]
-    if not files:
+    refused: list[OSError] = []
+    files = [name for name in _walk(path, refused.append) if os.path.splitext(name)[1].casefold() in suffixes]
+    if not files and not refused:
         listed = ", ".join(sorted(suffix.lstrip(".") for suffix in suffixes))
         problem = f"{path}: the folder holds no picture or clip; name files, or a folder with {listed}"
         yield Source(path, path, problem)
     for name in files:
         yield Source(name, name)
+    for error in refused:
+        name = error.filename
+        problem = f"{name}: the folder may not be read ({error.strerror}); ask for permission, or leave it out"
+        yield Source(name, name, problem)
 
 
-def _walk(folder: str) -> Iterator[str]:
-    for parent, folders, files in os.walk(folder):
+def _walk(folder: str, refused: Callable[[OSError], None]) -> Iterator[str]:
+    for parent, folders, files in os.walk(folder, onerror=refused):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         if OUTPUT_MARKER in files:  # what `inspect` has written
             folders.clear()

@@ -73,6 +73,53 @@ def test_quiet_says_nothing(tmp_path: Path, decode: Decode) -> None:
     assert decode(tmp_path / "a.png", "--quiet") == (0, "", "")
 
 
+def test_quiet_says_why_a_file_failed(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 2)
+    (tmp_path / "b.png").write_bytes(b"")
+    told = f"vlc-rx: {tmp_path / 'b.png'}: the file is empty (0 bytes); copy it from the camera again\n"
+    assert decode(tmp_path, "--quiet") == (3, "", told)
+
+
+def test_a_folder_that_may_not_be_read_and_a_link_to_nowhere(
+    tmp_path: Path, decode: Decode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "in" / "shut").mkdir(parents=True)
+    write_frame(tmp_path / "in" / "a.png", 2)
+    (tmp_path / "in" / "b.png").symlink_to("gone.png")
+    scan = os.scandir
+
+    def refuse(path: Any) -> Any:
+        if str(path).endswith("shut"):
+            raise PermissionError(13, "Permission denied", path)
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)  # permissions do not bind every user
+    code, _, err = decode(tmp_path / "in", "--quiet")
+    assert code == 3
+    link, shut = err.splitlines()
+    assert "b.png: is a link to gone.png, which is not there; name the file itself, or mend the link" in link
+    assert "shut: the folder may not be read (Permission denied)" in shut
+    code, _, err = decode(tmp_path / "in" / "shut", "--quiet")
+    assert (code, err) == (3, shut + "\n")
+
+
+def test_odd_names_can_be_told_from_tables(tmp_path: Path, decode: Decode) -> None:
+    names = ["line\nbreak.png", os.fsdecode(b"byte\xff.png"), "back\\nslash.png"]
+    shown = ["line\\nbreak.png", "byte\\xff.png", "back\\\\nslash.png"]
+    write_frame(tmp_path / "a.png", 2)
+    for name in names:
+        (tmp_path / name).write_bytes((tmp_path / "a.png").read_bytes())
+    csv_files = ("--summary", tmp_path / "s.csv", "--payloads", tmp_path / "p.csv")
+    code, out, _ = decode(*(tmp_path / name for name in names), *csv_files, "--junit", tmp_path / "j.xml")
+    assert code == 0
+    for file in ("s.csv", "p.csv"):
+        rows = csv.DictReader(io.StringIO((tmp_path / file).read_text(encoding="utf-8")))
+        assert list(dict.fromkeys(row["source"] for row in rows)) == [f"{tmp_path}/{name}" for name in shown]
+    [suite] = ElementTree.parse(tmp_path / "j.xml").getroot()
+    assert [case.get("name") for case in suite] == [f"{tmp_path}/{name}" for name in shown]
+    assert all(f"{tmp_path}/{name}" in out for name in shown)
+
+
 def test_a_picture_on_stdin(tmp_path: Path, decode: Decode, monkeypatch: pytest.MonkeyPatch) -> None:
     payloads = write_frame(tmp_path / "a.png", 3)
 
@@ -128,12 +175,37 @@ def test_packets_below_the_asked_confidence_do_not_count_and_are_told(tmp_path: 
     code, out, _ = decode(path, "--min-confidence", least)
     assert code == 0
     assert f"{n_sure} packet" in out
-    assert f"below --min-confidence {least:g}" in out
+    assert f"below the {least:g} asked for (--min-confidence)" in out
     assert "uncertain" not in out
     assert decode(path, "--min-confidence", least, "--min-packets", n_sure + 1)[0] == 1
     code, out, _ = decode(path, "--min-packet-confidence", least)
     assert code == 1
     assert f"a packet has a confidence of {min(sure):.4g}, below {least:g}" in out
+
+
+def test_what_is_wrong_is_named_by_column_burst_and_bits(tmp_path: Path, decode: Decode) -> None:
+    write_frame(tmp_path / "a.png", 1)
+    (tmp_path / "b.png").write_bytes((tmp_path / "a.png").read_bytes())
+    truth = json.loads((tmp_path / "a.truth.json").read_text())
+    payloads = truth["payload"]["0"]
+    payloads[3] = f"{int(payloads[3], 16) ^ 7 << 37:010x}"
+    payloads[5] = f"{int(payloads[5], 16) ^ 0xFFFFFFFFFF:010x}"
+    (tmp_path / "a.truth.json").write_text(json.dumps(truth))
+    told = "column 3 burst 0 (3 wrong bits), column 5 burst 0 (lost)"
+    code, out, _ = decode(tmp_path / "a.png", "--truth", "auto", "--max-ber", "1e-3", "--junit", tmp_path / "j.xml")
+    assert code == 1
+    assert f"is above 0.001: {told}" in " ".join(out.split())
+    [[[failure]]] = ElementTree.parse(tmp_path / "j.xml").getroot()
+    assert told in failure.get("message", "")
+    assert failure.text == told.replace(", ", "\n")
+    truth["frames"][0]["bursts"][0]["visible_slots"] = 70.0
+    (tmp_path / "a.truth.json").write_text(json.dumps(truth))
+    code, out, _ = decode(tmp_path / "a.png", "--truth", "auto", "--max-ber", "1e-3")
+    assert code == 1
+    assert "no bit error rate: the truth shows no burst for 1.02 packet lengths" in " ".join(out.split())
+    code, out, _ = decode(tmp_path / "b.png", "--truth", "auto", "--max-ber", "1e-3")
+    assert code == 1
+    assert "no truth to hold the bit error rate against" in out
 
 
 def test_a_case_has_one_failure_with_all_reasons(tmp_path: Path, decode: Decode) -> None:
@@ -163,6 +235,18 @@ def test_a_run_is_held_against_an_earlier_one(tmp_path: Path, decode: Decode) ->
     record["timing_ms"] = {"total": -1e9}
     base.write_text(json.dumps(record) + "\n")
     assert decode(tmp_path / "a.png", "--baseline", base)[0] == 1
+    write_frame(tmp_path / "b.png", 2)
+    base.unlink()
+    assert decode(tmp_path / "a.png", tmp_path / "b.png", "--json", base)[0] == 0
+    code, out, _ = decode(tmp_path / "a.png", "--baseline", base, "--slower", 1000)
+    assert code == 1
+    assert [
+        line.split("  ")[0] for line in out.splitlines() if line.endswith("in the baseline, and not in this run")
+    ] == [str(tmp_path / "b.png")]
+    more = ("--baseline", base, "--slower", 1000, "--quiet")
+    again = (tmp_path / "a.png", tmp_path / "b.png", "--json", tmp_path / "again.jsonl", *more)
+    assert decode(*again) == (0, "", "")
+    assert decode(*again, "--resume") == (0, "", "")  # packets of the earlier part count
     base.write_text("{}\n")
     code, _, err = decode(tmp_path / "a.png", "--baseline", base)
     assert code == 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rxcli.errors import ExitCode, InputError, UsageError
-from rxcli.results.report import format_frame, format_table, from_record, printable, shorten, to_json_line, to_record
+from rxcli.results.report import (
+    format_frame,
+    format_table,
+    from_record,
+    printable,
+    printable_name,
+    shorten,
+    to_json_line,
+    to_record,
+)
 from rxcli.results.summary import Limits, SourceSummary, exit_code, format_summary, total, write_junit, write_summary
 from rxcli.results.truth import Score
 from rxcli.types import ColumnResult, FrameResult, PacketResult
@@ -119,8 +129,22 @@ def test_file_names_that_are_no_utf8_survive() -> None:
     line = to_json_line(replace(OK, source=name))
     line.encode("ascii")
     assert from_record(json.loads(line)).source == name
-    assert printable(name) == "caf�.jpg"
+    assert printable(name) == "caf\\xe9.jpg"
     format_frame(replace(OK, source=name)).encode("utf-8")
+
+
+@given(st.binary(min_size=1, max_size=20))
+def test_a_name_can_be_told_from_what_is_printed(raw: bytes) -> None:
+    name = raw.decode(errors="surrogateescape")
+    shown = printable_name(name)
+    assert shown.isprintable()
+    plain = {"\\": "\\", "n": "\n", "r": "\r", "t": "\t"}
+
+    def character(escape: re.Match[str]) -> str:
+        text = escape[1]
+        return plain.get(text) or chr(int(text[1:], 16) + (0xDC00 if text[0] == "x" else 0))
+
+    assert re.sub(r"\\([\\nrt]|x..|u.{4}|U.{8})", character, shown) == name
 
 
 def test_the_table_shows_what_a_person_looks_for() -> None:
