@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from rxcli.ingest.v4l2 import CameraSettings
     from rxcli.options import ReceiverOptions
+    from rxcli.results.aim import AimState
     from rxcli.results.overlay import Preview
     from rxcli.types import Frame, FrameResult
 
@@ -123,29 +124,36 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
     decoder = replace(standard_decoder(prompt, watched.tap), open_source=lambda path: frames)
     packets: deque[dict[str, Any]] = deque(maxlen=_HISTORY)
     texts: list[dict[str, Any]] = []
-    last_s = 0.0
-    for received in decoder.results(Source("camera", "camera")):
-        result = replace(received, message=received.message and without_commands(received.message))
-        now_s = time.monotonic()
-        state = aim.update(result, now_s, watched.height, watched.light)
-        found = packets_of(result)
-        packets.extend(found)
-        texts += texts_of(result)
-        if now_s - last_s < 1 / _EVENTS_PER_S and not texts and result.status != "unreadable":
-            continue
-        last_s = now_s
-        yield {
+
+    def event(result: FrameResult, state: AimState) -> dict[str, Any]:
+        """A result, and the packets and texts since the event before."""
+        made = {
             "state": asdict(state),
             "light": state.light.word if state.light else None,
             "columns": [[column.column, column.status] for column in result.columns],
             "packets": list(packets),
-            "texts": texts,
+            "texts": list(texts),
             "picture": watched.picture(result, options),
             "screen": result.screen_profile,
             "camera": result.camera_profile,
         }
         packets.clear()
-        texts = []
+        texts.clear()
+        return made
+
+    last_s = 0.0
+    unsent: tuple[FrameResult, AimState] | None = None
+    for received in decoder.results(Source("camera", "camera")):
+        result = replace(received, message=received.message and without_commands(received.message))
+        now_s = time.monotonic()
+        unsent = result, aim.update(result, now_s, watched.height, watched.light)
+        packets.extend(packets_of(result))
+        texts += texts_of(result)
+        if now_s - last_s >= 1 / _EVENTS_PER_S or texts or result.status == "unreadable":
+            yield event(*unsent)
+            last_s, unsent = now_s, None
+    if unsent is not None:
+        yield event(*unsent)
 
 
 class _Watched:

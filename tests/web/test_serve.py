@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import itertools
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -418,11 +420,15 @@ def test_light_is_told_in_words(tmp_path: Path) -> None:
         assert light_of(frame).word == word
 
 
-def test_a_live_camera_gives_state_picture_and_packets() -> None:
-    """The clip's frames as a camera gives them."""
+@pytest.mark.parametrize("passed_s", [0.0, 1.0])
+def test_a_live_camera_gives_state_picture_and_packets(passed_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clip's frames as a camera gives them, however fast they are received."""
+    clock = itertools.count(100.0, passed_s)
+    monkeypatch.setattr("rxcli.web.live.time", SimpleNamespace(monotonic=lambda: next(clock)))
     options = receiver_options(cameras=(str(SAMPLES / "video1080.toml"),))
     events = list(live_events(open_source(SAMPLES / "video1080_chelsea_17k3.mp4"), options))
     assert events[-1]["state"]["locked"]
+    assert len(events) == 2 if passed_s == 0 else len(events) > 2
     assert len(events[-1]["picture"]["outlines"]) == 20
     assert sum(len(event["packets"]) for event in events) >= 20
     assert 0.7 < events[-1]["state"]["height_share"] < 1
