@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+import msgspec
 import numpy as np
 
 from rxcli.errors import UsageError
@@ -118,7 +119,8 @@ def _profiles(
     found: list[_Profile] = []
     for name in names:
         if isinstance(name, kind):
-            found.append(name)
+            # Made anew, so that one changed by `msgspec.structs.replace` is checked too.
+            found.append(kind(**msgspec.structs.asdict(name)))
         elif not isinstance(name, str):
             raise UsageError(f"{name!r} is no {kind.__name__}", "give a profile of this kind, its name, or a TOML file")
         elif name != AUTO:

@@ -37,7 +37,31 @@ ToneName = Literal["linear", "srgb", "bt709", "auto"]
 Triple = tuple[float, float, float]
 
 
-class ScreenProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Checked(msgspec.Struct, frozen=True):
+    """Values that are checked, and made plain, whoever gives them: a file or Python.
+
+    Raises:
+        ProfileError: an impossible value.
+    """
+
+    def __post_init__(self) -> None:
+        for field in msgspec.structs.fields(type(self)):
+            value = msgspec.to_builtins(getattr(self, field.name), enc_hook=_as_builtin)
+            try:
+                msgspec.structs.force_setattr(self, field.name, msgspec.convert(value, field.type))
+            except (msgspec.ValidationError, OverflowError) as error:
+                place, text = f"`$.{field.name}", str(error)
+                message = text.replace("`$", place) if "`$" in text else f"{text} - at {place}`"
+                reason = _explain(message, {field.name: value})
+                raise ProfileError(f"{type(self).__name__}: {reason}", "correct the value") from None
+
+
+def _as_builtin(value: Any) -> Any:
+    """NumPy's scalars and arrays as the numbers that they hold; anything else as text, which is no number."""
+    return value.tolist() if hasattr(value, "tolist") else repr(value)
+
+
+class ScreenProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A screen and what it sends (air interface, section 3)."""
 
     format: Literal[1] = 1
@@ -72,7 +96,7 @@ class ScreenProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         return self.width_mm / self.height_mm
 
 
-class ReadoutMode(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ReadoutMode(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How one picture format of a camera is read out."""
 
     name: Name
@@ -85,7 +109,7 @@ class ReadoutMode(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     frame_rate_hz: Annotated[float, Meta(gt=0, le=1e5)] | None = None
 
 
-class LensModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LensModel(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """OpenCV's pinhole model with radial and tangential distortion, for pictures of `width` x `height`."""
 
     width: PositiveInt
@@ -96,8 +120,12 @@ class LensModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     #: True where the camera has already taken the distortion out of its pictures.
     distortion_already_corrected: bool = False
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_lens(self)
 
-class CameraProfile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+
+class CameraProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A camera body (its readout modes), a lens, or both."""
 
     format: Literal[1] = 1
@@ -157,34 +185,31 @@ def check_profile(raw: dict[str, Any], kind: type[_Profile], source: str) -> _Pr
         if key not in raw:
             raise ProfileError(f"{source}: Object missing required field `{key}`", "correct the file")
     try:
-        profile = msgspec.convert(raw, kind, strict=True)
+        return msgspec.convert(raw, kind, strict=True)
     except (msgspec.ValidationError, OverflowError, RecursionError) as error:
         raise ProfileError(f"{source}: {_explain(str(error), raw)}", "correct the file") from None
-    if isinstance(profile, CameraProfile):
-        _check_lens(profile.lens, source)
-    return profile
+    except ProfileError as error:
+        raise ProfileError(f"{source}: {error.message}", error.hint) from None
 
 
-def _check_lens(lens: LensModel | None, source: str) -> None:
-    if lens is None:
-        return
+def _check_lens(lens: LensModel) -> None:
     (fx, skew, cx), (lower, fy, cy), last = lens.camera_matrix
     if not all(map(isfinite, (*lens.dist_coeffs, *chain.from_iterable(lens.camera_matrix)))):
-        raise ProfileError(f"{source}: lens: camera_matrix and dist_coeffs must be finite numbers", "correct the file")
+        raise ProfileError("lens: camera_matrix and dist_coeffs must be finite numbers", "correct the numbers")
     if fx <= 0 or fy <= 0 or (skew, lower) != (0.0, 0.0) or last != (0.0, 0.0, 1.0):
         raise ProfileError(
-            f"{source}: lens.camera_matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy "
+            "lens.camera_matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy "
             f"(got {[list(row) for row in lens.camera_matrix]})",
-            "correct the file",
+            "correct the matrix",
         )
     largest, size = max(map(abs, lens.dist_coeffs)), max(lens.width, lens.height)
     if largest > _LARGEST_COEFFICIENT:
         reason = f"no lens has distortion coefficients beyond {_LARGEST_COEFFICIENT:g} (got {largest:g})"
-        raise ProfileError(f"{source}: lens: {reason}", "correct the file, or calibrate again")
+        raise ProfileError(f"lens: {reason}", "correct them, or calibrate again")
     if max(fx, fy, abs(cx), abs(cy)) > _FARTHEST * size or min(fx, fy) < size / _FARTHEST:
         reason = f"camera_matrix does not fit a picture of {lens.width} x {lens.height} pixels"
         matrix = [list(row) for row in lens.camera_matrix]
-        raise ProfileError(f"{source}: lens: {reason} (got {matrix})", "correct the file, or calibrate again")
+        raise ProfileError(f"lens: {reason} (got {matrix})", "correct it, or calibrate again")
 
 
 def _explain(message: str, raw: dict[str, Any]) -> str:
@@ -196,7 +221,7 @@ def _explain(message: str, raw: dict[str, Any]) -> str:
     value: Any = raw
     for part in re.findall(r"[^.\[\]]+", path):
         try:
-            value = value[int(part)] if isinstance(value, list) else value[part]
+            value = value[int(part)] if isinstance(value, (list, tuple)) else value[part]
         except (KeyError, IndexError, ValueError, TypeError):
             return f"{path}: {message[: found.start()]}"
     return f"{path}: {message[: found.start()]} (got {_shown(value)})"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 import tomli_w
 from hypothesis import given, settings
@@ -16,6 +18,7 @@ from PIL import Image
 
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode, ProfileError
+from rxcli.options import receiver_options
 from rxcli.profiles import (
     CameraProfile,
     LensModel,
@@ -346,3 +349,42 @@ def test_lens_numbers_must_be_finite(number: str) -> None:
     lens = {"width": 60, "height": 40, "camera_matrix": matrix, "dist_coeffs": [0.1, 0.0, 0.0, 0.0]}
     with pytest.raises(ProfileError, match="finite"):
         check_profile({"format": 1, "kind": "camera", "name": "x", "lens": lens}, CameraProfile, "x.toml")
+
+
+def _screen(**values: Any) -> ScreenProfile:
+    return ScreenProfile(**({"name": "s", "columns": 4, "slot_rate_hz": 8650.0, "payload_symbols": 5} | values))
+
+
+def _lens(**values: Any) -> LensModel:
+    matrix = ((50.0, 0.0, 30.0), (0.0, 50.0, 20.0), (0.0, 0.0, 1.0))
+    known = {"width": 60, "height": 40, "camera_matrix": matrix, "dist_coeffs": (0.1, 0.0, 0.0, 0.0)}
+    return LensModel(**(known | values))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: _screen(columns=0), r"ScreenProfile: columns: Expected `int` >= 1 \(got 0\)"),
+        (lambda: _screen(slot_rate_hz=float("nan")), "slot_rate_hz"),
+        (lambda: _screen(name="a b"), "name"),
+        (lambda: _screen(columns=object()), "columns"),
+        (lambda: ReadoutMode(name="m", width=60, height=0, line_delay_s=1e-5), "ReadoutMode: height"),
+        (lambda: _lens(dist_coeffs=(0.1,)), "LensModel: dist_coeffs"),
+        (lambda: _lens(camera_matrix=np.zeros((3, 3))), "lens.camera_matrix must be"),
+        (lambda: CameraProfile(name="c", tone="odd"), "CameraProfile: tone"),  # type: ignore[arg-type]
+        (
+            lambda: receiver_options(msgspec.structs.replace(_screen(), columns=0)),
+            "ScreenProfile: columns",
+        ),
+    ],
+)
+def test_python_checks_values_as_files_are_checked(make: Callable[[], object], said: str) -> None:
+    with pytest.raises(ProfileError, match=said):
+        make()
+
+
+def test_numpys_numbers_are_taken_as_numbers() -> None:
+    screen = _screen(columns=np.int64(4), slot_rate_hz=np.float32(8650))
+    assert screen == _screen()
+    assert type(screen.slot_rate_hz) is float
+    assert _lens(dist_coeffs=np.array([0.1, 0, 0, 0])) == _lens()
