@@ -1,8 +1,8 @@
 """Lens profiles of the Gyroflow community (JSON, CC0): the lens as OpenCV's pinhole model, the readout as a hint.
 
-Such a profile holds OpenCV's fisheye model: a ray at the angle t from the axis falls at the distance
-`t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)` times the focal length. The receiver's model starts from `tan t` instead, so
-it is fitted to the rays that the picture's points come from. Readout times are given by users, who often guess them.
+Such a profile holds OpenCV's fisheye model, a polynomial of the angle from the axis. The receiver's model starts from
+the tangent of the angle, so it is fitted to the rays behind the picture's points. Users type in the readout, often
+wrongly.
 """
 
 from __future__ import annotations
@@ -15,23 +15,25 @@ from typing import Any
 
 import numpy as np
 
+from rxcli.calibrate.fitting import fit_distortion
 from rxcli.errors import InputError, ProfileError
 from rxcli.profiles import LensModel
 from rxcli.resources import read_limited
 from rxcli.types import FloatArray
 
-_MOST_BYTES = 4 << 20
+_MAX_BYTES = 4 << 20
+#: Points across and down at which the models are compared.
 _GRID = (33, 21)
-#: A pinhole's picture has no end before 90 degrees; beyond this no screen is flat enough to be read.
-_WIDEST_RAD = math.radians(70)
-#: Newton steps; an angle is found to 1e-12 in five.
-_STEPS = 20
+#: Angle from the axis above which no screen is flat enough to be read.
+_MAX_ANGLE_RAD = math.radians(70)
+#: Angles at which the fisheye polynomial is tabulated; linear interpolation is then right to 1e-8.
+_ANGLES = 10_000
 _HINT = "use `vlc-rx calibrate lens`, or another profile"
 
 
 @dataclass(frozen=True, slots=True)
 class GyroflowProfile:
-    """What a profile says of a camera."""
+    """The lens and readout of a profile."""
 
     lens: LensModel
     make: str
@@ -39,12 +41,11 @@ class GyroflowProfile:
     lens_name: str
     #: Largest distance between the fisheye's and the pinhole model's points over the picture, pixels.
     worst_px: float
-    #: Readout of the whole frame as users say, seconds; None where the profile is silent or says what cannot be.
+    #: Readout of the whole frame as typed in by a user, seconds; None where it is missing or impossible.
     readout_s: float | None
     #: True where the rows are read from the bottom to the top.
     reversed: bool
-    frame_rate_hz: float | None
-    #: What should be known before the readout is trusted.
+    #: Doubts about the readout.
     notes: tuple[str, ...]
 
 
@@ -53,8 +54,8 @@ def load_gyroflow(path: Path, size: tuple[int, int] | None = None) -> GyroflowPr
 
     Args:
         path: the JSON file.
-        size: width and height of the pictures that it is for, where they are not the calibrated ones: scaled by the
-            width, rows cut off or added equally above and below.
+        size: width and height of the pictures that it is for; None: as calibrated. The picture is scaled by the
+            width; rows are cut off or added equally above and below.
 
     Raises:
         InputError: it cannot be read.
@@ -62,32 +63,23 @@ def load_gyroflow(path: Path, size: tuple[int, int] | None = None) -> GyroflowPr
     """
     raw = _load(path)
     try:
-        matrix, coefficients, width, height = _calibrated(raw)
+        matrix, coefficients, calibrated = _calibrated(raw)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError):
         raise ProfileError(f"{path}: holds no fisheye lens with its size", _HINT) from None
-    if not (np.all(np.isfinite(matrix)) and np.all(np.isfinite(coefficients)) and matrix[0, 0] > 0 < matrix[1, 1]):
-        raise ProfileError(f"{path}: camera_matrix or distortion_coeffs are no lens's", _HINT)
-    if size is not None:
-        matrix, width, height = _resized(matrix, width, height, size)
-    lens, worst = _pinhole(matrix, coefficients, width, height, path)
-    rate = _positive(raw.get("fps"))
-    readout_s, reversed_, notes = _readout(raw, rate)
-    return GyroflowProfile(
-        lens=lens,
-        make=_text(raw, "camera_brand"),
-        model=_text(raw, "camera_model"),
-        lens_name=_text(raw, "lens_model"),
-        worst_px=worst,
-        readout_s=readout_s,
-        reversed=reversed_,
-        frame_rate_hz=rate,
-        notes=notes,
-    )
+    size = size or calibrated
+    scale = size[0] / calibrated[0]
+    matrix[:2] *= scale
+    matrix[:2, 2] += (scale - 1) / 2
+    matrix[1, 2] += (size[1] - calibrated[1] * scale) / 2
+    rays, points = _rays(matrix, coefficients, size, path)
+    lens, worst = fit_distortion(rays, points, matrix[[0, 1], [0, 1]], matrix[:2, 2], size)
+    make, model, lens_name = (_text(raw, key) for key in ("camera_brand", "camera_model", "lens_model"))
+    return GyroflowProfile(lens, make, model, lens_name, worst, *_readout(raw))
 
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        raw = json.loads(read_limited(path, _MOST_BYTES))
+        raw = json.loads(read_limited(path, _MAX_BYTES))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file", "check the name") from None
     except (OSError, ValueError, RecursionError) as error:
@@ -98,105 +90,60 @@ def _load(path: Path) -> dict[str, Any]:
     return raw
 
 
-def _calibrated(raw: dict[str, Any]) -> tuple[FloatArray, FloatArray, int, int]:
-    """Camera matrix and coefficients for stored pictures, and their size."""
-    width, height = int(raw["calib_dimension"]["w"]), int(raw["calib_dimension"]["h"])
-    matrix = np.array(raw["fisheye_params"]["camera_matrix"], np.float64).reshape(3, 3)
-    coefficients = np.array(raw["fisheye_params"]["distortion_coeffs"], np.float64).reshape(4)
+def _calibrated(raw: dict[str, Any]) -> tuple[FloatArray, FloatArray, tuple[int, int]]:
+    """Camera matrix and coefficients for stored pictures, and their size.
+
+    Raises:
+        KeyError, TypeError, ValueError, IndexError, OverflowError: the profile lacks one of them, or it is impossible.
+    """
+    fisheye, dimension = raw["fisheye_params"], raw["calib_dimension"]
+    matrix = np.array(fisheye["camera_matrix"], np.float64).reshape(3, 3)
+    coefficients = np.array(fisheye["distortion_coeffs"], np.float64).reshape(4)
     # Anamorphic pictures are stored narrower, or lower, than they were calibrated.
     stretch = [_positive(raw.get(f"input_{side}_stretch")) or 1.0 for side in ("horizontal", "vertical")]
-    width, height = round(width / stretch[0]), round(height / stretch[1])
-    if not (0 < width <= 100_000 and 0 < height <= 100_000):
+    width, height = (round(int(dimension[side]) / part) for side, part in zip("wh", stretch, strict=True))
+    finite = np.all(np.isfinite(matrix)) and np.all(np.isfinite(coefficients))
+    if not (finite and min(matrix[0, 0], matrix[1, 1]) > 0 and 0 < width <= 100_000 and 0 < height <= 100_000):
         raise ValueError
-    matrix[0] /= stretch[0]
-    matrix[1] /= stretch[1]
-    # A crop says how much of the sensor's width the clip shows, which calib_dimension already is.
-    return matrix, coefficients, width, height
+    matrix[:2] /= np.array(stretch)[:, None]
+    return matrix, coefficients, (width, height)
 
 
-def _resized(matrix: FloatArray, width: int, height: int, size: tuple[int, int]) -> tuple[FloatArray, int, int]:
-    scale = size[0] / width
-    resized = matrix.copy()
-    resized[:2] *= scale
-    resized[0, 2] += (scale - 1) / 2
-    resized[1, 2] += (scale - 1) / 2 + (size[1] - height * scale) / 2
-    return resized, *size
-
-
-def _pinhole(
-    matrix: FloatArray, coefficients: FloatArray, width: int, height: int, path: Path
-) -> tuple[LensModel, float]:
-    """The pinhole model with k1 k2 k3 whose points are nearest to the fisheye's, and the largest distance, pixels."""
-    x, y = np.meshgrid(np.linspace(0, width - 1, _GRID[0]), np.linspace(0, height - 1, _GRID[1]))
-    focal = np.array([matrix[0, 0], matrix[1, 1]])
-    seen = (np.column_stack([x.ravel(), y.ravel()]) - matrix[:2, 2]) / focal
-    radius = np.linalg.norm(seen, axis=1)
-    angle = _angles(radius, coefficients)
-    if angle is None or angle.max() > _WIDEST_RAD:
+def _rays(
+    matrix: FloatArray, coefficients: FloatArray, size: tuple[int, int], path: Path
+) -> tuple[FloatArray, FloatArray]:
+    """Rays (n, 2), x and y at depth 1, of points over the picture, and the points (n, 2) in focal lengths."""
+    x, y = np.meshgrid(np.linspace(0, size[0] - 1, _GRID[0]), np.linspace(0, size[1] - 1, _GRID[1]))
+    points = (np.column_stack([x.ravel(), y.ravel()]) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    radius = np.linalg.norm(points, axis=1)
+    angles = np.linspace(0, _MAX_ANGLE_RAD, _ANGLES)
+    radii = angles * np.polynomial.polynomial.polyval(angles**2, [1, *coefficients])
+    # Where the polynomial turns back before the corner, a point has two rays or none.
+    grows = np.logical_and.accumulate(np.diff(radii, prepend=-1) > 0)
+    if radius.max() > radii[grows][-1]:
         raise ProfileError(f"{path}: the lens sees too wide for a screen to look flat", _HINT)
-    ray = seen * (np.tan(angle) / np.maximum(radius, 1e-12))[:, None]
-    ray[radius < 1e-12] = 0
-    reach = float(np.max(np.linalg.norm(ray, axis=1)))
-    terms = (np.sum(ray**2, axis=1) / reach**2)[:, None] ** np.arange(4)
-    design = (ray[:, :, None] * terms[:, None, :]).reshape(-1, 4)
-    weights = np.linalg.lstsq(design, seen.ravel(), rcond=None)[0]
-    apart = ((design @ weights).reshape(-1, 2) - seen) * focal
-    scale = float(weights[0])
-    k1, k2, k3 = (float(w) / scale / reach ** (2 * n) for n, w in enumerate(weights[1:], start=1))
-    model = LensModel(
-        width=width,
-        height=height,
-        camera_matrix=(
-            (scale * float(focal[0]), 0.0, float(matrix[0, 2])),
-            (0.0, scale * float(focal[1]), float(matrix[1, 2])),
-            (0.0, 0.0, 1.0),
-        ),
-        dist_coeffs=(k1, k2, 0.0, 0.0, k3),
-    )
-    return model, float(np.max(np.linalg.norm(apart, axis=1)))
+    angle = np.interp(radius, radii[grows], angles[grows])
+    return points * (np.tan(angle) / np.maximum(radius, 1e-12))[:, None], points
 
 
-def _angles(radius: FloatArray, coefficients: FloatArray) -> FloatArray | None:
-    """Angles (n,) whose fisheye radius is `radius`, None where the model turns back before it reaches them."""
-    powers = np.arange(1, 10, 2)
-    factors = np.concatenate([[1.0], coefficients])
-
-    def value(angle: FloatArray) -> FloatArray:
-        return np.asarray((angle[:, None] ** powers) @ factors)
-
-    def slope(angle: FloatArray) -> FloatArray:
-        return np.asarray((angle[:, None] ** (powers - 1)) @ (factors * powers))
-
-    # The model must grow all the way to the corner, or a point would have two rays.
-    reach = np.linspace(0, _WIDEST_RAD, 400)
-    grows = np.logical_and.accumulate(slope(reach) > 0)
-    known = value(reach[grows])
-    if radius.max() > known[-1]:
-        return None
-    angle = np.interp(radius, known, reach[grows])
-    for _ in range(_STEPS):
-        angle = angle - (value(angle) - radius) / slope(angle)
-    return np.asarray(angle)
-
-
-def _readout(raw: dict[str, Any], rate: float | None) -> tuple[float | None, bool, tuple[str, ...]]:
-    """The readout as users say, whether it runs upwards, and what speaks against it."""
+def _readout(raw: dict[str, Any]) -> tuple[float | None, bool, tuple[str, ...]]:
+    """The readout in the profile, seconds, whether it runs upwards, and what speaks against it."""
     if raw.get("global_shutter") is True:
         return None, False, ("the profile says that the shutter is global: such a camera sees no stripes",)
-    told = raw.get("frame_readout_time")
-    if not isinstance(told, (int, float)) or isinstance(told, bool) or not math.isfinite(told) or told == 0:
+    told, direction, rate = raw.get("frame_readout_time"), raw.get("frame_readout_direction"), _positive(raw.get("fps"))
+    value = _positive(abs(told)) if isinstance(told, (int, float)) and not isinstance(told, bool) else None
+    if value is None or told is None:
         return None, False, ("the profile tells no readout",)
-    readout_s = abs(told) * 1e-3
-    upwards = told < 0 or str(raw.get("frame_readout_direction", "")) == "BottomToTop"
-    if rate is not None and readout_s > 1.02 / rate:
+    if direction in ("LeftToRight", "RightToLeft"):
+        return None, False, ("the profile says that columns are read one after the other, which is not supported",)
+    upwards = told < 0 or direction == "BottomToTop"
+    if rate is not None and value > 1.02e3 / rate:
         reason = f"a readout of {told:g} ms cannot be at {rate:g} frames/s: one takes {1e3 / rate:.2f} ms at most"
         return None, upwards, (reason,)
-    notes = ["the readout is as some user told it, and may be wrong: check it with --photo, or `calibrate shutter`"]
+    notes = ["a user typed in the readout, and it may be wrong: check it with --photo, or `calibrate shutter`"]
     if upwards:
         notes.append("the profile says that rows are read from the bottom to the top")
-    if str(raw.get("frame_readout_direction", "")) in ("LeftToRight", "RightToLeft"):
-        return None, False, ("the profile says that columns are read one after the other, which is not supported",)
-    return readout_s, upwards, tuple(notes)
+    return value * 1e-3, upwards, tuple(notes)
 
 
 def _positive(value: Any) -> float | None:

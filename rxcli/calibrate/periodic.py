@@ -1,8 +1,8 @@
 """A periodic signal of unknown frequency and waveform in one profile: search, maximum-likelihood fit, uncertainty.
 
 The model of a profile is `y(r) = m(r) + e(r) * w(f * r) + noise`: `m` and `e` are slow (light fall-off, vignetting, the
-scene), `w` is a harmonic series of the fundamental `f` in cycles per row. All harmonics are fitted jointly, so a
-harmonic is no rival of its fundamental, and a sub-harmonic has to explain something that the fundamental does not.
+scene), `w` is a harmonic series of the fundamental `f` in cycles per row. All harmonics are fitted jointly, so that a
+harmonic is not mistaken for the fundamental.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ from functools import lru_cache
 
 import numpy as np
 
+from rxcli.calibrate.fitting import least_squares
 from rxcli.types import BoolArray, FloatArray
 
 #: Oversampling of the spectrum in the search.
 _PAD = 8
-#: Harmonics looked at in the search, and numbers of them tried in the fit.
+#: Harmonics in the search, and numbers of them tried in the fit.
 _SEARCH_HARMONICS = 12
 _HARMONICS = (1, 2, 3, 5, 7, 10, 14, 20, 28)
-#: Slow terms while the number of harmonics is chosen.
-_AMPLE_SLOW = 8
-#: Highest frequency searched, cycles per row: beyond it a period has too few rows to be told from its alias.
+#: Numbers of slow terms tried, and the most of them while the number of harmonics is chosen.
+_SLOW_TERMS, _AMPLE_SLOW = (2, 3, 4, 6, 8, 11, 16), 8
+#: Highest frequency searched, cycles per row: beyond it a period cannot be told from its alias.
 MAX_FREQUENCY = 0.45
 #: Share of the variance that a harmonic must explain to pay for itself in the search.
 _PRICE = 0.01
 #: Power over the continuum from which a line counts: chance reaches it once in e^25 bins.
 _LINE_POWER = 25.0
-#: Fewest periods that a period is measured from, and where the lines of a spectrum stop running into each other.
-MIN_PERIODS = 2.0
-FEW_PERIODS = 6
-#: Score that so few must reach.
+#: Minimum number of periods, and the number from which the lines of a spectrum are separate.
+MIN_PERIODS, FEW_PERIODS = 2.0, 6
+#: Minimum score of fewer periods.
 _FEW_SCORE = 0.6
-#: What a sub-harmonic must add to the share explained, relative to it, to be taken for the fundamental.
+#: Relative gain of explained variance at which a sub-harmonic is taken for the fundamental.
 _SUBHARMONIC_SHARE = 0.08
 
 
@@ -47,79 +47,81 @@ class PeriodicFit:
     cosines: FloatArray
     sines: FloatArray
     origin: float
-    #: First row and number of rows fitted.
+    #: First row fitted.
     first_row: int
-    n_rows: int
     #: Share of the variance about the slow part that the stripes explain.
     explained: float
-    #: Sum of squared residuals, number of parameters, and how many independent values the residual is worth.
+    #: Sum of squared residuals, and the number of independent values in the residual.
     rss: float
-    n_parameters: int
+    n_effective: float
     #: Terms of the slow mean, and of the envelope.
     n_slow: int
-    n_effective: float
-    #: (n_rows,) slow mean and envelope of the stripes, profile units.
+    #: (n,) slow mean and envelope of the stripes, profile units.
     mean: FloatArray
     envelope: FloatArray
-    #: (n_rows,) derivative of the frequency by the profile's values.
+    #: (n,) derivative of the frequency by the profile's values.
     influence: FloatArray
 
     @property
     def periods(self) -> float:
         """Periods in the rows fitted."""
-        return self.frequency * self.n_rows
+        return self.frequency * self.mean.size
+
+    @property
+    def n_parameters(self) -> int:
+        """Parameters of the model."""
+        return 2 * self.n_slow + 2 * self.cosines.size
 
     def beats(self, other: PeriodicFit) -> bool:
         """Whether this fit is better by the Bayesian information criterion, as coloured noise allows.
 
-        The richer fit's residual says how many values are independent; counting all of them would let harmonics
+        The richer fit's residual gives the number of independent values; counting all of them would let harmonics
         follow slow noise.
         """
         richer = self if self.n_parameters >= other.n_parameters else other
         gain = float(np.log(max(other.rss, 1e-300) / max(self.rss, 1e-300))) * richer.n_effective
-        return gain > (self.n_parameters - other.n_parameters) * float(np.log(self.n_rows))
+        return gain > (self.n_parameters - other.n_parameters) * float(np.log(self.mean.size))
 
     def waveform(self, rows: FloatArray) -> FloatArray:
         """The periodic part at `rows`, in units of the profile where the envelope is 1."""
-        return harmonic_series(self.frequency * (rows - self.origin), self.cosines, self.sines)
+        cosine, sine = _waves(rows - self.origin, self.frequency, self.cosines.size)
+        return np.asarray(cosine @ self.cosines + sine @ self.sines)
+
+    @property
+    def significant(self) -> bool:
+        """Whether the fit is stripes and not a scene, in which a few waves can always be fitted badly."""
+        least = np.interp(self.periods, [2, 4, FEW_PERIODS, 2 * FEW_PERIODS], [0.985, 0.97, 0.93, 0.5])
+        return self.periods >= MIN_PERIODS and self.explained > float(least)
 
 
-def harmonic_series(phase: FloatArray, cosines: FloatArray, sines: FloatArray) -> FloatArray:
-    """Sum of harmonics at `phase` (cycles)."""
-    angle = 2 * np.pi * np.multiply.outer(phase, np.arange(1, cosines.size + 1))
-    return np.asarray(np.cos(angle) @ cosines + np.sin(angle) @ sines)
+def _waves(rows: FloatArray, frequency: float, n_harmonics: int) -> tuple[FloatArray, FloatArray]:
+    """Cosines and sines of the harmonics at `rows` (n,), (n, H) each."""
+    angle = 2 * np.pi * frequency * np.multiply.outer(rows, np.arange(1, n_harmonics + 1))
+    return np.cos(angle), np.sin(angle)
 
 
-def whitened_power(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Power spectra over their continuum.
+def _rows_and_slow(n: int, n_slow: int) -> tuple[FloatArray, FloatArray]:
+    """Rows about the middle (n,), and slow functions of them (n, n_slow)."""
+    rows = np.arange(n, dtype=np.float64) - (n - 1) / 2
+    return rows, np.asarray(np.polynomial.chebyshev.chebvander(2 * rows / n, n_slow - 1), np.float64)
 
-    Args:
-        profiles: (k, n) profiles.
 
-    Returns:
-        (F,) frequencies in cycles per row, and (k, F) power relative to a continuum `a + b / f^2` (white noise and the
-        spectrum of natural scenes), about 1 where there is nothing periodic.
-    """
-    n = profiles.shape[1]
-    taper = np.hanning(n)
-    power = np.abs(np.fft.rfft(_detrend(profiles) * taper, _PAD * n)) ** 2
-    frequency = np.fft.rfftfreq(_PAD * n)
-    low, high = (frequency > 3 / n) & (frequency < max(0.1, 6 / n)), frequency > 0.3
-    scene = np.median(power[:, low] * frequency[low] ** 2, axis=1, keepdims=True) / np.log(2)
-    white = np.median(power[:, high], axis=1, keepdims=True) / np.log(2)
-    floor = np.finfo(float).eps * power.max(axis=1, keepdims=True) + 1e-300
-    continuum = white + scene / np.maximum(frequency, 1 / n) ** 2 + floor
-    return np.asarray(frequency, np.float64), power / continuum
+def _basis(n: int, frequency: float, n_harmonics: int) -> FloatArray:
+    """(n, 4 + 2 H) orthonormal basis of a cubic and, after it, the harmonics."""
+    rows, slow = _rows_and_slow(n, 4)
+    return np.asarray(np.linalg.qr(np.hstack([slow, *_waves(rows, frequency, n_harmonics)]))[0])
 
 
 def _detrend(profiles: FloatArray) -> FloatArray:
     """Profiles less their least-squares cubic."""
-    basis, _ = np.linalg.qr(np.polynomial.chebyshev.chebvander(np.linspace(-1, 1, profiles.shape[1]), 3))
+    basis = _basis(profiles.shape[1], 0, 0)
     return np.asarray(profiles - (profiles @ basis) @ basis.T)
 
 
 def search_many(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The most likely fundamental of each profile, of `FEW_PERIODS` periods or more, from the lines of its spectrum.
+
+    Lines are measured against a continuum `a + b / f^2`: white noise and the spectrum of natural scenes.
 
     Args:
         profiles: (k, n) profiles of at least 24 rows.
@@ -128,18 +130,25 @@ def search_many(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
         (k,) frequencies in cycles per row, and (k,) scores: the share of the lines' power, less one per cent a
         harmonic; zero where no line stands above the continuum.
     """
-    frequency, power = whitened_power(profiles)
+    n = profiles.shape[1]
+    power = np.abs(np.fft.rfft(_detrend(profiles) * np.hanning(n), _PAD * n)) ** 2
+    frequency = np.fft.rfftfreq(_PAD * n)
+    low, high = (frequency > 3 / n) & (frequency < max(0.1, 6 / n)), frequency > 0.3
+    scene = np.median(power[:, low] * frequency[low] ** 2, axis=1, keepdims=True) / np.log(2)
+    white = np.median(power[:, high], axis=1, keepdims=True) / np.log(2)
+    rounding = np.finfo(float).eps * power.max(axis=1, keepdims=True) + 1e-300
+    power /= white + scene / np.maximum(frequency, 1 / n) ** 2 + rounding
     lines = np.where(power > _LINE_POWER, power, 0)
     # A Hann line has an equivalent width of 1.5 bins before the oversampling.
     share = lines / (lines.sum(axis=1, keepdims=True) / (1.5 * _PAD) + _LINE_POWER)
-    first, last = FEW_PERIODS * _PAD, int(MAX_FREQUENCY * _PAD * profiles.shape[1])
+    first, last = FEW_PERIODS * _PAD, int(MAX_FREQUENCY * _PAD * n)
     grid = np.arange(first, max(last, first) + 1)
     grid = grid[grid < frequency.size]
     total, best = np.zeros((len(profiles), grid.size)), np.zeros((len(profiles), grid.size))
     for harmonic in range(1, _SEARCH_HARMONICS + 1):
         inside = grid * harmonic < frequency.size
         total[:, inside] += share[:, grid[inside] * harmonic] - _PRICE
-        best[:, inside] = np.maximum(best[:, inside], total[:, inside])
+        best = np.maximum(best, np.where(inside, total, 0))
     at = np.argmax(best, axis=1)
     return frequency[grid[at]], best[np.arange(len(profiles)), at]
 
@@ -153,24 +162,18 @@ def search_few(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
     n = profiles.shape[1] // thin
     values = _detrend(profiles[:, : n * thin].reshape(len(profiles), n, thin).mean(axis=2))
     energy = np.sum(values**2, axis=1) + 1e-300
-    best, chosen = np.zeros(len(profiles)), np.full(len(profiles), MIN_PERIODS / profiles.shape[1])
-    for periods, n_harmonics, basis in _few_bases(n):
-        score = np.sum((values @ basis) ** 2, axis=1) / energy - _PRICE * n_harmonics
-        chosen = np.where(score > best, periods / (n * thin), chosen)
-        best = np.maximum(best, score)
-    return chosen, np.where(best > _FEW_SCORE, best, 0)
+    trials = _few_bases(n)
+    scores = np.array([np.sum((values @ basis) ** 2, axis=1) / energy - price for _, price, basis in trials])
+    frequencies = np.array([periods for periods, _, _ in trials]) / (n * thin)
+    best = scores.max(axis=0)
+    return frequencies[np.argmax(scores, axis=0)], np.where(best > _FEW_SCORE, best, 0)
 
 
 @lru_cache(maxsize=8)
-def _few_bases(n: int) -> list[tuple[float, int, FloatArray]]:
-    """Periods, number of harmonics and orthonormal basis (n, k) of every trial of `search_few`."""
-    trials = [(float(p), h) for p in np.arange(MIN_PERIODS, FEW_PERIODS + 1, 0.125) for h in (1, 3, 5)]
-    bases = []
-    for periods, n_harmonics in trials:
-        series = _Series.make(n, 4, n_harmonics)
-        basis, _ = np.linalg.qr(np.hstack([series.slow, *series.waves(periods / n)]))
-        bases.append((periods, n_harmonics, np.asarray(basis)))
-    return bases
+def _few_bases(n: int) -> list[tuple[float, float, FloatArray]]:
+    """Periods, price and basis of every trial of `search_few`."""
+    periods = np.arange(MIN_PERIODS, FEW_PERIODS + 1, 0.125).tolist()
+    return [(p, _PRICE * harmonics, _basis(n, p / n, harmonics)) for p in periods for harmonics in (1, 3, 5)]
 
 
 def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -> PeriodicFit | None:
@@ -180,33 +183,22 @@ def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -
         The fit of the highest frequency that no lower one betters by much; None where nothing fits.
     """
     n = profile.size
-    candidates = sorted((frequency * ratio for ratio in (3, 2, 1, 1 / 2, 1 / 3)), reverse=True)
     # With one limit for all, or the slow part of a fast candidate would follow the stripes themselves.
-    most_slow = max(frequency * n, 2.0)
+    max_slow = max(frequency * n, 2.0)
+    candidates = (frequency * ratio for ratio in (3, 2, 1, 1 / 2, 1 / 3))
     inside = [f for f in candidates if 1.5 / n <= f <= MAX_FREQUENCY]
-    shares = np.array([_rough_share(profile, f) for f in inside])
-    likely = [f for f, share in zip(inside, shares, strict=True) if share >= 0.6 * shares.max()]
-    fits = [fit_periodic(profile, f, first_row, most_slow) for f in likely]
+    flat = _detrend(profile[None])[0]
+    shares = [float(np.sum((flat @ _basis(n, f, 5)[:, 4:]) ** 2)) for f in inside]
     best: PeriodicFit | None = None
-    for fit in fits:
-        if fit is None:
-            continue
-        if best is None or (fit.beats(best) and fit.explained > best.explained * (1 + _SUBHARMONIC_SHARE)):
+    for candidate, share in zip(inside, shares, strict=True):
+        fit = fit_periodic(profile, candidate, first_row, max_slow) if share >= 0.6 * max(shares) else None
+        if fit and (best is None or (fit.beats(best) and fit.explained > best.explained * (1 + _SUBHARMONIC_SHARE))):
             best = fit
     return best
 
 
-def _rough_share(profile: FloatArray, frequency: float) -> float:
-    """Share of the variance about a cubic that five harmonics explain."""
-    series = _Series.make(profile.size, 4, 5)
-    basis, _ = np.linalg.qr(np.hstack([series.slow, *series.waves(frequency)]))
-    parts = (basis.T @ profile) ** 2
-    total = float(profile @ profile) - float(parts[:4].sum())
-    return float(parts[4:].sum()) / max(total, 1e-300)
-
-
 def fit_periodic(
-    profile: FloatArray, frequency: float, first_row: int = 0, most_slow: float = np.inf
+    profile: FloatArray, frequency: float, first_row: int = 0, max_slow: float = np.inf
 ) -> PeriodicFit | None:
     """Maximum-likelihood fit near `frequency`; the numbers of harmonics and of slow terms by information criterion.
 
@@ -214,171 +206,88 @@ def fit_periodic(
         profile: (n,) values.
         frequency: cycles per row, right to about a third of a cycle over the profile.
         first_row: row of the profile's first value.
-        most_slow: most terms of the slow mean and envelope.
+        max_slow: maximum number of terms of the slow mean and envelope.
     """
-    slow_terms = _slow_terms(min(frequency * profile.size, most_slow))
+    # With two terms a period the envelope could imitate the stripes.
+    slow_terms = [n for n in _SLOW_TERMS if n <= max(min(frequency * profile.size, max_slow), 2)]
     # A fall-off that is not followed passes for noise of long memory, in which harmonics drown.
     ample = max(terms for terms in slow_terms if terms <= _AMPLE_SLOW)
     best: PeriodicFit | None = None
-    worse = 0
+    misses = 0
     for n_harmonics in _HARMONICS:
-        # One harmonic of a pulse may vanish, two in a row say that there are no more.
-        if worse == 2 or (n_harmonics > 1 and n_harmonics * frequency >= 0.5):
+        # One harmonic of a pulse may vanish; two in a row mean that there are no more.
+        if misses == 2 or (n_harmonics > 1 and n_harmonics * frequency >= 0.5):
             break
         fit = _fit_near(profile, frequency, n_harmonics, ample, first_row)
         if fit is not None and (best is None or fit.beats(best)):
-            best, worse = fit, 0
+            best, misses = fit, 0
         else:
-            worse += 1
+            misses += 1
     if best is None:
         return None
-    fits = [_fit_near(profile, best.frequency, best.cosines.size, terms, first_row) for terms in slow_terms]
-    return _with_model_spread(profile, _choose_slow([fit for fit in fits if fit is not None] or [best]))
-
-
-def _choose_slow(fits: list[PeriodicFit]) -> PeriodicFit:
-    """The fit with the best number of slow terms; `fits` has the fewest first."""
-    best = fits[0]
-    for fit in fits[1:]:
-        if fit.beats(best):
+    frequency, n_harmonics = best.frequency, best.cosines.size
+    fits = [_fit_near(profile, frequency, n_harmonics, terms, first_row) for terms in slow_terms if terms != ample]
+    for fit in fits:
+        if fit is not None and fit.beats(best):
             best = fit
-    return best
-
-
-def _with_model_spread(profile: FloatArray, best: PeriodicFit) -> PeriodicFit:
-    """The fit with what richer envelopes would say added to its uncertainty.
-
-    Over a few periods the envelope trades against the frequency, and the choice between envelopes is an error that
-    the residual does not show.
-    """
     if best.periods >= FEW_PERIODS:
         return best
-    richer = (best.n_slow + extra for extra in (1, 2))
-    fits = [_fit_near(profile, best.frequency, best.cosines.size, terms, best.first_row) for terms in richer]
-    spread = max((abs(fit.frequency - best.frequency) for fit in fits if fit is not None), default=0.0)
+    # Over a few periods the envelope trades against the frequency, an error that the residual does not show.
+    richer = [_fit_near(profile, frequency, n_harmonics, best.n_slow + extra, first_row) for extra in (1, 2)]
+    spread = max((abs(fit.frequency - best.frequency) for fit in richer if fit), default=0.0)
     return replace(best, frequency_sd=float(np.hypot(best.frequency_sd, spread)))
-
-
-def _slow_terms(periods: float) -> list[int]:
-    """Numbers of Chebyshev terms to try; with two a period the envelope could imitate the stripes."""
-    return [terms for terms in (2, 3, 4, 6, 8, 11, 16) if terms <= max(periods, 2)]
 
 
 def _fit_near(
     profile: FloatArray, frequency: float, n_harmonics: int, n_slow: int, first_row: int
 ) -> PeriodicFit | None:
-    """Gauss-Newton on slow mean, envelope, harmonics and frequency together; None where it runs off."""
-    n = profile.size
-    series = _Series.make(n, n_slow, n_harmonics)
-    state = series.start(profile, frequency)
-    model, jacobian = series.evaluate(state)
-    rss = float(np.sum((profile - model) ** 2))
-    for _ in range(12):
-        step = _solve(jacobian, jacobian.T @ (profile - model))
-        state, model, jacobian, new_rss = series.descend(profile, state, step, rss)
-        converged = rss - new_rss <= 1e-7 * rss
-        rss = new_rss
-        if converged:
-            break
-    if abs(state[-1] - frequency) > 0.6 / n:
+    """Slow mean, envelope less its constant 1, harmonics and frequency, fitted together; None where it runs off."""
+    n, order = profile.size, np.arange(1, n_harmonics + 1)
+    rows, slow = _rows_and_slow(n, n_slow)
+    borders = np.cumsum([n_slow, n_slow - 1, n_harmonics, n_harmonics])
+
+    def parts(state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        mean, envelope, cosines, sines, _ = np.split(state, borders)
+        return slow @ mean, 1 + slow[:, 1:] @ envelope, cosines, sines
+
+    def residual(state: FloatArray) -> FloatArray:
+        mean, envelope, a, b = parts(state)
+        cosine, sine = _waves(rows, state[-1], n_harmonics)
+        return mean + envelope * (cosine @ a + sine @ b) - profile
+
+    def jacobian(state: FloatArray) -> FloatArray:
+        _, envelope, a, b = parts(state)
+        cosine, sine = _waves(rows, state[-1], n_harmonics)
+        wave, slope = cosine @ a + sine @ b, 2 * np.pi * rows * (cosine @ (order * b) - sine @ (order * a))
+        waves = np.hstack([cosine, sine, slope[:, None]]) * envelope[:, None]
+        return np.hstack([slow, slow[:, 1:] * wave[:, None], waves])
+
+    flat = np.hstack([slow, *_waves(rows, frequency, n_harmonics)])
+    linear = np.linalg.lstsq(flat, profile, rcond=None)[0]
+    start = np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
+    fit = least_squares(residual, start, jacobian, ftol=1e-7, max_nfev=40)
+    if abs(fit.state[-1] - frequency) > 0.6 / n:
         return None
-    trend = series.slow @ np.linalg.lstsq(series.slow, profile, rcond=None)[0]
-    mean, envelope, cosines, sines = series.unpack(state)
-    influence = _influence(jacobian)
+    mean, envelope, cosines, sines = parts(fit.state)
+    trend = profile - slow @ np.linalg.lstsq(slow, profile, rcond=None)[0]
+    q, r = np.linalg.qr(fit.jacobian)
+    influence = q[:, -1] / r[-1, -1]
+    rss = float(fit.residual @ fit.residual)
     return PeriodicFit(
-        frequency=float(state[-1]),
-        frequency_sd=_noise_sd(influence, profile - model, state.size),
+        frequency=float(fit.state[-1]),
+        frequency_sd=_noise_sd(influence, fit.residual, fit.state.size),
         cosines=cosines,
         sines=sines,
         origin=first_row + (n - 1) / 2,
         first_row=first_row,
-        n_rows=n,
-        explained=1 - rss / max(float(np.sum((profile - trend) ** 2)), 1e-300),
+        explained=1 - rss / max(float(trend @ trend), 1e-300),
         rss=rss,
-        n_parameters=state.size,
+        n_effective=_independent(fit.residual),
         n_slow=n_slow,
-        n_effective=_independent(profile - model),
         mean=mean,
         envelope=envelope,
         influence=influence,
     )
-
-
-@dataclass(frozen=True, slots=True)
-class _Series:
-    """The model `slow mean + envelope * harmonics`; its state is (mean, envelope less its constant 1, cosines, sines,
-    frequency)."""
-
-    #: (n,) rows about the middle, (n, K) slow functions, (H,) harmonic numbers.
-    rows: FloatArray
-    slow: FloatArray
-    order: FloatArray
-
-    @staticmethod
-    def make(n: int, n_slow: int, n_harmonics: int) -> _Series:
-        rows = np.arange(n, dtype=np.float64) - (n - 1) / 2
-        slow = np.asarray(np.polynomial.chebyshev.chebvander(2 * rows / n, n_slow - 1), np.float64)
-        return _Series(rows, slow, np.arange(1, n_harmonics + 1, dtype=np.float64))
-
-    def start(self, profile: FloatArray, frequency: float) -> FloatArray:
-        """Least squares with a constant envelope."""
-        cosine, sine = self.waves(frequency)
-        design = np.hstack([self.slow, cosine, sine])
-        linear = _solve(design, design.T @ profile)
-        n_slow = self.slow.shape[1]
-        return np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
-
-    def waves(self, frequency: float) -> tuple[FloatArray, FloatArray]:
-        """Cosines and sines of the harmonics, (n, H) each."""
-        angle = 2 * np.pi * frequency * np.multiply.outer(self.rows, self.order)
-        return np.cos(angle), np.sin(angle)
-
-    def unpack(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Mean (n,), envelope (n,), cosines (H,), sines (H,)."""
-        n_slow = self.slow.shape[1]
-        envelope = 1 + self.slow[:, 1:] @ state[n_slow : 2 * n_slow - 1]
-        cosines, sines = np.split(state[2 * n_slow - 1 : -1], 2)
-        return self.slow @ state[:n_slow], envelope, cosines, sines
-
-    def evaluate(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The model (n,) and its Jacobian (n, parameters)."""
-        mean, envelope, a, b = self.unpack(state)
-        cosine, sine = self.waves(state[-1])
-        wave = cosine @ a + sine @ b
-        slope = 2 * np.pi * self.rows * (cosine @ (self.order * b) - sine @ (self.order * a))
-        e = envelope[:, None]
-        by_envelope, by_frequency = self.slow[:, 1:] * wave[:, None], (envelope * slope)[:, None]
-        return mean + envelope * wave, np.hstack([self.slow, by_envelope, cosine * e, sine * e, by_frequency])
-
-    def descend(
-        self, profile: FloatArray, state: FloatArray, step: FloatArray, rss: float
-    ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-        """The step, halved until it does not make things worse; none otherwise. State, model, Jacobian, new RSS."""
-        for scale in (1.0, 0.5, 0.25, 0.1, 0.0):
-            trial = state + scale * step
-            model, jacobian = self.evaluate(trial)
-            new_rss = float(np.sum((profile - model) ** 2))
-            if new_rss <= rss:
-                break
-        return trial, model, jacobian, new_rss
-
-
-def _solve(design: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution of the normal equations of `design` for the right-hand side, with columns brought to one scale.
-
-    A trace of damping keeps parameters that hardly matter (the envelope of a vanishing wave) where they are.
-    """
-    scale = np.linalg.norm(design, axis=0) + 1e-300
-    gram = (design / scale).T @ (design / scale)
-    gram[np.diag_indices_from(gram)] += 1e-10
-    return np.asarray(np.linalg.solve(gram, right / scale) / scale)
-
-
-def _influence(jacobian: FloatArray) -> FloatArray:
-    """(n,) what a unit of noise in each row does to the frequency (the last parameter)."""
-    last = np.zeros(jacobian.shape[1])
-    last[-1] = 1
-    return np.asarray(jacobian @ _solve(jacobian, last))
 
 
 def _noise_sd(influence: FloatArray, residual: FloatArray, n_parameters: int) -> float:
@@ -386,20 +295,20 @@ def _noise_sd(influence: FloatArray, residual: FloatArray, n_parameters: int) ->
 
     The estimate is linear in the noise, so its variance is the integral of the noise's power spectrum over that of the
     influence. Where the noise is not stationary (a scene lit by the stripes is multiplied by them), the sum of
-    `influence * residual` over its own neighbourhood may say more.
+    `influence * residual` over its own neighbourhood may be larger.
     """
     n_fft = 4 * residual.size
     freedom = residual.size / max(residual.size - n_parameters, 1)
     weight = np.abs(np.fft.fft(influence, n_fft)) ** 2
-    stationary = float(np.sum(noise_spectrum(residual, n_fft) * weight)) / n_fft
+    stationary = float(noise_spectrum(residual, n_fft) @ weight) / n_fft
     score = influence * residual
     lag = max(int(4 * (residual.size / 100) ** (2 / 9)), 1)
-    local = float(np.sum(np.convolve(score, np.bartlett(2 * lag + 3)[1:-1], "same") * score))
+    local = float(np.convolve(score, np.bartlett(2 * lag + 3)[1:-1], "same") @ score)
     return float(np.sqrt(max(stationary, local) * freedom))
 
 
 def scatter_sd(influence: FloatArray, profiles: FloatArray) -> float:
-    """Standard deviation of the frequency by what parts of a region say one by one.
+    """Standard deviation of the frequency from the scatter between parts of a region.
 
     The influence is blind to the slow part and to the stripes' own shape, so each part's product with it is that part's
     deviation from the common frequency. Parts see different texture, which the residual's spectrum may not show.
@@ -409,41 +318,32 @@ def scatter_sd(influence: FloatArray, profiles: FloatArray) -> float:
         profiles: (k, n) profiles of its strips, in order across.
 
     Returns:
-        The standard deviation, widened for the few parts that it rests on; zero for fewer than four strips.
+        The standard deviation, widened for its few parts; zero for fewer than four strips.
     """
     if len(profiles) < 4:
         return 0.0
     parts = np.array([part.mean(axis=0) @ influence for part in np.array_split(profiles, min(8, len(profiles)))])
-    sizes = parts.size
     # Student's 97.5 % quantile over the normal one, nearly.
-    widening = 1 + 1.5 / (sizes - 2)
-    return float(np.std(parts, ddof=1) / np.sqrt(sizes) * widening)
+    widening = 1 + 1.5 / (parts.size - 2)
+    return float(np.std(parts, ddof=1) / np.sqrt(parts.size) * widening)
 
 
 def _independent(residual: FloatArray) -> float:
-    """Number of independent values that `residual` is worth (Bartlett).
+    """Number of independent values in `residual` (Bartlett).
 
     Its autocorrelation counts up to where it first vanishes: beyond, a harmonic not yet fitted would pass for noise
     of long memory.
     """
-    power = float(residual @ residual)
-    if power <= 0:
-        return float(residual.size)
-    total = 0.0
-    for lag in range(1, min(residual.size // 4, 100)):
-        correlation = float(residual[lag:] @ residual[:-lag]) / power
-        if correlation < 1 / np.sqrt(residual.size):
-            break
-        total += correlation**2
-    return residual.size / (1 + 2 * total)
+    lags = np.array([residual[: residual.size - k] @ residual[k:] for k in range(min(residual.size // 4, 100))])
+    correlation = lags / max(lags[0], 1e-300)
+    positive = np.logical_and.accumulate(correlation >= 1 / np.sqrt(residual.size))
+    return residual.size / max(2 * float(np.sum(correlation[positive] ** 2)) - 1, 1)
 
 
 def noise_spectrum(residual: FloatArray, n_fft: int) -> FloatArray:
     """(n_fft,) power spectrum of the autoregressive process that fits `residual` (Yule-Walker)."""
     order = int(np.clip(residual.size // 20, 1, 12))
     lags = np.array([residual[: residual.size - k] @ residual[k:] for k in range(order + 1)]) / residual.size
-    if lags[0] <= 0:
-        return np.zeros(n_fft)
     toeplitz = lags[np.abs(np.subtract.outer(np.arange(order), np.arange(order)))]
     coefficients = np.linalg.lstsq(toeplitz, lags[1:], rcond=1e-9)[0]
     innovation = max(lags[0] - coefficients @ lags[1:], 1e-12 * lags[0])
@@ -451,7 +351,7 @@ def noise_spectrum(residual: FloatArray, n_fft: int) -> FloatArray:
     return np.asarray(innovation / np.abs(response) ** 2)
 
 
-def explained_share(profiles: FloatArray, template: FloatArray) -> tuple[FloatArray, FloatArray]:
+def explained_share(profiles: FloatArray, template: FloatArray) -> FloatArray:
     """How much of each profile a template explains, beyond a straight line.
 
     Args:
@@ -459,33 +359,19 @@ def explained_share(profiles: FloatArray, template: FloatArray) -> tuple[FloatAr
         template: (n,) wave.
 
     Returns:
-        (k,) share of the variance, negative where the template fits upside down; (k,) amplitude.
+        (k,) share of the variance, negative where the template fits upside down.
     """
-    basis, _ = np.linalg.qr(np.polynomial.polynomial.polyvander(np.linspace(-1, 1, template.size), 1))
-    flat = profiles - (profiles @ basis) @ basis.T
-    wave = template - basis @ (basis.T @ template)
-    power = float(wave @ wave) + 1e-300
-    amplitude = flat @ wave / power
-    variance = np.sum(flat**2, axis=1) + 1e-300
-    return np.sign(amplitude) * amplitude**2 * power / variance, amplitude
-
-
-def significant(fit: PeriodicFit) -> bool:
-    """Whether a fit is stripes and not a scene: a few waves that fit badly are found in any picture."""
-    return fit.explained > float(np.interp(fit.periods, [2, 4, FEW_PERIODS, 2 * FEW_PERIODS], [0.985, 0.97, 0.93, 0.5]))
+    basis, _ = np.linalg.qr(_rows_and_slow(template.size, 2)[1])
+    flat, wave = (part - (part @ basis) @ basis.T for part in (profiles, template))
+    product = flat @ wave
+    return np.asarray(np.sign(product) * product**2 / (float(wave @ wave) * np.sum(flat**2, axis=1) + 1e-300))
 
 
 def longest_block(members: BoolArray) -> tuple[int, int]:
-    """The block range [b0, b1) and so the columns of `members` (strips, blocks) with the most information.
+    """The range [b0, b1) of the blocks of `members` (strips, blocks) with the most information on a frequency.
 
-    Information on a frequency grows with the number of strips and the cube of the length.
+    It grows with the number of strips that hold all of the range and with the cube of the range's length.
     """
-    n_blocks = members.shape[1]
-    run = np.concatenate([np.zeros((len(members), 1), int), np.cumsum(members, axis=1)], axis=1)
-    best, found = 0.0, (0, 0)
-    for b0 in range(n_blocks):
-        for b1 in range(b0 + 1, n_blocks + 1):
-            strips = int(np.sum(run[:, b1] - run[:, b0] == b1 - b0))
-            if strips * (b1 - b0) ** 3 > best:
-                best, found = strips * (b1 - b0) ** 3, (b0, b1)
-    return found
+    ends = range(members.shape[1] + 1)
+    ranges = [(0, 0)] + [(b0, b1) for b0 in ends for b1 in ends if b1 > b0]
+    return max(ranges, key=lambda r: int(members[:, r[0] : r[1]].all(axis=1).sum()) * (r[1] - r[0]) ** 3)

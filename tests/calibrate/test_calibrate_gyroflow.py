@@ -119,7 +119,7 @@ def test_a_wrong_hint_is_told_by_a_picture(tmp_path: Path, capsys: pytest.Captur
     profile = written(tmp_path, frame_readout_time=9.0)
     check = ["--photo", str(sample), "--screen", "paper-17k3", "--size", "1920x1080"]
     assert run(["calibrate", "gyroflow", str(profile), *check, "--save", str(tmp_path / "cam.toml")]) == 0
-    assert "% below what the picture says (12.7" in capsys.readouterr().out
+    assert "% below the picture's (12.7" in capsys.readouterr().out
     [mode] = load_profile(str(tmp_path / "cam.toml"), CameraProfile).modes
     assert mode.line_delay_s * 1080 == pytest.approx(12.74e-3, rel=2e-3)
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rxcli.calibrate.lensfun import fit_opencv, lens_from_database
+from rxcli.calibrate.fitting import fit_distortion
+from rxcli.calibrate.lensfun import lens_from_database
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode, ProfileError, UsageError
 from rxcli.profiles import CameraProfile, LensModel, load_profile
@@ -63,7 +64,9 @@ def by_opencv(lens: LensModel, points: Any, focal_px: float) -> Any:
 )
 def test_each_polynomial_becomes_opencv_coefficients(model: Any, terms: Any, tolerance_px: float) -> None:
     known = field(1)
-    lens, worst = fit_opencv(known, distorted(known, model, *terms), 4800.0, WIDTH, HEIGHT)
+    centre = np.array([WIDTH - 1, HEIGHT - 1]) / 2
+    rays, points = ((part - centre) / 4800 for part in (known, distorted(known, model, *terms)))
+    lens, worst = fit_distortion(rays, points, 4800.0, centre, (WIDTH, HEIGHT))
     other = field(2)
     error = np.linalg.norm(by_opencv(lens, other, 4800.0) - distorted(other, model, *terms), axis=1)
     assert worst <= tolerance_px
