@@ -94,6 +94,11 @@ class UsageError(ReceiverError):
     exit_code = ExitCode.USAGE
 
 
+def capitalised(text: str) -> str:
+    """`text` with a capital, for titles."""
+    return text[:1].upper() + text[1:]
+
+
 def sentence(text: str) -> str:
     """A message or a hint as a sentence of its own, for pages."""
-    return text[:1].upper() + text[1:].rstrip(".") + "." if text else ""
+    return capitalised(text).rstrip(".") + "." if text else ""

@@ -243,6 +243,10 @@ FrameStatus = Literal["ok", "partial", "no_screen", "no_signal", "unreadable"]
 ColumnStatus = Literal["ok", "weak", "dark", "no_packet"]
 
 
+#: A packet of at least this confidence is believed: it counts as received, and its column is not weak.
+BELIEVABLE = 0.5
+
+
 @dataclass(frozen=True, slots=True)
 class PacketResult:
     """One packet of one column."""
@@ -266,6 +270,11 @@ class PacketResult:
     frames: tuple[int, ...] | None = None
     #: What the confidence was made of, see `rxcli.receiver.decode.assemble`; for fits, not for reports.
     confidence_features: tuple[float, ...] = ()
+
+    @property
+    def is_believable(self) -> bool:
+        """Whether the packet is more likely right than wrong."""
+        return self.confidence >= BELIEVABLE
 
     @property
     def payload_bytes(self) -> bytes:

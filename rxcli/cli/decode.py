@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -23,6 +23,7 @@ from rxcli.cli.common import (
     receiver_arguments,
     receiver_options,
 )
+from rxcli.cli.printing import JsonLines, Progress, Table, Writer, print_line, print_text
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from rxcli.results.summary import SourceSummary
     from rxcli.results.truth import Scorer
     from rxcli.runs.batch import Decoded, Decoder, Source
-    from rxcli.runs.journal import Head, Journal, Lines
+    from rxcli.runs.journal import Head, Journal
     from rxcli.types import FrameResult
 
 log = logging.getLogger(__name__)
@@ -42,7 +43,7 @@ _NO_MATTER = frozenset(
     {
         *("json_path", "junit", "summary", "save_camera", "dump_dir", "save_undistorted", "quiet", "force", "resume"),
         *("workers", "cluster", "max_ber", "min_packets", "min_packet_confidence"),
-        *("baseline", "slower", "out", "payloads"),
+        *("baseline", "slower", "out", "payloads", "packets"),
     }
 )
 #: The source that is read from stdin.
@@ -86,6 +87,7 @@ STDIN = "-"
     ("--save-camera", _FILE, None, "Write what was estimated of an unknown camera as a profile (TOML)."),
     ("--stop-when-certain", None, False, "Pass over frames of a clip all of whose packets are certain already."),
     ("--out", _FOLDER, None, "Write files that came whole into this folder, under their own names."),
+    ("--packets", None, False, "Show every packet of a clip, not only its sum."),
     ("--payloads", _FILE, None, "Write one row a packet (CSV): where it is from, bits, hex, confidence."),
     ("--quiet", None, False, "No table, no summary, no progress; only why a file failed."),
 )
@@ -222,6 +224,7 @@ class _Run:
         self._estimated: FrameResult | None = None
         #: Name of a source -> where it is opened.
         self._paths: dict[str, str] = {}
+        self._output = Writer()
 
     def run(self, sources: list[Source]) -> ExitCode:
         from rxcli.results.summary import exit_code
@@ -238,7 +241,7 @@ class _Run:
             done = self._recover() if self._options["resume"] else set()
             if journal is not None:
                 journal.follow()
-            writer = self._writer(journal, begun=bool(done))
+            self._output = writer = self._writer(journal, begun=bool(done))
             try:
                 self._decode([source for source in sources if source.name not in done], writer, len(sources))
             except BaseException:
@@ -286,14 +289,14 @@ class _Run:
         configured = self._decoder.options
         return Head(__version__, options | {"profiles": _digest((configured.screens, configured.cameras))})
 
-    def _writer(self, journal: Journal | None, begun: bool) -> _Writer:
+    def _writer(self, journal: Journal | None, begun: bool) -> Writer:
         """What takes each result."""
         from rxcli.runs.journal import Lines
 
         if journal is None and not self._to_stdout:
-            return _Writer() if self._options["quiet"] else _Table()
+            return Writer() if self._options["quiet"] else Table(self._options["packets"])
         lines = Lines(self._head(), self._files(), begun)
-        return _JsonLines(lines, _print_line if journal is None else journal.append)
+        return JsonLines(lines, print_line if journal is None else journal.append)
 
     def _payloads(self, stack: ExitStack) -> Callable[[FrameResult], None]:
         """What writes the packets of a result, where --payloads asks for it."""
@@ -303,17 +306,16 @@ class _Run:
 
         return stack.enter_context(PayloadWriter(self._options["payloads"])).write
 
-    def _decode(self, sources: list[Source], writer: _Writer, n_total: int) -> None:
+    def _decode(self, sources: list[Source], writer: Writer, n_total: int) -> None:
         from rxcli.link.saving import save_objects
         from rxcli.results.report import plural, result_in_words
         from rxcli.runs.batch import with_last
 
         log.info("%s to decode, %d done before", plural(len(sources), "source"), n_total - len(sources))
-        n_frames = 0
-        with _bar(n_total, n_total - len(sources), self._options["quiet"]) as bar:
+        with Progress(n_total, n_total - len(sources), self._options["quiet"]) as progress:
             for source, results in self._decoded(sources):
                 summary, scorer = self._begin(source.name)
-                writer.begin(source.name)
+                writer.begin(source.name, scorer is not None)
                 try:
                     for result, last in with_last(results):
                         result = scorer.add(result) if scorer else result
@@ -332,13 +334,13 @@ class _Run:
                         self._keep_estimate(result)
                         self._write_payloads(result)
                         log.info("%s", result_in_words(result))
-                        with bar.external_write_mode():
+                        with progress.bar.external_write_mode():
                             writer.write(result, last)
+                        progress.add(result, last)
+                    with progress.bar.external_write_mode():
+                        writer.end(summary)
                 finally:
                     self._end(summary, scorer)
-                n_frames += summary.n_frames
-                bar.set_postfix_str(f"{n_frames} frames", refresh=False)
-                bar.update()
 
     def _combined(self, result: FrameResult) -> FrameResult:
         """The result of a photograph with what it and those before it show together."""
@@ -438,7 +440,7 @@ class _Run:
         return codes
 
     def _print_summary(self) -> None:
-        from rxcli.results.report import LEGEND, printable
+        from rxcli.results.report import LEGEND, printable, printable_name
         from rxcli.results.summary import format_summary
 
         if self._options["quiet"]:
@@ -447,9 +449,13 @@ class _Run:
                     name = "" if reason.startswith(f"{summary.source}: ") else f"{summary.source}: "
                     click.echo(f"vlc-rx: {printable(name + reason)}", err=True)
         elif self._summaries:
-            if self._options["json_path"] is None and any(summary.n_packets for summary in self._summaries):
-                _print_text(LEGEND + "\n")
-            _print_text(format_summary(self._summaries, self._limits), err=self._to_stdout)
+            if self._output.has_table:
+                print_text(LEGEND + "\n")
+            print_text(format_summary(self._summaries, self._limits), err=self._to_stdout)
+            for summary in self._summaries:
+                of = f"{printable_name(summary.source)}: " if len(self._summaries) > 1 else ""
+                for line in summary.came:
+                    print_text(of + line, err=self._to_stdout)
 
 
 def _baseline(options: dict[str, Any]) -> Baseline | None:
@@ -457,10 +463,10 @@ def _baseline(options: dict[str, Any]) -> Baseline | None:
     if options["baseline"] is None:
         return None
     from rxcli.results.baseline import load_baseline
-    from rxcli.results.summary import MIN_CONFIDENCE
+    from rxcli.types import BELIEVABLE
 
     asked = options["min_confidence"]
-    return load_baseline(options["baseline"], MIN_CONFIDENCE if asked is None else asked, options["slower"])
+    return load_baseline(options["baseline"], BELIEVABLE if asked is None else asked, options["slower"])
 
 
 def _order(names: list[str]) -> Any:
@@ -475,55 +481,3 @@ def _digest(profiles: Any) -> str:
     import msgspec
 
     return hashlib.sha256(msgspec.json.encode(profiles)).hexdigest()[:16]
-
-
-class _Writer:
-    """Takes the results of one source after the other; this one leaves them."""
-
-    def begin(self, source: str) -> None: ...
-
-    def write(self, result: FrameResult, last: bool) -> None: ...
-
-
-class _Table(_Writer):
-    def write(self, result: FrameResult, last: bool) -> None:
-        from rxcli.results.report import format_frame, format_link
-
-        for line in format_link(result):
-            _print_text(line)
-        _print_text(format_frame(result) + "\n")
-
-
-class _JsonLines(_Writer):
-    def __init__(self, lines: Lines, put: Callable[[str], None]) -> None:
-        self._lines, self._put = lines, put
-
-    def begin(self, source: str) -> None:
-        self._lines.begin(source)
-
-    def write(self, result: FrameResult, last: bool) -> None:
-        self._put(self._lines.line(result, last))
-
-
-def _print_line(line: str) -> None:
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
-
-
-def _print_text(text: str, err: bool = False) -> None:
-    """Text for people: on a terminal, lines end between words and states have colours."""
-    from rxcli.cli.terminal import for_terminal
-
-    click.echo(for_terminal(text, sys.stderr if err else sys.stdout), err=err)
-
-
-def _bar(n_total: int, n_done: int, quiet: bool) -> Any:
-    """A bar on stderr where people look at it: files, frames, rate, time left."""
-    from tqdm import tqdm
-
-    hidden = quiet or n_total < 2 or not _is_terminal(sys.stderr)
-    return tqdm(total=n_total, initial=n_done, unit="file", disable=hidden, file=sys.stderr, leave=False)
-
-
-def _is_terminal(stream: TextIO) -> bool:
-    return stream is not None and stream.isatty()

@@ -16,19 +16,12 @@ from rxcli.results.aim import height_share, light_of, split_message
 from rxcli.results.grids import rival_grids
 from rxcli.results.inspection import BINS, EYE_TIMES, RANGE, Inspection, Trace, inspect_frame
 from rxcli.results.overlay import column_polygons, jpeg_address, preview
-from rxcli.results.report import mirror_note, plural, printable
+from rxcli.results.report import headline, mirror_note, plural, printable
 from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult
 
 #: Told by the first lines of a page that this program wrote.
 MARK = "<!-- written by vlc-rx inspect -->"
 _WORDS = {"ok": "received", "weak": "unsure", "no_packet": "no packet", "dark": "too dark"}
-_STATUS = {
-    "ok": "Received",
-    "partial": "Received in part",
-    "no_screen": "No screen found",
-    "no_signal": "Nothing could be received",
-    "unreadable": "The picture could not be read",
-}
 _STYLE = Path(__file__).parents[1] / "web" / "page" / "app.css"
 #: Width of drawings, in their own units; rows are thinned out to so many points.
 _WIDTH, _POINTS, _FEW_POINTS = 1000, 1200, 500
@@ -83,7 +76,7 @@ def inspection_page(
         parts.append(_traces(known))
         parts += [_eye(known), _residuals(known), _crosstalk(known)] if received else []
     parts += [_confidence(result), _encoder(result), _times(result)]
-    title = html.escape(f"{printable(Path(result.source).name)}: {_STATUS[result.status].lower()}")
+    title = html.escape(f"{printable(Path(result.source).name)}: {headline(result).lower()}")
     return (
         f'<!doctype html>\n{MARK}\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -128,8 +121,6 @@ def _path(x: FloatArray, y: FloatArray) -> str:
 
 
 def _summary(frame: Frame, result: FrameResult) -> str:
-    packets = len(result.packets)
-    columns = sum(bool(column.packets) for column in result.columns)
     facts = {
         "Picture": f"{frame.width} x {frame.height}",
         "Light": light_of(frame).word,
@@ -143,13 +134,13 @@ def _summary(frame: Frame, result: FrameResult) -> str:
         facts["A row takes"] = f"{result.line_delay_s * 1e6:.3f} µs"
     cells = "".join(f"<div><dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd></div>" for k, v in facts.items())
     body = f"<p>{html.escape(printable(result.source))}</p>\n{_steps(result)}\n"
-    if packets:
-        body += f"<p>{plural(packets, 'packet')} from {columns} of {plural(len(result.columns), 'column')}.</p>\n"
+    if result.columns:
+        facts["Columns"] = str(len(result.columns))
     body += f"<p>{mirror_note(result)}</p>\n" if mirror_note(result) else ""
     if result.message:
         reason, advice = split_message(result)
         body += f"<p>{html.escape(reason)}</p>\n" + (f"<p class='advice'>{html.escape(advice)}</p>\n" if advice else "")
-    return _section(_STATUS[result.status], f"{body}{_texts(result)}<dl>{cells}</dl>")
+    return _section(headline(result), f"{body}{_texts(result)}<dl>{cells}</dl>")
 
 
 def _steps(result: FrameResult) -> str:
@@ -248,7 +239,7 @@ def _timeline(results: Sequence[FrameResult]) -> str:
     for number, (result, n) in enumerate(zip(results, counts, strict=True)):
         kind = "ok" if result.status in ("ok", "partial") else "no_packet"
         top = 100 - 90 * n / most
-        told = f"frame {result.frame}, {result.time_s:.2f} s: {_STATUS[result.status].lower()}, {plural(n, 'packet')}"
+        told = f"frame {result.frame}, {result.time_s:.2f} s: {headline(result).lower()}"
         bars.append(
             f'<g><title>{told}</title><rect class="axis" x="{number * step:.2f}" y="100" width="{step:.2f}" '
             f'height="8" fill="var(--{kind})"/><rect x="{number * step:.2f}" y="{top:.1f}" '
@@ -269,7 +260,7 @@ def _packets(result: FrameResult) -> str:
     rows = []
     for column, packet in packets:
         wrong = "" if packet.bit_errors is None else str(packet.bit_errors)
-        kind = "weak" if packet.confidence < 0.5 else "ok"
+        kind = "ok" if packet.is_believable else "weak"
         sure = math.floor(packet.confidence * 1000) / 10
         rows.append(
             f'<tr><td class="number">{column}</td><td class="number {kind}">{sure:.1f} %</td>'
@@ -482,7 +473,7 @@ def _confidence(result: FrameResult) -> str:
     for place, column in enumerate(result.columns):
         for number in range(n_packets):
             packet = column.packets[number] if number < len(column.packets) else None
-            kind = column.status if packet is None else "weak" if packet.confidence < 0.5 else "ok"
+            kind = column.status if packet is None else "ok" if packet.is_believable else "weak"
             fade = 0.25 if packet is None else 0.25 + 0.75 * packet.confidence
             told = f"column {column.column}: " + ("none" if packet is None else f"{packet.confidence:.4f}")
             x, y = 50 + place * step, 4 + number * height

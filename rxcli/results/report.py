@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from itertools import groupby
 from typing import Any, TypeVar, get_args
 
-from rxcli.errors import UsageError
+from rxcli.errors import UsageError, capitalised
 from rxcli.types import (
     ColumnResult,
     ColumnStatus,
@@ -24,10 +24,18 @@ from rxcli.types import (
 _T = TypeVar("_T")
 #: Hex digits of a payload that a table of 80 characters shows.
 _SHOWN_DIGITS = 20
+_STATUS = {
+    "ok": "Received",
+    "partial": "Received in part",
+    "no_screen": "No screen found",
+    "no_signal": "Nothing could be received",
+    "unreadable": "The picture could not be read",
+}
 #: What the columns of the table mean, for those who see it for the first time.
 LEGEND = (
     "w: lit slots of ten. copies: how often the packet is in view. confidence: probability that every bit is right.\n"
-    "payload: hex. *: corrected by the auto-encoder. weak: confidence below 0.5. dark: too little light to try."
+    "payload: hex. *: corrected by the auto-encoder. weak: confidence below 0.5, not counted as received.\n"
+    "dark: too little light to try."
 )
 
 
@@ -134,10 +142,14 @@ def _progress_from(record: dict[str, Any]) -> tuple[ObjectProgress, ...]:
 
 def format_link(result: FrameResult) -> list[str]:
     """What came through the link layer with a frame, one line each, for people."""
-    lines = [_message_line(message) for message in result.messages]
-    lines += [format_object(received) for received in result.objects]
+    lines = format_received(result)
     lines += [format_progress(progress) for progress in result.progress]
     return lines + [f"note: {printable(note)}" for note in result.link_notes]
+
+
+def format_received(result: FrameResult) -> list[str]:
+    """Texts and files that are complete with a frame, one line each."""
+    return [*map(_message_line, result.messages), *map(format_object, result.objects)]
 
 
 def _message_line(message: Message) -> str:
@@ -386,7 +398,6 @@ def printable_name(name: str) -> str:
 
 #: What makes a spreadsheet compute a cell.
 _FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
-_HEADER = "    col  status     w  snr dB  confidence  copies  errors  payload"
 
 
 def format_frame(result: FrameResult) -> str:
@@ -397,9 +408,11 @@ def format_frame(result: FrameResult) -> str:
         lines.append(f"  {note}")
     if result.message:
         lines.append(f"  {printable(result.message.removeprefix(result.source + ': '))}")
-    rows = list(_rows(result))
+    clip = _is_clip(result)
+    scored = any(packet.bit_errors is not None for packet in result.packets)
+    rows = table_rows(result, clip, scored)
     if rows:
-        lines += [_HEADER, *rows]
+        lines += [table_header(clip, scored), *rows]
     return "\n".join(lines)
 
 
@@ -423,8 +436,27 @@ def format_heading(result: FrameResult) -> str:
 def _counts(result: FrameResult) -> str:
     if _goes_on(result):
         return "its packets end in later frames"
-    with_packets = sum(bool(column.packets) for column in result.columns)
-    return f"{plural(len(result.packets), 'packet')} in {with_packets} of {plural(len(result.columns), 'column')}"
+    n_received = sum(packet.is_believable for packet in result.packets)
+    return f"{count_packets(n_received, len(result.packets) - n_received)} ({plural(len(result.columns), 'column')})"
+
+
+def headline(result: FrameResult) -> str:
+    """What became of a frame, in a few words."""
+    if not result.packets:
+        return _STATUS[result.status]
+    n_received = sum(packet.is_believable for packet in result.packets)
+    return capitalised(count_packets(n_received, len(result.packets) - n_received))
+
+
+def count_packets(n_received: int, n_unsure: int) -> str:
+    """The packets of a photo, a clip or a run: those that can be believed, and the rest apart.
+
+    Args:
+        n_received: packets that are believable, see `rxcli.types.BELIEVABLE`.
+        n_unsure: packets of lower confidence.
+    """
+    received = f"{plural(n_received, 'packet')} received" if n_received else "no packet received"
+    return f"{received}, {n_unsure} unsure" if n_unsure else received
 
 
 def result_in_words(result: FrameResult) -> str:
@@ -472,21 +504,33 @@ def _goes_on(result: FrameResult) -> bool:
     return result.status == "ok" and bool(result.columns) and not result.packets
 
 
-def _rows(result: FrameResult) -> Iterator[str]:
-    """Rows of the table. A clip's frames leave out columns in which no packet ended: most frames have some."""
-    clip = _is_clip(result)
-    for key, group in groupby(result.columns, key=_alike):
+def table_header(clip: bool, scored: bool) -> str:
+    """Header of `table_rows`."""
+    start = "   time s  burst" if clip else ""
+    return f"{start}    col  status     w  snr dB  confidence  copies{'  errors' * scored}  payload"
+
+
+def table_rows(result: FrameResult, clip: bool, scored: bool) -> list[str]:
+    """One row per packet; columns without packets share a row where their reasons agree, and are left out in a clip.
+
+    Args:
+        result: of a frame.
+        clip: whether it is a frame of a clip, whose packets have a time and a burst.
+        scored: whether wrong bits are counted.
+    """
+    rows: list[str] = []
+    for _, group in groupby(result.columns, key=_row_key):
         columns = list(group)
-        if isinstance(key, tuple):
-            if not clip:
-                yield _empty_row(columns)
-            continue
-        for column in columns:
-            yield from _packet_rows(column)
+        if columns[0].packets:
+            start = f"{result.time_s:9.3f}  " if clip else ""
+            rows += [_packet_row(columns[0], packet, start, clip, scored) for packet in columns[0].packets]
+        elif not clip:
+            rows.append(_empty_row(columns))
+    return rows
 
 
-def _alike(column: ColumnResult) -> tuple[str, str | None] | int:
-    """What two columns must share to stand in one row; the number of one that has packets, and so a row of its own."""
+def _row_key(column: ColumnResult) -> tuple[str, str | None] | int:
+    """Equal for columns without packets that share a row; the column's number where it has packets."""
     return column.column if column.packets else (column.status, column.message)
 
 
@@ -496,15 +540,14 @@ def _empty_row(columns: list[ColumnResult]) -> str:
     return f"  {span:>5}  {columns[0].status:<9}  {columns[0].message or ''}".rstrip()
 
 
-def _packet_rows(column: ColumnResult) -> Iterator[str]:
-    status = column.status + ("*" if column.denoised else "")
-    lead = f"  {column.column:>5}  {status:<9}  {_cell(column.w, 'd'):>1}  {_cell(column.snr_db, '.1f'):>6}"
-    for packet in column.packets:
-        yield (
-            f"{lead}  {_confidence(packet.confidence):>10}  {_cell(packet.copies, '.2f'):>6}"
-            f"  {_cell(packet.bit_errors, 'd'):>6}  {shorten(packet.payload)}"
-        )
-        lead = " " * len(lead)
+def _packet_row(column: ColumnResult, packet: PacketResult, start: str, clip: bool, scored: bool) -> str:
+    status = ("ok" if packet.is_believable else "weak") + "*" * column.denoised
+    burst = f"{_cell(packet.burst, 'd'):>5}" if clip else ""
+    errors = f"  {_cell(packet.bit_errors, 'd'):>6}" if scored else ""
+    return (
+        f"{start}{burst}  {column.column:>5}  {status:<9}  {_cell(column.w, 'd'):>1}  {_cell(column.snr_db, '.1f'):>6}"
+        f"  {_confidence(packet.confidence):>10}  {_cell(packet.copies, '.2f'):>6}{errors}  {shorten(packet.payload)}"
+    )
 
 
 def _cell(value: float | None, form: str) -> str:

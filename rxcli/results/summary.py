@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,12 +13,19 @@ from typing import Any
 
 from rxcli.errors import ExitCode, UsageError, worst
 from rxcli.outputs import replacing, write_whole
-from rxcli.results.report import csv_cell, format_progress, format_table, plural, printable, printable_name
+from rxcli.results.report import (
+    count_packets,
+    csv_cell,
+    format_progress,
+    format_received,
+    format_table,
+    plural,
+    printable,
+    printable_name,
+)
 from rxcli.results.truth import EXPECTED_LENGTHS, Fault, Score
-from rxcli.types import FrameResult
+from rxcli.types import BELIEVABLE, FrameResult
 
-#: Packets of less are as likely wrong as right: they are shown, but they do not make an input a success.
-MIN_CONFIDENCE = 0.5
 #: Packets that one sentence names.
 _MAX_NAMED = 6
 
@@ -46,15 +54,30 @@ class SourceSummary:
     n_packets: int = 0
     confidence_sum: float = 0.0
     #: Packets below this confidence do not count for the limits.
-    min_confidence: float = MIN_CONFIDENCE
+    min_confidence: float = BELIEVABLE
     #: Packets that count.
     n_sure: int = 0
+    #: Packets that can be believed, and the bits of them; columns in view, over all frames of photos.
+    n_received: int = 0
+    received_bits: int = 0
+    n_columns: int = 0
+    #: Bursts of a clip of which a packet was reported, and times of its first and its last frame.
+    bursts: set[int] = field(default_factory=set)
+    first_s: float = math.inf
+    last_s: float = -math.inf
+    #: What it was received with.
+    screen: str | None = None
+    camera: str | None = None
+    #: Texts and files, a line each.
+    came: list[str] = field(default_factory=list)
     lowest_confidence: float = math.inf
     #: Packets that were put together from several frames.
     n_combined: int = 0
     statuses: Counter[str] = field(default_factory=Counter)
-    #: Reasons of failure of frames and columns, with how often each came up.
+    #: Reasons of failure of frames and columns, with how often each came up; `_kinds` has those that differ in numbers
+    #: alone under the first of them.
     reasons: Counter[str] = field(default_factory=Counter)
+    _kinds: dict[str, str] = field(default_factory=dict)
     time_ms: float = 0.0
     #: Messages and files that came whole, files that did not, and those that could not be written.
     n_messages: int = 0
@@ -78,6 +101,14 @@ class SourceSummary:
         self.n_packets += len(packets)
         self.confidence_sum += sum(packet.confidence for packet in packets)
         self.n_sure += sum(packet.confidence >= self.min_confidence for packet in packets)
+        believable = [packet for packet in packets if packet.is_believable]
+        self.n_received += len(believable)
+        self.received_bits += sum(packet.payload_bits for packet in believable)
+        self.n_columns = max(self.n_columns, len(result.columns))
+        self.bursts |= {packet.burst for packet in packets if packet.burst is not None}
+        self.first_s, self.last_s = min(self.first_s, result.time_s), max(self.last_s, result.time_s)
+        self.screen, self.camera = result.screen_profile or self.screen, result.camera_profile or self.camera
+        self.came += format_received(result)
         self.lowest_confidence = min((packet.confidence for packet in packets), default=self.lowest_confidence)
         self.n_combined += sum(packet.frames is not None and len(packet.frames) > 1 for packet in packets)
         total = result.timing_ms.get("total", math.nan)
@@ -86,8 +117,34 @@ class SourceSummary:
         self.n_objects += len(result.objects)
         self.incomplete += [format_progress(progress) for progress in result.progress]
         if result.message:
-            self.reasons[result.message] += 1
-        self.reasons.update(column.message for column in result.columns if column.message and column.status != "ok")
+            self._count_reason(result.message)
+        for column in result.columns:
+            if column.message and column.status != "ok":
+                self._count_reason(column.message)
+
+    def _count_reason(self, reason: str) -> None:
+        self.reasons[self._kinds.setdefault(re.sub(r"\d+(\.\d+)?", "#", reason), reason)] += 1
+
+    @property
+    def n_unsure(self) -> int:
+        """Packets that were reported and cannot be believed."""
+        return self.n_packets - self.n_received
+
+    @property
+    def is_clip(self) -> bool:
+        """Whether there were several frames."""
+        return self.n_frames > 1
+
+    @property
+    def frames_failed(self) -> int:
+        """Frames of which nothing was received."""
+        return self.n_frames - self.statuses["ok"] - self.statuses["partial"]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every column gave a packet that can be believed, in every burst of a clip."""
+        expected = self.n_columns * max(len(self.bursts), 1)
+        return not (self.frames_failed or self.n_unsure) and self.n_received >= expected > 0
 
     @property
     def confidence(self) -> float | None:
@@ -127,10 +184,9 @@ class SourceSummary:
         return found
 
     def _too_few(self, asked: int) -> str:
-        of_them = (
-            "" if self.n_sure == self.n_packets else f", {self.n_sure} of confidence {self.min_confidence:g} or more"
-        )
-        return f"{plural(self.n_packets, 'packet')}{of_them}; {asked} {'was' if asked == 1 else 'were'} asked for"
+        counted = count_packets(self.n_sure, self.n_packets - self.n_sure)
+        of_them = "" if self.min_confidence == BELIEVABLE else f" (confidence {self.min_confidence:g} or more)"
+        return f"{counted}; {asked} {'was' if asked == 1 else 'were'} asked for{of_them}"
 
     def _ber_failures(self, max_ber: float) -> list[tuple[ExitCode, str]]:
         if self.score is None:
@@ -152,18 +208,25 @@ class SourceSummary:
             "source": printable_name(self.source),
             "exit_code": int(worst([code for code, _ in failures])),
             "frames": self.n_frames,
-            "frames_failed": self.n_frames - self.statuses["ok"] - self.statuses["partial"],
+            "frames_failed": self.frames_failed,
             "packets": self.n_packets,
+            "received": self.n_received,
+            "unsure": self.n_unsure,
             "combined": self.n_combined,
             "confidence": _finite(self.confidence),
             **{name: getattr(self.score, name) if self.score else None for name in _SCORED},
             "messages": self.n_messages,
             "files": self.n_objects,
             "time_ms": round(self.time_ms, 1),
-            "reason": (failures[0][1] if failures else "; ".join(self.incomplete) or self.reason).removeprefix(
-                f"{self.source}: "
-            ),
+            "reason": (failures[0][1] if failures else self._shortfall).removeprefix(f"{self.source}: "),
         }
+
+    @property
+    def _shortfall(self) -> str:
+        """What is missing of a source that passes: that no packet is whole in some frames of a clip is none."""
+        if self.incomplete or (self.is_clip and not self.frames_failed):
+            return "; ".join(self.incomplete)
+        return self.reason
 
 
 def _finite(value: float | None) -> float | None:
@@ -175,7 +238,7 @@ def total(summaries: Sequence[SourceSummary]) -> SourceSummary:
     whole = SourceSummary("total")
     for summary in summaries:
         for name in (
-            *("n_frames", "n_packets", "n_sure", "confidence_sum", "n_combined", "time_ms"),
+            *("n_frames", "n_packets", "n_sure", "n_received", "confidence_sum", "n_combined", "time_ms"),
             *("n_messages", "n_objects"),
         ):
             setattr(whole, name, getattr(whole, name) + getattr(summary, name))
@@ -195,15 +258,34 @@ def format_summary(summaries: Sequence[SourceSummary], limits: Limits) -> str:
     """One row per source, a total where there are several, and columns for the truth where any is known."""
     rows = [summary.row(limits) for summary in summaries]
     scored = any(summary.score is not None for summary in summaries)
-    names = ["source", "frames", "packets", "confidence"]
+    names = ["source", "frames", "received", "unsure", "confidence"]
     names += ["expected", "error_free", "lost", "false", "ber"] if scored else []
     cells = [[_text(row[name]) for name in names] + [printable(str(row["reason"]))] for row in rows]
     if len(summaries) > 1:
         whole = total(summaries).row(Limits())
         failed = sum(row["exit_code"] != 0 for row in rows)
-        ending = f"{failed} of {len(rows)} failed" if failed else "all received"
+        ending = f"{failed} of {len(rows)} failed" if failed else ""
+        if not failed and all(summary.is_complete for summary in summaries):
+            ending = "all received"
         cells.append([_text(whole[name]) for name in names] + [ending])
     return format_table([name.replace("_", "-") for name in names] + [""], cells)
+
+
+def format_clip(clip: SourceSummary) -> str:
+    """A clip in one line: what was received of it, with how many packets a burst, how quickly and how surely."""
+    span_s = (clip.last_s - clip.first_s) * clip.n_frames / max(clip.n_frames - 1, 1)
+    parts = [printable_name(clip.source), f"clip of {plural(clip.n_frames, 'frame')}, {span_s:.2f} s"]
+    if clip.screen:
+        parts += [f"screen {clip.screen}", f"camera {clip.camera or 'unknown'}"]
+    parts.append(f"{plural(len(clip.bursts), 'burst')}: {count_packets(clip.n_received, clip.n_unsure)}")
+    if clip.n_packets:
+        rate = f"{clip.received_bits / span_s / 1e3:.1f} kb/s" if span_s > 0 else "all in one instant"
+        parts += [rate, f"mean confidence {_text(_finite(clip.confidence))}"]
+    parts.append(f"{clip.time_ms:.0f} ms")
+    lines = [" | ".join(parts)]
+    if clip.frames_failed and clip.reasons:
+        lines.append(f"  {plural(clip.frames_failed, 'frame')} gave nothing: {printable(clip.reason)}")
+    return "\n".join(lines)
 
 
 def _text(value: Any) -> str:
@@ -286,6 +368,7 @@ def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) 
             reasons = "; ".join(dict.fromkeys(reason for _, reason in failures))
             element = ElementTree.SubElement(case, kind, message=printable(reasons), type=code.name.lower())
             element.text = "\n".join(map(str, summary.faults)) or None
+        ElementTree.SubElement(case, "system-out").text = count_packets(summary.n_received, summary.n_unsure)
         n_errors += case.find("error") is not None
         n_failures += case.find("error") is None and case.find("failure") is not None
     suite.set("errors", str(n_errors))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rxcli.errors import InputError, sentence, without_commands
+from rxcli.errors import InputError, capitalised, sentence, without_commands
 from rxcli.runs.processes import resident_bytes, start_process
 
 if TYPE_CHECKING:
@@ -124,6 +124,7 @@ def refusal(reason: str, step: str) -> dict[str, Any]:
     """The answer for a file that is not received."""
     return {
         "status": "unreadable",
+        "headline": "This file could not be read",
         "reason": sentence(without_commands(reason)),
         "advice": sentence(without_commands(step)),
     }
@@ -254,7 +255,7 @@ class _Gathered:
         self._best: tuple[int, FrameResult, dict[str, Any]] | None = None
         self._packets: list[dict[str, Any]] = []
         self._texts: list[dict[str, Any]] = []
-        self._n_frames = 0
+        self._n_frames = self._n_received = self._n_unsure = 0
         #: Whether packets or texts came in a frame that is not the first since the last answer.
         self.has_news = False
 
@@ -265,6 +266,9 @@ class _Gathered:
         self._n_frames += 1
         texts, found = texts_of(result), packets_of(result)
         self._texts += texts
+        received = sum(packet.is_believable for packet in result.packets)
+        self._n_received += received
+        self._n_unsure += len(result.packets) - received
         self._packets += found[: _MAX_PACKETS - len(self._packets)]
         self.has_news = result.frame > 0 and (self.has_news or bool(texts or found))
         if self._best is None or len(found) > self._best[0]:
@@ -282,7 +286,7 @@ class _Gathered:
         if self._best is None:
             return refusal("it holds no picture", "send another file")
         from rxcli.results.aim import split_message
-        from rxcli.results.report import mirror_note, to_record
+        from rxcli.results.report import count_packets, headline, mirror_note, to_record
 
         _, result, picture = self._best
         packets = self._packets
@@ -293,6 +297,7 @@ class _Gathered:
         ]
         return {
             "status": result.status if not packets or result.status != "unreadable" else "partial",
+            "headline": capitalised(count_packets(self._n_received, self._n_unsure)) if packets else headline(result),
             "reason": reason,
             "advice": advice,
             "mirrored": mirror_note(result),
@@ -326,6 +331,7 @@ def packets_of(result: FrameResult) -> list[dict[str, Any]]:
             "column": column.column,
             "payload": packet.payload,
             "confidence": round(packet.confidence, 4),
+            "status": "ok" if packet.is_believable else "weak",
             "frame": result.frame,
         }
         for column in result.columns

@@ -45,7 +45,7 @@ def test_a_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFi
     assert all(payload in page for payload in payloads)
     assert page.count('<polygon class="ok"') == N_COLUMNS
     titles = ["The picture", "Packets", "Light and slots", "How clear slots are", "Is the clock right?"]
-    titles += ["Light of neighbours", "Confidence", "Auto-encoder", "Time"]
+    titles += ["Light of neighbours", "Confidence", "Time"]
     for title in titles:
         assert f"<h2>{title}</h2>" in page
     drawings = re.findall(r"<svg[^>]*>", page)

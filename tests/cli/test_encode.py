@@ -102,6 +102,7 @@ def test_a_text_is_printed_as_text_and_first(photo: Path, capsys: pytest.Capture
     assert run(["decode", str(photo), "--camera", str(photo.with_name("camera.toml"))]) == ExitCode.OK
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("text: hällo")
+    assert lines[-1] == lines[0]
     assert "\x1b" not in lines[0]
 
 

@@ -30,7 +30,7 @@ def test_unharmed_samples_are_received(cases: readers.Cases, capsys: pytest.Capt
     path = cases.folder / "sample.png"
     path.write_bytes(cases.samples["known/a.png"])
     assert run(["decode", str(path), *cases.pictures["known"].options]) == 0
-    assert "6 packets in 6 of 6 columns" in capsys.readouterr().out
+    assert "6 packets received (6 columns)" in capsys.readouterr().out
     for seed in range(2, 6):
         cv2.imwrite(str(path), readers.drawn_screen(seed))
         assert run(["decode", str(path), *cases.pictures["known"].options]) == 0, seed

@@ -21,6 +21,7 @@ from rxcli.results.report import (
     format_frame,
     format_table,
     from_record,
+    headline,
     printable,
     printable_name,
     shorten,
@@ -150,11 +151,11 @@ def test_a_name_can_be_told_from_what_is_printed(raw: bytes) -> None:
 def test_the_table_shows_what_a_person_looks_for() -> None:
     text = format_frame(OK)
     heading, header, first, second, dark = text.splitlines()
-    assert heading == "a.jpg | ok | screen paper-34k6 | camera xs10 | 2 packets in 1 of 3 columns | 150 ms"
-    assert header.split() == ["col", "status", "w", "snr", "dB", "confidence", "copies", "errors", "payload"]
-    assert first.split() == ["0", "ok", "5", "21.3", "0.9980", "2.76", "-", "d076558cfe9de2d…5d9c"]
-    assert second.split() == ["0.9980", "2.76", "-", "d076558cfe9de2d…5d9c"]
-    assert first.index("d076") == second.index("d076") == header.index("payload")
+    assert heading == "a.jpg | ok | screen paper-34k6 | camera xs10 | 2 packets received (3 columns) | 150 ms"
+    assert header.split() == ["col", "status", "w", "snr", "dB", "confidence", "copies", "payload"]
+    assert first.split() == ["0", "ok", "5", "21.3", "0.9980", "2.76", "d076558cfe9de2d…5d9c"]
+    assert second == first
+    assert first.index("d076") == header.index("payload")
     assert dark.split(maxsplit=2) == ["1-2", "dark", "too little light; expose longer"]
 
 
@@ -218,7 +219,8 @@ def test_the_summary_names_reasons_and_scores() -> None:
     assert header.split() == [
         "source",
         "frames",
-        "packets",
+        "received",
+        "unsure",
         "confidence",
         "expected",
         "error-free",
@@ -226,10 +228,50 @@ def test_the_summary_names_reasons_and_scores() -> None:
         "false",
         "ber",
     ]
-    assert first.split()[:9] == ["a.jpg", "1", "2", "0.998", "4", "3", "0", "0", "0.02"]
+    assert first.split()[:10] == ["a.jpg", "1", "2", "0", "0.998", "4", "3", "0", "0", "0.02"]
     assert second.endswith("the file is empty; copy it again")
     assert last.endswith("1 of 2 failed")
     assert "expected" not in format_summary([summary(OK)], Limits())
+
+
+def unsure(n_unsure: int, n_columns: int = 3) -> FrameResult:
+    """A photo whose last packets are below what can be believed."""
+    confidence = [0.5] * (n_columns - n_unsure) + [0.499] * n_unsure
+    columns = (ColumnResult(n, "ok", packets=(replace(PACKET, confidence=c),)) for n, c in enumerate(confidence))
+    return replace(OK, columns=tuple(columns))
+
+
+@pytest.mark.parametrize(
+    ("n_unsure", "said"),
+    [(0, "3 packets received"), (1, "2 packets received, 1 unsure"), (3, "no packet received, 3 unsure")],
+)
+def test_headlines_count_packets_that_can_be_believed(n_unsure: int, said: str) -> None:
+    result = unsure(n_unsure)
+    assert f"| {said} (3 columns) |" in format_frame(result)
+    assert headline(result) == said[0].upper() + said[1:]
+    row = summary(result).row(Limits())
+    assert (row["packets"], row["received"], row["unsure"]) == (3, 3 - n_unsure, n_unsure)
+
+
+def test_all_received_is_said_only_where_it_is_so() -> None:
+    def last(*results: FrameResult) -> str:
+        return format_summary([summary(unsure(0)), summary(*results)], Limits()).splitlines()[-1]
+
+    in_clip = [replace(unsure(0), frame=n) for n in range(2)]
+    clip = [
+        replace(r, columns=tuple(replace(c, packets=(replace(PACKET, burst=r.frame),)) for c in r.columns))
+        for r in in_clip
+    ]
+    assert last(unsure(0)).endswith("all received")
+    assert last(*clip).endswith("all received")
+    lacking = replace(clip[1], columns=(replace(clip[1].columns[0], packets=()), *clip[1].columns[1:]))
+    for results in ([unsure(1)], [OK], [clip[0], lacking]):
+        assert "all received" not in last(*results)
+
+
+def test_reasons_that_differ_in_numbers_are_one() -> None:
+    many = [replace(LOST, frame=n, message=f"too dark at {n}.5 dB; expose longer") for n in range(9)]
+    assert summary(*many).reason == "too dark at 0.5 dB; expose longer"
 
 
 def test_summary_files(tmp_path: Path) -> None:
@@ -259,7 +301,7 @@ def test_junit(tmp_path: Path) -> None:
     [suite] = ElementTree.parse(tmp_path / "j.xml").getroot()
     assert (suite.get("tests"), suite.get("errors"), suite.get("failures")) == ("3", "1", "1")
     passed, error, failure = suite
-    assert len(passed) == 0
+    assert [(part.tag, part.text) for part in passed] == [("system-out", "2 packets received")]
     assert float(str(passed.get("time"))) == pytest.approx(0.150)
     assert "the file is empty" in str(error.find("error").get("message"))
     assert "no screen found" in str(failure.find("failure").get("message"))

@@ -11,6 +11,7 @@ from rxcli.protocol import PREAMBLE_SLOTS, bits_per_symbol, indices_to_bits
 from rxcli.receiver.decode.confidence import BurstInClip, Doubts, clip_doubts, confidence_features, doubts_of
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import (
+    BELIEVABLE,
     BoolArray,
     BurstPosteriors,
     Clock,
@@ -155,7 +156,7 @@ def _clip_column(
     packets: tuple[PacketResult, ...],
 ) -> ColumnResult:
     status = _column_status(packets, snr_db)
-    if not packets and going_on >= SETTINGS.weak_confidence:
+    if not packets and going_on >= BELIEVABLE:
         status = "ok"
     message = None
     if not packets:
@@ -304,7 +305,7 @@ def without_packets(columns: tuple[ColumnResult, ...], headerless: BoolArray) ->
 
 def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:
     if packets:
-        return "ok" if max(p.confidence for p in packets) >= SETTINGS.weak_confidence else "weak"
+        return "ok" if any(packet.is_believable for packet in packets) else "weak"
     return "dark" if snr_db is None or snr_db < SETTINGS.dark_snr_db else "no_packet"
 
 

@@ -13,8 +13,6 @@ class DecodeSettings:
     most_ber_hat: float = 0.1
     #: A photograph none of whose packets reaches this confidence shows none.
     surest_packet: float = 0.1
-    #: A column with a packet below this confidence is weak.
-    weak_confidence: float = 0.5
     #: A weight is reported, and its soft bits count, from this probability on.
     sure_weight: float = 0.99
     #: A column below this signal-to-noise ratio, dB, is too dark to try.

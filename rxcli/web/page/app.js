@@ -95,7 +95,7 @@
     for (const packet of rows) {
       const row = make("tr");
       row.append(make("td", packet.column, "number"),
-        make("td", `${(Math.floor(packet.confidence * 1000) / 10).toFixed(1)} %`, `number ${packet.confidence < 0.5 ? "weak" : "ok"}`),
+        make("td", `${(Math.floor(packet.confidence * 1000) / 10).toFixed(1)} %`, `number ${packet.status}`),
         make("td", packet.payload, "mono"));
       body.append(row);
     }
@@ -104,23 +104,10 @@
     return whole;
   }
 
-  function headline(answer) {
-    const n = answer.packets ? answer.packets.length : 0;
-    if (n && answer.partial) return `Received so far: ${count(n, "packet")}`;
-    if (n) {
-      const columns = new Set(answer.packets.map((packet) => packet.column)).size;
-      const of = answer.columns.length ? ` of ${answer.columns.length}` : "";
-      return `Received: ${count(n, "packet")} from ${columns}${of} columns`;
-    }
-    if (answer.status === "no_screen") return "No screen found";
-    if (answer.status === "unreadable") return "This file could not be read";
-    return "Nothing could be received";
-  }
-
   let saved = null;
   function show(answer) {
     const columns = answer.columns || [];
-    $("result-title").textContent = headline(answer);
+    $("result-title").textContent = answer.partial ? `So far: ${answer.headline}` : answer.headline;
     $("reason").textContent = (answer.reason || "").replace(/^No screen found: (.)/, (_, letter) => letter.toUpperCase()) || (answer.seconds !== undefined
       ? `Read in ${answer.seconds.toFixed(1)} s. Screen: ${answer.screen || "unknown"}. Camera: ${answer.camera || "unknown, estimated from the picture"}.${answer.cut_short ? " Only the beginning of the clip was read." : ""}${answer.mirrored ? ` ${answer.mirrored}` : ""}` : "");
     $("advice").textContent = answer.advice || "";
@@ -176,7 +163,7 @@
   async function send(file) {
     const progress = $("progress");
     if (file.size > largest) {
-      show({ status: "unreadable", reason: `The file is larger than ${Math.floor(largest / 1048576)} MB.`, advice: "Send a photo, or a shorter clip." });
+      show({ status: "unreadable", headline: "This file could not be read", reason: `The file is larger than ${Math.floor(largest / 1048576)} MB.`, advice: "Send a photo, or a shorter clip." });
       return;
     }
     progress.textContent = "Sending and reading the picture …";
@@ -188,7 +175,7 @@
       if (answer.headers.get("Content-Type").startsWith("application/x-ndjson")) await showLines(answer);
       else show(await answer.json());
     } catch (error) {
-      show({ status: "unreadable", reason: "The picture did not arrive.", advice: "Check that this phone is still in the same network, and try again." });
+      show({ status: "unreadable", headline: "This file could not be read", reason: "The picture did not arrive.", advice: "Check that this phone is still in the same network, and try again." });
     } finally {
       progress.textContent = "";
       progress.classList.remove("busy");

@@ -1,0 +1,160 @@
+"""What `decode` shows while it runs: texts and tables on stdout, progress on stderr."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TextIO
+
+import click
+
+from rxcli.cli.terminal import for_terminal
+
+if TYPE_CHECKING:
+    from rxcli.results.summary import SourceSummary
+    from rxcli.runs.journal import Lines
+    from rxcli.types import FrameResult
+
+#: Seconds between two lines of progress where stderr is no terminal.
+_EVERY_S = 10.0
+
+
+class Writer:
+    """Takes the results of one source after the other; this one writes nothing."""
+
+    #: Whether a table was shown, which a legend explains.
+    has_table = False
+
+    def begin(self, source: str, scored: bool) -> None:
+        """A source begins, whose packets are `scored` against the truth."""
+
+    def write(self, result: FrameResult, last: bool) -> None:
+        """The next result of the source."""
+
+    def end(self, summary: SourceSummary) -> None:
+        """The source has ended."""
+
+
+class Table(Writer):
+    """Texts and files first; then a photo's packets as a table, and a clip in one line.
+
+    Args:
+        packets: whether clips have a table, too.
+    """
+
+    def __init__(self, packets: bool) -> None:
+        self._packets = packets
+        self._scored = self._clip = self._has_header = False
+
+    def begin(self, source: str, scored: bool) -> None:
+        """Forget the source before."""
+        self._scored, self._clip, self._has_header = scored, False, False
+
+    def write(self, result: FrameResult, last: bool) -> None:
+        """Print what came with the frame."""
+        from rxcli.results.report import format_frame, format_link, table_header, table_rows
+
+        self._clip |= not last
+        for line in format_link(result):
+            print_text(line)
+        if not self._clip:
+            self.has_table |= bool(result.packets)
+            print_text(format_frame(result) + "\n")
+        elif self._packets and result.packets:
+            if not self._has_header:
+                print_text(table_header(clip=True, scored=self._scored))
+            self.has_table = self._has_header = True
+            print_text("\n".join(table_rows(result, clip=True, scored=self._scored)))
+
+    def end(self, summary: SourceSummary) -> None:
+        """Print the line of a clip."""
+        from rxcli.results.summary import format_clip
+
+        if self._clip:
+            print_text(format_clip(summary) + "\n")
+
+
+class JsonLines(Writer):
+    """One JSON object a frame, given to `put`."""
+
+    def __init__(self, lines: Lines, put: Callable[[str], None]) -> None:
+        self._lines, self._put = lines, put
+
+    def begin(self, source: str, scored: bool) -> None:
+        """Name the source."""
+        self._lines.begin(source)
+
+    def write(self, result: FrameResult, last: bool) -> None:
+        """Write the frame's object."""
+        self._put(self._lines.line(result, last))
+
+
+def print_line(line: str) -> None:
+    """A line of data, at once."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def print_text(text: str, err: bool = False) -> None:
+    """Text for people: on a terminal, lines end between words and states have colours."""
+    click.echo(for_terminal(text, sys.stderr if err else sys.stdout), err=err)
+
+
+class Progress:
+    """How far a run is, on stderr: a bar on a terminal, elsewhere a line every ten seconds; a context manager.
+
+    Args:
+        n_total: sources of the run.
+        n_done: those that an earlier run has done.
+        quiet: show nothing.
+    """
+
+    def __init__(self, n_total: int, n_done: int, quiet: bool) -> None:
+        from tqdm import tqdm
+
+        self._total, self._done, self._before = n_total, n_done, n_done
+        self._counts = [0, 0, 0]  # frames, packets, files and texts
+        self._start_s = self._said_s = time.monotonic()
+        self._prints = not quiet and not _is_terminal(sys.stderr)
+        hidden = quiet or self._prints
+        form: dict[str, Any] = {"unit": "source", "file": sys.stderr, "leave": False, "delay": 0.5}
+        self.bar = tqdm(total=n_total, initial=n_done, disable=hidden, **form)
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.close()
+
+    def add(self, result: FrameResult, last: bool) -> None:
+        """Count a result, the last of its source or not."""
+        came = len(result.messages) + len(result.objects)
+        received = sum(packet.is_believable for packet in result.packets)
+        self._counts = [sum(pair) for pair in zip(self._counts, (1, received, came), strict=True)]
+        self._done += last
+        self.bar.set_postfix_str(self._so_far(), refresh=False)
+        self.bar.update(int(last))
+        now_s = time.monotonic()
+        if self._prints and now_s - self._said_s >= _EVERY_S:
+            self._said_s = now_s
+            click.echo(f"vlc-rx: {self.line(now_s - self._start_s)}", err=True)
+
+    def _so_far(self) -> str:
+        from rxcli.results.report import plural
+
+        frames, packets, came = self._counts
+        return f"{plural(frames, 'frame')}, {plural(packets, 'packet')}, {came} texts and files"
+
+    def line(self, passed_s: float) -> str:
+        """How far it is after some seconds, and when it will end."""
+        done = self._done - self._before
+        parts = [f"{self._done} of {self._total} photos and clips", self._so_far()]
+        if done:
+            left_s = passed_s * (self._total - self._done) / done
+            parts += [f"{done / passed_s:.2g} a second", f"{left_s:.0f} s left"]
+        return "; ".join(parts)
+
+
+def _is_terminal(stream: TextIO) -> bool:
+    return stream is not None and stream.isatty()

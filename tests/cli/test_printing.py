@@ -1,0 +1,78 @@
+"""What `decode` shows: texts and files first, a clip in one line, and progress that tells the end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from rxcli.cli import printing
+from rxcli.cli.printing import Progress, Table
+from rxcli.results.summary import SourceSummary
+from rxcli.types import ColumnResult, FrameResult, Message, PacketResult
+
+PACKET = PacketResult(1.0, 1.5, 24, "abcdef", 0.998, 1e-5)
+
+
+def frame(number: int, n_frames: int, text: str | None = None) -> FrameResult:
+    burst = number if n_frames > 1 else None
+    columns = tuple(ColumnResult(c, "ok", w=5, snr_db=20.0, packets=(replace(PACKET, burst=burst),)) for c in (0, 1))
+    messages = (Message("text", text.encode(), "a", number, 0.0),) if text else ()
+    return FrameResult("a", number, number / 30, "ok", columns=columns, messages=messages)
+
+
+def shown(n_frames: int, packets: bool = False) -> tuple[list[str], Table]:
+    """Lines printed for a source whose last frame brings a text."""
+    table, summary = Table(packets), SourceSummary("a")
+    table.begin("a", scored=False)
+    for number in range(n_frames):
+        last = number == n_frames - 1
+        result = frame(number, n_frames, "hello" if last else None)
+        summary.add(result)
+        table.write(result, last)
+    table.end(summary)
+    return summary.came, table
+
+
+def test_a_photo_shows_its_text_before_its_table(capsys: pytest.CaptureFixture[str]) -> None:
+    came, table = shown(1)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "text: hello"
+    assert "2 packets received" in lines[1]
+    assert len([line for line in lines if "abcdef" in line]) == 2
+    assert (came, table.has_table) == (["text: hello"], True)
+
+
+def test_a_clip_is_one_line_without_hex(capsys: pytest.CaptureFixture[str]) -> None:
+    _, table = shown(30)
+    lines = capsys.readouterr().out.split("\n")
+    assert lines[0] == "text: hello"
+    assert lines[1] == (
+        "a | clip of 30 frames, 1.00 s | 30 bursts: 60 packets received | 1.4 kb/s | mean confidence 0.998 | 0 ms"
+    )
+    assert lines[2:] == ["", ""]
+    assert not table.has_table
+
+
+def test_a_clips_table_on_request_has_time_burst_and_status(capsys: pytest.CaptureFixture[str]) -> None:
+    shown(3, packets=True)
+    header, *rows = capsys.readouterr().out.splitlines()
+    assert header.split()[:5] == ["time", "s", "burst", "col", "status"]
+    assert rows[2].split()[:4] == ["0.033", "1", "0", "ok"]
+    assert rows[2].index("abcdef") == header.index("payload")
+    assert sum("abcdef" in row for row in rows) == 6
+
+
+def test_progress_tells_the_end(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress(12, 2, quiet=False) as progress:
+        progress.add(frame(0, 1, "hello"), last=True)
+        assert capsys.readouterr().err == ""  # not yet ten seconds
+        assert progress.line(2.0) == (
+            "3 of 12 photos and clips; 1 frame, 2 packets, 1 texts and files; 0.5 a second; 18 s left"
+        )
+        monkeypatch.setattr(printing, "_EVERY_S", 0.0)
+        progress.add(frame(0, 2), last=False)
+        assert capsys.readouterr().err.startswith("vlc-rx: 3 of 12 photos and clips; 2 frames, 4 packets")
+    with Progress(12, 2, quiet=True) as progress:
+        progress.add(frame(0, 1), last=True)
+    assert capsys.readouterr().err == ""
