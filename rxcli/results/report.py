@@ -29,7 +29,7 @@ _STATUS = {
     "partial": "Received in part",
     "no_screen": "No screen found",
     "no_signal": "Nothing could be received",
-    "unreadable": "The picture could not be read",
+    "unreadable": "The file could not be read",
 }
 #: What the columns of the table mean, for those who see it for the first time.
 LEGEND = (

@@ -124,7 +124,7 @@ def refusal(reason: str, step: str) -> dict[str, Any]:
     """The answer for a file that is not received."""
     return {
         "status": "unreadable",
-        "headline": "This file could not be read",
+        "headline": "The file could not be read",
         "reason": sentence(without_commands(reason)),
         "advice": sentence(without_commands(step)),
     }

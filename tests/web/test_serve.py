@@ -453,7 +453,7 @@ def test_a_phone_sends_the_samples_and_a_bad_file(dark: bool, tmp_path: Path) ->
         SAMPLES / "phone_chelsea_17k3.jpg": ("20 packets received", 20),
         SAMPLES / "xtrans_sky_17k3.dng": ("20 packets received", 20),
         SAMPLES / "video1080_chelsea_17k3.mp4": ("360 packets received", 20),
-        tmp_path / "bad.jpg": ("This file could not be read", 0),
+        tmp_path / "bad.jpg": ("The file could not be read", 0),
     }
     profiles = tuple(str(SAMPLES / f"{name}.toml") for name in ("phone12", "xs10-small", "video1080"))
 

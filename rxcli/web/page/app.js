@@ -163,7 +163,7 @@
   async function send(file) {
     const progress = $("progress");
     if (file.size > largest) {
-      show({ status: "unreadable", headline: "This file could not be read", reason: `The file is larger than ${Math.floor(largest / 1048576)} MB.`, advice: "Send a photo, or a shorter clip." });
+      show({ status: "unreadable", headline: "The file could not be read", reason: `The file is larger than ${Math.floor(largest / 1048576)} MB.`, advice: "Send a photo, or a shorter clip." });
       return;
     }
     progress.textContent = "Sending and reading the picture …";
@@ -175,7 +175,7 @@
       if (answer.headers.get("Content-Type").startsWith("application/x-ndjson")) await showLines(answer);
       else show(await answer.json());
     } catch (error) {
-      show({ status: "unreadable", headline: "This file could not be read", reason: "The picture did not arrive.", advice: "Check that this phone is still in the same network, and try again." });
+      show({ status: "unreadable", headline: "The file could not be read", reason: "The picture did not arrive.", advice: "Check that this phone is still in the same network, and try again." });
     } finally {
       progress.textContent = "";
       progress.classList.remove("busy");
