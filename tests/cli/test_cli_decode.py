@@ -195,7 +195,7 @@ def test_what_is_wrong_is_named_by_column_burst_and_bits(tmp_path: Path, decode:
     code, out, _ = decode(tmp_path / "a.png", "--truth", "auto", "--max-ber", "1e-3", "--junit", tmp_path / "j.xml")
     assert code == 1
     assert f"is above 0.001: {told}" in " ".join(out.split())
-    [[[failure]]] = ElementTree.parse(tmp_path / "j.xml").getroot()
+    [[[failure, _]]] = ElementTree.parse(tmp_path / "j.xml").getroot()
     assert told in failure.get("message", "")
     assert failure.text == told.replace(", ", "\n")
     truth["frames"][0]["bursts"][0]["visible_slots"] = 70.0
