@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -11,15 +13,20 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from watched_stages import watched
 
-from rxcli.lab.benchmark.stability import Problems, inspect_frame, small, thread_orders
+from rxcli.lab.benchmark.cases import nonsense
+from rxcli.lab.benchmark.draw import small
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
-from rxcli.lab.benchmark.watch import watched
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.protocol import encode_packet, payload_bits
 from rxcli.receiver import sampling
 from rxcli.receiver.decode import detect
-from rxcli.types import FloatArray, FrameResult
+from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.results.report import to_record
+from rxcli.types import FloatArray, Frame, FrameResult
+
+Problems = list[str]
 
 #: Ties: float32 may decide otherwise where the best two log-probabilities are this close.
 _TIE = 1e-2
@@ -29,6 +36,43 @@ _TIE = 1e-2
 def base_trial(picture: str = "coffee", screen: str = "paper-17k3") -> Trial:
     """A clean small frame of 240 x 1000 pixels that the hostile frames start from."""
     return simulate_trial(small(preset("phone-plain", screen), 240, 3.0, picture=picture), 1)
+
+
+def inspect_frame(frame: Frame, options: ReceiverOptions) -> tuple[FrameResult | None, Problems]:
+    """Receive one frame under watch; returns the result, None where it raised, and everything that is wrong."""
+    result = None
+    with watched() as found:
+        try:
+            result = next(iter(receive([frame], options)))
+        except Exception as error:  # whatever it is, it is what we look for
+            found.append(f"{type(error).__name__}: {error}")
+    return result, list(dict.fromkeys([*found, *(nonsense(result) if result else ())]))
+
+
+def unique(problems: Problems) -> Problems:
+    """Problems without repetition, in order."""
+    return list(dict.fromkeys(problems))
+
+
+def thread_orders(frame: Frame, options: ReceiverOptions) -> Problems:
+    """The same frame on one thread, on several, and several times at once: the same bits must come out."""
+    import cv2
+
+    before, texts = cv2.getNumThreads(), []
+    try:
+        for threads in (1, 4):
+            cv2.setNumThreads(threads)
+            texts.append(_bits(frame, options))
+        with ThreadPoolExecutor(3) as pool:
+            texts += pool.map(lambda _: _bits(frame, options), range(3))
+    finally:
+        cv2.setNumThreads(before)
+    return [] if len(set(texts)) == 1 else ["results differ with the order of threads"]
+
+
+def _bits(frame: Frame, options: ReceiverOptions) -> str:
+    result = replace(next(iter(receive([frame], options))), timing_ms={})
+    return json.dumps(to_record(result), sort_keys=True)
 
 
 # Hostile frames: the base frame's pixels with something done to them.

@@ -286,12 +286,8 @@ def test_cells_that_a_spreadsheet_would_compute_are_quoted(tmp_path: Path, names
 @pytest.mark.parametrize(
     "command",
     [
-        ["benchmark", "stability", "--readers", "1"],
-        ["benchmark", "confidence", "--frames", "1"],
-        ["benchmark", "memory", "--frames", "100"],
-        ["benchmark", "speed", "--medium", "jpeg-26mp", "--fresh"],
+        ["benchmark", "confidence", "--count", "1"],
         ["benchmark", "compare", "."],
-        ["benchmark", "goodput"],
         ["benchmark", "--quick"],
         ["inspect", "a.png"],
         ["train"],
@@ -312,7 +308,6 @@ def test_folders_of_results_are_no_folders_of_photos(
         pytest.importorskip(name)
     if command[1:2] == ["compare"]:
         monkeypatch.setattr("rxcli.lab.benchmark.compare.check_checkout", lambda path: path)
-        monkeypatch.setattr("rxcli.lab.benchmark.compare.shared_screens", lambda path: ())
     assert run([*command, *(["--out"] if command != ["train"] else []), "photos"]) == 2
     said = capsys.readouterr().err
     assert "photos: the folder holds files that this command did not write; name a new folder" in said

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rxcli.lab.benchmark import motion as benchmark
 from rxcli.lab.simulate.capture import prepare, stabilised
 from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
 from rxcli.lab.simulate.scenes import Change, Scene, preset
@@ -81,12 +80,3 @@ def test_a_stabilised_clip_stays_where_it_is() -> None:
         moved.append([x, y])
     assert np.ptp(moved, axis=0).max() > 4
     assert np.ptp(left, axis=0).max() < 0.7
-
-
-def test_rows_of_the_benchmark_add_up() -> None:
-    score = {"expected": 10, "error_free": 8, "false": 1, "sure": 7, "surely_wrong": 2}
-    record = {"speeds": [{"clip": score, "one_by_one": score}] * len(benchmark.SPEEDS_PX)}
-    rows = benchmark.rows([record, record])
-    assert [row["pixels_a_frame"] for row in rows] == list(benchmark.SPEEDS_PX)
-    assert all(row["expected"] == 20 and row["clip_error_free"] == 16 for row in rows)
-    assert all(row["one_by_one_surely_wrong"] == 4 for row in rows)

@@ -1,4 +1,4 @@
-"""Hostile values; and the watch over random scenes, of which `vlc-rx benchmark stability` does thousands."""
+"""Hostile values that must not upset the receiver."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hostile_cases import CASES, base_trial
+from hostile_cases import CASES, base_trial, inspect_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
+from watched_stages import watched
 
-from rxcli.lab.benchmark import stability
+from rxcli.lab.benchmark.cases import problems_in
+from rxcli.lab.benchmark.draw import small_scene
 from rxcli.lab.benchmark.trial import simulate_trial
-from rxcli.lab.benchmark.watch import problems_in, watched
 from rxcli.receiver.decode import detect
 
 
@@ -41,7 +42,7 @@ def test_no_block_of_extremes_upsets_the_receiver(
     part = pixels[top : top + block.shape[0] * 10, left : left + block.shape[1]]
     part[:] = np.repeat(block, 10, axis=0)[: part.shape[0], : part.shape[1]]
     options = replace(base.options(), corners=base.corners + shift * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]) / 10)
-    assert stability.inspect_frame(replace(base.frame, pixels=pixels), options)[1] == []
+    assert inspect_frame(replace(base.frame, pixels=pixels), options)[1] == []
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
@@ -87,21 +88,11 @@ def test_the_watch_names_the_stage(monkeypatch: pytest.MonkeyPatch) -> None:
     assert detect.broken is broken  # type: ignore[attr-defined]
 
 
-def test_random_scenes_are_counted() -> None:
-    records = [stability.scene_record({"seed": seed}) for seed in (3, 4)]
-    assert all(record["problems"] == [] for record in records)
-    verdict = stability.Verdict({}, 2, 400, 30, {"ok": 2})
-    assert not verdict.within_rate
-    assert not verdict.stable
-    assert replace(verdict, wrong=2).stable
-    assert stability.rows(replace(verdict, scenes={"NaN": [7]}))[-1]["seeds"] == "7"
-
-
 @pytest.mark.parametrize("seed", [3394, 1000463])
 def test_scenes_that_led_the_pose_astray(seed: int) -> None:
     """Found by ten thousand random scenes: sides that are no screen's, and a pose without a unique step."""
-    trial = simulate_trial(stability.small_scene(seed), seed)
-    result, problems = stability.inspect_frame(trial.frame, trial.options(known_outline=False))
+    trial = simulate_trial(small_scene(seed), seed)
+    result, problems = inspect_frame(trial.frame, trial.options(known_outline=False))
     assert not problems
     assert result is not None
     assert result.status == "no_screen"

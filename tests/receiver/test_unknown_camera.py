@@ -10,8 +10,7 @@ import pytest
 from small_frames import BOTTOM, LEFT, RIGHT, ROWS_PER_SLOT, SCREEN, TOP, write_frame
 
 from rxcli.ingest import open_source
-from rxcli.lab.benchmark import phones
-from rxcli.lab.benchmark.journal import SEEDS_A_RUN
+from rxcli.lab.benchmark.draw import FIRST_SEED, as_stored, phone_of
 from rxcli.lab.benchmark.trial import Trial, score_result, simulate_trial
 from rxcli.lab.simulate.isp import Isp, Tone
 from rxcli.lab.simulate.optics import Lens, Pose
@@ -40,8 +39,12 @@ def _frame(folder: Path) -> tuple[Frame, list[str]]:
 
 def test_packets_of_a_long_exposure_are_received() -> None:
     """It shows less than two packets, so that longer ones fit its light as well, without a second header."""
-    packets = phones.packets_of({"seed": SEEDS_A_RUN * 777 + 71, "cae": "never"})["packets"]
-    assert sum(packet["bit_errors"] == 0 for packet in packets) >= 10
+    scene, turned = phone_of(777, 71)
+    trial = simulate_trial(scene, FIRST_SEED + 71)
+    frame, corners = as_stored(trial, turned)
+    options = ReceiverOptions(cameras=(), corners=corners, cae="never")
+    result, _ = score_result(next(iter(receive([frame], options))), trial.truth)
+    assert sum(packet.bit_errors == 0 for packet in result.packets) >= 10
 
 
 @pytest.mark.parametrize("told_exposure_s", [None, 2e-6])

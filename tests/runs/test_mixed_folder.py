@@ -5,14 +5,12 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
-import av
 import pytest
 from mixed_folder import BAD, Contents, Outcome, make_folder, passed, reasons, run
 
 from rxcli.errors import UsageError
 from rxcli.ingest import open_source
-from rxcli.lab.benchmark import long_clip
-from rxcli.lab.benchmark.speed import repeat_clip
+from rxcli.lab.benchmark.media import repeat_clip
 
 N_GOOD = 12
 
@@ -70,26 +68,3 @@ def test_a_clip_written_several_times_over_is_one_clip(contents: Contents, tmp_p
     assert len(steps) == 1
     for number, frame in enumerate(thrice):
         assert (frame.pixels == once[number % len(once)].pixels).all()
-
-
-def test_the_endless_clips_payload_comes_again() -> None:
-    scene = long_clip.clip_scene()
-    slots = scene.n_frames * scene.screen.slot_rate_hz / scene.frame_rate_hz
-    bursts = slots / (scene.screen.packet_slots * scene.screen.repeats)
-    assert bursts == pytest.approx(round(bursts), abs=1e-9)
-    assert scene.payload is not None
-    assert len(scene.payload) * 8 == round(bursts) * scene.screen.columns * 35
-
-
-def test_memory_is_read_at_the_wanted_frames(contents: Contents, tmp_path: Path) -> None:
-    short = next(path for path in contents.good if path.suffix == ".mp4")
-    clip = tmp_path / "clip.mp4"
-    repeat_clip(short, clip, 2)
-    camera = (contents.folder / "camera.toml").read_text()
-    (tmp_path / "long.camera.toml").write_text(camera)
-    with av.open(str(clip)) as container:
-        n_frames = container.streams.video[0].frames
-    found = long_clip.measure(clip, (2, n_frames), tmp_path / "out.jsonl")
-    assert found.frames == (2, n_frames)
-    assert found.exit_code in (0, 1)
-    assert found.resident_mb[0] > 20

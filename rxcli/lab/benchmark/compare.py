@@ -1,14 +1,15 @@
-"""Do two checkouts give the same results on the same files, and which takes longer?
+"""Two checkouts on the same files: are the results the same to the last bit, which has more packets, which is quicker?
 
-Files are made once, by this checkout's simulator. Each checkout decodes all of them in a process of its own, through
-its command line, which outlives what is moved and renamed within. The two take turns, and the least time of the
-processor counts, so that a busy machine does little harm.
+Cases are drawn once, by this checkout. Each checkout decodes their files in a process of its own, through its command
+line, which outlives what is moved and renamed within. The two take turns, and the least processor time of a file
+counts.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -16,16 +17,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from rxcli.errors import ReceiverError, UsageError
-from rxcli.lab.benchmark import confidence, phones
-from rxcli.lab.benchmark.speed import write_capture
-from rxcli.lab.benchmark.tables import Row, write_text
-from rxcli.lab.benchmark.trial import corners_on_picture, simulate_trial
-from rxcli.lab.simulate.capture import prepare
-from rxcli.profiles import ScreenProfile, dump_profile, shipped_profiles
-from rxcli.types import FloatArray
+from rxcli.lab.benchmark.cases import Case
+from rxcli.lab.benchmark.draw import DRAWERS, Place
+from rxcli.lab.benchmark.measures import SURE, Row
+from rxcli.lab.benchmark.runner import Task
+from rxcli.lab.simulate.tiff import write_dng
+from rxcli.options import SKIPS, ReceiverOptions
+from rxcli.outputs import write_whole
+from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile
+from rxcli.results.truth import truth_path
 
 #: What the other process runs: argument lists come on stdin as JSON, records and CPU seconds go to stdout.
 _WORKER = """
@@ -39,10 +43,25 @@ for arguments in jobs[:1] + jobs:  # the first one once more: what is loaded onc
     done.append([said.getvalue(), time.process_time() - start, int(code)])
 json.dump(done[1:], sys.stdout)
 """
-_THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-_STILLS, _CLIPS = {".jpg", ".jpeg", ".png", ".tif", ".dng", ".raf"}, {".mp4", ".mov", ".mkv", ".avi"}
-#: Digits to which corners are handed over.
-_PLACES = 3
+_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+#: Earlier checkouts remembered cameras from file to file.
+_ENVIRONMENT["VLC_RX_NO_CAMERA_CACHE"] = "1"
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What one checkout made of one file."""
+
+    #: Lines of JSON, without times.
+    records: list[Any]
+    cpu_s: float
+    exit_code: int
+
+    @property
+    def packets(self) -> list[dict[str, Any]]:
+        """Those of all columns of all frames."""
+        columns = (column for record in self.records for column in record.get("columns", ()))
+        return [packet for column in columns for packet in column["packets"]]
 
 
 @dataclass(frozen=True)
@@ -50,23 +69,8 @@ class Job:
     """One file, and how it is decoded."""
 
     group: str
-    path: Path
-    #: Further arguments of `vlc-rx decode`.
-    arguments: tuple[str, ...] = ()
-
-    @property
-    def command(self) -> list[str]:
-        """Arguments of `vlc-rx`."""
-        return ["decode", str(self.path), "--json", "-", "--quiet", *self.arguments]
-
-
-@dataclass(frozen=True)
-class Decoded:
-    """What one checkout made of one file."""
-
-    records: list[Any]
-    cpu_s: float
-    exit_code: int
+    #: Of `vlc-rx`; the second is the file.
+    arguments: list[str]
 
 
 @dataclass(frozen=True)
@@ -85,70 +89,41 @@ class Comparison:
         return next(_differences("", self.other.records, self.this.records), None)
 
 
-def captures(folder: Path, arguments: tuple[str, ...]) -> list[Job]:
-    """The photographs and clips of a folder."""
-    paths = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in _STILLS | _CLIPS]
-    return [Job("clips" if path.suffix.lower() in _CLIPS else "captures", path, arguments) for path in paths]
+def arguments_of(case: Case, stem: Path) -> list[str]:
+    """Write a case as files of this stem: picture, truth, profiles; the arguments of `vlc-rx` that receive it."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    path, options = _written(case, stem), case.options
+    arguments = ["decode", str(path), "--json", "-", "--quiet", "--truth", "auto", "--cae", options.cae]
+    if case.truth is not None:
+        write_whole(truth_path(path), msgspec.json.encode(case.truth))
+    named: list[ScreenProfile | CameraProfile] = list(options.cameras if options.force_camera else ())
+    named += () if options.screens == ReceiverOptions().screens else options.screens
+    for number, profile in enumerate(named):
+        toml = stem.with_suffix(f".{number}.toml")
+        write_whole(toml, dump_profile(profile))
+        arguments += [f"--{profile.kind}", str(toml)]
+    if options.corners is not None:
+        arguments += ["--corners", *(f"{x:.3f},{y:.3f}" for x, y in options.corners)]
+    return arguments + [part for name in SKIPS if name not in options.skip for part in ("--no-skip", name)]
 
 
-def random_scenes(folder: Path, count: int, seed: int) -> Iterator[Job]:
-    """Random scenes of the benchmark of confidences: camera, screen and corners handed over."""
-    for number in range(count):
-        yield _job("random scenes", folder / f"scene-{seed}-{number}", seed, number, _write_scene)
-
-
-def random_phones(folder: Path, count: int, seed: int, screens: tuple[str, ...]) -> Iterator[Job]:
-    """Random phones that nobody has measured: corners handed over, and which screens there are."""
-    for number in range(count):
-        job = _job("phones", folder / f"phone-{seed}-{number}", seed, number, _write_phone)
-        yield replace(job, arguments=(*screens, *job.arguments))
-
-
-def _job(group: str, stem: Path, seed: int, number: int, write: Callable[[Path, int, int], Job]) -> Job:
-    """The job whose file has this stem, made unless an earlier run has."""
-    note = stem.with_suffix(".job.json")
-    if not note.exists():
-        stem.parent.mkdir(parents=True, exist_ok=True)
-        made = write(stem, seed, number)
-        write_text(note, json.dumps([str(made.path), *made.arguments]))
-    path, *arguments = json.loads(note.read_text(encoding="utf-8"))
-    return Job(group, Path(path), tuple(arguments))
-
-
-def _write_scene(stem: Path, seed: int, number: int) -> Job:
-    scene = confidence.scene_of(1_000_000 * seed + number)
-    path = stem.with_suffix(".dng" if scene.is_mosaic else ".jpg").resolve()
-    exposure = prepare(scene, number).exposure()
-    write_capture(scene, path, number)
-    screen = write_text(path.with_suffix(".screen.toml"), dump_profile(scene.screen))
-    corners = corners_on_picture(exposure.view, scene.isp.correct_distortion and not scene.is_mosaic)
-    camera = str(path.with_suffix(".camera.toml"))
-    return Job("", path, ("--screen", str(screen), "--camera", camera, *_corners(corners)))
-
-
-def _write_phone(stem: Path, seed: int, number: int) -> Job:
-    scene, turned = phones.phone_of(seed, number)
-    trial = simulate_trial(scene, phones.FIRST_SEED + number)
-    frame, corners = phones.as_stored(trial, turned)
-    path = stem.with_suffix(".png").resolve()
-    _write_grey(np.asarray(frame.pixels, np.uint8), path)
-    return Job("", path, _corners(corners))
-
-
-def _write_grey(pixels: np.ndarray[Any, np.dtype[np.uint8]], path: Path) -> None:
+def _written(case: Case, stem: Path) -> Path:
+    """The case's file: a copy, a JPEG or DNG where one was simulated, or else a PNG."""
     import cv2
 
-    path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
-
-
-def _corners(corners: FloatArray) -> tuple[str, ...]:
-    return ("--corners", *(f"{x:.{_PLACES}f},{y:.{_PLACES}f}" for x, y in corners))
-
-
-def shared_screens(other: Path) -> tuple[str, ...]:
-    """`--screen` for every screen that both checkouts ship, by the other's files."""
-    files = [other / "calibration" / "screens" / f"{screen.name}.toml" for screen in shipped_profiles(ScreenProfile)]
-    return tuple(part for file in files if file.is_file() for part in ("--screen", str(file)))
+    if isinstance(case.source, Path):
+        return Path(shutil.copyfile(case.source, stem.with_suffix(case.source.suffix)))
+    (frame, *_), capture = case.source, None if case.trial is None else case.trial.capture
+    if capture is not None and capture.is_mosaic:
+        path = stem.with_suffix(".dng")
+        write_dng(capture.raw, capture.scene, path)
+        return path
+    # A phone's picture was stored anew, without metadata.
+    as_simulated = capture is not None and frame.metadata.model is not None
+    data = capture.jpeg if capture and as_simulated else cv2.imencode(".png", np.asarray(frame.pixels))[1].tobytes()
+    path = stem.with_suffix(".jpg" if as_simulated else ".png")
+    write_whole(path, data)
+    return path
 
 
 def check_checkout(path: Path) -> Path:
@@ -167,36 +142,48 @@ def this_checkout() -> Path:
     return Path(__file__).resolve().parents[3]
 
 
-def compare(
-    jobs: Sequence[Job], this: Path, other: Path, repeats: int = 2, tick: Callable[[], None] = lambda: None
-) -> list[Comparison]:
-    """Decode every file with both checkouts, by turns.
+def compare(jobs: Sequence[Job], other: Path, repeats: int, tick: Callable[[], None]) -> list[Comparison]:
+    """Decode every file with this checkout and with the other, by turns.
 
     Args:
-        jobs: the files.
-        this: folder of this checkout.
-        other: folder of the other one.
+        jobs: from `jobs_of`.
+        other: folder of the other checkout.
         repeats: turns; the least time of each file counts.
         tick: called after every turn of either.
 
     Raises:
         ReceiverError: a checkout broke off.
     """
-    found: dict[Path, list[list[Decoded]]] = {this: [], other: []}
+    found: dict[Path, list[list[Decoded]]] = {other: [], this_checkout(): []}
     for _ in range(repeats):
-        for checkout in (other, this):
-            found[checkout].append(_decoded_by(checkout, jobs))
+        for checkout, turns in found.items():
+            turns.append(_decoded_by(checkout, [job.arguments for job in jobs]))
             tick()
-    first, second = (_least(found[checkout]) for checkout in (this, other))
-    return [Comparison(*parts) for parts in zip(jobs, first, second, strict=True)]
+    theirs, ours = (
+        [replace(one[0], cpu_s=min(d.cpu_s for d in one)) for one in zip(*turns, strict=True)]
+        for turns in found.values()
+    )
+    return [Comparison(*parts) for parts in zip(jobs, ours, theirs, strict=True)]
 
 
-def _decoded_by(checkout: Path, jobs: Sequence[Job]) -> list[Decoded]:
-    environment = {**os.environ, **_THREADS, "PYTHONPATH": str(checkout)}
+def jobs_of(tasks: Sequence[Task], folder: Path) -> Iterator[Job]:
+    """Draw the cases of a scenario's tasks, and write them as files into `folder`."""
+    for task in tasks:
+        for number, case in enumerate(
+            DRAWERS[task["draw"]](Place(task["seed"], task["number"], task["point"], folder))
+        ):
+            label = "-".join(filter(None, (task["draw"], task["label"])))
+            stem = folder / f"{Path(label).stem}-{task['seed']}-{task['number']}-{number}"
+            yield Job(next(iter(case.groups), label), arguments_of(case, stem.resolve()))
+
+
+def _decoded_by(checkout: Path, jobs: Sequence[Sequence[str]]) -> list[Decoded]:
+    environment = {**os.environ, **_ENVIRONMENT, "PYTHONPATH": str(checkout)}
     command = [sys.executable, "-P", "-c", _WORKER]
-    given = json.dumps([job.command for job in jobs])
     # Elsewhere: python would look into the folder that it stands in first.
-    done = subprocess.run(command, input=given, env=environment, capture_output=True, text=True, check=False, cwd="/")
+    done = subprocess.run(
+        command, input=json.dumps(jobs), env=environment, capture_output=True, text=True, check=False, cwd="/"
+    )
     if done.returncode:
         reason = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
         raise ReceiverError(f"{checkout}: decoding broke off ({reason[0]})", "run its own tests")
@@ -208,11 +195,6 @@ def _records(text: str) -> list[Any]:
     return [{k: v for k, v in json.loads(line).items() if k != "timing_ms"} for line in text.splitlines()]
 
 
-def _least(turns: Sequence[Sequence[Decoded]]) -> list[Decoded]:
-    """Results of the first turn, with the least time of all turns."""
-    return [Decoded(one[0].records, min(d.cpu_s for d in one), one[0].exit_code) for one in zip(*turns, strict=True)]
-
-
 def _differences(place: str, before: Any, now: Any) -> Iterator[str]:
     """Places where two JSON values differ, with both values."""
     if isinstance(before, dict) and isinstance(now, dict):
@@ -222,36 +204,31 @@ def _differences(place: str, before: Any, now: Any) -> Iterator[str]:
         for number, parts in enumerate(zip(before, now, strict=True)):
             yield from _differences(f"{place}[{number}]", *parts)
     elif before != now or type(before) is not type(now):
-        yield f"{place}: {_short(before)} -> {_short(now)}"
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+        yield f"{place}: {json.dumps(before):.60} -> {json.dumps(now):.60}"
 
 
 def rows(found: Sequence[Comparison]) -> list[Row]:
     """One row a group, and one for all."""
-    groups = list(dict.fromkeys(one.job.group for one in found))
-    return [_row(group, [one for one in found if one.job.group == group]) for group in groups] + [
-        _row("all", list(found))
-    ]
+    groups = {
+        name: [one for one in found if one.job.group == name] for name in dict.fromkeys(one.job.group for one in found)
+    }
+    return [_row(name, some) for name, some in (groups | {"all": list(found)}).items()]
 
 
 def _row(name: str, found: Sequence[Comparison]) -> Row:
-    this, other = (sum(getattr(one, side).cpu_s for one in found) for side in ("this", "other"))
-    columns = (column for one in found for record in one.this.records for column in record.get("columns", ()))
-    return {
-        "files": name,
-        "n": len(found),
-        "same": sum(one.difference is None for one in found),
-        "packets": sum(len(column["packets"]) for column in columns),
-        "cpu_s": this,
-        "other_cpu_s": other,
-        "cpu_ratio": this / other if other else None,
-    }
+    row: Row = {"files": name, "n": len(found), "same": sum(one.difference is None for one in found)}
+    for side in ("this", "other"):
+        packets = [packet for one in found for packet in getattr(one, side).packets]
+        sure = [packet for packet in packets if packet["confidence"] >= SURE]
+        row[f"{side}_packets"] = len(packets)
+        row[f"{side}_right"] = sum(packet.get("bit_errors") == 0 for packet in packets)
+        row[f"{side}_surely_wrong"] = sum(bool(packet.get("bit_errors")) for packet in sure)
+        row[f"{side}_cpu_s"] = sum(getattr(one, side).cpu_s for one in found)
+    return {**row, "cpu_ratio": row["this_cpu_s"] / row["other_cpu_s"] if row["other_cpu_s"] else None}
 
 
 def differing(found: Sequence[Comparison]) -> list[Row]:
     """The files whose results differ, and where first."""
-    return [{"file": one.job.path.name, "first difference": one.difference} for one in found if one.difference]
+    return [
+        {"file": Path(one.job.arguments[1]).name, "first difference": one.difference} for one in found if one.difference
+    ]

@@ -2,87 +2,80 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import subprocess
+import sys
+import time
 from pathlib import Path
+from statistics import median
+from typing import Any
 
-from rxcli.lab.benchmark import speed, stability, sweeps
-from rxcli.lab.benchmark.journal import Run
-from rxcli.lab.benchmark.tables import Row
+import msgspec
 
-#: Frames of each point, and runs whose median counts.
-_FRAMES, _REPEATS = 2, 3
-#: Random scenes that are received under watch.
-_SCENES = 20
-#: Easy ones, a hard picture, and a phone that nobody has measured.
+from rxcli.lab.benchmark.cases import Record
+from rxcli.lab.benchmark.measures import MEASURES, Group, Row
+from rxcli.lab.benchmark.runner import Run, scenarios
+
 _MEDIA = ("jpeg-26mp", "raw-26mp", "jpeg-26mp-hard", "jpeg-12mp-unknown")
+#: Runs of each medium, and small random scenes.
+_REPEATS, _SCENES = 3, 20
 
 
-def points() -> list[sweeps.Point]:
-    """The paper's three rates on its two pictures, a dim photo, a phone and a clip."""
-    paper = [point for point in sweeps.SWEEPS["rate"] if point.slot_rate_hz <= 34600]
-    dim = replace(sweeps.SWEEPS["picture"][0], picture="coffee", light=0.3, label="coffee x 0.3")
-    cameras = [p for p in sweeps.SWEEPS["camera"] if p.camera in ("phone-corrected", "video-4k")]
-    return [*paper, dim, *cameras]
-
-
-def run(folder: Path, how: Run) -> list[tuple[str, list[Row]]]:
+def run(how: Run, seed: int, folder: Path) -> list[tuple[str, list[Row]]]:
     """Measure the headline: titles and tables; the media that are timed lie in `folder`."""
-    errors = error_rows(sweeps.run(points(), _FRAMES, how))
-    verdict = stability.run(_SCENES, how)
+    table = scenarios()
+    speed = {name: point for name, point in table["speed"].points.items() if name in _MEDIA}
+    timed = msgspec.structs.replace(table["speed"], points=speed, ways=("two threads",))
+    watched = msgspec.structs.replace(table["stability"], ways=("receiver",))
+    errors = how(table["quick"].tasks(seed, table["quick"].count, folder), "errors")
+    stability = how(watched.tasks(seed, _SCENES, folder), "stability")
+    times = how(timed.tasks(seed, _REPEATS, folder), "times")
     return [
-        ("bit error rate, lost packets included: receiver, bound, the paper's pipeline", errors),
-        (
-            "time on two threads, of the wall and of the processor, against the bare decode on one",
-            _time_rows(folder, how.seed),
-        ),
-        ("checks", _check_rows(verdict)),
+        ("bit error rate, lost packets included: receiver, bound, the paper's pipeline", _by_label(errors, _errors)),
+        ("time on two threads, of the wall and of the processor, against the bare decode", _by_label(times, _times)),
+        ("checks", [_check(stability), *({"check": k, "result": f"{ms:.0f} ms"} for k, ms in start_times(3).items())]),
     ]
 
 
-def error_rows(summaries: Sequence[sweeps.Summary]) -> list[Row]:
-    """One row a point: error of the receiver and of both yardsticks."""
-    table = []
-    for point in dict.fromkeys(summary.point for summary in summaries):
-        mine = {summary.method: summary for summary in summaries if summary.point == point}
-        receiver = mine["receiver"]
-        table.append(
-            {
-                "scene": point.label,
-                "kb/s": point.rate_kbps,
-                "packets": receiver.score.expected,
-                "receiver": receiver.score.ber,
-                "receiver95": receiver.ber_interval,
-                "bound": mine[sweeps.BOUND].score.ber,
-                "paper": mine[sweeps.PAPER].score.ber,
-                "error_free": receiver.score.error_free,
-                "false": receiver.score.false,
-            }
-        )
-    return table
+def _by_label(records: list[Record], row: Any) -> list[Row]:
+    labels = dict.fromkeys(record["groups"][0] for record in records)
+    return [row(label, [record for record in records if record["groups"][0] == label]) for label in labels]
 
 
-def _time_rows(folder: Path, seed: int) -> list[Row]:
-    table = []
-    for medium in (medium for medium in speed.MEDIA if medium.name in _MEDIA):
-        timing = speed.time_medium(medium, speed.make_medium(medium, folder, seed), 2, _REPEATS)
-        table.append(
-            {
-                "medium": medium.name,
-                "bare_ms": timing.bare_ms,
-                "total_ms": timing.total_ms,
-                "ratio": timing.ratio,
-                "cpu_ratio": timing.total_cpu_ms / timing.bare_cpu_ms,
-                "target": speed.TARGETS[medium.name],
-                "status": timing.status,
-            }
-        )
-    return table
+def _errors(label: str, cases: list[Record]) -> Row:
+    receiver, bound, paper = (Group(cases, way, "receiver") for way in ("receiver", "bound", "paper"))
+    return {
+        "scene": label,
+        "kb/s": cases[0]["about"]["rate_kbps"],
+        "packets": receiver.score.expected,
+        "receiver": receiver.score.ber,
+        "receiver95": MEASURES["ber95"](receiver),
+        "bound": bound.score.ber,
+        "paper": paper.score.ber,
+        "error_free": receiver.score.error_free,
+        "false": receiver.score.false,
+    }
 
 
-def _check_rows(verdict: stability.Verdict) -> list[Row]:
-    start = speed.start_times(3)
-    return [
-        *({"check": row["check"], "result": row["result"]} for row in stability.rows(verdict)),
-        *({"check": name, "result": f"{ms:.0f} ms"} for name, ms in start.items()),
-    ]
+def _times(label: str, cases: list[Record]) -> Row:
+    columns = {"bare_ms": "bare_ms", "total_ms": "total_ms", "ratio": "over_bare_wall", "cpu_ratio": "over_bare"}
+    columns |= {"target": "target", "status": "status"}
+    group = Group(cases, "two threads", "two threads")
+    return {"medium": label, **{name: MEASURES[measure](group) for name, measure in columns.items()}}
+
+
+def _check(records: list[Record]) -> Row:
+    problems = Group(records, "receiver", "receiver").problems
+    return {"check": f"{len(records)} random scenes", "result": "; ".join(dict.fromkeys(problems)) or "ok"}
+
+
+def start_times(repeats: int) -> dict[str, float]:
+    """Milliseconds of bare Python, `import rxcli` and `vlc-rx --help`, medians."""
+    commands = {"bare python": ["-c", "pass"], "import rxcli": ["-c", "import rxcli"]}
+    commands["vlc-rx --help"] = ["-m", "rxcli.cli.main", "--help"]
+    times: dict[str, list[float]] = {name: [] for name in commands}
+    for name, arguments in repeats * list(commands.items()):
+        start = time.perf_counter()
+        root = Path(__file__).resolve().parents[3]
+        subprocess.run([sys.executable, *arguments], cwd=root, capture_output=True, check=True)
+        times[name].append(1e3 * (time.perf_counter() - start))
+    return {name: median(values) for name, values in times.items()}

@@ -1,17 +1,23 @@
-"""Plain tables for people, CSV and JSON for programs."""
+"""Plain tables for people, CSV and JSON for programs, and a plot."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
+import logging
 from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from rxcli.outputs import make_parent, write_whole
 
+log = logging.getLogger(__name__)
+
 Row = dict[str, Any]
+#: Rates of zero stand here on a logarithmic axis.
+_BOTTOM = 1e-6
 
 
 def format_table(rows: Sequence[Row]) -> str:
@@ -92,3 +98,39 @@ def write_text(path: Path, text: str) -> Path:
 def titled(sections: Iterable[tuple[str, Sequence[Row]]]) -> str:
     """Several tables under their titles."""
     return "\n\n".join(f"{title}\n{format_table(rows)}" for title, rows in sections)
+
+
+def plot(rows: Sequence[Row], path: Path, measure: str, interval: str, across: str = "scenes") -> bool:
+    """Draw one measure of a table with its intervals, a line for each way; False where matplotlib is not installed.
+
+    Args:
+        rows: the table.
+        path: of the PNG.
+        measure: a column between 0 and 1; error rates stand on a logarithmic axis.
+        interval: the column of its intervals.
+        across: the column along the other axis.
+    """
+    if find_spec("matplotlib") is None:
+        log.warning("no plots: matplotlib is not installed (pip install '.[plot]')")
+        return False
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(max(6.4, 0.7 * len({row[across] for row in rows})), 4.8), layout="constrained")
+    axes = figure.subplots()
+    names = list(dict.fromkeys(row[across] for row in rows))
+    for way in dict.fromkeys(row.get("way") for row in rows):
+        mine = [row for row in rows if row.get("way") == way and row[measure] is not None]
+        values = [max(row[measure], _BOTTOM) for row in mine]
+        low = [max(value - max(row[interval][0], _BOTTOM), 0.0) for value, row in zip(values, mine, strict=True)]
+        high = [max(row[interval][1] - value, 0.0) for value, row in zip(values, mine, strict=True)]
+        x = [names.index(row[across]) for row in mine]
+        axes.errorbar(x, values, yerr=[low, high], fmt="o-", capsize=2, label=way or measure)
+    axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
+    if measure == "ber":
+        axes.set_yscale("log")
+    axes.set(ylabel=measure, ylim=(_BOTTOM / 2 if measure == "ber" else 0, 1))
+    axes.legend(fontsize=8)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=130, format="png")
+    write_whole(path, buffer.getvalue())
+    return True

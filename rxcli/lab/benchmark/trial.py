@@ -1,31 +1,28 @@
-"""One trial: a simulated frame, the receiver on it, and the score against what was sent."""
+"""One trial: a simulated frame as a receiver gets it, and what the simulator knows of it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 
-from rxcli.ingest import open_source
 from rxcli.lab.simulate.capture import Capture, Take, simulate_frame
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.truth import build_camera_profile
+from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile
-from rxcli.receiver.acquisition import Acquisition, sample_columns
-from rxcli.receiver.cameras import find_camera
-from rxcli.receiver.context import Failure, Timer
-from rxcli.receiver.outline import find_outline
-from rxcli.receiver.pipeline import ReceiverOptions, receive
-from rxcli.receiver.screen_choice import acquire
+from rxcli.receiver.pipeline import receive
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import FloatArray, Frame, FrameResult, Metadata, Mosaic
 
-#: What simulated frames give as their source.
+if TYPE_CHECKING:
+    from rxcli.receiver.acquisition import Acquisition
+
+#: Source of simulated frames.
 SOURCE = "simulated"
 
 
@@ -82,20 +79,10 @@ class Trial:
 
 
 def score_result(result: FrameResult, truth: Truth) -> tuple[FrameResult, Score]:
-    """`result` with wrong bits filled in, and its score.
-
-    A trial's truth speaks of one frame, numbered 0.
-    """
+    """`result` with wrong bits filled in, and its score; a trial's truth holds one frame, numbered 0."""
     scorer = Scorer(truth)
     scored = scorer.add(replace(result, frame=0))
     return scored, scorer.score()
-
-
-def receive_clip(path: Path, options: ReceiverOptions, truth: Truth) -> tuple[list[FrameResult], Score]:
-    """The results of a clip's frames, wrong bits filled in, and their score."""
-    scorer = Scorer(truth)
-    results = [scorer.add(result) for result in receive(open_source(path), options)]
-    return results, scorer.score()
 
 
 def truth_of(take: Take) -> Truth:
@@ -120,13 +107,8 @@ def frame_of(capture: Capture, index: int = 0) -> Frame:
     """A capture as a frame: the luma of its JPEG, or its mosaic."""
     scene = capture.scene
     metadata = Metadata(make=scene.make, model=scene.model, exposure_s=scene.exposure_s, orientation=scene.orientation)
-    return Frame(
-        pixels=capture.pixels,
-        source=SOURCE,
-        index=index,
-        metadata=metadata,
-        mosaic=mosaic_of(scene) if capture.is_mosaic else None,
-    )
+    mosaic = mosaic_of(scene) if capture.is_mosaic else None
+    return Frame(pixels=capture.pixels, source=SOURCE, index=index, metadata=metadata, mosaic=mosaic)
 
 
 def mosaic_of(scene: Scene) -> Mosaic:
@@ -145,6 +127,12 @@ def mosaic_of(scene: Scene) -> Mosaic:
 
 def acquired(trial: Trial, *, quick: bool = True) -> Acquisition | None:
     """Screen and clock of a trial's first frame; None where they are not found. For `quick` see `sample_columns`."""
+    from rxcli.receiver.acquisition import sample_columns
+    from rxcli.receiver.cameras import find_camera
+    from rxcli.receiver.context import Failure, Timer
+    from rxcli.receiver.outline import find_outline
+    from rxcli.receiver.screen_choice import acquire
+
     options, timer = trial.options(), Timer()
     outline = find_outline(trial.frame, options, timer)
     context = outline if isinstance(outline, Failure) else find_camera(trial.frame, outline.corners, options, timer)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.benchmark.trial import SOURCE, Trial, score_result
-from rxcli.profiles import CameraProfile, ScreenProfile
+from rxcli.lab.benchmark.trial import SOURCE, Trial, corners_on_picture
+from rxcli.profiles import ScreenProfile
 from rxcli.protocol import (
     HEADER,
     PREAMBLE_SLOTS,
@@ -20,11 +20,8 @@ from rxcli.protocol import (
     indices_to_bits,
     payload_bits,
 )
-from rxcli.receiver.screen.geometry import lens_for
-from rxcli.receiver.screen.geometry import undistort as undistort_points
-from rxcli.results.truth import Score
 from rxcli.results.undistort import undistorted
-from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, Lens, PacketResult
+from rxcli.types import ColumnResult, FloatArray, FrameResult, Lens, PacketResult
 
 #: A header is taken for one where at least this share of its rows agrees with the template.
 _HEADER_AGREEMENT = 0.9
@@ -37,8 +34,8 @@ _THRESHOLD_SLOTS = 3 * SLOTS_PER_SYMBOL
 _SLOT_MIDDLE = 0.5
 
 
-def bound_score(trial: Trial) -> Score:
-    """Score of the genie, who knows outline, clock, light, picture and all other slots, and decides symbol by symbol.
+def bound_result(trial: Trial) -> FrameResult:
+    """The genie, who knows outline, clock, light, picture and all other slots, and decides symbol by symbol.
 
     Args:
         trial: simulated with its oracle.
@@ -48,42 +45,23 @@ def bound_score(trial: Trial) -> Score:
     columns = []
     for column, w in enumerate(truth.w):
         decisions = [oracle.decide(column, burst.burst) for burst in truth.frames[0].bursts]
-        packets = tuple(_packet(decided, w) for decided, _, observed in decisions if observed.all())
-        columns.append(ColumnResult(column, "ok", w=w, packets=packets))
-    return score_result(_result(columns), truth)[1]
-
-
-def paper_score(trial: Trial) -> Score:
-    """Score of the paper's pipeline, given the outline and the camera."""
-    result = paper_pipeline(trial.frame, trial.corners, trial.camera, trial.capture.scene.screen)
-    return score_result(result, trial.truth)[1]
-
-
-def paper_pipeline(frame: Frame, corners: FloatArray, camera: CameraProfile, screen: ScreenProfile) -> FrameResult:
-    """The paper's receiver, step by step, on pixel values as they are stored.
-
-    Undistort the whole frame, rectify the screen, average every column's pixels, threshold against the local mean, take
-    what lies between two headers one packet apart, and choose the codeword of least Hamming distance.
-
-    Args:
-        frame: the picture.
-        corners: (4, 2) of the screen on the stored picture, top-left first, clockwise for a viewer.
-        camera: profile with a readout mode for the picture's size.
-        screen: what is sent.
-    """
-    waves, rows_per_slot = column_waves(frame, corners, camera, screen)
-    lit = threshold(waves, rows_per_slot)
-    columns = [
-        ColumnResult(column, "ok" if packets else "no_packet", packets=packets)
-        for column, row in enumerate(lit)
-        for packets in [tuple(_between_headers(row, rows_per_slot, screen))]
-    ]
+        columns.append((w, tuple(_packet(decided, w) for decided, _, observed in decisions if observed.all())))
     return _result(columns)
 
 
-def column_waves(
-    frame: Frame, corners: FloatArray, camera: CameraProfile, screen: ScreenProfile
-) -> tuple[FloatArray, float]:
+def paper_result(trial: Trial) -> FrameResult:
+    """The paper's pipeline, given the outline and the camera, on pixel values as they are stored.
+
+    Undistort the whole frame, rectify the screen, average every column's pixels, threshold against the local mean, take
+    what lies between two headers one packet apart, and choose the codeword of least Hamming distance.
+    """
+    waves, rows_per_slot = column_waves(trial)
+    lit = threshold(waves, rows_per_slot)
+    screen = trial.capture.scene.screen
+    return _result([(None, tuple(_between_headers(row, rows_per_slot, screen))) for row in lit])
+
+
+def column_waves(trial: Trial) -> tuple[FloatArray, float]:
     """Mean pixel value of every column on every row of the rectified screen, in readout order.
 
     Returns:
@@ -91,23 +69,22 @@ def column_waves(
     """
     import cv2
 
-    mode = camera.mode_for(frame.width, frame.height)
-    assert mode is not None, "the camera must have a mode for the picture's size"
-    straight = Lens(np.eye(3), np.zeros(5), corrected=True)
-    lens = lens_for(camera.lens, frame.width, frame.height) if camera.lens else straight
-    picture = undistorted(frame, lens)
-    plane = corners if lens.corrected else undistort_points(corners, lens)
+    scene, view, frame = trial.capture.scene, trial.capture.exposure.view, trial.frame
+    corrected = scene.isp.correct_distortion and not scene.is_mosaic
+    picture = undistorted(frame, Lens(view.camera_matrix, np.array(scene.lens.distortion), corrected))
+    # Corners where a lens without distortion would show them.
+    plane = corners_on_picture(view, corrected=True)
     top_left, top_right, bottom_right, bottom_left = plane
-    width = max(round(float(np.linalg.norm(top_right - top_left))), screen.columns)
+    width = max(round(float(np.linalg.norm(top_right - top_left))), scene.screen.columns)
     height = max(round(float(np.linalg.norm(bottom_left - top_left))), 2)
     target = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float32)
     matrix = cv2.getPerspectiveTransform(plane.astype(np.float32), target)
     rectified = cv2.warpPerspective(picture, matrix, (width, height), flags=cv2.INTER_LINEAR)
-    edges = np.linspace(0, width, screen.columns + 1).round().astype(int)
+    edges = np.linspace(0, width, scene.screen.columns + 1).round().astype(int)
     waves = np.stack([rectified[:, a:b].mean(axis=1) for a, b in pairwise(edges)])
-    upside_down = bottom_left[1] < top_left[1]
     sensor_rows = float(abs(bottom_left[1] + bottom_right[1] - top_left[1] - top_right[1])) / 2
-    rows_per_slot = height / max(sensor_rows, 1.0) / (mode.line_delay_s * screen.slot_rate_hz)
+    rows_per_slot = height / max(sensor_rows, 1.0) / (scene.sensor.line_delay_s * scene.screen.slot_rate_hz)
+    upside_down = bottom_left[1] < top_left[1]
     return waves[:, ::-1] if upside_down else waves, rows_per_slot
 
 
@@ -169,16 +146,14 @@ def _nearest_packet(slots: NDArray[np.uint8], payload_symbols: int) -> PacketRes
 
 
 def _packet(index: NDArray[np.int64], w: int) -> PacketResult:
-    bits = indices_to_bits(index, w)
-    return PacketResult(
-        first_row=0.0,
-        copies=1.0,
-        payload_bits=payload_bits(w, index.size),
-        payload=bits_to_hex(bits),
-        confidence=1.0,
-        ber_hat=0.0,
+    payload = bits_to_hex(indices_to_bits(index, w))
+    # A yardstick claims nothing of its decisions.
+    return PacketResult(0.0, 1.0, payload_bits(w, index.size), payload, confidence=0.0, ber_hat=0.0)
+
+
+def _result(columns: Sequence[tuple[int | None, tuple[PacketResult, ...]]]) -> FrameResult:
+    results = (
+        ColumnResult(column, "ok" if packets else "no_packet", w=w, packets=packets, message="none found")
+        for column, (w, packets) in enumerate(columns)
     )
-
-
-def _result(columns: list[ColumnResult]) -> FrameResult:
-    return FrameResult(SOURCE, 0, 0.0, "ok", columns=tuple(columns))
+    return FrameResult(SOURCE, 0, 0.0, "ok", columns=tuple(results))

@@ -1,4 +1,4 @@
-"""The command that mutates files: the same seed makes the same case, and what goes wrong is named by its seed."""
+"""The program that mutates files: the same seed makes the same case, and what goes wrong is named by its seed."""
 
 from __future__ import annotations
 
@@ -6,66 +6,67 @@ import random
 from pathlib import Path
 
 import cv2
+import mutated_files
 import numpy as np
 import pytest
 
 from rxcli.cli.main import run
-from rxcli.lab.benchmark import readers
 
 
 @pytest.fixture(scope="module")
-def cases(tmp_path_factory: pytest.TempPathFactory) -> readers.Cases:
-    return readers.Cases(tmp_path_factory.mktemp("cases"), lambda arguments: int(run(arguments)))
+def cases(tmp_path_factory: pytest.TempPathFactory) -> mutated_files.Cases:
+    return mutated_files.Cases(tmp_path_factory.mktemp("cases"))
 
 
 def test_the_same_seed_makes_the_same_case() -> None:
     data = bytes(range(256)) * 20
-    cases = [readers.mutated(data, random.Random(seed)) for seed in range(50)]
-    assert cases == [readers.mutated(data, random.Random(seed)) for seed in range(50)]
+    cases = [mutated_files.mutated(data, random.Random(seed)) for seed in range(50)]
+    assert cases == [mutated_files.mutated(data, random.Random(seed)) for seed in range(50)]
     assert sum(case != data for case in cases) > 45
 
 
-def test_unharmed_samples_are_received(cases: readers.Cases, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unharmed_samples_are_received(cases: mutated_files.Cases, capsys: pytest.CaptureFixture[str]) -> None:
     """What is mutated must be good at first, or nothing is tried beyond the first check."""
     path = cases.folder / "sample.png"
     path.write_bytes(cases.samples["known/a.png"])
     assert run(["decode", str(path), *cases.pictures["known"].options]) == 0
     assert "6 packets received (6 columns)" in capsys.readouterr().out
     for seed in range(2, 6):
-        cv2.imwrite(str(path), readers.drawn_screen(seed))
+        cv2.imwrite(str(path), mutated_files.drawn_screen(seed))
         assert run(["decode", str(path), *cases.pictures["known"].options]) == 0, seed
     rng = random.Random(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(readers, "_mutated_text", lambda data, _rng: data)
+        patch.setattr(mutated_files, "_mutated_text", lambda data, _rng: data)
         for kind in ("screen", "camera", "truth", "journal", "baseline", "config", "gyroflow"):
             assert run(getattr(cases, f"_{kind}")(rng)) == 0, kind
 
 
-def test_damaged_pngs_can_have_right_checksums(cases: readers.Cases) -> None:
+def test_damaged_pngs_can_have_right_checksums(cases: mutated_files.Cases) -> None:
     data = cases.samples["thumb/a.png"]
-    assert readers.with_checksums(data) == data
+    assert mutated_files.with_checksums(data) == data
     damaged = data[:-20] + b"\x55\x55" + data[-18:]
     assert damaged != data
-    repaired = readers.with_checksums(damaged)
+    repaired = mutated_files.with_checksums(damaged)
     assert repaired not in (data, damaged)
-    assert readers.with_checksums(repaired) == repaired
+    assert mutated_files.with_checksums(repaired) == repaired
 
 
-def test_what_goes_wrong_is_a_problem_with_its_seed(cases: readers.Cases, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(readers, "peak_memory_mb", lambda: 100.0)  # This process has run other tests.
+def test_what_goes_wrong_is_a_problem_with_its_seed(
+    cases: mutated_files.Cases, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mutated_files, "peak_memory_mb", lambda: 100.0)  # This process has run other tests.
     assert cases.run(1)["problems"] == []
-    monkeypatch.setattr(readers, "_call", lambda *_: (1, "vlc-rx: internal error (IndexError: 5)"))
+    monkeypatch.setattr(mutated_files, "_call", lambda *_: (1, "vlc-rx: internal error (IndexError: 5)"))
     record = cases.run(7)
-    verdict = readers.Verdict()
+    verdict = mutated_files.Verdict()
     verdict.add(record)
     [(problem, seeds)] = verdict.problems.items()
     assert "internal error (IndexError: 5)" in problem
     assert seeds == [7]
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["benchmark", "stability", "--readers", "3", "--seed", "2", "--out", str(tmp_path)]
-    assert run(command) == 0
+def test_cases_run_in_a_process_of_their_own(capsys: pytest.CaptureFixture[str]) -> None:
+    assert mutated_files.main(["--count", "3", "--seed", "2"]) == 0
     assert "3 cases with seeds from 2000000 on" in capsys.readouterr().out
 
 
@@ -88,7 +89,7 @@ def test_a_clock_that_runs_away_is_no_clock(
     seed: int,
     name: str,
     options: list[str],
-    cases: readers.Cases,
+    cases: mutated_files.Cases,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -97,7 +98,7 @@ def test_a_clock_that_runs_away_is_no_clock(
     rng.random()  # the kind of the case, and the sample: what was drawn first
     rng.choice(range(17))
     for _ in range(rng.choice((1, 1, 2, 3))):
-        data = rng.choice(readers.MUTATIONS)(data, rng)
+        data = rng.choice(mutated_files.MUTATIONS)(data, rng)
     path = tmp_path / name
     path.write_bytes(data)
     _outcome([str(path), *options], capsys)
@@ -114,7 +115,7 @@ def test_few_rows_are_no_reason_for_an_error(height: int, tmp_path: Path, capsys
 
 
 def test_a_screen_profile_that_tells_nothing_of_its_columns_breaks_nothing(
-    cases: readers.Cases, monkeypatch: pytest.MonkeyPatch
+    cases: mutated_files.Cases, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(readers, "peak_memory_mb", lambda: 100.0)
+    monkeypatch.setattr(mutated_files, "peak_memory_mb", lambda: 100.0)
     assert cases.run(7522000672)["problems"] == []

@@ -1,4 +1,4 @@
-"""Looks over the shoulder of the numeric stages: every value that a public function of theirs returns is checked."""
+"""Watches the numeric stages: every value that a public function of theirs returns is checked."""
 
 from __future__ import annotations
 
@@ -6,45 +6,17 @@ import inspect
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-
+from rxcli.lab.benchmark.cases import problems_in
 from rxcli.receiver import channel, sampling, sync
 from rxcli.receiver.decode import detect
 from rxcli.receiver.screen import geometry
 
 STAGES = (geometry, sampling, sync, channel, detect)
-#: Fields that hold NaN by their contract.
-_NAN_ALLOWED = frozenset({"bit_llr"})
-
-
-def problems_in(value: Any, name: str) -> Iterator[str]:
-    """Places in `value` that hold NaN or positive infinity; -inf is the logarithm of an impossible event."""
-    if is_dataclass(value) and not isinstance(value, type):
-        for part in fields(value):
-            if part.name not in _NAN_ALLOWED:
-                yield from problems_in(getattr(value, part.name), f"{name}.{part.name}")
-    elif isinstance(value, (tuple, list)):
-        for number, part in enumerate(value):
-            yield from problems_in(part, f"{name}[{number}]")
-    elif isinstance(value, dict):
-        for key, part in value.items():
-            yield from problems_in(part, f"{name}[{key!r}]")
-    elif isinstance(value, (float, np.ndarray, np.floating)):
-        yield from _bad_numbers(np.asarray(value), name)
-
-
-def _bad_numbers(array: np.ndarray[Any, Any], name: str) -> Iterator[str]:
-    if array.dtype.kind == "f":
-        if np.isnan(array).any():
-            yield f"{name} holds NaN"
-        if np.isposinf(array).any():
-            yield f"{name} holds infinity"
 
 
 @contextmanager

@@ -1,5 +1,7 @@
 """Mutated files of every kind through the whole program: an answer within limits, and never an internal error.
 
+    python tests/mutated_files.py --seconds 60 --seed 1
+
 Every case is one call of `vlc-rx decode` (or `profiles validate`) on a valid file with something done to it: bytes
 changed, cut, repeated, moved; or on a mutated truth, profile, journal or option. Many cases run in one process, which
 reports a line each; a case that takes too long, or too much memory, ends the process and is named by its seed. The same
@@ -8,6 +10,7 @@ seed makes the same case.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import json
@@ -82,9 +85,6 @@ _GYROFLOW = {
 }
 
 Mutate = Callable[[bytes, random.Random], bytes]
-Program = Callable[[list[str]], int]
-#: The program is handed in by those above it.
-_START = "from rxcli.cli.main import run; from rxcli.lab.benchmark.readers import serve; serve(run)"
 
 
 def _change_bytes(data: bytes, rng: random.Random, most: int = 64) -> bytes:
@@ -276,7 +276,6 @@ class Verdict:
 
     n: int = 0
     codes: Counter[str] = field(default_factory=Counter)
-    kinds: Counter[str] = field(default_factory=Counter)
     #: What went wrong -> seeds.
     problems: dict[str, list[int]] = field(default_factory=dict)
     slowest_s: float = 0.0
@@ -287,7 +286,6 @@ class Verdict:
         """Count one case."""
         self.n += 1
         self.codes[str(record["code"])] += 1
-        self.kinds[record["kind"]] += 1
         self.most_mb = max(self.most_mb, record["mb"])
         if record["s"] > self.slowest_s:
             self.slowest_s, self.slowest_seed = record["s"], record["seed"]
@@ -300,13 +298,11 @@ class Cases:
 
     Args:
         folder: of samples and scratch files.
-        program: takes the arguments of the command line and returns the exit code.
     """
 
-    def __init__(self, folder: Path, program: Program) -> None:
+    def __init__(self, folder: Path) -> None:
         import cv2
 
-        self._program = program
         #: Scratch files of this process.
         self.folder = folder / f"work-{os.getpid()}"
         self._home = self.folder / "home"
@@ -342,7 +338,7 @@ class Cases:
 
     def _outcome(self, seed: int, name: str, arguments: list[str]) -> dict[str, Any]:
         began, cpu = time.monotonic(), time.process_time()
-        code, text = _call(self._program, arguments)
+        code, text = _call(arguments)
         problems = [f"{name}: {line}" for line in text.splitlines() if "internal error" in line or "Traceback" in line]
         cpu_s, mb = time.process_time() - cpu, peak_memory_mb()
         if code not in (0, 1, 2, 3):
@@ -422,7 +418,7 @@ class Cases:
         """What a run over both pictures writes."""
         if self._whole is None:
             out = self.folder / "whole.jsonl"
-            _call(self._program, ["decode", *self._both(), "--json", str(out), "--force"])
+            _call(["decode", *self._both(), "--json", str(out), "--force"])
             self._whole = out.read_bytes()
         return self._whole
 
@@ -454,8 +450,10 @@ def _mutated_text(data: bytes, rng: random.Random) -> bytes:
     return b"".join(words)
 
 
-def _call(program: Program, arguments: list[str]) -> tuple[int, str]:
+def _call(arguments: list[str]) -> tuple[int, str]:
     """Exit code, and all that is said."""
+    from rxcli.cli.main import run as program
+
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = program(arguments)
@@ -479,7 +477,7 @@ def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> Verdic
 
 def _run_process(verdict: Verdict, first: int, stop: int, folder: Path, end: float) -> int:
     """Run cases in a process until it ends or must be ended; returns the seed to go on with."""
-    command = [sys.executable, "-c", _START, str(folder), str(first), str(stop)]
+    command = [sys.executable, __file__, "--serve", str(folder), str(first), str(stop)]
     with tempfile.TemporaryFile() as complaints:
         process = subprocess.Popen(command, env=package_environment(1), stdout=subprocess.PIPE, stderr=complaints)
         following, problem = first, None
@@ -531,27 +529,43 @@ def _pass_on(stdout: Any, lines: Queue[bytes]) -> None:
     lines.put(b"")
 
 
-def rows(verdict: Verdict) -> list[dict[str, Any]]:
-    """The verdict as a table."""
-    table = [{"check": name, "result": f"{n} cases", "seeds": ""} for name, n in sorted(verdict.kinds.items())]
-    for problem, seeds in verdict.problems.items():
-        shown = " ".join(map(str, seeds[:5]))
-        table.append({"check": f"{len(seeds)} cases", "result": problem, "seeds": shown})
-    return table
-
-
-def serve(program: Program) -> None:
-    """Run the cases that the process is called with, a line of JSON each; ends early where the process has grown."""
-    folder, first, stop = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+def serve(folder: Path, first: int, stop: int) -> None:
+    """Run cases, a line of JSON each; end early where the process has grown."""
     resource.setrlimit(resource.RLIMIT_AS, (_ADDRESSES_MB << 20, _ADDRESSES_MB << 20))
     logging.raiseExceptions = False
     # What libraries print past Python is found among the complaints, and never between the answers.
     answers = os.dup(1)
     os.dup2(2, 1)
-    cases, out = Cases(folder, program), os.fdopen(answers, "w")
+    cases, out = Cases(folder), os.fdopen(answers, "w")
     for seed in range(first, stop):
         record = cases.run(seed)
         out.write(json.dumps(record) + "\n")
         out.flush()
         if record["mb"] > MOST_MB:
             sys.exit(_ENOUGH)
+
+
+def main(arguments: list[str]) -> int:
+    """Run cases for some time; 1 where something was found, which is printed with its seeds."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--count", type=int, default=100_000)
+    parser.add_argument("--seconds", type=float)
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args(arguments)
+    first = 1_000_000 * given.seed
+    with tempfile.TemporaryDirectory() as folder:
+        verdict = run(given.count, first, Path(folder), given.seconds)
+    for problem, seeds in verdict.problems.items():
+        print(f"{len(seeds)} cases, such as {seeds[:5]}: {problem}")
+    print(
+        f"{verdict.n} cases with seeds from {first} on; exit codes {dict(sorted(verdict.codes.items()))}; slowest "
+        f"{verdict.slowest_s:.1f} s (seed {verdict.slowest_seed}); at most {verdict.most_mb:.0f} MB"
+    )
+    return 1 if verdict.problems else 0
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--serve"]:
+        serve(Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
+    else:
+        sys.exit(main(sys.argv[1:]))

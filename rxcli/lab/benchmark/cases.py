@@ -1,0 +1,302 @@
+"""A case is a scene or clip as a receiver gets it. The ways to receive one, and the record of a reception."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from time import perf_counter, process_time
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from rxcli.ingest import open_source
+from rxcli.lab.benchmark.bare import bare_decode
+from rxcli.lab.benchmark.trial import Trial
+from rxcli.lab.benchmark.yardsticks import bound_result, paper_result
+from rxcli.options import SKIPS, ReceiverOptions
+from rxcli.profiles import CameraProfile
+from rxcli.receiver.pipeline import receive
+from rxcli.results.truth import Scorer, Truth
+from rxcli.runs.processes import ONE_THREAD, environment, peak_memory_mb
+from rxcli.types import FloatArray, Frame, FrameResult
+
+Record = dict[str, Any]
+#: Receives a case; results in order of time.
+Way = Callable[["Case"], Iterable[FrameResult]]
+
+#: OpenBLAS kernel of the way `OTHER_KERNEL`: runs on every x86-64 processor and is the native one of none sold today.
+KERNEL = "Prescott"
+#: Share of the pixels that a rounding error of one grey level hits in the way "grey levels".
+_GREY_SHARE = 0.01
+#: A screen's columns are shifted where at least so many right packets stand under numbers shifted alike.
+_MIN_SHIFTED = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """One scene or clip as a receiver gets it, with what is known of it."""
+
+    #: Frames in memory, or a file.
+    source: tuple[Frame, ...] | Path
+    options: ReceiverOptions
+    #: Rows of the table that count this case, beside the row of all cases.
+    groups: tuple[str, ...] = ()
+    #: What was drawn, as JSON values.
+    about: Record
+    #: What was sent, where that is known.
+    truth: Truth | None = None
+    #: False for pictures of which nothing may be reported.
+    has_data: bool = True
+    #: (4, 2) true corners of the screen on the stored picture.
+    corners: FloatArray | None = None
+    #: The simulated frame, for the bound and the paper's pipeline.
+    trial: Trial | None = None
+
+    def frames(self) -> Iterable[Frame]:
+        """The frames in order of time."""
+        return open_source(self.source) if isinstance(self.source, Path) else self.source
+
+
+def _with_options(**changes: Any) -> Way:
+    return lambda case: receive(case.frames(), replace(case.options, **changes))
+
+
+def _corners_given(case: Case) -> Iterable[FrameResult]:
+    return receive(case.frames(), replace(case.options, corners=case.corners))
+
+
+def _grey_levels(case: Case) -> Iterable[FrameResult]:
+    return receive(map(with_grey_levels, case.frames()), case.options)
+
+
+def _cropped(case: Case) -> Iterable[FrameResult]:
+    return receive(map(without_first_row, case.frames()), cropped_options(case.options))
+
+
+def _on_two_threads(case: Case) -> Iterator[FrameResult]:
+    with threads(2):
+        yield from receive(case.frames(), case.options)
+
+
+def _bound(case: Case) -> Iterable[FrameResult]:
+    assert case.trial is not None, "only a simulated frame has a bound"
+    return [bound_result(case.trial)]
+
+
+def _paper(case: Case) -> Iterable[FrameResult]:
+    assert case.trial is not None, "the paper's pipeline is given a simulated frame"
+    return [paper_result(case.trial)]
+
+
+RECEIVER, OTHER_KERNEL = "receiver", "another kernel"
+#: Name of a way -> how it receives a case. `OTHER_KERNEL` is `RECEIVER` in another process.
+WAYS: dict[str, Way] = {
+    RECEIVER: _with_options(),
+    "corners given": _corners_given,
+    "frames one by one": _with_options(skip=frozenset(SKIPS) - {"tracking"}),
+    "searched": _with_options(corners=None),
+    "no auto-encoder": _with_options(cae="never"),
+    "auto-encoder always": _with_options(cae="always"),
+    **{f"no skip of {name}": _with_options(skip=frozenset(SKIPS) - {name}) for name in SKIPS},
+    "no skip at all": _with_options(skip=frozenset()),
+    "two threads": _on_two_threads,
+    "grey levels": _grey_levels,
+    "cropped by a row": _cropped,
+    "bound": _bound,
+    "paper": _paper,
+}
+
+
+@contextmanager
+def threads(n: int) -> Iterator[None]:
+    """OpenCV and the matrix library on `n` threads for a while, so that times mean the same on every machine."""
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(n)
+    try:
+        with threadpool_limits(n):
+            yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def received(case: Case, way: str) -> Record:
+    """Receive a case in one of the ways; the record of it, as JSON values.
+
+    An exception is a finding here: it stands in the record like a warning and NaN in a result.
+    """
+    if way == OTHER_KERNEL:
+        # A trial stays here: its simulation is large, and no receiver looks at it.
+        return dict(_other_kernel().submit(received, replace(case, trial=None), RECEIVER).result())
+    scorer = None if case.truth is None else Scorer(case.truth)
+    results: list[FrameResult] = []
+    problems: list[str] = []
+    start, wall = process_time(), perf_counter()
+    with threads(1), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            results.extend(result if scorer is None else scorer.add(result) for result in WAYS[way](case))
+        except Exception as error:
+            problems.append(f"{type(error).__name__}: {error}")
+    cpu_s, wall_s = process_time() - start, perf_counter() - wall
+    problems += [f"{w.category.__name__}: {w.message} ({Path(w.filename).name}:{w.lineno})" for w in caught]
+    problems += [problem for result in results for problem in nonsense(result)]
+    return {
+        "cpu_s": cpu_s,
+        "wall_s": wall_s,
+        "stages_ms": dict(sum((Counter(result.timing_ms) for result in results), Counter[str]())),
+        "mb": peak_memory_mb(),
+        "problems": list(dict.fromkeys(problems)),
+        "score": None if scorer is None else asdict(scorer.score()),
+        "packets": [packet for result in results for packet in _packets(result, case)],
+        **(_found(results[0], case) if results else {"status": "exception"}),
+    }
+
+
+@lru_cache(maxsize=1)
+def _other_kernel() -> ProcessPoolExecutor:
+    """A process whose matrix library uses `KERNEL`: the library chooses once, when it is loaded."""
+    pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+    with environment({**ONE_THREAD, "OPENBLAS_CORETYPE": KERNEL}):
+        pool.submit(int).result()
+    return pool
+
+
+def bare(case: Case) -> Record:
+    """Frames of a case's file, and seconds that its bare decode takes; nothing for frames in memory."""
+    if not isinstance(case.source, Path):
+        return {}
+    decode = bare_decode(case.source)
+    with threads(1):
+        start, wall = process_time(), perf_counter()
+        n_frames = decode()
+    return {"bare_cpu_s": process_time() - start, "bare_wall_s": perf_counter() - wall, "n_frames": n_frames}
+
+
+def _packets(result: FrameResult, case: Case) -> Iterator[Record]:
+    """What one scored frame reported of every packet; where no truth is known none is wrong."""
+    truth = case.truth
+    for column in result.columns:
+        for packet in column.packets:
+            false = packet.payload_bits if truth is not None or not case.has_data else 0
+            yield {
+                "frame": result.frame,
+                "column": column.column,
+                "payload": packet.payload,
+                "confidence": packet.confidence,
+                "bit_errors": false if packet.bit_errors is None else packet.bit_errors,
+                "payload_bits": packet.payload_bits,
+                "w": column.w,
+                "tx_w": truth.w[column.column] if truth is not None and column.column < truth.columns else None,
+                "snr_db": column.snr_db,
+                "denoised": column.denoised,
+                "evidence": packet.confidence_features,
+            }
+
+
+def _found(result: FrameResult, case: Case) -> Record:
+    """What the first frame tells of the screen and the camera."""
+    has_corners = result.corners is not None and case.corners is not None
+    return {
+        "status": result.status,
+        "message": result.message,
+        "screen": result.screen_profile,
+        "rows_per_slot": result.estimated.get("rows_per_slot"),
+        "corner_error": corner_error(result.corners, case.corners) if has_corners else None,  # type: ignore[arg-type]
+        "shift": column_shift(result, case.truth) if case.truth is not None else 0,
+        "numbered": result.column_offset is not None,
+    }
+
+
+def corner_error(found: FloatArray, truth: FloatArray) -> float:
+    """Largest distance of a corner in screen widths, whichever comes first in their order."""
+    distances = [np.linalg.norm(np.roll(found, turn, axis=0) - truth, axis=1).max() for turn in range(4)]
+    return float(min(distances) / np.linalg.norm(truth[1] - truth[0]))
+
+
+def column_shift(result: FrameResult, truth: Truth) -> int:
+    """Number of columns by which right packets stand under a wrong number; 0 where they stand under their own."""
+    sent = {(p, column) for burst in truth.payload.values() for column, p in enumerate(burst) if len(p) > 2}
+    reported = ((column.column, packet.payload) for column in result.columns for packet in column.packets)
+    votes = Counter(column - own for column, payload in reported for this, own in sent if this == payload)
+    best = max(votes, key=votes.__getitem__, default=0)
+    return best if votes[best] >= _MIN_SHIFTED and votes[best] > votes[0] else 0
+
+
+# The same picture with a change that no receiver should notice.
+
+
+def with_grey_levels(frame: Frame) -> Frame:
+    """The frame with one grey level more or less on 1 % of its pixels; the same frame changes alike every time."""
+    rng = np.random.default_rng(frame.index)
+    dtype = frame.pixels.dtype
+    step = rng.choice(np.array([-1, 0, 1]), frame.pixels.shape, p=[_GREY_SHARE / 2, 1 - _GREY_SHARE, _GREY_SHARE / 2])
+    changed: Any = np.clip(frame.pixels.astype(np.int64) + step, 0, np.iinfo(dtype).max).astype(dtype)
+    return replace(frame, pixels=changed)
+
+
+def without_first_row(frame: Frame) -> Frame:
+    """The frame without its first row."""
+    mosaic = frame.mosaic
+    if mosaic is not None:
+        mosaic = replace(mosaic, pattern=np.roll(mosaic.pattern, -1, axis=0))
+    pixels: Any = np.ascontiguousarray(frame.pixels[1:])
+    return replace(frame, pixels=pixels, mosaic=mosaic)
+
+
+def cropped_options(options: ReceiverOptions) -> ReceiverOptions:
+    """What is known of a picture, said of it without its first row: corners, and sizes of a camera that is named."""
+    cameras = tuple(map(_cropped_camera, options.cameras)) if options.force_camera else options.cameras
+    corners = None if options.corners is None else options.corners - np.array([0.0, 1.0])
+    return replace(options, cameras=cameras, corners=corners)
+
+
+def _cropped_camera(camera: CameraProfile) -> CameraProfile:
+    modes = tuple(msgspec.structs.replace(mode, height=mode.height - 1) for mode in camera.modes)
+    lens = camera.lens
+    if lens is not None:
+        x, (skew, fy, cy), last = lens.camera_matrix
+        lens = msgspec.structs.replace(lens, height=lens.height - 1, camera_matrix=(x, (skew, fy, cy - 1), last))
+    return msgspec.structs.replace(camera, modes=modes, lens=lens)
+
+
+def nonsense(result: FrameResult) -> Iterator[str]:
+    """What a result must never hold."""
+    yield from problems_in(replace(result, timing_ms={}), "result")
+    for column in result.columns:
+        for packet in column.packets:
+            if not (0 <= packet.confidence <= 1 and 0 <= packet.ber_hat <= 1):
+                yield f"confidence {packet.confidence}, ber_hat {packet.ber_hat} out of 0..1"
+            if len(packet.payload) != 2 * -(-packet.payload_bits // 8):
+                yield f"payload of {len(packet.payload)} hex digits for {packet.payload_bits} bits"
+        if not column.packets and not column.message:
+            yield f"column {column.column} has neither packet nor message"
+    if not result.columns and not result.message:
+        yield "neither columns nor message"
+
+
+def problems_in(value: Any, name: str) -> Iterator[str]:
+    """Places in `value` that hold NaN or positive infinity; -inf is the logarithm of an impossible event."""
+    if is_dataclass(value) and not isinstance(value, type):
+        # Soft bits hold NaN by their contract.
+        for part in (part.name for part in fields(value) if part.name != "bit_llr"):
+            yield from problems_in(getattr(value, part), f"{name}.{part}")
+    elif isinstance(value, (tuple, list, dict)):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, part in items:
+            yield from problems_in(part, f"{name}[{key!r}]")
+    elif isinstance(value, (float, np.ndarray, np.floating)) and np.asarray(value).dtype.kind == "f":
+        if np.isnan(value).any():
+            yield f"{name} holds NaN"
+        if np.isposinf(value).any():
+            yield f"{name} holds infinity"

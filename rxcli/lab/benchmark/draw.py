@@ -1,0 +1,577 @@
+"""What the benchmark draws: for a seed and a number, the same case every time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from math import sqrt
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from rxcli.lab.benchmark.cases import Case
+from rxcli.lab.benchmark.media import Medium, camera_path
+from rxcli.lab.benchmark.trial import SOURCE, Trial, simulate_trial, truth_of
+from rxcli.lab.simulate.capture import Take, prepare
+from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
+from rxcli.lab.simulate.isp import Isp
+from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, draw_no_data
+from rxcli.lab.simulate.optics import Lens, Pose, View
+from rxcli.lab.simulate.pictures import PHOTOS, draw_name
+from rxcli.lab.simulate.scenes import Scene, preset, random_scene
+from rxcli.lab.simulate.sensor import Sensor
+from rxcli.lab.simulate.truth import build_camera_profile
+from rxcli.lab.simulate.video import write_video
+from rxcli.options import ReceiverOptions, receiver_options
+from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, load_profile, shipped_profiles
+from rxcli.protocol import packet_slots, payload_bits
+from rxcli.results.truth import find_truth, load_truth
+from rxcli.types import FloatArray, Frame
+
+#: Scenes that are drawn from one number have this many times the run's seed, and on.
+SEEDS_A_RUN = 1_000_000
+_SCREENS = ("paper-8k65", "paper-17k3", "paper-34k6")
+#: Shortest exposure of the cameras, seconds.
+_MIN_EXPOSURE_S = 1 / 32000
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a case stands in a run: it is drawn from this alone."""
+
+    seed: int
+    number: int
+    #: Of a scenario's points, this one's values.
+    point: Mapping[str, Any]
+    #: Where files that are made once are kept.
+    folder: Path
+    #: Whether to record what the bound needs.
+    oracle: bool = False
+
+    @property
+    def flat(self) -> int:
+        """Seed and number in one."""
+        return SEEDS_A_RUN * self.seed + self.number
+
+
+def _case(trial: Trial, options: ReceiverOptions, *groups: str, **about: Any) -> Case:
+    """A simulated photograph, with the facts of its scene."""
+    scene = trial.capture.scene
+    facts = {
+        "screen": scene.screen.name,
+        "camera": scene.camera_name,
+        "picture": scene.picture if isinstance(scene.picture, str) else "drawn",
+        "rows_per_slot": scene.rows_per_slot,
+        "exposure_slots": scene.exposure_s * scene.screen.slot_rate_hz,
+    }
+    return Case(
+        source=(trial.frame,),
+        options=options,
+        groups=groups,
+        about={**facts, **about},
+        truth=trial.truth,
+        corners=trial.corners,
+        trial=trial,
+    )
+
+
+# Phones that nobody has measured.
+
+_PHONE_HEIGHTS_PX, _PHONE_EXPOSURE_SLOTS = (720, 1080, 1440, 1800), (0.4, 0.7, 1.0, 1.5, 2.0)
+_PHONE_ROWS_PER_SLOT, _PHONE_READOUT_S, _PHONE_FILL = (1.5, 20.0), (5e-3, 45e-3), (0.75, 0.95)
+#: Packets that the screen's height holds, with some room for tilt over the 1.3 that are asked for.
+_PHONE_PACKETS = 1.35
+_FOCAL_WIDTHS, _K1, _K2_SHARE = (0.65, 1.2), 0.15, 1.2
+#: Noise of a phone's simulation starts from this and the phone's number.
+FIRST_SEED = 1000
+
+
+def draw_phone(at: Place) -> Iterator[Case]:
+    """A phone before a screen; the receiver gets the picture and the corners, and nothing else."""
+    scene, turned = phone_of(at.seed, at.number)
+    trial = simulate_trial(scene, FIRST_SEED + at.number, oracle=at.oracle)
+    frame, corners = as_stored(trial, turned)
+    corrected, slots = scene.isp.correct_distortion, scene.exposure_s * scene.screen.slot_rate_hz
+    kinds = {
+        "uncorrected": not corrected,
+        "corrected": corrected,
+        "below 3 rows a slot": scene.rows_per_slot < 3,
+        "exposed above 1.4 slots": slots > 1.4,
+        "star field": scene.picture == "hubble",
+    }
+    case = _case(trial, ReceiverOptions(cameras=(), corners=corners), *(name for name, is_so in kinds.items() if is_so))
+    about = {**case.about, "turned": turned, "k1": scene.lens.distortion[0] / scene.lens.focal_widths**2}
+    yield replace(case, source=(frame,), about=about, corners=corners)
+
+
+def phone_of(seed: int, number: int) -> tuple[Scene, bool]:
+    """A random phone before a screen, and whether its picture was turned upside down by software."""
+    rng = np.random.default_rng([seed, number])
+    screen, sensor, fill = _readout_of(rng)
+    focal, k1 = rng.uniform(*_FOCAL_WIDTHS), rng.uniform(-_K1, _K1)
+    k2 = -k1 * rng.uniform(0, _K2_SHARE)
+    corrected, turned = bool(rng.random() < 0.5), bool(rng.random() < 0.3)
+    base = preset("phone-plain", screen)
+    exposure_slots = float(rng.choice(_PHONE_EXPOSURE_SLOTS)) * rng.uniform(0.85, 1.15)
+    lens = Lens(focal, (k1, k2, rng.normal(0, 4e-4), rng.normal(0, 4e-4), 0.0))
+    tilt = rng.normal(0, (1.2, 4, 3))
+    roll, yaw, pitch = float(tilt[0]) + 180 * turned, float(tilt[1]), float(tilt[2])
+    shift_x, shift_y = (float(shift) for shift in rng.normal(0, 0.01, 2))
+    tone: Any = str(rng.choice(["srgb", "bt709"]))
+    sharpen, denoise_px = rng.uniform(0, 0.8), rng.uniform(0, 0.6)
+    scene = replace(
+        base,
+        sensor=sensor,
+        lens=lens,
+        pose=Pose(fill, roll, yaw, pitch, shift_x, shift_y),
+        isp=Isp(tone, 2.0, sharpen, denoise_px=denoise_px, correct_distortion=corrected, quality=90),
+        picture=str(rng.choice(list(PHOTOS))),
+        w="dimming" if rng.random() < 0.3 else int(rng.integers(3, 9)),
+        exposure_s=exposure_slots / screen.slot_rate_hz,
+        light_e_per_s=1.4e6 / 24000 / (exposure_slots / screen.slot_rate_hz) * 10 ** rng.uniform(-0.3, 0.2),
+        orientation=1,
+        slot_rate_error_ppm=0.0,
+        blur_px=rng.uniform(0.5, 1.2),
+    )
+    return scene, turned
+
+
+def _readout_of(rng: np.random.Generator) -> tuple[ScreenProfile, Sensor, float]:
+    """A screen, a sensor that reads out as fast as a phone's and sees enough packets, and how much the screen fills."""
+    screens = {screen.name: screen for screen in shipped_profiles(ScreenProfile)}
+    while True:
+        screen = screens[str(rng.choice(list(_SCREENS)))]
+        rows_per_slot = float(np.exp(rng.uniform(*np.log(_PHONE_ROWS_PER_SLOT))))
+        fill = rng.uniform(*_PHONE_FILL)
+        height = int(rng.choice(_PHONE_HEIGHTS_PX))
+        line_delay_s = 1 / (rows_per_slot * screen.slot_rate_hz)
+        rows = height * fill * (4 / 3) / screen.aspect
+        enough = rows / rows_per_slot / screen.packet_slots >= _PHONE_PACKETS
+        if enough and _PHONE_READOUT_S[0] <= line_delay_s * height <= _PHONE_READOUT_S[1]:
+            break
+    levels: dict[str, Any] = {"read_noise_e": 2.0, "full_scale_e": 260.0, "black_level": 64, "white_level": 1023}
+    return screen, Sensor(height * 4 // 3, height, line_delay_s, "bayer", **levels), fill
+
+
+def as_stored(trial: Trial, turned: bool) -> tuple[Frame, FloatArray]:
+    """The picture without any metadata, as software may have turned it, and the screen's corners on it."""
+    pixels, corners = np.asarray(trial.capture.pixels, np.uint8), trial.corners
+    if turned:
+        height, width = pixels.shape
+        pixels, corners = np.ascontiguousarray(pixels[::-1, ::-1]), np.array([width - 1, height - 1]) - corners
+    return Frame(pixels, SOURCE), corners
+
+
+# Screens anywhere in the picture.
+
+#: Share of screens with a hundred columns, and packets that a screen's height holds at least.
+_NARROW_SHARE, _SCREEN_PACKETS = 0.12, 1.25
+
+
+def draw_screen(at: Place) -> Iterator[Case]:
+    """A dark or ordinary picture on a screen anywhere in the frame; cameras are those that a user has."""
+    scene, kind = screen_of(at.seed, at.number)
+    dark = () if kind == "photo" else ("dark",)
+    yield _case(simulate_trial(scene, at.number, oracle=at.oracle), ReceiverOptions(), kind, *dark, kind=kind)
+
+
+def screen_of(seed: int, number: int) -> tuple[Scene, str]:
+    """A screen anywhere in a picture, and what kind of picture it shows."""
+    rng = np.random.default_rng([seed, number, 17])
+    screens = ("wide-100",) if rng.random() < _NARROW_SHARE else _SCREENS
+    while True:
+        base = preset(str(rng.choice(["xs10-still", "phone-corrected", "phone-plain"])), str(rng.choice(screens)))
+        share = rng.uniform(0.6, 0.97)
+        rows = share * base.sensor.height / base.rows_per_slot
+        if rows >= _SCREEN_PACKETS * base.screen.packet_slots:
+            break
+    kind = str(rng.choice(DARK_KINDS)) if rng.random() < 0.5 else "photo"
+    size = base.screen.width_px, base.screen.height_px
+    picture = str(rng.choice(list(PHOTOS))) if kind == "photo" else draw_dark_picture(kind, rng, *size)
+    slots = float(rng.choice([0.5, 1.0])) * rng.uniform(0.8, 1.2)
+    exposure_s = max(slots / base.screen.slot_rate_hz, _MIN_EXPOSURE_S)
+    scene = replace(
+        base,
+        picture=picture,
+        w="dimming" if rng.random() < 0.4 else int(rng.integers(2, 9)),
+        exposure_s=exposure_s,
+        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(-0.3, 0.3),
+        room=replace(base.room, light_e_per_s=base.light_e_per_s * 10 ** rng.uniform(-3, -1.3)),
+        blur_px=rng.uniform(0.5, 1.5),
+        slot_rate_error_ppm=rng.uniform(-50, 50),
+        orientation=1,
+        n_frames=1,
+        output="developed",
+    )
+    angles = (rng.normal(0, 1.5), rng.normal(0, 4), rng.normal(0, 4))
+    return placed(scene, share, angles, rng.uniform(-0.9, 0.9, 2)), kind
+
+
+def placed(scene: Scene, share: float, angles: tuple[float, float, float], place: FloatArray) -> Scene:
+    """The scene with a screen of a share of the picture, at `place` (-1..1) of the room that is left."""
+    sensor = scene.sensor
+    size = np.array([sensor.width, sensor.height])
+    roll, yaw, pitch = angles
+    pose = replace(scene.pose, fill=0.9, roll_deg=roll, yaw_deg=yaw, pitch_deg=pitch, shift_x=0.0, shift_y=0.0)
+    for _ in range(12):
+        view = View(scene.screen, scene.lens, pose, sensor.width, sensor.height, sensor.pixel_aspect)
+        low, high = view.corners.min(axis=0), view.corners.max(axis=0)
+        goal = size / 2 + place * np.maximum(size - (high - low), 0) / 2
+        x, y = 0.9 * (goal - (low + high) / 2) / size
+        fill = pose.fill * min(share * size[1] / (high - low)[1], 0.985 * size[0] / (high - low)[0])
+        pose = replace(pose, fill=float(fill), shift_x=pose.shift_x + float(x), shift_y=pose.shift_y + float(y))
+    return replace(scene, pose=pose)
+
+
+# Small scenes from clean to hopeless, for thousands of packets.
+
+#: Sensor widths of the confidence scenes, pixels; share of frames with few rows a slot, how many, and widths of those.
+_WIDTH_PX, _FEW_ROWS_SHARE, _FEW_ROWS, _FEW_ROWS_WIDTH_PX = (100.0, 320.0), 0.4, (1.5, 5.0), (100.0, 900.0)
+#: Share of the frames with a hundred columns, in whole pictures, as their screen is searched.
+_SEARCHED_SHARE, _SEARCHED_SCREEN = 0.05, "wide-100"
+#: Powers of ten of the light against that of the preset: most about where packets begin to fail.
+_LIGHT, _SEARCHED_LIGHT = (-1.4, 0.1), (-0.5, 0.4)
+#: Size of the panel of small scenes: drawing the picture would otherwise take longer than the reception.
+_PANEL_PX = (342, 192)
+
+
+def draw_confidence(at: Place) -> Iterator[Case]:
+    """A small, quick scene of random quality: from clean to hopeless."""
+    trial = simulate_trial(confidence_scene(at.flat), at.flat, oracle=at.oracle)
+    # How well narrow columns are found is part of how well their packets are received.
+    searched = trial.capture.scene.screen.name == _SEARCHED_SCREEN
+    yield _case(trial, trial.options(known_outline=not searched))
+
+
+def confidence_scene(seed: int) -> Scene:
+    """The scene of `draw_confidence`."""
+    rng = np.random.default_rng([seed, 5])
+    searched = np.random.default_rng([seed, 6]).random() < _SEARCHED_SHARE
+    base, light = (preset("xs10-still", _SEARCHED_SCREEN), _SEARCHED_LIGHT) if searched else (_small(rng), _LIGHT)
+    exposure_slots = rng.choice([0.5, 1.0, 1.5, 2.0]) * rng.uniform(0.8, 1.2)
+    exposure_s = max(float(exposure_slots) / base.screen.slot_rate_hz, _MIN_EXPOSURE_S)
+    return replace(
+        base,
+        picture=draw_name(rng),
+        w="dimming" if rng.random() < 0.3 else int(rng.integers(2, 9)),
+        pose=replace(base.pose, fill=rng.uniform(0.8, 0.97), roll_deg=rng.normal(0, 1.0), yaw_deg=rng.normal(0, 4)),
+        exposure_s=exposure_s,
+        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(*light),
+        blur_px=rng.uniform(0.4, 2.5),
+        slot_rate_error_ppm=rng.uniform(-100, 100),
+        column_delay_slots=float(rng.choice([0.0, rng.uniform(0, 2)])),
+        isp=replace(base.isp, sharpen=rng.uniform(0, 0.8), denoise_px=rng.uniform(0, 0.6)),
+        n_frames=1,
+        output="raw" if base.sensor.pattern is not None and rng.random() < 0.3 else "developed",
+    )
+
+
+def _small(rng: np.random.Generator) -> Scene:
+    """A screen of twenty columns, each a few pixels wide, before any camera."""
+    base = preset(str(rng.choice(["video-1080p", "phone-plain", "xs10-still"])), str(rng.choice(_SCREENS)))
+    few_rows = rng.random() < _FEW_ROWS_SHARE
+    rows = np.exp(rng.uniform(*np.log(_FEW_ROWS))) / base.rows_per_slot if few_rows else 1.0
+    width_px = rng.uniform(*(_FEW_ROWS_WIDTH_PX if few_rows else _WIDTH_PX))
+    return base.scaled(width_px / base.sensor.width, float(min(rows, 1.0)), keep_readout=True)
+
+
+def draw_small(at: Place) -> Iterator[Case]:
+    """Any scene on few pixels: a tenth of a second's work that meets every branch of the receiver."""
+    rng = np.random.default_rng([at.flat, 10])
+    trial = simulate_trial(small_scene(at.flat), at.flat, oracle=at.oracle)
+    screens = tuple(load_profile(name, ScreenProfile) for name in _SCREENS) if rng.random() < 0.2 else ()
+    options = trial.options(known_outline=bool(rng.random() < 0.7))
+    yield _case(trial, replace(options, screens=(*options.screens, *screens)))
+
+
+def small_scene(seed: int) -> Scene:
+    """The scene of `draw_small`, with more electrons: few pixels have to do with what many would gather."""
+    rng = np.random.default_rng([seed, 9])
+    scene = random_scene(rng)
+    width, rows = rng.integers(48, 400), rng.uniform(1.5, 6.0)
+    scene, factor = small(scene, float(width), rows), 10 ** rng.uniform(-0.5, 1.5)
+    return replace(
+        scene,
+        light_e_per_s=scene.light_e_per_s * factor,
+        room=replace(scene.room, light_e_per_s=scene.room.light_e_per_s * factor),
+        sensor=replace(scene.sensor, full_scale_e=scene.sensor.full_scale_e * factor),
+    )
+
+
+def small(scene: Scene, width: float, rows_per_slot: float, **changes: Any) -> Scene:
+    """A scene of the same time span on few pixels, and a coarse panel."""
+    screen = msgspec.structs.replace(scene.screen, width_px=_PANEL_PX[0], height_px=_PANEL_PX[1])
+    scene = replace(scene, screen=screen, n_frames=1, **changes)
+    shrink = min(rows_per_slot / scene.rows_per_slot, 1.0)
+    return scene.scaled(width / scene.sensor.width, shrink, keep_readout=True)
+
+
+# Clips.
+
+#: Average pixels from frame to frame of the clips from a hand, and their frames.
+SPEEDS_PX, _HAND_FRAMES = (0.0, 2.0, 4.0, 8.0), 12
+#: Bits per pixel and frame: a phone's or a camera's; and from a starved encoder's on.
+_BITS_PER_PIXEL, _ANY_BITS_PER_PIXEL = (0.12, 0.5), (0.09, 0.4)
+#: Camera, screen, how often, and most frames of the clips in every encoding. The fastest link has too few rows per slot
+#: in 1080p.
+_CLIP_KINDS = (
+    ("video-1080p", "paper-8k65", 0.42, 9),
+    ("video-1080p", "paper-17k3", 0.42, 9),
+    ("video-4k", "paper-17k3", 0.08, 5),
+    ("video-4k", "paper-34k6", 0.08, 5),
+)
+_CODECS, _ENCODER_PRESETS = ("h264", "h264", "hevc"), ("ultrafast", "veryfast", "veryfast", "medium")
+#: Times that a scene is compressed; shares of clips from a hand and of cameras not named; pixels that a hand moves.
+_ENCODINGS, _MOVING, _UNNAMED, _HAND_PX = 3, 0.35, 0.3, (0.5, 6.0)
+#: Codec, preset and bits per second.
+Encoding = tuple[str, str, int]
+
+
+def draw_motion(at: Place) -> Iterator[Case]:
+    """One scene filmed at every speed, screen and camera named."""
+    rng = np.random.default_rng([at.flat, 5])
+    base = preset("video-1080p", str(rng.choice(_SCREENS[:2])))
+    scene = replace(_filmed_scene(rng, base), shake_px=0.0, n_frames=_HAND_FRAMES)
+    encoding = "h264", "veryfast", _bit_rate(np.random.default_rng([at.flat, 6]), scene, _BITS_PER_PIXEL)
+    for speed in SPEEDS_PX:
+        take = prepare(replace(scene, hand_px=speed), at.flat)
+        with filmed(take, [encoding]) as (path,):
+            yield _clip(take, path, True, f"{speed:g} pixels a frame")
+
+
+def draw_clips(at: Place) -> Iterator[Case]:
+    """A scene filmed once and compressed several times; half of the pictures dark, some clips from a hand."""
+    rng = np.random.default_rng([at.flat, 17])
+    name, screen, _, frames = _CLIP_KINDS[rng.choice(len(_CLIP_KINDS), p=[kind[2] for kind in _CLIP_KINDS])]
+    scene = _filmed_scene(rng, preset(name, screen))
+    size = scene.screen.width_px, scene.screen.height_px
+    dark = bool(rng.random() < 0.5)
+    scene = replace(
+        scene,
+        picture=draw_dark_picture(str(rng.choice(DARK_KINDS)), rng, *size) if dark else scene.picture,
+        shake_px=0.0,
+        hand_px=rng.uniform(*_HAND_PX) if rng.random() < _MOVING else 0.0,
+        n_frames=int(rng.integers(3, frames, endpoint=True)),
+    )
+    camera_named = bool(rng.random() >= _UNNAMED)
+    groups = (
+        name,
+        "dark pictures" if dark else "photographs",
+        "from a hand" if scene.hand_px else "from a tripod",
+        "camera named" if camera_named else "camera unknown",
+    )
+    encodings = [
+        (str(rng.choice(_CODECS)), str(rng.choice(_ENCODER_PRESETS)), _bit_rate(rng, scene, _ANY_BITS_PER_PIXEL))
+        for _ in range(_ENCODINGS)
+    ]
+    take = prepare(scene, at.flat)
+    with filmed(take, encodings) as paths:
+        for path, (codec, _, _) in zip(paths, encodings, strict=True):
+            yield _clip(take, path, camera_named, *groups, codec)
+
+
+def _filmed_scene(rng: np.random.Generator, base: Scene) -> Scene:
+    """A random picture and pose before a camera for clips."""
+    exposure_s = float(rng.choice([0.5, 1.0]) * rng.uniform(0.85, 1.15)) / base.screen.slot_rate_hz
+    pose = replace(
+        base.pose,
+        fill=rng.uniform(0.75, 0.88),
+        roll_deg=rng.normal(0, 1.2),
+        yaw_deg=rng.normal(0, 3),
+        pitch_deg=rng.normal(0, 2),
+    )
+    return replace(
+        base,
+        picture=draw_name(rng),
+        w=5 if rng.random() < 0.6 else int(rng.integers(3, 8)),
+        pose=pose,
+        exposure_s=exposure_s,
+        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(-0.5, 0.2),
+    )
+
+
+def _bit_rate(rng: np.random.Generator, scene: Scene, bits_per_pixel: tuple[float, float]) -> int:
+    bits = np.exp(rng.uniform(*np.log(bits_per_pixel)))
+    return int(bits * scene.sensor.width * scene.sensor.height * scene.frame_rate_hz)
+
+
+@contextmanager
+def filmed(take: Take, encodings: Iterable[Encoding]) -> Iterator[list[Path]]:
+    """The clips of a take in every encoding, as files in a folder that goes away afterwards."""
+    pictures = [take.frame(n, threads=1).rgb for n in range(take.scene.n_frames)]
+    with TemporaryDirectory() as folder:
+        paths = []
+        for number, (codec, speed, bit_rate) in enumerate(encodings):
+            paths.append(Path(folder) / f"{number}.mp4")
+            write_video(pictures, paths[-1], codec, take.scene.frame_rate_hz, bit_rate, speed)
+        yield paths
+
+
+def _clip(take: Take, path: Path, camera_named: bool, *groups: str) -> Case:
+    scene, exposure = take.scene, take.exposure()
+    cameras = (build_camera_profile(scene, exposure),) if camera_named else ()
+    return Case(
+        source=path,
+        options=ReceiverOptions(screens=(scene.screen,), cameras=cameras, force_camera=camera_named),
+        groups=groups,
+        about={"screen": scene.screen.name, "camera": scene.camera_name, "hand_px": scene.hand_px},
+        truth=truth_of(take),
+        corners=exposure.corners,
+    )
+
+
+# Pictures without data.
+
+#: Seconds that a named camera takes to read a picture out, and rows that it exposes, whatever the picture shows.
+_READOUT_S, _EXPOSURE_ROWS = (10e-3, 40e-3), (0.5, 12.0)
+
+
+def draw_nodata(at: Place) -> Iterator[Case]:
+    """Frames without data, every other one striped; point: `n_frames`, `camera_named`."""
+    rng = np.random.default_rng([at.seed, at.number, 23])
+    drawn = draw_no_data(draw_kind(rng, at.number % 2 == 0), rng, at.point.get("n_frames", 1))
+    height, width = drawn.frames[0].shape
+    line_delay_s = float(np.exp(rng.uniform(*np.log(_READOUT_S)))) / height
+    step_s = drawn.frame_rows * line_delay_s
+    frames = tuple(Frame(pixels, SOURCE, index, index * step_s) for index, pixels in enumerate(drawn.frames))
+    options = ReceiverOptions(cameras=())
+    if at.point.get("camera_named"):
+        exposure_s = line_delay_s * float(rng.uniform(*_EXPOSURE_ROWS))
+        mode = ReadoutMode(name="whole", width=width, height=height, line_delay_s=line_delay_s, exposure_s=exposure_s)
+        profile = CameraProfile(format=1, kind="camera", name="named", modes=(mode,))
+        options = ReceiverOptions(cameras=(profile,), force_camera=True)
+    groups = (drawn.kind, *(("striped",) if drawn.kind in STRIPED_KINDS else ()))
+    about = {"kind": drawn.kind, **drawn.about}
+    yield Case(source=frames, options=options, groups=groups, about=about, has_data=False)
+
+
+# Sweeps: one thing varies. Sensors are narrowed by binning: the rows, and with them all that concerns time, stay whole;
+# the width shrinks, and every pixel gathers the light of those it stands for. So error rates are near those of the
+# whole sensor, and a sweep takes minutes.
+
+#: Width of the binned sensors, pixels for each column of the screen.
+_PX_PER_COLUMN = 45.0
+_FRAMES_A_SECOND = 60.0
+#: Megapixels of the X-S10's sensor.
+_XS10_MP = 26.0
+
+
+@dataclass(frozen=True)
+class Point:
+    """One place of a sweep; None leaves the preset's."""
+
+    camera: str = "xs10-still"
+    columns: int = 20
+    slot_rate_hz: float = 34600.0
+    payload_symbols: int = 24
+    repeats: int = 3
+    picture: str = "coffee"
+    #: Light against the preset's.
+    light: float = 1.0
+    exposure_slots: float | None = None
+    #: Fields of the pose.
+    pose: Mapping[str, Any] = field(default_factory=dict)
+    #: False for the sensor as it is.
+    binned: bool = True
+    #: Megapixels of a whole picture, which shows the same time at any size.
+    megapixels: float | None = None
+
+    @property
+    def rate_kbps(self) -> float:
+        """Data rate as the paper counts it: one payload (w = 5) per column in each of 60 frames a second."""
+        return self.columns * payload_bits(5, self.payload_symbols) * _FRAMES_A_SECOND / 1e3
+
+    @property
+    def free_rate_kbps(self) -> float:
+        """Payload bits a second that the free-running screen sends."""
+        bursts = self.slot_rate_hz / (packet_slots(self.payload_symbols) * self.repeats)
+        return self.columns * payload_bits(5, self.payload_symbols) * bursts / 1e3
+
+
+def draw_point(at: Place) -> Iterator[Case]:
+    """A frame of one place of a sweep, screen, camera and corners handed over; point: fields of `Point`."""
+    point = Point(**at.point)
+    trial = simulate_trial(scene_at(point), at.flat, oracle=at.oracle)
+    yield _case(trial, trial.options(), rate_kbps=point.rate_kbps, free_rate_kbps=point.free_rate_kbps)
+
+
+def scene_at(point: Point) -> Scene:
+    """The scene of a point."""
+    base = load_profile("wide-100" if point.columns == 100 else "paper-34k6", ScreenProfile)
+    clock = {name: getattr(point, name) for name in ("columns", "slot_rate_hz", "payload_symbols", "repeats")}
+    name = f"{point.columns}-columns-{point.slot_rate_hz / 1e3:g}k-{point.repeats}x"
+    scene = preset(point.camera, msgspec.structs.replace(base, name=name, **clock))
+    pose = replace(scene.pose, **point.pose)
+    light = scene.light_e_per_s * point.light
+    scene = replace(scene, picture=point.picture, light_e_per_s=light, pose=pose, n_frames=1)
+    if point.exposure_slots is not None:
+        scene = _exposed(scene, point.exposure_slots / point.slot_rate_hz)
+    if point.megapixels is not None:
+        factor = sqrt(point.megapixels / _XS10_MP)
+        return scene.scaled(factor, keep_readout=True) if factor != 1 else scene
+    return binned(scene, point.columns * _PX_PER_COLUMN / scene.sensor.width) if point.binned else scene
+
+
+def _exposed(scene: Scene, exposure_s: float) -> Scene:
+    """The scene at another exposure, its gain turned so that white stays white."""
+    ratio = exposure_s / scene.exposure_s
+    sensor = replace(scene.sensor, full_scale_e=scene.sensor.full_scale_e * ratio)
+    return replace(scene, exposure_s=exposure_s, sensor=sensor)
+
+
+def binned(scene: Scene, share: float) -> Scene:
+    """The scene on a sensor of `share` of the width, whose pixels gather the light of those they stand for."""
+    if share >= 1:
+        return scene
+    narrow = scene.scaled(share, 1.0)
+    sensor = replace(
+        narrow.sensor,
+        full_scale_e=narrow.sensor.full_scale_e / share,
+        read_noise_e=narrow.sensor.read_noise_e / sqrt(share),
+        row_noise_e=narrow.sensor.row_noise_e / share,
+        prnu=narrow.sensor.prnu * sqrt(share),
+    )
+    room = replace(narrow.room, light_e_per_s=narrow.room.light_e_per_s / share)
+    return replace(narrow, sensor=sensor, room=room, light_e_per_s=narrow.light_e_per_s / share)
+
+
+# Files.
+
+
+def draw_capture(at: Place) -> Iterator[Case]:
+    """A photograph or clip, nothing told, with the truth that lies beside it; point: `path`."""
+    path = Path(at.point["path"])
+    truth = find_truth(path)
+    case = Case(source=path, options=ReceiverOptions(), about={"file": path.name})
+    yield case if truth is None else replace(case, truth=load_truth(truth))
+
+
+def draw_medium(at: Place) -> Iterator[Case]:
+    """A file of full size, made once in the folder of results; point: fields of `Medium`."""
+    medium = Medium(**at.point)
+    # In another process, for the memory of this one is to be that of the reception.
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        path = pool.submit(medium.make, at.folder, at.seed).result()
+    options = receiver_options(medium.screen, str(camera_path(path))) if medium.named else ReceiverOptions(cameras=())
+    yield Case(source=path, options=options, about={"target": medium.target, "frame_rate_hz": medium.frame_rate_hz})
+
+
+#: What a scenario names as its drawing.
+DRAWERS: dict[str, Callable[[Place], Iterator[Case]]] = {
+    "phone": draw_phone,
+    "screen": draw_screen,
+    "confidence": draw_confidence,
+    "small": draw_small,
+    "motion": draw_motion,
+    "clips": draw_clips,
+    "nodata": draw_nodata,
+    "point": draw_point,
+    "capture": draw_capture,
+    "medium": draw_medium,
+}

@@ -1,0 +1,118 @@
+"""Files of full size that receptions are timed on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from rxcli.lab.simulate.capture import prepare
+from rxcli.lab.simulate.scenes import Scene, preset
+from rxcli.lab.simulate.tiff import write_dng
+from rxcli.lab.simulate.truth import build_camera_profile, write_truth
+from rxcli.lab.simulate.video import write_video
+from rxcli.profiles import dump_profile
+from rxcli.protocol import payload_bits
+
+
+@dataclass(frozen=True, kw_only=True)
+class Medium:
+    """One kind of file."""
+
+    file: str
+    camera: str
+    screen: str
+    picture: str = "coffee"
+    #: Light against the preset's.
+    light: float = 1.0
+    #: Width and height against the preset's.
+    scale: float = 1.0
+    #: Whether the receiver is told camera and screen.
+    named: bool = True
+    #: Clips: frames to simulate, times that they are written, and bursts from one frame to the next, together a whole
+    #: number, so that the clip may be repeated.
+    n_frames: int = 1
+    times: int = 1
+    bursts_a_frame: float | None = None
+    bit_rate: int | None = None
+    #: What a reception may take of the bare decode on one thread.
+    target: float | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of a photograph, or of a clip whose payload comes again after its last frame."""
+        scene = preset(self.camera, self.screen)
+        scene = replace(scene, picture=self.picture, light_e_per_s=scene.light_e_per_s * self.light)
+        scene = scene.scaled(self.scale, self.scale, keep_readout=True) if self.scale != 1 else scene
+        if self.bursts_a_frame is None:
+            return scene
+        screen = scene.screen
+        n_bits = round(self.bursts_a_frame * self.n_frames) * screen.columns * payload_bits(5, screen.payload_symbols)
+        return replace(
+            scene,
+            payload=np.random.default_rng(0).bytes(n_bits // 8),
+            shake_px=0.0,
+            n_frames=self.n_frames,
+            frame_rate_hz=screen.slot_rate_hz / (screen.packet_slots * screen.repeats * self.bursts_a_frame),
+        )
+
+    @property
+    def frame_rate_hz(self) -> float | None:
+        """Frames a second of a clip; None for a photograph."""
+        return None if self.bursts_a_frame is None else self.scene.frame_rate_hz
+
+    def make(self, folder: Path, seed: int) -> Path:
+        """The file in `folder` beside its camera profile; simulated unless it is there already."""
+        path = folder / self.file
+        if path.exists() and camera_path(path).exists():
+            return path
+        if self.times == 1:
+            write_capture(self.scene, path, seed, self.bit_rate)
+            return path
+        once = path.with_stem(path.stem + "-once")
+        write_capture(self.scene, once, seed, self.bit_rate)
+        repeat_clip(once, path, self.times)
+        camera_path(once).replace(camera_path(path))
+        return path
+
+
+def camera_path(path: Path) -> Path:
+    """Where the camera profile of a file lies."""
+    return path.with_name(path.stem + ".camera.toml")
+
+
+def write_capture(scene: Scene, path: Path, seed: int, bit_rate: int | None = None) -> None:
+    """Simulate a JPEG, DNG or clip, with its truth and its camera profile beside it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    raw = path.suffix == ".dng"
+    scene = replace(scene, output="raw" if raw else "developed")
+    take = prepare(scene, seed)
+    if path.suffix == ".mp4":
+        frames = (take.frame(number).rgb for number in range(scene.n_frames))
+        write_video(frames, path, "h264", scene.frame_rate_hz, bit_rate)
+    elif raw:
+        write_dng(take.frame().raw, scene, path)
+    else:
+        path.write_bytes(take.frame().jpeg)
+    write_truth(take.truth(path.name), path)
+    camera_path(path).write_text(dump_profile(build_camera_profile(scene, take.exposure())), encoding="utf-8")
+
+
+def repeat_clip(short: Path, out: Path, times: int) -> None:
+    """Write the packets of a clip several times over, one time after the other, without encoding them again."""
+    import av
+
+    with av.open(str(out), "w") as target:
+        stream = None
+        for turn in range(times):
+            with av.open(str(short)) as source:
+                video = source.streams.video[0]
+                stream = stream or target.add_stream_from_template(video)
+                for packet in source.demux(video):
+                    if packet.dts is None or packet.pts is None:
+                        continue  # the empty packet at the end
+                    packet.pts += turn * video.duration
+                    packet.dts += turn * video.duration
+                    packet.stream = stream
+                    target.mux(packet)

@@ -1,0 +1,182 @@
+"""The one runner: draws the cases of a scenario, receives each in every way, and keeps a journal of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from hashlib import sha256
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rxcli.errors import InputError
+from rxcli.ingest import KNOWN_SUFFIXES
+from rxcli.lab.benchmark import goodput
+from rxcli.lab.benchmark.cases import Record, bare, received
+from rxcli.lab.benchmark.draw import DRAWERS, Place
+from rxcli.lab.benchmark.measures import COMMON, COMMON_COST
+from rxcli.resources import data_dir
+from rxcli.runs.processes import ONE_THREAD, environment
+
+#: What a case is drawn and received from, as JSON values; equal tasks of equal code give equal records.
+Task = dict[str, Any]
+Work = Callable[[Task], list[Record]]
+
+
+class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One row of `scenarios.toml`."""
+
+    about: str
+    #: Of `DRAWERS`, or "transfer".
+    draw: str
+    #: Numbers that are drawn at each point, by default.
+    count: int
+    #: Of `rxcli.lab.benchmark.cases.WAYS`. Packets of the others are compared with those of the first.
+    ways: tuple[str, ...] = ("receiver",)
+    #: The way whose right packets `share` counts against.
+    beside: str | None = None
+    #: Measures in the table, where they are not the common ones.
+    columns: tuple[str, ...] = ()
+    #: Measures in the table beside the common ones.
+    more: tuple[str, ...] = ()
+    #: Label -> what the drawing is told there; and what it is told everywhere.
+    points: dict[str, dict[str, Any]] = msgspec.field(default_factory=lambda: {"": {}})
+    base: dict[str, Any] = {}
+    #: Whether to print the bins of the confidence.
+    bins: bool = False
+    #: Whether every case has a process of its own, whose memory then tells something.
+    alone: bool = False
+
+    @property
+    def all_columns(self) -> tuple[str, ...]:
+        """Measures of the table."""
+        return self.columns or (*COMMON, *self.more, *COMMON_COST)
+
+    def tasks(self, seed: int, count: int, folder: Path, cae: str | None = None) -> list[Task]:
+        """What is to be done: `count` numbers at every point."""
+        shared = {"draw": self.draw, "ways": self.ways, "seed": seed, "folder": str(folder), "cae": cae}
+        return [
+            {**shared, "number": number, "label": label, "point": {**self.base, **point}}
+            for label, point in self.points.items()
+            for number in range(count)
+        ]
+
+
+@lru_cache(maxsize=1)
+def scenarios() -> dict[str, Scenario]:
+    """The table of scenarios, in order."""
+    text = Path(__file__).with_name("scenarios.toml").read_text(encoding="utf-8")
+    return msgspec.toml.decode(text, type=dict[str, Scenario])
+
+
+def capture_points(folder: Path | None) -> dict[str, dict[str, Any]]:
+    """The photographs and clips of a folder as points, by name; None: the samples."""
+    paths = sorted((folder or data_dir("sample_frames")).resolve().iterdir())
+    return {path.name: {"path": str(path)} for path in paths if path.suffix.lower() in KNOWN_SUFFIXES}
+
+
+def do(task: Task) -> list[Record]:
+    """Draw the cases of a task and receive each in every way."""
+    if task["draw"] == "transfer":
+        way = {"receiver": goodput.transferred(**task["point"], seed=(task["seed"], task["number"]))}
+        return [{"about": {}, "has_data": True, "groups": [task["label"]], "ways": way}]
+    oracle = "bound" in task["ways"]
+    place = Place(task["seed"], task["number"], task["point"], Path(task["folder"]), oracle)
+    records = []
+    for case in DRAWERS[task["draw"]](place):
+        if task["cae"] is not None:
+            case = replace(case, options=replace(case.options, cae=task["cae"]))
+        ways = {way: received(case, way) for way in task["ways"]}
+        groups = [*filter(None, [task["label"]]), *case.groups]
+        about = {"number": task["number"], **case.about}
+        records.append({"about": about, "has_data": case.has_data, "groups": groups, **bare(case), "ways": ways})
+    return records
+
+
+class Journal:
+    """Records of finished tasks, in memory and, where a path is given, in a file of JSON lines that is appended to."""
+
+    def __init__(self, path: Path | None = None) -> None:
+        self._path = path
+        self.records: dict[str, list[Record]] = {}
+        lines = [] if path is None or not path.exists() else path.read_text("utf-8").splitlines(keepends=True)
+        for number, line in enumerate(lines, 1):
+            if path is not None and not line.endswith("\n"):
+                # The run was killed while it wrote this line: its task is simply done again.
+                path.write_text("".join(lines[:-1]), encoding="utf-8")
+                break
+            try:
+                entry = json.loads(line)
+                self.records[entry["key"]] = entry["records"]
+            except (ValueError, KeyError, TypeError):
+                raise InputError(f"{path}: line {number} is no journal entry", "name another file") from None
+
+    def add(self, key: str, records: list[Record]) -> None:
+        """Keep the records of a finished task."""
+        self.records[key] = records
+        if self._path is not None:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"key": key, "records": records}, separators=(",", ":")) + "\n")
+
+
+@lru_cache(maxsize=1)
+def code_fingerprint() -> str:
+    """Hash of the package's source: what an earlier version has found is not taken for what this one does."""
+    root = Path(__file__).resolve().parents[2]
+    digest = sha256()
+    for path in sorted(path for path in root.rglob("*.py") if path.parent.name != "cli"):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """How tasks are done: those that the journal lacks, in processes of one thread each."""
+
+    journal: Journal
+    jobs: int = 1
+    quiet: bool = False
+
+    def __call__(self, tasks: Sequence[Task], label: str, *, alone: bool = False, work: Work = do) -> list[Record]:
+        """The records of all tasks, in order.
+
+        Args:
+            tasks: JSON values each.
+            label: of the progress bar.
+            alone: a process for each task.
+            work: a function of a module, so that other processes find it.
+        """
+        from tqdm import tqdm
+
+        keys = {json.dumps({**task, "code": code_fingerprint()}, sort_keys=True): task for task in tasks}
+        missing = {key: task for key, task in keys.items() if key not in self.journal.records}
+        n_done = len(keys) - len(missing)
+        with tqdm(total=len(keys), initial=n_done, desc=label, disable=self.quiet or None, leave=False) as bar:
+            for key, records in self._each(missing, alone, work):
+                self.journal.add(key, records)
+                bar.update()
+        return [record for key in keys for record in self.journal.records[key]]
+
+    def _each(self, tasks: dict[str, Task], alone: bool, work: Work) -> Iterator[tuple[str, list[Record]]]:
+        if not alone and (self.jobs == 1 or len(tasks) <= 1):
+            for key, task in tasks.items():
+                yield key, work(task)
+            return
+        # Libraries read these when they are loaded, which in a spawned worker is later than here.
+        context = get_context("spawn")
+        limit = 1 if alone else None
+        with (
+            environment(ONE_THREAD),
+            ProcessPoolExecutor(self.jobs, context, max_tasks_per_child=limit) as pool,
+        ):
+            futures = {pool.submit(work, task): key for key, task in tasks.items()}
+            try:
+                for future in as_completed(futures):
+                    yield futures[future], future.result()
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)

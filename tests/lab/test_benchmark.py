@@ -1,0 +1,421 @@
+"""The benchmark: ways to receive, the runner and its journal, measures, tables, and the commands."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rxcli.cli.benchmark import benchmark
+from rxcli.errors import InputError, ReceiverError, UsageError
+from rxcli.lab.benchmark import cases, compare, measures, quick, tables, yardsticks
+from rxcli.lab.benchmark.bare import bare_decode
+from rxcli.lab.benchmark.cases import Case, received
+from rxcli.lab.benchmark.draw import Place, Point, binned, draw_nodata, draw_small, scene_at
+from rxcli.lab.benchmark.measures import Group, cluster_interval, logistic_regression, wilson
+from rxcli.lab.benchmark.media import write_capture
+from rxcli.lab.benchmark.runner import Journal, Run, Task, do, scenarios
+from rxcli.lab.benchmark.trial import Trial, simulate_trial
+from rxcli.lab.simulate.scenes import preset
+from rxcli.protocol import encode_packet, payload_bits
+from rxcli.types import FrameResult
+
+
+@pytest.fixture(scope="module")
+def easy() -> Trial:
+    """A plain picture, plenty of light, a camera that is held straight."""
+    scene = preset("xs10-still", "paper-17k3")
+    pose = replace(scene.pose, roll_deg=0.0, yaw_deg=0.0, pitch_deg=0.0)
+    return simulate_trial(replace(binned(scene, 0.07), picture="sky", pose=pose), 3, oracle=True)
+
+
+def case_of(trial: Trial, **changes: Any) -> Case:
+    case = Case(source=(trial.frame,), options=trial.options(), about={}, truth=trial.truth, corners=trial.corners)
+    return replace(case, trial=trial, **changes)
+
+
+# Ways.
+
+
+def test_bound_and_paper_read_an_easy_frame(easy: Trial) -> None:
+    records = {way: received(case_of(easy), way) for way in ("receiver", "bound", "paper")}
+    scores = {way: record["score"] for way, record in records.items()}
+    assert all(record["problems"] == [] for record in records.values())
+    assert scores["receiver"]["expected"] == scores["bound"]["error_free"] == scores["bound"]["expected"] > 0
+    assert scores["receiver"]["error_free"] == scores["bound"]["error_free"]
+    assert scores["paper"]["error_free"] > 0.5 * scores["paper"]["expected"]
+
+
+def test_the_bound_is_no_magic(easy: Trial) -> None:
+    dark = replace(easy.capture.scene, light_e_per_s=easy.capture.scene.light_e_per_s * 1e-4)
+    score = Group([{"ways": {"bound": received(case_of(simulate_trial(dark, 3, oracle=True)), "bound")}}], "bound", "")
+    assert score.score.ber is not None
+    assert score.score.ber > 0.25
+
+
+def test_paper_reads_packets_between_two_headers() -> None:
+    rng = np.random.default_rng(0)
+    screen = scene_at(Point(payload_symbols=5)).screen
+    payload = rng.integers(0, 2, payload_bits(4, 5)).astype(np.uint8)
+    lit = np.repeat(np.tile(encode_packet(payload, 4), 2)[:-20], 6)
+    starts, agreement = yardsticks.find_headers(lit.astype(bool), 6.0)
+    assert 0 in np.round(starts)
+    assert agreement.max() == 1
+    # The second header is cut off: two are needed.
+    assert list(yardsticks._between_headers(lit[: 70 * 6], 6.0, screen)) == []
+    found = list(yardsticks._between_headers(lit, 6.0, screen))
+    assert [packet.payload for packet in found] == [np.packbits(payload).tobytes().hex()]
+
+
+def test_changes_that_nobody_sees_are_as_small_as_said(easy: Trial) -> None:
+    frame = easy.frame
+    changed = cases.with_grey_levels(frame)
+    step = np.abs(changed.pixels.astype(int) - frame.pixels.astype(int))
+    assert step.max() == 1
+    assert step.mean() == pytest.approx(0.01, rel=0.1)
+    assert np.array_equal(changed.pixels, cases.with_grey_levels(frame).pixels)
+    assert np.array_equal(cases.without_first_row(frame).pixels, frame.pixels[1:])
+
+
+@pytest.mark.parametrize("output", ["raw", "developed"])
+def test_a_picture_without_its_first_row_gives_the_same_packets(easy: Trial, output: Any) -> None:
+    case = case_of(simulate_trial(replace(easy.capture.scene, output=output), 3))
+    whole, cropped = (received(case, way) for way in ("receiver", "cropped by a row"))
+    assert cropped["problems"] == []
+    assert measures.reported_payloads(cropped) == measures.reported_payloads(whole) != set()
+
+
+def test_the_other_kernel_is_another_processs(easy: Trial) -> None:
+    import os
+
+    assert cases._other_kernel().submit(os.getpid).result() != os.getpid()
+    assert cases._other_kernel().submit(os.getenv, "OPENBLAS_CORETYPE").result() == cases.KERNEL
+    record = received(case_of(easy), cases.OTHER_KERNEL)
+    assert record["score"]["error_free"] == record["score"]["expected"]
+
+
+def test_what_a_reception_raises_warns_or_says_wrongly_is_a_problem(
+    easy: Trial, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_case: Case) -> list[FrameResult]:
+        np.divide(np.ones(1), np.zeros(1))
+        raise ValueError("out of order")
+
+    monkeypatch.setitem(cases.WAYS, "broken", broken)
+    monkeypatch.setitem(cases.WAYS, "mute", lambda _case: [FrameResult("", 0, float("nan"), "ok")])
+    record = received(case_of(easy), "broken")
+    assert record["problems"][0] == "ValueError: out of order"
+    assert "divide by zero" in record["problems"][1]
+    assert received(case_of(easy), "mute")["problems"] == ["result.time_s holds NaN", "neither columns nor message"]
+
+
+def test_right_packets_under_wrong_numbers_are_shifted(easy: Trial) -> None:
+    result, _ = easy.receive(easy.options())
+    moved = replace(result, columns=tuple(replace(c, column=c.column + 2) for c in result.columns))
+    assert (cases.column_shift(result, easy.truth), cases.column_shift(moved, easy.truth)) == (0, 2)
+
+
+def test_an_error_is_the_farthest_corner_in_any_order() -> None:
+    truth = np.array([[0.0, 0], [100, 0], [100, 60], [0, 60]])
+    found = np.roll(truth + np.array([[0, 0], [0, 3], [0, 0], [0, 1]]), 2, axis=0)
+    assert cases.corner_error(found, truth) == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".dng", ".mp4"])
+def test_the_bare_decode_counts_frames(suffix: str, tmp_path: Path) -> None:
+    name = "xs10-still" if suffix == ".dng" else "video-1080p"
+    scene = preset(name, "paper-17k3").scaled(0.2, 0.2, keep_readout=True)
+    path = tmp_path / f"small{suffix}"
+    write_capture(replace(scene, n_frames=3 if suffix == ".mp4" else 1), path, 0)
+    assert bare_decode(path)() == (3 if suffix == ".mp4" else 1)
+    (tmp_path / "a.txt").write_text("text")
+    with pytest.raises(UsageError, match="no bare decode"):
+        bare_decode(tmp_path / "a.txt")
+
+
+# Runner.
+
+
+def _double(task: Task) -> list[dict[str, Any]]:
+    _calls.append(task["n"])
+    return [{"twice": 2 * task["n"]}]
+
+
+_calls: list[int] = []
+
+
+def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
+    _calls.clear()
+    path = tmp_path / "journal.jsonl"
+    tasks: list[Task] = [{"n": n} for n in range(4)]
+    Run(Journal(path), quiet=True)(tasks[:3], "double", work=_double)
+    with path.open("a") as file:
+        file.write('{"key": "half a li')  # as a killed process leaves it
+    records = Run(Journal(path), quiet=True)(tasks, "double", work=_double)
+    assert [record["twice"] for record in records] == [0, 2, 4, 6]
+    assert _calls == [0, 1, 2, 3]
+    assert len(Journal(path).records) == 4
+    path.write_text("no journal\n")
+    with pytest.raises(InputError, match="line 1 is no journal entry"):
+        Journal(path)
+
+
+def test_small_scenes_are_received_without_problems(tmp_path: Path) -> None:
+    for number in (3, 4):
+        (case,) = draw_small(Place(0, number, {}, tmp_path))
+        assert received(case, "receiver")["problems"] == []
+
+
+def test_a_picture_without_data_that_gave_packets_does_not_pass(tmp_path: Path) -> None:
+    (case,) = draw_nodata(Place(2, 1, {}, tmp_path))
+    record = {
+        "groups": ["noise"],
+        "about": case.about,
+        "has_data": False,
+        "ways": {"receiver": received(case, "receiver")},
+    }
+    assert measures.passes([record], ["receiver"])
+    assert measures.worth_a_look([record], ["receiver"]) == []
+    packet = {"confidence": 0.4, "bit_errors": 35, "frame": 0, "column": 2, "payload": "ab"}
+    gave = {**record, "ways": {"receiver": {**record["ways"]["receiver"], "packets": [packet]}}}
+    assert not measures.passes([record, gave], ["receiver"])
+    assert [row["packets"] for row in measures.worth_a_look([record, gave], ["receiver"])] == [1]
+
+
+def test_a_transfer_is_byte_exact() -> None:
+    scenario = scenarios()["goodput"]
+    (record,) = do(scenario.tasks(1, 1, Path())[0])
+    (row, _) = measures.rows([record], scenario.ways, scenario.columns)
+    assert (row["n"], row["exact"]) == (1, 1)
+    assert 0 < row["of_visible"] < 1
+    assert row["kbps_worst"] == pytest.approx(0.8 / row["s_worst"])
+
+
+# Measures.
+
+
+def _record(group: str = "", packets: tuple[tuple[float, int], ...] = (), **changes: Any) -> dict[str, Any]:
+    """A case of four rows a slot, received in two ways; the other one reports nothing."""
+    listed = [
+        {"confidence": c, "bit_errors": e, "frame": 0, "column": n, "payload": "00", "evidence": [1.0, c]}
+        for n, (c, e) in enumerate(packets)
+    ]
+    score = {"expected": 10, "bits": 770, "error_free": 8, "bit_errors": 5, "lost": 1, "lost_bits": 77, "false": 1}
+    reception = {"packets": listed, "score": score, "status": "ok", "problems": [], "cpu_s": 2.0, **changes}
+    other = {"packets": [], "score": {**score, "error_free": 10}, "status": "ok", "problems": [], "cpu_s": 1.0}
+    about = {"rows_per_slot": 4.0}
+    return {"about": about, "has_data": True, "groups": [group], "ways": {"receiver": reception, "bound": other}}
+
+
+def test_groups_ways_and_packets_are_counted() -> None:
+    records = [
+        _record("a", ((0.95, 0), (0.999, 3), (0.5, 1)), shift=1, numbered=True),
+        _record("b", status="no_screen", shift=2, numbered=False),
+    ]
+    columns = ["n", "right", "share", "ber", "packets_0.9", "sure", "surely_wrong", "changed", "not_found", "of_shown"]
+    table = measures.rows(records, ["receiver", "bound"], [*columns, "numbered_wrong", "target"], "bound")
+    assert [(row["scenes"], row["way"]) for row in table[::2]] == [(n, "receiver") for n in ("a", "b", "all")]
+    whole, bound = table[-2:]
+    assert (whole["n"], whole["right"], whole["share"]) == (2, 16, 0.8)
+    assert whole["ber"] == pytest.approx((5 + 77 / 2) / 770)
+    assert (whole["packets_0.9"], whole["sure"], whole["surely_wrong"], bound["changed"]) == (2, 1, 1, 3)
+    assert (whole["not_found"], whole["of_shown"], whole["numbered_wrong"]) == (1, 2, 1)
+    assert "target" not in whole
+
+
+def test_estimates_of_rows_are_counted() -> None:
+    estimates = [(4.0, 0.001), (4.0015, 0.001), (4.1, 0.001), None]
+    group = Group([_record(rows_per_slot=estimate) for estimate in estimates], "receiver", "receiver")
+    names = ("rows_within", "rows_none", "rows_wild", "in_1_sd", "in_2_sd")
+    assert [measures.MEASURES[name](group) for name in names] == [2, 1, 1, 0.5, 1.0]
+
+
+def test_intervals_of_error_rates_hold_the_rate() -> None:
+    low, high = measures.MEASURES["ber95"](Group([_record(), _record()], "receiver", "receiver"))
+    assert low < (5 + 77 / 2) / 770 < high
+
+
+def test_bins_show_calibration() -> None:
+    rng = np.random.default_rng(3)
+    confidence = rng.random(6000)
+    right = rng.random(6000) < confidence
+    packets = [{"confidence": c, "bit_errors": int(not r)} for c, r in zip(confidence, right, strict=True)]
+    bins, error = measures.calibration(packets)
+    assert sum(row["packets"] for row in bins) == 6000
+    assert sum(row["calibrated"] for row in bins) >= 8
+    assert error < 0.02
+    too_sure = [{**packet, "confidence": packet["confidence"] ** 0.3} for packet in packets]
+    bins, error = measures.calibration(too_sure)
+    assert sum(bool(row["calibrated"]) for row in bins) <= 3
+    assert error > 0.2
+
+
+def test_weights_of_features_are_found_again() -> None:
+    rng = np.random.default_rng(7)
+    terms = np.concatenate([np.ones((8000, 1)), rng.normal(size=(8000, 2))], axis=1)
+    weights = np.array([0.5, 1.5, -0.8])
+    right = rng.random(8000) < 1 / (1 + np.exp(-terms @ weights))
+    assert logistic_regression(terms, right) == pytest.approx(weights, abs=0.1)
+    packets = [{"evidence": t, "bit_errors": int(not r)} for t, r in zip(terms.tolist(), right, strict=True)]
+    assert measures.fitted_weights([*packets, {"evidence": [1.0, 2.0], "bit_errors": 0}]) == {
+        3: pytest.approx(weights, abs=0.1)
+    }
+
+
+def test_wilson_agrees_with_published_values() -> None:
+    # Newcombe, Stat. Med. 17, 857 (1998), table I, method 3.
+    assert wilson(81, 263) == pytest.approx((0.2553, 0.3662), abs=5e-5)
+    assert wilson(15, 148) == pytest.approx((0.0624, 0.1605), abs=5e-5)
+    assert wilson(0, 20) == pytest.approx((0.0, 0.1611), abs=5e-5)
+    assert (wilson(0, 0), wilson(20, 20)[1]) == ((0.0, 1.0), 1.0)
+
+
+def test_clusters_widen_the_interval() -> None:
+    apart = cluster_interval([5.0] * 8 + [6.0] * 8, [100.0] * 16, units=16)
+    together = cluster_interval([0.0] * 14 + [44.0] * 2, [100.0] * 16, units=16)
+    assert apart == pytest.approx(wilson(88, 1600))
+    assert together[1] - together[0] > 3 * (apart[1] - apart[0])
+    assert cluster_interval([0.0, 0.0], [1000.0, 1000.0], units=20) == wilson(0, 20)
+    assert cluster_interval([], [], units=0) == (0.0, 1.0)
+
+
+def test_tables_align_and_survive_csv(tmp_path: Path) -> None:
+    rows = [{"name": "a", "rate": 0.00012345, "range": (0.0, 0.5)}, {"name": "bcd", "rate": None, "range": (0.25, 1.0)}]
+    lines = tables.format_table(rows).splitlines()
+    assert lines[2].split() == ["a", "0.000123", "0..0.5"]
+    assert lines[3].split() == ["bcd", "-", "0.25..1"]
+    table = tables.to_csv(rows).splitlines()
+    assert table == ["name,rate,range_low,range_high", "a,0.00012345,0.0,0.5", "bcd,,0.25,1.0"]
+    _, as_json = tables.write_outputs(tmp_path / "new", "x", rows, {"more": 1})
+    assert json.loads(as_json.read_text())["details"] == {"more": 1}
+    assert tables.format_table([]) == "(nothing to show)"
+
+
+def test_error_rates_are_plotted(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    rows = [{"scenes": s, "way": w, "ber": 0.01, "ber95": (0.0, 0.1)} for s in "ab" for w in ("receiver", "bound")]
+    assert tables.plot(rows, tmp_path / "ber.png", "ber", "ber95")
+    assert (tmp_path / "ber.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_headline_puts_receiver_and_yardsticks_side_by_side() -> None:
+    record = _record("sky")
+    record["about"]["rate_kbps"] = 42.0
+    record["ways"]["paper"] = record["ways"]["bound"]
+    row = quick._errors("sky", [record, record])
+    assert (row["scene"], row["kb/s"], row["packets"], row["error_free"]) == ("sky", 42.0, 20, 16)
+    assert row["receiver"] == row["bound"] == pytest.approx((5 + 77 / 2) / 770)
+
+
+# Commands.
+
+
+def test_a_scenario_writes_table_and_journal(tmp_path: Path) -> None:
+    arguments = ["phones", "--count", "1", "--seed", "905", "--cae", "never", "--out", str(tmp_path), "--quiet"]
+    result = CliRunner().invoke(benchmark, arguments)
+    assert result.exit_code == 0, result.output
+    row = json.loads((tmp_path / "phones.json").read_text())["rows"][-1]
+    assert (row["scenes"], row["n"], row["rows_within"]) == ("all", 1, 1)
+    assert row["right"] >= 5
+    assert (tmp_path / "phones.journal.jsonl").read_text().count("\n") == 1
+
+
+def test_packets_of_earlier_journals_are_in_the_bins(tmp_path: Path) -> None:
+    earlier = tmp_path / "earlier.jsonl"
+    earlier.write_text(json.dumps({"key": "x", "records": [_record(packets=((0.95, 0), (0.95, 1)))]}) + "\n")
+    arguments = ["confidence", "--count", "1", "--seed", "5", "--out", str(tmp_path / "out"), "--quiet"]
+    alone, both = (CliRunner().invoke(benchmark, [*arguments, *more]) for more in ((), ("--also", str(earlier))))
+    assert alone.exit_code == both.exit_code == 0, both.output
+    counts = [int(result.output.split(" packets, ")[0].split()[-1]) for result in (alone, both)]
+    assert counts[1] == counts[0] + 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["sweep-light", "--only", "nope"], "is not one of x 0.01"),
+        (["phones", "--way", "nope"], "is not one of receiver"),
+        (["compare", ".", "nope"], "is no scenario"),
+        (["--quick", "confidence"], "stands alone"),
+    ],
+)
+def test_mistakes_are_told(arguments: list[str], message: str) -> None:
+    result = CliRunner().invoke(benchmark, arguments)
+    assert result.exit_code == 2
+    assert message in result.output
+
+
+def test_without_a_command_help_is_shown() -> None:
+    result = CliRunner().invoke(benchmark, [])
+    assert result.exit_code == 0
+    assert "stability" in result.output
+
+
+# Two checkouts.
+
+
+def compared(before: list[Any], now: list[Any], codes: tuple[int, int] = (0, 0)) -> compare.Comparison:
+    job = compare.Job("captures", ["decode", "a.jpg"])
+    return compare.Comparison(job, compare.Decoded(now, 1.0, codes[1]), compare.Decoded(before, 2.0, codes[0]))
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "difference"),
+    [
+        ([{"a": [1, 2.5]}], [{"a": [1, 2.5]}], None),
+        ([{"a": [1, 2.5]}], [{"a": [1, 2.5000001]}], "[0].a[1]: 2.5 -> 2.5000001"),
+        ([{"a": 1}], [{"a": 1, "b": 2}], "[0].b: null -> 2"),
+        ([{"a": [1]}], [{"a": [1, 2]}], "[0].a: [1] -> [1, 2]"),
+        ([{"a": 1}], [{"a": True}], "[0].a: 1 -> true"),
+    ],
+)
+def test_the_first_difference_is_named(before: list[Any], now: list[Any], difference: str | None) -> None:
+    assert compared(before, now).difference == difference
+    assert compared(before, now, (0, 1)).difference == "exit code: 0 -> 1"
+
+
+def test_rows_of_two_checkouts_add_up() -> None:
+    packets = [{"confidence": 0.999, "bit_errors": 0}, {"confidence": 0.999, "bit_errors": 2}]
+    same = [{"columns": [{"packets": packets}]}]
+    found = [compared(same * 2, same), compared([], [])]
+    (group, total) = compare.rows(found)
+    assert (group["files"], total["files"], group["n"], group["same"]) == ("captures", "all", 2, 1)
+    assert (group["this_right"], group["this_surely_wrong"], group["other_right"]) == (1, 1, 2)
+    assert group["cpu_ratio"] == pytest.approx(0.5)
+    assert [row["file"] for row in compare.differing(found)] == ["a.jpg"]
+
+
+def test_a_checkout_that_breaks_off_is_told(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no checkout of this project"):
+        compare.check_checkout(tmp_path)
+    package = tmp_path / "rxcli" / "cli"
+    package.mkdir(parents=True)
+    for folder in (package.parent, package):
+        (folder / "__init__.py").touch()
+    (package / "main.py").write_text("raise RuntimeError('out of order')\n")
+    with pytest.raises(ReceiverError, match="out of order"):
+        compare.compare([], compare.check_checkout(tmp_path), 1, lambda: None)
+
+
+def test_a_changed_receiver_is_found_out(tmp_path: Path) -> None:
+    """A copy of this checkout that rounds confidences differently, on one random scene."""
+    here, other = compare.this_checkout(), tmp_path / "other"
+    for name in ("rxcli", "calibration", "models"):
+        shutil.copytree(here / name, other / name, ignore=shutil.ignore_patterns("__pycache__"))
+    arguments = ["compare", str(other), "confidence", "--count", "1", "--repeats", "1", "--seed", "9"]
+    arguments += ["--out", str(tmp_path / "out"), "--quiet"]
+    same = CliRunner().invoke(benchmark, arguments, standalone_mode=False)
+    assert same.return_value == 0, same.output
+    report = other / "rxcli" / "results" / "report.py"
+    text = report.read_text()
+    assert '"confidence": _rounded(packet.confidence, 6)' in text
+    report.write_text(text.replace("packet.confidence, 6", "packet.confidence, 1"))
+    changed = CliRunner().invoke(benchmark, arguments, standalone_mode=False)
+    assert changed.return_value == 1, changed.output
+    assert "confidence: " in changed.output

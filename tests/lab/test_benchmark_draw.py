@@ -1,0 +1,166 @@
+"""What the benchmark draws: as asked for, the same for the same seed, and as in earlier versions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rxcli.lab.benchmark import draw
+from rxcli.lab.benchmark.cases import WAYS
+from rxcli.lab.benchmark.draw import DRAWERS, Place, Point, phone_of, screen_of
+from rxcli.lab.benchmark.measures import MEASURES
+from rxcli.lab.benchmark.media import Medium
+from rxcli.lab.benchmark.runner import scenarios
+from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
+from rxcli.lab.simulate.no_data import EVEN_KINDS, NO_DATA_KINDS, STRIPED_KINDS, draw_no_data
+from rxcli.lab.simulate.optics import View
+from rxcli.lab.simulate.scenes import preset
+
+#: What earlier versions drew.
+PHONE = {"picture": "hubble", "turned": False, "rows_per_slot": 4.934242608710645, "blur_px": 0.5571024930222309}
+SCREEN = {"kind": "night", "screen": "paper-34k6", "shift_x": 0.009276227773983495, "blur_px": 1.4390870244467169}
+
+
+def test_every_row_of_the_table_names_what_there_is() -> None:
+    for name, scenario in scenarios().items():
+        assert scenario.draw in {*DRAWERS, "transfer"}, name
+        assert set(scenario.ways) <= {*WAYS, "another kernel"}, name
+        assert set(scenario.all_columns) <= MEASURES.keys(), name
+        assert scenario.beside is None or scenario.beside in scenario.ways, name
+
+
+def test_phones_are_as_asked_for() -> None:
+    drawn = [phone_of(3, number) for number in range(60)]
+    assert len({turned for _, turned in drawn}) == 2
+    assert {scene.isp.correct_distortion for scene, _ in drawn} == {False, True}
+    for scene, _ in drawn:
+        sensor, screen = scene.sensor, scene.screen
+        assert 1.5 <= scene.rows_per_slot <= 20
+        assert 5e-3 <= sensor.line_delay_s * sensor.height <= 45e-3
+        assert 0.65 <= scene.lens.focal_widths <= 1.2
+        assert abs(scene.lens.distortion[0]) <= 0.15
+        rows = scene.pose.fill * sensor.width / screen.aspect
+        assert rows / scene.rows_per_slot / screen.packet_slots >= 1.3
+    assert phone_of(3, 7) == drawn[7]
+    assert drawn[7] != drawn[8]
+
+
+def test_seeds_of_published_figures_draw_the_scenes_of_old() -> None:
+    scene, turned = phone_of(501, 0)
+    assert (scene.picture, turned) == (PHONE["picture"], PHONE["turned"])
+    assert (scene.rows_per_slot, scene.blur_px) == pytest.approx((PHONE["rows_per_slot"], PHONE["blur_px"]))
+    screen, kind = screen_of(60613, 1)
+    assert (kind, screen.screen.name) == (SCREEN["kind"], SCREEN["screen"])
+    assert (screen.pose.shift_x, screen.blur_px) == pytest.approx((SCREEN["shift_x"], SCREEN["blur_px"]))
+
+
+def test_a_turned_picture_has_its_corners_turned() -> None:
+    pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    corners = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 2.0], [0.0, 2.0]])
+    trial: Any = SimpleNamespace(capture=SimpleNamespace(pixels=pixels), corners=corners)
+    frame, turned = draw.as_stored(trial, True)
+    assert frame.pixels[0, 0] == 11
+    np.testing.assert_allclose(turned[0], [3, 2])
+
+
+def test_screens_lie_in_the_picture_and_are_dark_half_of_the_time() -> None:
+    drawn = [screen_of(5, number) for number in range(30)]
+    assert 6 < sum(kind != "photo" for _, kind in drawn) < 24
+    for scene, _ in drawn:
+        sensor = scene.sensor
+        corners = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect).corners
+        assert (corners > 0).all()
+        assert (corners < np.array([sensor.width, sensor.height])).all()
+
+
+@pytest.mark.parametrize("kind", DARK_KINDS)
+def test_dark_pictures_are_dark_but_not_black(kind: str) -> None:
+    picture, again = (draw_dark_picture(kind, np.random.default_rng(3), 683, 384) for _ in range(2))
+    assert picture.shape == (384, 683, 3)
+    assert picture.max() > 60
+    assert np.mean(picture.max(axis=2) < 40) > 0.1
+    assert np.array_equal(picture, again)
+
+
+@pytest.mark.parametrize("kind", NO_DATA_KINDS)
+def test_every_kind_without_data_is_drawn_and_drawn_again(kind: str) -> None:
+    one, again = (draw_no_data(kind, np.random.default_rng(4), 2) for _ in range(2))
+    assert one.frames[0].dtype == np.uint8
+    assert one.frames[0].std() > 0.5
+    assert all(np.array_equal(a, b) for a, b in zip(one.frames, again.frames, strict=True))
+
+
+def test_switched_light_moves_from_frame_to_frame_and_slats_do_not() -> None:
+    """Rows of the frames: those of a lamp are at another place of its period, those of slats are where they were."""
+
+    def likeness(kind: str) -> float:
+        first, second = draw_no_data(kind, np.random.default_rng(11), 2).frames
+        by_row = [np.diff(frame.astype(np.float64).mean(axis=1)) for frame in (first, second)]
+        return float(np.corrcoef(*by_row)[0, 1])
+
+    assert likeness("blinds") > 0.9
+    assert likeness("pwm") < 0.8
+
+
+def test_every_other_picture_without_data_is_striped(tmp_path: Path) -> None:
+    cases = [next(draw.draw_nodata(Place(3, number, {"camera_named": True}, tmp_path))) for number in range(6)]
+    assert [case.about["kind"] in STRIPED_KINDS for case in cases] == [True, False] * 3
+    assert all(case.about["kind"] in EVEN_KINDS for case in cases[1::2])
+    assert all(case.options.force_camera and not case.has_data for case in cases)
+
+
+def test_the_files_of_clips_go_away() -> None:
+    small = preset("video-1080p", "paper-8k65").scaled(0.2, 0.2, keep_readout=True)
+    take = draw.prepare(replace(small, picture="coffee", shake_px=0.0, n_frames=2), 44)
+    with draw.filmed(take, [("h264", "veryfast", 2_000_000), ("hevc", "veryfast", 2_000_000)]) as paths:
+        assert all(path.stat().st_size > 1000 for path in paths)
+    assert not paths[0].parent.exists()
+
+
+def test_points_of_sweeps_have_scenes_and_the_papers_rates() -> None:
+    rates = []
+    sweeps = {name: scenario for name, scenario in scenarios().items() if scenario.draw == "point"}
+    for name, scenario in sweeps.items():
+        for point in (Point(**{**scenario.base, **values}) for values in scenario.points.values()):
+            scene = draw.scene_at(point)
+            assert scene.screen.columns == point.columns
+            assert not point.binned or point.megapixels or scene.sensor.width <= point.columns * 46
+            rates += [point.rate_kbps] if name == "sweep-rate" else []
+    assert rates[:3] == pytest.approx([42.0, 92.4, 201.6])
+
+
+def test_growth_shows_the_same_time_at_any_size() -> None:
+    for megapixels in (2.0, 26.0):
+        scene = draw.scene_at(Point(slot_rate_hz=17300.0, payload_symbols=11, columns=50, megapixels=megapixels))
+        assert scene.sensor.width * scene.sensor.height == pytest.approx(megapixels * 1e6, rel=0.01)
+        assert scene.sensor.height * scene.sensor.line_delay_s == pytest.approx(24.098e-3, rel=1e-3)
+
+
+def test_binning_keeps_the_electrons() -> None:
+    whole = preset("xs10-still", "paper-17k3")
+    narrow = draw.binned(whole, 0.25)
+    assert narrow.sensor.height == whole.sensor.height
+    assert narrow.light_e_per_s / narrow.sensor.full_scale_e == pytest.approx(
+        whole.light_e_per_s / whole.sensor.full_scale_e
+    )
+    assert narrow.light_e_per_s * narrow.sensor.width == pytest.approx(whole.light_e_per_s * whole.sensor.width)
+    assert draw.binned(whole, 1.5) is whole
+
+
+@pytest.mark.parametrize("name", ["speed/video-4k", "speed/video-1080p", "memory/clip of 1000"])
+def test_the_payload_comes_again_with_the_first_frame_of_a_clip(name: str) -> None:
+    scenario, _, point = name.partition("/")
+    medium = Medium(**scenarios()[scenario].points[point])
+    scene = medium.scene
+    bursts = scene.n_frames * scene.screen.slot_rate_hz / scene.frame_rate_hz
+    bursts /= scene.screen.packet_slots * scene.screen.repeats
+    assert bursts == pytest.approx(round(bursts), abs=1e-9)
+    bits = {"paper-8k65": 35, "paper-17k3": 77, "paper-34k6": 168}[medium.screen] * 20 * round(bursts)
+    assert scene.payload is not None
+    assert len(scene.payload) == bits // 8
+    assert scene.sensor.width % 2 == scene.sensor.height % 2 == 0
