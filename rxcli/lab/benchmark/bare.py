@@ -8,21 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from rxcli.errors import UsageError
 from rxcli.ingest.sniff import HEAD_BYTES, read_bytes, sniff
 
 
-def bare_decode(path: Path) -> Callable[[], int]:
-    """A function that decodes the file, nothing else, and returns the number of frames.
-
-    Raises:
-        UsageError: neither JPEG, PNG, RAW nor clip.
-    """
+def bare_decode(path: Path) -> Callable[[], int] | None:
+    """A function that decodes the file, nothing else, and gives the number of frames; None for other kinds of files."""
     kind = sniff(read_bytes(path, HEAD_BYTES), path.suffix.lower())
-    decoders = {"jpeg": _jpeg, "png": _png, "video": _video, "raw": _raw, "tiff": _raw}
-    if kind not in decoders:
-        raise UsageError(f"{path}: there is no bare decode of this kind", "name a JPEG, PNG or RAW file or a clip")
-    return partial(decoders[kind], path)
+    decoder = {"jpeg": _jpeg, "png": _png, "video": _video, "raw": _raw, "tiff": _raw}.get(kind or "")
+    return None if decoder is None else partial(decoder, path)
 
 
 def _jpeg(path: Path) -> int:

@@ -173,10 +173,10 @@ def _other_kernel() -> ProcessPoolExecutor:
 
 
 def bare(case: Case) -> Record:
-    """Frames of a case's file, and seconds that its bare decode takes; nothing for frames in memory."""
-    if not isinstance(case.source, Path):
+    """Frames of a case's file, and seconds that its bare decode takes; nothing where there is none."""
+    decode = bare_decode(case.source) if isinstance(case.source, Path) else None
+    if decode is None:
         return {}
-    decode = bare_decode(case.source)
     with threads(1):
         start, wall = process_time(), perf_counter()
         n_frames = decode()
