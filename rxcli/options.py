@@ -12,7 +12,7 @@ import numpy as np
 
 from rxcli.errors import UsageError
 from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles, load_profile, shipped_profiles
-from rxcli.types import FloatArray
+from rxcli.types import FILE_MEMORY_MB, FloatArray
 
 if TYPE_CHECKING:
     from rxcli.receiver.channel.denoise import Denoiser
@@ -55,6 +55,8 @@ class ReceiverOptions:
     dump_dir: Path | None = None
     #: Whether results carry the payload's soft bits, for the link layer.
     soft_bits: bool = False
+    #: Memory of all files under way, 2^20 bytes; the least complete are dropped.
+    file_memory_mb: int = FILE_MEMORY_MB
 
 
 def receiver_options(
@@ -70,6 +72,7 @@ def receiver_options(
     denoiser: Denoiser | None = None,
     dump_dir: str | Path | None = None,
     soft_bits: bool = False,
+    file_memory_mb: int = FILE_MEMORY_MB,
 ) -> ReceiverOptions:
     """The receiver's options from names, files or profiles.
 
@@ -88,6 +91,7 @@ def receiver_options(
         denoiser: in place of the shipped auto-encoder.
         dump_dir: folder for the arrays of every stage boundary.
         soft_bits: whether results carry the payload's soft bits, for the link layer.
+        file_memory_mb: memory of all files under way, 2^20 bytes; the least complete are dropped.
 
     Raises:
         ProfileError: a profile is missing or malformed.
@@ -109,6 +113,7 @@ def receiver_options(
         # Absolute, for workers may stand in other folders.
         dump_dir=None if dump_dir is None else Path(dump_dir).absolute(),
         soft_bits=soft_bits,
+        file_memory_mb=file_memory_mb,
     )
 
 

@@ -353,6 +353,10 @@ class ReceivedObject:
     path: str | None = None
 
 
+#: Memory of all files that are being received at a time where nothing else is said, 2^20 bytes.
+FILE_MEMORY_MB = 512
+
+
 @dataclass(frozen=True, slots=True)
 class ObjectProgress:
     """A file under way."""

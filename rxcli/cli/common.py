@@ -134,8 +134,14 @@ receiver_arguments = options(
         "times.",
         {"callback": _check_skip},
     ),
+    (
+        "--file-memory=MB file_memory_mb",
+        click.IntRange(1, 1 << 20),
+        512,
+        "Memory for the files that are being received; the least complete are dropped.",
+    ),
 )
-_RECEIVER = ("screens", "cameras", "corners", "mirrored", "cae", "min_confidence", "no_skip")
+_RECEIVER = ("screens", "cameras", "corners", "mirrored", "cae", "min_confidence", "no_skip", "file_memory_mb")
 #: For every command that writes files which may be somebody's.
 force_argument = options(
     ("--force", None, False, "Replace files that are there already and were not written by the same option."),

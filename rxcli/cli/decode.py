@@ -217,7 +217,7 @@ class _Run:
         self._limits = Limits(options["max_ber"], options["min_packets"], options["min_packet_confidence"])
         self._summaries: list[SourceSummary] = []
         self._to_stdout = options["json_path"] == "-"
-        self._photos = Collector(decoder.link_screens)
+        self._photos = Collector(decoder.link_screens, decoder.file_memory_mb)
         self._n_photos = 0
         self._write_payloads: Callable[[FrameResult], None] = lambda result: None
         #: The frame with the most packets of those whose camera was estimated.

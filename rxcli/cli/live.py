@@ -89,7 +89,7 @@ def live(device: Path, **options: Any) -> int:
         write = _writer(options["json_path"], stack)
         stack.enter_context(status)
         frames = stack.enter_context(closing(_limited(source, options["n_frames"])))
-        collector = Collector(configured.screens)
+        collector = Collector(configured.screens, configured.file_memory_mb)
         for received in receive(status.watched(frames), configured):
             result = collector.add(received)
             if options["out"] is not None:

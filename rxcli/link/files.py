@@ -29,7 +29,7 @@ from rxcli.link.softbits import (
     log_likelihood,
     surprise,
 )
-from rxcli.types import FrameSoftBits
+from rxcli.types import FILE_MEMORY_MB, FrameSoftBits
 
 _LN2 = float(np.log(2.0))
 #: Information of an announcement from which on it is tried, in its bits, and the log-likelihood of its copies.
@@ -51,6 +51,8 @@ _MIN_LIKELIHOOD = 0.5
 _MAX_WAITING, _MAX_RECENT = 32 << 20, 96
 #: Bytes of a file that are accepted where nothing else is said.
 MAX_OBJECT_BYTES = 16 << 20
+#: Of a file beside its sums, and what is remembered of changes and refusals at most.
+_STATE_BYTES, _MAX_TIMELINES, _MAX_NOTES = 1 << 14, 16, 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,8 @@ class FileState:
     done: bool = False
     #: Why it can never be complete.
     failure: str | None = None
+    #: Whether it was dropped to make room for others; it begins anew where it is announced again.
+    dropped: bool = False
     frames_waited: int = 0
     first_time_s: float | None = None
     last_time_s: float = 0.0
@@ -94,6 +98,16 @@ class FileState:
         # Memory that is not touched is not taken, so that a length that lies costs nothing.
         total = np.zeros((n, layout.n_bits), np.int8)
         return cls(announcement, layout, total, np.zeros(n), np.full(n, layout.ready))
+
+    @property
+    def under_way(self) -> bool:
+        """Whether more of it is wanted."""
+        return not (self.done or self.failure or self.dropped)
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory that it may take."""
+        return self.total.nbytes + self.known.nbytes + self.threshold.nbytes + 2 * self.layout.length + _STATE_BYTES
 
     @property
     def share(self) -> float:
@@ -192,7 +206,7 @@ class FileState:
 
     def unpacked(self, max_bytes: int) -> Container | None:
         """The file, where all blocks are read and the hash fits; `failure` says what is wrong."""
-        if self.done or self.failure or len(self.blocks) < self.layout.n_blocks:
+        if not self.under_way or len(self.blocks) < self.layout.n_blocks:
             return None
         container = b"".join(self.blocks[number] for number in range(self.layout.n_blocks))[: self.layout.length]
         try:
@@ -208,8 +222,45 @@ class FileState:
         return found
 
     def release(self) -> None:
-        """Give back the memory of the sums."""
+        """Give back the memory of sums and blocks."""
         self.total = np.zeros((0, self.layout.n_bits), np.int8)
+        self.known = self.threshold = np.zeros(0)
+        self.blocks = {}
+
+
+class FilesUnderWay:
+    """Files that are being received, of all screens of a source: together they take no more than a bound.
+
+    Args:
+        memory_mb: the bound, 2^20 bytes.
+    """
+
+    def __init__(self, memory_mb: int = FILE_MEMORY_MB) -> None:
+        self._max_bytes = memory_mb << 20
+        self._files: list[FileState] = []
+        self._n_dropped = 0
+
+    def admit(self, file: FileState) -> bool:
+        """Make room for a file by dropping the least complete, of these the oldest; False where it can never fit."""
+        self._files = [known for known in self._files if known.under_way]
+        if file.n_bytes > self._max_bytes:
+            return False
+        while sum(known.n_bytes for known in self._files) + file.n_bytes > self._max_bytes:
+            least = min(self._files, key=lambda known: round(known.share, 2))
+            self._files.remove(least)
+            least.dropped = True
+            least.release()
+            self._n_dropped += 1
+        self._files.append(file)
+        return True
+
+    @property
+    def notes(self) -> list[str]:
+        """A sentence about what was dropped."""
+        if not self._n_dropped:
+            return []
+        files = "1 incomplete file was" if self._n_dropped == 1 else f"{self._n_dropped} incomplete files were"
+        return [f"{files} dropped: together they would take more than {self._max_bytes >> 20} MB (--file-memory)"]
 
 
 def _is_likely(layout: FileLayout, information_bits: NDArray[np.uint8], llr: NDArray[np.int8]) -> bool:
@@ -219,13 +270,16 @@ def _is_likely(layout: FileLayout, information_bits: NDArray[np.uint8], llr: NDA
     return bool(log_likelihood(sent, seen) > _MIN_LIKELIHOOD * _LN2 * information(seen).sum())
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class _Timeline:
     """From burst numbers of an epoch to those of an object."""
 
     epoch: int
     offset: int
     file: FileState
+    #: The first and the last burst whose announcement says so.
+    since: int
+    until: int
 
 
 class FileSearch:
@@ -235,16 +289,19 @@ class FileSearch:
         columns: C.
         payload_symbols: N.
         max_object_bytes: longer files are refused.
+        under_way: bounds the memory of all files.
     """
 
-    def __init__(self, columns: int, payload_symbols: int, max_object_bytes: int = MAX_OBJECT_BYTES) -> None:
+    def __init__(self, columns: int, payload_symbols: int, max_object_bytes: int, under_way: FilesUnderWay) -> None:
+        self._under_way = under_way
         self._columns, self._payload_symbols, self._max_bytes = columns, payload_symbols, max_object_bytes
         self._layout = announcement_layout(columns, payload_symbols)
         self.files: dict[tuple[int, int, int, int], FileState] = {}
         #: Of every epoch, latest last.
         self._timelines: dict[int, list[_Timeline]] = {}
         self._waiting: list[_Burst] = []
-        self._recent: list[_Burst] = []
+        #: With the timeline by which they were added.
+        self._recent: list[tuple[_Timeline, _Burst]] = []
         self._candidates: list[tuple[int, int, Float32]] = []
         self._n_gathered = 0
         #: Of the frame at hand.
@@ -298,7 +355,11 @@ class FileSearch:
         if line is None or burst % ANNOUNCEMENT_PERIOD or burst >= 1 << 32:
             return False
         coded = replace(line.file.announcement, burst=burst).protected()
-        return is_likely(self._layout, np.unpackbits(np.frombuffer(coded, np.uint8)), buffer)
+        bits = np.unpackbits(np.frombuffer(coded, np.uint8))
+        if line.file.dropped or not is_likely(self._layout, bits, buffer):
+            return False
+        line.until = max(line.until, number)
+        return True
 
     def _try_gathered(self) -> None:
         candidates, self._candidates = self._candidates, []
@@ -314,35 +375,59 @@ class FileSearch:
 
     def _announced(self, announcement: Announcement, epoch: int, number: int) -> None:
         known = self.files.get(announcement.key)
-        if known is None:
-            if announcement.length > self._max_bytes:
-                self._note(
-                    f"a file of {announcement.length} bytes was announced, more than the {self._max_bytes} that are "
-                    "accepted; it was not received"
-                )
+        if known is None or known.dropped:
+            known = self._begun(announcement)
+            if known is None:
                 return
-            known = self.files[announcement.key] = FileState.begin(announcement, self._columns, self._payload_symbols)
         offset = announcement.burst - number
         lines = self._timelines.setdefault(epoch, [])
         if not lines or (lines[-1].offset, lines[-1].file) != (offset, known):
-            lines.append(_Timeline(epoch, offset, known))
-            self._claim(lines[-1])
+            lines.append(_Timeline(epoch, offset, known, number, number))
+            self._claim(lines)
+            del lines[:-_MAX_TIMELINES]
+
+    def _begun(self, announcement: Announcement) -> FileState | None:
+        """A file that was not known; None where it is too long."""
+        if announcement.length > self._max_bytes:
+            self._note(
+                f"a file of {announcement.length} bytes was announced, more than the {self._max_bytes} that are "
+                "accepted; it was not received"
+            )
+            return None
+        file = FileState.begin(announcement, self._columns, self._payload_symbols)
+        if not self._under_way.admit(file):
+            self._note(
+                f"a file of {announcement.length} bytes was announced, which takes {file.n_bytes >> 20} MB to receive; "
+                "it was not received (--file-memory)"
+            )
+            return None
+        self.files = {key: known for key, known in self.files.items() if not known.dropped}
+        self.files[announcement.key] = file
+        return file
 
     def _note(self, sentence: str) -> None:
-        if sentence not in self.notes:
+        if sentence not in self.notes and len(self.notes) < _MAX_NOTES:
             self.notes.append(sentence)
 
-    def _claim(self, line: _Timeline) -> None:
-        """Give a new timeline what came before its first announcement: what waits, and what an earlier one took."""
-        mine = [b for b in self._waiting if b.epoch == line.epoch]
-        self._waiting = [b for b in self._waiting if b.epoch != line.epoch]
-        taken = [b for b in self._recent if b.epoch == line.epoch and b.number + line.offset >= 0]
-        earlier = self._timelines[line.epoch][:-1]
-        for burst in taken:
-            before = _line_of(earlier, burst.number)
-            if before is not None:
-                _enter_bursts(before, [burst], -1)
-        _enter_bursts(line, [b for b in mine + taken if b.number + line.offset >= 0], 1)
+    def _claim(self, lines: list[_Timeline]) -> None:
+        """Give a new timeline, the last, what came before its first announcement: what waits, what others took."""
+        line = lines[-1]
+        waiting, self._waiting = self._waiting, []
+        mine: list[_Burst] = []
+        for burst in waiting:
+            (mine if burst.epoch == line.epoch and _line_of(lines, burst.number) is line else self._waiting).append(
+                burst
+            )
+        recent, self._recent = self._recent, []
+        for before, burst in recent:
+            if burst.epoch != line.epoch or _line_of(lines, burst.number) is before:
+                self._recent.append((before, burst))
+                continue
+            _enter_bursts(before, [burst], -1)
+            if _line_of(lines, burst.number) is line:
+                mine.append(burst)
+                self._recent.append((line, burst))
+        _enter_bursts(line, mine, 1)
 
     # -- data ----------------------------------------------------------------------------------------------------------
 
@@ -365,13 +450,13 @@ class FileSearch:
         for key, line in lines.items():
             _enter_bursts(line, [burst for owner, burst in fresh if id(owner) == key], 1)
             line.file.frames_waited += 1
-        self._recent += [burst for _, burst in fresh]
+        self._recent += fresh
         del self._recent[:-_MAX_RECENT]
 
     def _complete(self, at_last: bool) -> list[tuple[FileState, Container]]:
         found = []
         for file in self.files.values():
-            if file.done or file.failure:
+            if not file.under_way:
                 continue
             which = file.ready(at_last)
             if which.size:
@@ -385,12 +470,19 @@ class FileSearch:
 
 
 def _line_of(lines: list[_Timeline], number: int) -> _Timeline | None:
-    """The latest timeline that a burst can be of."""
-    return next((line for line in reversed(lines) if number + line.offset >= 0), None)
+    """The latest timeline that a burst can be of; None where there is none, or it may be of either of two."""
+    for place in reversed(range(len(lines))):
+        line, earlier = lines[place], lines[place - 1] if place else None
+        if number + line.offset < 0 or (earlier is not None and number <= earlier.until):
+            continue
+        # Where a file begins, the change of files is known; where it goes on, only its announcements are.
+        begins = earlier is None or -line.offset > earlier.until
+        return line if begins or number >= line.since else None
+    return None
 
 
 def _enter_bursts(line: _Timeline, bursts: list[_Burst], sign: int) -> None:
-    if line.file.done or line.file.failure:
+    if not bursts or not line.file.under_way:
         return
     counted = np.array([burst.number + line.offset for burst in bursts], np.int64)
     data = np.flatnonzero(counted % ANNOUNCEMENT_PERIOD)

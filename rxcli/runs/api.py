@@ -84,7 +84,7 @@ class Receiver:
 
     def _with_messages(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
         """Results with the texts and files that they complete; the last one with what is left of others."""
-        collector = Collector(self.options.screens)
+        collector = Collector(self.options.screens, self.options.file_memory_mb)
         for result, last in with_last(results):
             yield collector.finish(collector.add(result)) if last else collector.add(result)
 

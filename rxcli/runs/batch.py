@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
 from rxcli.outputs import OUTPUT_MARKER
 from rxcli.runs.processes import ONE_THREAD, environment, start_process
-from rxcli.types import Frame, FrameResult
+from rxcli.types import FILE_MEMORY_MB, Frame, FrameResult
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -126,6 +126,8 @@ class Decoder:
     after: Callable[[FrameResult, str], None] | None = None
     #: Screens whose messages and files are looked for; empty: none are.
     link_screens: tuple[ScreenProfile, ...] = ()
+    #: Bound of all files under way, 2^20 bytes.
+    file_memory_mb: int = FILE_MEMORY_MB
 
     def results(self, source: Source) -> Iterator[FrameResult]:
         """The results of all frames of `source`, at least one; an input that fails ends in an `unreadable` one.
@@ -163,7 +165,7 @@ class Decoder:
             return
         from rxcli.link.collector import Collector
 
-        collector = Collector(self.link_screens)
+        collector = Collector(self.link_screens, self.file_memory_mb)
         for number, (result, last) in enumerate(with_last(results)):
             taken = collector.add(result)
             if last:
@@ -249,7 +251,8 @@ def standard_decoder(
     from rxcli.ingest import open_source
     from rxcli.receiver.pipeline import receive
 
-    return Decoder(options, open_source, receive, tap, after, options.screens if options.soft_bits else ())
+    screens = options.screens if options.soft_bits else ()
+    return Decoder(options, open_source, receive, tap, after, screens, options.file_memory_mb)
 
 
 def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import tracemalloc
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from rxcli.link.encoder import (
     message,
     packet_slots_of,
 )
+from rxcli.link.files import FilesUnderWay
 from rxcli.link.formats import protect
 from rxcli.link.layout import announcement_layout
 from rxcli.link.receiver import LinkReceiver
@@ -145,6 +147,25 @@ def test_another_file_in_mid_clip_does_not_spoil_either() -> None:
     assert [e.data for e in events if isinstance(e, ReceivedObject)] == [one, two]
 
 
+@pytest.mark.parametrize("ways", ["from its start", "where it was left", "by one clock"])
+def test_two_files_sent_by_turns_both_arrive(ways: str) -> None:
+    """What lies between the last announcement of one and the first of the other may be of either."""
+    rng = np.random.default_rng(17)
+    data = [rng.bytes(12_000), rng.bytes(12_000)]
+    sendings = [file_object("a", data[0], 1), file_object("b", data[1], 2)]
+    shown = []
+    for turn in range(24):
+        first = {"from its start": 0, "where it was left": 100 * (turn // 2), "by one clock": 100 * turn}[ways]
+        shown += [(sendings[turn % 2], first + k) for k in range(100)]
+    receiver, came = LinkReceiver(COLUMNS, SYMBOLS), {}
+    for at in range(0, len(shown) - 3, 5):
+        labels = [sending.labels(np.array([burst]), COLUMNS, SYMBOLS) for sending, burst in shown[at : at + 3]]
+        llr = detect(np.concatenate(labels), 5, BRIGHT, rng)
+        events = receiver.add(FrameSoftBits(np.arange(at, at + 3), llr, 0, frame=at, time_s=at / 150))
+        came |= {event.name: event.data for event in events if isinstance(event, ReceivedObject)}
+    assert came == {"a": data[0], "b": data[1]}
+
+
 def test_clips_of_an_object_whose_start_is_not_shared_add_up() -> None:
     """Two clips of one object: each needs an announcement of its own, and then what both saw is added."""
     rng = np.random.default_rng(9)
@@ -204,6 +225,31 @@ def test_an_announcement_of_four_gigabytes_takes_no_memory() -> None:
     assert peak < 32 << 20
     assert any("4294967295 bytes" in note for note in receiver.notes)
     assert not receiver.progress
+
+
+def test_the_least_complete_of_many_files_are_dropped() -> None:
+    """A sender that announces file after file costs no more than the bound, and not the file that comes."""
+    rng = np.random.default_rng(18)
+    data = rng.bytes(12_000)
+    frames = list(clip(file_object("wanted", data, 1), 0, 60, rng))
+    receiver = LinkReceiver(COLUMNS, SYMBOLS, under_way=FilesUnderWay(memory_mb=120))
+    events = []
+    for number, frame in enumerate(frames):
+        epoch = 1000 + number
+        bait = announced((1, 2, 3 + number, 2 << 20, 32, 1, 0), rng)  # version, mother, id, length, CRC, burst
+        events += receiver.add(frame)
+        assert receiver.add(replace(bait, epoch=epoch)) == []
+        assert sum(file.n_bytes for file in receiver._files.files.values() if file.under_way) <= 120 << 20
+    assert [event.data for event in events if isinstance(event, ReceivedObject)] == [data]
+    [note] = receiver.notes
+    assert "incomplete files were dropped: together they would take more than 120 MB (--file-memory)" in note
+
+
+def test_a_file_that_would_take_more_than_all_may_is_refused() -> None:
+    receiver = LinkReceiver(COLUMNS, SYMBOLS, under_way=FilesUnderWay(memory_mb=16))
+    receiver.add(announced((1, 2, 5, 8 << 20, 32, 1, 0), np.random.default_rng(19)))
+    assert not receiver.progress
+    assert any("MB to receive; it was not received (--file-memory)" in note for note in receiver.notes)
 
 
 def test_memory_is_bounded_while_no_announcement_comes() -> None:
