@@ -8,7 +8,6 @@ harmonic is not mistaken for the fundamental.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -51,14 +50,12 @@ class PeriodicFit:
     first_row: int
     #: Share of the variance about the slow part that the stripes explain.
     explained: float
-    #: Sum of squared residuals, and the number of independent values in the residual.
-    rss: float
-    n_effective: float
     #: Terms of the slow mean, and of the envelope.
     n_slow: int
-    #: (n,) slow mean and envelope of the stripes, profile units.
+    #: (n,) slow mean and envelope of the stripes, and what the fit leaves, profile units.
     mean: FloatArray
     envelope: FloatArray
+    residual: FloatArray
     #: (n,) derivative of the frequency by the profile's values.
     influence: FloatArray
 
@@ -79,7 +76,8 @@ class PeriodicFit:
         follow slow noise.
         """
         richer = self if self.n_parameters >= other.n_parameters else other
-        gain = float(np.log(max(other.rss, 1e-300) / max(self.rss, 1e-300))) * richer.n_effective
+        ours, theirs = (float(fit.residual @ fit.residual) + 1e-300 for fit in (self, other))
+        gain = float(np.log(theirs / ours)) * _independent(richer.residual)
         return gain > (self.n_parameters - other.n_parameters) * float(np.log(self.mean.size))
 
     def waveform(self, rows: FloatArray) -> FloatArray:
@@ -118,62 +116,52 @@ def _detrend(profiles: FloatArray) -> FloatArray:
     return np.asarray(profiles - (profiles @ basis) @ basis.T)
 
 
-def search_many(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The most likely fundamental of each profile, of `FEW_PERIODS` periods or more, from the lines of its spectrum.
+def search(profiles: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """The most likely fundamental of each profile, from the lines of its spectrum.
 
-    Lines are measured against a continuum `a + b / f^2`: white noise and the spectrum of natural scenes.
+    Of many periods, lines are measured against a continuum `a + b / f^2`: white noise and the spectrum of natural
+    scenes. Few periods leave no continuum: their lines are measured against the whole power.
 
     Args:
         profiles: (k, n) profiles of at least 24 rows.
 
     Returns:
-        (k,) frequencies in cycles per row, and (k,) scores: the share of the lines' power, less one per cent a
-        harmonic; zero where no line stands above the continuum.
+        For `FEW_PERIODS` periods or more and then for fewer, (k,) frequencies in cycles per row, and (k,) scores: the
+        share of the lines' power, less one per cent a harmonic; zero where no line stands out.
     """
     n = profiles.shape[1]
-    power = np.abs(np.fft.rfft(_detrend(profiles) * np.hanning(n), _PAD * n)) ** 2
+    power = np.abs(np.fft.rfft(_detrend(profiles) * np.hanning(n), _PAD * n)) ** 2 + 1e-300
     frequency = np.fft.rfftfreq(_PAD * n)
     low, high = (frequency > 3 / n) & (frequency < max(0.1, 6 / n)), frequency > 0.3
     scene = np.median(power[:, low] * frequency[low] ** 2, axis=1, keepdims=True) / np.log(2)
     white = np.median(power[:, high], axis=1, keepdims=True) / np.log(2)
-    rounding = np.finfo(float).eps * power.max(axis=1, keepdims=True) + 1e-300
-    power /= white + scene / np.maximum(frequency, 1 / n) ** 2 + rounding
-    lines = np.where(power > _LINE_POWER, power, 0)
+    rounding = np.finfo(float).eps * power.max(axis=1, keepdims=True)
+    whitened = power / (white + scene / np.maximum(frequency, 1 / n) ** 2 + rounding)
+    few = power / power.max(axis=1, keepdims=True) * 1e9
+    border, last = FEW_PERIODS * _PAD, min(int(MAX_FREQUENCY * _PAD * n), frequency.size - 1)
+    return [
+        _best_harmonics(np.where(whitened > _LINE_POWER, whitened, 0), n, border, last, 0.0),
+        _best_harmonics(few, n, int(MIN_PERIODS * _PAD), border, _FEW_SCORE),
+    ]
+
+
+def _best_harmonics(
+    lines: FloatArray, n: int, first: int, last: int, min_score: float
+) -> tuple[FloatArray, FloatArray]:
+    """Frequency (k,) between two bins whose harmonics hold most of the power of `lines` (k, F), and its score (k,).
+
+    The lines are those of profiles of `n` rows.
+    """
     # A Hann line has an equivalent width of 1.5 bins before the oversampling.
     share = lines / (lines.sum(axis=1, keepdims=True) / (1.5 * _PAD) + _LINE_POWER)
-    first, last = FEW_PERIODS * _PAD, int(MAX_FREQUENCY * _PAD * n)
-    grid = np.arange(first, max(last, first) + 1)
-    grid = grid[grid < frequency.size]
-    total, best = np.zeros((len(profiles), grid.size)), np.zeros((len(profiles), grid.size))
+    grid = np.arange(first, min(max(last, first) + 1, lines.shape[1]))
+    total, best = np.zeros((len(lines), grid.size)), np.zeros((len(lines), grid.size))
     for harmonic in range(1, _SEARCH_HARMONICS + 1):
-        inside = grid * harmonic < frequency.size
+        inside = grid * harmonic < lines.shape[1]
         total[:, inside] += share[:, grid[inside] * harmonic] - _PRICE
         best = np.maximum(best, np.where(inside, total, 0))
-    at = np.argmax(best, axis=1)
-    return frequency[grid[at]], best[np.arange(len(profiles)), at]
-
-
-def search_few(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same for `MIN_PERIODS` to `FEW_PERIODS` periods, whose lines run into each other.
-
-    Trend and harmonics are fitted jointly, by least squares, to the thinned profiles.
-    """
-    thin = max(profiles.shape[1] // 256, 1)
-    n = profiles.shape[1] // thin
-    values = _detrend(profiles[:, : n * thin].reshape(len(profiles), n, thin).mean(axis=2))
-    energy = np.sum(values**2, axis=1) + 1e-300
-    trials = _few_bases(n)
-    scores = np.array([np.sum((values @ basis) ** 2, axis=1) / energy - price for _, price, basis in trials])
-    frequencies = np.array([periods for periods, _, _ in trials]) / (n * thin)
-    best = scores.max(axis=0)
-    return frequencies[np.argmax(scores, axis=0)], np.where(best > _FEW_SCORE, best, 0)
-
-
-@lru_cache(maxsize=8)
-def _few_bases(n: int) -> list[tuple[float, float, FloatArray]]:
-    """Periods, price and basis of every trial of `search_few`."""
-    periods = np.arange(MIN_PERIODS, FEW_PERIODS + 1, 0.125).tolist()
-    return [(p, _PRICE * harmonics, _basis(n, p / n, harmonics)) for p in periods for harmonics in (1, 3, 5)]
+    score = best.max(axis=1)
+    return grid[np.argmax(best, axis=1)] / (_PAD * n), np.where(score > min_score, score, 0)
 
 
 def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -> PeriodicFit | None:
@@ -246,18 +234,16 @@ def _fit_near(
     rows, slow = _rows_and_slow(n, n_slow)
     borders = np.cumsum([n_slow, n_slow - 1, n_harmonics, n_harmonics])
 
-    def parts(state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def parts(state: FloatArray) -> tuple[FloatArray, ...]:
         mean, envelope, cosines, sines, _ = np.split(state, borders)
-        return slow @ mean, 1 + slow[:, 1:] @ envelope, cosines, sines
+        return slow @ mean, 1 + slow[:, 1:] @ envelope, cosines, sines, *_waves(rows, state[-1], n_harmonics)
 
     def residual(state: FloatArray) -> FloatArray:
-        mean, envelope, a, b = parts(state)
-        cosine, sine = _waves(rows, state[-1], n_harmonics)
+        mean, envelope, a, b, cosine, sine = parts(state)
         return mean + envelope * (cosine @ a + sine @ b) - profile
 
     def jacobian(state: FloatArray) -> FloatArray:
-        _, envelope, a, b = parts(state)
-        cosine, sine = _waves(rows, state[-1], n_harmonics)
+        _, envelope, a, b, cosine, sine = parts(state)
         wave, slope = cosine @ a + sine @ b, 2 * np.pi * rows * (cosine @ (order * b) - sine @ (order * a))
         waves = np.hstack([cosine, sine, slope[:, None]]) * envelope[:, None]
         return np.hstack([slow, slow[:, 1:] * wave[:, None], waves])
@@ -268,11 +254,10 @@ def _fit_near(
     fit = least_squares(residual, start, jacobian, ftol=1e-7, max_nfev=40)
     if abs(fit.state[-1] - frequency) > 0.6 / n:
         return None
-    mean, envelope, cosines, sines = parts(fit.state)
+    mean, envelope, cosines, sines, *_ = parts(fit.state)
     trend = profile - slow @ np.linalg.lstsq(slow, profile, rcond=None)[0]
     q, r = np.linalg.qr(fit.jacobian)
     influence = q[:, -1] / r[-1, -1]
-    rss = float(fit.residual @ fit.residual)
     return PeriodicFit(
         frequency=float(fit.state[-1]),
         frequency_sd=_noise_sd(influence, fit.residual, fit.state.size),
@@ -280,12 +265,11 @@ def _fit_near(
         sines=sines,
         origin=first_row + (n - 1) / 2,
         first_row=first_row,
-        explained=1 - rss / max(float(trend @ trend), 1e-300),
-        rss=rss,
-        n_effective=_independent(fit.residual),
+        explained=1 - float(fit.residual @ fit.residual) / max(float(trend @ trend), 1e-300),
         n_slow=n_slow,
         mean=mean,
         envelope=envelope,
+        residual=fit.residual,
         influence=influence,
     )
 
@@ -301,8 +285,7 @@ def _noise_sd(influence: FloatArray, residual: FloatArray, n_parameters: int) ->
     freedom = residual.size / max(residual.size - n_parameters, 1)
     weight = np.abs(np.fft.fft(influence, n_fft)) ** 2
     stationary = float(noise_spectrum(residual, n_fft) @ weight) / n_fft
-    score = influence * residual
-    lag = max(int(4 * (residual.size / 100) ** (2 / 9)), 1)
+    score, lag = influence * residual, max(int(4 * (residual.size / 100) ** (2 / 9)), 1)
     local = float(np.convolve(score, np.bartlett(2 * lag + 3)[1:-1], "same") @ score)
     return float(np.sqrt(max(stationary, local) * freedom))
 

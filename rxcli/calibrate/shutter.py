@@ -8,7 +8,7 @@ lamp's region is then summed to one profile and fitted (`rxcli.calibrate.periodi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.calibrate.exposure import estimate_exposure
+from rxcli.calibrate.exposure import ExposureEstimate, estimate_exposure
 from rxcli.calibrate.fitting import Z95, weighted_mean
 from rxcli.calibrate.periodic import (
     FEW_PERIODS,
@@ -25,8 +25,7 @@ from rxcli.calibrate.periodic import (
     fit_fundamental,
     longest_block,
     scatter_sd,
-    search_few,
-    search_many,
+    search,
 )
 from rxcli.calibrate.spots import find_spots
 from rxcli.errors import ReceiverError, UsageError
@@ -91,10 +90,7 @@ class ShutterCalibration:
     line_delay_sd_s: float
     #: Largest number of periods in one region.
     periods: float
-    #: Why there is no exposure, or what it rests on.
-    exposure_note: str
-    exposure_s: float | None = None
-    exposure_interval_s: tuple[float, float] | None = None
+    exposure: ExposureEstimate
     lamps: tuple[Stripes, ...] = ()
     #: What a user should know before trusting the figures.
     warnings: tuple[str, ...] = ()
@@ -217,39 +213,23 @@ def _seed(strips: FloatArray, free: BoolArray) -> PeriodicFit | None:
     A few waves are searched only where there are not many: the fall-off of a spot passes for a wave or two.
     """
     n = strips.shape[1]
-    spans = [
-        (first, n // parts)
-        for parts in (1, 2, 4)
-        if n // parts >= _MIN_SIDE
-        for first in range(0, n - n // parts + 1, n // parts // 2)
-    ]
-    windows = []
-    for first, length in spans:
-        rows = slice(first, first + length)
-        groups = _groups(strips[:, rows], np.asarray(free[:, rows].all(axis=1)))
-        if len(groups):
-            windows.append((first, groups))
-    for search in (search_many, search_few):
-        for frequency, profile, first in _best_windows(windows, search):
+    candidates = []
+    for length in (n, n // 2, n // 4):
+        for first in range(0, n - length + 1, max(length // 2, 1)) if length >= _MIN_SIDE else ():
+            rows = slice(first, first + length)
+            groups = _groups(strips[:, rows], np.asarray(free[:, rows].all(axis=1)))
+            for few, (frequencies, scores) in enumerate(search(groups) if len(groups) else ()):
+                at = int(np.argmax(scores))
+                # Among equally clear windows the longer one determines the frequency better.
+                worth = float(scores[at] * np.log(length))
+                candidates.append((few, -worth, float(frequencies[at]), groups[at], first))
+    for few in (0, 1):
+        best = sorted((c[1:] for c in candidates if c[0] == few and c[1] < 0), key=lambda c: c[0])
+        for _, frequency, profile, first in best[:3]:
             fit = fit_fundamental(profile, frequency, first)
             if fit is not None and fit.significant:
                 return fit
     return None
-
-
-def _best_windows(
-    windows: list[tuple[int, FloatArray]], search: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-) -> list[tuple[float, FloatArray, int]]:
-    """Frequency, profile and first row of the three clearest windows."""
-    candidates = []
-    for first, groups in windows:
-        frequencies, scores = search(groups)
-        at = int(np.argmax(scores))
-        if scores[at] > 0:
-            # Among equally clear windows the longer one determines the frequency better.
-            worth = float(scores[at] * np.log(groups.shape[1]))
-            candidates.append((worth, float(frequencies[at]), groups[at], first))
-    return [candidate[1:] for candidate in sorted(candidates, key=lambda c: -c[0])[:3]]
 
 
 def _groups(strips: FloatArray, usable: BoolArray) -> FloatArray:
@@ -331,16 +311,13 @@ def calibrate_shutter(
         [lamp.fit.frequency / hz for lamp, hz in used], [lamp.fit.frequency_sd / hz for lamp, hz in used]
     )
     clearest = max((lamp for lamp, _ in used), key=lambda lamp: lamp.fit.explained * np.sqrt(lamp.area_px))
-    exposure = estimate_exposure(clearest.fit, clearest.profile, value, exif_exposure_s, tone_known)
     return ShutterCalibration(
         along,
         pictures[0].shape,
         value,
         sd,
-        periods=max(lamp.fit.periods for lamp, _ in used),
-        exposure_s=exposure.exposure_s,
-        exposure_interval_s=exposure.interval_s,
-        exposure_note=exposure.note,
+        max(lamp.fit.periods for lamp, _ in used),
+        estimate_exposure(clearest.fit, clearest.profile, value, exif_exposure_s, tone_known),
         lamps=tuple(lamps),
         warnings=tuple(_warnings(lamps, frequencies_hz, value)),
     )

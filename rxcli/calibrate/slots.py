@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rxcli.calibrate.exposure import ExposureEstimate
 from rxcli.calibrate.fitting import weighted_mean
 from rxcli.calibrate.shutter import Axis, ShutterCalibration
 from rxcli.errors import ReceiverError
@@ -47,8 +48,8 @@ def calibrate_slots(frames: Sequence[Frame], screen: ScreenProfile, axis: Axis =
         (frames[0].height, frames[0].width),
         value,
         sd,
-        periods=upright[0].height * value * screen.slot_rate_hz,
-        exposure_note="not estimated from data; use a lamp and --frequency",
+        upright[0].height * value * screen.slot_rate_hz,
+        ExposureEstimate(None, None, "not estimated from data; use a lamp and --frequency"),
         warnings=("the camera corrected its lens distortion: line delay and distortion were estimated together",)
         * bent,
     )

@@ -42,25 +42,22 @@ class _Results:
     """The profile that a command extends, and the JSON that it writes.
 
     Args:
-        save: file of the profile.
-        name: of the profile, in place of a file.
-        json_path: file of the JSON, "-" for stdout; None: text on stdout.
-        force: replace files that others wrote.
+        given: options of a command; those of `_RESULTS` and `force_argument` are taken out.
 
     Raises:
-        UsageError: both `save` and `name` are given, or the name is impossible.
+        UsageError: both --save and --name are given, or the name is impossible.
     """
 
-    def __init__(self, save: Path | None, name: str | None, json_path: str | None, force: bool) -> None:
+    def __init__(self, given: dict[str, Any]) -> None:
         from rxcli.profiles import NAME
         from rxcli.resources import user_dir
 
+        save, name, self._json_path, self._force = (given.pop(key) for key in ("save", "name", "json_path", "force"))
         if name is not None and save is not None:
             raise UsageError("--save and --name both say where the profile goes", "give one of them")
         if name is not None and not NAME.fullmatch(name):
             raise UsageError(f"--name {name!r} cannot name a profile", _NAME_HINT)
-        self._target = save if name is None else user_dir() / "cameras" / f"{name}.toml"
-        self._json_path, self._force = json_path, force
+        self._target: Path | None = save if name is None else user_dir() / "cameras" / f"{name}.toml"
 
     def claim(self, read: list[Path], *json_keys: str, screen: str | None = None, picture: Path | None = None) -> None:
         """Refuse outputs that would destroy something; the profile may be added to.
@@ -106,9 +103,10 @@ class _Results:
 def _integers(option: str, text: str, separator: str, example: str) -> tuple[int, ...]:
     """The numbers of an option such as 9x6, as many as the example has."""
     n = len(re.split(separator, example))
-    if not re.fullmatch(rf"\d{{1,6}}(?:{separator}\d{{1,6}}){{{n - 1}}}", text):
+    numbers = re.split(separator, text)
+    if len(numbers) != n or not all(re.fullmatch(r"\d{1,6}", number) for number in numbers) or "0" in numbers[-2:]:
         raise UsageError(f"{option} {text!r} is not {n} whole numbers", f"write it as {example}")
-    return tuple(map(int, re.split(separator, text)))
+    return tuple(map(int, numbers))
 
 
 def _files(paths: tuple[Path, ...]) -> list[Path]:
@@ -131,6 +129,20 @@ def _lens_record(model: LensModel) -> dict[str, Any]:
 
 def _distortion(model: LensModel) -> tuple[str, str]:
     return "distortion", " ".join(f"{value:.5f}" for value in model.dist_coeffs) + "  (k1 k2 p1 p2 k3)"
+
+
+def _converted_report(
+    model: LensModel, worst_px: float, camera: str, name: str, at: str, source: str
+) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+    """The record and the lines of a lens model that was converted from another; `at` follows the lens's name."""
+    record = {"camera": camera, "lens": name, **_lens_record(model), "worst_px": worst_px}
+    return record, [
+        ("camera", camera or "not named"),
+        ("lens", f"{name or 'not named'}{at}"),
+        ("focal", f"{model.camera_matrix[0][0]:.1f} px"),
+        _distortion(model),
+        ("conversion", f"within {worst_px:.2f} px of {source}"),
+    ]
 
 
 class _BoardReader:
@@ -158,7 +170,7 @@ class _BoardReader:
 @calibrate.command(short_help="A lens, from pictures of a chessboard.")
 @_PATHS
 @options(
-    ("--board", str, "9x6", "Inner corners, across x down."),
+    ("--board board_size", str, "9x6", "Inner corners, across x down."),
     ("--square square_mm", float, 25.0, "Side of a square, mm."),
     ("--charuco=DICT dictionary", str, None, "ChArUco board of this dictionary (DICT_5X5_100, ...)."),
     ("--marker marker_ratio", float, 0.75, "Marker over square side."),
@@ -167,16 +179,7 @@ class _BoardReader:
     *_RESULTS,
 )
 @force_argument
-def lens(
-    paths: tuple[Path, ...],
-    board: str,
-    square_mm: float,
-    dictionary: str | None,
-    marker_ratio: float,
-    every: int,
-    picture: Path | None,
-    **results: Any,
-) -> None:
+def lens(paths: tuple[Path, ...], board_size: str, every: int, picture: Path | None, **given: Any) -> None:
     """Lens model from PATHS: pictures of a chessboard or ChArUco board, folders of them, or clips.
 
     Pictures are taken as stored, never rotated. Fill the frame out to its corners and tilt the board both ways.
@@ -185,12 +188,12 @@ def lens(
     from rxcli.calibrate.picture import write_residuals
     from rxcli.calibrate.saving import with_lens
 
-    columns, rows = _integers("--board", board, "[xX]", "9x6")
-    wanted_board = Board(columns, rows, square_mm, dictionary, marker_ratio)
-    wanted, files = _Results(**results), _files(paths)
+    wanted = _Results(given)
+    columns, rows = _integers("--board", board_size, "[xX]", "9x6")
+    board, files = Board(columns, rows, **given), _files(paths)
     wanted.claim(files, "rms_px", "camera_matrix", picture=picture)
     reader = _BoardReader(every)
-    found, width, height = find_boards(reader.read(files), wanted_board)
+    found, width, height = find_boards(reader.read(files), board)
     result = calibrate_lens([*reader.unreadable, *found], width, height)
     if picture is not None:
         write_residuals(result, picture)
@@ -238,7 +241,7 @@ def shutter(
     exposure_s: float | None,
     frames: int,
     mode: str | None,
-    **results: Any,
+    **given: Any,
 ) -> None:
     """Line delay and readout from PATHS: pictures or clips, of one readout mode, of blinking lamps.
 
@@ -256,7 +259,7 @@ def shutter(
     window = None if region is None else _integers("--region", region, ",", "100,80,640,400")
     if screen and window:
         raise UsageError("--region goes with --frequency only", "leave it out")
-    wanted, files = _Results(**results), _files(paths)
+    wanted, files = _Results(given), _files(paths)
     wanted.claim(files, "readout_s", "line_delay_s", screen=screen)
     chosen = _frames(files, frames)
     raw = chosen[0].mosaic is not None  # its rows are the sensor's
@@ -310,32 +313,25 @@ def _mode(result: ShutterCalibration, name: str | None = None) -> ReadoutMode:
 
 def _shutter_report(result: ShutterCalibration) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """The record of the JSON, and the lines for people."""
-    keys = ("readout_s", "readout_interval_s", "line_delay_s", "line_delay_interval_s", "periods", "axis")
-    more = ("exposure_s", "exposure_interval_s", "exposure_note", "warnings")
+    keys = ("readout_s", "readout_interval_s", "line_delay_s", "line_delay_interval_s", "periods", "axis", "warnings")
     of_lamp = ("picture", "bounds", "frequency_hz", "period_px", "period_sd_px", "line_delay_s")
-    record: dict[str, Any] = {key: getattr(result, key) for key in (*keys, *more)}
-    record["height"], record["width"] = result.shape
+    of_fit = ("periods", "explained")
+    exposure = result.exposure
+    record: dict[str, Any] = {key: getattr(result, key) for key in keys}
+    record |= {"height": result.shape[0], "width": result.shape[1], "exposure_s": exposure.exposure_s}
+    record |= {"exposure_interval_s": exposure.interval_s, "exposure_note": exposure.note}
     record["lamps"] = [
-        {
-            **{key: getattr(lamp, key) for key in of_lamp},
-            "periods": lamp.fit.periods,
-            "explained": lamp.fit.explained,
-        }
+        {key: getattr(lamp, key) for key in of_lamp} | {key: getattr(lamp.fit, key) for key in of_fit}
         for lamp in result.lamps
     ]
-    delays = [value * 1e6 for value in (result.line_delay_s, *result.line_delay_interval_s)]
-    readouts = [value * 1e3 for value in (result.readout_s, *result.readout_interval_s)]
-    exposure = "unknown" if result.exposure_s is None else f"{result.exposure_s * 1e6:.1f} us"
+    readout, *interval = (f"{value * 1e3:.4f}" for value in (result.readout_s, *result.readout_interval_s))
+    delay, *around = (f"{value * 1e6:.5f}" for value in (result.line_delay_s, *result.line_delay_interval_s))
+    exposed = "unknown" if exposure.exposure_s is None else f"{exposure.exposure_s * 1e6:.1f} us"
     lines = [
-        (
-            "readout",
-            "{:.4f} ms over {} {} (95 %: {:.4f} to {:.4f})".format(
-                readouts[0], result.n_lines, result.axis, *readouts[1:]
-            ),
-        ),
-        ("line delay", "{:.5f} us (95 %: {:.5f} to {:.5f})".format(*delays)),
+        ("readout", f"{readout} ms over {result.n_lines} {result.axis} (95 %: {' to '.join(interval)})"),
+        ("line delay", f"{delay} us (95 %: {' to '.join(around)})"),
         ("periods", f"{result.periods:.2f}"),
-        ("exposure", f"{exposure} ({result.exposure_note})"),
+        ("exposure", f"{exposed} ({exposure.note})"),
     ]
     for lamp in result.lamps:
         frequency = "unknown frequency" if lamp.frequency_hz is None else f"{lamp.frequency_hz:g} Hz"
@@ -353,26 +349,21 @@ def _shutter_report(result: ShutterCalibration) -> tuple[dict[str, Any], list[tu
     *_RESULTS,
 )
 @force_argument
-def lensfun(path: Path, save: Path | None, name: str | None, json_path: str | None, force: bool, **given: Any) -> None:
+def lensfun(path: Path, **given: Any) -> None:
     """Lens model of the picture PATH from the lensfun database, by camera, lens and focal length (extra [lensfun])."""
     from rxcli.calibrate.lensfun import lens_from_database
     from rxcli.calibrate.saving import with_lens
     from rxcli.ingest import open_source
 
-    wanted = _Results(save, name, json_path, force)
+    wanted = _Results(given)
     wanted.claim([path], "camera", "lens", "camera_matrix")
     frame = next(open_source(path))
     metadata = replace(frame.metadata, **{key: value for key, value in given.items() if value})
     found = lens_from_database(metadata, frame.width, frame.height)
-    names = {"camera": found.camera_name, "lens": found.lens_name}
-    lines = [
-        ("camera", found.camera_name),
-        ("lens", f"{found.lens_name} at {metadata.focal_length_mm:g} mm"),
-        ("focal", f"{found.lens.camera_matrix[0][0]:.1f} px"),
-        _distortion(found.lens),
-        ("conversion", f"within {found.worst_px:.2f} px of lensfun's own"),
-    ]
-    record = {**names, **_lens_record(found.lens), "worst_px": found.worst_px}
+    at = f" at {metadata.focal_length_mm:g} mm"
+    record, lines = _converted_report(
+        found.lens, found.worst_px, found.camera_name, found.lens_name, at, "lensfun's own"
+    )
     wanted.write(record, lines, metadata, lambda profile: with_lens(profile, found.lens, metadata.lens))
 
 
@@ -385,7 +376,7 @@ def lensfun(path: Path, save: Path | None, name: str | None, json_path: str | No
     *_RESULTS,
 )
 @force_argument
-def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | None, **results: Any) -> None:
+def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | None, **given: Any) -> None:
     """Lens model from PATH, a lens profile of the Gyroflow community (.json).
 
     A user typed in the readout of such a profile. It is written only where it is measured on a picture of a known
@@ -397,7 +388,7 @@ def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | Non
 
     if (photo is None) != (screen is None):
         raise UsageError("--photo and --screen belong together", "give both, or neither")
-    wanted = _Results(**results)
+    wanted = _Results(given)
     wanted.claim([path, *([photo] if photo else [])], "camera", "lens", "camera_matrix", screen=screen)
     width_height: Any = None if size is None else _integers("--size", size, "[xX]", "3840x2160")
     found = load_gyroflow(path, width_height)
@@ -408,25 +399,11 @@ def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | Non
         profile = with_lens(profile, found.lens, found.lens_name or None)
         return with_mode(profile, _mode(measured)) if measured else profile
 
-    camera = f"{found.make} {found.model}".strip()
-    record = {
-        "camera": camera,
-        "lens": found.lens_name,
-        **_lens_record(found.lens),
-        "worst_px": found.worst_px,
-        "readout_told_s": found.readout_s,
-        "readout_measured_s": measured.readout_s if measured else None,
-        "reversed": found.reversed,
-        "notes": notes,
-    }
-    lines = [
-        ("camera", camera or "not named"),
-        ("lens", f"{found.lens_name or 'not named'}, {found.lens.width} x {found.lens.height}"),
-        ("focal", f"{found.lens.camera_matrix[0][0]:.1f} px"),
-        _distortion(found.lens),
-        ("conversion", f"within {found.worst_px:.2f} px of the fisheye model"),
-        *(("readout", note) for note in notes),
-    ]
+    camera, at = f"{found.make} {found.model}".strip(), f", {found.lens.width} x {found.lens.height}"
+    record, lines = _converted_report(found.lens, found.worst_px, camera, found.lens_name, at, "the fisheye model")
+    record |= {"readout_told_s": found.readout_s, "reversed": found.reversed, "notes": notes}
+    record["readout_measured_s"] = measured.readout_s if measured else None
+    lines += [("readout", note) for note in notes]
     wanted.write(record, lines, Metadata(make=found.make or None, model=found.model or None), extended)
 
 

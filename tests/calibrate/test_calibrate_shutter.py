@@ -266,24 +266,26 @@ def test_more_pictures_narrow_the_interval() -> None:
 def test_exposure_from_the_edges(exposure_s: float) -> None:
     light = lamp(800, 800, exposure_s)[:, None] * scene(800, 200)
     result = calibrate_shutter([exposed(light, np.random.default_rng(10))], [800])
-    assert result.exposure_s == pytest.approx(exposure_s, rel=0.03)
-    assert result.exposure_interval_s is not None
-    assert result.exposure_interval_s[0] < result.exposure_s < result.exposure_interval_s[1]
+    assert result.exposure.exposure_s == pytest.approx(exposure_s, rel=0.03)
+    assert result.exposure.interval_s is not None
+    assert result.exposure.interval_s[0] < result.exposure.exposure_s < result.exposure.interval_s[1]
 
 
 def test_the_files_exposure_decides_between_flash_and_exposure() -> None:
     """A flash of 0.1 ms seen through 0.4 ms looks as a flash of 0.4 ms through 0.1 ms does."""
     light = lamp(800, 800, 4e-4, 0.08)[:, None] * scene(800, 200)
     picture = exposed(light, np.random.default_rng(11), gain=2.0)
-    assert calibrate_shutter([picture], [800]).exposure_s == pytest.approx(1e-4, rel=0.05)
-    assert calibrate_shutter([picture], [800], exif_exposure_s=1 / 2500).exposure_s == pytest.approx(4e-4, rel=0.05)
+    assert calibrate_shutter([picture], [800]).exposure.exposure_s == pytest.approx(1e-4, rel=0.05)
+    assert calibrate_shutter([picture], [800], exif_exposure_s=1 / 2500).exposure.exposure_s == pytest.approx(
+        4e-4, rel=0.05
+    )
 
 
 def test_no_exposure_from_a_sine() -> None:
     light = lamp(800, 800, 1e-4, None)[:, None] * scene(800, 200)
     result = calibrate_shutter([exposed(light, np.random.default_rng(12))], [800])
-    assert result.exposure_s is None
-    assert result.exposure_note
+    assert result.exposure.exposure_s is None
+    assert result.exposure.note
 
 
 def test_cell_helpers() -> None:
