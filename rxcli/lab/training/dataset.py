@@ -7,7 +7,6 @@ of every word that could have been sent, and the word that was.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import fields
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -45,7 +44,7 @@ def frame_samples(n_frames: int, seed: int, folder: Path, *, progress: bool = Tr
         progress: show a bar on stderr.
     """
 
-    def make(number: int) -> list[Sample]:
+    def make(number: int) -> Sample | None:
         rng = np.random.default_rng([_FRAMES, seed, number])
         return _simulated(training_scene(rng), int(rng.integers(2**31)))
 
@@ -55,69 +54,51 @@ def frame_samples(n_frames: int, seed: int, folder: Path, *, progress: bool = Tr
 def validation_samples(n_frames: int, folder: Path, *, progress: bool = True) -> list[Sample]:
     """Samples of pictures and cameras that are not trained on, all scene classes in turn."""
 
-    def make(number: int) -> list[Sample]:
+    def make(number: int) -> Sample | None:
         kind, turn = SCENE_CLASSES[number % len(SCENE_CLASSES)], number // len(SCENE_CLASSES)
         return _simulated(validation_scene(kind, _SCREENS[turn % 2], turn // 2), _VALIDATION + number)
 
     return list(_cached(make, n_frames, folder / "validation", "validation", progress))
 
 
-def _cached(make: Callable[[int], list[Sample]], n: int, folder: Path, what: str, progress: bool) -> Iterator[Sample]:
+def _cached(make: Callable[[int], Sample | None], n: int, folder: Path, what: str, progress: bool) -> Iterator[Sample]:
+    """Samples of `n` frames, one file each; a missing or damaged file is made again."""
     folder.mkdir(parents=True, exist_ok=True)
     for number in tqdm(range(n), desc=what, disable=not progress):
         path = folder / f"{number:05d}.npz"
-        samples = _read(path)
-        if samples is None:
-            samples = make(number)
-            _write(path, samples)
-        yield from samples
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                sample = Sample(**stored) if stored.files else None
+        except (OSError, ValueError, TypeError, BadZipFile, EOFError):
+            sample, part = make(number), path.with_suffix(".part")
+            with part.open("wb") as out:
+                np.savez(out, allow_pickle=False, **(vars(sample) if sample else {}))
+            part.replace(path)
+        if sample is not None:
+            yield sample
 
 
-def _write(path: Path, samples: list[Sample]) -> None:
-    arrays = {
-        f"{part.name}{i}": np.asarray(getattr(sample, part.name))
-        for i, sample in enumerate(samples)
-        for part in fields(Sample)
-    }
-    part = path.with_suffix(".part")
-    with part.open("wb") as file:
-        np.savez(file, allow_pickle=False, n=np.array(len(samples)), **arrays)
-    part.replace(path)
-
-
-def _read(path: Path) -> list[Sample] | None:
-    """Samples of a file; None where it is missing or damaged, so that it is made again."""
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            return [
-                Sample(**{part.name: stored[f"{part.name}{i}"] for part in fields(Sample)})
-                for i in range(int(stored["n"]))
-            ]
-    except (OSError, ValueError, KeyError, BadZipFile, EOFError):
-        return None
-
-
-def _simulated(simulated: SimulatedScene, seed: int) -> list[Sample]:
-    """One frame as a sample; none where the receiver finds no clock, a wrong one, or nothing doubtful."""
+def _simulated(simulated: SimulatedScene, seed: int) -> Sample | None:
+    """One frame as a sample; None where the receiver finds no clock, a wrong one, or nothing doubtful."""
     trial = simulate_trial(simulated, seed)
     acquisition = acquired(trial)
     if acquisition is None:
-        return []
+        return None
     reception = decode(acquisition, trial.options().skip)
     scene, columns = reception.scene, doubtful_columns(reception)
     if scene is None or not columns.size:
-        return []
+        return None
     slots = sent_slots(trial.capture.exposure, scene.clock)
     if not _headers_fit(slots, scene.clock):
-        return []
+        return None
     chosen = np.sort(np.random.default_rng(seed).permutation(columns.size)[:_MOST_COLUMNS])
     return sample_of(scene, columns[chosen], slots, trial.capture.exposure.link.weights)
 
 
 def sample_of(
     scene: DenoiserInput, columns: NDArray[np.int64], slots: NDArray[np.uint8], weights: NDArray[np.integer]
-) -> list[Sample]:
-    """What is to be learned from some columns of a scene; nothing where the receiver mixed up the bursts.
+) -> Sample | None:
+    """What is to be learned from some columns of a scene; None where the receiver mixed up the bursts.
 
     Args:
         scene: what the network is shown.
@@ -128,7 +109,7 @@ def sample_of(
     clock = scene.clock
     lit, dark = (_by_packet(part, clock) for part in (slots[columns], 1 - slots[columns]))
     if (lit * dark).any():
-        return []
+        return None
     bursts = by_burst(scene.metrics[columns], clock)
     scores, words = [], []
     for burst in range(bursts.shape[0]):
@@ -139,19 +120,17 @@ def sample_of(
             words.append(np.where(_payload(lit[burst, row] + dark[burst, row]).all(axis=1), word, UNKNOWN))
     shape = (*bursts.shape[:2], len(words[0]))
     strips, features = network_inputs(scene, columns)
-    return [
-        Sample(
-            strips=strips.astype(np.float16),
-            columns=features.astype(np.float16),
-            reception=payload_observed(scene)[columns].astype(np.float16),
-            first_slot=np.array(clock.first_slot),
-            packet_slots=np.array(clock.packet_slots),
-            burst=clock.burst,
-            w=np.asarray(weights[columns], np.int64),
-            scores=np.stack(scores).reshape(*shape, MOST_WORDS),
-            words=np.stack(words).reshape(shape),
-        )
-    ]
+    return Sample(
+        strips=strips.astype(np.float16),
+        columns=features.astype(np.float16),
+        reception=payload_observed(scene)[columns].astype(np.float16),
+        first_slot=np.array(clock.first_slot),
+        packet_slots=np.array(clock.packet_slots),
+        burst=clock.burst,
+        w=np.asarray(weights[columns], np.int64),
+        scores=np.stack(scores).reshape(*shape, MOST_WORDS),
+        words=np.stack(words).reshape(shape),
+    )
 
 
 def _by_packet(slots: NDArray[np.uint8], clock: Clock) -> NDArray[np.int64]:

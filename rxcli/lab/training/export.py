@@ -7,6 +7,7 @@ import logging
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -65,12 +66,6 @@ def export_model(
         raise ReceiverError(f"{file}: differs from torch by {difference:.1e}", "report this")
     if calibration:
         quantise(file, calibration)
-    contract = Contract(
-        version=2,
-        samples_per_slot=4,
-        strip_features=STRIP_FEATURES,
-        column_features=COLUMN_FEATURES,
-    )
     card = ModelCard(
         format=1,
         kind="denoiser",
@@ -78,7 +73,9 @@ def export_model(
         version=version,
         file=file.name,
         sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
-        contract=contract,
+        contract=Contract(
+            version=2, samples_per_slot=4, strip_features=STRIP_FEATURES, column_features=COLUMN_FEATURES
+        ),
         description="Corrections of the light model's log-likelihood ratios of slots",
         recipe=recipe,
         figures=figures,
@@ -89,6 +86,8 @@ def export_model(
 
 def _write_onnx(network: StripNetwork, file: Path) -> None:
     example = (torch.zeros(2, 3, N_STRIP_FEATURES, 40), torch.zeros(2, N_COLUMN_FEATURES, 40))
+    inputs = {"strips": {0: "batch", 1: "strip", 3: "slot"}, "columns": {0: "batch", 2: "slot"}}
+    output = {"correction": {0: "batch", 1: "slot"}}
     with warnings.catch_warnings():
         # The exporter that needs no further package is marked as the old one.
         warnings.simplefilter("ignore")
@@ -96,32 +95,12 @@ def _write_onnx(network: StripNetwork, file: Path) -> None:
             network,
             example,
             str(file),
-            input_names=["strips", "columns"],
-            output_names=["correction"],
-            dynamic_axes={
-                "strips": {0: "batch", 1: "strip", 3: "slot"},
-                "columns": {0: "batch", 2: "slot"},
-                "correction": {0: "batch", 1: "slot"},
-            },
+            input_names=list(inputs),
+            output_names=list(output),
+            dynamic_axes=inputs | output,
             opset_version=_OPSET,
             dynamo=False,
         )
-
-
-class _Ranges:
-    """Feeds calibration samples to ONNX Runtime's quantiser, a few columns of each."""
-
-    def __init__(self, samples: Sequence[Sample]) -> None:
-        self._left = iter(samples)
-
-    def get_next(self) -> dict[str, Any] | None:
-        sample = next(self._left, None)
-        if sample is None:
-            return None
-        return {
-            "strips": sample.strips[:_CALIBRATION_COLUMNS].astype(np.float32),
-            "columns": sample.columns[:_CALIBRATION_COLUMNS].astype(np.float32),
-        }
 
 
 def quantise(file: Path, samples: Sequence[Sample]) -> None:
@@ -134,22 +113,20 @@ def quantise(file: Path, samples: Sequence[Sample]) -> None:
     onnx_runtime()
     from onnxruntime import quantization
 
-    log = logging.getLogger()
-    level = log.level
-    log.setLevel(logging.ERROR)
+    inputs = (
+        {name: getattr(sample, name)[:_CALIBRATION_COLUMNS].astype(np.float32) for name in ("strips", "columns")}
+        for sample in samples
+    )
+    reader = SimpleNamespace(get_next=lambda: next(inputs, None))
+    kinds = {"activation_type": quantization.QuantType.QUInt8, "weight_type": quantization.QuantType.QInt8}
+    part = file.with_suffix(".part")
+    level = logging.getLogger().level
+    logging.getLogger().setLevel(logging.ERROR)
     try:
-        part = file.with_suffix(".part")
-        quantization.quantize_static(
-            file,
-            part,
-            _Ranges(samples),
-            per_channel=True,
-            activation_type=quantization.QuantType.QUInt8,
-            weight_type=quantization.QuantType.QInt8,
-        )
-        part.replace(file)
+        quantization.quantize_static(file, part, reader, per_channel=True, **kinds)
     finally:
-        log.setLevel(level)
+        logging.getLogger().setLevel(level)
+    part.replace(file)
 
 
 def parity(network: StripNetwork, file: Path, seed: int = 0) -> float:

@@ -167,11 +167,10 @@ class SceneClass:
     quality: int = 93
     #: Exposure in slots; None: the preset's.
     exposure_slots: float | None = None
-    hard: bool = True
 
 
 SCENE_CLASSES = (
-    SceneClass("clean", ("sky", "coffee", "astronaut"), 1.5, hard=False),
+    SceneClass("clean", ("sky", "coffee", "astronaut"), 1.5),
     SceneClass("dark", ("flower", "night", "rocket")),
     SceneClass("textured", ("chelsea", "motorcycle", "text")),
     SceneClass("low light", ("coffee", "sky", "astronaut"), 0.25),
