@@ -158,7 +158,7 @@ def compare(checkout: Path, name: str, out: Path, **given: Any) -> int:
 
     from rxcli.errors import ExitCode
     from rxcli.lab.benchmark import compare as work
-    from rxcli.lab.benchmark import tables
+    from rxcli.lab.benchmark import measures, tables
     from rxcli.lab.benchmark.runner import scenarios
     from rxcli.outputs import claim_own_folder
 
@@ -167,10 +167,9 @@ def compare(checkout: Path, name: str, out: Path, **given: Any) -> int:
     scenario, other = _chosen(name, given["captures"], given["only"]), work.check_checkout(checkout)
     claim_own_folder("--out", out, ("*.journal.jsonl", "compare.json"))
     tasks = scenario.tasks(given["seed"], given["count"] or scenario.count, out / "media")
-    jobs = list(work.jobs_of(tasks, out / "compare"))
     with tqdm(total=2 * given["repeats"], desc="compare", leave=False, disable=given["quiet"] or None) as bar:
-        found = work.compare(jobs, other, given["repeats"], bar.update)
-    rows, differing = work.rows(found), work.differing(found)
+        records = work.compare(tasks, other, out / "compare", given["repeats"], bar.update)
+    rows, differing = measures.rows(records, work.WAYS, work.COLUMNS), work.differing(records)
     click.echo(tables.titled([("this checkout against the other", rows), ("results that differ", differing)]))
     _say_written(tables.write_outputs(out, "compare", rows, differing))
     return ExitCode.NOT_RECEIVED if differing else ExitCode.OK

@@ -17,7 +17,7 @@ from rxcli.errors import InputError, ReceiverError, UsageError
 from rxcli.lab.benchmark import cases, compare, measures, quick, tables, yardsticks
 from rxcli.lab.benchmark.bare import bare_decode
 from rxcli.lab.benchmark.cases import Case, received
-from rxcli.lab.benchmark.draw import Place, Point, binned, draw_nodata, draw_small, scene_at
+from rxcli.lab.benchmark.draw import Place, binned, draw_nodata, draw_small, scene_at
 from rxcli.lab.benchmark.measures import Group, cluster_interval, logistic_regression, wilson
 from rxcli.lab.benchmark.media import write_capture
 from rxcli.lab.benchmark.runner import Journal, Run, Task, do, scenarios
@@ -61,7 +61,7 @@ def test_the_bound_is_no_magic(easy: Trial) -> None:
 
 def test_paper_reads_packets_between_two_headers() -> None:
     rng = np.random.default_rng(0)
-    screen = scene_at(Point(payload_symbols=5)).screen
+    screen = scene_at(payload_symbols=5).screen
     payload = rng.integers(0, 2, payload_bits(4, 5)).astype(np.uint8)
     lit = np.repeat(np.tile(encode_packet(payload, 4), 2)[:-20], 6)
     starts, agreement = yardsticks.find_headers(lit.astype(bool), 6.0)
@@ -361,11 +361,6 @@ def test_without_a_command_help_is_shown() -> None:
 # Two checkouts.
 
 
-def compared(before: list[Any], now: list[Any], codes: tuple[int, int] = (0, 0)) -> compare.Comparison:
-    job = compare.Job("captures", ["decode", "a.jpg"])
-    return compare.Comparison(job, compare.Decoded(now, 1.0, codes[1]), compare.Decoded(before, 2.0, codes[0]))
-
-
 @pytest.mark.parametrize(
     ("before", "now", "difference"),
     [
@@ -377,19 +372,18 @@ def compared(before: list[Any], now: list[Any], codes: tuple[int, int] = (0, 0))
     ],
 )
 def test_the_first_difference_is_named(before: list[Any], now: list[Any], difference: str | None) -> None:
-    assert compared(before, now).difference == difference
-    assert compared(before, now, (0, 1)).difference == "exit code: 0 -> 1"
+    assert next(compare.differences("", before, now), None) == difference
 
 
 def test_rows_of_two_checkouts_add_up() -> None:
-    packets = [{"confidence": 0.999, "bit_errors": 0}, {"confidence": 0.999, "bit_errors": 2}]
-    same = [{"columns": [{"packets": packets}]}]
-    found = [compared(same * 2, same), compared([], [])]
-    (group, total) = compare.rows(found)
-    assert (group["files"], total["files"], group["n"], group["same"]) == ("captures", "all", 2, 1)
-    assert (group["this_right"], group["this_surely_wrong"], group["other_right"]) == (1, 1, 2)
-    assert group["cpu_ratio"] == pytest.approx(0.5)
-    assert [row["file"] for row in compare.differing(found)] == ["a.jpg"]
+    packets = [{"confidence": c, "bit_errors": e, "frame": 0, "column": e, "payload": ""} for c, e in ((1, 0), (1, 2))]
+    before, now = {"packets": packets, "cpu_s": 2.0}, {"packets": packets[1:], "cpu_s": 1.0, "difference": "a: 1 -> 2"}
+    ways = dict(zip(compare.WAYS, (before, now), strict=True))
+    record = {"about": {"file": "b/a.jpg"}, "has_data": True, "groups": [], "ways": ways}
+    other, this = measures.rows([record], compare.WAYS, compare.COLUMNS)
+    assert (other["right_packets"], this["right_packets"], this["surely_wrong"], this["changed"]) == (1, 0, 1, 1)
+    assert (this["same"], this["cpu_ratio"]) == (0, 0.5)
+    assert compare.differing([record]) == [{"file": "a.jpg", "first difference": "a: 1 -> 2"}]
 
 
 def test_a_checkout_that_breaks_off_is_told(tmp_path: Path) -> None:
@@ -401,7 +395,7 @@ def test_a_checkout_that_breaks_off_is_told(tmp_path: Path) -> None:
         (folder / "__init__.py").touch()
     (package / "main.py").write_text("raise RuntimeError('out of order')\n")
     with pytest.raises(ReceiverError, match="out of order"):
-        compare.compare([], compare.check_checkout(tmp_path), 1, lambda: None)
+        compare.compare([], compare.check_checkout(tmp_path), tmp_path, 1, lambda: None)
 
 
 def test_a_changed_receiver_is_found_out(tmp_path: Path) -> None:

@@ -69,38 +69,16 @@ def _with_options(**changes: Any) -> Way:
     return lambda case: receive(case.frames(), replace(case.options, **changes))
 
 
-def _corners_given(case: Case) -> Iterable[FrameResult]:
-    return receive(case.frames(), replace(case.options, corners=case.corners))
-
-
-def _grey_levels(case: Case) -> Iterable[FrameResult]:
-    return receive(map(with_grey_levels, case.frames()), case.options)
-
-
-def _cropped(case: Case) -> Iterable[FrameResult]:
-    return receive(map(without_first_row, case.frames()), cropped_options(case.options))
-
-
 def _on_two_threads(case: Case) -> Iterator[FrameResult]:
     with threads(2):
         yield from receive(case.frames(), case.options)
-
-
-def _bound(case: Case) -> Iterable[FrameResult]:
-    assert case.trial is not None, "only a simulated frame has a bound"
-    return [bound_result(case.trial)]
-
-
-def _paper(case: Case) -> Iterable[FrameResult]:
-    assert case.trial is not None, "the paper's pipeline is given a simulated frame"
-    return [paper_result(case.trial)]
 
 
 RECEIVER, OTHER_KERNEL = "receiver", "another kernel"
 #: Name of a way -> how it receives a case. `OTHER_KERNEL` is `RECEIVER` in another process.
 WAYS: dict[str, Way] = {
     RECEIVER: _with_options(),
-    "corners given": _corners_given,
+    "corners given": lambda case: receive(case.frames(), replace(case.options, corners=case.corners)),
     "frames one by one": _with_options(skip=frozenset(SKIPS) - {"tracking"}),
     "searched": _with_options(corners=None),
     "no auto-encoder": _with_options(cae="never"),
@@ -108,10 +86,10 @@ WAYS: dict[str, Way] = {
     **{f"no skip of {name}": _with_options(skip=frozenset(SKIPS) - {name}) for name in SKIPS},
     "no skip at all": _with_options(skip=frozenset()),
     "two threads": _on_two_threads,
-    "grey levels": _grey_levels,
-    "cropped by a row": _cropped,
-    "bound": _bound,
-    "paper": _paper,
+    "grey levels": lambda case: receive(map(with_grey_levels, case.frames()), case.options),
+    "cropped by a row": lambda case: receive(map(without_first_row, case.frames()), cropped_options(case.options)),
+    "bound": lambda case: [bound_result(case.trial)],
+    "paper": lambda case: [paper_result(case.trial)],
 }
 
 
@@ -151,10 +129,11 @@ def received(case: Case, way: str) -> Record:
     cpu_s, wall_s = process_time() - start, perf_counter() - wall
     problems += [f"{w.category.__name__}: {w.message} ({Path(w.filename).name}:{w.lineno})" for w in caught]
     problems += [problem for result in results for problem in nonsense(result)]
+    stages_ms = sum((Counter(result.timing_ms) for result in results), Counter[str]())
     return {
         "cpu_s": cpu_s,
         "wall_s": wall_s,
-        "stages_ms": dict(sum((Counter(result.timing_ms) for result in results), Counter[str]())),
+        "stages_ms": dict(stages_ms),
         "mb": peak_memory_mb(),
         "problems": list(dict.fromkeys(problems)),
         "score": None if scorer is None else asdict(scorer.score()),
@@ -185,34 +164,22 @@ def bare(case: Case) -> Record:
 
 def _packets(result: FrameResult, case: Case) -> Iterator[Record]:
     """What one scored frame reported of every packet; where no truth is known none is wrong."""
-    truth = case.truth
     for column in result.columns:
         for packet in column.packets:
-            false = packet.payload_bits if truth is not None or not case.has_data else 0
-            yield {
-                "frame": result.frame,
-                "column": column.column,
-                "payload": packet.payload,
-                "confidence": packet.confidence,
-                "bit_errors": false if packet.bit_errors is None else packet.bit_errors,
-                "payload_bits": packet.payload_bits,
-                "w": column.w,
-                "tx_w": truth.w[column.column] if truth is not None and column.column < truth.columns else None,
-                "snr_db": column.snr_db,
-                "denoised": column.denoised,
-                "evidence": packet.confidence_features,
-            }
+            false = packet.payload_bits if case.truth is not None or not case.has_data else 0
+            wrong = false if packet.bit_errors is None else packet.bit_errors
+            place = {"frame": result.frame, "column": column.column, "payload": packet.payload}
+            features = packet.confidence_features
+            yield {**place, "confidence": packet.confidence, "bit_errors": wrong, "evidence": features}
 
 
 def _found(result: FrameResult, case: Case) -> Record:
     """What the first frame tells of the screen and the camera."""
-    has_corners = result.corners is not None and case.corners is not None
+    found, truth = result.corners, case.corners
     return {
         "status": result.status,
-        "message": result.message,
-        "screen": result.screen_profile,
         "rows_per_slot": result.estimated.get("rows_per_slot"),
-        "corner_error": corner_error(result.corners, case.corners) if has_corners else None,  # type: ignore[arg-type]
+        "corner_error": corner_error(found, truth) if found is not None and truth is not None else None,
         "shift": column_shift(result, case.truth) if case.truth is not None else 0,
         "numbered": result.column_offset is not None,
     }
@@ -239,9 +206,9 @@ def column_shift(result: FrameResult, truth: Truth) -> int:
 def with_grey_levels(frame: Frame) -> Frame:
     """The frame with one grey level more or less on 1 % of its pixels; the same frame changes alike every time."""
     rng = np.random.default_rng(frame.index)
-    dtype = frame.pixels.dtype
-    step = rng.choice(np.array([-1, 0, 1]), frame.pixels.shape, p=[_GREY_SHARE / 2, 1 - _GREY_SHARE, _GREY_SHARE / 2])
-    changed: Any = np.clip(frame.pixels.astype(np.int64) + step, 0, np.iinfo(dtype).max).astype(dtype)
+    pixels = frame.pixels.astype(np.int32)
+    pixels += rng.choice([-1, 0, 1], pixels.shape, p=[_GREY_SHARE / 2, 1 - _GREY_SHARE, _GREY_SHARE / 2])
+    changed: Any = pixels.clip(0, np.iinfo(frame.pixels.dtype).max).astype(frame.pixels.dtype)
     return replace(frame, pixels=changed)
 
 

@@ -13,7 +13,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,9 @@ import msgspec
 import numpy as np
 
 from rxcli.errors import ReceiverError, UsageError
-from rxcli.lab.benchmark.cases import Case
+from rxcli.lab.benchmark.cases import Case, Record
 from rxcli.lab.benchmark.draw import DRAWERS, Place
-from rxcli.lab.benchmark.measures import SURE, Row
+from rxcli.lab.benchmark.measures import Row
 from rxcli.lab.benchmark.runner import Task
 from rxcli.lab.simulate.tiff import write_dng
 from rxcli.options import SKIPS, ReceiverOptions
@@ -48,45 +47,9 @@ _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NU
 _ENVIRONMENT["VLC_RX_NO_CAMERA_CACHE"] = "1"
 
 
-@dataclass(frozen=True)
-class Decoded:
-    """What one checkout made of one file."""
-
-    #: Lines of JSON, without times.
-    records: list[Any]
-    cpu_s: float
-    exit_code: int
-
-    @property
-    def packets(self) -> list[dict[str, Any]]:
-        """Those of all columns of all frames."""
-        columns = (column for record in self.records for column in record.get("columns", ()))
-        return [packet for column in columns for packet in column["packets"]]
-
-
-@dataclass(frozen=True)
-class Job:
-    """One file, and how it is decoded."""
-
-    group: str
-    #: Of `vlc-rx`; the second is the file.
-    arguments: list[str]
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Both checkouts on one file."""
-
-    job: Job
-    this: Decoded
-    other: Decoded
-
-    @property
-    def difference(self) -> str | None:
-        """The first place where the results differ, None where they are the same."""
-        if self.this.exit_code != self.other.exit_code:
-            return f"exit code: {self.other.exit_code} -> {self.this.exit_code}"
-        return next(_differences("", self.other.records, self.this.records), None)
+#: The ways of a comparison; packets of this checkout are compared with those of the other.
+WAYS = ("other checkout", "this checkout")
+COLUMNS = ("n", "same", "packets", "right_packets", "sure", "surely_wrong", "changed", "cpu_s", "cpu_ratio")
 
 
 def arguments_of(case: Case, stem: Path) -> list[str]:
@@ -142,42 +105,42 @@ def this_checkout() -> Path:
     return Path(__file__).resolve().parents[3]
 
 
-def compare(jobs: Sequence[Job], other: Path, repeats: int, tick: Callable[[], None]) -> list[Comparison]:
-    """Decode every file with this checkout and with the other, by turns.
+def compare(tasks: Sequence[Task], other: Path, folder: Path, repeats: int, tick: Callable[[], None]) -> list[Record]:
+    """Draw the cases of the tasks as files, and decode each with this checkout and with the other, by turns.
 
     Args:
-        jobs: from `jobs_of`.
+        tasks: of a scenario.
         other: folder of the other checkout.
+        folder: where the files go.
         repeats: turns; the least time of each file counts.
         tick: called after every turn of either.
 
     Raises:
         ReceiverError: a checkout broke off.
     """
-    found: dict[Path, list[list[Decoded]]] = {other: [], this_checkout(): []}
-    for _ in range(repeats):
-        for checkout, turns in found.items():
-            turns.append(_decoded_by(checkout, [job.arguments for job in jobs]))
-            tick()
-    theirs, ours = (
-        [replace(one[0], cpu_s=min(d.cpu_s for d in one)) for one in zip(*turns, strict=True)]
-        for turns in found.values()
-    )
-    return [Comparison(*parts) for parts in zip(jobs, ours, theirs, strict=True)]
-
-
-def jobs_of(tasks: Sequence[Task], folder: Path) -> Iterator[Job]:
-    """Draw the cases of a scenario's tasks, and write them as files into `folder`."""
+    records: list[Record] = []
+    jobs: list[list[str]] = []
     for task in tasks:
-        for number, case in enumerate(
-            DRAWERS[task["draw"]](Place(task["seed"], task["number"], task["point"], folder))
-        ):
-            label = "-".join(filter(None, (task["draw"], task["label"])))
-            stem = folder / f"{Path(label).stem}-{task['seed']}-{task['number']}-{number}"
-            yield Job(next(iter(case.groups), label), arguments_of(case, stem.resolve()))
+        for case in DRAWERS[task["draw"]](Place(task["seed"], task["number"], task["point"], folder)):
+            jobs.append(arguments_of(case, (folder / f"{task['draw']}-{task['seed']}-{len(jobs)}").resolve()))
+            groups = [*filter(None, [task["label"]]), *case.groups]
+            records.append({"about": {"file": jobs[-1][1]}, "has_data": case.has_data, "groups": groups, "ways": {}})
+    turns: dict[str, list[list[Record]]] = {way: [] for way in WAYS}
+    for _ in range(repeats):
+        for way, checkout in zip(WAYS, (other, this_checkout()), strict=True):
+            turns[way].append(_decoded_by(checkout, jobs))
+            tick()
+    for way, several in turns.items():
+        for record, decoded in zip(records, zip(*several, strict=True), strict=True):
+            record["ways"][way] = {**decoded[0], "cpu_s": min(one["cpu_s"] for one in decoded)}
+    for record in records:
+        before, now = (record["ways"][way] for way in WAYS)
+        now["difference"] = next(differences("", before["lines"], now["lines"]), None)
+    return records
 
 
-def _decoded_by(checkout: Path, jobs: Sequence[Sequence[str]]) -> list[Decoded]:
+def _decoded_by(checkout: Path, jobs: Sequence[Sequence[str]]) -> list[Record]:
+    """What one checkout made of every file: lines without times, packets, seconds."""
     environment = {**os.environ, **_ENVIRONMENT, "PYTHONPATH": str(checkout)}
     command = [sys.executable, "-P", "-c", _WORKER]
     # Elsewhere: python would look into the folder that it stands in first.
@@ -187,48 +150,33 @@ def _decoded_by(checkout: Path, jobs: Sequence[Sequence[str]]) -> list[Decoded]:
     if done.returncode:
         reason = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
         raise ReceiverError(f"{checkout}: decoding broke off ({reason[0]})", "run its own tests")
-    return [Decoded(_records(text), cpu_s, code) for text, cpu_s, code in json.loads(done.stdout)]
+    return [_reception(text, cpu_s, code) for text, cpu_s, code in json.loads(done.stdout)]
 
 
-def _records(text: str) -> list[Any]:
-    """The lines of a run without what differs from run to run."""
-    return [{k: v for k, v in json.loads(line).items() if k != "timing_ms"} for line in text.splitlines()]
+def _reception(text: str, cpu_s: float, exit_code: int) -> Record:
+    lines = [{k: v for k, v in json.loads(line).items() if k != "timing_ms"} for line in text.splitlines()]
+    packets = [
+        {**packet, "frame": line["frame"], "column": column["column"], "bit_errors": packet["bit_errors"] or 0}
+        for line in lines
+        for column in line.get("columns", ())
+        for packet in column["packets"]
+    ]
+    return {"lines": [*lines, {"exit code": exit_code}], "packets": packets, "cpu_s": cpu_s}
 
 
-def _differences(place: str, before: Any, now: Any) -> Iterator[str]:
+def differences(place: str, before: Any, now: Any) -> Iterator[str]:
     """Places where two JSON values differ, with both values."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key in dict.fromkeys((*before, *now)):
-            yield from _differences(f"{place}.{key}".lstrip("."), before.get(key), now.get(key))
+            yield from differences(f"{place}.{key}".lstrip("."), before.get(key), now.get(key))
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
         for number, parts in enumerate(zip(before, now, strict=True)):
-            yield from _differences(f"{place}[{number}]", *parts)
+            yield from differences(f"{place}[{number}]", *parts)
     elif before != now or type(before) is not type(now):
         yield f"{place}: {json.dumps(before):.60} -> {json.dumps(now):.60}"
 
 
-def rows(found: Sequence[Comparison]) -> list[Row]:
-    """One row a group, and one for all."""
-    groups = {
-        name: [one for one in found if one.job.group == name] for name in dict.fromkeys(one.job.group for one in found)
-    }
-    return [_row(name, some) for name, some in (groups | {"all": list(found)}).items()]
-
-
-def _row(name: str, found: Sequence[Comparison]) -> Row:
-    row: Row = {"files": name, "n": len(found), "same": sum(one.difference is None for one in found)}
-    for side in ("this", "other"):
-        packets = [packet for one in found for packet in getattr(one, side).packets]
-        sure = [packet for packet in packets if packet["confidence"] >= SURE]
-        row[f"{side}_packets"] = len(packets)
-        row[f"{side}_right"] = sum(packet.get("bit_errors") == 0 for packet in packets)
-        row[f"{side}_surely_wrong"] = sum(bool(packet.get("bit_errors")) for packet in sure)
-        row[f"{side}_cpu_s"] = sum(getattr(one, side).cpu_s for one in found)
-    return {**row, "cpu_ratio": row["this_cpu_s"] / row["other_cpu_s"] if row["other_cpu_s"] else None}
-
-
-def differing(found: Sequence[Comparison]) -> list[Row]:
+def differing(records: Sequence[Record]) -> list[Row]:
     """The files whose results differ, and where first."""
-    return [
-        {"file": Path(one.job.arguments[1]).name, "first difference": one.difference} for one in found if one.difference
-    ]
+    found = ((record["about"]["file"], record["ways"][WAYS[1]]["difference"]) for record in records)
+    return [{"file": Path(file).name, "first difference": difference} for file, difference in found if difference]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from math import sqrt
 from multiprocessing import get_context
 from pathlib import Path
@@ -26,11 +26,12 @@ from rxcli.lab.simulate.optics import Lens, Pose, View
 from rxcli.lab.simulate.pictures import PHOTOS, draw_name
 from rxcli.lab.simulate.scenes import Scene, preset, random_scene
 from rxcli.lab.simulate.sensor import Sensor
+from rxcli.lab.simulate.transmitter import Weights
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.lab.simulate.video import write_video
 from rxcli.options import ReceiverOptions, receiver_options
 from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, load_profile, shipped_profiles
-from rxcli.protocol import packet_slots, payload_bits
+from rxcli.protocol import payload_bits
 from rxcli.results.truth import find_truth, load_truth
 from rxcli.types import FloatArray, Frame
 
@@ -62,23 +63,21 @@ class Place:
 
 def _case(trial: Trial, options: ReceiverOptions, *groups: str, **about: Any) -> Case:
     """A simulated photograph, with the facts of its scene."""
-    scene = trial.capture.scene
-    facts = {
-        "screen": scene.screen.name,
-        "camera": scene.camera_name,
-        "picture": scene.picture if isinstance(scene.picture, str) else "drawn",
-        "rows_per_slot": scene.rows_per_slot,
-        "exposure_slots": scene.exposure_s * scene.screen.slot_rate_hz,
-    }
-    return Case(
-        source=(trial.frame,),
-        options=options,
-        groups=groups,
-        about={**facts, **about},
-        truth=trial.truth,
-        corners=trial.corners,
-        trial=trial,
-    )
+    scene, frames = trial.capture.scene, (trial.frame,)
+    about |= {"screen": scene.screen.name, "camera": scene.camera_name, "rows_per_slot": scene.rows_per_slot}
+    about["picture"] = scene.picture if isinstance(scene.picture, str) else "drawn"
+    known: dict[str, Any] = {"truth": trial.truth, "corners": trial.corners, "trial": trial}
+    return Case(source=frames, options=options, groups=groups, about=about, **known)
+
+
+def _weight(rng: np.random.Generator, dimming: float, low: int = 2) -> Weights:
+    """Lit slots of a symbol: by the picture's light with a probability of `dimming`, or the same in all columns."""
+    return "dimming" if rng.random() < dimming else int(rng.integers(low, 9))
+
+
+def _lit(base: Scene, exposure_s: float, factor: float) -> dict[str, Any]:
+    """The preset's light, times a factor, at another exposure."""
+    return {"exposure_s": exposure_s, "light_e_per_s": base.light_e_per_s * (base.exposure_s / exposure_s) * factor}
 
 
 # Phones that nobody has measured.
@@ -87,7 +86,6 @@ _PHONE_HEIGHTS_PX, _PHONE_EXPOSURE_SLOTS = (720, 1080, 1440, 1800), (0.4, 0.7, 1
 _PHONE_ROWS_PER_SLOT, _PHONE_READOUT_S, _PHONE_FILL = (1.5, 20.0), (5e-3, 45e-3), (0.75, 0.95)
 #: Packets that the screen's height holds, with some room for tilt over the 1.3 that are asked for.
 _PHONE_PACKETS = 1.35
-_FOCAL_WIDTHS, _K1, _K2_SHARE = (0.65, 1.2), 0.15, 1.2
 #: Noise of a phone's simulation starts from this and the phone's number.
 FIRST_SEED = 1000
 
@@ -97,48 +95,36 @@ def draw_phone(at: Place) -> Iterator[Case]:
     scene, turned = phone_of(at.seed, at.number)
     trial = simulate_trial(scene, FIRST_SEED + at.number, oracle=at.oracle)
     frame, corners = as_stored(trial, turned)
-    corrected, slots = scene.isp.correct_distortion, scene.exposure_s * scene.screen.slot_rate_hz
     kinds = {
-        "uncorrected": not corrected,
-        "corrected": corrected,
+        "corrected" if scene.isp.correct_distortion else "uncorrected": True,
         "below 3 rows a slot": scene.rows_per_slot < 3,
-        "exposed above 1.4 slots": slots > 1.4,
+        "exposed above 1.4 slots": scene.exposure_s * scene.screen.slot_rate_hz > 1.4,
         "star field": scene.picture == "hubble",
     }
-    case = _case(trial, ReceiverOptions(cameras=(), corners=corners), *(name for name, is_so in kinds.items() if is_so))
-    about = {**case.about, "turned": turned, "k1": scene.lens.distortion[0] / scene.lens.focal_widths**2}
-    yield replace(case, source=(frame,), about=about, corners=corners)
+    groups = [name for name, is_so in kinds.items() if is_so]
+    case = _case(trial, ReceiverOptions(cameras=(), corners=corners), *groups, turned=turned)
+    yield replace(case, source=(frame,), corners=corners)
 
 
 def phone_of(seed: int, number: int) -> tuple[Scene, bool]:
     """A random phone before a screen, and whether its picture was turned upside down by software."""
     rng = np.random.default_rng([seed, number])
     screen, sensor, fill = _readout_of(rng)
-    focal, k1 = rng.uniform(*_FOCAL_WIDTHS), rng.uniform(-_K1, _K1)
-    k2 = -k1 * rng.uniform(0, _K2_SHARE)
+    focal_widths, k1 = rng.uniform(0.65, 1.2), rng.uniform(-0.15, 0.15)
+    k2 = -k1 * rng.uniform(0, 1.2)
     corrected, turned = bool(rng.random() < 0.5), bool(rng.random() < 0.3)
-    base = preset("phone-plain", screen)
-    exposure_slots = float(rng.choice(_PHONE_EXPOSURE_SLOTS)) * rng.uniform(0.85, 1.15)
-    lens = Lens(focal, (k1, k2, rng.normal(0, 4e-4), rng.normal(0, 4e-4), 0.0))
-    tilt = rng.normal(0, (1.2, 4, 3))
-    roll, yaw, pitch = float(tilt[0]) + 180 * turned, float(tilt[1]), float(tilt[2])
-    shift_x, shift_y = (float(shift) for shift in rng.normal(0, 0.01, 2))
+    exposure_s = float(rng.choice(_PHONE_EXPOSURE_SLOTS)) * rng.uniform(0.85, 1.15) / screen.slot_rate_hz
+    lens = Lens(focal_widths, (k1, k2, rng.normal(0, 4e-4), rng.normal(0, 4e-4), 0.0))
+    roll, yaw, pitch = rng.normal(0, (1.2, 4, 3)).tolist()
+    pose = Pose(fill, roll + 180 * turned, yaw, pitch, *rng.normal(0, 0.01, 2).tolist())
     tone: Any = str(rng.choice(["srgb", "bt709"]))
     sharpen, denoise_px = rng.uniform(0, 0.8), rng.uniform(0, 0.6)
-    scene = replace(
-        base,
-        sensor=sensor,
-        lens=lens,
-        pose=Pose(fill, roll, yaw, pitch, shift_x, shift_y),
-        isp=Isp(tone, 2.0, sharpen, denoise_px=denoise_px, correct_distortion=corrected, quality=90),
-        picture=str(rng.choice(list(PHOTOS))),
-        w="dimming" if rng.random() < 0.3 else int(rng.integers(3, 9)),
-        exposure_s=exposure_slots / screen.slot_rate_hz,
-        light_e_per_s=1.4e6 / 24000 / (exposure_slots / screen.slot_rate_hz) * 10 ** rng.uniform(-0.3, 0.2),
-        orientation=1,
-        slot_rate_error_ppm=0.0,
-        blur_px=rng.uniform(0.5, 1.2),
-    )
+    isp = Isp(tone, 2.0, sharpen, denoise_px=denoise_px, correct_distortion=corrected, quality=90)
+    picture, w = str(rng.choice(list(PHOTOS))), _weight(rng, 0.3, 3)
+    light_e_per_s = 1.4e6 / 24000 / exposure_s * 10 ** rng.uniform(-0.3, 0.2)
+    base = preset("phone-plain", screen)
+    base = replace(base, sensor=sensor, lens=lens, pose=pose, isp=isp, picture=picture, w=w, orientation=1)
+    scene = replace(base, exposure_s=exposure_s, light_e_per_s=light_e_per_s, blur_px=rng.uniform(0.5, 1.2))
     return scene, turned
 
 
@@ -188,28 +174,20 @@ def screen_of(seed: int, number: int) -> tuple[Scene, str]:
     while True:
         base = preset(str(rng.choice(["xs10-still", "phone-corrected", "phone-plain"])), str(rng.choice(screens)))
         share = rng.uniform(0.6, 0.97)
-        rows = share * base.sensor.height / base.rows_per_slot
-        if rows >= _SCREEN_PACKETS * base.screen.packet_slots:
+        if share * base.sensor.height / base.rows_per_slot >= _SCREEN_PACKETS * base.screen.packet_slots:
             break
     kind = str(rng.choice(DARK_KINDS)) if rng.random() < 0.5 else "photo"
     size = base.screen.width_px, base.screen.height_px
     picture = str(rng.choice(list(PHOTOS))) if kind == "photo" else draw_dark_picture(kind, rng, *size)
     slots = float(rng.choice([0.5, 1.0])) * rng.uniform(0.8, 1.2)
     exposure_s = max(slots / base.screen.slot_rate_hz, _MIN_EXPOSURE_S)
-    scene = replace(
-        base,
-        picture=picture,
-        w="dimming" if rng.random() < 0.4 else int(rng.integers(2, 9)),
-        exposure_s=exposure_s,
-        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(-0.3, 0.3),
-        room=replace(base.room, light_e_per_s=base.light_e_per_s * 10 ** rng.uniform(-3, -1.3)),
-        blur_px=rng.uniform(0.5, 1.5),
-        slot_rate_error_ppm=rng.uniform(-50, 50),
-        orientation=1,
-        n_frames=1,
-        output="developed",
-    )
+    w = _weight(rng, 0.4)
+    lit = _lit(base, exposure_s, 10 ** rng.uniform(-0.3, 0.3))
+    room = replace(base.room, light_e_per_s=base.light_e_per_s * 10 ** rng.uniform(-3, -1.3))
+    blur_px, slot_rate_error_ppm = rng.uniform(0.5, 1.5), rng.uniform(-50, 50)
+    scene = replace(base, picture=picture, w=w, room=room, blur_px=blur_px, n_frames=1, **lit)
     angles = (rng.normal(0, 1.5), rng.normal(0, 4), rng.normal(0, 4))
+    scene = replace(scene, slot_rate_error_ppm=slot_rate_error_ppm)
     return placed(scene, share, angles, rng.uniform(-0.9, 0.9, 2)), kind
 
 
@@ -254,22 +232,18 @@ def confidence_scene(seed: int) -> Scene:
     rng = np.random.default_rng([seed, 5])
     searched = np.random.default_rng([seed, 6]).random() < _SEARCHED_SHARE
     base, light = (preset("xs10-still", _SEARCHED_SCREEN), _SEARCHED_LIGHT) if searched else (_small(rng), _LIGHT)
-    exposure_slots = rng.choice([0.5, 1.0, 1.5, 2.0]) * rng.uniform(0.8, 1.2)
-    exposure_s = max(float(exposure_slots) / base.screen.slot_rate_hz, _MIN_EXPOSURE_S)
-    return replace(
-        base,
-        picture=draw_name(rng),
-        w="dimming" if rng.random() < 0.3 else int(rng.integers(2, 9)),
-        pose=replace(base.pose, fill=rng.uniform(0.8, 0.97), roll_deg=rng.normal(0, 1.0), yaw_deg=rng.normal(0, 4)),
-        exposure_s=exposure_s,
-        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(*light),
-        blur_px=rng.uniform(0.4, 2.5),
-        slot_rate_error_ppm=rng.uniform(-100, 100),
-        column_delay_slots=float(rng.choice([0.0, rng.uniform(0, 2)])),
-        isp=replace(base.isp, sharpen=rng.uniform(0, 0.8), denoise_px=rng.uniform(0, 0.6)),
-        n_frames=1,
-        output="raw" if base.sensor.pattern is not None and rng.random() < 0.3 else "developed",
-    )
+    slots = float(rng.choice([0.5, 1.0, 1.5, 2.0]) * rng.uniform(0.8, 1.2))
+    exposure_s = max(slots / base.screen.slot_rate_hz, _MIN_EXPOSURE_S)
+    picture, w = draw_name(rng), _weight(rng, 0.3)
+    fill, roll_deg, yaw_deg = rng.uniform(0.8, 0.97), rng.normal(0, 1.0), rng.normal(0, 4)
+    pose = replace(base.pose, fill=fill, roll_deg=roll_deg, yaw_deg=yaw_deg)
+    scene = replace(base, picture=picture, w=w, pose=pose, **_lit(base, exposure_s, 10 ** rng.uniform(*light)))
+    blur_px, slot_rate_error_ppm = rng.uniform(0.4, 2.5), rng.uniform(-100, 100)
+    delay = float(rng.choice([0.0, rng.uniform(0, 2)]))
+    isp = replace(base.isp, sharpen=rng.uniform(0, 0.8), denoise_px=rng.uniform(0, 0.6))
+    raw = base.sensor.pattern is not None and rng.random() < 0.3
+    scene = replace(scene, blur_px=blur_px, slot_rate_error_ppm=slot_rate_error_ppm, column_delay_slots=delay)
+    return replace(scene, isp=isp, n_frames=1, output="raw" if raw else "developed")
 
 
 def _small(rng: np.random.Generator) -> Scene:
@@ -296,12 +270,9 @@ def small_scene(seed: int) -> Scene:
     scene = random_scene(rng)
     width, rows = rng.integers(48, 400), rng.uniform(1.5, 6.0)
     scene, factor = small(scene, float(width), rows), 10 ** rng.uniform(-0.5, 1.5)
-    return replace(
-        scene,
-        light_e_per_s=scene.light_e_per_s * factor,
-        room=replace(scene.room, light_e_per_s=scene.room.light_e_per_s * factor),
-        sensor=replace(scene.sensor, full_scale_e=scene.sensor.full_scale_e * factor),
-    )
+    room = replace(scene.room, light_e_per_s=scene.room.light_e_per_s * factor)
+    sensor = replace(scene.sensor, full_scale_e=scene.sensor.full_scale_e * factor)
+    return replace(scene, light_e_per_s=scene.light_e_per_s * factor, room=room, sensor=sensor)
 
 
 def small(scene: Scene, width: float, rows_per_slot: float, **changes: Any) -> Scene:
@@ -337,7 +308,7 @@ def draw_motion(at: Place) -> Iterator[Case]:
     """One scene filmed at every speed, screen and camera named."""
     rng = np.random.default_rng([at.flat, 5])
     base = preset("video-1080p", str(rng.choice(_SCREENS[:2])))
-    scene = replace(_filmed_scene(rng, base), shake_px=0.0, n_frames=_HAND_FRAMES)
+    scene = replace(_filmed_scene(rng, base), n_frames=_HAND_FRAMES)
     encoding = "h264", "veryfast", _bit_rate(np.random.default_rng([at.flat, 6]), scene, _BITS_PER_PIXEL)
     for speed in SPEEDS_PX:
         take = prepare(replace(scene, hand_px=speed), at.flat)
@@ -351,21 +322,13 @@ def draw_clips(at: Place) -> Iterator[Case]:
     name, screen, _, frames = _CLIP_KINDS[rng.choice(len(_CLIP_KINDS), p=[kind[2] for kind in _CLIP_KINDS])]
     scene = _filmed_scene(rng, preset(name, screen))
     size = scene.screen.width_px, scene.screen.height_px
-    dark = bool(rng.random() < 0.5)
-    scene = replace(
-        scene,
-        picture=draw_dark_picture(str(rng.choice(DARK_KINDS)), rng, *size) if dark else scene.picture,
-        shake_px=0.0,
-        hand_px=rng.uniform(*_HAND_PX) if rng.random() < _MOVING else 0.0,
-        n_frames=int(rng.integers(3, frames, endpoint=True)),
-    )
-    camera_named = bool(rng.random() >= _UNNAMED)
-    groups = (
-        name,
-        "dark pictures" if dark else "photographs",
-        "from a hand" if scene.hand_px else "from a tripod",
-        "camera named" if camera_named else "camera unknown",
-    )
+    if dark := bool(rng.random() < 0.5):
+        scene = replace(scene, picture=draw_dark_picture(str(rng.choice(DARK_KINDS)), rng, *size))
+    hand_px = rng.uniform(*_HAND_PX) if rng.random() < _MOVING else 0.0
+    scene = replace(scene, hand_px=hand_px, n_frames=int(rng.integers(3, frames, endpoint=True)))
+    named = bool(rng.random() >= _UNNAMED)
+    kinds = "dark pictures" if dark else "photographs", "from a hand" if hand_px else "from a tripod"
+    groups = name, *kinds, "camera named" if named else "camera unknown"
     encodings = [
         (str(rng.choice(_CODECS)), str(rng.choice(_ENCODER_PRESETS)), _bit_rate(rng, scene, _ANY_BITS_PER_PIXEL))
         for _ in range(_ENCODINGS)
@@ -373,27 +336,18 @@ def draw_clips(at: Place) -> Iterator[Case]:
     take = prepare(scene, at.flat)
     with filmed(take, encodings) as paths:
         for path, (codec, _, _) in zip(paths, encodings, strict=True):
-            yield _clip(take, path, camera_named, *groups, codec)
+            yield _clip(take, path, named, *groups, codec)
 
 
 def _filmed_scene(rng: np.random.Generator, base: Scene) -> Scene:
     """A random picture and pose before a camera for clips."""
     exposure_s = float(rng.choice([0.5, 1.0]) * rng.uniform(0.85, 1.15)) / base.screen.slot_rate_hz
-    pose = replace(
-        base.pose,
-        fill=rng.uniform(0.75, 0.88),
-        roll_deg=rng.normal(0, 1.2),
-        yaw_deg=rng.normal(0, 3),
-        pitch_deg=rng.normal(0, 2),
-    )
-    return replace(
-        base,
-        picture=draw_name(rng),
-        w=5 if rng.random() < 0.6 else int(rng.integers(3, 8)),
-        pose=pose,
-        exposure_s=exposure_s,
-        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(-0.5, 0.2),
-    )
+    fill, roll_deg, yaw_deg = rng.uniform(0.75, 0.88), rng.normal(0, 1.2), rng.normal(0, 3)
+    pose = replace(base.pose, fill=fill, roll_deg=roll_deg, yaw_deg=yaw_deg, pitch_deg=rng.normal(0, 2))
+    picture = draw_name(rng)
+    w = 5 if rng.random() < 0.6 else int(rng.integers(3, 8))
+    lit = _lit(base, exposure_s, 10 ** rng.uniform(-0.5, 0.2))
+    return replace(base, picture=picture, w=w, pose=pose, shake_px=0.0, **lit)
 
 
 def _bit_rate(rng: np.random.Generator, scene: Scene, bits_per_pixel: tuple[float, float]) -> int:
@@ -416,14 +370,10 @@ def filmed(take: Take, encodings: Iterable[Encoding]) -> Iterator[list[Path]]:
 def _clip(take: Take, path: Path, camera_named: bool, *groups: str) -> Case:
     scene, exposure = take.scene, take.exposure()
     cameras = (build_camera_profile(scene, exposure),) if camera_named else ()
-    return Case(
-        source=path,
-        options=ReceiverOptions(screens=(scene.screen,), cameras=cameras, force_camera=camera_named),
-        groups=groups,
-        about={"screen": scene.screen.name, "camera": scene.camera_name, "hand_px": scene.hand_px},
-        truth=truth_of(take),
-        corners=exposure.corners,
-    )
+    options = ReceiverOptions(screens=(scene.screen,), cameras=cameras, force_camera=camera_named)
+    about = {"screen": scene.screen.name, "camera": scene.camera_name, "hand_px": scene.hand_px}
+    truth = truth_of(take)
+    return Case(source=path, options=options, groups=groups, about=about, truth=truth, corners=exposure.corners)
 
 
 # Pictures without data.
@@ -462,60 +412,48 @@ _FRAMES_A_SECOND = 60.0
 _XS10_MP = 26.0
 
 
-@dataclass(frozen=True)
-class Point:
-    """One place of a sweep; None leaves the preset's."""
-
-    camera: str = "xs10-still"
-    columns: int = 20
-    slot_rate_hz: float = 34600.0
-    payload_symbols: int = 24
-    repeats: int = 3
-    picture: str = "coffee"
-    #: Light against the preset's.
-    light: float = 1.0
-    exposure_slots: float | None = None
-    #: Fields of the pose.
-    pose: Mapping[str, Any] = field(default_factory=dict)
-    #: False for the sensor as it is.
-    binned: bool = True
-    #: Megapixels of a whole picture, which shows the same time at any size.
-    megapixels: float | None = None
-
-    @property
-    def rate_kbps(self) -> float:
-        """Data rate as the paper counts it: one payload (w = 5) per column in each of 60 frames a second."""
-        return self.columns * payload_bits(5, self.payload_symbols) * _FRAMES_A_SECOND / 1e3
-
-    @property
-    def free_rate_kbps(self) -> float:
-        """Payload bits a second that the free-running screen sends."""
-        bursts = self.slot_rate_hz / (packet_slots(self.payload_symbols) * self.repeats)
-        return self.columns * payload_bits(5, self.payload_symbols) * bursts / 1e3
-
-
 def draw_point(at: Place) -> Iterator[Case]:
-    """A frame of one place of a sweep, screen, camera and corners handed over; point: fields of `Point`."""
-    point = Point(**at.point)
-    trial = simulate_trial(scene_at(point), at.flat, oracle=at.oracle)
-    yield _case(trial, trial.options(), rate_kbps=point.rate_kbps, free_rate_kbps=point.free_rate_kbps)
+    """A frame of one place of a sweep, screen, camera and corners handed over; for the point see `scene_at`."""
+    trial = simulate_trial(scene_at(**at.point), at.flat, oracle=at.oracle)
+    screen = trial.capture.scene.screen
+    # As the paper counts it: one payload (w = 5) per column in each of 60 frames a second.
+    rate_kbps = screen.columns * payload_bits(5, screen.payload_symbols) * _FRAMES_A_SECOND / 1e3
+    yield _case(trial, trial.options(), rate_kbps=rate_kbps)
 
 
-def scene_at(point: Point) -> Scene:
-    """The scene of a point."""
-    base = load_profile("wide-100" if point.columns == 100 else "paper-34k6", ScreenProfile)
-    clock = {name: getattr(point, name) for name in ("columns", "slot_rate_hz", "payload_symbols", "repeats")}
-    name = f"{point.columns}-columns-{point.slot_rate_hz / 1e3:g}k-{point.repeats}x"
-    scene = preset(point.camera, msgspec.structs.replace(base, name=name, **clock))
-    pose = replace(scene.pose, **point.pose)
-    light = scene.light_e_per_s * point.light
-    scene = replace(scene, picture=point.picture, light_e_per_s=light, pose=pose, n_frames=1)
-    if point.exposure_slots is not None:
-        scene = _exposed(scene, point.exposure_slots / point.slot_rate_hz)
-    if point.megapixels is not None:
-        factor = sqrt(point.megapixels / _XS10_MP)
+def scene_at(
+    camera: str = "xs10-still",
+    picture: str = "coffee",
+    light: float = 1.0,
+    exposure_slots: float | None = None,
+    pose: Mapping[str, Any] | None = None,
+    is_binned: bool = True,
+    megapixels: float | None = None,
+    **clock: Any,
+) -> Scene:
+    """The scene of a point.
+
+    Args:
+        camera: preset.
+        picture: name.
+        light: against the preset's.
+        exposure_slots: None for the preset's.
+        pose: fields of the pose that are not the preset's.
+        is_binned: False for the sensor as it is.
+        megapixels: of a whole picture, which shows the same time at any size.
+        clock: fields of the screen's profile.
+    """
+    screen = load_profile("wide-100" if clock.get("columns") == 100 else "paper-34k6", ScreenProfile)
+    screen = msgspec.structs.replace(screen, name="sweep", **clock)
+    scene = preset(camera, screen)
+    scene = replace(scene, light_e_per_s=scene.light_e_per_s * light, pose=replace(scene.pose, **(pose or {})))
+    scene = replace(scene, picture=picture, n_frames=1)
+    if exposure_slots is not None:
+        scene = _exposed(scene, exposure_slots / screen.slot_rate_hz)
+    if megapixels is not None:
+        factor = sqrt(megapixels / _XS10_MP)
         return scene.scaled(factor, keep_readout=True) if factor != 1 else scene
-    return binned(scene, point.columns * _PX_PER_COLUMN / scene.sensor.width) if point.binned else scene
+    return binned(scene, screen.columns * _PX_PER_COLUMN / scene.sensor.width) if is_binned else scene
 
 
 def _exposed(scene: Scene, exposure_s: float) -> Scene:
@@ -530,15 +468,11 @@ def binned(scene: Scene, share: float) -> Scene:
     if share >= 1:
         return scene
     narrow = scene.scaled(share, 1.0)
-    sensor = replace(
-        narrow.sensor,
-        full_scale_e=narrow.sensor.full_scale_e / share,
-        read_noise_e=narrow.sensor.read_noise_e / sqrt(share),
-        row_noise_e=narrow.sensor.row_noise_e / share,
-        prnu=narrow.sensor.prnu * sqrt(share),
-    )
+    old, light_e_per_s = narrow.sensor, narrow.light_e_per_s / share
+    noise: dict[str, Any] = {"row_noise_e": old.row_noise_e / share, "read_noise_e": old.read_noise_e / sqrt(share)}
+    sensor = replace(old, full_scale_e=old.full_scale_e / share, prnu=old.prnu * sqrt(share), **noise)
     room = replace(narrow.room, light_e_per_s=narrow.room.light_e_per_s / share)
-    return replace(narrow, sensor=sensor, room=room, light_e_per_s=narrow.light_e_per_s / share)
+    return replace(narrow, sensor=sensor, room=room, light_e_per_s=light_e_per_s)
 
 
 # Files.
@@ -564,14 +498,7 @@ def draw_medium(at: Place) -> Iterator[Case]:
 
 #: What a scenario names as its drawing.
 DRAWERS: dict[str, Callable[[Place], Iterator[Case]]] = {
-    "phone": draw_phone,
-    "screen": draw_screen,
-    "confidence": draw_confidence,
-    "small": draw_small,
-    "motion": draw_motion,
-    "clips": draw_clips,
-    "nodata": draw_nodata,
-    "point": draw_point,
-    "capture": draw_capture,
-    "medium": draw_medium,
+    drawer.__name__.removeprefix("draw_"): drawer
+    for drawer in (draw_phone, draw_screen, draw_confidence, draw_small, draw_motion, draw_clips, draw_nodata)
 }
+DRAWERS |= {"point": draw_point, "capture": draw_capture, "medium": draw_medium}

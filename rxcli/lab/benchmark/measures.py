@@ -79,9 +79,10 @@ class Group:
         """What the receptions hold under a name, as far as they do."""
         return [reception[name] for reception in self.receptions if reception.get(name) is not None]
 
-    def beside_group(self) -> Group | None:
+    @property
+    def yardstick(self) -> Group:
         """The same cases in the way that this one is compared with."""
-        return None if self.beside in (None, self.way) else Group(self.cases, str(self.beside), self.first)
+        return Group(self.cases, self.beside or self.way, self.first)
 
     def rows_errors(self) -> tuple[FloatArray, FloatArray]:
         """Relative error of rows per slot, NaN where none was estimated, and its stated standard deviation."""
@@ -98,8 +99,7 @@ class Group:
 
     def shown(self) -> list[Record]:
         """Receptions of screens that can be found: the way beside gave packets."""
-        beside = self.beside_group()
-        pairs = [] if beside is None else zip(self.receptions, beside.scores, strict=True)
+        pairs = zip(self.receptions, self.yardstick.scores, strict=True)
         return [reception for reception, score in pairs if score.error_free >= SHOWN]
 
     def ratio(self, over: str, of: str) -> float | None:
@@ -111,10 +111,6 @@ class Group:
 def reported_payloads(reception: Record) -> set[tuple[int, int, str]]:
     """Frame, column and payload of every packet."""
     return {(packet["frame"], packet["column"], packet["payload"]) for packet in reception["packets"]}
-
-
-def _share(part: float, whole: float) -> float | None:
-    return part / whole if whole else None
 
 
 def _within(group: Group, sd: float) -> float | None:
@@ -149,26 +145,22 @@ def _transfers(name: str, of: Callable[[list[Any]], Any]) -> Callable[[Group], A
     return measure
 
 
-def _beside_share(group: Group) -> float | None:
-    beside = group.beside_group()
-    return None if beside is None else _share(group.score.error_free, beside.score.error_free)
-
-
 #: Name -> measure of a group.
 MEASURES: dict[str, Callable[[Group], Any]] = {
     "n": lambda g: len(g.cases),
     "gave_packets": lambda g: sum(bool(r["packets"]) for r in g.receptions),
     "expected": lambda g: g.score.expected if g.scores else None,
     "right": lambda g: g.score.error_free if g.scores else None,
-    "share": _beside_share,
+    "share": lambda g: g.score.error_free / max(g.yardstick.score.error_free, 1) if g.beside else None,
     "ber": lambda g: g.score.ber,
     "ber95": _ber_interval,
-    "error_free95": lambda g: wilson(g.score.error_free, g.score.expected),
     "lost": lambda g: g.score.lost,
-    "extra": lambda g: g.score.extra_error_free,
     # The genie decides whatever it sees, sure or not.
     "false": lambda g: None if g.way == "bound" or not g.scores else g.score.false,
     "packets": lambda g: len(g.packets),
+    "right_packets": lambda g: sum(packet["bit_errors"] == 0 for packet in g.packets),
+    "same": lambda g: sum(r.get("difference") is None for r in g.receptions),
+    "cpu_ratio": lambda g: sum(g.values("cpu_s")) / sum(Group(g.cases, g.first, g.first).values("cpu_s")),
     "packets_0.5": lambda g: len(g.confident(0.5)),
     "packets_0.9": lambda g: len(g.confident(0.9)),
     "sure": lambda g: len(g.confident()),
@@ -205,7 +197,6 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "kbps_worst": lambda g: min(g.values("kbps")) if all(g.values("exact")) else 0.0,
     "of_visible": _transfers("of_visible", np.mean),
     "packet_crc_kbps": _transfers("packet_crc_kbps", np.mean),
-    "link_cpu_s": _transfers("cpu_s", np.mean),
 }
 COMMON = ("n", "expected", "right", "share", "false", "sure", "surely_wrong", "at_most", "calibration", "problems")
 COMMON_COST = ("cpu_s", "over_bare", "mb")

@@ -49,7 +49,7 @@ def format_value(value: Any) -> str:
 
 def to_csv(rows: Sequence[Row]) -> str:
     """Rows as CSV; an interval becomes two columns `NAME_low`, `NAME_high`."""
-    flat = [_flat(row) for row in rows]
+    flat = [dict(part for name, value in row.items() for part in _parts(name, value)) for row in rows]
     names = list(dict.fromkeys(name for row in flat for name in row))
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, names, lineterminator="\n")
@@ -58,14 +58,9 @@ def to_csv(rows: Sequence[Row]) -> str:
     return buffer.getvalue()
 
 
-def _flat(row: Row) -> Row:
-    out: Row = {}
-    for name, value in row.items():
-        if isinstance(value, (tuple, list)):
-            out[f"{name}_low"], out[f"{name}_high"] = value
-        else:
-            out[name] = value
-    return out
+def _parts(name: str, value: Any) -> list[tuple[str, Any]]:
+    is_interval = isinstance(value, (tuple, list))
+    return list(zip((f"{name}_low", f"{name}_high"), value, strict=True)) if is_interval else [(name, value)]
 
 
 def write_outputs(folder: Path, name: str, rows: Sequence[Row], details: Any = None) -> list[Path]:
