@@ -9,6 +9,7 @@ COPY pyproject.toml README.md LICENSE ./
 COPY rxcli rxcli
 COPY calibration calibration
 COPY models models
+COPY pages pages
 COPY sample_frames sample_frames
 RUN pip wheel --no-cache-dir --wheel-dir /wheels '.[web]'
 

@@ -64,6 +64,8 @@ def test_errors_pass_between_processes_whole(kind: type[ReceiverError]) -> None:
     assert str(copy) == "a.jpg: no picture; name a photo"
 
 
-@pytest.mark.parametrize(("name", "suffix"), [("calibration", ".toml"), ("models", ".onnx"), ("sample_frames", ".jpg")])
+@pytest.mark.parametrize(
+    ("name", "suffix"), [("calibration", ".toml"), ("models", ".onnx"), ("pages", ".html"), ("sample_frames", ".jpg")]
+)
 def test_shipped_data_are_found(name: str, suffix: str) -> None:
     assert any(path.suffix == suffix for path in data_dir(name).rglob("*"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,22 +28,14 @@ class Preview:
     #: Pixels of the frame for one of these.
     step: int
 
-    def jpeg(self, quality: int = 80) -> bytes:
-        """The picture as JPEG."""
-        return grey_jpeg(self.pixels, quality)
 
-
-def grey_jpeg(pixels: NDArray[np.uint8], quality: int) -> bytes:
-    """A JPEG of grey values (height, width)."""
+def encoded_jpeg(pixels: NDArray[np.uint8], quality: int) -> str:
+    """Grey values (height, width) as a JPEG in base64."""
     import simplejpeg
 
     plane = np.ascontiguousarray(pixels)[:, :, None]
-    return bytes(simplejpeg.encode_jpeg(plane, quality, colorspace="GRAY", colorsubsampling="Gray"))
-
-
-def jpeg_address(pixels: NDArray[np.uint8], quality: int) -> str:
-    """The same as an address that a page can hold."""
-    return f"data:image/jpeg;base64,{base64.b64encode(grey_jpeg(pixels, quality)).decode()}"
+    data = simplejpeg.encode_jpeg(plane, quality, colorspace="GRAY", colorsubsampling="Gray")
+    return base64.b64encode(data).decode()
 
 
 def preview(frame: Frame, width_px: int = 1000) -> Preview:
@@ -77,3 +70,25 @@ def column_polygons(
         sides = np.concatenate([np.column_stack([left, rows]), np.column_stack([right, rows])[::-1]])
         found.append((column.column, column.status, sides))
     return found
+
+
+def picture_of(
+    result: FrameResult,
+    frame: Frame,
+    small: Preview,
+    screen: ScreenProfile | None,
+    camera: CameraProfile | None,
+    quality: int = 80,
+) -> dict[str, Any]:
+    """The small copy of a frame as JPEG, with the screen's and its columns' outlines in its pixels, as plain data."""
+    corners = [] if result.corners is None else (result.corners / small.step).round(1).tolist()
+    return {
+        "jpeg": encoded_jpeg(small.pixels, quality),
+        "width": int(small.pixels.shape[1]),
+        "height": int(small.pixels.shape[0]),
+        "corners": corners,
+        "outlines": [
+            {"column": number, "status": status, "points": (points / small.step).round(1).tolist()}
+            for number, status, points in column_polygons(result, frame, screen, camera)
+        ],
+    }

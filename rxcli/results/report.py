@@ -68,9 +68,9 @@ def _details(result: FrameResult) -> dict[str, Any]:
             name: [_significant(value), _significant(sigma)] for name, (value, sigma) in result.estimated.items()
         }
     if result.skipped:
-        details["skipped"] = _plain(result.skipped)
+        details["skipped"] = plain(result.skipped)
     if result.denoiser is not None:
-        details["denoiser"] = _plain(result.denoiser)
+        details["denoiser"] = plain(result.denoiser)
     if result.messages:
         details["messages"] = [_message_record(message) for message in result.messages]
     if result.objects:
@@ -251,14 +251,14 @@ def _significant(value: float | None) -> float | None:
     return float(f"{value:.7g}")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """`value` with numpy's scalars and arrays as Python's, and what is not finite as None."""
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float):
         return _significant(value)
     return value
@@ -472,7 +472,7 @@ def result_in_words(result: FrameResult) -> str:
     parts += [f"{stage} {value:.0f} ms" for stage, value in result.timing_ms.items()]
     parts += [f"left out: {name} {count}" for name, count in result.skipped.items()]
     if result.denoiser:
-        parts.append(f"auto-encoder: {_plain(result.denoiser)}")
+        parts.append(f"auto-encoder: {plain(result.denoiser)}")
     return "; ".join(parts)
 
 

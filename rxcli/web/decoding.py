@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import logging
 import os
 import time
@@ -264,7 +263,9 @@ class _Gathered:
         if self._frames.cut_short and result.status == "unreadable":
             return
         self._n_frames += 1
-        texts, found = texts_of(result), packets_of(result)
+        from rxcli.results.columns import packet_rows, text_rows
+
+        texts, found = text_rows(result), packet_rows(result)
         self._texts += texts
         received = sum(packet.is_believable for packet in result.packets)
         self._n_received += received
@@ -286,14 +287,14 @@ class _Gathered:
         if self._best is None:
             return refusal("it holds no picture", "send another file")
         from rxcli.results.aim import split_message
+        from rxcli.results.columns import column_rows
         from rxcli.results.report import count_packets, headline, mirror_note, to_record
 
         _, result, picture = self._best
         packets = self._packets
         reason, advice = ("", "") if packets else split_message(result)
         columns = [
-            {"column": c.column, "status": c.status, "message": c.message and without_commands(c.message)}
-            for c in result.columns
+            row | {"message": row["message"] and without_commands(row["message"])} for row in column_rows(result)
         ]
         return {
             "status": result.status if not packets or result.status != "unreadable" else "partial",
@@ -313,48 +314,12 @@ class _Gathered:
         }
 
 
-def texts_of(result: FrameResult) -> list[dict[str, Any]]:
-    """Texts and files that the link layer has complete with a frame: the one place where they come to the page."""
-    texts: list[dict[str, Any]] = []
-    for message in result.messages:
-        text = message.text if message.text is not None else message.data.hex()
-        texts.append({"kind": message.kind, "text": text})
-    for received in result.objects:
-        data = base64.b64encode(received.data).decode()
-        texts.append({"kind": "file", "name": received.name, "size": received.size, "base64": data})
-    return texts
-
-
-def packets_of(result: FrameResult) -> list[dict[str, Any]]:
-    return [
-        {
-            "column": column.column,
-            "payload": packet.payload,
-            "confidence": round(packet.confidence, 4),
-            "status": "ok" if packet.is_believable else "weak",
-            "frame": result.frame,
-        }
-        for column in result.columns
-        for packet in column.packets
-    ]
-
-
 def picture_of(
     result: FrameResult, frame: Frame, small: Preview, options: ReceiverOptions, quality: int = 80
 ) -> dict[str, Any]:
     """The small copy of a frame as JPEG, and outlines in its pixels."""
+    from rxcli.results import overlay
     from rxcli.results.cameras import camera_of, screen_of
-    from rxcli.results.overlay import column_polygons
 
     screen, camera = screen_of(result, options.screens), camera_of(frame, result, options.cameras)
-    corners = [] if result.corners is None else (result.corners / small.step).round(1).tolist()
-    return {
-        "jpeg": base64.b64encode(small.jpeg(quality)).decode(),
-        "width": int(small.pixels.shape[1]),
-        "height": int(small.pixels.shape[0]),
-        "corners": corners,
-        "outlines": [
-            {"column": number, "status": status, "points": (points / small.step).round(1).tolist()}
-            for number, status, points in column_polygons(result, frame, screen, camera)
-        ],
-    }
+    return overlay.picture_of(result, frame, small, screen, camera, quality)

@@ -116,8 +116,8 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
         options: of the receiver.
     """
     from rxcli.results.aim import Aim
+    from rxcli.results.columns import packet_rows, text_rows
     from rxcli.runs.batch import Source, standard_decoder
-    from rxcli.web.decoding import packets_of, texts_of
 
     watched, aim = _Watched(), Aim()
     prompt = replace(options, prompt=True)
@@ -147,8 +147,8 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
         result = replace(received, message=received.message and without_commands(received.message))
         now_s = time.monotonic()
         unsent = result, aim.update(result, now_s, watched.height, watched.light)
-        packets.extend(packets_of(result))
-        texts += texts_of(result)
+        packets.extend(packet_rows(result))
+        texts += text_rows(result)
         if now_s - last_s >= 1 / _EVENTS_PER_S or texts or result.status == "unreadable":
             yield event(*unsent)
             last_s, unsent = now_s, None

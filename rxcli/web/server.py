@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 from aiohttp import web
 
 from rxcli.errors import UsageError
+from rxcli.resources import data_dir
 from rxcli.web.decoding import DecodingProcess, Limits, refusal
 
 if TYPE_CHECKING:
@@ -34,9 +35,14 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_PAGE = Path(__file__).parent / "page"
+_PAGE = data_dir("pages")
 #: Everything that is served from disk: name -> type.
-_ASSETS = {"app.css": "text/css", "app.js": "text/javascript", "icon.svg": "image/svg+xml"}
+_ASSETS = {
+    "app.css": "text/css",
+    "app.js": "text/javascript",
+    "view.js": "text/javascript",
+    "icon.svg": "image/svg+xml",
+}
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
     "connect-src 'self'; form-action 'none'; base-uri 'none'; frame-ancestors 'none'",

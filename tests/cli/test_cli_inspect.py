@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +23,16 @@ from rxcli.results.inspection import column_light, decided_slots, inspect_frame
 from rxcli.runs.batch import collect_sources
 from rxcli.types import ColumnResult, PacketResult
 
+
+def shown(page: Path) -> dict[str, Any]:
+    """What a page draws, out of the page itself."""
+    text = page.read_text()
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text)
+    assert found is not None
+    data: dict[str, Any] = json.loads(found[1])
+    return data
+
+
 SAMPLE = Path(__file__).parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
 
 
@@ -28,7 +41,8 @@ def test_a_text_that_came_is_said(capsys: pytest.CaptureFixture[str], tmp_path: 
     captured = capsys.readouterr()
     assert captured.out == f"{tmp_path / 'page' / 'index.html'}\n"
     assert captured.err == "text: Hello! This text came as light.\n"
-    assert "<blockquote>Hello! This text came as light.</blockquote>" in (tmp_path / "page" / "index.html").read_text()
+    page = tmp_path / "page" / "index.html"
+    assert shown(page)["texts"] == [{"kind": "text", "text": "Hello! This text came as light."}]
 
 
 def test_a_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -42,15 +56,43 @@ def test_a_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFi
     assert "a&lt;b&gt;.png" in page
     assert "<b>" not in page
     assert not re.search(r'(src|href)="(?!data:)', page)
-    assert all(payload in page for payload in payloads)
-    assert page.count('<polygon class="ok"') == N_COLUMNS
-    titles = ["The picture", "Packets", "Light and slots", "How clear slots are", "Is the clock right?"]
-    titles += ["Light of neighbours", "Confidence", "Time"]
-    for title in titles:
-        assert f"<h2>{title}</h2>" in page
-    drawings = re.findall(r"<svg[^>]*>", page)
-    assert all("aria-label=" in drawing or "aria-hidden" in drawing for drawing in drawings)
-    assert all("alt=" in image for image in re.findall(r"<img[^>]*>", page))
+    data = shown(out / "index.html")
+    assert [packet["payload"] for packet in data["packets"]] == payloads
+    assert {packet["errors"] for packet in data["packets"]} == {0}
+    assert [outline["status"] for outline in data["picture"]["outlines"]] == ["ok"] * N_COLUMNS
+    assert len(data["inspection"]["traces"]) == len(data["inspection"]["crosstalk"]) == N_COLUMNS
+    assert data["maps"]
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_page_draws_all_sections_in_a_browser(width: int, tmp_path: Path) -> None:
+    pytest.importorskip("aiohttp")
+    from browser import CHROMIUM, Browser
+
+    if CHROMIUM is None:
+        pytest.skip("needs Debian's chromium")
+    write_frame(tmp_path / "a.png", 1)
+    out = tmp_path / "page"
+    command = ["inspect", str(tmp_path / "a.png"), "--out", str(out), "--truth", "auto", *write_profiles(tmp_path)]
+    assert run(command) == 0
+
+    async def look() -> None:
+        async with Browser(width=width) as browser:
+            await browser.call("Page.navigate", url=(out / "index.html").as_uri())
+            await browser.until("document.querySelectorAll('h2').length > 5")
+            titles = await browser.run("[...document.querySelectorAll('h2')].map((node) => node.textContent).join('|')")
+            assert titles == (
+                f"{N_COLUMNS} packets received|The picture|Packets|Light and slots|How clear slots are|"
+                "Is the clock right?|Light of neighbours|Confidence|Time"
+            )
+            assert await browser.run("document.querySelectorAll('polygon.ok').length") == N_COLUMNS
+            assert await browser.run("document.querySelectorAll('tbody tr').length") >= N_COLUMNS
+            unnamed = "svg:not([aria-label]):not([aria-hidden]), img:not([alt])"
+            assert await browser.run(f"document.querySelectorAll('{unnamed}').length") == 0
+            assert await browser.run("document.documentElement.scrollWidth <= innerWidth")
+            assert browser.complaints == []
+
+    asyncio.run(look())
 
 
 def test_it_writes_beside_no_photo_and_is_passed_over_by_runs_over_folders(
@@ -85,11 +127,11 @@ def test_a_failure_says_how_far_it_came_and_the_next_step(tmp_path: Path) -> Non
 
     cv2.imwrite(str(tmp_path / "black.png"), np.zeros((620, 840), np.uint8))
     assert run(["inspect", str(tmp_path / "black.png"), "--out", str(tmp_path / "page")]) == 1
-    page = (tmp_path / "page" / "index.html").read_text()
-    assert "<h2>No screen found</h2>" in page
-    assert '<li class="failed"><span aria-hidden="true">✗</span> screen found' in page
-    assert "Expose longer, raise ISO" in page
-    assert "Auto-encoder" not in page
+    data = shown(tmp_path / "page" / "index.html")
+    assert data["headline"] == "No screen found"
+    assert next(name for name, good in data["steps"] if not good) == "screen found"
+    assert "Expose longer, raise ISO" in data["advice"]
+    assert data["denoiser"] is None
 
 
 def test_a_clip_has_a_timeline(tmp_path: Path) -> None:
@@ -97,9 +139,9 @@ def test_a_clip_has_a_timeline(tmp_path: Path) -> None:
     profile = str(samples / "video1080.toml")
     clip = str(samples / "video1080_chelsea_17k3.mp4")
     assert run(["inspect", clip, "--camera", profile, "--out", str(tmp_path)]) == 0
-    page = (tmp_path / "index.html").read_text()
-    assert "<h2>The clip</h2>" in page
-    assert "24 frames, 360 packets, 0 frames without reception." in page
+    timeline = shown(tmp_path / "index.html")["timeline"]
+    assert [len(timeline), sum(frame[3] for frame in timeline)] == [24, 360]
+    assert all(frame[4] for frame in timeline)
 
 
 def test_what_is_measured_agrees_with_what_was_sent(tmp_path: Path) -> None:

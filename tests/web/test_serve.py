@@ -30,18 +30,18 @@ from small_frames import N_COLUMNS, write_frame, write_profiles
 aiohttp = pytest.importorskip("aiohttp")
 pytest.importorskip("segno")
 
+from browser import CHROMIUM, Browser  # noqa: E402
+
 from rxcli.cli.main import run  # noqa: E402
 from rxcli.ingest import open_source  # noqa: E402
 from rxcli.options import ReceiverOptions, receiver_options  # noqa: E402
 from rxcli.results.aim import Aim, Light, light_of  # noqa: E402
+from rxcli.results.columns import text_rows  # noqa: E402
 from rxcli.runs.processes import resident_bytes  # noqa: E402
 from rxcli.types import ColumnResult, FrameResult, Message, PacketResult, ReceivedObject  # noqa: E402
-from rxcli.web.decoding import DecodingProcess, Limits, answer_for, texts_of  # noqa: E402
+from rxcli.web.decoding import DecodingProcess, Limits, answer_for  # noqa: E402
 from rxcli.web.live import live_events  # noqa: E402
 from rxcli.web.server import Bounds, Server, Site  # noqa: E402
-
-sys.path.insert(0, str(Path(__file__).parent))
-from browser import CHROMIUM, Browser  # noqa: E402
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_frames"
 MEGABYTE = 1 << 20
@@ -209,7 +209,16 @@ def test_the_address_for_phones_holds_a_new_secret(monkeypatch: pytest.MonkeyPat
     assert serve._site(None, {**dict.fromkeys(("keep", "exposure", "gain")), **_ASKED, "host": None}).token is None
 
 
-_ASKED = {"host": "0.0.0.0", "port": 0, "max_upload": 96, "screens": (), "cameras": (), "corners": None, "cae": "auto"}
+_ASKED = {
+    "host": "0.0.0.0",
+    "port": 0,
+    "max_upload": 96,
+    "screens": (),
+    "cameras": (),
+    "corners": None,
+    "mirrored": False,
+    "cae": "auto",
+}
 _ASKED |= {"min_confidence": None, "no_skip": ()}
 
 
@@ -406,7 +415,7 @@ def test_texts_and_files_come_to_the_page() -> None:
     result = result_of("ok", packets=1)
     texts = (Message("text", "Grüße".encode(), "camera", 0, 0.0), Message("uri", b"https://a.b", "camera", 0, 0.0))
     received = ReceivedObject("a.txt", b"abc", 3, "00", 1, 1, "camera", 0, 0.0)
-    assert texts_of(replace(result, messages=texts, objects=(received,))) == [
+    assert text_rows(replace(result, messages=texts, objects=(received,))) == [
         {"kind": "text", "text": "Grüße"},
         {"kind": "uri", "text": "https://a.b"},
         {"kind": "file", "name": "a.txt", "size": 3, "base64": "YWJj"},

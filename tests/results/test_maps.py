@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli.results.grids import rival_grids
+from rxcli.results.maps import column_map, stripe_map
 from rxcli.types import Frame
 
 HEIGHT, WIDTH = 1200, 1000
@@ -23,17 +23,21 @@ def drawn(light: float) -> NDArray[np.uint8]:
 
 
 def test_borders_of_the_likeliest_grid_are_drawn() -> None:
-    told = rival_grids(Frame(drawn(40.0), "drawn"))
-    assert told.count("<polyline") >= 15
-    assert "columns 45 pixels wide" in told
+    shown = column_map(Frame(drawn(40.0), "drawn"))
+    assert shown is not None
+    assert len(shown["grids"][0]["lines"]) >= 15
+    assert round(shown["grids"][0]["pitch_px"]) == 45
 
 
 def test_where_no_grid_stands_out_the_map_says_so() -> None:
-    told = rival_grids(Frame(drawn(0.0), "drawn"))
-    assert "<polyline" not in told
-    assert "No grid of columns stands out" in told
+    shown = column_map(Frame(drawn(0.0), "drawn"))
+    assert shown is not None
+    assert shown["grids"] == []
+    assert "No grid of columns stands out" in shown["told"]
 
 
 @pytest.mark.parametrize("shape", [(64, 400), (400, 64)])
 def test_tiny_pictures_have_no_map(shape: tuple[int, int]) -> None:
-    assert rival_grids(Frame(np.zeros(shape, np.uint8), "tiny")) == ""
+    frame = Frame(np.zeros(shape, np.uint8), "tiny")
+    assert column_map(frame) is None
+    assert stripe_map(frame) is None

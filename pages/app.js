@@ -3,107 +3,10 @@
 (() => {
   const $ = (id) => document.getElementById(id);
   const page = document.documentElement.dataset;
-  const words = { ok: "received", weak: "unsure", no_packet: "no packet", dark: "too dark" };
+  const { make, draw, toldOf, showTexts, table, silent } = view;
   const largest = Number(page.largest);
 
-  function make(name, text, kind) {
-    const node = document.createElement(name);
-    if (text !== undefined && text !== null) node.textContent = text;
-    if (kind) node.className = kind;
-    return node;
-  }
-
-  function count(number, noun) { return `${number} ${noun}${number === 1 ? "" : "s"}`; }
-
-  // -- a picture with outlines over it ---------------------------------------------------------------------------
-  const SVG = "http://www.w3.org/2000/svg";
-  function shape(name, attributes) {
-    const node = document.createElementNS(SVG, name);
-    for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
-    return node;
-  }
-  const path = (points) => points.map((point) => point.join(",")).join(" ");
-
-  function draw(figure, picture, told) {
-    if (!picture) { figure.replaceChildren(); return; }
-    const view = make("div", null, "view");
-    const image = make("img");
-    image.src = `data:image/jpeg;base64,${picture.jpeg}`;
-    image.alt = told;
-    image.width = picture.width;
-    image.height = picture.height;
-    const over = shape("svg", { viewBox: `0 0 ${picture.width} ${picture.height}`, "aria-hidden": "true" });
-    for (const column of picture.outlines) {
-      over.append(shape("polygon", { points: path(column.points), class: column.status }));
-    }
-    if (picture.corners.length) over.append(shape("polygon", { points: path(picture.corners), class: "corners" }));
-    if (picture.outlines.length && picture.outlines.length <= 24) {
-      for (const column of picture.outlines) {
-        const x = column.points.reduce((sum, point) => sum + point[0], 0) / column.points.length;
-        const y = column.points.reduce((most, point) => Math.max(most, point[1]), 0) - 10;
-        const label = shape("text", { x, y, "text-anchor": "middle", "font-size": picture.width / 70 });
-        label.textContent = column.column;
-        over.append(label);
-      }
-    }
-    view.append(image, over);
-    figure.replaceChildren(view, make("figcaption", told));
-  }
-
-  function toldOf(columns) {
-    if (!columns.length) return "The picture, without a screen that could be read.";
-    const numbers = {};
-    for (const column of columns) numbers[column.status] = (numbers[column.status] || 0) + 1;
-    const parts = Object.keys(words).filter((key) => numbers[key]).map((key) => `${numbers[key]} ${words[key]}`);
-    return `The screen's ${count(columns.length, "column")}: ${parts.join(", ")}.`;
-  }
-
-  // -- texts and files ---------------------------------------------------------------------------------------------
-  function showTexts(place, texts) {
-    for (const item of texts) {
-      if (item.kind === "file") {
-        const link = make("a", `${item.name} (${count(item.size, "byte")})`, "link");
-        const bytes = Uint8Array.from(atob(item.base64), (letter) => letter.charCodeAt(0));
-        link.href = URL.createObjectURL(new Blob([bytes], { type: "application/octet-stream" }));
-        link.download = item.name;
-        const line = make("p", "File: ");
-        line.append(link);
-        place.append(line);
-      } else {
-        place.append(make("blockquote", item.text)); // an address is shown, never opened
-      }
-    }
-  }
-
   // -- the result of a photo -----------------------------------------------------------------------------------
-  function table(answer) {
-    const rows = answer.packets.slice(0, 400);
-    const whole = make("div", null, "scroll");
-    whole.tabIndex = 0;
-    const grid = make("table");
-    const more = answer.packets.length - rows.length;
-    grid.append(make("caption", `Payload of each column (hex), and how sure it is${more > 0 ? `; ${more} more in the details` : ""}`));
-    const head = make("tr");
-    for (const [title, kind] of [["Column", "number"], ["Sure", "number"], ["Payload", ""]]) {
-      const cell = make("th", title, kind);
-      cell.scope = "col";
-      head.append(cell);
-    }
-    const top = make("thead");
-    top.append(head);
-    const body = make("tbody");
-    for (const packet of rows) {
-      const row = make("tr");
-      row.append(make("td", packet.column, "number"),
-        make("td", `${(Math.floor(packet.confidence * 1000) / 10).toFixed(1)} %`, `number ${packet.status}`),
-        make("td", packet.payload, "mono"));
-      body.append(row);
-    }
-    grid.append(top, body);
-    whole.append(grid);
-    return whole;
-  }
-
   let saved = null;
   function show(answer) {
     const columns = answer.columns || [];
@@ -116,16 +19,17 @@
     draw($("picture"), answer.picture, toldOf(columns));
     $("legend").hidden = !columns.length;
     $("payloads").replaceChildren();
-    if (answer.packets && answer.packets.length) $("payloads").append(table(answer));
-    const reasons = [...new Set(columns.filter((column) => column.message && !["ok", "weak"].includes(column.status)).map((column) => column.message))];
-    if (reasons.length) {
-      const list = make("ul");
-      for (const reason of reasons.slice(0, 6)) {
-        const which = columns.filter((column) => column.message === reason).map((column) => column.column);
-        list.append(make("li", `Column${which.length > 1 ? "s" : ""} ${which.join(", ")}: ${reason}`));
-      }
-      $("payloads").append(make("h3", "Columns without a packet"), list);
+    if (answer.packets && answer.packets.length) {
+      const more = answer.packets.length - 400;
+      const caption = `Payload of each column (hex), and how sure it is${more > 0 ? `; ${more} more in the details` : ""}`;
+      const grid = table(answer.packets.slice(0, 400), caption);
+      if ((answer.texts || []).length) {
+        const folded = make("details");
+        folded.append(make("summary", "Payloads as they came"), grid);
+        $("payloads").append(folded);
+      } else $("payloads").append(grid);
     }
+    $("payloads").append(...silent(columns));
     if (saved) URL.revokeObjectURL(saved);
     $("save").hidden = !answer.record;
     if (answer.record) {

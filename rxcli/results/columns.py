@@ -1,0 +1,49 @@
+"""What a frame brought, as plain data: the rows and columns that the terminal, `--payloads` and the pages show."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+from rxcli.types import FrameResult
+
+
+def packet_rows(result: FrameResult) -> list[dict[str, Any]]:
+    """Every packet of a frame as plain data, by column and in time order.
+
+    `status` is `weak` below the confidence that can be believed; `burst` and `errors` are None where nobody knows them.
+    """
+    return [
+        {
+            "frame": result.frame,
+            "time_s": result.time_s,
+            "column": column.column,
+            "burst": packet.burst,
+            "status": "ok" if packet.is_believable else "weak",
+            "denoised": column.denoised,
+            "w": column.w,
+            "snr_db": column.snr_db,
+            "confidence": packet.confidence,
+            "copies": packet.copies,
+            "errors": packet.bit_errors,
+            "payload_bits": packet.payload_bits,
+            "payload": packet.payload,
+        }
+        for column in result.columns
+        for packet in column.packets
+    ]
+
+
+def text_rows(result: FrameResult) -> list[dict[str, Any]]:
+    """Texts and files that are complete with a frame."""
+    texts = [{"kind": message.kind, "text": message.text or message.data.hex()} for message in result.messages]
+    files = [
+        {"kind": "file", "name": o.name, "size": o.size, "base64": base64.b64encode(o.data).decode()}
+        for o in result.objects
+    ]
+    return texts + files
+
+
+def column_rows(result: FrameResult) -> list[dict[str, Any]]:
+    """What became of every column, without its packets."""
+    return [{"column": c.column, "status": c.status, "message": c.message} for c in result.columns]
