@@ -219,7 +219,7 @@ _ASKED = {
     "mirrored": False,
     "cae": "auto",
 }
-_ASKED |= {"min_confidence": None, "no_skip": ()}
+_ASKED |= {"min_confidence": None, "no_skip": (), "file_memory_mb": 512}
 
 
 def test_a_port_that_is_taken_is_told(capsys: pytest.CaptureFixture[str]) -> None:
