@@ -109,7 +109,8 @@ class _Clip:
         self._waiting: deque[Waiting] = deque()
         self._bursts = BurstReader(options.skip)
         self._link: _Link | None = None
-        #: The first frames, until they have agreed on a clock; None when that is done, or not needed.
+        #: The first frames that show screen and camera, until they have agreed on a clock; None when that is done, or
+        #: not needed.
         self._first: list[Frame] | None = [] if "tracking" in options.skip else None
         self._outline: FirstOutline | None = None
         #: Probability that the screen's columns are numbered right.
@@ -132,7 +133,7 @@ class _Clip:
         #: Some pixels of the last frame.
         self._some: NDArray[np.float32] | None = None
         #: Number of a frame that is yet to be received, and where its screen is.
-        self._found: tuple[int, Located] | None = None
+        self._found: tuple[int, Located | Failure] | None = None
         #: None where nothing is known, or frames cannot be tracked; and the one before the last search.
         self._scene: TrackedScreen | None = None
         self._scene_before: TrackedScreen | None = None
@@ -156,7 +157,6 @@ class _Clip:
         if self._first is None:
             return self._take(frame)
         if not self._first and not self._opens(frame):
-            self._first = None
             return self._take(frame)
         assert self._outline is not None
         if self._first:
@@ -166,28 +166,31 @@ class _Clip:
         return self._begin() if self._outline.settled and enough else []
 
     def _opens(self, frame: Frame) -> bool:
-        """Whether a first frame shows a screen; its outline, and perhaps its clock, is then found with others."""
-        located = locate(frame, self._options, Timer())
-        if isinstance(located, Failure):
+        """Whether a frame shows screen and camera; the outline, and perhaps the clock, is then found with the next."""
+        located = self._with_camera(frame)
+        self._found = frame.index, located
+        if isinstance(located, Failure) or not isinstance(located.context, FrameContext):
             return False
-        outline = located.outline
-        context = located.context or likely_camera(frame, outline.corners, self._options, Timer())
-        self._found = frame.index, replace(located, context=context)
-        known = None if isinstance(context, Failure) else context
-        self._outline = FirstOutline(frame, outline.corners, self._options, known)
-        self._little = known is not None and shows_little(known)
+        self._outline = FirstOutline(frame, located.outline.corners, self._options, located.context)
+        self._little = shows_little(located.context)
         return True
+
+    def _with_camera(self, frame: Frame) -> Located | Failure:
+        """The screen in a frame of which nothing is known, and its camera."""
+        located = self._located(frame, Timer())
+        if isinstance(located, Failure) or located.context is not None:
+            return located
+        return replace(located, context=likely_camera(frame, located.outline.corners, self._options, Timer()))
 
     def _begin(self) -> list[FrameResult]:
         """The first frames, once they have agreed on an outline and, where each shows little, on a clock."""
         frames, self._first = self._first or [], None
-        if self._outline is not None and self._found is not None:
-            index, located = self._found
-            located = self._read_in_time(_moved_to(located, self._outline.corners, self._options), frames)
-            self._found = index, located
-            context = located.context
-            if self._little and len(frames) > 1 and isinstance(context, FrameContext):
-                self._start = agree(frames, context)
+        if self._outline is not None and self._found is not None and isinstance(self._found[1], Located):
+            located = _moved_to(self._found[1], self._outline.corners, self._options)
+            located = self._read_in_time(located, frames)
+            if self._little and len(frames) > 1:
+                located = self._with_common_clock(located, frames)
+            self._found = self._found[0], located
         return [result for frame in frames for result in self._take(frame)]
 
     def _read_in_time(self, located: Located, frames: Sequence[Frame]) -> Located:
@@ -199,16 +202,44 @@ class _Clip:
         if not isinstance(context, FrameContext) or context.camera.blind_estimate is None or period_s is None:
             return located
         too_long = context.camera.line_delay_s * context.frame.height / (period_s * SETTINGS.readout_slack)
-        if too_long <= 1:
+        if too_long <= 1 and not self._little:
             return located
         slowest_hz = too_long * max(screen.slot_rate_hz for screen in context.screens)
         screens = tuple(screen for screen in self._options.screens if screen.slot_rate_hz >= slowest_hz)
-        options = replace(self._options, screens=screens)
-        found = likely_camera(context.frame, context.corners, options, context.timer) if screens else None
+        options, found = replace(self._options, screens=screens), None
+        if too_long > 1 and screens:
+            found = likely_camera(context.frame, context.corners, options, context.timer)
+        if screens and (self._little or isinstance(found, FrameContext)):
+            self._options = options
         if not isinstance(found, FrameContext):
             return located
-        self._options, self._little = options, shows_little(found)
+        self._little = shows_little(found)
         return replace(located, context=found)
+
+    def _with_common_clock(self, located: Located, frames: Sequence[Frame]) -> Located:
+        """Find the clock that the first frames share: with the first frame's camera, else with the best of the others'.
+
+        An estimate from less than a packet may be wrong, in the direction of the readout for instance.
+        """
+        first = located.context
+        if not isinstance(first, FrameContext):
+            return located
+        self._start, chosen = agree(frames, first), first
+        if self._start is None and first.camera.blind_estimate is not None:
+            for context in self._other_cameras(first, frames[1:]):
+                start = agree(frames, context)
+                if start is not None and (self._start is None or start.lead > self._start.lead):
+                    self._start, chosen = start, context
+        return replace(located, context=chosen)
+
+    def _other_cameras(self, first: FrameContext, frames: Sequence[Frame]) -> Iterator[FrameContext]:
+        """The first frame with the cameras that other frames tell."""
+        for frame in frames:
+            other = self._with_camera(frame)
+            if isinstance(other, Located) and isinstance(other.context, FrameContext):
+                moved = replace(other.context, frame=first.frame, timer=first.timer)
+                # Other corners, be they equal, so that the strips are read from the first frame.
+                yield context_at(moved, first.corners.copy())
 
     def _take(self, frame: Frame) -> list[FrameResult]:
         timer = Timer()
@@ -491,9 +522,11 @@ class _Clip:
             first_copy = known.time.take(frame.index, frame.time_s, view.bursts.clock)
         if first_copy is None:
             done = self._finish_scene_before() if self._link is not None else []
-            self._begin_link(view, frame)
-            assert self._link is not None
-            first_copy = self._link.time.take(frame.index, frame.time_s, view.bursts.clock)
+            first_copy = self._begin_link(view, frame)
+            if first_copy is None:
+                # The clock that the first frames seemed to share is not this frame's.
+                self._start = None
+                first_copy = self._begin_link(view, frame)
             assert first_copy is not None
         assert self._link is not None
         self._link.last_time_s = frame.time_s
@@ -511,7 +544,8 @@ class _Clip:
                     self._receive_first_again(at_last=False)
         return done + self._ready()
 
-    def _begin_link(self, view: View, frame: Frame) -> None:
+    def _begin_link(self, view: View, frame: Frame) -> int | None:
+        """Begin the link's time anew; returns the number of the frame's first copy in it, None where it fits none."""
         screen = view.acquisition.screen
         offset = self._next_number
         stretch = self._stretch or 1.0
@@ -523,6 +557,7 @@ class _Clip:
         self._link = _Link(time, tracking.BurstPhase(view.acquisition.repeats), _shape(view), offset)
         self._epoch += 1
         self._bursts.begin()
+        return time.take(frame.index, frame.time_s, view.bursts.clock)
 
     # -- time stamps that are not the time -------------------------------------------------------------------------
 
@@ -726,12 +761,10 @@ def _moved_to(located: Located, corners: FloatArray, options: ReceiverOptions) -
     """The same with the corners elsewhere; a lens that was seen in the sides between them is looked for there."""
     context = located.context
     if isinstance(context, FrameContext) and corners is not context.corners:
-        estimated = context.camera.blind_estimate
+        estimated, found = context.camera.blind_estimate, None
         if estimated is not None and estimated[1].side_curvature is not None:
             found = likely_camera(context.frame, corners, options, context.timer)
-            context = found if isinstance(found, FrameContext) else None
-        else:
-            context = context_at(context, corners)
+        context = found if isinstance(found, FrameContext) else context_at(context, corners)
     return Located(replace(located.outline, corners=corners), context)
 
 

@@ -33,6 +33,8 @@ class Start:
     #: It and those that differ from it in how often a packet is sent.
     variants: tuple[ScreenProfile, ...]
     time: LinkTime
+    #: How much likelier the headers' place is than the best elsewhere.
+    lead: float
 
 
 def shows_little(context: FrameContext) -> bool:
@@ -46,16 +48,16 @@ def shows_little(context: FrameContext) -> bool:
 
 def agree(frames: Sequence[Frame], context: FrameContext) -> Start | None:
     """The clock that the headers of several frames agree on, None where they do not; `context` is of the first."""
-    best: tuple[float, Start] | None = None
+    best: Start | None = None
     for n_columns in sorted({screen.columns for screen in context.screens}):
         profiles_of = [sample_columns(replace(context, frame=frame), n_columns).profiles for frame in frames]
         for screen in (s for s in told_apart_by_clock(context.screens) if s.columns == n_columns):
             lead, slot, period = _phase(frames, profiles_of, screen, context.camera)
-            if lead > SETTINGS.min_lead and (best is None or lead > best[0]):
+            if lead > SETTINGS.min_lead and (best is None or lead > best.lead):
                 time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
                 time.begin(frames[0].index, frames[0].time_s, slot, period)
-                best = lead, Start(screen, variants_of(screen, context.screens), time)
-    return best[1] if best else None
+                best = Start(screen, variants_of(screen, context.screens), time, lead)
+    return best
 
 
 def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:
