@@ -55,8 +55,9 @@
       text = lines.pop();
       if (lines.length) {
         const answer = JSON.parse(lines.pop());
-        show(answer);
-        if (answer.partial) $("progress").textContent = "Reading the rest of the clip …";
+        if (answer.status === "waiting") $("progress").textContent = `Waiting: ${count(answer.place, "picture")} before yours …`;
+        else show(answer);
+        if (answer.partial && answer.status !== "waiting") $("progress").textContent = "Reading the rest of the clip …";
         whole = answer;
       }
       if (done) break;

@@ -81,6 +81,9 @@ async def _run(site: Site) -> None:
 
     from rxcli.web.server import Server
 
+    stopped = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGHUP):  # before there is anything to leave behind
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     async with Server(site) as server:
         if site.token is not None:
             _show_qr(server.address)
@@ -90,8 +93,6 @@ async def _run(site: Site) -> None:
             hint += " For a phone in the same network: vlc-rx serve --host 0.0.0.0"
         click.echo(hint, err=True)
         sys.stdout.flush()
-        stopped = asyncio.Event()
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stopped.set)
         await stopped.wait()
 
 

@@ -50,17 +50,19 @@ class DecodingProcess:
     Args:
         options: of the receiver.
         limits: when it is ended and replaced.
+        folder: of uploads, which it removes where the server was killed; None: there is none.
     """
 
-    def __init__(self, options: ReceiverOptions, limits: Limits | None = None) -> None:
+    def __init__(self, options: ReceiverOptions, limits: Limits | None = None, folder: Path | None = None) -> None:
         self._options = options
+        self._folder = folder
         self._limits = limits or Limits()
         self._process: BaseProcess | None = None
         self._connection: Connection | None = None
 
     def start(self) -> None:
         """Start the process before it is needed, so that the first picture need not wait for it."""
-        self._process, self._connection = start_process(_work, self._options)
+        self._process, self._connection = start_process(_work, self._options, self._folder)
 
     def close(self) -> None:
         """End the process; may be called again."""
@@ -129,11 +131,13 @@ def refusal(reason: str, step: str) -> dict[str, Any]:
     }
 
 
-def _work(connection: Connection, options: ReceiverOptions) -> None:
+def _work(connection: Connection, options: ReceiverOptions, folder: Path | None) -> None:
     """The process's life: take a file, send the answer, until the other end is closed."""
+    import shutil
     import signal
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides what an interrupt means
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # the server decides what they mean
+        signal.signal(number, signal.SIG_IGN)
     _confine()
     _warm_up(options)
     try:
@@ -141,7 +145,8 @@ def _work(connection: Connection, options: ReceiverOptions) -> None:
             path, name = connection.recv()
             connection.send(answer_for(Path(path), name, options, connection.send))
     except (EOFError, OSError):
-        return
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _confine() -> None:

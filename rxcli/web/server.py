@@ -17,13 +17,14 @@ import tempfile
 import time
 import uuid
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aiohttp import web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from rxcli.errors import UsageError
 from rxcli.resources import data_dir
@@ -62,10 +63,16 @@ class Bounds:
     """What visitors may cost."""
 
     upload_bytes: int = 96 << 20
-    #: An upload must be whole after so long.
+    #: An upload must be whole after so long, and may be behind its least rate by so much.
     upload_s: float = 60.0
-    #: Pictures that may be on their way or waiting at once.
+    grace_s: float = 5.0
+    #: Least rate of an upload, bytes a second.
+    upload_rate: int = 32 << 10
+    #: Pictures that may be on their way at once, and whole ones that may wait to be read.
     uploads: int = 4
+    waiting: int = 8
+    #: A part of an answer must be taken after so long.
+    answer_s: float = 30.0
     #: Pages that may watch the live camera.
     watchers: int = 8
     #: Open connections; of more, those that have asked for nothing are closed, oldest first.
@@ -111,6 +118,19 @@ def own_address() -> str:
             return "127.0.0.1"
 
 
+@dataclass(eq=False, slots=True)
+class _Upload:
+    """A picture on its way."""
+
+    begun_s: float
+    limit: asyncio.Timeout
+    n_bytes: int = 0
+
+    def is_slow(self, now_s: float, rate: int) -> bool:
+        """Whether it is slower than uploads must be, in its second second or later."""
+        return now_s - self.begun_s > 1.0 and self.n_bytes < rate * (now_s - self.begun_s)
+
+
 class Server:
     """One running server; an async context manager.
 
@@ -120,11 +140,14 @@ class Server:
 
     def __init__(self, site: Site) -> None:
         self._site = site
-        self._decoder = DecodingProcess(site.options, site.bounds.decoding)
-        self._thread = ThreadPoolExecutor(1, "decode")
         self._folder = Path(tempfile.mkdtemp(prefix="vlc-rx-serve-"))
-        self._n_uploads = 0
-        self._watchers: set[asyncio.Queue[str]] = set()
+        self._decoder = DecodingProcess(site.options, site.bounds.decoding, self._folder)
+        self._thread = ThreadPoolExecutor(1, "decode")
+        self._arriving: list[_Upload] = []
+        #: Who is told their place, in the order in which pictures are read.
+        self._queue: list[Callable[[dict[str, Any]], None]] = []
+        #: The oldest first.
+        self._watchers: dict[asyncio.Queue[str], web.Request] = {}
         self._history: deque[str] = deque(maxlen=20)
         self._idle_since: dict[int, float] = {}
         self._live: Any = None
@@ -156,7 +179,9 @@ class Server:
         app.router.add_get(f"{site.prefix}/asset/{{name}}", self._asset)
         app.router.add_post(f"{site.prefix}/photo", self._photo)
         app.router.add_get(f"{site.prefix}/live", self._events)
-        self._runner = web.AppRunner(app, access_log=None, keepalive_timeout=site.bounds.idle_s)
+        self._runner = web.AppRunner(
+            app, access_log=None, keepalive_timeout=site.bounds.idle_s, logger=_requests_log(), shutdown_timeout=1.0
+        )
         await self._runner.setup()
         try:
             await web.TCPSite(self._runner, site.host, site.port, backlog=32).start()
@@ -206,12 +231,24 @@ class Server:
             raise
         if not response.prepared:
             response.headers.update(_HEADERS)
+            with self._taken_in_time(request):
+                async with asyncio.timeout(self._site.bounds.answer_s):
+                    await response.prepare(request)
+                    await response.write_eof()
         return response
+
+    @contextlib.contextmanager
+    def _taken_in_time(self, request: web.Request) -> Iterator[None]:
+        """Close the connection of who does not take what is written; nothing more is written to who has gone."""
+        try:
+            yield
+        except (ConnectionError, TimeoutError):
+            _abort(request)
 
     def _is_ours(self, request: web.Request) -> bool:
         site, host = self._site, request.host
         if site.token is not None:
-            given = request.path.split("/")[1]
+            given = request.path.removeprefix("/").split("/")[0]
             if not hmac.compare_digest(given.encode(), site.token.encode()):
                 raise web.HTTPNotFound(headers=_HEADERS)
         elif host.rsplit(":", 1)[0] not in (*_LOCAL, site.host):
@@ -232,7 +269,8 @@ class Server:
             idle.sort(key=lambda c: self._idle_since[id(c)])
             too_many = max(0, len(connections) - bounds.connections)
             for number, connection in enumerate(idle):
-                if number < too_many or now_s - self._idle_since[id(connection)] > bounds.idle_s:
+                most_s = bounds.answer_s if _is_taking(connection) else bounds.idle_s
+                if number < too_many or now_s - self._idle_since[id(connection)] > most_s:
                     connection.force_close()
                     if connection.transport is not None:
                         connection.transport.abort()
@@ -256,38 +294,63 @@ class Server:
 
     async def _photo(self, request: web.Request) -> web.StreamResponse:
         bounds = self._site.bounds
-        if self._n_uploads >= bounds.uploads:
-            return _answer(refusal("other pictures are being read just now", "try again in a few seconds"), 503)
+        self._make_room()
+        if len(self._arriving) >= bounds.uploads or len(self._queue) >= bounds.waiting:
+            busy = refusal("other pictures are being read just now", "try again in a few seconds")
+            return _answer(busy, 503)
         if (request.content_length or 0) > bounds.upload_bytes:
             return _answer(self._too_large(), 413, close=True)
-        self._n_uploads += 1
         path = self._folder / uuid.uuid4().hex
         try:
-            async with asyncio.timeout(bounds.upload_s):
-                size = await self._save(request, path)
+            size = await self._save(request, path)
             if size is None:
                 return _answer(self._too_large(), 413, close=True)
             if _LINES in request.headers.get("Accept", ""):
                 return await self._answer_by_and_by(request, path)
-            answer = await self._decoded(path, None)
-            return _answer(answer, 200)
+            return _answer(await self._decoded(request, path, lambda _: None), 200)
         except TimeoutError:
-            slow = refusal(
-                f"the picture took more than {bounds.upload_s:.0f} s to arrive", "move nearer to the network"
-            )
+            slow = refusal("the picture took too long to arrive", "move nearer to the network")
             return _answer(slow, 408, close=True)
         except OSError as error:
             log.warning("an upload could not be stored: %s", error)
             return _answer(refusal("there is no room for the picture", "tell who runs this page"), 507, close=True)
         finally:
             path.unlink(missing_ok=True)
-            self._n_uploads -= 1
 
-    async def _decoded(self, path: Path, tell: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
+    def _make_room(self) -> None:
+        """End the slowest upload where there is no room for another and it is slower than uploads must be."""
+        bounds, now_s = self._site.bounds, asyncio.get_running_loop().time()
+        slow = [upload for upload in self._arriving if upload.is_slow(now_s, bounds.upload_rate)]
+        if slow and len(self._arriving) >= bounds.uploads:
+            slowest = min(slow, key=lambda upload: upload.n_bytes / (now_s - upload.begun_s))
+            slowest.limit.reschedule(now_s)
+            self._arriving.remove(slowest)
+
+    async def _decoded(
+        self, request: web.Request, path: Path, tell: Callable[[dict[str, Any]], None]
+    ) -> dict[str, Any]:
+        """The answer for an upload, in its turn; `tell` is given its place before, and what is known meanwhile."""
         loop = asyncio.get_running_loop()
-        answer = await loop.run_in_executor(self._thread, self._decoder.decode, path, "the picture", tell)
+        self._queue.append(tell)
+        self._tell_places()
+        try:
+            answer = await loop.run_in_executor(self._thread, self._decode_for, request, path, tell)
+        finally:
+            self._queue.remove(tell)
+            self._tell_places()
         self._keep(path, answer)
         return answer
+
+    def _decode_for(self, request: web.Request, path: Path, tell: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+        if request.transport is None or request.transport.is_closing():
+            return refusal("nobody waits for the answer", "send it again")
+        return self._decoder.decode(path, "the picture", tell)
+
+    def _tell_places(self) -> None:
+        """Tell all but the first how many are before them."""
+        for place, tell in enumerate(self._queue):
+            if place:
+                tell({"status": "waiting", "place": place, "partial": True})
 
     async def _answer_by_and_by(self, request: web.Request, path: Path) -> web.StreamResponse:
         """A line of JSON for what is known of a clip so far, from time to time, and one for the whole answer."""
@@ -300,26 +363,47 @@ class Server:
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(lines.put_nowait, answer)
 
-        decoding = asyncio.create_task(self._decoded(path, tell))
+        decoding = asyncio.create_task(self._decoded(request, path, tell))
         decoding.add_done_callback(lambda _: lines.put_nowait({}))
-        with contextlib.suppress(ConnectionError):  # the upload stays until it is decoded, whoever still listens
+        with self._taken_in_time(request):  # the upload stays until it is decoded, whoever still listens
             while answer := await lines.get():
-                await response.write(json.dumps(answer).encode() + b"\n")
+                await self._write_line(response, answer)
         whole = await decoding
-        with contextlib.suppress(ConnectionError):
-            await response.write(json.dumps(whole).encode() + b"\n")
+        with self._taken_in_time(request):
+            await self._write_line(response, whole)
+            async with asyncio.timeout(self._site.bounds.answer_s):
+                await response.write_eof()
         return response
 
+    async def _write_line(self, response: web.StreamResponse, answer: dict[str, Any]) -> None:
+        async with asyncio.timeout(self._site.bounds.answer_s):
+            await response.write(json.dumps(answer).encode() + b"\n")
+
     async def _save(self, request: web.Request, path: Path) -> int | None:
-        """Write the body to `path`; its size, None where it is too large."""
-        size = 0
-        with path.open("wb") as file:
-            async for chunk in _chunks(request):
-                size += len(chunk)
-                if size > self._site.bounds.upload_bytes:
-                    return None
-                file.write(chunk)
-        return size
+        """Write the body to `path`; its size, None where it is too large.
+
+        Raises:
+            TimeoutError: it comes too slowly.
+        """
+        bounds = self._site.bounds
+        begun_s = asyncio.get_running_loop().time()
+        async with asyncio.timeout(bounds.grace_s) as limit:
+            upload = _Upload(begun_s, limit)
+            self._arriving.append(upload)
+            try:
+                with path.open("wb") as file:
+                    while chunk := await request.content.read(_CHUNK):
+                        upload.n_bytes += len(chunk)
+                        if upload.n_bytes > bounds.upload_bytes:
+                            return None
+                        file.write(chunk)
+                        late_s = bounds.grace_s + upload.n_bytes / bounds.upload_rate
+                        if upload in self._arriving:
+                            limit.reschedule(begun_s + min(bounds.upload_s, late_s))
+            finally:
+                if upload in self._arriving:
+                    self._arriving.remove(upload)
+        return upload.n_bytes
 
     def _too_large(self) -> dict[str, Any]:
         return refusal(
@@ -344,21 +428,24 @@ class Server:
         if self._site.device is None:
             raise web.HTTPNotFound(headers=_HEADERS)
         if len(self._watchers) >= self._site.bounds.watchers:
-            raise web.HTTPServiceUnavailable(text="too many pages watch already", headers=_HEADERS)
+            late = [queue for queue, watcher in self._watchers.items() if _is_taking(watcher)]
+            if not late:
+                raise web.HTTPServiceUnavailable(text="too many pages watch already", headers=_HEADERS)
+            _abort(self._watchers.pop(late[0]))
         response = web.StreamResponse(headers={**_HEADERS, "Content-Type": "text/event-stream"})
         await response.prepare(request)
         queue: asyncio.Queue[str] = asyncio.Queue(maxsize=3)
-        for text in self._history:
-            await response.write(f"data: {text}\n\n".encode())
-        self._watchers.add(queue)
+        history = list(self._history)
+        self._watchers[queue] = request
         try:
-            while True:
-                async with asyncio.timeout(30):
-                    await response.write(f"data: {await _next(queue)}\n\n".encode())
-        except (ConnectionError, TimeoutError, asyncio.CancelledError):
-            return response
+            with self._taken_in_time(request):
+                while True:
+                    text = history.pop(0) if history else await _next(queue)
+                    async with asyncio.timeout(self._site.bounds.answer_s):
+                        await response.write(f"data: {text}\n\n".encode())
         finally:
-            self._watchers.discard(queue)
+            self._watchers.pop(queue, None)
+        return response
 
     def _tell(self, event: dict[str, Any]) -> None:
         """Give an event to all who watch; one that lags misses pictures, not texts."""
@@ -381,9 +468,22 @@ async def _next(queue: asyncio.Queue[str]) -> str:
         return "{}"
 
 
-async def _chunks(request: web.Request) -> AsyncIterator[bytes]:
-    while chunk := await request.content.read(_CHUNK):
-        yield chunk
+def _is_taking(asked: Any) -> bool:
+    """Whether the connection, or that of a request, still holds a part of an answer that was written to it."""
+    return asked.transport is not None and asked.transport.get_write_buffer_size() > 0
+
+
+def _abort(request: web.Request) -> None:
+    if request.transport is not None:
+        request.transport.abort()
+
+
+def _requests_log() -> logging.Logger:
+    """Where aiohttp says what is wrong with requests: those that are no HTTP are nobody's concern."""
+    requests = logging.getLogger(f"{__name__}.requests")
+    if not requests.filters:
+        requests.addFilter(lambda record: not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError)))
+    return requests
 
 
 def _answer(answer: dict[str, Any], status: int, close: bool = False) -> web.Response:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import io
 import itertools
 import json
@@ -13,6 +14,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import zlib
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -46,6 +48,12 @@ from rxcli.web.server import Bounds, Server, Site  # noqa: E402
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_frames"
 MEGABYTE = 1 << 20
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs Debian's chromium")
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Uploads of other servers of this machine lie elsewhere."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path_factory.mktemp("uploads")))
 
 
 @pytest.fixture
@@ -198,6 +206,124 @@ def test_who_may_ask(options: ReceiverOptions) -> None:
 
     serving(Site(options, port=0), local)
     serving(Site(options, port=0, host="0.0.0.0", token="secret"), elsewhere)
+
+
+async def raw(server: Server, head: str, body: bytes = b"") -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """Send a request as it stands."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port, limit=1 << 12)
+    writer.write(f"{head} HTTP/1.1\r\nHost: localhost\r\n".encode() + b"\r\n" * (b"\r\n\r\n" not in body) + body)
+    await writer.drain()
+    return reader, writer
+
+
+def test_who_sends_a_byte_a_second_keeps_nobody_out(options: ReceiverOptions) -> None:
+    body = b"Content-Length: 1000000\r\n\r\nx"
+
+    async def work(server: Server, client: Any) -> None:
+        slow = [await raw(server, "POST /photo", body) for _ in range(2)]
+        await asyncio.sleep(1.5)
+        status, answer = await post(server, client, b"hello")
+        assert (status, answer["status"]) == (200, "unreadable")
+        done, _ = await asyncio.wait([asyncio.create_task(r.read()) for r, _ in slow], return_when="FIRST_COMPLETED")
+        assert b" 408 " in done.pop().result()
+        for _, writer in slow:
+            writer.close()
+
+    async def alone(server: Server, client: Any) -> None:
+        reader, writer = await raw(server, "POST /photo", body)
+        answer = await reader.read()
+        assert b" 408 " in answer
+        assert b"took too long to arrive" in answer
+        writer.close()
+
+    serving(Site(options, port=0, bounds=Bounds(uploads=2, grace_s=60)), work)
+    serving(Site(options, port=0, bounds=Bounds(grace_s=0.1)), alone)
+
+
+def test_who_never_reads_the_answer_keeps_nobody_out(options: ReceiverOptions, monkeypatch: pytest.MonkeyPatch) -> None:
+    def decode(_self: DecodingProcess, path: Path, *_: Any) -> dict[str, Any]:
+        large = path.read_bytes() == b"large"
+        return {"status": "ok", "text": "x" * (64 * MEGABYTE if large else 1)}
+
+    monkeypatch.setattr(DecodingProcess, "decode", decode)
+    before = leftovers()
+
+    async def work(server: Server, client: Any) -> None:
+        deaf = []
+        for lines in ("", "Accept: application/x-ndjson\r\n"):
+            deaf.append(await raw(server, "POST /photo", f"{lines}Content-Length: 5\r\n\r\nlarge".encode()))
+            await asyncio.sleep(0.3)  # its answer is being written
+            status, answer = await post(server, client, b"hello")
+            assert (status, answer["text"]) == (200, "x")
+        [folder] = set(leftovers()) - set(before)
+        assert not os.listdir(Path(tempfile.gettempdir()) / folder)
+        await asyncio.sleep(1.0)
+        for reader, writer in deaf:  # the connection was closed before all was taken
+            with contextlib.suppress(ConnectionError):
+                assert len(await reader.read()) < 64 * MEGABYTE
+            writer.close()
+
+    serving(Site(options, port=0, bounds=Bounds(uploads=1, answer_s=0.5)), work)
+
+
+def test_who_waits_is_told_the_place(options: ReceiverOptions, monkeypatch: pytest.MonkeyPatch) -> None:
+    released = threading.Event()
+
+    def decode(_self: DecodingProcess, *_: Any) -> dict[str, Any]:
+        released.wait(60)
+        return {"status": "ok"}
+
+    monkeypatch.setattr(DecodingProcess, "decode", decode)
+
+    async def work(server: Server, client: Any) -> None:
+        headers = {"Accept": "application/x-ndjson"}
+        asked = [await client.post(server.address + "photo", data=b"hello", headers=headers) for _ in range(3)]
+        assert json.loads(await asked[2].content.readline()) == {"status": "waiting", "place": 2, "partial": True}
+        status, answer = await post(server, client, b"hello")
+        assert (status, answer["reason"]) == (503, "Other pictures are being read just now.")
+        released.set()
+        lines = [[json.loads(line) async for line in answer.content] for answer in asked]
+        assert [part[-1]["status"] for part in lines] == ["ok"] * 3
+        assert lines[2][0]["place"] == 1
+
+    serving(Site(options, port=0, bounds=Bounds(waiting=3)), work)
+
+
+@pytest.mark.parametrize("token", [None, "secret"])
+@pytest.mark.parametrize("head", ["OPTIONS *", "CONNECT a.example:443", "CONNECT /", "GET *", "PRI *"])
+def test_odd_requests_are_refused_without_a_word(
+    head: str, token: str | None, options: ReceiverOptions, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def work(server: Server, client: Any) -> None:
+        reader, writer = await raw(server, head)
+        assert (await reader.readline()).split()[1] in (b"400", b"403", b"404", b"405")
+        writer.close()
+
+    serving(Site(options, port=0, token=token), work)
+    assert not [record for record in caplog.records if record.exc_info or record.levelname == "ERROR"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT, signal.SIGKILL])
+def test_no_upload_is_left_however_the_server_ends(number: int, tmp_path: Path) -> None:
+    """While an upload arrives, whose sender does not go away."""
+    environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-m", "rxcli.cli.main", "serve", "--port", "0"]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as server:
+        assert server.stdout is not None
+        port = int(server.stdout.readline().decode().rsplit(":", 1)[1].strip("/\n"))
+        with socket.create_connection(("127.0.0.1", port)) as slow:
+            slow.sendall(
+                b"POST /photo HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99999999\r\n\r\n" + bytes(1 << 20)
+            )
+            while not [path for path in tmp_path.rglob("*") if path.is_file() and path.stat().st_size]:
+                time.sleep(0.05)
+            server.send_signal(number)
+            server.wait(60)
+    for _ in range(600):  # who was killed leaves it to the process that decodes
+        if not list(tmp_path.glob("vlc-rx-*")):
+            break
+        time.sleep(0.1)
+    assert not list(tmp_path.glob("vlc-rx-*"))
 
 
 def test_the_address_for_phones_holds_a_new_secret(monkeypatch: pytest.MonkeyPatch) -> None:
