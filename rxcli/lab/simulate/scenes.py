@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import tomllib
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from math import sqrt
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -131,82 +134,20 @@ class Scene:
         )
 
 
-def _xs10_still(screen: ScreenProfile) -> Scene:
-    return Scene(
-        screen,
-        lens=Lens(19000 / 6240, (-0.06, 0.02, 0.0005, -0.0003, 0.0)),
-        pose=Pose(fill=0.965, roll_deg=0.35, yaw_deg=2.0, pitch_deg=-1.0),
-        room=Room(light_e_per_s=8e4),
-        isp=Isp(tone="srgb", gain=1.6, denoise_px=0.35, denoise_colour_px=1.0, subsampling="422", quality=93),
-        camera_name="xs10",
-        make="FUJIFILM",
-        model="X-S10",
-    )
+#: Names of presets, in order.
+PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-plain")
+_PARTS: dict[str, type] = {"sensor": Sensor, "lens": Lens, "pose": Pose, "room": Room, "isp": Isp}
 
 
-def _xs10_video(screen: ScreenProfile, width: int, height: int, readout_s: float, name: str) -> Scene:
-    return replace(
-        _xs10_still(screen),
-        sensor=Sensor(width, height, readout_s / height, "rgb", full_scale_e=400.0, read_noise_e=3.0),
-        lens=Lens(2.5, (-0.05, 0.02, 0.0, 0.0002, 0.0)),
-        pose=Pose(fill=0.86, roll_deg=0.3, yaw_deg=1.0, pitch_deg=0.5),
-        room=Room(light_e_per_s=3e5),
-        isp=Isp(tone="bt709", gain=1.3, sharpen=0.3, denoise_px=0.6),
-        blur_px=0.7,
-        camera_name=name,
-    )
-
-
-def _video_4k(screen: ScreenProfile) -> Scene:
-    scene = _xs10_video(screen, 3840, 2160, 20.35e-3, "video4k")
-    return replace(scene, n_frames=24, frame_rate_hz=30000 / 1001, light_e_per_s=2.4e6, shake_px=1.5)
-
-
-def _video_1080p(screen: ScreenProfile) -> Scene:
-    scene = _xs10_video(screen, 1920, 1080, 12.74e-3, "video1080")
-    return replace(
-        scene, n_frames=48, frame_rate_hz=60000 / 1001, light_e_per_s=2.4e6, exposure_s=1 / 16000, shake_px=1.0
-    )
-
-
-def _phone_corrected(screen: ScreenProfile) -> Scene:
-    return Scene(
-        screen,
-        sensor=Sensor(
-            4032, 3024, 5.6e-6, "bayer", full_scale_e=260.0, read_noise_e=2.0, black_level=64, white_level=1023
-        ),
-        lens=Lens(0.78, (0.07, -0.09, 0.0004, 0.0006, 0.0)),
-        pose=Pose(fill=0.92, roll_deg=1.2, yaw_deg=3.0, pitch_deg=-2.0),
-        room=Room(light_e_per_s=1.2e5),
-        isp=Isp(tone="bt709", gain=2.0, sharpen=0.8, denoise_px=0.5, correct_distortion=True, quality=90),
-        exposure_s=1 / 24000,
-        light_e_per_s=1.7e6,
-        camera_name="phone12",
-        model="Phone 12MP",
-    )
-
-
-def _phone_plain(screen: ScreenProfile) -> Scene:
-    return replace(
-        _phone_corrected(screen),
-        sensor=Sensor(
-            4000, 3000, 7.1e-6, "bayer", full_scale_e=220.0, read_noise_e=2.4, black_level=256, white_level=4095
-        ),
-        lens=Lens(0.82, (-0.03, 0.01, 0.0, 0.0, 0.0)),
-        isp=Isp(tone="srgb", gain=1.8, sharpen=0.5, denoise_px=0.4, quality=93),
-        exposure_s=1 / 20000,
-        camera_name="phone12b",
-        model="Phone 12MP B",
-    )
-
-
-PRESETS: dict[str, Callable[[ScreenProfile], Scene]] = {
-    "xs10-still": _xs10_still,
-    "video-4k": _video_4k,
-    "video-1080p": _video_1080p,
-    "phone-corrected": _phone_corrected,
-    "phone-plain": _phone_plain,
-}
+@lru_cache(maxsize=1)
+def _presets() -> dict[str, dict[str, Any]]:
+    """Fields of the scene by preset, from `presets.toml`."""
+    text = Path(__file__).with_name("presets.toml").read_text(encoding="utf-8")
+    found: dict[str, dict[str, Any]] = {}
+    for name, table in tomllib.loads(text).items():
+        own = {key: msgspec.convert(value, _PARTS[key]) if key in _PARTS else value for key, value in table.items()}
+        found[name] = {**found.get(own.pop("like", ""), {}), **own}
+    return found
 
 
 def preset(name: str, screen: str | ScreenProfile = "paper-34k6") -> Scene:
@@ -223,7 +164,7 @@ def preset(name: str, screen: str | ScreenProfile = "paper-34k6") -> Scene:
     if name not in PRESETS:
         raise UsageError(f"no preset {name!r}", f"choose from: {', '.join(PRESETS)}")
     profile = screen if isinstance(screen, ScreenProfile) else load_profile(screen, ScreenProfile)
-    return PRESETS[name](profile)
+    return Scene(profile, **_presets()[name])
 
 
 def random_scene(rng: np.random.Generator) -> Scene:
