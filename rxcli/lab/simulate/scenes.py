@@ -104,6 +104,11 @@ class Scene:
         """Sensor rows read during one slot."""
         return 1 / (self.sensor.line_delay_s * self.screen.slot_rate_hz)
 
+    def exposed(self, exposure_s: float, factor: float = 1.0) -> Scene:
+        """The scene at another exposure, with as many electrons as before times `factor`."""
+        light_e_per_s = self.light_e_per_s * (self.exposure_s / exposure_s) * factor
+        return replace(self, exposure_s=exposure_s, light_e_per_s=light_e_per_s)
+
     def scaled(self, x: float, y: float | None = None, *, keep_readout: bool = False) -> Scene:
         """The same view on a smaller sensor, for quick sweeps.
 
@@ -173,32 +178,19 @@ def random_scene(rng: np.random.Generator) -> Scene:
     exposure_slots = float(rng.choice([0.25, 0.5, 1.0, 1.5, 2.0])) * rng.uniform(0.8, 1.2)
     exposure_s = max(exposure_slots / base.screen.slot_rate_hz, 1 / 32000)
     upside_down = rng.random() < 0.15
-    pose = replace(
-        base.pose,
-        fill=rng.uniform(0.6, 0.97),
-        roll_deg=rng.normal(0, 1.5) + 180 * upside_down,
-        yaw_deg=rng.normal(0, 6),
-        pitch_deg=rng.normal(0, 5),
-        shift_x=rng.normal(0, 0.02),
-        shift_y=rng.normal(0, 0.02),
-    )
-    return replace(
-        base,
-        picture=draw_name(rng),
-        w="dimming" if rng.random() < 0.3 else int(rng.integers(2, 9)),
-        pose=pose,
-        room=replace(
-            base.room,
-            light_e_per_s=base.light_e_per_s * 10 ** rng.uniform(-3, -0.5),
-            flicker_hz=float(rng.choice([100, 120])),
-            lamp=float(rng.choice([0.0, rng.uniform(0, 0.05)])),
-        ),
-        exposure_s=exposure_s,
-        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(-0.7, 0.3),
-        blur_px=rng.uniform(0.4, 3.0),
-        slot_rate_error_ppm=rng.uniform(-100, 100),
-        column_delay_slots=float(rng.choice([0.0, rng.uniform(0, 2)])),
-        n_frames=1,
-        orientation=3 if upside_down else 1,
-        output="raw" if rng.random() < 0.3 else "developed",
-    )
+    fill, roll, yaw, pitch = rng.uniform(0.6, 0.97), rng.normal(0, 1.5), rng.normal(0, 6), rng.normal(0, 5)
+    pose = Pose(fill, roll + 180 * upside_down, yaw, pitch, rng.normal(0, 0.02), rng.normal(0, 0.02))
+    picture, w = draw_name(rng), draw_weight(rng, 0.3)
+    light_e_per_s, flicker_hz = base.light_e_per_s * 10 ** rng.uniform(-3, -0.5), float(rng.choice([100, 120]))
+    lamp = float(rng.choice([0.0, rng.uniform(0, 0.05)]))
+    room = replace(base.room, light_e_per_s=light_e_per_s, flicker_hz=flicker_hz, lamp=lamp)
+    scene = replace(base.exposed(exposure_s, 10 ** rng.uniform(-0.7, 0.3)), picture=picture, w=w, pose=pose, room=room)
+    blur_px, slot_rate_error_ppm = rng.uniform(0.4, 3.0), rng.uniform(-100, 100)
+    delay, raw = float(rng.choice([0.0, rng.uniform(0, 2)])), rng.random() < 0.3
+    scene = replace(scene, blur_px=blur_px, slot_rate_error_ppm=slot_rate_error_ppm, column_delay_slots=delay)
+    return replace(scene, n_frames=1, orientation=3 if upside_down else 1, output="raw" if raw else "developed")
+
+
+def draw_weight(rng: np.random.Generator, dimming: float, low: int = 2) -> Weights:
+    """Lit slots of a symbol: by the picture's light with a probability of `dimming`, or the same in all columns."""
+    return "dimming" if rng.random() < dimming else int(rng.integers(low, 9))

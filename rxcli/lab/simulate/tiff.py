@@ -87,7 +87,13 @@ def write_dng(raw: NDArray[np.uint16], scene: Scene, path: Path, bits: int = 16)
         _rationals(50728, "2I", sensor.response, 10_000),
         (50778, "H", 1, 21, True),
     ]
-    layout: dict[str, Any] = {"photometric": 32803, "rowsperstrip": raw.shape[0], "metadata": None, "extratags": tags}
+    layout: dict[str, Any] = {
+        "photometric": 32803,
+        "rowsperstrip": raw.shape[0],
+        "metadata": None,
+        "software": False,
+        "extratags": tags,
+    }
     if bits == 16:
         tifffile.imwrite(path, raw, **layout)
     else:
