@@ -15,7 +15,7 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.cameras import context_at, known_lens
+from rxcli.receiver.cameras import known_lens
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.corners import (
     levels_of,
@@ -334,7 +334,7 @@ def _by_packets(
         best = _likeliest([replace(one, log_odds=score) for one, score in zip(candidates, odds, strict=True)])
     if best is None:
         return None
-    chosen = context_at(context, best.corners)
+    chosen = replace(context, corners=best.corners)
     for other in looked_at:
         if other.corners is best.corners:
             chosen.kept.update(other.kept)

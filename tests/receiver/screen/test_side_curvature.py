@@ -173,7 +173,7 @@ def test_stripes_are_bent_in_a_corrected_picture(mistaken: bool, monkeypatch: py
     """Bent stripes are believed, also where something else was taken for bowed sides."""
     trial = take(0.2, corrected=True)
     if mistaken:
-        monkeypatch.setattr("rxcli.receiver.cameras._sides_of", lambda *_: (-0.1, 0.01))
+        monkeypatch.setattr("rxcli.receiver.unknown_camera._distortion", lambda *_: (-0.1, 0.01))
     options = ReceiverOptions(cameras=(), corners=trial.corners, cae="never")
     estimated = next(receive([trial.frame], options)).estimated
     assert estimated["distortion_corrected"][0] == 1
