@@ -70,7 +70,7 @@
       const folded = make("details"), inside = make("figure"), list = make("ul", null, "legend");
       draw(inside, map, map.told);
       for (const [number, grid] of (map.grids || []).entries()) {
-        list.append(make("li", `Grid ${number + 1}: columns ${grid.pitch_px.toFixed(0)} pixels wide, explains ${percent(grid.share, 1)} of what the best one does`, `grid${number}`));
+        list.append(make("li", `Columns ${grid.pitch_px.toFixed(0)} pixels wide`, `grid${number}`));
       }
       folded.append(make("summary", map.title), inside, make("p", map.caption, "hint"), list);
       node.append(folded);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen.find import ColumnLayout, find_outlines, why_useless
 from rxcli.receiver.settings import SETTINGS
 from rxcli.types import FloatArray, Frame
 
@@ -18,6 +20,11 @@ _TOO_SLOW = (
 )
 #: Orientations in which the readout runs along the columns' width.
 _PORTRAIT = (5, 6, 7, 8)
+_NO_COLUMNS = "no columns of a modulated backlight were found in the picture"
+_SHOW_COLUMNS = (
+    "photograph a screen that sends, from near, with the electronic shutter and a short exposure (1/8000 s), and use "
+    "the picture in its full size; if the picture does show one, give its place with --corners"
+)
 
 
 def unreadable_orientation(frame: Frame) -> Failure | None:
@@ -69,12 +76,10 @@ def whole_picture(frame: Frame) -> FloatArray:
     return geometry.viewer_order(corners, frame.metadata.orientation)
 
 
-def turned_pixels(frame: Frame) -> str | None:
+def turned_pixels(frame: Frame, layouts: Sequence[ColumnLayout]) -> str | None:
     """What to say of a picture whose pixels lie on their side; None where they do not. Of a clip the first is asked."""
-    from rxcli.receiver.screen.find import find_screen
-
     turned: Any = np.ascontiguousarray(frame.pixels.T)
-    if frame.index or find_screen(turned, **levels_of(frame)).corners is None:
+    if frame.index or not find_outlines(turned, layouts):
         return None
     return (
         "the picture was turned by 90 degrees after it was taken, or taken in portrait: its stripes run downwards; use "
@@ -82,12 +87,11 @@ def turned_pixels(frame: Frame) -> str | None:
     )
 
 
-def levels_of(frame: Frame) -> dict[str, Any]:
-    """What pixel values mean, by the names of the arguments of `find_screen` and `measure_side_curvature`."""
+def reason_for_none(frame: Frame) -> str:
+    """Why no screen was found in a frame, and what to do."""
     levels = frame.mosaic
-    if levels is None:
-        return {"black": frame.black, "white": frame.white}
-    return {"black": float(np.mean(levels.black)), "white": levels.white, "mosaic_period": levels.pattern.shape[1]}
+    black, white = (frame.black, frame.white) if levels is None else (float(np.mean(levels.black)), levels.white)
+    return "; ".join(why_useless(frame.pixels, black, white) or (_NO_COLUMNS, _SHOW_COLUMNS))
 
 
 def too_small(context: FrameContext, screen: ScreenProfile) -> str | None:

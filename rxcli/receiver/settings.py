@@ -9,27 +9,6 @@ from dataclasses import dataclass
 class WiringSettings:
     """Each with its unit and the reason for it."""
 
-    #: Shares of the rows, one of so many, by which sides are held against the columns' borders.
-    row_parts: tuple[int, int] = (3, 1)
-    #: Sides agree with a grid where columns differ less than this on average and anywhere, columns.
-    sides_agree: float = 0.12
-    sides_agree_anywhere: float = 0.45
-    #: Support of left and right together from which these two tell that no column is missing between them.
-    both_show: float = 0.3
-    #: Strips that a column needs to be asked for light.
-    strips_a_column: float = 6.0
-    #: Log-odds of an outline by sides that contradict the grid; what sides that agree with a numbering add to it; what
-    #: sides add that were found for top or bottom less. Where left or right is missing, the other one's line says all.
-    contradicted_log_odds: float = -3.0
-    confirmed_log_odds: float = 4.0
-    inferred_log_odds: float = 1.0
-    #: Lines of text may have been taken for the screen's sides where packets prefer sides that contradict a grid, or
-    #: where no grid shows: how sure their columns' numbers are at most.
-    trust_in_sides_alone: float = 0.85
-    #: What tells a grid from others counts so much: strips err together.
-    likelihood_counts: float = 0.01
-    #: Log-odds by which an outline must lead so that packets are not asked.
-    clear_log_odds: float = 6.0
     #: What packets say counts so much: the light model is surer than it should be. At most so many outlines are
     #: received.
     packets_count: float = 0.08
@@ -49,14 +28,6 @@ class WiringSettings:
     #: Headers without symbols count so much.
     headers_alone: float = 0.1
 
-    #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with: where
-    #: packets show plainly, and where they do not.
-    matters_slots: float = 0.05
-    #: Sides of a screen are bowed by an unknown camera's lens from so many standard deviations on.
-    bowed_sds: float = 3.0
-    max_fits: int = 2
-    #: What is received with a refitted camera shows packets as well as before from this share of the evidence on.
-    kept_evidence: float = 0.9
     #: Packets, all columns together, which show plainly, nats: with a wrong camera they reach 103. It is right then but
     #: for their length, and other outlines are looked at with the screen that shows them alone.
     plain_packets: float = 200.0
@@ -65,10 +36,6 @@ class WiringSettings:
     #: show less than 10, right ones 80. And headers and packets under which an initial pass leaves no hope of any: of
     #: 120 hard pictures that show packets, none had less than 74.
     some_packets: float = 20.0
-    #: Packets and headers, for a screen of twenty columns, of an estimated camera: wrong ones show less than the first
-    #: where they show no packets, and hardly ever more than the second, from which no other is looked at.
-    few_packets: float = 60.0
-    beyond_doubt: float = 400.0
 
     #: Samples a slot on which columns are compared, and by how many slots they may be apart: slats may slant.
     light_samples: int = 2

@@ -1,4 +1,4 @@
-"""Maps of a picture that tell why a screen was found where it was, or was not: stripes, and grids of columns."""
+"""The map of a picture that tells why a screen was found where it was, or was not: coherence and the column grid."""
 
 from __future__ import annotations
 
@@ -12,59 +12,38 @@ from rxcli.types import FloatArray, Frame
 if TYPE_CHECKING:
     from rxcli.receiver.screen.grid import Grid
 
-#: Width of a map, pixels, and grids that are drawn.
-_WIDTH, _MAX_GRIDS = 640, 3
+#: Width of a map, pixels.
+_WIDTH = 640
 _QUALITY = 85
 #: Grey levels of nothing and of all.
 _LOW, _RANGE = 20, 215
 
 
-def stripe_map(frame: Frame) -> dict[str, Any] | None:
-    """Where the picture has stripes that neighbouring pixels share; None for tiny pictures."""
-    from rxcli.receiver.corners import levels_of
-    from rxcli.receiver.screen.picture import MIN_SIZE, Picture, reduce
-    from rxcli.receiver.screen.stripes import find_stripes
-
-    if min(frame.width, frame.height) < MIN_SIZE:
-        return None
-    levels = levels_of(frame)
-    plane = reduce(Picture(frame.pixels, levels["black"], levels["white"], levels.get("mosaic_period", 1)))
-    striped = find_stripes(plane).striped
-    return {
-        "title": "Where the picture has stripes",
-        "told": f"Stripes were found in {100 * float(striped.mean()):.0f} % of the picture.",
-        "caption": "White: light that changes from row to row alike in neighbouring pixels, as only a flickering light "
-        "does. The search for the screen begins with this map.",
-        **_drawn(frame, striped),
-    }
-
-
 def column_map(frame: Frame) -> dict[str, Any] | None:
-    """Coherent strips, with the grids of columns that may be; None for tiny pictures."""
-    from rxcli.receiver.corners import levels_of
-    from rxcli.receiver.screen.coherence import measure_coherence
-    from rxcli.receiver.screen.columns import ColumnLayout, likely_grids
-    from rxcli.receiver.screen.picture import MIN_SIZE
-    from rxcli.receiver.screen.waveforms import StripLight
+    """Coherent strips, with the grid of columns that was found; None for tiny pictures."""
+    from rxcli.options import ReceiverOptions
+    from rxcli.receiver.outline import layouts_of
+    from rxcli.receiver.screen.find import find_outlines
+    from rxcli.receiver.screen.settings import SETTINGS
+    from rxcli.receiver.screen.strips import read_strips
 
-    if min(frame.width, frame.height) < MIN_SIZE:
+    if min(frame.width, frame.height) < SETTINGS.min_size_px:
         return None
-    coherence = measure_coherence(frame.pixels, mosaic_period=int(levels_of(frame).get("mosaic_period", 1)))
-    light = StripLight.of(coherence, ColumnLayout().sigma, None)
-    grids = likely_grids(coherence, light, None)[:_MAX_GRIDS]
-    told = f"{len(grids)} possible grids of columns." if len(grids) != 1 else "One possible grid of columns."
+    period = 1 if frame.mosaic is None else frame.mosaic.pattern.shape[1]
+    found = find_outlines(frame.pixels, layouts_of(ReceiverOptions()), mosaic_period=period)
+    grids = [one.grid for one in found[:1]]
     scale = _WIDTH / frame.width
     return {
         "title": "Where the columns may be",
-        "told": told if grids else "No grid of columns stands out: strips of pixels change alike nowhere.",
+        "told": "A grid of columns was found."
+        if grids
+        else "No grid of columns stands out: strips of pixels change alike nowhere.",
         "caption": "Bright: neighbouring strips of pixels change alike from row to row, as they do in front of a "
-        "backlight however dark the picture is. Lines: borders of columns, across which they do not. Packets decide "
-        "between rival grids.",
-        **_drawn(frame, coherence.lit),
+        "backlight however dark the picture is. Lines: borders of columns, across which they do not.",
+        **_drawn(frame, read_strips(frame.pixels, period).lit),
         "grids": [
             {
                 "pitch_px": grid.pitch_px,
-                "share": grid.likelihood / grids[0].likelihood,
                 "lines": [(line * scale).round(1) for line in _borders(grid, frame.width, frame.height)],
             }
             for grid in grids

@@ -16,7 +16,7 @@ from rxcli.resources import data_dir
 from rxcli.results.aim import height_share, light_of, split_message
 from rxcli.results.columns import column_rows, packet_rows, text_rows
 from rxcli.results.inspection import Inspection, Trace, inspect_frame
-from rxcli.results.maps import column_map, stripe_map
+from rxcli.results.maps import column_map
 from rxcli.results.overlay import picture_of, preview
 from rxcli.results.report import headline, mirror_note, plain, printable
 from rxcli.types import FloatArray, Frame, FrameResult
@@ -56,7 +56,7 @@ def inspection_page(
         "texts": text_rows(result),
         "facts": _facts(frame, result),
         "picture": picture_of(result, frame, preview(frame, _WIDTH_PX), screen, camera),
-        "maps": [shown for shown in (stripe_map(frame), column_map(frame)) if shown],
+        "maps": [shown for shown in (column_map(frame),) if shown],
         "timeline": [
             [one.frame, one.time_s, headline(one), len(one.packets), one.status in ("ok", "partial")]
             for one in timeline

@@ -1,4 +1,4 @@
-"""The map of coherent strips with rival grids, on pictures drawn here."""
+"""The map of coherent strips with the grid of columns, on pictures drawn here."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli.results.maps import column_map, stripe_map
+from rxcli.results.maps import column_map
 from rxcli.types import Frame
 
 HEIGHT, WIDTH = 1200, 1000
@@ -22,7 +22,7 @@ def drawn(light: float) -> NDArray[np.uint8]:
     return np.clip(luma, 0, 255).astype(np.uint8)
 
 
-def test_borders_of_the_likeliest_grid_are_drawn() -> None:
+def test_borders_of_the_grid_are_drawn() -> None:
     shown = column_map(Frame(drawn(40.0), "drawn"))
     assert shown is not None
     assert len(shown["grids"][0]["lines"]) >= 15
@@ -40,4 +40,3 @@ def test_where_no_grid_stands_out_the_map_says_so() -> None:
 def test_tiny_pictures_have_no_map(shape: tuple[int, int]) -> None:
     frame = Frame(np.zeros(shape, np.uint8), "tiny")
     assert column_map(frame) is None
-    assert stripe_map(frame) is None

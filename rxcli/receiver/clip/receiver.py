@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.acquisition import Acquisition, sample_columns
-from rxcli.receiver.cameras import has_profile
+from rxcli.receiver.cameras import context_at, has_profile
 from rxcli.receiver.clip import results
 from rxcli.receiver.clip.bursts import BurstReader
 from rxcli.receiver.clip.outline import FirstOutline
@@ -138,7 +138,7 @@ class _Clip:
         self._scene: TrackedScreen | None = None
         self._scene_before: TrackedScreen | None = None
         #: Frames in a row that were received like photographs, and that showed no screen.
-        self._n_unknown = self._n_without = 0
+        self._n_unknown = 0
         self._hold_first()
 
     def _hold_first(self) -> None:
@@ -177,7 +177,7 @@ class _Clip:
 
     def _with_camera(self, frame: Frame) -> Located | Failure:
         """The screen in a frame of which nothing is known, and its camera."""
-        located = self._located(frame, Timer())
+        located = locate(frame, self._options, Timer(), self._context)
         if isinstance(located, Failure) or located.context is not None:
             return located
         return replace(located, context=likely_camera(frame, located.outline.corners, self._options, Timer()))
@@ -186,7 +186,7 @@ class _Clip:
         """The first frames, once they have agreed on an outline and, where each shows little, on a clock."""
         frames, self._first = self._first or [], None
         if self._outline is not None and self._found is not None and isinstance(self._found[1], Located):
-            located = _moved_to(self._found[1], self._outline.corners)
+            located = _moved_to(self._found[1], self._outline.corners, self._options)
             located = self._read_in_time(located, frames)
             if self._little and len(frames) > 1:
                 located = self._with_common_clock(located, frames)
@@ -199,7 +199,7 @@ class _Clip:
         An estimate tells rows per slot; with a slower screen than the right one the camera seems slower, too.
         """
         context, period_s = located.context, _shortest_period_s(frames)
-        if not isinstance(context, FrameContext) or context.camera.hypothesis is None or period_s is None:
+        if not isinstance(context, FrameContext) or context.camera.blind_estimate is None or period_s is None:
             return located
         too_long = context.camera.line_delay_s * context.frame.height / (period_s * SETTINGS.readout_slack)
         if too_long <= 1 and not self._little:
@@ -225,7 +225,7 @@ class _Clip:
         if not isinstance(first, FrameContext):
             return located
         self._start, chosen = agree(frames, first), first
-        if self._start is None and first.camera.hypothesis is not None:
+        if self._start is None and first.camera.blind_estimate is not None:
             for context in self._other_cameras(first, frames[1:]):
                 start = agree(frames, context)
                 if start is not None and (self._start is None or start.lead > self._start.lead):
@@ -237,7 +237,9 @@ class _Clip:
         for frame in frames:
             other = self._with_camera(frame)
             if isinstance(other, Located) and isinstance(other.context, FrameContext):
-                yield replace(other.context, frame=first.frame, corners=first.corners, timer=first.timer)
+                moved = replace(other.context, frame=first.frame, timer=first.timer)
+                # Other corners, be they equal, so that the strips are read from the first frame.
+                yield context_at(moved, first.corners.copy())
 
     def _take(self, frame: Frame) -> list[FrameResult]:
         timer = Timer()
@@ -388,8 +390,7 @@ class _Clip:
             self._context = None
         found, self._found = self._found, None
         known = found is not None and found[0] == frame.index
-        located = found[1] if found and known else self._located(frame, timer)
-        self._n_without = self._n_without + 1 if isinstance(located, Failure) else 0
+        located = found[1] if found and known else locate(frame, self._options, timer, self._context)
         if isinstance(located, Failure):
             return located
         corners, self._certainty = located.outline.corners, located.outline.certainty
@@ -403,25 +404,20 @@ class _Clip:
             self._context, self._taken_with = context, _taken_with(frame)
         return replace(self._context, frame=frame, corners=corners, timer=timer)
 
-    def _located(self, frame: Frame, timer: Timer) -> Located | Failure:
-        """The screen in a frame; where frame after frame shows none, its columns are searched in one of so many."""
-        thorough = self._n_without < SETTINGS.search_every or self._n_without % SETTINGS.search_every == 0
-        return locate(frame, self._options, timer, self._context, by_columns=thorough)
-
     def _with_settled_camera(self, context: FrameContext) -> _Settled | Failure:
         """The frame's clock; and where its camera was estimated, the camera that its slots tell, from then on."""
         sampler = sample_columns(context, context.n_columns)
         acquisition = with_data(context, sampler, self._predicted(context) or acquire(context, sampler))
         if isinstance(acquisition, Failure):
             return acquisition
-        if context.camera.hypothesis is None or self._start is not None:
+        if context.camera.blind_estimate is None or self._start is not None:
             return _Settled(context, acquisition)
         received = receive_unknown(context, acquisition, self._options.skip)
         return self._settled(received)
 
     def _settled(self, received: Received) -> _Settled:
         """What was received, its camera being known from now on."""
-        camera = replace(received.context.camera, hypothesis=None)
+        camera = replace(received.context.camera, blind_estimate=None)
         context = replace(received.context, camera=camera)
         self._context = context
         return _Settled(context, received.acquisition, received.reception)
@@ -755,11 +751,14 @@ def _shortest_period_s(frames: Sequence[Frame]) -> float | None:
     return min(passed, default=None)
 
 
-def _moved_to(located: Located, corners: FloatArray) -> Located:
-    """The same with the corners elsewhere."""
+def _moved_to(located: Located, corners: FloatArray, options: ReceiverOptions) -> Located:
+    """The same with the corners elsewhere; a lens that was seen in the sides between them is looked for there."""
     context = located.context
     if isinstance(context, FrameContext) and corners is not context.corners:
-        context = replace(context, corners=corners)
+        estimated, found = context.camera.blind_estimate, None
+        if estimated is not None and estimated[1].side_curvature is not None:
+            found = likely_camera(context.frame, corners, options, context.timer)
+        context = found if isinstance(found, FrameContext) else context_at(context, corners)
     return Located(replace(located.outline, corners=corners), context)
 
 

@@ -162,16 +162,18 @@ class TrackedScreen:
 
         It is looked for in every other frame, and less often as long as it stays where it is and nothing is a surprise.
         """
-        from rxcli.receiver.screen.find import track_screen
+        from rxcli.receiver.screen.find import ColumnLayout, follow_outline
 
         self._n_untold += 1
         if self._n_untold % (SETTINGS.look_every if self._n_still >= SETTINGS.still_looks and not surprised else 2):
             return None
         stored, order = _stored_order(corners)
-        found = track_screen(frame.pixels, stored, black=frame.black, white=frame.white, reach=SETTINGS.outline_reach)
-        if found.corners is None:
+        screen = self._begun_with[0].screen
+        layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
+        found = follow_outline(frame.pixels, stored, layout)
+        if found is None:
             return None
-        outline = found.corners[order]
+        outline = found[order]
         moved = outline - corners
         if np.abs(moved).max() > 2 * SETTINGS.outline_reach * self._width:
             return None

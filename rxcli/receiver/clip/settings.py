@@ -92,8 +92,6 @@ class ClipSettings:
     same_share: float = 0.25
     #: Frames in a row that may be received like photographs before the picture is learned anew.
     most_unknown: int = 3
-    #: Frames without a screen after which one of so many is searched for columns, which takes most of a search.
-    search_every: int = 8
     #: How much longer than from one frame to the next a readout may seem to take: time stamps are rounded.
     readout_slack: float = 1.1
     #: Frames that find their clock together where each shows little.

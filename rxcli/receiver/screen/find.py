@@ -1,146 +1,98 @@
-"""Finding the screen in a picture: where the stripes of a modulated backlight begin and end.
+"""The finder: outlines that the screen in a picture may have, from the coherence of strips alone.
 
-Nothing in a room changes from row to row as a modulated backlight does, and the change is the same in neighbouring
-pixels. So the search looks at one product: the change of light over a few rows, times the same change a little further
-along the rows. Its mean is the stripes' energy and zero for noise, for still light of any strength, and for upright
-edges. Four steps, each on less of the picture:
-
-1. Every fourth or so row is taken and averaged along the row in strips: some thousand rows that keep the stripes' full
-   contrast, whatever the number of rows of a slot. Cells of this plane with stripe energy outline the screen coarsely.
-2. Across each coarse side many segments look for the place where the energy begins.
-3. Through these places goes the *outermost* line with support. A column that is dark at the instant of the screen's top
-   row, or a black part of the picture, makes energy begin too late, never too early.
-4. Along the four lines pixels are read at full resolution (`edges`), and a flat screen of known aspect before one lens
-   is fitted to all sides together (`pose`).
-
-Where the camera is unknown, `side_curvature` asks afterwards what lens bows the sides between the corners.
-
-A side that shows nothing (black, or outside the picture) is put where a flat screen of known aspect must have it.
+No side of the screen has to show. Strips (`strips`) give combs of borders (`combs`); the comb whose waveforms explain
+the light best becomes a grid of columns (`grid`, `waveforms`); light outside and columns out of view say which column
+is the first (`numbering`), and light along the columns where the rows begin and end (`rows`). The finder proposes
+outlines with log-odds and decides nothing.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.receiver.screen.edges import refine
-from rxcli.receiver.screen.onsets import Reach, fit_side
-from rxcli.receiver.screen.picture import MIN_SIZE, Picture, Pixels, Plane, reduce
-from rxcli.receiver.screen.pose import Places, Rectangle, fit_pose, misfit, pose_of
-from rxcli.receiver.screen.side_curvature import measure_side_curvature
-from rxcli.receiver.screen.sides import INWARD, SIDE_NAMES, Side, corners_of, extent, from_top_left, straight
-from rxcli.receiver.screen.stripes import Stripes, coarse_sides, find_stripes
-from rxcli.types import FloatArray
+from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen.combs import find_combs, grid_of_comb
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
+from rxcli.receiver.screen.numbering import first_columns, light_profile
+from rxcli.receiver.screen.rows import find_rows
+from rxcli.receiver.screen.settings import SETTINGS
+from rxcli.receiver.screen.strips import Pixels, Strips, read_strips, shows_narrow_columns
+from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
+from rxcli.types import FloatArray, Lens
 
-__all__ = ["ScreenSearch", "find_screen", "measure_side_curvature", "track_screen"]
-
-#: Least share of a side's segments that must agree on a line.
-_MIN_SUPPORT = 0.06
-#: How well a side is known from the reduced picture, screen widths.
-_SIDE_SD = 0.002
-#: A side with this support is one of the screen's, or there is no screen.
-_CLEAR_SUPPORT = 0.6
-#: Misfit of four sides from which one is suspected to be another edge; what its support counts then; least margin.
-_CONTRADICTION, _TRUST, _SUSPICION = 6.0, 12.0, 3.0
-#: Least score of a screen; photographs without one stay below 0.15.
-_MIN_SCORE = 0.25
-_GIVE_CORNERS = (
-    "take the whole screen into view, straight from the front; if the picture does show a screen that sends, give its "
-    "place with --corners"
-)
-_LANDSCAPE = "hold the camera so that the long side of the picture lies along the long side of the screen"
-_NO_STRIPES = "no area with the stripes of a modulated backlight was found in the picture"
-_MAKE_STRIPES = (
-    "photograph a screen that sends, from near, with the electronic shutter and a short exposure (1/8000 s), and use "
-    "the picture in its full size"
-)
-_NO_OUTLINE = "what looks like stripes in the picture has no clear outline of a screen"
-_NO_SHAPE = "the stripes in the picture do not have the shape of a screen"
+#: Parts of a picture that are searched for narrow columns.
+_PARTS = 5
+#: Columns without light beside a side from which on it does not show.
+_UNLIT_COLUMNS = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class ScreenSearch:
-    """Where the screen is, or why it was not found."""
+class ColumnLayout:
+    """What is known of a screen's columns."""
 
-    #: (4, 2) float64: pixels of the stored picture, clockwise from the corner of smallest x + y; may lie outside the
-    #: picture. None: no screen.
-    corners: FloatArray | None
-    #: How sure, 0..1: share of the sides that is seen, times the share of the screen with stripes on it.
-    score: float
-    #: Why none was found: thing and reason. Empty where one was.
-    reason: str = ""
-    #: What to do about it, by what was seen.
-    advice: str = _GIVE_CORNERS
-    #: Sides (top, right, bottom, left of the stored picture) that were inferred from the others.
-    inferred: tuple[str, ...] = ()
-    #: Lines where stripes begin, in that order, whether or not they bound a screen; none where there are no stripes.
-    lines: tuple[Side, ...] = ()
+    n_columns: int = 20
+    #: Light spread, column pitches.
+    sigma: float = 0.45
+    #: Width over height of the screen.
+    aspect: float = 16 / 9
+
+    @property
+    def is_narrow(self) -> bool:
+        """Whether columns are so many that each fifth of a picture is searched for them."""
+        return self.n_columns >= SETTINGS.narrow_columns
 
 
-def find_screen(
-    pixels: Pixels, *, black: float, white: float, mosaic_period: int = 1, aspect: float = 16 / 9
-) -> ScreenSearch:
-    """Find the lit screen in a picture.
+@dataclass(frozen=True, slots=True)
+class OutlineCandidate:
+    """A place that the screen may have."""
 
-    Args:
-        pixels: (height, width) uint8 or uint16: luma (uint8 is taken as gamma-coded, uint16 as linear), or a mosaic.
-        black: value of no light.
-        white: value of full light.
-        mosaic_period: pixels after which the colours of a mosaic repeat (2 Bayer, 6 X-Trans); 1 for luma.
-        aspect: width over height of the screen.
-    """
-    trouble = _unusable(pixels, black, white)
-    if trouble:
-        return ScreenSearch(None, 0.0, *trouble)
-    picture = Picture(pixels, black, white, mosaic_period)
-    plane = reduce(picture)
-    stripes = find_stripes(plane)
-    initial = coarse_sides(plane, stripes)
-    if initial is None:
-        return ScreenSearch(None, 0.0, _NO_STRIPES, _MAKE_STRIPES)
-    size = extent(initial, plane.height)
-    out = max(0.025 * size, 1.5 * plane.cell_rows * plane.fy)
-    return _search(picture, plane, stripes, initial, Reach(out, max(0.09 * size, 3 * out), size), aspect)
+    #: (4, 2) pixels of the stored picture, clockwise from the screen's top left there: one for every extent of its rows
+    #: that may be, likeliest first.
+    corners: tuple[FloatArray, ...]
+    #: Its columns count from the screen's first.
+    grid: Grid
+    layout: ColumnLayout
+    #: Log-odds of its first column and number of columns against the likeliest.
+    log_odds: float
+    #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
+    fills: bool
+    #: Sides of the stored picture at which no light shows with the likeliest rows.
+    unlit_sides: tuple[str, ...]
 
 
-def track_screen(
-    pixels: Pixels,
-    previous: FloatArray,
-    *,
-    black: float,
-    white: float,
-    mosaic_period: int = 1,
-    aspect: float = 16 / 9,
-    reach: float = 0.012,
-) -> ScreenSearch:
-    """Find the screen again near where it was one frame earlier; no corners where it is not there any more.
+def find_outlines(
+    pixels: Pixels, layouts: Sequence[ColumnLayout], *, mosaic_period: int = 1, lens: Lens | None = None
+) -> list[OutlineCandidate]:
+    """Outlines that the screen in a picture may have, likeliest first; none where no columns show.
 
     Args:
-        pixels: as for `find_screen`.
-        previous: (4, 2) corners as `find_screen` gave them.
-        black: value of no light.
-        white: value of full light.
-        mosaic_period: as for `find_screen`.
-        aspect: width over height of the screen.
-        reach: how far a side may have moved, in screen widths.
+        pixels: (height, width) uint8 or uint16: luma, or a mosaic.
+        layouts: that the screen may have.
+        mosaic_period: pixels after which the colours of a mosaic repeat; 1 for luma.
+        lens: of the picture, where it is known.
     """
-    trouble = _unusable(pixels, black, white)
-    if trouble:
-        return ScreenSearch(None, 0.0, *trouble)
-    picture = Picture(pixels, black, white, mosaic_period)
-    plane = reduce(picture)
-    stripes = find_stripes(plane)
-    initial = [straight(previous, side) for side in range(4)]
-    size = float(np.linalg.norm(previous[1] - previous[0]))
-    return _search(picture, plane, stripes, initial, Reach(reach * size, 3 * reach * size, size), aspect)
+    if min(pixels.shape) < SETTINGS.min_size_px:
+        return []
+    strips = read_strips(pixels, mosaic_period, lens)
+    narrow, wide = ([one for one in layouts if one.is_narrow is many] for many in (True, False))
+    if narrow and shows_narrow_columns(strips):
+        fine = read_strips(pixels, mosaic_period, lens, n_parts=_PARTS)
+        grid = narrow_grid(fine, narrow[0].sigma)
+        if grid is not None:
+            return _numbered(fine, grid, narrow)
+    grid = wide_grid(strips, wide[0].sigma) if wide else None
+    return [] if grid is None else _numbered(strips, grid, wide)
 
 
-def _unusable(pixels: Pixels, black: float, white: float) -> tuple[str, str] | None:
+def why_useless(pixels: Pixels, black: float, white: float) -> tuple[str, str] | None:
     """Why a picture cannot show a screen at all, and what to do; None where it can."""
     height, width = pixels.shape
-    if min(height, width) < MIN_SIZE:
-        size = f"the picture has {width} x {height} pixels, a screen needs at least {MIN_SIZE} each way"
+    if min(height, width) < SETTINGS.min_size_px:
+        least = SETTINGS.min_size_px
+        size = f"the picture has {width} x {height} pixels, a screen needs at least {least} each way"
         return size, "use the picture in its full size, not a thumbnail or a messenger's copy"
     sample = (pixels[:: max(1, height // 64), :: max(1, width // 64)] - np.float32(black)) / (white - black)
     if np.mean(sample >= 0.004) < 0.005:
@@ -150,117 +102,96 @@ def _unusable(pixels: Pixels, black: float, white: float) -> tuple[str, str] | N
     return None
 
 
-def _search(
-    picture: Picture, plane: Plane, stripes: Stripes, initial: list[Side], reach: Reach, aspect: float
-) -> ScreenSearch:
-    """Fit the four sides near a guess; where they bound a screen, infer those that do not show, and refine all."""
-    if not 0.02 * plane.width < reach.size < 4 * plane.width:
-        return ScreenSearch(None, 0.0, _NO_SHAPE)
-    sides = [fit_side(picture, plane, stripes, initial, side, reach) for side in range(4)]
-    sides = [side if side.support >= _MIN_SUPPORT else replace(side, support=0.0) for side in sides]
-    return replace(_outlined(picture, plane, stripes, initial, reach, aspect, sides), lines=tuple(sides))
+def follow_outline(pixels: Pixels, corners: FloatArray, layout: ColumnLayout) -> FloatArray | None:
+    """The outline of a screen near to where it was one frame earlier; None where it does not show there any more.
+
+    Args:
+        pixels: (height, width) luma.
+        corners: (4, 2) of the frame before, clockwise from the screen's top left in the stored picture.
+        layout: of the screen's columns.
+    """
+    height, width = pixels.shape
+    if min(pixels.shape) < SETTINGS.min_size_px:
+        return None
+    strips = read_strips(pixels, n_parts=_PARTS if layout.is_narrow else 1)
+    n, start = layout.n_columns, grid_between(corners, layout.n_columns, (width, height), None)
+    grid = moved_by_waveforms(strips, start, layout.sigma, SETTINGS.first_steps + SETTINGS.last_steps)
+    grid = with_light(strips, grid, layout.sigma)
+    if not _stands_out(strips, grid):
+        return None
+    light = predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), layout.sigma)
+    plane, ends = find_rows(strips, light, grid, n, layout.aspect)
+    if len(ends) > 1:  # Bars at its top or bottom: the rows are where they were.
+        before = plane.along_flat(*grid.flat(corners))
+        ends = [(float(before[:2].mean()), float(before[2:].mean()))]
+    return plane.corners(ends[0])
 
 
-def _outlined(
-    picture: Picture,
-    plane: Plane,
-    stripes: Stripes,
-    initial: list[Side],
-    reach: Reach,
-    aspect: float,
-    sides: list[Side],
-) -> ScreenSearch:
-    """The screen that sides bound."""
-    rectangle = Rectangle(plane.width, plane.height, aspect)
-    expected = corners_of(initial, plane.width, plane.height)
-    missing = [number for number, side in enumerate(sides) if not side.support]
-    if len(missing) > 1:
-        names = [SIDE_NAMES[side] for side in missing]
-        listed = " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
-        return ScreenSearch(None, 0.0, f"something like stripes was found, but no {listed} side of a screen")
-    sides, pose = _agreed(sides, missing, expected, reach.size, rectangle)
-    trouble = _implausible(corners_of(sides, plane.width, plane.height), plane, aspect)
-    if trouble:
-        return ScreenSearch(None, 0.0, *trouble)
-    corners, support = refine(picture, sides, pose, rectangle)
-    return _judged(corners, sides, support, stripes, plane, aspect)
+def wide_grid(strips: Strips, sigma: float) -> Grid | None:
+    """The grid of wide columns that explains the strips' light best; None where none stands out."""
+    some = strips.blocks(slice(None, None, 2))
+    grids = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in find_combs(strips, sigma)]
+    best = max(grids, key=lambda one: one.explained + SETTINGS.contrast_weight * one.contrast)
+    return _settled(strips, moved_by_waveforms(some, best, sigma, SETTINGS.first_steps), sigma)
 
 
-def _judged(
-    corners: FloatArray, sides: list[Side], support: list[float], stripes: Stripes, plane: Plane, aspect: float
-) -> ScreenSearch:
-    trouble = _implausible(corners, plane, aspect)
-    if trouble:
-        return ScreenSearch(None, 0.0, *trouble)
-    score = float(np.mean([side.support for side in sides])) ** 0.5 * stripes.share_inside(corners)
-    if score < _MIN_SCORE:
-        return ScreenSearch(None, score, _NO_OUTLINE)
-    names = tuple(SIDE_NAMES[i] for i, side in enumerate(sides) if not side.support and not support[i])
-    return ScreenSearch(from_top_left(corners), min(score, 1.0), inferred=names)
+def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
+    """The grid of narrow columns, followed from the part of the picture that shows it best; None where none does."""
+    some = strips.blocks(slice(None, None, 2))
+    n, n_steps = some.n_windows, SETTINGS.narrow_steps
+    grids = []
+    for comb in find_combs(strips, sigma):
+        part = some.blocks(slice(comb.part * n, (comb.part + 1) * n))
+        grid = moved_by_waveforms(part, grid_of_comb(comb, strips), sigma, n_steps)
+        grids.append((with_light(part, grid, sigma), float(part.raw_x.mean())))
+    grid, middle = max(grids, key=lambda one: one[0].contrast / max(one[0].explained, 1.0))
+    reach = 0.5 / _PARTS
+    while reach < 0.5 + abs(middle):
+        reach *= SETTINGS.reach_gain
+        within = np.abs(some.raw_x - middle) < reach
+        near = np.flatnonzero(within.any(axis=1))
+        grid = moved_by_waveforms(some.blocks(near), grid, sigma, n_steps, within[near])
+    return _settled(strips, grid, sigma)
 
 
-def _agreed(
-    sides: list[Side], missing: list[int], expected: FloatArray, size: float, rectangle: Rectangle
-) -> tuple[list[Side], FloatArray]:
-    """The sides, those that are missing or contradict the others put where a flat screen has them; and its pose."""
-    start = pose_of(corners_of(sides, rectangle.width, rectangle.height), rectangle)
-    pose, cost = _pose_without(sides, missing, expected, start, rectangle, size)
-    if not missing and cost > _CONTRADICTION:
-        others = [_pose_without(sides, [number], expected, start, rectangle, size) for number in range(4)]
-        costs = [
-            left + side.support * (_TRUST + _inside(side, number, other, rectangle) / (_SIDE_SD * size))
-            for number, (side, (other, left)) in enumerate(zip(sides, others, strict=True))
-        ]
-        number = int(np.argmin(costs))
-        # Where two sides could be the false one, none is chosen.
-        clear = min(*costs[:number], *costs[number + 1 :], cost) > costs[number] + _SUSPICION
-        if clear and sides[number].support < _CLEAR_SUPPORT:
-            pose, missing = others[number][0], [number]
-    projected = rectangle.project(pose)
-    agreed = [
-        replace(straight(projected, number), support=0.0) if number in missing else side
-        for number, side in enumerate(sides)
-    ]
-    return agreed, pose
+def _settled(strips: Strips, grid: Grid, sigma: float) -> Grid | None:
+    """A grid after its last steps; None where it explains nearly as much with its borders elsewhere."""
+    grid = with_light(strips, moved_by_waveforms(strips, grid, sigma, SETTINGS.last_steps), sigma)
+    return grid if _stands_out(strips, grid) else None
 
 
-def _pose_without(
-    sides: list[Side],
-    missing: list[int],
-    expected: FloatArray,
-    start: FloatArray,
-    rectangle: Rectangle,
-    size: float,
-) -> tuple[FloatArray, float]:
-    """The pose of a screen from the sides that are not missing, and how badly it fits them."""
-    places = [
-        None if number in missing else Places(*side.some_places, _SIDE_SD * size) for number, side in enumerate(sides)
-    ]
-    pose = fit_pose(places, expected, 0.3 * size, start, rectangle, 6)
-    return pose, misfit(places, pose, rectangle)
+def _stands_out(strips: Strips, grid: Grid) -> bool:
+    by_chance = SETTINGS.min_contrast * grid.explained / np.sqrt(strips.n_rows * SETTINGS.n_windows)
+    return bool(grid.contrast > max(by_chance, SETTINGS.min_contrast_per_strip * strips.lit.size))
 
 
-def _inside(side: Side, number: int, pose: FloatArray, rectangle: Rectangle) -> float:
-    """How far a pose has a side inside of where its stripes begin, pixels: stripes go to the side, not beyond."""
-    expected = straight(rectangle.project(pose), number)
-    return max(INWARD[number] * (expected.at(side.middle) - side.at(side.middle)), 0.0)
+def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> list[OutlineCandidate]:
+    """The outlines of a grid: every first column that may be; those of one layout have the same rows."""
+    light = predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), layouts[0].sigma)
+    profile = light_profile(strips, light, grid)
+    starts = [first_columns(profile, layout.n_columns) for layout in layouts]
+    likeliest = max(float(start.log_odds.max()) for start in starts)
+    found: list[OutlineCandidate] = []
+    for layout, start in zip(layouts, starts, strict=True):
+        likely = np.flatnonzero(start.log_odds > likeliest + SETTINGS.min_log_odds)
+        if not likely.size:
+            continue
+        best = int(start.first[start.log_odds.argmax()])
+        plane, ends = find_rows(strips, light, grid.shifted(best), layout.n_columns, layout.aspect)
+        for number, odds in zip(start.first[likely].tolist(), start.log_odds[likely].tolist(), strict=True):
+            corners = tuple(plane.corners(one, number - best) for one in ends)
+            lit = (profile.ends[0] - number, number + layout.n_columns - profile.ends[1])
+            unlit = _unlit_sides(corners[0], lit, len(ends) > 1, (strips.width, strips.height))
+            own = grid.shifted(number)
+            found.append(OutlineCandidate(corners, own, layout, odds - likeliest, start.fills, unlit))
+    return sorted(found, key=lambda one: -one.log_odds)
 
 
-def _implausible(corners: FloatArray, plane: Plane, aspect: float) -> tuple[str, str] | None:
-    """Why four corners cannot be a screen's, and what to do; None where they can."""
-    edges = np.roll(corners, -1, axis=0) - corners
-    following = np.roll(edges, -1, axis=0)
-    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-    top, right, bottom, left = np.linalg.norm(edges, axis=1)
-    ratio = (top + bottom) / (left + right) / aspect
-    if not (turns > 0).all() or not (0.6 < top / bottom < 1.6 and 0.6 < left / right < 1.6):
-        return _NO_SHAPE, _GIVE_CORNERS
-    if 0.8 < ratio * aspect**2 < 1.25:
-        return "the screen stands upright in the picture, so its columns lie along the rows", _LANDSCAPE
-    if not 0.92 < ratio < 1.09:
-        shape = f"the striped area is {ratio * aspect:.2f} times as wide as high, the screen {aspect:.2f} times"
-        return shape, _GIVE_CORNERS
-    if (left + right) / 2 < 0.12 * plane.height:
-        fill = f"the screen fills only {(left + right) / 2 / plane.height:.0%} of the picture's height"
-        return fill, "move closer, or zoom with the lens"
-    return None
+def _unlit_sides(
+    corners: FloatArray, unlit: tuple[float, float], has_bars: bool, size: tuple[int, int]
+) -> tuple[str, ...]:
+    """Sides outside the picture, or beside columns or rows without light."""
+    middles = (corners + np.roll(corners, -1, axis=0)) / 2
+    outside = ((middles < 0) | (middles > np.array(size) - 1)).any(axis=1)
+    dark = np.array([has_bars, unlit[1] > _UNLIT_COLUMNS, has_bars, unlit[0] > _UNLIT_COLUMNS])
+    return tuple(name for name, hidden in zip(geometry.SIDE_NAMES, outside | dark, strict=True) if hidden)

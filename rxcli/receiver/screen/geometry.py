@@ -22,6 +22,8 @@ _Real = TypeVar("_Real", np.float32, np.float64)
 _VIEWER_CORNERS = {1: (0, 1, 2, 3), 2: (1, 0, 3, 2), 3: (2, 3, 0, 1), 4: (3, 2, 1, 0)}
 #: Share of the screen's height beyond its corners that outlines reach, so that no edge row is lost.
 _OVERHANG = 0.02
+#: Sides of a picture, in the order of its corners: side i goes from corner i to corner i + 1.
+SIDE_NAMES = ("top", "right", "bottom", "left")
 _OUTLINE_POINTS, _MIDDLE_POINTS = 65, 33
 #: No lens moves a point of the picture by more than this many focal lengths.
 _LARGEST_MOVE = 10.0

@@ -6,97 +6,36 @@ eighths of a column: the edge of a screen lies on a border of its columns, the e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.receiver.screen.coherence import Coherence
 from rxcli.receiver.screen.grid import Grid, columns_at
-from rxcli.receiver.screen.rows import find_rows
-from rxcli.receiver.screen.sides import BOTTOM, LEFT, RIGHT, SHOWS, TOP, Side
-from rxcli.receiver.screen.still_light import StillSteps, still_steps
-from rxcli.receiver.screen.waveforms import StripLight, predicted_light
-from rxcli.types import BoolArray, FloatArray, IntArray
+from rxcli.receiver.screen.strips import Strips
+from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
-#: Log-odds against the likeliest first column down to which another is possible.
-LEAST_ODDS = -7.0
-#: Parts of a column that are asked for light.
-_PARTS = 8
+#: Parts of a column that are asked for light; and those at which its level is asked.
+_PARTS, _LEVEL_PARTS = 8, 16
 #: Significance of light off the screen and on it, as scales of exponential distributions; the log-odds that a part
 #: without light is off the screen; and how much each counts, neighbouring parts being dark together.
 _OFF_SCALE, _LIT_SCALE, _DARK_PART, _PART_COUNTS = 1.2, 6.0, 0.25, 0.5
 #: Log-odds that parts of a column must have so that light ends no earlier.
 _ENDS = 0.05
-#: Log-odds of a screen that goes on outside the picture, for every column that is there; and by however much, where
-#: light reaches to that end of the picture.
+#: Log-odds of each column outside the picture; and at least, where light reaches to that end of the picture.
 _OUTSIDE, _LARGER = -4.0, -3.0
 #: The light's middle is the screen's, but for this, screen widths.
 _LIGHT_SD = 0.175
-#: Films with bars beside them begin and end sharply, lie in the screen's middle to this, columns, and take these shares
-#: of its width: log-odds that this adds where top and bottom are the screen's, or do not show, of so many columns.
-_USUAL_COLUMNS, _IN_MIDDLE, _BARS, _FILM = 20, 0.2, (0.53, 0.95), 3.5
-#: How far the distance of top and bottom may be off that of a screen's, a share.
-_AS_HIGH = 0.05
-#: How well a border is known, columns.
-_BORDER_SD = 0.08
 #: So much of the picture, columns, must lie beyond light that ends in it.
 _IN_VIEW = 0.4
-#: How near to a border a line where stripes begin lies, columns, and the log-odds that it, or light that begins on a
-#: border, adds there.
-_NEAR_BORDER, _ON_BORDER = 0.1, 2.0
-#: Light on one side of a border, log-odds, from which it begins there, and the share of it that may lie beyond.
-_BEGINS, _BEYOND = 2.0, 0.3
-
-
-@dataclass(frozen=True, slots=True)
-class Numbering:
-    """A grid with its first column chosen."""
-
-    #: Its columns count from the screen's first.
-    grid: Grid
-    #: (4, 2) the screen's corners in pixels of the stored picture, clockwise from its top left: with the likeliest rows
-    #: first, then with others.
-    corners: tuple[FloatArray, ...]
-    #: Natural logarithm of its odds against the other numberings of the same grid.
-    log_odds: float
-    #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
-    fills: bool
-
-
-def possible_numberings(
-    coherence: Coherence,
-    strips: StripLight,
-    grid: Grid,
-    n_columns: int,
-    aspect: float,
-    lines: Sequence[Side] = (),
-) -> list[Numbering]:
-    """The columns that may be the screen's first, likeliest first.
-
-    Args:
-        coherence: of the picture.
-        strips: its strips' light.
-        grid: columns of it.
-        n_columns: columns of the screen.
-        aspect: width over height of the screen.
-        lines: top, right, bottom, left, where stripes begin; none: nothing is known of them.
-    """
-    light = light_profile(strips, grid)
-    start = first_columns(light, grid, n_columns, lines, aspect)
-    likely: IntArray = np.flatnonzero(start.log_odds > LEAST_ODDS)
-    chosen = likely[np.argsort(-start.log_odds[likely], kind="stable")]
-    best = int(start.first[chosen[0]])
-    # All have their rows in common, so that packets can tell them apart.
-    middle = float((light.by_window * coherence.y).sum() / max(light.by_window.sum(), TINY))
-    rows = find_rows(strips, grid.shifted(best), n_columns, aspect, middle, tuple(lines[::2]))
-    out = []
-    for i in chosen:
-        number = int(start.first[i])
-        corners = tuple(one.corners(number - best) for one in rows)
-        out.append(Numbering(grid.shifted(number), corners, float(start.log_odds[i]), start.fills))
-    return out
+#: Light on one side of a border, log-odds, from which it begins there, the share of it that may lie beyond, and what it
+#: adds.
+_BEGINS_ODDS, _BEYOND, _ON_BORDER = 2.0, 0.3, 3.0
+#: A film has dark bars beside it. It begins where its level is this share of the way from dark to bright (percentiles
+#: over the columns), is dark to this share so far beyond, takes these shares of the screen's width, and lies in its
+#: middle to this, columns; what that adds in log-odds with 20 columns: with more it is less likely by chance.
+_DARK, _BRIGHT, _BEGINS = 5, 75, 0.25
+_LEFT_OVER, _BESIDE, _FILM_WIDTHS, _IN_MIDDLE, _FILM, _USUAL_COLUMNS = 0.12, 0.45, (0.53, 0.95), 0.2, 3.5, 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,13 +45,10 @@ class LightProfile:
     #: (P,) middles of the parts of columns, and whether the picture shows them.
     place: FloatArray
     in_picture: BoolArray
-    #: (P,) light in standard deviations, and the log-odds that it is the screen's over being off it.
-    significance: FloatArray
+    #: (P,) log-odds that a part is on the screen over being off it.
     log_odds: FloatArray
-    #: (W,) light of every window of rows.
-    by_window: FloatArray
-    #: Steps of the light that does not change.
-    still: StillSteps
+    #: Columns at which a film with dark bars beside it begins and ends; None: there is none.
+    film: tuple[float, float] | None
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -124,68 +60,95 @@ class LightProfile:
         return left + start / _PARTS, left + end / _PARTS
 
 
-def light_profile(strips: StripLight, grid: Grid) -> LightProfile:
-    """The light across the columns of a grid: how alike strips are to what their neighbours' waveforms predict."""
+def light_profile(strips: Strips, light: Float32Array, grid: Grid) -> LightProfile:
+    """The light across the columns of a grid.
+
+    Args:
+        strips: of the picture.
+        light: (B, S, R) what the strips have in common with their neighbours' waveforms, see `predicted_light`.
+        grid: of the picture.
+    """
     u = columns_at(grid.numbers, strips.x, strips.y)
-    alike = predicted_light(strips, u)
     first = int(np.floor(u.min())) - 1
     n = (int(np.ceil(u.max())) + 1 - first) * _PARTS
     part = ((u - first) * _PARTS).astype(np.int64).ravel()
     count = np.bincount(part, minlength=n)
-    total = np.bincount(part, alike.sum(axis=2).ravel(), n)
-    power = np.bincount(part, (alike * alike).sum(axis=2).ravel(), n)
-    share = total / np.sqrt(np.maximum(power * count * alike.shape[2], TINY))
-    shown = count > 0
-    light = np.maximum(share, 0.0) * np.sqrt(count * strips.n_rows)
-    off = np.exp(-light / _OFF_SCALE) / _OFF_SCALE + TINY
-    lit = np.exp(-light / _LIT_SCALE) / _LIT_SCALE
+    total = np.bincount(part, light.sum(axis=2).ravel(), n)
+    power = np.bincount(part, np.einsum("bsr,bsr->bs", light, light).ravel(), n)
+    share = total / np.sqrt(np.maximum(power * count * light.shape[2], TINY))
+    significance = np.maximum(share, 0.0) * np.sqrt(count * strips.n_rows)
+    off = np.exp(-significance / _OFF_SCALE) / _OFF_SCALE + TINY
+    lit = np.exp(-significance / _LIT_SCALE) / _LIT_SCALE
     odds = _PART_COUNTS * np.log(np.exp(-_DARK_PART) + (1 - np.exp(-_DARK_PART)) * lit / off)
-    by_window = np.maximum(alike.mean(axis=(1, 2)), 0.0)
     place = first + (np.arange(n) + 0.5) / _PARTS
-    still = still_steps(strips.level, u, by_window)
-    return LightProfile(place, shown, light, np.where(shown, odds, 0.0), np.asarray(by_window, np.float64), still)
+    by_block = np.maximum(light.mean(axis=(1, 2)), 0.0)
+    film = _film(np.where(by_block[:, None] > 0, strips.level, 0), u)
+    return LightProfile(place, count > 0, np.where(count > 0, odds, 0.0), film)
+
+
+def _film(level: Float32Array, u: FloatArray) -> tuple[float, float] | None:
+    """Columns at which a picture with dark bars on both sides begins and ends, by the level (B, S) of strips."""
+    shown = level > 0
+    first = float(np.floor(u.min()))
+    part = ((u[shown] - first) * _LEVEL_PARTS).astype(np.int64)
+    if part.size == 0:
+        return None
+    count = np.bincount(part)
+    known = np.flatnonzero(count)
+    profile = np.interp(np.arange(count.size), known, (np.bincount(part, level[shown]) / np.maximum(count, 1))[known])
+    dark, bright = np.percentile(profile, [_DARK, _BRIGHT])
+    is_bright = np.flatnonzero(profile > dark + _BEGINS * (bright - dark))
+    if is_bright.size == 0:
+        return None
+    beside, ends = round(_BESIDE * _LEVEL_PARTS), (int(is_bright[0]), int(is_bright[-1]))
+    for end, side in zip(ends, (1, -1), strict=True):
+        outside, inside = end - side * beside, end + side * beside
+        if not (0 <= outside < profile.size and 0 <= inside < profile.size):
+            return None
+        if profile[outside] - dark > _LEFT_OVER * (profile[inside] - dark):
+            return None
+    return first + ends[0] / _LEVEL_PARTS, first + (ends[1] + 1) / _LEVEL_PARTS
 
 
 @dataclass(frozen=True, slots=True)
 class FirstColumns:
-    """What a picture says of the columns that may be the screen's first."""
+    """How likely each column of a grid is the screen's first."""
 
-    #: (F,) such columns of the grid, and the natural logarithm of their odds against the likeliest.
+    #: (F,) columns of the grid, and their log-odds, comparable between numbers of columns.
     first: IntArray
     log_odds: FloatArray
     #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
-    fills: bool = False
+    fills: bool
 
 
-def first_columns(
-    light: LightProfile, grid: Grid, n_columns: int, lines: Sequence[Side] = (), aspect: float = 16 / 9
-) -> FirstColumns:
-    """How likely each column of a grid is the screen's first.
+def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
+    """How likely each column of a grid is the first of a screen with `n_columns`.
 
-    Light outside the screen, columns outside the picture, light that begins on a border, a line where stripes begin,
-    steps of still light and films in the middle tell. Where columns are dark at both ends and none of these shows the
-    numberings stay alike.
+    Light outside the screen, columns outside the picture and a film in the screen's middle decide. Where columns are
+    dark at both ends and none of these shows, several stay as likely.
     """
     shown = light.place[light.in_picture]
     left, right = float(shown.min()), float(shown.max())
     first = np.arange(int(left) - n_columns + 3, int(right) - 2)
     begin, end_of_light = light.ends
     reaches = (begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW)
-    film = _film(light, grid, n_columns, aspect, lines)
+    film = _FILM + float(np.log(n_columns / _USUAL_COLUMNS)) if _is_film(light, n_columns) else 0.0
     scores = []
-    lying = {number: _columns_of_line(grid, lines, number) for number in (LEFT, RIGHT)}
     for start in first.tolist():
         end = start + n_columns
         hidden = max(left - start, 0.0), max(end - right, 0.0)
         off = (begin + end_of_light) / 2 - start - n_columns / 2
         score = _light_within(light, start, end) + _hidden(hidden, reaches) - 0.5 * (off / (_LIGHT_SD * n_columns)) ** 2
-        score += film[1] * (abs(film[0] - start - n_columns / 2) < _IN_MIDDLE)
-        score += _still_edges(light, (start, end))
-        for border, side, number in ((start, 1, LEFT), (end, -1, RIGHT)):
-            signs = (_begins(light, border, side), _is_on(lying[number], border))
-            score += _ON_BORDER * sum(signs)
+        if light.film is not None:
+            score += film * (abs(sum(light.film) / 2 - start - n_columns / 2) < _IN_MIDDLE)
+        score += _ON_BORDER * (_begins(light, start, 1) + _begins(light, end, -1))
         scores.append(score)
-    return FirstColumns(first, np.array(scores) - max(scores), all(reaches))
+    return FirstColumns(first, np.array(scores), all(reaches))
+
+
+def _is_film(light: LightProfile, n_columns: int) -> bool:
+    film = light.film
+    return film is not None and _FILM_WIDTHS[0] < (film[1] - film[0]) / n_columns < _FILM_WIDTHS[1]
 
 
 def _hidden(columns: tuple[float, float], reaches: tuple[bool, bool]) -> float:
@@ -196,56 +159,16 @@ def _hidden(columns: tuple[float, float], reaches: tuple[bool, bool]) -> float:
     return sum(max(one, _LARGER) if to_the_end else one for one, to_the_end in zip(odds, reaches, strict=True))
 
 
-def _light_within(light: LightProfile, start: int, end: int) -> float:
-    """Log-odds that the screen lies between two borders; what lies next to them is the screen's if it has light."""
-    near = np.minimum(np.abs(light.place - start), np.abs(light.place - end)) < 1 / _PARTS
-    inside = (light.place > start) & (light.place < end) & ~near
-    return float(light.log_odds[inside].sum() + np.maximum(light.log_odds[near], 0.0).sum())
-
-
 def _begins(light: LightProfile, border: int, side: int) -> bool:
     """Whether light begins on a border, to its right (1) or left (-1)."""
     off = side * (light.place - border)
     beyond = (off < -1 / _PARTS) & (off > -0.5)
     inside, outside = light.log_odds[(off > 1 / _PARTS) & (off < 0.5)].sum(), light.log_odds[beyond].sum()
-    seen = light.in_picture[beyond].all()
-    return bool(seen and inside > _BEGINS and outside < _BEYOND * inside)
+    return bool(light.in_picture[beyond].all() and inside > _BEGINS_ODDS and outside < _BEYOND * inside)
 
 
-def _still_edges(light: LightProfile, borders: tuple[int, int]) -> float:
-    """Log-odds of the steps of still light on two borders; of light that begins there the own step says no more."""
-    places = []
-    for border, side in zip(borders, (1, -1), strict=True):
-        off = side * (light.place - border)
-        is_lit = light.log_odds[(off > 1 / _PARTS) & (off < 0.5)].sum() > _BEGINS
-        places.append(np.nan if is_lit else float(border))
-    return light.still.on_borders((places[0], places[1]), _BORDER_SD)
-
-
-def _film(light: LightProfile, grid: Grid, n_columns: int, aspect: float, lines: Sequence[Side]) -> tuple[float, float]:
-    """Middle column of a picture that has dark bars left and right, and log-odds that it is the screen's middle."""
-    ends = light.still.sharp_ends
-    if ends is None or not _BARS[0] < (ends[1] - ends[0]) / n_columns < _BARS[1]:
-        return 0.0, 0.0
-    middle = (ends[0] + ends[1]) / 2
-    # The more columns there are the less likely it lies in their middle by chance.
-    by_chance = float(np.log(n_columns / _USUAL_COLUMNS))
-    if not lines or min(lines[number].support for number in (TOP, BOTTOM)) < SHOWS:
-        return middle, _FILM + by_chance
-    x = grid.width / 2
-    height = (lines[BOTTOM].at(x) - lines[TOP].at(x)) / grid.pitch_px * aspect / n_columns
-    return middle, (_FILM + by_chance) * (abs(height - 1) < _AS_HIGH)
-
-
-def _columns_of_line(grid: Grid, lines: Sequence[Side], number: int) -> FloatArray | None:
-    """Columns on which the line where stripes begin on a side lies, at some places; None where it does not show."""
-    if not lines or lines[number].support < SHOWS:
-        return None
-    line = lines[number]
-    y, x = line.some_places
-    return grid.columns_at(np.stack([x, y], axis=-1))
-
-
-def _is_on(columns: FloatArray | None, border: int) -> bool:
-    """Whether columns, of a line, are those of a border."""
-    return columns is not None and bool(np.median(np.abs(columns - border)) < _NEAR_BORDER)
+def _light_within(light: LightProfile, start: int, end: int) -> float:
+    """Log-odds that the screen lies between two borders; what lies next to them is the screen's if it has light."""
+    near = np.minimum(np.abs(light.place - start), np.abs(light.place - end)) < 1 / _PARTS
+    inside = (light.place > start) & (light.place < end) & ~near
+    return float(light.log_odds[inside].sum() + np.maximum(light.log_odds[near], 0.0).sum())

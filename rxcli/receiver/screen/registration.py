@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.picture import TONE
 from rxcli.types import Float32Array, FloatArray, Frame, Lens
 
+#: Exponent of the tone curve that is taken off where texture is placed; any of the usual ones will do.
+_TONE = 2.2
 #: Width of a screen over its height.
 _ASPECT = 16 / 9
 #: Cells across and down the screen that its texture is known by, about.
@@ -442,7 +443,7 @@ def _light_and_noise(
 ) -> tuple[Float32Array, Float32Array]:
     """Light of sums of so many pixels, and what a cell of that light errs by, in parts of what stripes leave."""
     coded = np.clip((sums / np.float32(cell_y) - np.float32(black)) / np.float32(white - black), 0, 1)
-    tone = np.float32(1.0 if linear else TONE)
+    tone = np.float32(1.0 if linear else _TONE)
     steep = np.maximum(coded, np.float32(_DARKEST)) ** (tone - np.float32(1))
     return coded**tone, steep * np.float32(tone * _CELL_NOISE / _STRIPE_NOISE)
 

@@ -1,0 +1,169 @@
+"""The comb of column borders: strips that are some way apart are least alike where a border lies between them.
+
+With the columns' light spread a Gaussian of `sigma` column pitches, two strips at the places `u` and `u + d` (in
+columns) are as alike as the vectors `exp(-(u - k)^2 / 2 sigma^2)` over the columns k. Along the screen this goes up and
+down once a column, most at a distance of about 0.7. A Fourier sum over all pairs of about that distance finds the
+period: it needs no edge of the screen and no decoding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.numerics import TINY
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_slopes, grid_step
+from rxcli.receiver.screen.settings import SETTINGS
+from rxcli.receiver.screen.strips import Strips
+from rxcli.types import Float32Array, FloatArray
+
+#: Combs that differ by less than this in pitch, and by this at the picture's ends, lead to the same grid; columns.
+_SAME_PITCH, _SAME_SHAPE = 0.7, 0.8
+#: Gauss-Newton steps that turn a comb into a grid; weight of a place, columns to the power of minus two.
+_STEPS, _PRECISION = 4, 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class Comb:
+    """Borders of columns in one part of a picture: u = phase + pitch (X + turn Y + across X^2 + along X Y).
+
+    X and Y are offsets from the part's middle over its width.
+    """
+
+    #: Height over the standard deviation that it would have by chance, were all pairs independent.
+    score: float
+    pitch: float
+    turn: float
+    across: float
+    along: float
+    phase: float
+    #: Number of the part, from the left.
+    part: int
+
+    def is_like(self, other: Comb) -> bool:
+        """Whether two combs differ so little that one fit finds both."""
+        shape = abs(self.turn - other.turn) + (abs(self.across - other.across) + abs(self.along - other.along)) / 4
+        same = self.part == other.part and abs(self.pitch - other.pitch) < _SAME_PITCH
+        return same and shape * self.pitch < _SAME_SHAPE
+
+
+@lru_cache(maxsize=64)
+def likeness(sigma: float, distance: float) -> tuple[float, float]:
+    """Mean and first harmonic, over the phase, of how alike two places `distance` columns apart are."""
+    middle, centres = np.arange(64) / 64, np.arange(-6, 8) + 0.5
+    one, other = (np.exp(-((middle[:, None] + s * distance / 2 - centres) ** 2) / (2 * sigma**2)) for s in (-1, 1))
+    cosine = (one * other).sum(-1) / np.sqrt((one**2).sum(-1) * (other**2).sum(-1))
+    return float(cosine.mean()), float(2 * (cosine * np.cos(2 * np.pi * middle)).mean())
+
+
+def find_combs(strips: Strips, sigma: float) -> list[Comb]:
+    """The combs that show best, best first: some of a picture that is one part, else the best of each part.
+
+    Args:
+        strips: of the picture.
+        sigma: light spread of the screen, column pitches.
+    """
+    n_windows, n_parts = strips.n_windows, strips.n_parts
+    found: list[Comb] = []
+    for part in range(n_parts):
+        own = strips.blocks(slice(part * n_windows, (part + 1) * n_windows))
+        combs = sorted(_combs_of_part(own, sigma, part), key=lambda one: -one.score)
+        found += _distinct(combs, SETTINGS.n_combs if n_parts == 1 else 1)
+    return sorted(found, key=lambda one: -one.score)
+
+
+def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
+    """The grid of the whole picture that is nearest to a comb in its part."""
+    n = strips.n_windows
+    own = slice(comb.part * n, (comb.part + 1) * n)
+    raw_x, raw_y, x, y = (values[own].ravel() for values in (strips.raw_x, strips.raw_y, strips.x, strips.y))
+    local_x, local_y = (raw_x - raw_x.mean()) * strips.n_parts, raw_y * strips.n_parts
+    bent = local_x + comb.turn * local_y + comb.across * local_x**2 + comb.along * local_x * local_y
+    u = comb.phase + comb.pitch * bent
+    pitch = comb.pitch * strips.n_parts
+    numbers = np.array([comb.phase - pitch * raw_x.mean(), pitch, pitch * comb.turn, 0.0, 0.0, 0.0])
+    for _ in range(_STEPS):
+        off = u - columns_at(numbers, x, y)
+        numbers = numbers + grid_step(numbers, off, np.full(off.shape, _PRECISION), grid_slopes(numbers, x, y))
+    return Grid(numbers, strips.width, strips.height, strips.lens)
+
+
+def _distinct(combs: list[Comb], most: int) -> list[Comb]:
+    chosen: list[Comb] = []
+    for comb in combs:
+        if len(chosen) == most:
+            break
+        if not any(comb.is_like(other) for other in chosen):
+            chosen.append(comb)
+    return chosen
+
+
+def _combs_of_part(strips: Strips, sigma: float, part: int) -> list[Comb]:
+    """The best comb of each pitch."""
+    pitches = np.arange(SETTINGS.min_pitch, SETTINGS.max_pitch, SETTINGS.pitch_step)
+    step = strips.step * strips.n_parts
+    apart = np.maximum(np.round(SETTINGS.pair_distance / (pitches * step)), 1).astype(np.int64)
+    y = strips.raw_y.mean(axis=1) * strips.n_parts
+    found: list[Comb] = []
+    for distance in np.unique(apart).tolist():
+        both = strips.lit[:, :-distance] * strips.lit[:, distance:]
+        tried = pitches[apart == distance]
+        mean, harmonic = likeness(sigma, round(float(tried.mean()) * distance * step, 2))
+        rest = np.sqrt(both) * strips.coherence(distance) - np.float32(mean) * both
+        chance = np.sqrt(float(both.sum()) / (2 * strips.n_rows)) + TINY
+        # Combs are weighed by their own height, so that pitches of unlike distances can be compared.
+        rest *= np.float32(np.sign(harmonic) / chance)
+        found += _best_combs(rest, step, y, tried, part, strips.n_parts)
+    return found
+
+
+def _range(largest: float, at_corner: float) -> FloatArray:
+    """Values from minus to plus `largest`, 0 among them, that differ by the corner's step where each counts so much."""
+    n = int(np.ceil(largest * at_corner / SETTINGS.corner_step))
+    return np.linspace(-largest, largest, 2 * n + 1)
+
+
+def _best_combs(
+    rest: Float32Array, step: float, y: FloatArray, pitches: FloatArray, part: int, n_parts: int
+) -> list[Comb]:
+    """The best comb of each pitch by values (W, n) of pairs of strips: along the strips, then over the windows."""
+    largest, half_x, half_y = float(pitches[-1]), 0.5, float(np.abs(y).max())
+    if SETTINGS.max_turn * largest * (y[1] - y[0]) < SETTINGS.corner_step and len(y) % 2 == 0:
+        rest, y = rest[::2] + rest[1::2], (y[::2] + y[1::2]) / 2
+    turns = _range(SETTINGS.max_turn, largest * half_y)
+    across = _range(SETTINGS.max_across / n_parts, largest * half_x**2)
+    along = _range(SETTINGS.max_along / n_parts, largest * half_x * half_y)
+    spacing, reach = SETTINGS.pitch_step / 2, float(along.max()) * half_y * largest
+    first = int(np.floor((float(pitches[0]) - reach) / spacing))
+    n_frequencies = int(np.ceil((largest + reach) / spacing)) - first + 1
+    own = pitches[:, None, None] * (1 + along[:, None] * y)
+    nearest = np.round(own / spacing).astype(np.int64) - first
+    wave = _waves(rest.shape[1], step, first, n_frequencies)
+    x = (np.arange(rest.shape[1]) - (rest.shape[1] - 1) / 2) * step
+    over_windows = _turned(pitches[:, None, None] * np.multiply.outer(y, turns))
+    sums = np.empty((pitches.size, across.size, along.size, turns.size), np.complex64)
+    for number, bend in enumerate((float(pitches.mean()) * across).tolist()):
+        along_strips = (rest * _turned(bend * x * x)) @ wave
+        sums[:, number] = np.matmul(along_strips[np.arange(y.size), nearest], over_windows)
+    heights, out = np.abs(sums), []
+    for number, pitch in enumerate(pitches.tolist()):
+        i, j, k = np.unravel_index(int(heights[number].argmax()), heights[number].shape)
+        phase = -float(np.angle(sums[number, i, j, k])) / (2 * np.pi)
+        shape = float(turns[k]), float(across[i]), float(along[j])
+        out.append(Comb(float(heights[number, i, j, k]), pitch, *shape, phase, part))
+    return out
+
+
+@lru_cache(maxsize=32)
+def _waves(n: int, step: float, first: int, n_frequencies: int) -> NDArray[np.complex64]:
+    """(n, F) waves along pairs of strips `step` apart, at whole multiples of the spacing of frequencies."""
+    x = (np.arange(n) - (n - 1) / 2) * step
+    return _turned(np.outer(x, (first + np.arange(n_frequencies)) * (SETTINGS.pitch_step / 2)))
+
+
+def _turned(turns: FloatArray) -> NDArray[np.complex64]:
+    wave: NDArray[np.complex64] = np.exp((2j * np.pi) * turns).astype(np.complex64)
+    return wave

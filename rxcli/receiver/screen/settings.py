@@ -1,0 +1,85 @@
+"""The numbers of the search for the screen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class FinderSettings:
+    """What the search for the screen is set to; lengths in column pitches unless a name says otherwise."""
+
+    #: Smallest picture that is searched, pixels each way.
+    min_size_px: int = 96
+    #: Strips across the picture, windows of rows, and strips across each fifth of a picture with narrow columns.
+    n_strips: int = 200
+    n_windows: int = 16
+    n_fifth_strips: int = 150
+    #: Rows that are averaged, as a share of the lag at which strips are half as alike as one row apart, least and most;
+    #: one of so many strips is asked. Of pictures of more rows than the last, about two rows of an average are kept.
+    short_share: float = 0.8
+    min_short_rows: int = 2
+    max_short_rows: int = 6
+    sampled_strips: int = 4
+    many_rows: int = 1500
+    #: Standard deviations at which changes of light are clipped: larger ones are edges of the picture.
+    clip_sd: float = 2.5
+    #: Largest bend of stripes, and how many are tried; distance of the strips that tell it; kept rows of bend that are
+    #: worth straightening.
+    max_bend: float = 0.4
+    n_bends: int = 41
+    bend_strips: int = 3
+    min_bend_rows: float = 0.5
+    #: Share of the strips, the least coherent, that show the sensor's row noise; share that shows the stripes best.
+    dark_share: float = 0.3
+    bright_share: float = 0.2
+    #: Kept rows over which light may be correlated, as those of a slot are.
+    max_lag: int = 40
+    #: Columns are narrow where coherence this many picture widths apart falls below a share of that nearer by.
+    near_widths: float = 0.004
+    far_widths: float = 0.018
+    narrow_ratio: float = 0.45
+    #: Mean coherence of neighbours below which nothing in the picture flickers.
+    min_lit: float = 0.02
+
+    #: Columns from which on a screen's are narrow.
+    narrow_columns: int = 50
+    #: Columns across the picture, or across a fifth of it, and their step; largest turn and changes of pitch across and
+    #: along the columns, as shares of the pitch; step of all three at a corner of the picture.
+    min_pitch: float = 9.0
+    max_pitch: float = 46.0
+    pitch_step: float = 0.4
+    max_turn: float = 0.12
+    max_across: float = 0.2
+    max_along: float = 0.3
+    corner_step: float = 0.4
+    #: Distance of the pairs of strips that show the comb of borders best.
+    pair_distance: float = 0.72
+    #: Combs that are tried as grids.
+    n_combs: int = 6
+
+    #: Weight against waveforms of columns that hardly show, strips.
+    ridge: float = 0.5
+    #: Steps of the fit come out too short by this, because waveforms follow the grid that they were estimated with.
+    step_gain: float = 2.5
+    #: Standard deviations beyond which a strip's offset counts less.
+    huber_sd: float = 1.0
+    #: Standard deviations of perspective and of radial distortion before anything is seen.
+    perspective_sd: float = 0.15
+    radial_sd: float = 0.004
+    #: Weight of the evidence that borders add, against that of the light that waveforms explain.
+    contrast_weight: float = 3.0
+    #: Steps on every second window, steps of narrow columns at each reach, and last steps on all windows.
+    first_steps: int = 3
+    narrow_steps: int = 8
+    last_steps: int = 3
+    #: How much further a grid of narrow columns is followed at a time.
+    reach_gain: float = 1.6
+    #: Least contrast: as a share of what is explained times the root of the number of rows, and log-likelihood a strip.
+    min_contrast: float = 0.95
+    min_contrast_per_strip: float = 0.05
+    #: Log-odds against the likeliest first column down to which another is possible.
+    min_log_odds: float = -7.0
+
+
+SETTINGS = FinderSettings()

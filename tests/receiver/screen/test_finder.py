@@ -1,0 +1,345 @@
+"""The outlines that the finder proposes, on pictures drawn here: no side of the screen need show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen.combs import find_combs, likeness
+from rxcli.receiver.screen.find import ColumnLayout, OutlineCandidate, find_outlines, follow_outline, why_useless
+from rxcli.receiver.screen.grid import columns_at, grid_between
+from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
+from rxcli.receiver.screen.rows import lit_range
+from rxcli.receiver.screen.strips import read_strips, shows_narrow_columns
+from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
+from rxcli.types import FloatArray, Lens
+
+WIDE, NARROW = ColumnLayout(), ColumnLayout(100, 0.5)
+HEIGHT, WIDTH = 1600, 1200
+NARROW_HEIGHT, NARROW_WIDTH = 1120, 1680
+#: Tilted, turned, and away from the picture's middle.
+CORNERS = np.array([[150.0, 320.0], [1105.0, 290.0], [1130.0, 880.0], [120.0, 850.0]])
+NARROW_CORNERS = np.array([[110.0, 120.0], [1575.0, 150.0], [1560.0, 985.0], [95.0, 950.0]])
+
+
+def draw(
+    picture: str,
+    corners: FloatArray = CORNERS,
+    *,
+    n_columns: int = 20,
+    rows_per_slot: float = 10.0,
+    bend: float = 0.0,
+    seed: int = 0,
+    size: tuple[int, int] = (HEIGHT, WIDTH),
+) -> NDArray[np.uint8]:
+    """Luma of a screen whose columns send random slots behind a picture, in a dark room, with row noise.
+
+    `bend`: of a picture that was corrected in the camera, see `strips`.
+    """
+    height, width = size
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+    seen = np.linalg.inv(geometry.homography(corners)).astype(np.float32)
+    below = seen[2, 0] * x + seen[2, 1] * y + seen[2, 2]
+    u, v = ((row[0] * x + row[1] * y + row[2]) / below for row in seen[:2])
+    sent = rng.integers(0, 2, (int(height / rows_per_slot) + 40, n_columns + 6)).astype(np.float32)
+    centred_x, centred_y = (x - (width - 1) / 2) / width, (y - (height - 1) / 2) / width
+    sensor_row = y + bend * centred_y * (centred_x**2 + centred_y**2) * width
+    slot = np.clip(sensor_row / rows_per_slot + 20, 0, len(sent) - 1).astype(int)
+    light, own = np.zeros_like(u), np.clip(np.floor(n_columns * u), 0, n_columns - 1).astype(int)
+    for beside in (-2, -1, 0, 1, 2):
+        spread = np.exp(-((n_columns * u - own - beside - 0.5) ** 2) / (2 * 0.47**2))
+        light += spread * sent[slot, own + beside + 3]
+    light *= shown(picture, u, v) * ((u > 0) & (u < 1) & (v > 0) & (v < 1))
+    luma = 150 * light + 12 + rng.normal(0, 4, u.shape) + rng.normal(0, 0.5, (height, 1))
+    return np.clip(luma, 0, 255).astype(np.uint8)
+
+
+def shown(picture: str, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.float32] | float:
+    """What a picture lets through of the light."""
+    if picture == "white":
+        return 1.0
+    if picture == "letterbox":
+        return ((v > 0.13) & (v < 0.87)).astype(np.float32)
+    if picture == "film":
+        return ((u > 0.13) & (u < 0.87)).astype(np.float32)
+    if picture == "dark sides":
+        return ((u > 0.18) & (u < 0.86)).astype(np.float32)
+    if picture == "fading":
+        return np.clip(1 - np.abs(u - 0.5) / 0.35, 0, 1)
+    if picture == "round":
+        return (np.hypot((u - 0.5) * 16 / 9, v - 0.5) < 0.88).astype(np.float32)
+    if picture == "window":
+        return np.where((u > 0.07) & (u < 0.8) & (v > 0.2) & (v < 0.7), 0.9, 0.06).astype(np.float32)
+    return (0.15 + 0.85 * (np.sin(23 * u + 9 * v) * np.sin(17 * v - 5 * u) > 0)).astype(np.float32)
+
+
+@lru_cache(maxsize=8)
+def found(picture: str) -> list[OutlineCandidate]:
+    return find_outlines(draw(picture), [WIDE])
+
+
+def apart(candidate: OutlineCandidate, corners: FloatArray = CORNERS, lens: Lens | None = None) -> FloatArray:
+    """Columns between a grid that was found and the true one, over the screen."""
+    u, v = np.meshgrid(np.linspace(0.02, 0.98, 15), np.linspace(0.02, 0.98, 9), indexing="ij")
+    points = geometry.screen_to_picture(np.stack([u, v], axis=-1), corners, lens)
+    return candidate.grid.columns_at(points) - candidate.layout.n_columns * u
+
+
+@pytest.mark.parametrize("picture", ["white", "letterbox", "round", "window", "blobs"])
+def test_the_grid_is_found_whatever_the_picture(picture: str) -> None:
+    off = apart(found(picture)[0])
+    assert np.abs(off - np.round(np.median(off))).max() < 0.2
+    assert any(round(float(np.median(apart(one)))) == 0 for one in found(picture))
+
+
+@pytest.mark.parametrize("picture", ["white", "letterbox", "blobs", "window", "film"])
+def test_where_light_reaches_the_ends_or_a_film_lies_in_the_middle_the_first_column_is_plain(picture: str) -> None:
+    candidates = found(picture)
+    assert round(float(np.median(apart(candidates[0])))) == 0
+    assert len(candidates) == 1 or candidates[1].log_odds < -2
+
+
+def test_where_the_outer_columns_are_dark_others_are_proposed() -> None:
+    candidates = found("dark sides")
+    assert candidates[1].log_odds > -3
+    assert {round(float(np.median(apart(one)))) for one in candidates} >= {-1, 0, 1}
+    assert {"left", "right"} & set(candidates[0].unlit_sides)
+
+
+def test_corners_follow_from_the_columns_and_the_light() -> None:
+    corners, *others = found("white")[0].corners
+    assert not others
+    assert np.abs(corners[:, 0] - CORNERS[:, 0]).max() < 0.2 * 50
+    assert np.abs(corners[:, 1] - CORNERS[:, 1]).max() < 0.02 * 590
+    assert found("white")[0].unlit_sides == ()
+
+
+def test_where_bars_are_other_rows_are_proposed() -> None:
+    tall = [corners[2:, 1].mean() - corners[:2, 1].mean() for corners in found("letterbox")[0].corners]
+    true = CORNERS[2:, 1].mean() - CORNERS[:2, 1].mean()
+    assert tall[0] == pytest.approx(true, rel=0.02)
+    assert min(tall) < 0.9 * true
+    assert {"top", "bottom"} <= set(found("letterbox")[0].unlit_sides)
+
+
+@pytest.mark.parametrize("rows_per_slot", [1.6, 3.0, 8.0])
+def test_slots_of_few_and_of_many_rows(rows_per_slot: float) -> None:
+    candidates = find_outlines(draw("blobs", rows_per_slot=rows_per_slot), [WIDE])
+    assert np.abs(apart(candidates[0])).max() < 0.2
+
+
+def test_stripes_that_are_bent_are_straightened() -> None:
+    bent = find_outlines(draw("white", bend=0.3, rows_per_slot=5.0), [WIDE])
+    assert np.abs(apart(bent[0])).max() < 0.2
+    strips = read_strips(draw("white", bend=0.3, rows_per_slot=5.0))
+    # The rows of a window follow the stripes: further out at its corner, by what the camera moved them.
+    moved = (strips.raw_y[0] - strips.raw_y[0, strips.raw_y.shape[1] // 2]) * WIDTH
+    assert moved[0] == pytest.approx(0.3 * 0.625 * (0.25 + 0.0) * WIDTH, rel=0.35)
+
+
+@pytest.mark.parametrize("period", [2, 6])
+def test_a_mosaic_is_searched_over_whole_periods(period: int) -> None:
+    gains = np.random.default_rng(1).uniform(0.3, 1.0, (period, period))
+    tiled = np.tile(gains, (HEIGHT // period + 1, WIDTH // period + 1))[:HEIGHT, :WIDTH]
+    pixels = (draw("white") * tiled * 60 + 1000).astype(np.uint16)
+    candidates = find_outlines(pixels, [WIDE], mosaic_period=period)
+    assert np.abs(apart(candidates[0])).max() < 0.2
+
+
+def test_a_lens_that_is_known_is_taken_off() -> None:
+    lens = Lens(np.array([[1100.0, 0, 599.5], [0, 1100.0, 799.5], [0, 0, 1]]), np.array([-0.12, 0, 0, 0]), False)
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float64)
+    flat = geometry.undistort(np.stack([x, y], axis=-1), lens).astype(np.float32)
+    # Every row of the picture as the sensor read it: light comes from its place on the screen, slots from its row.
+    rng = np.random.default_rng(5)
+    seen = np.linalg.inv(geometry.homography(CORNERS)).astype(np.float32)
+    place = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1) @ seen.T
+    u, v = place[..., 0] / place[..., 2], place[..., 1] / place[..., 2]
+    sent = rng.integers(0, 2, (HEIGHT // 10 + 1, 20)).astype(np.float32)[np.arange(HEIGHT) // 10]
+    light = sum(np.exp(-((20 * u - k - 0.5) ** 2) / (2 * 0.45**2)) * sent[:, k, None] for k in range(20))
+    light = light * ((u > 0) & (u < 1) & (v > 0) & (v < 1))
+    luma = np.clip(150 * light + 12 + rng.normal(0, 4, u.shape), 0, 255).astype(np.uint8)
+    candidates = find_outlines(luma, [WIDE], lens=lens)
+    bent = geometry.distort(CORNERS, lens)
+    assert np.abs(apart(candidates[0], bent, lens)).max() < 0.35
+    np.testing.assert_allclose(candidates[0].corners[0], bent, atol=25)
+
+
+def test_a_screen_larger_than_the_picture_shows_no_side() -> None:
+    large = np.array([[-160.0, 300.0], [1380.0, 280.0], [1400.0, 1170.0], [-180.0, 1140.0]])
+    candidates = find_outlines(draw("white", large), [WIDE])
+    assert candidates[0].fills
+    assert {"left", "right"} <= set(candidates[0].unlit_sides)
+    off = apart(candidates[0], large)
+    assert np.abs(off - np.round(np.median(off))).max() < 0.3
+
+
+def test_numbers_of_columns_compete() -> None:
+    candidates = find_outlines(draw("white"), [ColumnLayout(10), WIDE, ColumnLayout(40)])
+    assert candidates[0].layout == WIDE
+    assert np.abs(apart(candidates[0])).max() < 0.2
+
+
+def test_the_true_grid_explains_more_than_others_and_is_reached_from_near() -> None:
+    strips, true = read_strips(draw("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    own = with_light(strips, true, 0.45)
+    for factor in (0.8, 0.95, 1.05, 1.3):
+        other = with_light(
+            strips, replace(true, numbers=true.numbers * np.array([factor, factor, factor, 1, 1, 1])), 0.45
+        )
+        assert other.explained + 3 * other.contrast < own.explained + 3 * own.contrast
+    near = replace(true, numbers=true.numbers * np.array([1, 1.015, 1, 1, 1, 1]) + np.array([0.1, 0, 0.2, 0, 0, 0]))
+    off = moved_by_waveforms(strips, near, 0.45, 8).numbers[:3] - true.numbers[:3]
+    assert np.abs(off).max() < 0.3
+
+
+def profile_of(picture: str) -> LightProfile:
+    strips, grid = read_strips(draw(picture)), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    return light_profile(strips, predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), 0.45), grid)
+
+
+def test_columns_with_light_are_told_from_those_without() -> None:
+    light = profile_of("window")
+    inside, outside = (light.place > 3) & (light.place < 14), (light.place < -0.2) | (light.place > 20.2)
+    assert light.log_odds[inside].min() > light.log_odds[outside].max()
+
+
+def test_a_film_has_sharp_ends_and_fading_light_has_none() -> None:
+    film = profile_of("film").film
+    assert film is not None
+    np.testing.assert_allclose(film, (2.6, 17.4), atol=0.3)
+    assert profile_of("fading").film is None
+    start = first_columns(profile_of("film"), 20)
+    assert start.first[start.log_odds.argmax()] == 0
+
+
+def test_light_ends_where_bars_begin_and_takes_no_more_than_a_screen() -> None:
+    v = (np.arange(320) + 0.5) / 320 * 2.2 - 0.6
+    rng = np.random.default_rng(1)
+    for low, high in ((0.0, 1.0), (0.15, 0.85)):
+        top, bottom = lit_range(v, 0.5 * ((v > low) & (v < high)) + rng.normal(0, 0.03, v.size))
+        assert abs(top - low) < 0.04
+        assert abs(bottom - high) < 0.04
+    top, bottom = lit_range(v, np.full(v.size, 0.5))
+    assert bottom - top == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.parametrize("distance", [0.5, 0.72, 1.2])
+def test_likeness_is_the_mean_cosine_of_two_places_light(distance: float) -> None:
+    k, cosines = np.arange(-8, 9) + 0.5, []
+    for u in np.arange(0, 1, 0.05):
+        one, other = (np.exp(-((u + side * distance / 2 - k) ** 2) / (2 * 0.45**2)) for side in (-1, 1))
+        cosines.append(one @ other / np.sqrt((one @ one) * (other @ other)))
+    mean, harmonic = likeness(0.45, distance)
+    assert mean == pytest.approx(np.mean(cosines), abs=0.01)
+    assert harmonic == pytest.approx(2 * np.mean(cosines * np.cos(2 * np.pi * np.arange(0, 1, 0.05))), abs=0.02)
+
+
+def test_coherence_of_independent_strips_is_chance() -> None:
+    luma = np.clip(100 + np.random.default_rng(4).normal(0, 10, (HEIGHT, WIDTH)), 0, 255).astype(np.uint8)
+    strips = read_strips(luma)
+    pairs = strips.coherence(7)
+    assert abs(float(pairs.mean())) < 0.01
+    assert float(pairs.std()) == pytest.approx(strips.n_rows**-0.5, rel=0.3)
+    assert not [comb for comb in find_combs(strips, 0.45) if comb.score > 7]
+
+
+@lru_cache(maxsize=1)
+def narrow_film() -> NDArray[np.uint8]:
+    return draw("film", NARROW_CORNERS, n_columns=100, rows_per_slot=5.0, seed=5, size=(NARROW_HEIGHT, NARROW_WIDTH))
+
+
+def test_a_hundred_columns_are_found_in_a_film_with_bars() -> None:
+    candidate = find_outlines(narrow_film(), [WIDE, NARROW])[0]
+    assert candidate.layout == NARROW
+    # The film lies in the middle, and so do its columns.
+    assert np.abs(apart(candidate, NARROW_CORNERS)).max() < 0.35
+    grid = grid_between(NARROW_CORNERS, 100, (NARROW_WIDTH, NARROW_HEIGHT), None)
+    np.testing.assert_allclose(grid.columns_at(candidate.corners[0]), [0, 100, 100, 0], atol=0.5)
+    np.testing.assert_allclose(candidate.corners[0][:, 1], NARROW_CORNERS[:, 1], atol=25)
+
+
+def test_wide_columns_are_not_taken_for_narrow_ones() -> None:
+    assert shows_narrow_columns(read_strips(narrow_film()))
+    assert not shows_narrow_columns(read_strips(draw("film")))
+
+
+def test_a_screen_that_moved_a_little_is_followed_and_a_lost_one_is_noticed() -> None:
+    before = CORNERS + np.array([6.0, -4.0])
+    followed = follow_outline(draw("blobs"), before, WIDE)
+    assert followed is not None
+    np.testing.assert_allclose(followed, CORNERS, atol=16)
+    barred = follow_outline(draw("letterbox"), before, WIDE)
+    assert barred is not None
+    np.testing.assert_allclose(barred[:, 1], before[:, 1], atol=16)
+    assert follow_outline(np.zeros((HEIGHT, WIDTH), np.uint8), before, WIDE) is None
+    noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
+    assert follow_outline(noise, before, WIDE) is None
+
+
+def without_screen(name: str) -> NDArray[Any]:
+    rng, shape = np.random.default_rng(11), (1080, 1920)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    texture = cv2.GaussianBlur(rng.normal(0, 1, shape).astype(np.float32), (0, 0), 6)
+    pictures = {
+        "grey": np.full(shape, 128.0),
+        "noise": rng.integers(0, 256, shape).astype(float),
+        "dim noise": rng.normal(10, 3, shape),
+        "row noise": rng.normal(60, 8, (shape[0], 1)) + rng.normal(0, 8, shape),
+        "stripes over all": np.tile((rng.random((216, 1)) < 0.5).repeat(5, axis=0) * 200.0, (1, 1920)),
+        "checkerboard": ((x // 60 + y // 60) % 2) * 200.0 + 20,
+        "texture": 100 + 1500 * texture,
+        "texture with lines": 100 + 1500 * texture + 20 * np.sin(y / 3) + rng.normal(0, 4, shape),
+        "flickering room": np.tile(90 + 40 * np.sin(y[:, :1] / 170), (1, 1920)),
+    }
+    return np.clip(pictures[name], 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "grey",
+        "noise",
+        "dim noise",
+        "row noise",
+        "stripes over all",
+        "checkerboard",
+        "texture",
+        "texture with lines",
+        "flickering room",
+    ],
+)
+def test_pictures_without_columns_propose_nothing(name: str) -> None:
+    assert not find_outlines(without_screen(name), [WIDE, NARROW])
+    assert why_useless(without_screen(name), 0.0, 255.0) is None
+
+
+@pytest.mark.parametrize(
+    ("pixels", "reason"),
+    [
+        (np.zeros((1080, 1920), np.uint8), "black"),
+        (np.full((1080, 1920), 255, np.uint8), "saturated"),
+        (np.zeros((0, 0), np.uint8), "0 x 0"),
+        (np.zeros((1, 1), np.uint8), "1 x 1"),
+        (np.zeros((1, 4000), np.uint8), "4000 x 1"),
+        (np.zeros((20, 30), np.uint16), "30 x 20"),
+    ],
+)
+def test_useless_pictures_are_named(pixels: NDArray[Any], reason: str) -> None:
+    assert not find_outlines(pixels, [WIDE, NARROW])
+    useless = why_useless(pixels, 0.0, 255.0)
+    assert useless is not None
+    assert reason in useless[0]
+
+
+@pytest.mark.parametrize("shape", [(96, 96), (97, 501), (500, 97), (240, 320)])
+def test_small_pictures_do_not_fail(shape: tuple[int, int]) -> None:
+    assert not find_outlines(np.random.default_rng(2).integers(0, 256, shape, dtype=np.uint8), [WIDE, NARROW])
