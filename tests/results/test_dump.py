@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mixed_folder import scene
+from small_scene import scene
 
 from rxcli.errors import OutputError
 from rxcli.lab.benchmark.trial import Trial, frame_of, simulate_trial
