@@ -15,21 +15,21 @@ import contextlib
 import io
 import json
 import logging
+import multiprocessing
 import os
 import random
 import re
 import resource
-import subprocess
 import sys
 import tempfile
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
-from queue import Empty, Queue
-from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -37,14 +37,14 @@ from numpy.typing import NDArray
 
 from rxcli.protocol import bits_to_hex, encode_packet, payload_bits
 from rxcli.resources import data_dir
-from rxcli.runs.processes import environment, package_environment, peak_memory_mb
+from rxcli.runs.processes import ONE_THREAD, environment, peak_memory_mb
 
 #: What one process may take: resident memory, and time for one case on a machine of its own.
 MOST_MB, MOST_S = 1500, 60.0
 #: Address space of the process, which libraries reserve more of than they use; and waiting on a loaded machine.
 _ADDRESSES_MB, _PATIENCE = 6000, 3
-#: Exit code of a process that has grown and is to be begun anew.
-_ENOUGH = 77
+#: Marks what was written to the file of stderr by others than Python.
+_PAST = "written past stderr:"
 #: Bytes that decide much: ends of ranges, and what formats count with.
 _TELLING = (b"\0", b"\xff", b"\x7f", b"\x80", b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\0\0\0\0", b"\x01\0\0\0")
 _NUMBERS = ("nan", "inf", "-inf", "-1", "0", "1e999", "1e-999", "9" * 5000, "x", "", "1,2", "0x10", "٣")
@@ -71,13 +71,9 @@ _SIZE, _BORDER, _COLUMN_PX, _ROWS_PER_SLOT = (256, 140), 10, 20, 3
 _COLUMNS, _SYMBOLS, _LIT = 6, 3, 5
 _BLIND_PX = 256
 _GYROFLOW = {
-    "camera_brand": "Maker",
-    "camera_model": "M 1",
-    "lens_model": "15 mm",
     "calib_dimension": {"w": 3840, "h": 2160},
     "frame_readout_time": 14.5,
     "fps": 30.0,
-    "input_horizontal_stretch": 1.0,
     "fisheye_params": {
         "camera_matrix": [[2600.0, 0, 1910.0], [0, 2610.0, 1085.0], [0, 0, 1]],
         "distortion_coeffs": [0.3, 0.1, -0.2, 0.1],
@@ -339,7 +335,8 @@ class Cases:
     def _outcome(self, seed: int, name: str, arguments: list[str]) -> dict[str, Any]:
         began, cpu = time.monotonic(), time.process_time()
         code, text = _call(arguments)
-        problems = [f"{name}: {line}" for line in text.splitlines() if "internal error" in line or "Traceback" in line]
+        signs = ("internal error", "Traceback", _PAST)
+        problems = [f"{name}: {line}" for line in text.splitlines() if any(sign in line for sign in signs)]
         cpu_s, mb = time.process_time() - cpu, peak_memory_mb()
         if code not in (0, 1, 2, 3):
             problems.append(f"{name}: exit code {code}")
@@ -423,6 +420,10 @@ class Cases:
         return self._whole
 
 
+#: What a process that runs cases has made ready.
+_cases: Cases | None = None
+
+
 def with_checksums(data: bytes) -> bytes:
     """A damaged PNG whose chunks have the checksums of what they hold: damage that goes beyond the first check."""
     out, place = bytearray(data), 8
@@ -451,13 +452,21 @@ def _mutated_text(data: bytes, rng: random.Random) -> bytes:
 
 
 def _call(arguments: list[str]) -> tuple[int, str]:
-    """Exit code, and all that is said."""
+    """Exit code, and all that is said; what libraries write past Python is marked."""
     from rxcli.cli.main import run as program
 
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = program(arguments)
-    return int(code), f"{out.getvalue()}\n{err.getvalue()}"
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), tempfile.TemporaryFile() as past:
+        kept = os.dup(2)
+        os.dup2(past.fileno(), 2)
+        try:
+            code = program(arguments)
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+        past.seek(0)
+        lines = past.read().decode(errors="replace").strip().splitlines()
+    return int(code), "\n".join([out.getvalue(), err.getvalue(), *(f"{_PAST} {line}" for line in lines[-1:])])
 
 
 def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> Verdict:
@@ -469,80 +478,43 @@ def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> Verdic
         folder: of samples and scratch files.
         seconds: begin no case after so long; None: run all.
     """
-    verdict, following, end = Verdict(), seed, time.monotonic() + (seconds or 1e9)
-    while following < seed + n and time.monotonic() < end:
-        following = _run_process(verdict, following, seed + n, folder, end)
+    verdict, pool, end = Verdict(), None, time.monotonic() + (seconds or 1e9)
+    for number in range(seed, seed + n):
+        if time.monotonic() > end:
+            break
+        if pool is None:
+            with environment(ONE_THREAD):
+                pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin, (folder,))
+                pool.submit(os.getpid).result()
+        try:
+            record = pool.submit(_run_case, number).result(_PATIENCE * MOST_S)
+        except (TimeoutError, BrokenProcessPool) as error:
+            reason = "the process ended" if isinstance(error, BrokenProcessPool) else "no answer for too long"
+            record = {"seed": number, "code": reason, "s": 0.0, "mb": np.inf, "problems": [reason]}
+        verdict.add(record)
+        if record["mb"] == np.inf:
+            for process in multiprocessing.active_children():
+                process.kill()
+        if record["mb"] > MOST_MB:
+            pool.shutdown()
+            pool = None
+    if pool is not None:
+        pool.shutdown()
     return verdict
 
 
-def _run_process(verdict: Verdict, first: int, stop: int, folder: Path, end: float) -> int:
-    """Run cases in a process until it ends or must be ended; returns the seed to go on with."""
-    command = [sys.executable, __file__, "--serve", str(folder), str(first), str(stop)]
-    with tempfile.TemporaryFile() as complaints:
-        process = subprocess.Popen(command, env=package_environment(1), stdout=subprocess.PIPE, stderr=complaints)
-        following, problem = first, None
-        try:
-            for line in _lines(process):
-                if line is None:
-                    problem = f"no answer within {_PATIENCE * MOST_S:.0f} s"
-                    break
-                verdict.add(json.loads(line))
-                following += 1
-                if time.monotonic() > end:
-                    return following
-        finally:
-            process.kill()
-            code = process.wait()
-            assert process.stdout is not None
-            process.stdout.close()
-        complaints.seek(0)
-        said = complaints.read().decode(errors="replace").strip()
-    if said:
-        verdict.problems.setdefault(f"written past stderr: {said.splitlines()[-1]:.200}", []).append(following - 1)
-    if following < stop and (problem or code != _ENOUGH):
-        verdict.problems.setdefault(problem or f"the process ended with {code}", []).append(following)
-        return following + 1
-    return following
-
-
-def _lines(process: subprocess.Popen[bytes]) -> Iterator[bytes | None]:
-    """What the process prints, line by line; None where nothing came for too long."""
-    assert process.stdout is not None
-    lines: Queue[bytes] = Queue()
-    Thread(target=_pass_on, args=(process.stdout, lines), daemon=True).start()
-    while True:
-        try:
-            line = lines.get(timeout=_PATIENCE * MOST_S)
-        except Empty:
-            yield None
-            return
-        if not line:
-            process.wait()
-            return
-        yield line
-
-
-def _pass_on(stdout: Any, lines: Queue[bytes]) -> None:
-    with contextlib.suppress(ValueError):
-        for line in iter(stdout.readline, b""):
-            lines.put(line)
-    lines.put(b"")
-
-
-def serve(folder: Path, first: int, stop: int) -> None:
-    """Run cases, a line of JSON each; end early where the process has grown."""
+def _begin(folder: Path) -> None:
+    """Make a process ready for cases."""
+    global _cases
     resource.setrlimit(resource.RLIMIT_AS, (_ADDRESSES_MB << 20, _ADDRESSES_MB << 20))
     logging.raiseExceptions = False
-    # What libraries print past Python is found among the complaints, and never between the answers.
-    answers = os.dup(1)
     os.dup2(2, 1)
-    cases, out = Cases(folder), os.fdopen(answers, "w")
-    for seed in range(first, stop):
-        record = cases.run(seed)
-        out.write(json.dumps(record) + "\n")
-        out.flush()
-        if record["mb"] > MOST_MB:
-            sys.exit(_ENOUGH)
+    _cases = Cases(folder)
+
+
+def _run_case(seed: int) -> dict[str, Any]:
+    assert _cases is not None
+    return _cases.run(seed)
 
 
 def main(arguments: list[str]) -> int:
@@ -565,7 +537,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--serve"]:
-        serve(Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))
-    else:
-        sys.exit(main(sys.argv[1:]))
+    sys.exit(main(sys.argv[1:]))

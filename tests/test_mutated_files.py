@@ -80,18 +80,9 @@ def _outcome(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return said.out
 
 
-@pytest.mark.parametrize(
-    ("seed", "name", "options"),
-    [(77000206, "a.ts", ["--no-skip", "no_screen"]), (77000377, "a.webp", [])],
-    ids=["a.ts", "a.webp"],
-)
+@pytest.mark.parametrize(("seed", "name"), [(77000206, "a.ts"), (77000377, "a.webp")])
 def test_a_clock_that_runs_away_is_no_clock(
-    seed: int,
-    name: str,
-    options: list[str],
-    cases: mutated_files.Cases,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    seed: int, name: str, cases: mutated_files.Cases, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Least squares on damaged pictures went to negative periods, or out of the picture, and ended in an error."""
     rng, data = random.Random(seed), cases.samples[f"blind/{name}"]
@@ -99,9 +90,8 @@ def test_a_clock_that_runs_away_is_no_clock(
     rng.choice(range(17))
     for _ in range(rng.choice((1, 1, 2, 3))):
         data = rng.choice(mutated_files.MUTATIONS)(data, rng)
-    path = tmp_path / name
-    path.write_bytes(data)
-    _outcome([str(path), *options], capsys)
+    (tmp_path / name).write_bytes(data)
+    _outcome([str(tmp_path / name), "--no-skip", "no_screen"], capsys)
 
 
 @pytest.mark.parametrize("height", [1, 2, 24, 47, 66])
