@@ -11,10 +11,9 @@ import pytest
 from PIL import Image
 
 from rxcli.calibrate.frames import light_of
-from rxcli.calibrate.periodic import explained_share, fit_fundamental, fit_periodic, longest_block, noise_spectrum
+from rxcli.calibrate.periodic import fit_fundamental, fit_periodic
 from rxcli.calibrate.saving import profile_to_extend, with_mode, write_profile
 from rxcli.calibrate.shutter import calibrate_shutter, find_stripes
-from rxcli.calibrate.spots import find_spots
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode, ProfileError, ReceiverError, UsageError
 from rxcli.profiles import CameraProfile, ReadoutMode, load_profile
@@ -80,14 +79,6 @@ def test_strong_harmonics_are_no_fundamental() -> None:
         fit = fit_fundamental(1 + wave + 0.05 * rng.standard_normal(900), 3 / 90)
         assert fit is not None
         assert 1 / fit.frequency == pytest.approx(90, rel=2e-3)
-
-
-def test_columns_are_found_as_the_readout_axis() -> None:
-    light = (lamp(1200, 600, 1e-4)[:, None] * scene(600, 300)).T
-    along, found = only(exposed(light, np.random.default_rng(3)))
-    assert along == "columns"
-    assert found.period_px == pytest.approx(1 / 1200 / LINE_DELAY_S, rel=1e-3)
-    assert found.bounds == (0, 0, 600, 300)
 
 
 def test_a_spot_in_a_corner_is_enough() -> None:
@@ -170,17 +161,6 @@ def test_lamps_that_fit_in_two_ways_are_refused() -> None:
     assert calibrate_shutter([picture], [1000, 2000]).line_delay_s == pytest.approx(LINE_DELAY_S, rel=1e-3)
 
 
-def test_spots_are_found_in_dark_pictures_only() -> None:
-    picture, placed = dark_photo(4, 75)
-    boxes = find_spots(picture)
-    assert len(boxes) == 10  # each spot and its inner part
-    assert all(any(a <= x <= c and b <= y <= d for a, b, c, d in boxes) for _, x, y in placed)
-    assert find_spots(textured(np.random.default_rng(22))) == []
-    assert find_spots(np.zeros((300, 400))) == []
-    noise = np.random.default_rng(23).standard_normal((300, 400))
-    assert find_spots(0.01 + 0.001 * noise) == []
-
-
 def textured(rng: np.random.Generator) -> Any:
     """A picture with the spectrum of natural scenes."""
     spectrum = np.fft.rfft2(rng.standard_normal((400, 300)))
@@ -198,56 +178,40 @@ def test_no_stripes_are_found_where_there_are_none() -> None:
     assert [find_stripes(picture)[1] for picture in scenes] == [[]] * len(scenes)
     with pytest.raises(ReceiverError, match="no stripes"):
         calibrate_shutter(scenes, [1000])
+    lit = lamp(1800, 400, 1e-4)[:, None] * (0.4 + textured(rng))
+    assert calibrate_shutter([exposed(lit, rng)], [1800]).line_delay_s == pytest.approx(LINE_DELAY_S, rel=3e-3)
 
 
-def test_stripes_are_found_on_a_textured_scene() -> None:
-    rng = np.random.default_rng(8)
-    light = lamp(1800, 400, 1e-4)[:, None] * (0.4 + textured(rng))
-    result = calibrate_shutter([exposed(light, rng)], [1800])
-    assert result.line_delay_s == pytest.approx(LINE_DELAY_S, rel=3e-3)
+def autoregressive(n: int, rng: np.random.Generator) -> Any:
+    noise = rng.standard_normal(n)
+    for i in range(1, n):
+        noise[i] += 0.9 * noise[i - 1]
+    return noise
 
 
 @pytest.mark.parametrize(
-    ("duty", "noise", "gain"), [(None, 0.1, 0.15), (0.5, 0.05, 0.5), (0.2, 0.2, 0.6), (None, 0.3, 0.4)]
+    ("duty", "noise", "gain", "least"),
+    [(None, 0.1, 0.15, 51), (0.5, 0.05, 0.5, 51), (0.2, 0.2, 0.6, 51), (None, 0.3, 0.4, 51), (None, None, 10.0, 50)],
 )
-def test_the_interval_holds_as_often_as_it_says(duty: float | None, noise: float, gain: float) -> None:
-    """Of 60 intervals of 95 % at least 51 hold (fewer: 1 in 2000), and they are not needlessly wide."""
+def test_the_interval_holds_as_often_as_it_says(duty: Any, noise: Any, gain: float, least: int) -> None:
+    """Of 60 intervals of 95 % at least 51 hold (fewer: 1 in 2000), and they are not needlessly wide.
+
+    In autoregressive noise (no number) they must follow the noise's power at the stripes' own frequency.
+    """
     deviations = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
         period = 25 + rng.random()
         light = lamp(1 / (period * LINE_DELAY_S), 400, 1e-4, duty, rng.random())
-        profile = exposed(light[:, None] * scene(400, 12), rng, noise, gain).mean(axis=1)
+        if noise is None:
+            profile = gain * light + autoregressive(400, rng)
+        else:
+            profile = exposed(light[:, None] * scene(400, 12), rng, noise, gain).mean(axis=1)
         fit = fit_periodic(profile, 1 / 25.5)
         assert fit is not None
         deviations.append((fit.frequency - 1 / period) / fit.frequency_sd)
-    assert sum(abs(d) < 1.96 for d in deviations) >= 51
+    assert sum(abs(d) < 1.96 for d in deviations) >= least
     assert np.std(deviations) > 0.5
-
-
-def test_coloured_noise_widens_the_interval() -> None:
-    """Autoregressive noise: the interval must follow the noise's power at the stripes' own frequency."""
-    deviations = []
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        noise = rng.standard_normal(600)
-        for i in range(1, 600):
-            noise[i] += 0.9 * noise[i - 1]
-        fit = fit_periodic(10 * lamp(500, 600, 1e-4, None, rng.random()) + noise, 0.01)
-        if fit is not None:
-            deviations.append((fit.frequency - 0.01) / fit.frequency_sd)
-    assert len(deviations) >= 55
-    assert np.mean(np.abs(deviations) < 1.96) > 0.84
-
-
-def test_noise_spectrum_of_a_known_process() -> None:
-    rng = np.random.default_rng(9)
-    noise = rng.standard_normal(20_000)
-    for i in range(1, noise.size):
-        noise[i] += 0.8 * noise[i - 1]
-    found = noise_spectrum(noise, 256)
-    truth = 1 / np.abs(1 - 0.8 * np.exp(-2j * np.pi * np.arange(256) / 256)) ** 2
-    np.testing.assert_allclose(found, truth, rtol=0.2)
 
 
 def test_more_pictures_narrow_the_interval() -> None:
@@ -262,52 +226,34 @@ def test_more_pictures_narrow_the_interval() -> None:
     assert low - np.ptp([low, high]) < LINE_DELAY_S < high + np.ptp([low, high])
 
 
-@pytest.mark.parametrize("exposure_s", [1e-4, 2e-4])
-def test_exposure_from_the_edges(exposure_s: float) -> None:
-    light = lamp(800, 800, exposure_s)[:, None] * scene(800, 200)
-    result = calibrate_shutter([exposed(light, np.random.default_rng(10))], [800])
-    assert result.exposure.exposure_s == pytest.approx(exposure_s, rel=0.03)
-    assert result.exposure.interval_s is not None
-    assert result.exposure.interval_s[0] < result.exposure.exposure_s < result.exposure.interval_s[1]
+@pytest.mark.parametrize(
+    ("on_s", "exposure_s", "exif_s", "expected_s"),
+    [
+        (6.25e-4, 1e-4, None, 1e-4),
+        (6.25e-4, 2e-4, None, 2e-4),
+        (1e-4, 4e-4, None, 1e-4),  # a flash of 0.1 ms seen through 0.4 ms looks like the reverse
+        (1e-4, 4e-4, 1 / 2500, 4e-4),
+        (None, 1e-4, None, None),  # a sine has no edges
+    ],
+)
+def test_exposure_from_the_edges(on_s: float | None, exposure_s: float, exif_s: Any, expected_s: Any) -> None:
+    light = lamp(800, 800, exposure_s, on_s and 800 * on_s)[:, None] * scene(800, 200)
+    picture = exposed(light, np.random.default_rng(11), gain=2.0 if on_s == 1e-4 else 0.6)
+    found = calibrate_shutter([picture], [800], exif_exposure_s=exif_s).exposure
+    assert found.exposure_s == (expected_s and pytest.approx(expected_s, rel=0.05))
+    assert found.note
+    if found.exposure_s is not None:
+        assert found.interval_s is not None
+        assert found.interval_s[0] < found.exposure_s < found.interval_s[1]
 
 
-def test_the_files_exposure_decides_between_flash_and_exposure() -> None:
-    """A flash of 0.1 ms seen through 0.4 ms looks as a flash of 0.4 ms through 0.1 ms does."""
-    light = lamp(800, 800, 4e-4, 0.08)[:, None] * scene(800, 200)
-    picture = exposed(light, np.random.default_rng(11), gain=2.0)
-    assert calibrate_shutter([picture], [800]).exposure.exposure_s == pytest.approx(1e-4, rel=0.05)
-    assert calibrate_shutter([picture], [800], exif_exposure_s=1 / 2500).exposure.exposure_s == pytest.approx(
-        4e-4, rel=0.05
-    )
-
-
-def test_no_exposure_from_a_sine() -> None:
-    light = lamp(800, 800, 1e-4, None)[:, None] * scene(800, 200)
-    result = calibrate_shutter([exposed(light, np.random.default_rng(12))], [800])
-    assert result.exposure.exposure_s is None
-    assert result.exposure.note
-
-
-def test_cell_helpers() -> None:
-    wave = np.sin(np.arange(60) / 3.0)
-    share = explained_share(np.array([2 * wave + 5, -wave, np.zeros(60)]), wave)
-    np.testing.assert_allclose(share, [1, -1, 0], atol=1e-9)
-    members = np.array([[0, 1, 1, 1], [0, 1, 1, 0], [1, 1, 1, 0], [0, 1, 1, 0]], dtype=bool)
-    assert longest_block(members) == (1, 3)  # four strips of two blocks: 32; one strip of three: 27
-    assert longest_block(members[:3]) == (0, 3)
-    assert longest_block(np.zeros((2, 3), dtype=bool)) == (0, 0)
-
-
-def test_green_rows_of_a_mosaic_are_not_mixed() -> None:
+def test_light_undoes_tone_and_range_and_mixes_no_rows_of_a_mosaic() -> None:
     pattern = np.array([[0, 1], [1, 2]], np.uint8)
     rows = np.arange(8, dtype=np.uint16)[:, None] * np.ones((1, 6), np.uint16)
     pixels = (1000 + 100 * rows).astype(np.uint16)
     pixels[::2, ::2] = 4000  # red pixels, which a red lamp would saturate
     frame = Frame(pixels, "x", mosaic=Mosaic(pattern, (2.0, 1.0, 1.5), (1000.0,) * 3, 5000.0))
     np.testing.assert_allclose(light_of(frame), np.repeat(np.arange(8)[:, None] * 100 / 4000, 6, axis=1), rtol=1e-6)
-
-
-def test_light_undoes_tone_and_range() -> None:
     frame = Frame(np.array([[16, 235, 126]], np.uint8), "x", black=16, white=235)
     np.testing.assert_allclose(light_of(frame), [[0, 1, ((110 / 219 + 0.055) / 1.055) ** 2.4]], rtol=1e-5)
     linear = Frame(np.array([[0, 128]], np.uint8), "x", linear=True)
@@ -376,12 +322,16 @@ def test_command(lamp_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[s
         (["--frequency", "1000", "--exposure", "3"], "--exposure"),
         (["--frequency", "1000", "--save", "a.toml", "--name", "b"], "--name"),
         (["--frequency", "1000", "--name", "a/b"], "--name"),
+        (["--board", "9"], "--board"),
+        (["--board", "1x1"], "1x1"),
+        (["--square", "0"], "square"),
     ],
 )
 def test_wrong_usage_is_one_line(
     lamp_file: str, extra: list[str], word: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["calibrate", "shutter", lamp_file, *extra]) == ExitCode.USAGE
+    command = "lens" if extra[:1] in (["--board"], ["--square"]) else "shutter"
+    assert run(["calibrate", command, lamp_file, *extra]) == ExitCode.USAGE
     err = capsys.readouterr().err
     assert word in err
     assert len(err.strip().splitlines()) == 1
@@ -404,19 +354,9 @@ def test_rotated_pictures_give_no_mode(tmp_path: Path, capsys: pytest.CaptureFix
     assert not (tmp_path / "c.toml").exists()
     capsys.readouterr()
     assert run([*arguments, "--json", "-"]) == 0
-    assert json.loads(capsys.readouterr().out)["axis"] == "columns"
-
-
-def test_a_photo_of_five_leds(shared_real: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A dark phone photo of five spots of 2 to 4 kHz, 47.54 thousand rows a second."""
-    found = sorted(path for path in (shared_real / "shutter").iterdir() if "led" in path.name.casefold())
-    if not found:
-        pytest.skip(f"needs a photo of five LEDs in {shared_real / 'shutter'}")
-    lamps = [word for frequency in LAMPS_HZ for word in ("--frequency", str(frequency))]
-    assert run(["calibrate", "shutter", str(found[0]), *lamps, "--json", "-"]) == 0
     record = json.loads(capsys.readouterr().out)
-    assert 1 / record["line_delay_s"] == pytest.approx(47_540, rel=2e-3)
-    assert {lamp["frequency_hz"] for lamp in record["lamps"]} >= set(LAMPS_HZ)
+    assert record["axis"] == "columns"
+    assert record["lamps"][0]["period_px"] == pytest.approx(1e-3 / LINE_DELAY_S, rel=2e-3)
 
 
 def test_nikon_led(shared_real: Path, capsys: pytest.CaptureFixture[str]) -> None:
