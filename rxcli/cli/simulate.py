@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -315,14 +316,15 @@ def _payload(text: str) -> bytes | None:
 
 def _write(take: Take, out: Path, file_format: str, bit_rate: int | None) -> Path:
     """Write the capture and its truth; returns the truth's path."""
+    from tqdm import tqdm
+
+    from rxcli.lab.simulate.capture import write_capture
     from rxcli.lab.simulate.truth import write_truth
     from rxcli.outputs import replacing
 
+    progress = partial(tqdm, desc=out.name, unit="frame", leave=False, disable=None)
     with replacing(out) as hidden:
-        if file_format in _CODECS:
-            _write_clip(take, hidden, file_format, bit_rate)
-        else:
-            _write_still(take, hidden, file_format)
+        write_capture(take, hidden, file_format, bit_rate, progress)
     return write_truth(take.truth(out.name), out)
 
 
@@ -339,33 +341,6 @@ def _write_extras(take: Take, options: dict[str, Any]) -> None:
     if options["waveforms"] is not None:
         n_bursts = 1 + int(last.row_start_slots[-1] // take.link.burst_slots)
         export_waveforms(take.drive, take.link, n_bursts, options["waveforms"])
-
-
-def _write_still(take: Take, out: Path, file_format: str) -> None:
-    from rxcli.lab.simulate.files import write_png
-    from rxcli.lab.simulate.tiff import write_dng, write_tiff
-
-    capture = take.frame(0)
-    if file_format == "jpeg":
-        out.write_bytes(capture.jpeg)
-    elif file_format.startswith("dng"):
-        write_dng(capture.raw, take.scene, out, 14 if file_format == "dng14" else 16)
-    else:
-        bits = 16 if file_format.endswith("16") else 8
-        rgb = capture.developed(bits)
-        write_png(rgb, out) if file_format.startswith("png") else write_tiff(rgb, take.scene, out)
-
-
-def _write_clip(take: Take, out: Path, codec: str, bit_rate: int | None) -> None:
-    from tqdm import tqdm
-
-    from rxcli.lab.simulate.video import CODECS, write_video
-
-    scene, bits = take.scene, 16 if CODECS[codec].bits > 8 else 8
-    numbers = tqdm(range(scene.n_frames), desc=out.name, unit="frame", leave=False, disable=None)
-    captures = (take.frame(number) for number in numbers)
-    frames = (capture.developed(bits) for capture in captures)
-    write_video(frames, out, codec, scene.frame_rate_hz, bit_rate)
 
 
 def _summary(take: Take) -> str:

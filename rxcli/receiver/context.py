@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver import camera as blind
+from rxcli.receiver.camera import CameraHypothesis
 from rxcli.receiver.sampling import RowStore
 from rxcli.types import FloatArray, Frame, Lens
 
@@ -61,8 +61,8 @@ class Camera:
     reversed: bool = False
     #: What was estimated: name -> (value, standard deviation).
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
-    #: The estimate and the strips it is of, for `refitted_camera`; None for a camera from a profile.
-    blind_estimate: tuple[blind.BlindEstimate, blind.Strips] | None = None
+    #: What it was estimated to be, until its slots were fitted; None for a known camera.
+    hypothesis: CameraHypothesis | None = None
 
     @property
     def facts(self) -> dict[str, Any]:

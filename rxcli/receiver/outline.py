@@ -14,7 +14,7 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.cameras import context_at, known_lens
+from rxcli.receiver.cameras import known_lens
 from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.corners import (
     may_fill,
@@ -181,7 +181,7 @@ def _by_packets(
     least = max(lost.values())
     odds = [one.log_odds - SETTINGS.packets_count * lost.get(one.family, least) for one in candidates]
     best = _likeliest([replace(one, log_odds=score) for one, score in zip(candidates, odds, strict=True)])
-    chosen = context_at(context, best.corners)
+    chosen = replace(context, corners=best.corners)
     for other in looked_at:
         if other.corners is best.corners:
             chosen.kept.update(other.kept)

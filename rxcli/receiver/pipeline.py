@@ -25,7 +25,7 @@ from rxcli.receiver.reception import Reception, headerless, slot_margin, soft_bi
 from rxcli.receiver.screen_choice import quick_look, quick_sampler
 from rxcli.receiver.single_light import with_data
 from rxcli.receiver.still import apply_autoencoder, decode_likeliest
-from rxcli.receiver.unknown_camera import likely_camera, receive_unknown, without_estimate
+from rxcli.receiver.unknown_camera import likely_camera, receive_unknown
 from rxcli.results.dump import dump_stages
 from rxcli.types import FloatArray, Frame, FrameResult
 
@@ -102,7 +102,7 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
     if isinstance(acquisition, Failure):
         return failed(replace(result, **context.camera.facts), acquisition)
     # Channel and decode, in turn: slot metrics to symbols, and what they say of the picture.
-    if context.camera.blind_estimate is None:
+    if context.camera.hypothesis is None:
         with timer("detect"):
             reception = decode_likeliest(acquisition, options.skip)
     else:
@@ -142,7 +142,7 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
     if result.status != "no_signal":
         return replace(result, message=_COUNTED_FROM_LEFT) if outline.is_counted_from_left else result
     message = too_small(context, acquisition.screen) or assemble.why_no_packet(columns)
-    return without_estimate(replace(result, message=message), context.camera, reception)
+    return replace(result, message=message)
 
 
 def _taps(corners: FloatArray, acquisition: Acquisition, reception: Reception) -> dict[str, Any]:

@@ -28,6 +28,12 @@ class WiringSettings:
     #: Headers without symbols count so much.
     headers_alone: float = 0.1
 
+    #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with: where
+    #: packets show plainly, and where they do not.
+    matters_slots: float = 0.05
+    max_fits: int = 2
+    #: What is received with a refitted camera shows packets as well as before from this share of the evidence on.
+    kept_evidence: float = 0.9
     #: Packets, all columns together, which show plainly, nats: with a wrong camera they reach 103. It is right then but
     #: for their length, and other outlines are looked at with the screen that shows them alone.
     plain_packets: float = 200.0
@@ -36,6 +42,10 @@ class WiringSettings:
     #: show less than 10, right ones 80. And headers and packets under which an initial pass leaves no hope of any: of
     #: 120 hard pictures that show packets, none had less than 74.
     some_packets: float = 20.0
+    #: Packets and headers, for a screen of twenty columns, of an estimated camera: wrong ones show less than the first
+    #: where they show no packets, and hardly ever more than the second, from which no other is looked at.
+    few_packets: float = 60.0
+    beyond_doubt: float = 400.0
 
     #: Samples a slot on which columns are compared, and by how many slots they may be apart: slats may slant.
     light_samples: int = 2

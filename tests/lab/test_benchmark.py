@@ -19,7 +19,7 @@ from rxcli.lab.benchmark.bare import bare_decode
 from rxcli.lab.benchmark.cases import Case, received
 from rxcli.lab.benchmark.draw import Place, binned, draw_nodata, draw_small, scene_at
 from rxcli.lab.benchmark.measures import Group, cluster_interval, logistic_regression, wilson
-from rxcli.lab.benchmark.media import write_capture
+from rxcli.lab.benchmark.media import write_known
 from rxcli.lab.benchmark.runner import Journal, Run, Task, do, scenarios
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
@@ -132,7 +132,7 @@ def test_the_bare_decode_counts_frames(suffix: str, tmp_path: Path) -> None:
     name = "xs10-still" if suffix == ".dng" else "video-1080p"
     scene = preset(name, "paper-17k3").scaled(0.2, 0.2, keep_readout=True)
     path = tmp_path / f"small{suffix}"
-    write_capture(replace(scene, n_frames=3 if suffix == ".mp4" else 1), path, 0)
+    write_known(replace(scene, n_frames=3 if suffix == ".mp4" else 1), path, 0)
     decode = bare_decode(path)
     assert decode is not None
     assert decode() == (3 if suffix == ".mp4" else 1)

@@ -16,7 +16,6 @@ from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
 from rxcli.receiver import channel, sampling, screen_choice, still, sync
 from rxcli.receiver.acquisition import Acquisition, sample_columns
-from rxcli.receiver.cameras import find_camera
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.context import FrameContext, Timer
 from rxcli.receiver.decode import detect
@@ -24,6 +23,7 @@ from rxcli.receiver.outline import Outline, find_outline
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.reception import headerless
 from rxcli.receiver.screen_choice import acquire
+from rxcli.receiver.unknown_camera import likely_camera
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Frame, FrameResult, Metadata, Mosaic, PacketResult
 
@@ -429,7 +429,7 @@ def test_rows_that_developing_mixes_are_told_from_the_light(monkeypatch: pytest.
 def context_of(frame: Frame, options: ReceiverOptions) -> FrameContext:
     outline = find_outline(frame, options, Timer())
     assert isinstance(outline, Outline)
-    context = find_camera(frame, outline.corners, options, Timer())
+    context = likely_camera(frame, outline.corners, options, Timer())
     assert isinstance(context, FrameContext)
     return context
 

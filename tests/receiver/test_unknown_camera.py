@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,14 +18,13 @@ from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.profiles import ScreenProfile, load_profile, parse_profile
+from rxcli.receiver import camera as blind
 from rxcli.receiver import unknown_camera
-from rxcli.receiver.acquisition import Acquisition, sample_columns
-from rxcli.receiver.cameras import find_cameras
-from rxcli.receiver.context import Camera, Timer
+from rxcli.receiver.acquisition import Acquisition
+from rxcli.receiver.context import Failure, FrameContext, Timer
 from rxcli.receiver.pipeline import ReceiverOptions, receive
-from rxcli.receiver.screen_choice import acquire
-from rxcli.receiver.still import decode
-from rxcli.types import Frame, FrameResult
+from rxcli.receiver.screen_choice import quick_look
+from rxcli.types import Frame
 
 CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
 OPTIONS = ReceiverOptions(
@@ -60,31 +60,56 @@ def test_an_unknown_camera_is_refitted_and_received(tmp_path: Path, told_exposur
     assert all(right)
 
 
-def test_an_estimate_that_neither_packets_nor_edges_bear_out_is_taken_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def _proposed(*rows_per_slot: float) -> list[blind.CameraHypothesis]:
+    return [
+        blind.CameraHypothesis(
+            rows_per_slot=rows,
+            packet_slots=OPTIONS.screens[0].packet_slots,
+            reversed=False,
+            curvature=np.zeros(4),
+            corrected=True,
+            exposure_slots=0.5,
+            score=100.0,
+            rows_per_slot_sd=0.01,
+            curvature_sd=np.zeros(4),
+        )
+        for rows in rows_per_slot
+    ]
+
+
+def _chosen(
+    frame: Frame, proposed: Iterable[blind.CameraHypothesis], monkeypatch: pytest.MonkeyPatch
+) -> FrameContext | Failure:
+    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_, **__: iter(proposed))
+    return unknown_camera.likely_camera(frame, CORNERS, OPTIONS, Timer())
+
+
+def test_packets_decide_between_hypotheses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, _ = _frame(tmp_path)
+    wrong, right, other = _proposed(1.13 * ROWS_PER_SLOT, ROWS_PER_SLOT, 0.7 * ROWS_PER_SLOT)
+    unused = iter([right, other])
+    for proposed in ([wrong, right], [wrong, other, right], unused):
+        chosen = _chosen(frame, proposed, monkeypatch)
+        assert isinstance(chosen, FrameContext)
+        assert chosen.camera.hypothesis is right
+    assert next(unused) is other
 
-    context = find_cameras(frame, CORNERS, OPTIONS, Timer()).first
-    assert context is not None
-    right = context.camera
-    assert right.blind_estimate is not None
-    estimate, strips = right.blind_estimate
-    wrong = replace(right, blind_estimate=(replace(estimate, rows_per_slot=1.03 * ROWS_PER_SLOT), strips))
-    acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
-    assert isinstance(acquisition, Acquisition)
-    reception = decode(acquisition, OPTIONS.skip)
-    result = FrameResult("small", 0, None, "no_signal", message="none", **right.facts)
 
-    def after(camera: Camera, packets: float) -> FrameResult:
-        monkeypatch.setattr(unknown_camera, "packet_llr", lambda _: packets)
-        return unknown_camera.without_estimate(result, camera, reception)
+def test_without_packets_there_is_no_camera_but_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, _ = _frame(tmp_path)
+    for proposed in ([], _proposed(1.13 * ROWS_PER_SLOT, 0.7 * ROWS_PER_SLOT)):
+        failure = _chosen(frame, proposed, monkeypatch)
+        assert isinstance(failure, Failure)
+        assert "no packet header" in failure.message
 
-    assert after(wrong, 100.0) == after(right, 0.0) == after(replace(wrong, blind_estimate=None), 0.0) == result
-    doubted = after(wrong, 0.0)
-    assert not doubted.estimated
-    assert doubted.line_delay_s is None
-    assert "no packet header" in (doubted.message or "")
+
+def test_a_period_that_is_somewhat_off_is_fitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame, payloads = _frame(tmp_path)
+    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_, **__: iter(_proposed(1.002 * ROWS_PER_SLOT)))
+    result = next(receive([frame], OPTIONS))
+    found, sd = result.estimated["rows_per_slot"]
+    assert abs(found - ROWS_PER_SLOT) < 4 * sd < 0.01 * ROWS_PER_SLOT
+    assert all(packet.payload == payloads[column.column] for column in result.columns for packet in column.packets)
 
 
 def _small_phone(tone: Tone) -> tuple[Trial, Frame]:
@@ -106,11 +131,19 @@ def _small_phone(tone: Tone) -> tuple[Trial, Frame]:
 
 
 @pytest.mark.parametrize("tone", ["srgb", "linear"])
-def test_the_tone_curve_is_estimated(tone: Tone) -> None:
+def test_the_tone_curve_is_estimated_and_used(tone: Tone, monkeypatch: pytest.MonkeyPatch) -> None:
     trial, frame = _small_phone(tone)
     options = ReceiverOptions(cameras=(), corners=trial.corners, cae="never")
+    read: list[str] = []
+
+    def noting_the_tone(context: FrameContext) -> Acquisition | Failure:
+        read.append(context.camera.tone)
+        return quick_look(context)
+
+    monkeypatch.setattr(unknown_camera, "quick_look", noting_the_tone)
     result = next(receive([frame], options))
     exponent, sd = result.estimated["tone_exponent"]
     assert abs(exponent - (1.0 if tone == "linear" else 2.2)) < 2 * sd
+    assert ("linear" in read) == (tone == "linear")
     _, score = score_result(result, trial.truth)
     assert score.error_free >= 15

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from rxcli.options import ReceiverOptions
-from rxcli.receiver import cameras
+from rxcli.receiver import unknown_camera
+from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.pipeline import receive
 from rxcli.types import Frame, Metadata
 from tests.receiver.test_video import Clip, scored, simulate
@@ -33,13 +35,14 @@ def _line_delay_s(clip: Clip) -> float:
 
 def test_the_camera_is_estimated_once_and_refitted(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Frame] = []
-    find = cameras.find_cameras
+    find = unknown_camera.likely_camera
 
-    def counted(frame: Frame, *rest: object, **named: str) -> cameras.Cameras:
+    def counted(frame: Frame, *rest: Any) -> FrameContext | Failure:
         asked.append(frame)
-        return find(frame, *rest, **named)  # type: ignore[arg-type]
+        return find(frame, *rest)
 
-    monkeypatch.setattr("rxcli.receiver.unknown_camera.find_cameras", counted)
+    for module in ("outline", "clip.receiver"):
+        monkeypatch.setattr(f"rxcli.receiver.{module}.likely_camera", counted)
     results, score = scored(list(receive(clip.frames, _unknown(clip))), clip.truth)
     assert len(asked) == 1
     known = scored(list(receive(clip.frames, clip.options)), clip.truth)[1]

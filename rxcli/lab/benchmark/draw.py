@@ -24,9 +24,8 @@ from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, draw_no_data
 from rxcli.lab.simulate.optics import Lens, Pose, View
 from rxcli.lab.simulate.pictures import PHOTOS, draw_name
-from rxcli.lab.simulate.scenes import Scene, preset, random_scene
+from rxcli.lab.simulate.scenes import Scene, draw_weight, preset, random_scene
 from rxcli.lab.simulate.sensor import Sensor
-from rxcli.lab.simulate.transmitter import Weights
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.lab.simulate.video import write_video
 from rxcli.options import ReceiverOptions, receiver_options
@@ -70,16 +69,6 @@ def _case(trial: Trial, options: ReceiverOptions, *groups: str, **about: Any) ->
     return Case(source=frames, options=options, groups=groups, about=about, **known)
 
 
-def _weight(rng: np.random.Generator, dimming: float, low: int = 2) -> Weights:
-    """Lit slots of a symbol: by the picture's light with a probability of `dimming`, or the same in all columns."""
-    return "dimming" if rng.random() < dimming else int(rng.integers(low, 9))
-
-
-def _lit(base: Scene, exposure_s: float, factor: float) -> dict[str, Any]:
-    """The preset's light, times a factor, at another exposure."""
-    return {"exposure_s": exposure_s, "light_e_per_s": base.light_e_per_s * (base.exposure_s / exposure_s) * factor}
-
-
 # Phones that nobody has measured.
 
 _PHONE_HEIGHTS_PX, _PHONE_EXPOSURE_SLOTS = (720, 1080, 1440, 1800), (0.4, 0.7, 1.0, 1.5, 2.0)
@@ -120,7 +109,7 @@ def phone_of(seed: int, number: int) -> tuple[Scene, bool]:
     tone: Any = str(rng.choice(["srgb", "bt709"]))
     sharpen, denoise_px = rng.uniform(0, 0.8), rng.uniform(0, 0.6)
     isp = Isp(tone, 2.0, sharpen, denoise_px=denoise_px, correct_distortion=corrected, quality=90)
-    picture, w = str(rng.choice(list(PHOTOS))), _weight(rng, 0.3, 3)
+    picture, w = str(rng.choice(list(PHOTOS))), draw_weight(rng, 0.3, 3)
     light_e_per_s = 1.4e6 / 24000 / exposure_s * 10 ** rng.uniform(-0.3, 0.2)
     base = preset("phone-plain", screen)
     base = replace(base, sensor=sensor, lens=lens, pose=pose, isp=isp, picture=picture, w=w, orientation=1)
@@ -181,11 +170,11 @@ def screen_of(seed: int, number: int) -> tuple[Scene, str]:
     picture = str(rng.choice(list(PHOTOS))) if kind == "photo" else draw_dark_picture(kind, rng, *size)
     slots = float(rng.choice([0.5, 1.0])) * rng.uniform(0.8, 1.2)
     exposure_s = max(slots / base.screen.slot_rate_hz, _MIN_EXPOSURE_S)
-    w = _weight(rng, 0.4)
-    lit = _lit(base, exposure_s, 10 ** rng.uniform(-0.3, 0.3))
+    w = draw_weight(rng, 0.4)
+    lit = base.exposed(exposure_s, 10 ** rng.uniform(-0.3, 0.3))
     room = replace(base.room, light_e_per_s=base.light_e_per_s * 10 ** rng.uniform(-3, -1.3))
     blur_px, slot_rate_error_ppm = rng.uniform(0.5, 1.5), rng.uniform(-50, 50)
-    scene = replace(base, picture=picture, w=w, room=room, blur_px=blur_px, n_frames=1, **lit)
+    scene = replace(lit, picture=picture, w=w, room=room, blur_px=blur_px, n_frames=1)
     angles = (rng.normal(0, 1.5), rng.normal(0, 4), rng.normal(0, 4))
     scene = replace(scene, slot_rate_error_ppm=slot_rate_error_ppm)
     return placed(scene, share, angles, rng.uniform(-0.9, 0.9, 2)), kind
@@ -234,10 +223,10 @@ def confidence_scene(seed: int) -> Scene:
     base, light = (preset("xs10-still", _SEARCHED_SCREEN), _SEARCHED_LIGHT) if searched else (_small(rng), _LIGHT)
     slots = float(rng.choice([0.5, 1.0, 1.5, 2.0]) * rng.uniform(0.8, 1.2))
     exposure_s = max(slots / base.screen.slot_rate_hz, _MIN_EXPOSURE_S)
-    picture, w = draw_name(rng), _weight(rng, 0.3)
+    picture, w = draw_name(rng), draw_weight(rng, 0.3)
     fill, roll_deg, yaw_deg = rng.uniform(0.8, 0.97), rng.normal(0, 1.0), rng.normal(0, 4)
     pose = replace(base.pose, fill=fill, roll_deg=roll_deg, yaw_deg=yaw_deg)
-    scene = replace(base, picture=picture, w=w, pose=pose, **_lit(base, exposure_s, 10 ** rng.uniform(*light)))
+    scene = replace(base.exposed(exposure_s, 10 ** rng.uniform(*light)), picture=picture, w=w, pose=pose)
     blur_px, slot_rate_error_ppm = rng.uniform(0.4, 2.5), rng.uniform(-100, 100)
     delay = float(rng.choice([0.0, rng.uniform(0, 2)]))
     isp = replace(base.isp, sharpen=rng.uniform(0, 0.8), denoise_px=rng.uniform(0, 0.6))
@@ -346,8 +335,8 @@ def _filmed_scene(rng: np.random.Generator, base: Scene) -> Scene:
     pose = replace(base.pose, fill=fill, roll_deg=roll_deg, yaw_deg=yaw_deg, pitch_deg=rng.normal(0, 2))
     picture = draw_name(rng)
     w = 5 if rng.random() < 0.6 else int(rng.integers(3, 8))
-    lit = _lit(base, exposure_s, 10 ** rng.uniform(-0.5, 0.2))
-    return replace(base, picture=picture, w=w, pose=pose, shake_px=0.0, **lit)
+    lit = base.exposed(exposure_s, 10 ** rng.uniform(-0.5, 0.2))
+    return replace(lit, picture=picture, w=w, pose=pose, shake_px=0.0)
 
 
 def _bit_rate(rng: np.random.Generator, scene: Scene, bits_per_pixel: tuple[float, float]) -> int:

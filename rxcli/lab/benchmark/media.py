@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rxcli.lab.simulate.capture import prepare
+from rxcli.lab.simulate.capture import prepare, write_capture
 from rxcli.lab.simulate.scenes import Scene, preset
-from rxcli.lab.simulate.tiff import write_dng
 from rxcli.lab.simulate.truth import build_camera_profile, write_truth
-from rxcli.lab.simulate.video import write_video
 from rxcli.profiles import dump_profile
 from rxcli.protocol import payload_bits
 
@@ -68,10 +66,10 @@ class Medium:
         if path.exists() and camera_path(path).exists():
             return path
         if self.times == 1:
-            write_capture(self.scene, path, seed, self.bit_rate)
+            write_known(self.scene, path, seed, self.bit_rate)
             return path
         once = path.with_stem(path.stem + "-once")
-        write_capture(self.scene, once, seed, self.bit_rate)
+        write_known(self.scene, once, seed, self.bit_rate)
         repeat_clip(once, path, self.times)
         camera_path(once).replace(camera_path(path))
         return path
@@ -82,21 +80,14 @@ def camera_path(path: Path) -> Path:
     return path.with_name(path.stem + ".camera.toml")
 
 
-def write_capture(scene: Scene, path: Path, seed: int, bit_rate: int | None = None) -> None:
+def write_known(scene: Scene, path: Path, seed: int, bit_rate: int | None = None) -> None:
     """Simulate a JPEG, DNG or clip, with its truth and its camera profile beside it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    raw = path.suffix == ".dng"
-    scene = replace(scene, output="raw" if raw else "developed")
-    take = prepare(scene, seed)
-    if path.suffix == ".mp4":
-        frames = (take.frame(number).rgb for number in range(scene.n_frames))
-        write_video(frames, path, "h264", scene.frame_rate_hz, bit_rate)
-    elif raw:
-        write_dng(take.frame().raw, scene, path)
-    else:
-        path.write_bytes(take.frame().jpeg)
+    file_format = {".jpg": "jpeg", ".dng": "dng", ".mp4": "h264"}[path.suffix]
+    take = prepare(replace(scene, output="raw" if file_format == "dng" else "developed"), seed)
+    write_capture(take, path, file_format, bit_rate)
     write_truth(take.truth(path.name), path)
-    camera_path(path).write_text(dump_profile(build_camera_profile(scene, take.exposure())), encoding="utf-8")
+    camera_path(path).write_text(dump_profile(build_camera_profile(take.scene, take.exposure())), encoding="utf-8")
 
 
 def repeat_clip(short: Path, out: Path, times: int) -> None:

@@ -128,14 +128,14 @@ def mosaic_of(scene: Scene) -> Mosaic:
 def acquired(trial: Trial, *, quick: bool = True) -> Acquisition | None:
     """Screen and clock of a trial's first frame; None where they are not found. For `quick` see `sample_columns`."""
     from rxcli.receiver.acquisition import sample_columns
-    from rxcli.receiver.cameras import find_camera
     from rxcli.receiver.context import Failure, Timer
     from rxcli.receiver.outline import find_outline
     from rxcli.receiver.screen_choice import acquire
+    from rxcli.receiver.unknown_camera import likely_camera
 
     options, timer = trial.options(), Timer()
     outline = find_outline(trial.frame, options, timer)
-    context = outline if isinstance(outline, Failure) else find_camera(trial.frame, outline.corners, options, timer)
+    context = outline if isinstance(outline, Failure) else likely_camera(trial.frame, outline.corners, options, timer)
     if isinstance(context, Failure):
         return None
     found = acquire(context, sample_columns(context, context.n_columns, quick=quick))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +18,10 @@ from rxcli.lab.simulate.motion import HandMotion, turned
 from rxcli.lab.simulate.optics import Pose, View, homography
 from rxcli.lab.simulate.pictures import load_picture, picture_names
 from rxcli.lab.simulate.scenes import Change, Scene
+from rxcli.lab.simulate.tiff import write_dng, write_tiff
 from rxcli.lab.simulate.transmitter import Dimming, Drive, Link, Weights, drive_screen
 from rxcli.lab.simulate.truth import build_truth
+from rxcli.lab.simulate.video import CODECS, write_video
 from rxcli.profiles import ScreenProfile
 
 FloatArray = NDArray[np.float64]
@@ -225,3 +229,31 @@ def simulate_frame(scene: Scene, rng: np.random.Generator | int, *, oracle: bool
         threads: bands of rows computed at the same time; the pixels do not depend on it.
     """
     return prepare(scene, rng).frame(oracle=oracle, threads=threads)
+
+
+def write_capture(
+    take: Take, path: Path, file_format: str, bit_rate: int | None = None, progress: Callable[..., Any] = iter
+) -> None:
+    """Write a still or clip of a take.
+
+    Args:
+        take: whose frames are written, of a still the first.
+        path: of the file.
+        file_format: jpeg, dng, dng14, png, png16, tiff, tiff16, or a codec of `write_video`.
+        bit_rate: of clips, bits per second; None for the encoder's constant quality.
+        progress: wraps the numbers of the frames.
+    """
+    from rxcli.lab.simulate.files import write_png
+
+    scene = take.scene
+    if file_format in CODECS:
+        bits = 16 if CODECS[file_format].bits > 8 else 8
+        frames = (take.frame(number).developed(bits) for number in progress(range(scene.n_frames)))
+        write_video(frames, path, file_format, scene.frame_rate_hz, bit_rate)
+    elif file_format == "jpeg":
+        path.write_bytes(take.frame().jpeg)
+    elif file_format.startswith("dng"):
+        write_dng(take.frame().raw, scene, path, 14 if file_format == "dng14" else 16)
+    else:
+        rgb = take.frame().developed(16 if file_format.endswith("16") else 8)
+        write_png(rgb, path) if file_format.startswith("png") else write_tiff(rgb, scene, path)

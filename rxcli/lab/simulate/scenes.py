@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import tomllib
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from math import sqrt
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -101,6 +104,11 @@ class Scene:
         """Sensor rows read during one slot."""
         return 1 / (self.sensor.line_delay_s * self.screen.slot_rate_hz)
 
+    def exposed(self, exposure_s: float, factor: float = 1.0) -> Scene:
+        """The scene at another exposure, with as many electrons as before times `factor`."""
+        light_e_per_s = self.light_e_per_s * (self.exposure_s / exposure_s) * factor
+        return replace(self, exposure_s=exposure_s, light_e_per_s=light_e_per_s)
+
     def scaled(self, x: float, y: float | None = None, *, keep_readout: bool = False) -> Scene:
         """The same view on a smaller sensor, for quick sweeps.
 
@@ -131,82 +139,20 @@ class Scene:
         )
 
 
-def _xs10_still(screen: ScreenProfile) -> Scene:
-    return Scene(
-        screen,
-        lens=Lens(19000 / 6240, (-0.06, 0.02, 0.0005, -0.0003, 0.0)),
-        pose=Pose(fill=0.965, roll_deg=0.35, yaw_deg=2.0, pitch_deg=-1.0),
-        room=Room(light_e_per_s=8e4),
-        isp=Isp(tone="srgb", gain=1.6, denoise_px=0.35, denoise_colour_px=1.0, subsampling="422", quality=93),
-        camera_name="xs10",
-        make="FUJIFILM",
-        model="X-S10",
-    )
+#: Names of presets, in order.
+PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-plain")
+_PARTS: dict[str, type] = {"sensor": Sensor, "lens": Lens, "pose": Pose, "room": Room, "isp": Isp}
 
 
-def _xs10_video(screen: ScreenProfile, width: int, height: int, readout_s: float, name: str) -> Scene:
-    return replace(
-        _xs10_still(screen),
-        sensor=Sensor(width, height, readout_s / height, "rgb", full_scale_e=400.0, read_noise_e=3.0),
-        lens=Lens(2.5, (-0.05, 0.02, 0.0, 0.0002, 0.0)),
-        pose=Pose(fill=0.86, roll_deg=0.3, yaw_deg=1.0, pitch_deg=0.5),
-        room=Room(light_e_per_s=3e5),
-        isp=Isp(tone="bt709", gain=1.3, sharpen=0.3, denoise_px=0.6),
-        blur_px=0.7,
-        camera_name=name,
-    )
-
-
-def _video_4k(screen: ScreenProfile) -> Scene:
-    scene = _xs10_video(screen, 3840, 2160, 20.35e-3, "video4k")
-    return replace(scene, n_frames=24, frame_rate_hz=30000 / 1001, light_e_per_s=2.4e6, shake_px=1.5)
-
-
-def _video_1080p(screen: ScreenProfile) -> Scene:
-    scene = _xs10_video(screen, 1920, 1080, 12.74e-3, "video1080")
-    return replace(
-        scene, n_frames=48, frame_rate_hz=60000 / 1001, light_e_per_s=2.4e6, exposure_s=1 / 16000, shake_px=1.0
-    )
-
-
-def _phone_corrected(screen: ScreenProfile) -> Scene:
-    return Scene(
-        screen,
-        sensor=Sensor(
-            4032, 3024, 5.6e-6, "bayer", full_scale_e=260.0, read_noise_e=2.0, black_level=64, white_level=1023
-        ),
-        lens=Lens(0.78, (0.07, -0.09, 0.0004, 0.0006, 0.0)),
-        pose=Pose(fill=0.92, roll_deg=1.2, yaw_deg=3.0, pitch_deg=-2.0),
-        room=Room(light_e_per_s=1.2e5),
-        isp=Isp(tone="bt709", gain=2.0, sharpen=0.8, denoise_px=0.5, correct_distortion=True, quality=90),
-        exposure_s=1 / 24000,
-        light_e_per_s=1.7e6,
-        camera_name="phone12",
-        model="Phone 12MP",
-    )
-
-
-def _phone_plain(screen: ScreenProfile) -> Scene:
-    return replace(
-        _phone_corrected(screen),
-        sensor=Sensor(
-            4000, 3000, 7.1e-6, "bayer", full_scale_e=220.0, read_noise_e=2.4, black_level=256, white_level=4095
-        ),
-        lens=Lens(0.82, (-0.03, 0.01, 0.0, 0.0, 0.0)),
-        isp=Isp(tone="srgb", gain=1.8, sharpen=0.5, denoise_px=0.4, quality=93),
-        exposure_s=1 / 20000,
-        camera_name="phone12b",
-        model="Phone 12MP B",
-    )
-
-
-PRESETS: dict[str, Callable[[ScreenProfile], Scene]] = {
-    "xs10-still": _xs10_still,
-    "video-4k": _video_4k,
-    "video-1080p": _video_1080p,
-    "phone-corrected": _phone_corrected,
-    "phone-plain": _phone_plain,
-}
+@lru_cache(maxsize=1)
+def _presets() -> dict[str, dict[str, Any]]:
+    """Fields of the scene by preset, from `presets.toml`."""
+    text = Path(__file__).with_name("presets.toml").read_text(encoding="utf-8")
+    found: dict[str, dict[str, Any]] = {}
+    for name, table in tomllib.loads(text).items():
+        own = {key: msgspec.convert(value, _PARTS[key]) if key in _PARTS else value for key, value in table.items()}
+        found[name] = {**found.get(own.pop("like", ""), {}), **own}
+    return found
 
 
 def preset(name: str, screen: str | ScreenProfile = "paper-34k6") -> Scene:
@@ -223,7 +169,7 @@ def preset(name: str, screen: str | ScreenProfile = "paper-34k6") -> Scene:
     if name not in PRESETS:
         raise UsageError(f"no preset {name!r}", f"choose from: {', '.join(PRESETS)}")
     profile = screen if isinstance(screen, ScreenProfile) else load_profile(screen, ScreenProfile)
-    return PRESETS[name](profile)
+    return Scene(profile, **_presets()[name])
 
 
 def random_scene(rng: np.random.Generator) -> Scene:
@@ -232,32 +178,19 @@ def random_scene(rng: np.random.Generator) -> Scene:
     exposure_slots = float(rng.choice([0.25, 0.5, 1.0, 1.5, 2.0])) * rng.uniform(0.8, 1.2)
     exposure_s = max(exposure_slots / base.screen.slot_rate_hz, 1 / 32000)
     upside_down = rng.random() < 0.15
-    pose = replace(
-        base.pose,
-        fill=rng.uniform(0.6, 0.97),
-        roll_deg=rng.normal(0, 1.5) + 180 * upside_down,
-        yaw_deg=rng.normal(0, 6),
-        pitch_deg=rng.normal(0, 5),
-        shift_x=rng.normal(0, 0.02),
-        shift_y=rng.normal(0, 0.02),
-    )
-    return replace(
-        base,
-        picture=draw_name(rng),
-        w="dimming" if rng.random() < 0.3 else int(rng.integers(2, 9)),
-        pose=pose,
-        room=replace(
-            base.room,
-            light_e_per_s=base.light_e_per_s * 10 ** rng.uniform(-3, -0.5),
-            flicker_hz=float(rng.choice([100, 120])),
-            lamp=float(rng.choice([0.0, rng.uniform(0, 0.05)])),
-        ),
-        exposure_s=exposure_s,
-        light_e_per_s=base.light_e_per_s * (base.exposure_s / exposure_s) * 10 ** rng.uniform(-0.7, 0.3),
-        blur_px=rng.uniform(0.4, 3.0),
-        slot_rate_error_ppm=rng.uniform(-100, 100),
-        column_delay_slots=float(rng.choice([0.0, rng.uniform(0, 2)])),
-        n_frames=1,
-        orientation=3 if upside_down else 1,
-        output="raw" if rng.random() < 0.3 else "developed",
-    )
+    fill, roll, yaw, pitch = rng.uniform(0.6, 0.97), rng.normal(0, 1.5), rng.normal(0, 6), rng.normal(0, 5)
+    pose = Pose(fill, roll + 180 * upside_down, yaw, pitch, rng.normal(0, 0.02), rng.normal(0, 0.02))
+    picture, w = draw_name(rng), draw_weight(rng, 0.3)
+    light_e_per_s, flicker_hz = base.light_e_per_s * 10 ** rng.uniform(-3, -0.5), float(rng.choice([100, 120]))
+    lamp = float(rng.choice([0.0, rng.uniform(0, 0.05)]))
+    room = replace(base.room, light_e_per_s=light_e_per_s, flicker_hz=flicker_hz, lamp=lamp)
+    scene = replace(base.exposed(exposure_s, 10 ** rng.uniform(-0.7, 0.3)), picture=picture, w=w, pose=pose, room=room)
+    blur_px, slot_rate_error_ppm = rng.uniform(0.4, 3.0), rng.uniform(-100, 100)
+    delay, raw = float(rng.choice([0.0, rng.uniform(0, 2)])), rng.random() < 0.3
+    scene = replace(scene, blur_px=blur_px, slot_rate_error_ppm=slot_rate_error_ppm, column_delay_slots=delay)
+    return replace(scene, n_frames=1, orientation=3 if upside_down else 1, output="raw" if raw else "developed")
+
+
+def draw_weight(rng: np.random.Generator, dimming: float, low: int = 2) -> Weights:
+    """Lit slots of a symbol: by the picture's light with a probability of `dimming`, or the same in all columns."""
+    return "dimming" if rng.random() < dimming else int(rng.integers(low, 9))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rxcli.receiver.camera.curvature import strip_distances
-from rxcli.receiver.camera.scan import autocorrelation, half_width
+from rxcli.receiver.camera.proposals import stripe_rows
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, levelled
 from rxcli.types import BoolArray, Float32Array, FloatArray
@@ -27,34 +26,31 @@ def why_not(strips: Strips) -> str:
             "only a part of the screen's height shows stripes; the picture may be merged from several exposures or "
             "taken with flash: switch HDR and flash off, or use a manual-camera app"
         )
-    level, weight = levelled(strips.light, strips.inside, 38, strips.noise)
-    columns = (level * weight).reshape(strips.n_columns, -1, strips.rows.size).mean(axis=1)
-    width = half_width(autocorrelation(columns))
-    if width < SETTINGS.half_width_slots[0] * SETTINGS.least_rows_per_slot:
+    width = stripe_rows(strips)
+    if width < SETTINGS.half_width_slots[0] * SETTINGS.min_rows_per_slot:
         return (
             f"the stripes are about {width:.1f} rows wide, too few to tell slots apart (at least "
-            f"{SETTINGS.least_rows_per_slot} rows a slot); use the picture in its full size, or a slower slot rate"
+            f"{SETTINGS.min_rows_per_slot} rows a slot); use the picture in its full size, or a slower slot rate"
         )
     return (
-        "there are stripes but no packet header among them; the screen may show less than one packet (move closer), "
-        "the picture may be merged from several exposures (switch HDR off), or the screen is none of those tried"
+        "there are stripes but no packet header where it should be; the screen may show less than one packet (move "
+        "closer), the picture may be merged from several exposures (switch HDR off), or the screen is none of those "
+        "tried"
     )
 
 
 def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
     """Correlation of neighbouring strips in bands of rows, 0..1; and whether a band is lit."""
-    level, weight = levelled(strips.light, strips.inside, SETTINGS.bend_level_rows, strips.noise)
+    level, weight = levelled(strips.light, strips.inside, SETTINGS.likeness_rows, strips.noise)
     blocks = np.linspace(0, strips.rows.size, SETTINGS.likeness_bands + 1).astype(int)[:-1]
-    step = strip_distances(strips)[0] if strip_distances(strips) else 1
 
     def summed(values: Float32Array) -> FloatArray:
         return np.asarray(np.add.reduceat(values, blocks, axis=1), np.float64)
 
     # Strips without light have no say.
     level = level * weight
-    product = summed(level[:-step] * level[step:]).sum(axis=0)
-    power = np.sqrt(summed(level[:-step] ** 2).sum(axis=0) * summed(level[step:] ** 2).sum(axis=0))
-    likeness = product / np.maximum(power, 1e-9)
+    product = summed(level[:-1] * level[1:]).sum(axis=0)
+    power = np.sqrt(summed(level[:-1] ** 2).sum(axis=0) * summed(level[1:] ** 2).sum(axis=0))
     lit = summed(weight).max(axis=0) > 0.2 * strips.rows.size / SETTINGS.likeness_bands
     lit |= summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / SETTINGS.likeness_bands
-    return np.asarray(likeness), np.asarray(lit)
+    return np.asarray(product / np.maximum(power, 1e-9)), np.asarray(lit)

@@ -1,4 +1,4 @@
-"""What an estimate means for the receiver, the report and the next picture."""
+"""What a camera hypothesis means for the receiver, the report and the next picture."""
 
 from __future__ import annotations
 
@@ -7,25 +7,18 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
-from rxcli.receiver.camera.estimates import BlindEstimate
-from rxcli.receiver.camera.tone import is_linear
+from rxcli.receiver.camera.proposals import CameraHypothesis
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.types import FloatArray, Lens, RowProfiles
 
-
-def lens_of(estimate: BlindEstimate, width: int, height: int) -> Lens | None:
-    """The lens model of a picture; None where neither sides nor stripes were seen to be bent."""
-    if estimate.corrected:
-        return Lens(_one_width(width, height), np.append(estimate.curvature, 0.0), corrected=True)
-    return curving_lens(estimate.side_curvature, width, height)
+_COEFFICIENTS = ("k1", "k2", "p1", "p2")
 
 
-def curving_lens(side_curvature: tuple[float, float] | None, width: int, height: int) -> Lens | None:
-    """The lens that bows the sides of the screen; None where they are not bowed."""
-    if side_curvature is None:
+def lens_of(curvature: FloatArray, width: int, height: int, *, corrected: bool) -> Lens | None:
+    """The lens of a picture with distortion k1 k2 p1 p2, see `CameraHypothesis`; None where there is none."""
+    if not curvature.any():
         return None
-    return Lens(
-        _one_width(width, height), np.array([side_curvature[0], -side_curvature[0], 0.0, 0.0, 0.0]), corrected=False
-    )
+    return Lens(_one_width(width, height), np.append(curvature, 0.0), corrected=corrected)
 
 
 def _one_width(width: int, height: int) -> FloatArray:
@@ -50,38 +43,29 @@ def in_time_order(profiles: RowProfiles, height: int) -> RowProfiles:
     )
 
 
-def summary(estimate: BlindEstimate, slot_rate_hz: float) -> dict[str, tuple[float, float]]:
+def summary(hypothesis: CameraHypothesis, slot_rate_hz: float) -> dict[str, tuple[float, float]]:
     """What was estimated: name -> (value, standard deviation)."""
-    line_delay_s = 1 / (estimate.rows_per_slot * slot_rate_hz)
-    relative = estimate.rows_per_slot_sd / estimate.rows_per_slot
-    out = summary_of_rows(estimate)
-    out["line_delay_s"] = (line_delay_s, line_delay_s * relative)
-    out["readout_reversed"] = (float(estimate.reversed), 0.0)
-    if estimate.exposure_slots_sd > 0:
-        out["exposure_s"] = (estimate.exposure_slots / slot_rate_hz, estimate.exposure_slots_sd / slot_rate_hz)
-    if estimate.tone:
-        out["tone_exponent"] = estimate.tone
+    rows_per_slot, sd = hypothesis.rows_per_slot, hypothesis.rows_per_slot_sd
+    line_delay_s = 1 / (rows_per_slot * slot_rate_hz)
+    out = {
+        "rows_per_slot": (rows_per_slot, sd),
+        "line_delay_s": (line_delay_s, line_delay_s * sd / rows_per_slot),
+        "readout_reversed": (float(hypothesis.reversed), 0.0),
+    }
+    if hypothesis.curvature.any():
+        values, sds = hypothesis.curvature.tolist(), hypothesis.curvature_sd.tolist()
+        out |= {name: (value, sd) for name, value, sd in zip(_COEFFICIENTS, values, sds, strict=True)}
+        out["distortion_corrected"] = (float(hypothesis.corrected), 0.0)
+    if hypothesis.exposure_slots_sd > 0:
+        out["exposure_s"] = (hypothesis.exposure_slots / slot_rate_hz, hypothesis.exposure_slots_sd / slot_rate_hz)
+    if hypothesis.tone:
+        out["tone_exponent"] = hypothesis.tone
     return out
 
 
-def _coefficients(estimated: dict[str, tuple[float, float]]) -> tuple[float, ...]:
-    """k1 k2 p1 p2 of what was estimated."""
-    return tuple(estimated.get(name, (0.0, 0.0))[0] for name in ("k1", "k2", "p1", "p2"))
-
-
-def summary_of_rows(estimate: BlindEstimate) -> dict[str, tuple[float, float]]:
-    """What of it needs no screen's slot rate: name -> (value, standard deviation)."""
-    out = {"rows_per_slot": (estimate.rows_per_slot, estimate.rows_per_slot_sd)}
-    if estimate.corrected:
-        names = ("k1", "k2", "p1", "p2")
-        out |= {
-            n: (float(v), float(sd)) for n, v, sd in zip(names, estimate.curvature, estimate.curvature_sd, strict=True)
-        }
-        out["distortion_corrected"] = (1.0, 0.0)
-    elif estimate.side_curvature:
-        k1, sd = estimate.side_curvature
-        out |= {"k1": (k1, sd), "k2": (-k1, sd), "distortion_corrected": (0.0, 0.0)}
-    return out
+def is_linear(tone: tuple[float, float] | None) -> bool:
+    """Whether a picture of some exponent is read as one whose values follow light."""
+    return tone is not None and tone[0] < SETTINGS.linear_below
 
 
 def camera_profile(
@@ -102,13 +86,12 @@ def camera_profile(
     """
     lens = None
     if "k1" in estimated:
-        k = _coefficients(estimated)
         top, middle, bottom = (tuple(row) for row in _one_width(width, height).tolist())
         lens = LensModel(
             width=width,
             height=height,
             camera_matrix=(top, middle, bottom),
-            dist_coeffs=(*k, 0.0),
+            dist_coeffs=(*(estimated[name][0] for name in _COEFFICIENTS), 0.0),
             distortion_already_corrected=bool(estimated["distortion_corrected"][0]),
         )
     line_delay_s, sd = estimated["line_delay_s"]

@@ -56,7 +56,7 @@ def repeat_evidence(lit: BoolArray, position: NDArray[np.int64], packet_slots: i
     copy = np.cumsum(np.diff(position[payload], prepend=position[payload[0]]) < 0)
     by_copy = np.bincount(copy, ratio)
     # Half the rows per slot repeat as well, with twice the slots: this may decide a draw, no more.
-    return min(float(np.logaddexp(by_copy + np.log(2 / 3), np.log(1 / 3)).sum()), SETTINGS.most_for_repeats_nats)
+    return min(float(np.logaddexp(by_copy + np.log(2 / 3), np.log(1 / 3)).sum()), SETTINGS.max_repeats)
 
 
 def _sliced(slots: FloatArray | Float32Array) -> BoolArray:
@@ -101,4 +101,4 @@ def _agreement_llr(agree: NDArray[np.int64], n: int) -> FloatArray:
 
 def _share_of(lit: BoolArray) -> FloatArray:
     """(C,) share of slots that are lit."""
-    return np.asarray(np.clip(lit.mean(axis=1), SETTINGS.least_share, 1 - SETTINGS.least_share))
+    return np.asarray(np.clip(lit.mean(axis=1), SETTINGS.min_share, 1 - SETTINGS.min_share))

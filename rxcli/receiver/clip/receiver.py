@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.acquisition import Acquisition, sample_columns
-from rxcli.receiver.cameras import context_at, has_profile
+from rxcli.receiver.cameras import has_profile
 from rxcli.receiver.clip import results
 from rxcli.receiver.clip.bursts import BurstReader
 from rxcli.receiver.clip.outline import FirstOutline
@@ -186,7 +186,7 @@ class _Clip:
         """The first frames, once they have agreed on an outline and, where each shows little, on a clock."""
         frames, self._first = self._first or [], None
         if self._outline is not None and self._found is not None and isinstance(self._found[1], Located):
-            located = _moved_to(self._found[1], self._outline.corners, self._options)
+            located = _moved_to(self._found[1], self._outline.corners)
             located = self._read_in_time(located, frames)
             if self._little and len(frames) > 1:
                 located = self._with_common_clock(located, frames)
@@ -199,7 +199,7 @@ class _Clip:
         An estimate tells rows per slot; with a slower screen than the right one the camera seems slower, too.
         """
         context, period_s = located.context, _shortest_period_s(frames)
-        if not isinstance(context, FrameContext) or context.camera.blind_estimate is None or period_s is None:
+        if not isinstance(context, FrameContext) or context.camera.hypothesis is None or period_s is None:
             return located
         too_long = context.camera.line_delay_s * context.frame.height / (period_s * SETTINGS.readout_slack)
         if too_long <= 1 and not self._little:
@@ -225,7 +225,7 @@ class _Clip:
         if not isinstance(first, FrameContext):
             return located
         self._start, chosen = agree(frames, first), first
-        if self._start is None and first.camera.blind_estimate is not None:
+        if self._start is None and first.camera.hypothesis is not None:
             for context in self._other_cameras(first, frames[1:]):
                 start = agree(frames, context)
                 if start is not None and (self._start is None or start.lead > self._start.lead):
@@ -237,9 +237,7 @@ class _Clip:
         for frame in frames:
             other = self._with_camera(frame)
             if isinstance(other, Located) and isinstance(other.context, FrameContext):
-                moved = replace(other.context, frame=first.frame, timer=first.timer)
-                # Other corners, be they equal, so that the strips are read from the first frame.
-                yield context_at(moved, first.corners.copy())
+                yield replace(other.context, frame=first.frame, corners=first.corners, timer=first.timer)
 
     def _take(self, frame: Frame) -> list[FrameResult]:
         timer = Timer()
@@ -410,14 +408,14 @@ class _Clip:
         acquisition = with_data(context, sampler, self._predicted(context) or acquire(context, sampler))
         if isinstance(acquisition, Failure):
             return acquisition
-        if context.camera.blind_estimate is None or self._start is not None:
+        if context.camera.hypothesis is None or self._start is not None:
             return _Settled(context, acquisition)
         received = receive_unknown(context, acquisition, self._options.skip)
         return self._settled(received)
 
     def _settled(self, received: Received) -> _Settled:
         """What was received, its camera being known from now on."""
-        camera = replace(received.context.camera, blind_estimate=None)
+        camera = replace(received.context.camera, hypothesis=None)
         context = replace(received.context, camera=camera)
         self._context = context
         return _Settled(context, received.acquisition, received.reception)
@@ -751,14 +749,11 @@ def _shortest_period_s(frames: Sequence[Frame]) -> float | None:
     return min(passed, default=None)
 
 
-def _moved_to(located: Located, corners: FloatArray, options: ReceiverOptions) -> Located:
-    """The same with the corners elsewhere; a lens that was seen in the sides between them is looked for there."""
+def _moved_to(located: Located, corners: FloatArray) -> Located:
+    """The same with the corners elsewhere."""
     context = located.context
     if isinstance(context, FrameContext) and corners is not context.corners:
-        estimated, found = context.camera.blind_estimate, None
-        if estimated is not None and estimated[1].side_curvature is not None:
-            found = likely_camera(context.frame, corners, options, context.timer)
-        context = found if isinstance(found, FrameContext) else context_at(context, corners)
+        context = replace(context, corners=corners)
     return Located(replace(located.outline, corners=corners), context)
 
 

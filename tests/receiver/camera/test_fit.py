@@ -1,4 +1,4 @@
-"""The camera once more from decoded slots, and the choice between several estimates."""
+"""An estimated camera fitted to decoded slots."""
 
 from __future__ import annotations
 
@@ -15,9 +15,11 @@ from rxcli.types import Clock, FloatArray
 WIDTH, ROWS, COLUMNS, LENGTH = 1600, 1200, 20, 130
 ROWS_PER_SLOT, EXPOSURE, START = 4.2, 1.7, -7.3
 BEND = np.array([-0.22, 0.1, 4e-4, -3e-4])
+#: Light spread of the screen, column pitches: hardly any.
+SPREAD = 0.1
 
 
-def _strips(rng: np.random.Generator, curvature: FloatArray, reverse: bool) -> tuple[blind.Strips, FloatArray]:
+def _strips(rng: np.random.Generator, curvature: FloatArray) -> tuple[blind.Strips, FloatArray]:
     """Strips of a textured picture whose sensor rows are bent, and the slots (C, N) that they show."""
     bits = [rng.integers(0, 2, payload_bits(w, 11), dtype=np.uint8) for w in rng.integers(3, 8, COLUMNS)]
     lit = np.stack([np.tile(encode_packet(b, _weight(b)), 3)[:300] for b in bits]).astype(np.float64)
@@ -45,32 +47,39 @@ def _strips(rng: np.random.Generator, curvature: FloatArray, reverse: bool) -> t
         width=WIDTH,
         height=ROWS,
     )
-    return (blind.in_readout_order(strips) if reverse else strips), lit
+    return strips, lit
 
 
 def _weight(bits: np.ndarray) -> int:
     return next(w for w in (3, 4, 5, 6, 7) if payload_bits(w, 11) == bits.size)
 
 
-def _estimate(curvature: FloatArray, reverse: bool) -> blind.BlindEstimate:
-    """A first estimate: a period that is off by a thousandth, half of the bend, an exposure too short."""
-    turned = curvature * np.array([1.0, 1.0, -1.0, 1.0]) if reverse else curvature
-    return blind.BlindEstimate(
+def _hypothesis(curvature: FloatArray, reverse: bool = False) -> blind.CameraHypothesis:
+    """A first estimate: a period that is off by a thousandth, most of the bend, an exposure too short."""
+    return blind.CameraHypothesis(
         rows_per_slot=1.001 * ROWS_PER_SLOT,
-        rows_per_slot_sd=0.001,
         packet_slots=LENGTH,
         reversed=reverse,
+        curvature=0.9 * _as_stored(curvature, reverse),
+        corrected=True,
         exposure_slots=1.3,
-        exposure_slots_sd=0.05,
-        curvature=0.9 * turned,
+        score=300.0,
+        rows_per_slot_sd=0.001,
         curvature_sd=np.full(4, 1e-3),
-        corrected=bool(curvature.any()),
-        log_evidence=300.0,
-        explained=0.5,
     )
 
 
-def _clock(estimate: blind.BlindEstimate) -> Clock:
+def _as_stored(curvature: FloatArray, reverse: bool) -> FloatArray:
+    return curvature * np.array([1.0, 1.0, -1.0, 1.0]) if reverse else curvature
+
+
+def _settled(
+    strips: blind.Strips, first: blind.CameraHypothesis, lit: FloatArray, tone: str | None = None
+) -> tuple[blind.CameraHypothesis, float]:
+    return blind.settle(strips, first, _clock(first), lit.astype(np.float32), SPREAD, tone=tone)
+
+
+def _clock(estimate: blind.CameraHypothesis) -> Clock:
     return Clock(
         rows_per_slot=estimate.rows_per_slot,
         exposure_slots=estimate.exposure_slots,
@@ -86,42 +95,45 @@ def _clock(estimate: blind.BlindEstimate) -> Clock:
 
 @pytest.mark.parametrize(("curvature", "reverse"), [(np.zeros(4), False), (BEND, False), (BEND, True)])
 def test_decoded_slots_correct_a_first_estimate(curvature: FloatArray, reverse: bool) -> None:
-    strips, lit = _strips(np.random.default_rng(11), curvature, reverse)
-    estimate = _estimate(curvature, reverse)
-    found, moved_slots = blind.refit(strips, estimate, _clock(estimate), lit.astype(np.float32))
+    strips, lit = _strips(np.random.default_rng(11), curvature)
+    found, moved_slots = _settled(strips, _hypothesis(curvature, reverse), lit)
     assert found.rows_per_slot == pytest.approx(ROWS_PER_SLOT, rel=2e-4)
     assert abs(found.rows_per_slot - ROWS_PER_SLOT) < 4 * found.rows_per_slot_sd
-    assert found.exposure_slots == pytest.approx(EXPOSURE, rel=0.06)
-    assert found.corrected == bool(curvature.any())
+    assert 1.3 < found.exposure_slots == pytest.approx(EXPOSURE, rel=0.06)
+    assert bool(found.curvature.any()) == bool(curvature.any())
     assert 0.1 < moved_slots < 2
     if curvature.any():
-        turned = curvature * np.array([1.0, 1.0, -1.0, 1.0]) if reverse else curvature
-        assert found.curvature[0] == pytest.approx(turned[0], abs=0.01)
+        assert found.curvature[0] == pytest.approx(_as_stored(curvature, reverse)[0], abs=0.01)
 
 
 def test_a_bend_that_is_none_is_taken_out() -> None:
-    strips, lit = _strips(np.random.default_rng(12), np.zeros(4), False)
-    wrong = replace(_estimate(np.zeros(4), False), curvature=np.array([0.01, 0.02, 0.0, 0.0]), corrected=True)
-    found, _ = blind.refit(strips, wrong, _clock(wrong), lit.astype(np.float32))
-    assert not found.corrected
+    strips, lit = _strips(np.random.default_rng(12), np.zeros(4))
+    found, _ = _settled(strips, replace(_hypothesis(np.zeros(4)), curvature=np.array([0.01, 0.02, 0.0, 0.0])), lit)
     assert not found.curvature.any()
     assert found.rows_per_slot == pytest.approx(ROWS_PER_SLOT, rel=2e-4)
 
 
+def test_a_distortion_that_is_left_in_the_picture_stays() -> None:
+    strips, lit = _strips(np.random.default_rng(12), np.zeros(4))
+    first = replace(_hypothesis(np.zeros(4)), curvature=np.array([0.1, -0.1, 0.0, 0.0]), corrected=False)
+    found, _ = _settled(strips, first, lit)
+    assert found.curvature is first.curvature
+    assert found.rows_per_slot == pytest.approx(ROWS_PER_SLOT, rel=2e-4)
+
+
 def test_slots_that_explain_nothing_change_nothing() -> None:
-    strips, lit = _strips(np.random.default_rng(13), np.zeros(4), False)
-    estimate = _estimate(np.zeros(4), False)
-    found, moved_slots = blind.refit(strips, estimate, _clock(estimate), np.full_like(lit, 0.5, np.float32))
-    assert found is estimate
+    strips, lit = _strips(np.random.default_rng(13), np.zeros(4))
+    first = _hypothesis(np.zeros(4))
+    found, moved_slots = _settled(strips, first, np.full_like(lit, 0.5))
+    assert found is first
     assert moved_slots == 0.0
 
 
 @pytest.mark.parametrize(("tone", "power", "exponent"), [("srgb", 1.0, 2.2), ("srgb", 2.2, 1.0), ("linear", 1.0, 1.0)])
 def test_light_that_bends_over_the_slots_tells_the_tone_curve(tone: str, power: float, exponent: float) -> None:
-    strips, lit = _strips(np.random.default_rng(15), np.zeros(4), False)
-    estimate = _estimate(np.zeros(4), False)
-    bent = replace(strips, light=np.maximum(strips.light, 0) ** np.float32(power), tone=tone)
-    found, _ = blind.refit(bent, estimate, _clock(estimate), lit.astype(np.float32))
+    strips, lit = _strips(np.random.default_rng(15), np.zeros(4))
+    bent = replace(strips, light=np.maximum(strips.light, 0) ** np.float32(power))
+    found, _ = _settled(bent, _hypothesis(np.zeros(4)), lit, tone)
     assert found.tone is not None
     assert found.tone[0] == pytest.approx(exponent, rel=0.2)
     assert abs(found.tone[0] - exponent) < 2 * found.tone[1]
@@ -130,17 +142,15 @@ def test_light_that_bends_over_the_slots_tells_the_tone_curve(tone: str, power: 
 
 
 def test_values_that_are_known_to_be_light_tell_no_tone_curve() -> None:
-    strips, lit = _strips(np.random.default_rng(15), np.zeros(4), False)
-    estimate = _estimate(np.zeros(4), False)
-    found, _ = blind.refit(strips, estimate, _clock(estimate), lit.astype(np.float32))
+    strips, lit = _strips(np.random.default_rng(15), np.zeros(4))
+    found, _ = _settled(strips, _hypothesis(np.zeros(4)), lit)
     assert found.tone is None
     assert "tone_exponent" not in blind.summary(found, 17300.0)
 
 
-def test_the_file_tells_the_least_exposure() -> None:
-    strips, lit = _strips(np.random.default_rng(14), np.zeros(4), False)
-    told = replace(_estimate(np.zeros(4), False), least_exposure_slots=2.0)
-    found, _ = blind.refit(strips, told, _clock(told), lit.astype(np.float32))
+def test_the_file_states_the_least_exposure() -> None:
+    strips, lit = _strips(np.random.default_rng(14), np.zeros(4))
+    found, _ = _settled(strips, replace(_hypothesis(np.zeros(4)), stated_exposure_slots=2.0), lit)
     assert found.exposure_slots == 2.0
     assert found.exposure_slots_sd == 0.0
     assert "exposure_s" not in blind.summary(found, 17300.0)

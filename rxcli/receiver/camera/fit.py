@@ -1,0 +1,218 @@
+"""The camera once more, from decoded slots: start, period and bend by least squares, exposure and tone curve.
+
+The slots, as probabilities seen through the exposure, predict the light of every strip on every row. What is missing
+is the derivative with respect to time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rxcli.numerics import TINY, local_mean
+from rxcli.receiver.camera.curvature import curvature_terms, reversed_curvature
+from rxcli.receiver.camera.proposals import CameraHypothesis
+from rxcli.receiver.camera.settings import SETTINGS
+from rxcli.receiver.camera.strips import Strips, joined
+from rxcli.receiver.light import SlotLight, light_of_columns
+from rxcli.types import Clock, Float32Array, FloatArray
+
+#: Rows over which the bend is straight: of a block of the normal equations.
+_BLOCK_ROWS = 16
+#: Inverse covariance of k1 k2 p1 p2 before the picture is seen: lenses bend back further out, k2 is about -k1.
+_PRECISION: FloatArray = np.diag(np.array([0.3, 0.6, 1.5e-3, 1.5e-3]) ** -2.0 * [1, 0, 1, 1])
+_PRECISION[:2, :2] += 0.2**-2
+#: Exponent that makes light of values, as nearly as a power does, by the tone curve that was undone.
+_EXPONENTS = {"srgb": 2.2, "linear": 1.0}
+
+
+def settle(
+    strips: Strips,
+    hypothesis: CameraHypothesis,
+    clock: Clock,
+    lit: Float32Array,
+    light_spread: float,
+    *,
+    may_bend: bool = True,
+    tone: str | None = None,
+) -> tuple[CameraHypothesis, float]:
+    """The hypothesis fitted to decoded slots, and how far that moves the clock anywhere on the screen, slots.
+
+    It comes back as it was, moved by nothing, where the slots explain too little.
+
+    Args:
+        strips: with rows in readout order.
+        hypothesis: the camera that the slots were received with.
+        clock: on which the slots stand, rows in readout order.
+        lit: (C, N) probability that each slot of the clock's grid is lit.
+        light_spread: sigma of the Gaussian that a column's light falls off with, column pitches.
+        may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
+        tone: the curve that was undone; None where values are known to follow light.
+    """
+    model = _Model(joined(strips, max(1, int(clock.rows_per_slot // 4))), lit, light_spread, clock.rows_per_slot)
+    bend = hypothesis.curvature * hypothesis.corrected
+    start = np.concatenate([[clock.row0, clock.rows_per_slot], _turned(bend, hypothesis)])
+    may_bend = may_bend and hypothesis.corrected
+    least = hypothesis.stated_exposure_slots
+    exposure, exposure_sd = model.exposure(start, max(clock.exposure_slots, least))
+    exposure = max(exposure, least)
+    values, covariance, near = model.fit(start, exposure, 6 if may_bend else 2)
+    if may_bend and _chi_square(values[2:], covariance[2:, 2:]) < SETTINGS.bent_chi_square:
+        values, covariance, near = model.fit(values * (np.arange(6) < 2), exposure, 2)
+    moved = float((np.abs(model.times(values) - model.times(start)) * model.strips.inside).max())
+    if near.explained < SETTINGS.min_explained or moved > SETTINGS.max_moved_slots:
+        return hypothesis, 0.0
+    sd = np.sqrt(np.diag(covariance))
+    found = replace(
+        hypothesis,
+        rows_per_slot=float(values[1]),
+        rows_per_slot_sd=float(sd[1]),
+        exposure_slots=exposure,
+        exposure_slots_sd=exposure_sd if exposure > least else 0.0,
+        tone=None if tone is None else model.tone(near, tone),
+    )
+    if hypothesis.corrected:
+        found = replace(found, curvature=_turned(values[2:], hypothesis), curvature_sd=sd[2:])
+    return found, moved
+
+
+def _turned(bend: FloatArray, hypothesis: CameraHypothesis) -> FloatArray:
+    """A bend with rows in the order of readout for one with rows as stored, or the other way round."""
+    return reversed_curvature(bend) if hypothesis.reversed else bend
+
+
+def _chi_square(values: FloatArray, covariance: FloatArray) -> float:
+    return float(values @ np.linalg.solve(covariance + TINY * np.eye(values.size), values))
+
+
+@dataclass(frozen=True, slots=True)
+class _Near:
+    """The light of strips (M, R) as a local level plus a local gain times a wave."""
+
+    wave: Float32Array
+    gain: Float32Array
+    residual: Float32Array
+    #: Inverse variance of the residuals thereabouts, noise included; 0 off the screen.
+    weight: Float32Array
+    #: Share of the light's local variance that the wave explains.
+    explained: float
+
+
+class _Model:
+    """Strips in readout order, and the slots (C, N) that explain their light.
+
+    A row-time map is (6,) start, rows per slot, k1, k2, p1, p2.
+    """
+
+    def __init__(self, strips: Strips, lit: Float32Array, light_spread: float, rows_per_slot: float) -> None:
+        shares = light_of_columns(strips.light.shape[0], strips.n_columns, light_spread)
+        mixed = np.asarray(shares / shares.sum(axis=1, keepdims=True) @ lit, np.float32)
+        self.strips = strips
+        self._slots = SlotLight(mixed, 0.5)
+        self._window = max(round(SETTINGS.picture_slots * rows_per_slot / strips.pitch), 1)
+        self._inside = local_mean(strips.inside, self._window) + np.float32(1e-3)
+        self._mean = self._local(strips.light)
+        n = strips.rows.size
+        #: Rows at the borders of blocks, and the bend terms (4, M, blocks + 1) there.
+        self._nodes = np.minimum(np.arange(-(-n // _BLOCK_ROWS) + 1) * _BLOCK_ROWS, n - 1)
+        self._terms = curvature_terms(strips.x[:, self._nodes], strips.rows[self._nodes], strips.width, strips.height)
+
+    def times(self, values: FloatArray) -> Float32Array:
+        """(M, R) slot position of every strip's row; the bend is interpolated between the blocks' borders."""
+        n, (start, rows_per_slot) = self.strips.rows.size, values[:2]
+        straight = ((self.strips.rows - start) / rows_per_slot).astype(np.float32)
+        moved = (np.tensordot(values[2:], self._terms, 1) / rows_per_slot).astype(np.float32)[..., None]
+        along = np.arange(_BLOCK_ROWS) / np.maximum(np.diff(self._nodes), 1)[:, None]
+        bent: Float32Array = moved[:, :-1] + np.diff(moved, axis=1) * along.astype(np.float32)
+        return np.asarray(bent.reshape(len(bent), -1)[:, :n] + straight, np.float32)
+
+    def exposure(self, values: FloatArray, exposure_slots: float) -> tuple[float, float]:
+        """The exposure near one that leaves least, and its standard deviation, slots."""
+        times, tried = self.times(values), exposure_slots * np.array(SETTINGS.exposure_factors)
+        left = [1 - self._near(self._slots.seen(times, exposure)).explained for exposure in tried.tolist()]
+        misfit = np.log(np.maximum(left, TINY))
+        at = int(np.clip(misfit.argmin(), 1, tried.size - 2))
+        curve, slope, _ = np.polyfit(tried[at - 1 : at + 2], misfit[at - 1 : at + 2], 2)
+        if curve <= 0:
+            return float(tried[misfit.argmin()]), 0.3 * exposure_slots
+        n_slots = self.strips.n_columns * float(np.ptp(self.strips.rows)) / values[1]
+        return float(np.clip(-slope / (2 * curve), tried[0], tried[-1])), float(np.sqrt(1 / (curve * n_slots)))
+
+    def fit(self, values: FloatArray, exposure_slots: float, n_free: int) -> tuple[FloatArray, FloatArray, _Near]:
+        """Gauss-Newton on the first `n_free` values: the row-time map, its covariance, the fit."""
+        times = self.times(values)
+        for _ in range(SETTINGS.settle_steps):
+            wave, slope = self._slots.seen_with_slope(times, exposure_slots)
+            near = self._near(wave)
+            step, covariance = self._step(values, times, near, slope, n_free)
+            values = values + step
+            before, times = times, self.times(values)
+            if float(np.abs(times - before)[:, ::_BLOCK_ROWS].max()) < SETTINGS.converged_slots:
+                break
+        return values, covariance, near
+
+    def tone(self, near: _Near, undone: str) -> tuple[float, float] | None:
+        """The exponent that makes light of the picture's values, and its standard deviation.
+
+        Where values follow light they lie on a line over the shares of a slot that rows see. Light to the power of p is
+        bent by what w^p is above or below w. None where no row sees shares between none and all.
+        """
+        wave, light = near.wave, self.strips.light - self._mean
+
+        def by_column(values: Float32Array) -> FloatArray:
+            return np.asarray((values * near.weight).reshape(self.strips.n_columns, -1).sum(axis=1, dtype=np.float64))
+
+        line, arc = ((values - self._local(values)) * near.gain for values in (wave, wave * (1 - wave)))
+        on_line = by_column(arc * line) / np.maximum(by_column(line * line), TINY)
+        pull = by_column(arc * light) - on_line * by_column(line * light)
+        information = by_column(arc * arc) - on_line * by_column(arc * line)
+        if information.sum() <= 0:
+            return None
+        bend = pull.sum() / information.sum()
+        sd = np.hypot(np.linalg.norm(pull - bend * information) / information.sum(), SETTINGS.tone_bend_sd)
+        half = max(0.5 + bend / 4, SETTINGS.min_half)
+        power = -np.log2(half)
+        exponent = _EXPONENTS[undone] / power
+        return float(exponent), float(exponent * sd / (4 * np.log(2) * half * power))
+
+    def _local(self, values: Float32Array) -> Float32Array:
+        """Mean of values (M, R) over the screen within the window."""
+        return np.asarray(local_mean(values * self.strips.inside, self._window) / self._inside)
+
+    def _near(self, wave: Float32Array) -> _Near:
+        light, inside = self.strips.light, self.strips.inside
+        mean = self._local(wave)
+        covariance = self._local(light * wave) - self._mean * mean
+        variance = self._local(wave * wave) - mean * mean
+        gain = np.asarray(np.maximum(covariance, 0) / (variance + np.float32(0.02)), np.float32)
+        residual = (light - self._mean - gain * (wave - mean)) * inside
+        weight = inside / (self._local(residual * residual) + self.strips.noise.variance(self._mean))
+        power, left = (float((square * weight).sum()) for square in (gain * gain * variance, residual * residual))
+        return _Near(wave, gain, residual, weight, power / max(power + left, TINY))
+
+    def _step(
+        self, values: FloatArray, times: Float32Array, near: _Near, slope: Float32Array, n_free: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Step (6,) of the row-time map and its covariance, by what the columns differ in."""
+        power = near.gain * slope
+        blocks = np.arange(0, self.strips.rows.size, _BLOCK_ROWS)
+        information = np.add.reduceat(near.weight * power * power, blocks, axis=1).astype(np.float64)
+        pull = np.add.reduceat(near.weight * power * near.residual, blocks, axis=1).astype(np.float64)
+        middle = np.minimum(blocks + _BLOCK_ROWS // 2, times.shape[1] - 1)
+        bend = (self._terms[:, :, :-1] + self._terms[:, :, 1:]) / 2
+        jacobian = np.concatenate([np.full((1, *pull.shape), -1.0), -times[None, :, middle], bend])[:n_free] / values[1]
+        flat = jacobian.reshape(n_free, -1)
+        prior = np.zeros((6, 6))
+        prior[2:, 2:] = SETTINGS.samples_as_one * _PRECISION
+        prior = prior[:n_free, :n_free]
+        inverse = np.linalg.inv((flat * information.ravel()) @ flat.T + prior + TINY * np.eye(n_free))
+        step = np.zeros(6)
+        step[:n_free] = inverse @ (flat @ pull.ravel() - prior @ values[:n_free])
+        n_columns = self.strips.n_columns
+        spread = (jacobian * pull).reshape(n_free, n_columns, -1).sum(axis=2)
+        spread -= spread.mean(axis=1, keepdims=True)
+        scale = SETTINGS.sd_scale**2 * n_columns / max(n_columns - 1, 1)
+        covariance = np.zeros((6, 6))
+        covariance[:n_free, :n_free] = scale * inverse @ (spread @ spread.T) @ inverse
+        return step, covariance

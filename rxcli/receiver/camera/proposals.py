@@ -1,0 +1,245 @@
+"""Hypotheses of an unknown camera, best first, from one picture of a sending screen. Nothing is decided here.
+
+Neighbouring strips show the same slots, so the lag between them is the slope of the stripes: the bend. Edges fall
+between slots, so their power has a spectral line at the rate of the slots; columns repeat themselves a packet later.
+The periods that stand out so are scored by the header's correlation there. Read backwards the header is its own
+complement, so the sign tells the direction of readout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rxcli.numerics import folded, header_correlation, local_mean
+from rxcli.profiles import ScreenProfile
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.receiver.camera.curvature import estimate_curvature, straightened
+from rxcli.receiver.camera.settings import SETTINGS
+from rxcli.receiver.camera.strips import Strips, columns_of, joined, levelled
+from rxcli.types import Float32Array, FloatArray
+
+#: Samples a slot at which headers are sought; bins of the spectrum to a line's width.
+_SAMPLES, _FINE = 4, 4
+
+
+@dataclass(frozen=True, slots=True)
+class CameraHypothesis:
+    """A camera that may have taken a picture, with standard deviations where its slots were fitted."""
+
+    rows_per_slot: float
+    packet_slots: int
+    #: True where the picture's rows run against the readout.
+    reversed: bool
+    #: (4,) k1 k2 p1 p2 for a focal length of one picture width, 0 where there is no distortion; and whether the camera
+    #: took it out of its picture, whose stripes are bent then. Otherwise the screen's sides are.
+    curvature: FloatArray
+    corrected: bool
+    exposure_slots: float
+    #: Twice a log-likelihood ratio, roughly, of what stands out over chance.
+    score: float
+    rows_per_slot_sd: float
+    curvature_sd: FloatArray
+    #: 0 where it was not measured.
+    exposure_slots_sd: float = 0.0
+    #: Exposure that the file states, 0 where it does not: the least there can be.
+    stated_exposure_slots: float = 0.0
+    #: Exponent that makes light of the picture's values, and its standard deviation; None where it was not measured.
+    tone: tuple[float, float] | None = None
+
+
+def propose(
+    strips: Strips,
+    screens: Sequence[ScreenProfile],
+    exposure_s: float | None = None,
+    *,
+    distortion: tuple[float, float] | None = None,
+    may_bend: bool = True,
+) -> Iterator[CameraHypothesis]:
+    """Cameras that may have taken a picture, best first; a second few, from wider levels, after the first.
+
+    Args:
+        strips: of the picture as it is stored.
+        screens: screens that it may show, at least one.
+        exposure_s: exposure, None where the file does not state it.
+        distortion: k1 of a lens that bows the screen's sides (focal length of one picture width, k2 = -k1) and its
+            standard deviation; None where the sides may be straight.
+        may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
+
+    Raises:
+        ValueError: no screens.
+    """
+    if not screens:
+        raise ValueError("screens must name at least one screen (got none)")
+    width = stripe_rows(strips)
+    if width <= 0:
+        return
+    rates = {screen.packet_slots: screen.slot_rate_hz for screen in reversed(screens)}
+    exposures = {length: (exposure_s or 0.0) * rate for length, rate in rates.items()}
+    coarse = joined(strips, max(1, int(width / SETTINGS.rows_per_width)))
+    bends: list[FloatArray] | None = None
+    proposed: list[CameraHypothesis] = []
+    for widths, n_proposed in zip(SETTINGS.level_widths, SETTINGS.n_proposed, strict=True):
+        level, weight = levelled(coarse.light, coarse.inside, round(widths * width / coarse.pitch), coarse.noise)
+        level *= weight
+        if bends is None:
+            # Stripes that are bent beyond doubt say that something else was taken for bowed sides.
+            bends = _bends(coarse, level)[: 1 if distortion else None] if may_bend else [np.zeros(4)]
+        found = [one for bend in bends for one in _clocks(coarse, level, bend, width, exposures)]
+        distinct: list[CameraHypothesis] = []
+        for one in sorted(found, key=lambda one: -one.score):
+            if len(distinct) < n_proposed and not any(_same(one, other) for other in proposed + distinct):
+                distinct.append(one)
+        proposed += distinct
+        yield from (_left_in(one, *distortion) if distortion and not one.curvature.any() else one for one in distinct)
+
+
+def _left_in(hypothesis: CameraHypothesis, k1: float, sd: float) -> CameraHypothesis:
+    """The hypothesis with a lens distortion that is left in the picture."""
+    curvature, curvature_sd = np.array([k1, -k1, 0.0, 0.0]), np.array([sd, sd, 0.0, 0.0])
+    return replace(hypothesis, curvature=curvature, curvature_sd=curvature_sd, corrected=False)
+
+
+def stripe_rows(strips: Strips) -> float:
+    """Rows of the lag at which columns are half as like themselves as a row later; 0 where there are no stripes.
+
+    Texture that is wider than the stripes counts as well, so that levels follow what was found.
+    """
+    width = float(SETTINGS.first_width_rows)
+    for _ in range(SETTINGS.width_rounds):
+        window = round(SETTINGS.scale_widths * width)
+        level, weight = levelled(strips.light, strips.inside, window, strips.noise)
+        width = _half_width(_autocorrelation(columns_of(level * weight, strips.n_columns)))
+        if width <= 0:
+            break
+    return width
+
+
+def _half_width(correlation: FloatArray) -> float:
+    """Lag at which an autocorrelation is half of that at lag 1; 0 where there is none."""
+    top = correlation[1] if correlation.size > 2 else 0.0
+    below = np.flatnonzero(correlation[1:] < top / 2)
+    if top <= 0 or below.size == 0:
+        return 0.0
+    lag = int(below[0]) + 1
+    return float(lag - (top / 2 - correlation[lag]) / max(correlation[lag - 1] - correlation[lag], 1e-12))
+
+
+def _bends(strips: Strips, level: Float32Array) -> list[FloatArray]:
+    """Bends (4,) that are worth a look."""
+    curvature, gain = estimate_curvature(strips, level)
+    possible, sure = SETTINGS.bend_gains
+    return ([np.zeros(4)] if gain < sure else []) + ([curvature] if gain > possible else [])
+
+
+def _same(one: CameraHypothesis, other: CameraHypothesis) -> bool:
+    return (
+        abs(np.log(one.rows_per_slot / other.rows_per_slot)) < SETTINGS.same_clock
+        and (one.reversed, one.packet_slots) == (other.reversed, other.packet_slots)
+        and bool(one.curvature.any()) == bool(other.curvature.any())
+    )
+
+
+def _clocks(
+    strips: Strips, level: Float32Array, bend: FloatArray, width: float, exposures: dict[int, float]
+) -> Iterator[CameraHypothesis]:
+    """Clocks that stand out on stripes of one bend, in any order."""
+    columns = columns_of(straightened(strips, level, bend), strips.n_columns)
+    n_rows, pitch = columns.shape[1], strips.pitch
+    correlation = _autocorrelation(columns)
+    shortest, longest = (width / slots / pitch for slots in reversed(SETTINGS.half_width_slots))
+    shortest = max(shortest, SETTINGS.min_rows_per_slot / pitch)
+    # The line: places are cycles over the picture, times _FINE.
+    line = _slot_line(columns)
+    low, high = (int(_FINE * n_rows / rows) for rows in (longest, shortest))
+    lines = _FINE * n_rows / (low + _peaks(line[low : high + 2], SETTINGS.n_lines, 2 * _FINE))
+    copies = _surprise(correlation, round(2 * SLOTS_PER_SYMBOL * shortest))
+    total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
+    for length, exposure in exposures.items():
+        first, last = (int(rows * length) for rows in (shortest, longest))
+        lags = first + _peaks(copies[first : last + 1], SETTINGS.n_copies, max(round(2 * shortest), 1))
+        for rows in np.concatenate([lines, lags / length]).tolist():
+            if rows * (length - PREAMBLE_SLOTS) > n_rows:
+                continue  # No payload is in view as a whole.
+            common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
+            common += 2 * min(float(np.interp(_FINE * n_rows / rows, np.arange(line.size), line)), SETTINGS.max_line)
+            for is_reversed, header in enumerate(_header_peaks(total, rows, length)):
+                score = max(header, 0.0) ** 2 + common
+                if score < SETTINGS.min_score:
+                    continue
+                yield CameraHypothesis(
+                    rows_per_slot=rows * pitch,
+                    packet_slots=length,
+                    reversed=bool(is_reversed),
+                    curvature=bend,
+                    corrected=True,
+                    exposure_slots=exposure or 1.0,
+                    score=score,
+                    # A period that is off by a quarter of a slot over the picture shows as well.
+                    rows_per_slot_sd=rows * rows * pitch / (4 * n_rows),
+                    curvature_sd=np.abs(bend) / 4,
+                    stated_exposure_slots=exposure,
+                )
+
+
+def _autocorrelation(columns: Float32Array) -> FloatArray:
+    """(R,) sum over columns (C, R) of the product with the same column later."""
+    n = columns.shape[1]
+    size = 1 << int(np.ceil(np.log2(2 * n)))
+    spectrum = np.fft.rfft(columns, size, axis=1)
+    return np.asarray(np.fft.irfft((spectrum * spectrum.conj()).real.sum(axis=0), size)[:n])
+
+
+def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:
+    """(R,) excess of an autocorrelation over its median, in standard deviations of lags from `shortest` on."""
+    n = correlation.size
+    scaled = correlation / np.sqrt(np.arange(n, 0, -1))
+    part = scaled[min(shortest, n // 2) : max(n - SLOTS_PER_SYMBOL, n // 2 + 1)]
+    middle = float(np.median(part))
+    out = np.maximum(scaled - middle, 0) / (1.4826 * float(np.median(np.abs(part - middle))) + 1e-9)
+    # Hardly any row overlaps there.
+    out[-SLOTS_PER_SYMBOL:] = 0
+    return np.asarray(out)
+
+
+def _slot_line(columns: Float32Array) -> FloatArray:
+    """Spectrum of the edges' power, log-likelihood ratio over chance, by cycles over the picture times _FINE."""
+    steps = np.diff(columns, axis=1)
+    square = np.asarray(steps * steps, np.float32)
+    power = (square - local_mean(square, SETTINGS.edge_level_rows)).sum(axis=0, dtype=np.float64)
+    spectrum = np.abs(np.fft.rfft(power, _FINE * columns.shape[1])) ** 2
+    return np.asarray(spectrum / max(float(power @ power), 1e-30))
+
+
+def _peaks(values: FloatArray, n: int, distance: int) -> FloatArray:
+    """Places of the `n` highest peaks, by parabolas; none nearer to a higher one than `distance`."""
+    inner = np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])) + 1
+    chosen: list[int] = []
+    for at in inner[np.argsort(-values[inner])].tolist():
+        if len(chosen) < n and all(abs(at - other) >= distance for other in chosen):
+            chosen.append(at)
+    at = np.array(chosen, np.int64)
+    before, here, after = values[at - 1], values[at], values[at + 1]
+    return np.asarray(at + 0.5 * (before - after) / (before - 2 * here + after))
+
+
+def _header_peaks(total: FloatArray, rows_per_slot: float, packet_slots: int) -> tuple[float, float]:
+    """Highest peaks of the folded header correlation, in deviations: of headers as sent, and of ones read backwards.
+
+    Args:
+        total: (R + 1,) running sum of the columns' mean.
+        rows_per_slot: rows a slot.
+        packet_slots: slots of a packet.
+    """
+    step = rows_per_slot / _SAMPLES
+    places = np.arange(int((total.size - 1) / step) + 1) * step
+    response = header_correlation(np.interp(places, np.arange(total.size), total), _SAMPLES) / step
+    if response.size == 0:
+        return 0.0, 0.0
+    spread = 1.4826 * float(np.median(np.abs(response))) + 1e-6
+    period = packet_slots * _SAMPLES
+    n_copies = folded(np.ones(response.size), period)
+    score = folded(response, period) / np.sqrt(np.maximum(n_copies, 1)) / spread
+    return float(score.max()), float(-score.min())
