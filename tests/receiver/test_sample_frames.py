@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+from itertools import permutations
 from pathlib import Path
 
 import pytest
@@ -32,3 +34,20 @@ def test_samples_decode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         assert found["expected"] == expected
         assert found["error_free"] >= floor, name
         assert (found["false"], found["wrong_w"]) == (0, 0), name
+
+
+def test_results_depend_on_neither_order_nor_workers_nor_earlier_runs(tmp_path: Path) -> None:
+    """Byte for byte, but for the times: in three orders in one process, and with 1, 2 and 4 workers."""
+    samples = [str(data_dir("sample_frames") / name) for name in FLOORS]
+    orders = [list(order) for order in permutations(samples)][::2]
+    results = []
+    for number, (order, workers) in enumerate([*((order, 1) for order in orders), (samples, 2), (samples, 4)]):
+        out = tmp_path / f"{number}.jsonl"
+        assert run(["decode", *order, "--json", str(out), "--quiet", "--workers", str(workers)]) == ExitCode.OK
+        lines = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
+        assert lines[0].pop("run")  # the options, with the first line of a file
+        assert all(line.pop("timing_ms") for line in lines)
+        by_source = {source: [line for line in lines if line.get("source") == source] for source in samples}
+        results.append(json.dumps(by_source))
+    assert {len(json.loads(result)[samples[1]]) for result in results} == {24}
+    assert len(set(results)) == 1
