@@ -6,6 +6,7 @@ driver dropped, gives the time of each, refuses a pixel format instead of silent
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import math
 import mmap
@@ -293,7 +294,7 @@ class Camera:
             sequence = buffer.sequence
             self._offer(buffer)
 
-    def _dequeue(self) -> abi.Buffer | None:
+    def _dequeue(self) -> ctypes.Structure | None:
         """A filled buffer, None where there is none yet."""
         if not select.select([self._descriptor], [], [], _POLL_S)[0]:
             return None
@@ -305,7 +306,7 @@ class Camera:
             return None
         return buffer
 
-    def _offer(self, buffer: abi.Buffer) -> None:
+    def _offer(self, buffer: ctypes.Structure) -> None:
         """Make a capture the newest; the one that it replaces goes back to the driver unseen."""
         if buffer.flags & abi.BUF_FLAG_ERROR:
             self.counts.damaged += 1
@@ -603,7 +604,7 @@ def _set(descriptor: int, control: int, value: int) -> int | None:
     return int(state.value)
 
 
-def _buffer(index: int) -> abi.Buffer:
+def _buffer(index: int) -> ctypes.Structure:
     return abi.Buffer(index=index, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
 
 

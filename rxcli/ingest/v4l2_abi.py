@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import fcntl
+from typing import Any
 
 CAP_VIDEO_CAPTURE, CAP_STREAMING, CAP_DEVICE_CAPS = 0x00000001, 0x04000000, 0x80000000
 BUF_TYPE_VIDEO_CAPTURE = 1
@@ -21,145 +22,55 @@ EXPOSURE_MANUAL = 1
 #: Unit of CID_EXPOSURE_ABSOLUTE, seconds.
 EXPOSURE_UNIT_S = 100e-6
 
-_u32, _i32 = ctypes.c_uint32, ctypes.c_int32
+#: Letters of `_structure`, as in the module struct; where there is none, a field is a __u32.
+_TYPES: dict[str, Any] = {
+    "": ctypes.c_uint32,
+    "I": ctypes.c_uint32,
+    "i": ctypes.c_int32,
+    "q": ctypes.c_int64,
+    "Q": ctypes.c_uint64,
+    "s": ctypes.c_char,
+    "B": ctypes.c_uint8,
+}
 
 
-class Capability(ctypes.Structure):
-    """struct v4l2_capability"""
-
-    _fields_ = [
-        ("driver", ctypes.c_char * 16),
-        ("card", ctypes.c_char * 32),
-        ("bus_info", ctypes.c_char * 32),
-        ("version", _u32),
-        ("capabilities", _u32),
-        ("device_caps", _u32),
-        ("reserved", _u32 * 3),
-    ]
+def _structure(name: str, fields: str) -> type[ctypes.Structure]:
+    """The structure of that name in linux/videodev2.h; a field is NAME, NAME:i or NAME:32s."""
+    found = []
+    for field in fields.split():
+        label, _, form = field.partition(":")
+        kind, count = _TYPES[form[-1:]], form[:-1]
+        found.append((label, kind * int(count) if count else kind))
+    return type(name, (ctypes.Structure,), {"_fields_": found})
 
 
-class FormatDescription(ctypes.Structure):
-    """struct v4l2_fmtdesc"""
-
-    _fields_ = [
-        ("index", _u32),
-        ("type", _u32),
-        ("flags", _u32),
-        ("description", ctypes.c_char * 32),
-        ("pixelformat", _u32),
-        ("mbus_code", _u32),
-        ("reserved", _u32 * 3),
-    ]
-
-
-class FrameSize(ctypes.Structure):
-    """struct v4l2_frmsizeenum; the union holds width and height, or min, max, step of both."""
-
-    _fields_ = [("index", _u32), ("pixel_format", _u32), ("type", _u32), ("size", _u32 * 6), ("reserved", _u32 * 2)]
-
-
-class FrameInterval(ctypes.Structure):
-    """struct v4l2_frmivalenum; the union holds one fraction, or min, max, step."""
-
-    _fields_ = [
-        ("index", _u32),
-        ("pixel_format", _u32),
-        ("width", _u32),
-        ("height", _u32),
-        ("type", _u32),
-        ("interval", _u32 * 6),
-        ("reserved", _u32 * 2),
-    ]
-
-
-class Format(ctypes.Structure):
-    """struct v4l2_format with its v4l2_pix_format; the union is aligned to 8 bytes."""
-
-    _fields_ = [
-        ("type", _u32),
-        ("padding", _u32),
-        ("width", _u32),
-        ("height", _u32),
-        ("pixelformat", _u32),
-        ("field", _u32),
-        ("bytesperline", _u32),
-        ("sizeimage", _u32),
-        ("colorspace", _u32),
-        ("priv", _u32),
-        ("flags", _u32),
-        ("ycbcr_enc", _u32),
-        ("quantization", _u32),
-        ("xfer_func", _u32),
-        ("rest", ctypes.c_uint8 * 152),
-    ]
-
-
-class StreamParameters(ctypes.Structure):
-    """struct v4l2_streamparm with its v4l2_captureparm."""
-
-    _fields_ = [
-        ("type", _u32),
-        ("capability", _u32),
-        ("capturemode", _u32),
-        ("numerator", _u32),
-        ("denominator", _u32),
-        ("rest", ctypes.c_uint8 * 184),
-    ]
-
-
-class RequestBuffers(ctypes.Structure):
-    """struct v4l2_requestbuffers"""
-
-    _fields_ = [("count", _u32), ("type", _u32), ("memory", _u32), ("capabilities", _u32), ("flags", _u32)]
-
-
-class Buffer(ctypes.Structure):
-    """struct v4l2_buffer"""
-
-    _fields_ = [
-        ("index", _u32),
-        ("type", _u32),
-        ("bytesused", _u32),
-        ("flags", _u32),
-        ("field", _u32),
-        ("seconds", ctypes.c_int64),
-        ("microseconds", ctypes.c_int64),
-        ("timecode", _u32 * 4),
-        ("sequence", _u32),
-        ("memory", _u32),
-        ("offset", ctypes.c_uint64),
-        ("length", _u32),
-        ("reserved2", _u32),
-        ("request_fd", _u32),
-    ]
-
-
-class ControlRange(ctypes.Structure):
-    """struct v4l2_queryctrl"""
-
-    _fields_ = [
-        ("id", _u32),
-        ("type", _u32),
-        ("name", ctypes.c_char * 32),
-        ("minimum", _i32),
-        ("maximum", _i32),
-        ("step", _i32),
-        ("default_value", _i32),
-        ("flags", _u32),
-        ("reserved", _u32 * 2),
-    ]
-
-
-class Control(ctypes.Structure):
-    """struct v4l2_control"""
-
-    _fields_ = [("id", _u32), ("value", _i32)]
-
-
-class BufferType(ctypes.Structure):
-    """The int that VIDIOC_STREAMON takes."""
-
-    _fields_ = [("value", _i32)]
+Capability = _structure(
+    "v4l2_capability", "driver:16s card:32s bus_info:32s version capabilities device_caps reserved:3I"
+)
+FormatDescription = _structure("v4l2_fmtdesc", "index type flags description:32s pixelformat mbus_code reserved:3I")
+#: `size` holds width and height, or min, max, step of both; `interval` one fraction, or min, max, step.
+FrameSize = _structure("v4l2_frmsizeenum", "index pixel_format type size:6I reserved:2I")
+FrameInterval = _structure("v4l2_frmivalenum", "index pixel_format width height type interval:6I reserved:2I")
+#: With its v4l2_pix_format; the union is aligned to 8 bytes.
+Format = _structure(
+    "v4l2_format",
+    "type padding width height pixelformat field bytesperline sizeimage colorspace priv flags ycbcr_enc quantization "
+    "xfer_func rest:152B",
+)
+#: With its v4l2_captureparm.
+StreamParameters = _structure("v4l2_streamparm", "type capability capturemode numerator denominator rest:184B")
+RequestBuffers = _structure("v4l2_requestbuffers", "count type memory capabilities flags")
+Buffer = _structure(
+    "v4l2_buffer",
+    "index type bytesused flags field seconds:q microseconds:q timecode:4I sequence memory offset:Q length reserved2 "
+    "request_fd",
+)
+ControlRange = _structure(
+    "v4l2_queryctrl", "id type name:32s minimum:i maximum:i step:i default_value:i flags reserved:2I"
+)
+Control = _structure("v4l2_control", "id value:i")
+#: The int that VIDIOC_STREAMON takes.
+BufferType = _structure("int", "value:i")
 
 
 def _request(direction: int, number: int, structure: type[ctypes.Structure]) -> int:
