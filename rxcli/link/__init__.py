@@ -25,35 +25,12 @@ pixels.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from rxcli.link.collector import Collector as Collector
-    from rxcli.link.encoder import Sending as Sending
-    from rxcli.link.encoder import file_object as file_object
-    from rxcli.link.encoder import message as message
-    from rxcli.link.receiver import LinkReceiver as LinkReceiver
-    from rxcli.types import FrameSoftBits as FrameSoftBits
-    from rxcli.types import Message as Message
-    from rxcli.types import ObjectProgress as ObjectProgress
-    from rxcli.types import ReceivedObject as ReceivedObject
-
-_HOME = {
-    "Collector": "rxcli.link.collector",
-    "Sending": "rxcli.link.encoder",
-    "file_object": "rxcli.link.encoder",
-    "message": "rxcli.link.encoder",
-    "LinkReceiver": "rxcli.link.receiver",
-    "FrameSoftBits": "rxcli.types",
-    "Message": "rxcli.types",
-    "ObjectProgress": "rxcli.types",
-    "ReceivedObject": "rxcli.types",
-}
-__all__ = list(_HOME)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_HOME[name]), name)
+from rxcli.link.collector import Collector as Collector
+from rxcli.link.encoder import Sending as Sending
+from rxcli.link.encoder import file_object as file_object
+from rxcli.link.encoder import message as message
+from rxcli.link.receiver import LinkReceiver as LinkReceiver
+from rxcli.types import FrameSoftBits as FrameSoftBits
+from rxcli.types import Message as Message
+from rxcli.types import ObjectProgress as ObjectProgress
+from rxcli.types import ReceivedObject as ReceivedObject

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from rxcli.link.files import MAX_OBJECT_BYTES, FilesUnderWay
+from rxcli.link.files import FilesUnderWay
 from rxcli.link.receiver import LinkReceiver
 from rxcli.link.softbits import Event
 from rxcli.profiles import ScreenProfile
@@ -20,18 +20,11 @@ class Collector:
     Args:
         screens: profiles that results may name.
         file_memory_mb: bound of all files under way, 2^20 bytes.
-        max_object_bytes: longer files are refused.
     """
 
-    def __init__(
-        self,
-        screens: Sequence[ScreenProfile],
-        file_memory_mb: int = FILE_MEMORY_MB,
-        max_object_bytes: int = MAX_OBJECT_BYTES,
-    ) -> None:
+    def __init__(self, screens: Sequence[ScreenProfile], file_memory_mb: int = FILE_MEMORY_MB) -> None:
         self._under_way = FilesUnderWay(file_memory_mb)
         self._shapes = {screen.name: (screen.columns, screen.payload_symbols) for screen in screens}
-        self._max_bytes = max_object_bytes
         #: By the columns and symbols of a packet, and whether columns are counted from the other side.
         self._receivers: dict[tuple[int, int, bool], LinkReceiver] = {}
         #: Whether columns are counted from the other side; None: nothing has come that would say so.
@@ -59,7 +52,7 @@ class Collector:
         if shape is None or soft.llr.shape[1:3] != shape[::-1]:
             return []
         if (*shape, turned) not in self._receivers:
-            self._receivers[*shape, turned] = LinkReceiver(*shape, self._max_bytes, self._under_way)
+            self._receivers[*shape, turned] = LinkReceiver(*shape, self._under_way)
         receiver = self._receivers[*shape, turned]
         events = receiver.add(replace(soft, llr=soft.llr[:, :, ::-1]) if turned else soft)
         if self._turned is None and (events or receiver.progress):

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import UsageError
 from rxcli.link import ldpc
-from rxcli.link.formats import Announcement, beacon_body, block_prefix, pack_container, protect
-from rxcli.link.formats import protect_beacon as _protect_beacon
+from rxcli.link.formats import Announcement, beacon_body, block_prefix, pack_container, protect, protect_beacon
 from rxcli.link.layout import (
     ANNOUNCEMENT_PERIOD,
     LABEL_BITS,
@@ -33,27 +31,6 @@ _LABEL_WEIGHTS = 1 << np.arange(LABEL_BITS - 1, -1, -1)
 _BATCH = 64
 
 Labels = NDArray[np.uint8]
-
-
-class Sending(Protocol):
-    """Something that is sent until it is stopped."""
-
-    def labels(self, bursts: Places, columns: int, payload_symbols: int) -> Labels:
-        """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
-        ...
-
-    def check(self, weights: NDArray[np.int64], payload_symbols: int) -> None:
-        """Refuse what columns of these weights (C,) cannot carry."""
-        ...
-
-    def usual_bursts(self, columns: int, payload_symbols: int) -> int:
-        """How many bursts are sent where nothing else is asked for."""
-        ...
-
-    @property
-    def summary(self) -> str:
-        """One line for people."""
-        ...
 
 
 def _bits(data: bytes) -> NDArray[np.uint8]:
@@ -95,7 +72,7 @@ class MessageSending:
         return beacon_layout(len(self.body), columns, payload_symbols).period
 
     def _buffer(self, layout: BeaconLayout) -> NDArray[np.uint8]:
-        buffer: NDArray[np.uint8] = ldpc.encode(layout.code, _bits(_protect_beacon(self.body))[None])[0]
+        buffer: NDArray[np.uint8] = ldpc.encode(layout.code, _bits(protect_beacon(self.body))[None])[0]
         return buffer
 
     @property
@@ -207,6 +184,10 @@ class FileSending:
             f"file {self.name}, container of {len(self.container)} bytes in {layout.n_blocks} "
             f"block{'s' * (layout.n_blocks > 1)}"
         )
+
+
+#: Something that is sent until it is stopped.
+Sending = MessageSending | FileSending
 
 
 def file_object(name: str, data: bytes, object_id: int | None = None, mother: int = 2) -> FileSending:

@@ -29,7 +29,7 @@ from rxcli.link.softbits import (
     log_likelihood,
     surprise,
 )
-from rxcli.types import FILE_MEMORY_MB, FrameSoftBits
+from rxcli.types import FILE_MEMORY_MB, FrameSoftBits, ObjectProgress
 
 _LN2 = float(np.log(2.0))
 #: Information of an announcement from which on it is tried, in its bits, and the log-likelihood of its copies.
@@ -49,7 +49,7 @@ _LEARN_FROM, _PROBES, _FEW = 16, 8, 0.25
 _MIN_LIKELIHOOD = 0.5
 #: Bytes of bursts that wait for an announcement, and bursts that an object that changes may claim back.
 _MAX_WAITING, _MAX_RECENT = 32 << 20, 96
-#: Bytes of a file that are accepted where nothing else is said.
+#: Bytes of a file that are accepted.
 MAX_OBJECT_BYTES = 16 << 20
 #: Of a file beside its sums, and what is remembered of changes and refusals at most.
 _STATE_BYTES, _MAX_TIMELINES, _MAX_NOTES = 1 << 14, 16, 20
@@ -118,11 +118,12 @@ class FileState:
         part[list(self.blocks)] = 1.0
         return float(part.mean())
 
-    def seconds_left(self) -> float | None:
-        """More seconds of such a clip that would do."""
-        passed = self.last_time_s - self.first_time_s if self.first_time_s is not None else 0.0
-        share = self.share
-        return passed * (1 - share) / share if passed > 0 and share > 0 else None
+    def progress(self) -> ObjectProgress:
+        """What is there, and how many seconds more of such a clip would do."""
+        passed_s = self.last_time_s - self.first_time_s if self.first_time_s is not None else 0.0
+        share, layout = self.share, self.layout
+        left_s = passed_s * (1 - share) / share if passed_s > 0 and share > 0 else None
+        return ObjectProgress(layout.object_id, layout.length, layout.n_blocks, len(self.blocks), share, left_s)
 
     def add(self, bursts: NDArray[np.int64], llr: NDArray[np.int8], sign: int = 1) -> None:
         """Add data bursts, counted from the object's start; `sign` -1 takes them back."""
@@ -204,7 +205,7 @@ class FileState:
         failed = which[~read]
         self.threshold[failed] = self.known[failed] + _TRY_AGAIN * layout.code.k
 
-    def unpacked(self, max_bytes: int) -> Container | None:
+    def unpacked(self) -> Container | None:
         """The file, where all blocks are read and the hash fits; `failure` says what is wrong."""
         if not self.under_way or len(self.blocks) < self.layout.n_blocks:
             return None
@@ -212,7 +213,7 @@ class FileState:
         try:
             if zlib.crc32(container) != self.announcement.container_crc:
                 raise ContainerError("its blocks do not give the CRC-32 that was announced")
-            found = unpack_container(container, max_bytes)
+            found = unpack_container(container, MAX_OBJECT_BYTES)
         except ContainerError as error:
             self.failure = str(error)
             return None
@@ -288,13 +289,12 @@ class FileSearch:
     Args:
         columns: C.
         payload_symbols: N.
-        max_object_bytes: longer files are refused.
         under_way: bounds the memory of all files.
     """
 
-    def __init__(self, columns: int, payload_symbols: int, max_object_bytes: int, under_way: FilesUnderWay) -> None:
+    def __init__(self, columns: int, payload_symbols: int, under_way: FilesUnderWay) -> None:
         self._under_way = under_way
-        self._columns, self._payload_symbols, self._max_bytes = columns, payload_symbols, max_object_bytes
+        self._columns, self._payload_symbols = columns, payload_symbols
         self._layout = announcement_layout(columns, payload_symbols)
         self.files: dict[tuple[int, int, int, int], FileState] = {}
         #: Of every epoch, latest last.
@@ -388,9 +388,9 @@ class FileSearch:
 
     def _begun(self, announcement: Announcement) -> FileState | None:
         """A file that was not known; None where it is too long."""
-        if announcement.length > self._max_bytes:
+        if announcement.length > MAX_OBJECT_BYTES:
             self._note(
-                f"a file of {announcement.length} bytes was announced, more than the {self._max_bytes} that are "
+                f"a file of {announcement.length} bytes was announced, more than the {MAX_OBJECT_BYTES} that are "
                 "accepted; it was not received"
             )
             return None
@@ -461,7 +461,7 @@ class FileSearch:
             which = file.ready(at_last)
             if which.size:
                 file.read(which)
-            container = file.unpacked(self._max_bytes)
+            container = file.unpacked()
             if container is not None:
                 found.append((file, container))
             elif file.failure:

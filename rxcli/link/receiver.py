@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.link.beacons import BeaconSearch
-from rxcli.link.files import MAX_OBJECT_BYTES, FileSearch, FileState, FilesUnderWay
+from rxcli.link.files import FileSearch, FileState, FilesUnderWay
 from rxcli.link.formats import Container
 from rxcli.link.layout import LABEL_BITS
 from rxcli.link.softbits import MAX_LLR, Event
@@ -21,21 +21,14 @@ class LinkReceiver:
     Args:
         columns: C.
         payload_symbols: N.
-        max_object_bytes: files longer than this are refused.
         under_way: bounds the memory of files, of several receivers where they share it.
     """
 
-    def __init__(
-        self,
-        columns: int,
-        payload_symbols: int,
-        max_object_bytes: int = MAX_OBJECT_BYTES,
-        under_way: FilesUnderWay | None = None,
-    ) -> None:
+    def __init__(self, columns: int, payload_symbols: int, under_way: FilesUnderWay | None = None) -> None:
         self._under_way = FilesUnderWay() if under_way is None else under_way
         self._shape = (payload_symbols, columns, LABEL_BITS)
         self._beacons = BeaconSearch(columns, payload_symbols)
-        self._files = FileSearch(columns, payload_symbols, max_object_bytes, self._under_way)
+        self._files = FileSearch(columns, payload_symbols, self._under_way)
         self._last: FrameSoftBits | None = None
         #: All that came, in order.
         self.messages: list[Message] = []
@@ -93,23 +86,12 @@ class LinkReceiver:
     @property
     def progress(self) -> list[ObjectProgress]:
         """Files under way."""
-        return [_progress(file) for file in self._files.files.values() if file.under_way]
+        return [file.progress() for file in self._files.files.values() if file.under_way]
 
     @property
     def notes(self) -> list[str]:
         """Sentences about what was seen and refused."""
         return [*self._files.notes, *self._under_way.notes]
-
-
-def _progress(file: FileState) -> ObjectProgress:
-    return ObjectProgress(
-        object_id=file.layout.object_id,
-        container_bytes=file.layout.length,
-        n_blocks=file.layout.n_blocks,
-        blocks_done=len(file.blocks),
-        share=file.share,
-        seconds_left=file.seconds_left(),
-    )
 
 
 def _cleaned(soft: FrameSoftBits) -> FrameSoftBits:
