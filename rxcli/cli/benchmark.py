@@ -59,14 +59,14 @@ _RECEPTION = (
 
 def _begin(name: str, out: Path, fresh: bool, jobs: int, quiet: bool) -> Run:
     """A run that keeps its journal in the folder of results."""
-    from rxcli.lab.benchmark.runner import Journal, Run
+    from rxcli.lab.benchmark.runner import Run
     from rxcli.outputs import claim_own_folder
 
     claim_own_folder("--out", out, ("*.journal.jsonl",))
     path = out / f"{name}.journal.jsonl"
     if fresh:
         path.unlink(missing_ok=True)
-    return Run(Journal(path), jobs, quiet)
+    return Run(path, jobs, quiet)
 
 
 def _chosen(name: str, captures: Path | None, only: tuple[str, ...], ways: tuple[str, ...] = ()) -> Scenario:
@@ -89,7 +89,7 @@ def _chosen(name: str, captures: Path | None, only: tuple[str, ...], ways: tuple
 def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given: Any) -> int:
     from rxcli.errors import ExitCode
     from rxcli.lab.benchmark import measures, tables
-    from rxcli.lab.benchmark.runner import Journal
+    from rxcli.lab.benchmark.runner import load_journal
 
     name, out = str(context.info_name), given["out"]
     scenario = _chosen(name, given["captures"], given["only"], given["ways"])
@@ -101,7 +101,7 @@ def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given
     click.echo(tables.titled([(scenario.about, rows), *([("worth a look", odd)] if odd else [])]))
     details: dict[str, Any] = {"worth_a_look": odd}
     if scenario.bins:
-        earlier = [record for path in journals for some in Journal(path).records.values() for record in some]
+        earlier = [record for path in journals for some in load_journal(path).values() for record in some]
         packets = measures.Group([*records, *earlier], scenario.ways[0], scenario.ways[0]).packets
         bins, error = measures.calibration(packets)
         details |= {"bins": bins, "weights": measures.fitted_weights(packets)}
@@ -137,11 +137,13 @@ def benchmark(context: click.Context, /, quick: bool, seed: int, **run: Any) -> 
         click.echo(context.get_help())
         return
     from rxcli.lab.benchmark import quick as work
-    from rxcli.lab.benchmark.tables import titled, write_text
+    from rxcli.lab.benchmark.tables import titled
+    from rxcli.outputs import write_whole
 
     text = titled(work.run(_begin("quick", **run), seed, run["out"] / "media"))
     click.echo(text)
-    _say_written([write_text(run["out"] / "quick.txt", text + "\n")])
+    write_whole(run["out"] / "quick.txt", text + "\n")
+    _say_written([run["out"] / "quick.txt"])
 
 
 @benchmark.command()

@@ -20,7 +20,7 @@ from rxcli.lab.benchmark.cases import Case, received
 from rxcli.lab.benchmark.draw import Place, binned, draw_nodata, draw_small, scene_at
 from rxcli.lab.benchmark.measures import Group, cluster_interval, logistic_regression, wilson
 from rxcli.lab.benchmark.media import write_known
-from rxcli.lab.benchmark.runner import Journal, Run, Task, do, scenarios
+from rxcli.lab.benchmark.runner import Run, Task, do, load_journal, scenarios
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.protocol import encode_packet, payload_bits
@@ -155,16 +155,16 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
     _calls.clear()
     path = tmp_path / "journal.jsonl"
     tasks: list[Task] = [{"n": n} for n in range(4)]
-    Run(Journal(path), quiet=True)(tasks[:3], "double", work=_double)
+    Run(path, quiet=True)(tasks[:3], "double", work=_double)
     with path.open("a") as file:
         file.write('{"key": "half a li')  # as a killed process leaves it
-    records = Run(Journal(path), quiet=True)(tasks, "double", work=_double)
+    records = Run(path, quiet=True)(tasks, "double", work=_double)
     assert [record["twice"] for record in records] == [0, 2, 4, 6]
     assert _calls == [0, 1, 2, 3]
-    assert len(Journal(path).records) == 4
+    assert len(load_journal(path)) == 4
     path.write_text("no journal\n")
     with pytest.raises(InputError, match="line 1 is no journal entry"):
-        Journal(path)
+        load_journal(path)
 
 
 def test_small_scenes_are_received_without_problems(tmp_path: Path) -> None:
@@ -293,7 +293,7 @@ def test_tables_align_and_survive_csv(tmp_path: Path) -> None:
     assert lines[3].split() == ["bcd", "-", "0.25..1"]
     table = tables.to_csv(rows).splitlines()
     assert table == ["name,rate,range_low,range_high", "a,0.00012345,0.0,0.5", "bcd,,0.25,1.0"]
-    _, as_json = tables.write_outputs(tmp_path / "new", "x", rows, {"more": 1})
+    _, as_json = tables.write_outputs(tmp_path, "x", rows, {"more": 1})
     assert json.loads(as_json.read_text())["details"] == {"more": 1}
     assert tables.format_table([]) == "(nothing to show)"
 
@@ -301,7 +301,7 @@ def test_tables_align_and_survive_csv(tmp_path: Path) -> None:
 def test_error_rates_are_plotted(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     rows = [{"scenes": s, "way": w, "ber": 0.01, "ber95": (0.0, 0.1)} for s in "ab" for w in ("receiver", "bound")]
-    assert tables.plot(rows, tmp_path / "ber.png", "ber", "ber95")
+    tables.plot(rows, tmp_path / "ber.png", "ber", "ber95")
     assert (tmp_path / "ber.png").read_bytes().startswith(b"\x89PNG")
 
 

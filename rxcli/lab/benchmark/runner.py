@@ -98,30 +98,19 @@ def do(task: Task) -> list[Record]:
     return records
 
 
-class Journal:
-    """Records of finished tasks, in memory and, where a path is given, in a file of JSON lines that is appended to."""
-
-    def __init__(self, path: Path | None = None) -> None:
-        self._path = path
-        self.records: dict[str, list[Record]] = {}
-        lines = [] if path is None or not path.exists() else path.read_text("utf-8").splitlines(keepends=True)
-        for number, line in enumerate(lines, 1):
-            if path is not None and not line.endswith("\n"):
-                # The run was killed while it wrote this line: its task is simply done again.
-                path.write_text("".join(lines[:-1]), encoding="utf-8")
-                break
-            try:
-                entry = json.loads(line)
-                self.records[entry["key"]] = entry["records"]
-            except (ValueError, KeyError, TypeError):
-                raise InputError(f"{path}: line {number} is no journal entry", "name another file") from None
-
-    def add(self, key: str, records: list[Record]) -> None:
-        """Keep the records of a finished task."""
-        self.records[key] = records
-        if self._path is not None:
-            with self._path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"key": key, "records": records}, separators=(",", ":")) + "\n")
+def load_journal(path: Path) -> dict[str, list[Record]]:
+    """Records of finished tasks by their key; a last line that a killed run left unfinished is taken away."""
+    found = {}
+    lines = path.read_text("utf-8").splitlines(keepends=True) if path.exists() else []
+    if lines and not lines[-1].endswith("\n"):
+        path.write_text("".join(lines := lines[:-1]), encoding="utf-8")
+    for number, line in enumerate(lines, 1):
+        try:
+            entry = json.loads(line)
+            found[entry["key"]] = entry["records"]
+        except (ValueError, KeyError, TypeError):
+            raise InputError(f"{path}: line {number} is no journal entry", "name another file") from None
+    return found
 
 
 @lru_cache(maxsize=1)
@@ -138,7 +127,8 @@ def code_fingerprint() -> str:
 class Run:
     """How tasks are done: those that the journal lacks, in processes of one thread each."""
 
-    journal: Journal
+    #: JSON lines, a finished task each.
+    journal: Path
     jobs: int = 1
     quiet: bool = False
 
@@ -154,13 +144,19 @@ class Run:
         from tqdm import tqdm
 
         keys = {json.dumps({**task, "code": code_fingerprint()}, sort_keys=True): task for task in tasks}
-        missing = {key: task for key, task in keys.items() if key not in self.journal.records}
+        done = load_journal(self.journal)
+        missing = {key: task for key, task in keys.items() if key not in done}
         n_done = len(keys) - len(missing)
-        with tqdm(total=len(keys), initial=n_done, desc=label, disable=self.quiet or None, leave=False) as bar:
+        with (
+            tqdm(total=len(keys), initial=n_done, desc=label, disable=self.quiet or None, leave=False) as bar,
+            self.journal.open("a", encoding="utf-8") as file,
+        ):
             for key, records in self._each(missing, alone, work):
-                self.journal.add(key, records)
+                done[key] = records
+                file.write(json.dumps({"key": key, "records": records}, separators=(",", ":")) + "\n")
+                file.flush()
                 bar.update()
-        return [record for key in keys for record in self.journal.records[key]]
+        return [record for key in keys for record in done[key]]
 
     def _each(self, tasks: dict[str, Task], alone: bool, work: Work) -> Iterator[tuple[str, list[Record]]]:
         if not alone and (self.jobs == 1 or len(tasks) <= 1):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,9 +18,6 @@ from rxcli.profiles import CameraProfile
 from rxcli.receiver.pipeline import receive
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import FloatArray, Frame, FrameResult, Metadata, Mosaic
-
-if TYPE_CHECKING:
-    from rxcli.receiver.acquisition import Acquisition
 
 #: Source of simulated frames.
 SOURCE = "simulated"
@@ -123,20 +120,3 @@ def mosaic_of(scene: Scene) -> Mosaic:
         black=(float(sensor.black_level),) * 3,
         white=float(sensor.white_level),
     )
-
-
-def acquired(trial: Trial, *, quick: bool = True) -> Acquisition | None:
-    """Screen and clock of a trial's first frame; None where they are not found. For `quick` see `sample_columns`."""
-    from rxcli.receiver.acquisition import sample_columns
-    from rxcli.receiver.context import Failure, Timer
-    from rxcli.receiver.outline import find_outline
-    from rxcli.receiver.screen_choice import acquire
-    from rxcli.receiver.unknown_camera import likely_camera
-
-    options, timer = trial.options(), Timer()
-    outline = find_outline(trial.frame, options, timer)
-    context = outline if isinstance(outline, Failure) else likely_camera(trial.frame, outline.corners, options, timer)
-    if isinstance(context, Failure):
-        return None
-    found = acquire(context, sample_columns(context, context.n_columns, quick=quick))
-    return None if isinstance(found, Failure) else found

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from rxcli.lab.benchmark.trial import acquired, simulate_trial
+from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.camera import Exposure
 from rxcli.lab.simulate.scenes import Scene as SimulatedScene
+from rxcli.lab.training.acquire import acquired
 from rxcli.lab.training.fit import MOST_WORDS, UNKNOWN, Sample
 from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_scene
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from rxcli.errors import ProfileError
-from rxcli.lab.benchmark.trial import Trial, acquired, simulate_trial
+from rxcli.lab.benchmark.trial import Trial, simulate_trial
+from rxcli.lab.training.acquire import acquired
 from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
 from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
 from rxcli.receiver import channel, still
