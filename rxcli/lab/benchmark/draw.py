@@ -325,7 +325,8 @@ def draw_clips(at: Place) -> Iterator[Case]:
     take = prepare(scene, at.flat)
     with filmed(take, encodings) as paths:
         for path, (codec, _, _) in zip(paths, encodings, strict=True):
-            yield _clip(take, path, named, *groups, codec)
+            case = _clip(take, path, named, *groups, codec)
+            yield replace(case, options=replace(case.options, screens=ReceiverOptions().screens))
 
 
 def _filmed_scene(rng: np.random.Generator, base: Scene) -> Scene:
