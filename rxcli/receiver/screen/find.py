@@ -136,22 +136,38 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
 
 
 def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
-    """The grid of narrow columns, followed from the part of the picture that shows it best; None where none does."""
+    """The grid of narrow columns; None where none stands out.
+
+    Each part of the picture gives a grid, which is followed over the whole width. One that slips by a column on the way
+    ends anywhere, the right ones all end at the same place: the search stops once two do.
+    """
     some = strips.blocks(slice(None, None, 2))
-    n, n_steps = some.n_windows, SETTINGS.narrow_steps
-    grids = []
+    n = some.n_windows
+    starts = []
     for comb in find_combs(strips, sigma):
         part = some.blocks(slice(comb.part * n, (comb.part + 1) * n))
-        grid = moved_by_waveforms(part, grid_of_comb(comb, strips), sigma, n_steps)
-        grids.append((with_light(part, grid, sigma), float(part.raw_x.mean())))
-    grid, middle = max(grids, key=lambda one: one[0].contrast / max(one[0].explained, 1.0))
+        grid = moved_by_waveforms(part, grid_of_comb(comb, strips), sigma, SETTINGS.narrow_steps)
+        starts.append((with_light(part, grid, sigma), float(part.raw_x.mean())))
+    starts.sort(key=lambda start: -start[0].contrast / max(start[0].explained, 1.0))
+    best: Grid | None = None
+    for start, middle in starts[: SETTINGS.n_followed]:
+        grid = with_light(some, _followed(some, start, middle, sigma), sigma)
+        if best is not None and abs(grid.contrast - best.contrast) < SETTINGS.same_contrast * best.contrast:
+            break
+        if best is None or grid.contrast > best.contrast:
+            best = grid
+    return None if best is None else _settled(strips, best, sigma)
+
+
+def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
+    """A grid of the part of a picture around `middle`, followed over the whole width."""
     reach = 0.5 / _PARTS
     while reach < 0.5 + abs(middle):
         reach *= SETTINGS.reach_gain
-        within = np.abs(some.raw_x - middle) < reach
+        within = np.abs(strips.raw_x - middle) < reach
         near = np.flatnonzero(within.any(axis=1))
-        grid = moved_by_waveforms(some.blocks(near), grid, sigma, n_steps, within[near])
-    return _settled(strips, grid, sigma)
+        grid = moved_by_waveforms(strips.blocks(near), grid, sigma, SETTINGS.narrow_steps, within[near])
+    return grid
 
 
 def _settled(strips: Strips, grid: Grid, sigma: float) -> Grid | None:

@@ -75,6 +75,10 @@ class FinderSettings:
     last_steps: int = 3
     #: How much further a grid of narrow columns is followed at a time.
     reach_gain: float = 1.6
+    #: Grids of narrow columns that are followed, at most.
+    n_followed: int = 3
+    #: Relative difference of contrast up to which two grids are one.
+    same_contrast: float = 0.02
     #: Least contrast: as a share of what is explained times the root of the number of rows, and log-likelihood a strip.
     min_contrast: float = 0.95
     min_contrast_per_strip: float = 0.05
