@@ -237,6 +237,16 @@ def test_estimates_of_rows_are_counted() -> None:
     assert [measures.MEASURES[name](group) for name in names] == [2, 1, 1, 0.5, 1.0]
 
 
+def test_stages_are_columns_as_ratios_to_the_bare_decode() -> None:
+    slow, quick_one = (
+        _record(wall_s=wall, stages_ms={"detect": 1e3 * wall, "total": 2e3 * wall})
+        | {"bare_wall_s": 0.5, "n_frames": 1}
+        for wall in (3.0, 2.0)
+    )
+    row = measures.rows([slow, quick_one], ["receiver"], ["total_ms", "stages"])[-1]
+    assert row == {"scenes": "all", "way": "receiver", "total_ms": 2000.0, "detect": 4.0}
+
+
 def test_intervals_of_error_rates_hold_the_rate() -> None:
     low, high = measures.MEASURES["ber95"](Group([_record(), _record()], "receiver", "receiver"))
     assert low < (5 + 77 / 2) / 770 < high

@@ -135,6 +135,14 @@ def _real_time(group: Group) -> float | None:
     return float(group.cases[0]["n_frames"] / rates[0] / min(group.values("wall_s")))
 
 
+def _stages(group: Group) -> Row:
+    """Time of every stage of the quickest reception over the bare decode, by the wall."""
+    bare_ms = 1e3 * min(case["bare_wall_s"] for case in group.cases)
+    stages: dict[str, float] = dict(min(group.receptions, key=lambda reception: reception["wall_s"])["stages_ms"])
+    stages.pop("total", None)
+    return {name: ms / bare_ms for name, ms in stages.items()}
+
+
 def _transfers(name: str, of: Callable[[list[Any]], Any]) -> Callable[[Group], Any]:
     """A figure of the transfers that came whole."""
 
@@ -176,6 +184,7 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "bare_ms": lambda g: 1e3 * min(case["bare_wall_s"] / case["n_frames"] for case in g.cases),
     "total_ms": lambda g: 1e3 * min(g.values("wall_s")) / g.cases[0]["n_frames"],
     "real_time": _real_time,
+    "stages": _stages,
     "target": lambda g: g.cases[0]["about"].get("target"),
     "status": lambda g: " ".join(dict.fromkeys(map(str, g.values("status")))),
     "rows_within": lambda g: int((g.rows_errors()[0] < ROWS_BOUND).sum()),
@@ -214,13 +223,16 @@ def rows(
         beside: the way whose right packets are the measure of the others.
     """
     names = [name for name in dict.fromkeys(group for record in records for group in record["groups"]) if name]
-    table = []
+    table: list[Row] = []
     for name in [*names, "all"]:
         cases = [record for record in records if name == "all" or name in record["groups"]]
         for way in ways:
             group = Group(cases, way, ways[0], beside)
-            table.append({"scenes": name, "way": way} | {column: MEASURES[column](group) for column in columns})
-    return [{key: row[key] for key in row if any(other[key] is not None for other in table)} for row in table]
+            cells = {column: MEASURES[column](group) for column in columns}
+            stages = cells.pop("stages", {})
+            table.append({"scenes": name, "way": way} | cells | stages)
+    shown = dict.fromkeys(key for row in table for key, value in row.items() if value is not None)
+    return [{key: row.get(key) for key in shown} for row in table]
 
 
 def worth_a_look(records: Sequence[Record], ways: Sequence[str]) -> list[Row]:

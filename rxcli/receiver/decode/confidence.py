@@ -146,7 +146,7 @@ def confidence_features(
 
     The light model's likelihoods are tempered, since strips and samples err together; still they are too sure where
     picture or camera are not as the model has them. There single slots speak against the packet. The weights are a
-    logistic regression on packets of `lab.benchmark.confidence` and of `lab.benchmark.phones`; whatever changes the
+    logistic regression on packets of the benchmark's `confidence` and `phones`; whatever changes the
     likelihoods of the light model or the auto-encoder asks for a new fit.
 
     Args:
