@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,8 +64,6 @@ class Acquisition:
     variants: tuple[ScreenProfile, ...] = ()
     #: (n_copies,) burst of every copy; None where the light is to tell.
     burst: IntArray | None = None
-    #: What was worked out of it already, see `still.initial_pass`; another acquisition begins anew.
-    kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def profiles(self) -> RowProfiles:

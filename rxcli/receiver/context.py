@@ -14,6 +14,47 @@ from rxcli.receiver.sampling import RowStore
 from rxcli.types import FloatArray, Frame, Lens
 
 DEFAULT_TONE = "srgb"
+#: Certainty from which the number of a column is likely.
+_LIKELY = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """Where the screen is."""
+
+    #: (4, 2) pixels of the stored picture, the viewer's top left first.
+    corners: FloatArray
+    #: Probability that its columns are numbered as the screen's.
+    certainty: float = 1.0
+    #: Sides of the stored picture that show no light.
+    inferred: tuple[str, ...] = ()
+    #: Column of the screen that is the first; None where that is not sure, or columns are counted from the left of what
+    #: is seen.
+    column_offset: int | None = 0
+    log_odds: float = 0.0
+    #: Outlines of one family are alike but for the first column.
+    family: int = 0
+    #: Whether light reaches to both ends of the picture.
+    fills: bool = False
+    #: Corners that it has with other rows, likeliest first.
+    other_rows: tuple[FloatArray, ...] = ()
+    #: Columns whose borders were found on it, many of them; None: not asked, or few, of which many may have been taken.
+    n_columns: int | None = None
+
+    @property
+    def is_counted_from_left(self) -> bool:
+        """Whether no side is in view that tells which column is the first."""
+        return self.fills and self.column_offset is None and self.certainty < _LIKELY
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What a result says of it, by the names of its fields."""
+        return {
+            "corners": self.corners,
+            "column_certainty": self.certainty,
+            "inferred_sides": self.inferred,
+            "column_offset": self.column_offset,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +65,11 @@ class Failure:
     message: str
     #: What was estimated of the camera all the same: name -> (value, standard deviation).
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
+    #: The outline and the camera that came nearest.
+    outline: Outline | None = None
+    context: FrameContext | None = None
+    #: Every hypothesis that was tried, see `search.Tried`.
+    tried: tuple[Any, ...] = ()
 
 
 class Timer:
@@ -91,8 +137,6 @@ class FrameContext:
     #: Screens that it may be, at least one.
     screens: tuple[ScreenProfile, ...]
     timer: Timer
-    #: What was worked out of it already, see `screen_choice.quick_look`; another context begins anew.
-    kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def n_columns(self) -> int:

@@ -1,7 +1,7 @@
 """The wiring of the receiver: `receive_frame` reads as the block diagram.
 
-`corners` finds the screen, `cameras` and `unknown_camera` tell the camera, `acquisition` samples the columns and finds
-the clock, `still` turns light model and detection, `clip` carries over from frame to frame what is known.
+`search` finds the screen, its camera and its clock, `still` turns light model and detection, and `clip` carries over
+from frame to frame what is known.
 """
 
 from __future__ import annotations
@@ -20,12 +20,10 @@ from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.outline import locate, with_columns
 from rxcli.receiver.reception import Reception, headerless, slot_margin, soft_bits
-from rxcli.receiver.screen_choice import quick_look, quick_sampler
-from rxcli.receiver.single_light import with_data
-from rxcli.receiver.still import apply_autoencoder, decode_likeliest
-from rxcli.receiver.unknown_camera import likely_camera, receive_unknown
+from rxcli.receiver.search import search
+from rxcli.receiver.still import apply_autoencoder, decode_photograph
+from rxcli.receiver.unknown_camera import settle
 from rxcli.results.dump import dump_stages
 from rxcli.types import FloatArray, Frame, FrameResult
 
@@ -43,6 +41,7 @@ def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[Frame
 
     A clip's result may come some frames later than the frame, because a packet stands in the last frame that shows it.
     """
+    options = _in_total_order(options)
     with closing(_iterator(frames)) as source:
         first = next(source, None)
         if first is None:
@@ -66,11 +65,18 @@ def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
     yield from frames
 
 
+def _in_total_order(options: ReceiverOptions) -> ReceiverOptions:
+    """The same with profiles in an order of their own, so that a result does not depend on how they were listed."""
+    screens = sorted(options.screens, key=lambda one: (one.columns, -one.slot_rate_hz, one.packet_slots, one.name))
+    cameras = options.cameras if options.force_camera else tuple(sorted(options.cameras, key=lambda one: one.name))
+    return replace(options, screens=tuple(screens), cameras=cameras)
+
+
 def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     """Receive one frame as a photograph."""
     timer = Timer()
     with one_blas_thread():
-        result = _receive_still(frame, options, timer)
+        result = _receive_still(frame, _in_total_order(options), timer)
     result = replace(result, message=_with_tried(result, options.screens), timing_ms=timer.total())
     if options.mirrored:
         return result.with_columns_mirrored()
@@ -86,34 +92,22 @@ def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str 
 
 def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
-    # Screen: where the columns are.
-    located = locate(frame, options, timer)
-    if isinstance(located, Failure):
-        return failed(result, located)
-    outline, corners = located.outline, located.outline.corners
-    result = replace(result, **outline.facts)
-    # Camera: what a row is in time.
-    context = located.context or likely_camera(frame, corners, options, timer)
-    if isinstance(context, Failure):
-        return failed(result, context)
-    context = with_columns(context, outline)
-    # Sampling: pixels to row profiles; sync: row profiles to a clock.
-    acquisition = with_data(context, quick_sampler(context), quick_look(context))
-    if isinstance(acquisition, Failure):
-        return failed(replace(result, **context.camera.facts), acquisition)
+    # Search: where the columns are, what a row is in time, which screen and clock.
+    found = search(frame, options, timer)
+    if isinstance(found, Failure):
+        return failed(result, found)
+    outline, context, acquisition = found.outline, found.best.context, found.best.acquisition
     # Channel and decode, in turn: slot metrics to symbols, and what they say of the picture.
-    if context.camera.hypothesis is None:
-        with timer("detect"):
-            reception = decode_likeliest(acquisition, options.skip)
-    else:
-        received = receive_unknown(context, acquisition, options.skip)
-        context, acquisition, reception = received.context, received.acquisition, received.reception
+    with timer("detect"):
+        reception = decode_photograph(acquisition, options.skip, found.best.reception)
+    camera, _ = settle(context, acquisition, reception)
+    result = replace(result, **outline.facts, **camera.facts)
     with timer("detect"):
         no_header = headerless(reception)
     with timer("denoise"):
         reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     if options.dump_dir is not None:
-        dump_stages(options.dump_dir, frame.source, frame.index, _taps(corners, acquisition, reception))
+        dump_stages(options.dump_dir, frame.source, frame.index, _taps(outline.corners, acquisition, reception))
     # Packets, with the probability that they are right.
     columns = assemble.column_results(
         reception.clock,
@@ -126,11 +120,10 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
         denoised,
     )
     columns = assemble.with_doubt(columns, outline.certainty, options.min_confidence)
-    if context.camera.reversed:
+    if camera.reversed:
         columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
     result = replace(
         result,
-        **context.camera.facts,
         screen_profile=acquisition.variant(sync.likely_repeats(reception.clock, acquisition.repeats)).name,
         columns=columns,
         status=assemble.frame_status(columns),
@@ -159,6 +152,11 @@ def _taps(corners: FloatArray, acquisition: Acquisition, reception: Reception) -
 
 def failed(result: FrameResult, failure: Failure) -> FrameResult:
     """A result of which nothing more comes, with the reason."""
+    facts = {
+        **(failure.outline.facts if failure.outline else {}),
+        **(failure.context.camera.facts if failure.context else {}),
+    }
+    result = replace(result, **facts)
     return replace(
         result,
         status=failure.status,

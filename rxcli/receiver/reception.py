@@ -69,6 +69,11 @@ def column_llr(reception: Reception) -> FloatArray:
     return kept
 
 
+def packets_are_plain(reception: Reception) -> bool:
+    """Whether packets show beyond doubt."""
+    return packet_llr(reception) >= SETTINGS.plain_packets
+
+
 def word_log_prob(reception: Reception) -> FloatArray:
     """(C,) log probability that all words decided of a column are right, as far as the light model is."""
     return np.asarray(reception.posteriors.log_prob.sum(axis=(0, 2)))

@@ -30,18 +30,17 @@ from rxcli.receiver.settings import SETTINGS, STILL
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 
-def decode_likeliest(acquisition: Acquisition, skip: frozenset[str]) -> Reception:
-    """Decode with the bursts whose initial pass looks most like packets.
+def decode_photograph(acquisition: Acquisition, skip: frozenset[str], first: Reception) -> Reception:
+    """Decode a photograph from its initial pass; what shows no packets there is not looked at further.
 
     Args:
         acquisition: the clock and the row profiles.
         skip: shortcuts in use, see `rxcli.options.SKIPS`.
+        first: the initial pass.
     """
-    first = initial_pass(acquisition)
     if "no_packets" in skip and not _may_show_packets(first):
         return replace(first, skipped={"no_packets": first.snr.shape[0]})
-    likeliest = _with_likeliest_bursts(acquisition, first)
-    return decode(_in_bursts_of(acquisition, likeliest) if likeliest is not first else acquisition, skip, likeliest)
+    return decode(acquisition, skip, first)
 
 
 def _may_show_packets(first: Reception) -> bool:
@@ -49,35 +48,6 @@ def _may_show_packets(first: Reception) -> bool:
     if (packet_confidence(first)[complete_packets(first)] > STILL.doubtful).any():
         return True
     return packet_llr(first) + max(float(first.posteriors.header_llr.sum()), 0.0) > SETTINGS.some_packets
-
-
-def _with_likeliest_bursts(acquisition: Acquisition, first: Reception) -> Reception:
-    """Choose between the initial pass and passes with other bursts; the initial pass where there is no doubt."""
-    complete = complete_packets(first)
-    # Bursts that leave no packet complete do not depend on how similar copies are.
-    copies_weight = STILL.copies_weight if complete.any() else 0.0
-    if complete.any():
-        confidence = np.where(complete, packet_confidence(first), 0.0).max(axis=0)
-        if not confidence.any() or (confidence > STILL.clear_confidence).mean() >= STILL.clear_columns:
-            return first
-    possible = sync.possible_bursts(first.clock, detect.slot_llr(first.metrics), acquisition.repeats)
-    plain = len(possible) == 1 or possible[0][1] - possible[1][1] > STILL.plain_bursts
-    if complete.any() and plain and np.array_equal(possible[0][0].burst, first.clock.burst):
-        return first
-    passes, scores = [], []
-    for clock, similarity in possible:
-        same = np.array_equal(clock.burst, first.clock.burst)
-        reception = first if same else initial_pass(replace(acquisition, burst=clock.burst))
-        passes.append(reception)
-        # Bursts that leave no packet whole give nothing: they must be plainly likelier.
-        gain = SETTINGS.plain_structure if complete_packets(reception).any() else 0.0
-        scores.append(packet_llr(reception) + copies_weight * similarity + gain)
-    return passes[int(np.argmax(scores))]
-
-
-def _in_bursts_of(acquisition: Acquisition, reception: Reception) -> Acquisition:
-    """The acquisition with the bursts of what was received."""
-    return replace(acquisition, burst=reception.clock.burst)
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
@@ -102,14 +72,8 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
 
 
 def initial_pass(acquisition: Acquisition) -> Reception:
-    """One pass over the strips pooled in pairs, from the first guess; made once for an acquisition."""
-    if "initial" not in acquisition.kept:
-        acquisition.kept["initial"] = _initial_pass(acquisition.binned())
-    kept: Reception = acquisition.kept["initial"]
-    return kept
-
-
-def _initial_pass(acquisition: Acquisition) -> Reception:
+    """One pass over the strips pooled in pairs, from a first guess of the slots."""
+    acquisition = acquisition.binned()
     clock = acquisition.clock
     # Demosaicing and denoising mix neighbouring rows: with few rows per slot this widens the effective exposure.
     exposure_slots = float(np.hypot(clock.exposure_slots, STILL.mixed_rows / clock.rows_per_slot))

@@ -58,10 +58,8 @@ def test_only_what_may_show_packets_is_looked_at_in_depth(
     acquisition = Acquisition(None, None, CLOCK)  # type: ignore[arg-type]
     monkeypatch.setattr(still, "complete_packets", lambda one: np.ones((1, 3), bool))
     monkeypatch.setattr(still, "packet_confidence", lambda one: np.full((1, 3), confidence))
-    monkeypatch.setattr(still, "initial_pass", lambda one: _first(headers))
     seen: list[str] = []
     monkeypatch.setattr(still, "decode", lambda *rest: (seen.append("decode"), rest[2])[1])
-    monkeypatch.setattr(still, "_with_likeliest_bursts", lambda _, reception, *rest: reception)
-    reception = still.decode_likeliest(acquisition, skip)
+    reception = still.decode_photograph(acquisition, skip, _first(headers))
     assert bool(seen) == looked
     assert reception.skipped == ({} if looked else {"no_packets": 3})

@@ -1,8 +1,6 @@
-"""Which column is the first: shifted outlines compared on the same rows; and the camera asked once for all of them."""
+"""Which column is the first: shifted outlines compared on the same rows, and how sure the columns' numbers are."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +8,10 @@ from numpy.typing import NDArray
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, load_profile
-from rxcli.receiver import outline as outlines
-from rxcli.receiver.context import Camera, FrameContext, Timer
-from rxcli.receiver.outline import Located, Outline, locate, possible_outlines
+from rxcli.receiver.context import Outline, Timer
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.grid import grid_between
+from rxcli.receiver.search.outlines import likeliest_of_family, numbered, possible_outlines
 from rxcli.types import FloatArray, Frame
 
 HEIGHT, WIDTH, ROWS_PER_SLOT, COLUMNS = 1600, 1200, 10.0, 20
@@ -62,12 +59,19 @@ def test_the_grid_between_corners_has_its_columns_there() -> None:
     np.testing.assert_allclose(grid.columns_at(points), COLUMNS * u, atol=1e-6)
 
 
+def likeliest(candidates: list[Outline]) -> Outline:
+    """The likeliest outline and how sure its columns' numbers are, packets showing under all alike."""
+    family = max(candidates, key=lambda one: one.log_odds).family
+    own = likeliest_of_family([one for one in candidates if one.family == family])
+    return numbered(own, candidates, lambda _: None)
+
+
 LARGE = np.array([[-160.0, 300.0], [1380.0, 280.0], [1400.0, 1170.0], [-180.0, 1140.0]])
 
 
 def test_a_screen_larger_than_the_picture_has_its_columns_counted_from_the_left_of_what_is_seen() -> None:
     candidates = possible_outlines(Frame(drawn(0, 20, LARGE), "drawn"), OPTIONS, Timer())
-    best = outlines._likeliest(candidates)
+    best = likeliest(candidates)
     assert best.column_offset is None
     assert best.is_counted_from_left
     assert -60 < best.corners[0, 0] < 20
@@ -80,63 +84,25 @@ def test_a_screen_larger_than_the_picture_has_its_columns_counted_from_the_left_
 def test_a_side_in_view_tells_the_columns_of_a_screen_that_goes_on_outside_the_picture() -> None:
     corners = LARGE + np.array([300.0, 0.0])
     candidates = possible_outlines(Frame(drawn(0, 20, corners), "drawn"), OPTIONS, Timer())
-    best = outlines._likeliest(candidates)
+    best = likeliest(candidates)
     assert best.column_offset == 0
     assert abs(float(grid_between(corners, COLUMNS, (WIDTH, HEIGHT), None).columns_at(best.corners)[0])) < 0.3
 
 
-def camera_of(frame: Frame, corners: FloatArray) -> FrameContext:
-    return FrameContext(frame, corners, Camera(None, 1e-5, 1e-4, None, "srgb"), OPTIONS.screens, Timer())
+def test_what_packets_do_not_tell_stays_in_doubt() -> None:
+    candidates = [Outline(moved(k), log_odds=-float(k)) for k in range(4)]
+    assert likeliest(candidates).certainty == pytest.approx(1 / np.exp(-np.arange(4.0)).sum())
 
 
-@pytest.mark.parametrize("packets", [0.0, 500.0])
-def test_the_camera_is_asked_once_and_handed_on(packets: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    frame, asked = Frame(np.zeros((200, 300), np.uint8), "drawn"), []
-
-    def likely(frame: Frame, corners: FloatArray, *_: object) -> FrameContext:
-        asked.append(corners)
-        return camera_of(frame, corners)
-
-    candidates = [Outline(moved(k), log_odds=-float(k), other_rows=(moved(k) + 1.0,)) for k in range(4)]
-    monkeypatch.setattr(outlines, "possible_outlines", lambda *_: candidates)
-    monkeypatch.setattr(outlines, "likely_camera", likely)
-    monkeypatch.setattr(outlines, "_packets", lambda _: packets)
-    located = locate(frame, OPTIONS, Timer())
-    assert isinstance(located, Located)
-    assert len(asked) == 1
-    assert isinstance(located.context, FrameContext)
-    assert located.context.corners is located.outline.corners
-    # What the packets do not tell stays in doubt, with packets or without.
-    assert located.outline.certainty == pytest.approx(1 / np.exp(-np.arange(4.0)).sum())
-
-
-def test_once_a_screen_shows_plainly_other_outlines_are_looked_at_with_it_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    frame = Frame(np.zeros((200, 300), np.uint8), "drawn")
-    looked: list[FrameContext] = []
-
-    def packets(context: FrameContext) -> float:
-        looked.append(context)
-        context.kept["look"] = len(looked)
-        return 1000.0 - len(looked)
-
-    candidates = [replace(Outline(moved(k)), family=k) for k in range(3)]
-    monkeypatch.setattr(outlines, "possible_outlines", lambda *_: candidates)
-    monkeypatch.setattr(outlines, "likely_camera", lambda frame, corners, *_, **__: camera_of(frame, corners))
-    monkeypatch.setattr(outlines, "_packets", packets)
-    monkeypatch.setattr(outlines, "_screens_shown", lambda context: context.screens[:1])
-    located = locate(frame, OPTIONS, Timer())
-    assert isinstance(located, Located)
-    assert [len(context.screens) for context in looked] == [len(OPTIONS.screens), 1, 1]
-    # What the look at the chosen outline worked out is handed on.
-    assert isinstance(located.context, FrameContext)
-    assert located.context.kept["look"] == 1
-    assert located.context.screens == OPTIONS.screens
+def test_packets_tell_between_families() -> None:
+    candidates = [Outline(CORNERS, log_odds=-2.0), Outline(moved(1), log_odds=-2.0), Outline(moved(3), family=1)]
+    own = numbered(candidates[0], candidates, {0: 500.0, 1: 60.0}.get)
+    assert own.certainty == pytest.approx(0.5, abs=1e-9)
+    assert numbered(candidates[0], candidates, {0: 500.0, 1: 480.0}.get).certainty < 0.15
 
 
 @pytest.mark.parametrize(("odds", "offset"), [(3.5, 0), (1.0, None)])
 def test_columns_are_said_to_be_the_screens_only_where_that_is_sure(odds: float, offset: int | None) -> None:
-    best = outlines._likeliest([Outline(CORNERS, log_odds=odds), Outline(moved(1))])
+    best = likeliest([Outline(CORNERS, log_odds=odds), Outline(moved(1))])
     assert best.column_offset == offset
     np.testing.assert_array_equal(best.corners, CORNERS)

@@ -14,16 +14,16 @@ from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.capture import Capture, simulate_frame
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
-from rxcli.receiver import channel, sampling, screen_choice, still, sync
-from rxcli.receiver.acquisition import Acquisition, sample_columns
+from rxcli.receiver import channel, sampling, still
 from rxcli.receiver.channel import denoise
-from rxcli.receiver.context import FrameContext, Timer
+from rxcli.receiver.context import Timer
 from rxcli.receiver.decode import detect
-from rxcli.receiver.outline import Outline, find_outline
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.reception import headerless
-from rxcli.receiver.screen_choice import acquire
-from rxcli.receiver.unknown_camera import likely_camera
+from rxcli.receiver.search import Found, search
+from rxcli.receiver.search.evidence import log_evidence
+from rxcli.receiver.search.propose import Proposer
+from rxcli.receiver.still import initial_pass
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Frame, FrameResult, Metadata, Mosaic, PacketResult
 
@@ -159,10 +159,8 @@ def test_columns_in_doubt_are_read_pixel_by_pixel(n_strips: int, monkeypatch: py
     monkeypatch.setattr(sampling, "strips_per_column", lambda _: n_strips)
     taken = clean()
     frame, options = frame_of(taken), options_for(taken)
-    context = context_of(frame, options)
-    quick, exact = (acquire(context, sample_columns(context, 20, quick=quick)) for quick in (True, False))
-    assert isinstance(quick, Acquisition)
-    assert isinstance(exact, Acquisition)
+    founds = [search(frame, options, Timer(), quick=quick) for quick in (True, False)]
+    quick, exact = (found.best.acquisition for found in founds if isinstance(found, Found))
     assert not np.array_equal(quick.profiles.light, exact.profiles.light)
     asked = np.array([0, 4, 5, 6, 19])
     light = quick.in_depth(asked).profiles.light
@@ -426,54 +424,31 @@ def test_rows_that_developing_mixes_are_told_from_the_light(monkeypatch: pytest.
     assert sum(score.error_free for score in nominal) <= sum(score.error_free for score in mixed) / 1.2
 
 
-def context_of(frame: Frame, options: ReceiverOptions) -> FrameContext:
-    outline = find_outline(frame, options, Timer())
-    assert isinstance(outline, Outline)
-    context = likely_camera(frame, outline.corners, options, Timer())
-    assert isinstance(context, FrameContext)
-    return context
+def found_in(taken: Capture, options: ReceiverOptions) -> Found:
+    found = search(frame_of(taken), options, Timer())
+    assert isinstance(found, Found)
+    return found
 
 
-def acquired(taken: Capture) -> tuple[Acquisition, ReceiverOptions]:
+def test_bursts_are_hypotheses_where_packets_leave_doubt() -> None:
+    taken = simulate_frame(replace(small_scene("paper-17k3", "phone-plain"), start_slot=300.0), 1)
     options = options_for(taken)
-    context = context_of(frame_of(taken), options)
-    acquisition = acquire(context, sample_columns(context, context.n_columns))
-    assert isinstance(acquisition, Acquisition)
-    return acquisition, options
-
-
-def test_copies_of_two_packets_taken_for_one_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = replace(small_scene("paper-17k3", "phone-plain"), start_slot=300.0)
-    acquisition, options = acquired(simulate_frame(scene, 1))
-    right = still.decode_likeliest(acquisition, options.skip)
-    assert right.clock.burst.max() > 0
-    repeats = acquisition.screen.repeats
-    for clock, _ in sync.possible_bursts(right.clock, detect.slot_llr(right.metrics), (repeats,))[1:]:
-        burst = clock.burst
-        monkeypatch.setattr(sync, "assign_bursts", lambda clock, *_, burst=burst: replace(clock, burst=burst))
-        anew = replace(acquisition)
-        assert np.array_equal(still.decode(anew, options.skip).clock.burst, burst)
-        again = still.decode_likeliest(anew, options.skip)
-        assert again.clock.burst.tolist() == right.clock.burst.tolist()
-        np.testing.assert_array_equal(again.posteriors.index, right.posteriors.index)
-
-
-def test_copies_told_apart_so_that_no_packet_is_whole_are_weighed_by_packets(monkeypatch: pytest.MonkeyPatch) -> None:
-    acquisition, options = acquired(clean())
-    right = still.decode_likeliest(acquisition, options.skip).clock.burst
-    last = int(np.flatnonzero(right == right[0])[-1])
-    split = np.where(np.arange(right.size) >= max(last, 1), right[0] + 1, right[0])
-    assert not np.array_equal(split, right)
-    monkeypatch.setattr(sync, "assign_bursts", lambda clock, *_: replace(clock, burst=split))
-    whole = still.complete_packets
-    monkeypatch.setattr(still, "complete_packets", lambda one: whole(one) & np.array_equal(one.clock.burst, right))
-    assert np.array_equal(still.initial_pass(replace(acquisition)).clock.burst, split)
-    assert np.array_equal(still.decode_likeliest(replace(acquisition), options.skip).clock.burst, right)
+    found = found_in(taken, options)
+    right, best = found.best.reception.clock.burst, found.best
+    assert right.max() > 0
+    proposer = Proposer(frame_of(taken), options, Timer(), (found.outline,))
+    assert all(one.bursts is None for one in proposer.siblings(best))
+    burst = np.zeros_like(right)
+    wrong = initial_pass(replace(best.acquisition, burst=burst))
+    own = log_evidence(wrong)
+    misled = replace(best, reception=wrong, evidence=own)
+    assert tuple(right.tolist()) in {one.bursts for one in proposer.siblings(misled)}
+    assert own < best.evidence
 
 
 def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:
-    acquisition, options = acquired(clean())
-    reception = still.decode(acquisition, options.skip)
+    options = options_for(clean())
+    reception = still.decode(found_in(clean(), options).best.acquisition, options.skip)
     assert not headerless(reception).any()
     unseen = replace(reception.posteriors, header_llr=np.full_like(reception.posteriors.header_llr, -30.0))
     assert not headerless(replace(reception, posteriors=unseen)).any()
@@ -483,29 +458,12 @@ def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_no
     assert headerless(replace(reception, posteriors=moved, metrics=metrics)).all()
 
 
-def screen_chosen(taken: Capture) -> str:
-    options = replace(options_for(taken), screens=tuple(shipped_profiles(ScreenProfile)))
-    context = context_of(frame_of(taken), options)
-    acquisition = acquire(context, sample_columns(context, context.n_columns, quick=True))
-    assert isinstance(acquisition, Acquisition)
-    return acquisition.screen.name
-
-
 @pytest.mark.parametrize("screen", ["paper-8k65", "paper-17k3", "paper-34k6"])
-def test_where_clocks_leave_doubt_packets_tell_the_screen(screen: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures with strong texture hide all structure of a clock's slots: here it speaks for the wrong screens."""
+def test_packets_tell_the_screen(screen: str) -> None:
+    """Pictures with strong texture hide all structure of a clock's slots."""
     taken = capture(screen, "phone-plain", "sky", 30.0, 1)
-    right = load_profile(screen, ScreenProfile)
-    assert screen_chosen(taken) == screen
-    monkeypatch.setattr(screen_choice, "SETTINGS", replace(screen_choice.SETTINGS, min_peak_ratio=0.0))
-    misled = lambda _, clock: -20.0 if clock.packet_slots == right.packet_slots else -3.0  # noqa: E731
-    monkeypatch.setattr(screen_choice, "_structure", misled)
-    assert screen_chosen(taken) == screen
-
-
-@pytest.mark.parametrize(("structure", "plain"), [([5.0], True), ([300.0, 2.0], True), ([300.0, 280.0], False)])
-def test_only_a_clear_lead_spares_an_initial_pass(structure: list[float], plain: bool) -> None:
-    assert screen_choice._is_plain(structure) == plain
+    options = replace(options_for(taken), screens=tuple(shipped_profiles(ScreenProfile)))
+    assert found_in(taken, options).best.acquisition.screen.name == screen
 
 
 @pytest.mark.parametrize(("period_rows", "duty"), [(19.3, 0.4), (14.2, 0.15), (27.9, 0.12), (32.1, 0.53), (25.7, 0.38)])

@@ -20,10 +20,9 @@ from rxcli.lab.simulate.sensor import Sensor
 from rxcli.profiles import ScreenProfile, load_profile, parse_profile
 from rxcli.receiver import camera as blind
 from rxcli.receiver import unknown_camera
-from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.context import Failure, FrameContext, Timer
+from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.pipeline import ReceiverOptions, receive
-from rxcli.receiver.screen_choice import quick_look
+from rxcli.receiver.search import Found, search
 from rxcli.types import Frame
 
 CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
@@ -79,9 +78,9 @@ def _proposed(*rows_per_slot: float) -> list[blind.CameraHypothesis]:
 
 def _chosen(
     frame: Frame, proposed: Iterable[blind.CameraHypothesis], monkeypatch: pytest.MonkeyPatch
-) -> FrameContext | Failure:
+) -> Found | Failure:
     monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_, **__: iter(proposed))
-    return unknown_camera.likely_camera(frame, CORNERS, OPTIONS, Timer())
+    return search(frame, OPTIONS, Timer())
 
 
 def test_packets_decide_between_hypotheses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,9 +88,11 @@ def test_packets_decide_between_hypotheses(tmp_path: Path, monkeypatch: pytest.M
     wrong, right, other = _proposed(1.13 * ROWS_PER_SLOT, ROWS_PER_SLOT, 0.7 * ROWS_PER_SLOT)
     unused = iter([right, other])
     for proposed in ([wrong, right], [wrong, other, right], unused):
-        chosen = _chosen(frame, proposed, monkeypatch)
-        assert isinstance(chosen, FrameContext)
-        assert chosen.camera.hypothesis is right
+        found = _chosen(frame, proposed, monkeypatch)
+        assert isinstance(found, Found)
+        chosen = found.best.hypothesis.camera.hypothesis
+        assert chosen is not None
+        assert chosen.rows_per_slot == right.rows_per_slot
     assert next(unused) is other
 
 
@@ -131,19 +132,11 @@ def _small_phone(tone: Tone) -> tuple[Trial, Frame]:
 
 
 @pytest.mark.parametrize("tone", ["srgb", "linear"])
-def test_the_tone_curve_is_estimated_and_used(tone: Tone, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_tone_curve_is_estimated_and_used(tone: Tone) -> None:
     trial, frame = _small_phone(tone)
     options = ReceiverOptions(cameras=(), corners=trial.corners, cae="never")
-    read: list[str] = []
-
-    def noting_the_tone(context: FrameContext) -> Acquisition | Failure:
-        read.append(context.camera.tone)
-        return quick_look(context)
-
-    monkeypatch.setattr(unknown_camera, "quick_look", noting_the_tone)
     result = next(receive([frame], options))
     exponent, sd = result.estimated["tone_exponent"]
     assert abs(exponent - (1.0 if tone == "linear" else 2.2)) < 2 * sd
-    assert ("linear" in read) == (tone == "linear")
     _, score = score_result(result, trial.truth)
     assert score.error_free >= 15

@@ -9,7 +9,6 @@ import pytest
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import unknown_camera
-from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.pipeline import receive
 from rxcli.types import Frame, Metadata
 from tests.receiver.test_video import Clip, scored, simulate
@@ -35,14 +34,13 @@ def _line_delay_s(clip: Clip) -> float:
 
 def test_the_camera_is_estimated_once_and_refitted(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Frame] = []
-    find = unknown_camera.likely_camera
+    find = unknown_camera.propose_cameras
 
-    def counted(frame: Frame, *rest: Any) -> FrameContext | Failure:
+    def counted(frame: Frame, *rest: Any) -> Any:
         asked.append(frame)
         return find(frame, *rest)
 
-    for module in ("outline", "clip.receiver"):
-        monkeypatch.setattr(f"rxcli.receiver.{module}.likely_camera", counted)
+    monkeypatch.setattr("rxcli.receiver.search.propose.propose_cameras", counted)
     results, score = scored(list(receive(clip.frames, _unknown(clip))), clip.truth)
     assert len(asked) == 1
     known = scored(list(receive(clip.frames, clip.options)), clip.truth)[1]

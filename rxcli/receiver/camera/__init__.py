@@ -6,7 +6,7 @@ one to the slots that were decoded with it. docs/blind.md explains both.
 
 from rxcli.receiver.camera.advice import stripe_likeness, why_not
 from rxcli.receiver.camera.camera import camera_profile, in_time_order, is_linear, lens_of, summary
-from rxcli.receiver.camera.columns import likely_columns
+from rxcli.receiver.camera.columns import columns_misfit
 from rxcli.receiver.camera.curvature import curvature_terms, estimate_curvature, straightened
 from rxcli.receiver.camera.fit import settle
 from rxcli.receiver.camera.proposals import CameraHypothesis, propose
@@ -17,6 +17,7 @@ __all__ = [
     "CameraHypothesis",
     "Strips",
     "camera_profile",
+    "columns_misfit",
     "curvature_terms",
     "estimate_curvature",
     "in_time_order",
@@ -24,7 +25,6 @@ __all__ = [
     "joined",
     "lens_of",
     "levelled",
-    "likely_columns",
     "propose",
     "settle",
     "straightened",

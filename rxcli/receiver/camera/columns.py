@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS
 from rxcli.receiver.camera.strips import levelled
@@ -13,8 +14,8 @@ from rxcli.receiver.light import NoiseModel, light_of_columns
 from rxcli.types import BoolArray, Clock, FloatArray, RowProfiles
 
 
-def likely_columns(profiles: RowProfiles, clock: Clock, screens: Sequence[ScreenProfile]) -> ScreenProfile:
-    """The screen whose columns are as wide as the picture's, by how far strips are alike.
+def columns_misfit(profiles: RowProfiles, clock: Clock, screens: Sequence[ScreenProfile]) -> dict[int, float]:
+    """How badly each number of columns explains up to which distance strips are similar: squared error by columns.
 
     Strips at u and v see the columns c with weights g(u - c) and g(v - c), so that their slots correlate by the
     product of both, summed over c. Header and dimming symbol are the same everywhere and must be left out.
@@ -30,13 +31,14 @@ def likely_columns(profiles: RowProfiles, clock: Clock, screens: Sequence[Screen
     n_strips = slots.shape[0]
     reach = max(2, min(n_strips - 1, round(1.5 * n_strips / min(screen.columns for screen in screens))))
     measured = np.array([_mean_likeness(slots, observed, distance) for distance in range(1, reach)])
-    misfit = []
+    misfit = {}
     for screen in screens:
         # Codewords are not quite random, so that strips far apart are a little alike too: a constant.
         basis = np.stack([_expected_likeness(n_strips, reach, screen), np.ones(reach - 1)], axis=1)
         fit, *_ = np.linalg.lstsq(basis, measured, rcond=None)
-        misfit.append(float(((measured - basis @ fit) ** 2).sum()) if fit[0] > 0 else np.inf)
-    return screens[int(np.argmin(misfit))]
+        left = measured - basis @ fit if fit[0] > 0 else measured
+        misfit[screen.columns] = float((left**2).sum()) + TINY
+    return misfit
 
 
 def _strip_slots(profiles: RowProfiles, borders: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -11,9 +11,9 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.context import Failure, FrameContext, Timer
-from rxcli.receiver.outline import find_outline
+from rxcli.receiver.context import FrameContext, Timer
 from rxcli.receiver.screen.registration import ScreenTexture
+from rxcli.receiver.search import search
 from rxcli.types import FloatArray, Frame
 
 
@@ -57,13 +57,14 @@ class FirstOutline:
         moved = self._texture.find(frame)
         if not moved.tells:
             moved = self._texture.with_outline(moved, self._first)
-        found = find_outline(frame, self._options, Timer(), self._known)
-        if isinstance(found, Failure) or not moved.fits or self._is_far(found.corners - moved.corners):
+        found = search(frame, self._options, Timer(), self._known)
+        outline = found.outline
+        if outline is None or not moved.fits or self._is_far(outline.corners - moved.corners):
             # Nothing to compare with: what was found so far must do.
             self._texture = None
             return
         self._texture.learn(frame, moved)
-        self._differences.append(found.corners - moved.corners)
+        self._differences.append(outline.corners - moved.corners)
 
     def _is_far(self, difference: FloatArray) -> bool:
         return bool(np.abs(difference).max() > self._width / 2)

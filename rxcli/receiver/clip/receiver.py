@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.acquisition import Acquisition, sample_columns
+from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.cameras import has_profile
 from rxcli.receiver.clip import results
 from rxcli.receiver.clip.bursts import BurstReader
@@ -22,17 +22,16 @@ from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.start import Start, acquisition_at, agree, shows_little
 from rxcli.receiver.clip.views import View, Waiting
-from rxcli.receiver.context import Failure, FrameContext, Timer
+from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
-from rxcli.receiver.outline import Located, locate
-from rxcli.receiver.reception import Reception, complete_packets, shows_steady_light
-from rxcli.receiver.screen_choice import acquire
-from rxcli.receiver.single_light import STEADY_LIGHT, with_data
-from rxcli.receiver.still import apply_autoencoder, decode, doubtful_columns, initial_pass
+from rxcli.receiver.reception import Reception, complete_packets, packets_are_plain, shows_steady_light
+from rxcli.receiver.search import Found, search
+from rxcli.receiver.search.nulls import STEADY_LIGHT, light_without_data
+from rxcli.receiver.still import apply_autoencoder, decode, decode_photograph, doubtful_columns, initial_pass
 from rxcli.receiver.sync import tracking
-from rxcli.receiver.unknown_camera import Received, likely_camera, packets_are_plain, receive_unknown
+from rxcli.receiver.unknown_camera import settle
 from rxcli.results.dump import dump_stages
 from rxcli.types import BoolArray, FloatArray, Frame, FrameResult, FrameSoftBits, IntArray
 
@@ -97,8 +96,19 @@ class _Settled:
 
     context: FrameContext
     acquisition: Acquisition
-    #: What was received to know its camera; None where that was known.
+    #: Its initial pass, where there was one; what was decoded to refine its camera, where that was estimated.
+    first: Reception | None = None
     reception: Reception | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Located:
+    """Where the screen is in a frame, and what the search found there."""
+
+    outline: Outline
+    context: FrameContext
+    #: None where the screen was moved since, or the camera is another one.
+    found: Found | Failure | None = None
 
 
 class _Clip:
@@ -133,7 +143,7 @@ class _Clip:
         #: Some pixels of the last frame.
         self._some: NDArray[np.float32] | None = None
         #: Number of a frame that is yet to be received, and where its screen is.
-        self._found: tuple[int, Located | Failure] | None = None
+        self._found: tuple[int, _Located | Failure] | None = None
         #: None where nothing is known, or frames cannot be tracked; and the one before the last search.
         self._scene: TrackedScreen | None = None
         self._scene_before: TrackedScreen | None = None
@@ -167,25 +177,18 @@ class _Clip:
 
     def _opens(self, frame: Frame) -> bool:
         """Whether a frame shows screen and camera; the outline, and perhaps the clock, is then found with the next."""
-        located = self._with_camera(frame)
+        located = self._locate(frame, Timer())
         self._found = frame.index, located
-        if isinstance(located, Failure) or not isinstance(located.context, FrameContext):
+        if isinstance(located, Failure):
             return False
         self._outline = FirstOutline(frame, located.outline.corners, self._options, located.context)
         self._little = shows_little(located.context)
         return True
 
-    def _with_camera(self, frame: Frame) -> Located | Failure:
-        """The screen in a frame of which nothing is known, and its camera."""
-        located = locate(frame, self._options, Timer(), self._context)
-        if isinstance(located, Failure) or located.context is not None:
-            return located
-        return replace(located, context=likely_camera(frame, located.outline.corners, self._options, Timer()))
-
     def _begin(self) -> list[FrameResult]:
         """The first frames, once they have agreed on an outline and, where each shows little, on a clock."""
         frames, self._first = self._first or [], None
-        if self._outline is not None and self._found is not None and isinstance(self._found[1], Located):
+        if self._outline is not None and self._found is not None and isinstance(self._found[1], _Located):
             located = _moved_to(self._found[1], self._outline.corners)
             located = self._read_in_time(located, frames)
             if self._little and len(frames) > 1:
@@ -193,13 +196,13 @@ class _Clip:
             self._found = self._found[0], located
         return [result for frame in frames for result in self._take(frame)]
 
-    def _read_in_time(self, located: Located, frames: Sequence[Frame]) -> Located:
+    def _read_in_time(self, located: _Located, frames: Sequence[Frame]) -> _Located:
         """The same with another camera, where the one estimated would need more than a frame's time to read it.
 
         An estimate tells rows per slot; with a slower screen than the right one the camera seems slower, too.
         """
         context, period_s = located.context, _shortest_period_s(frames)
-        if not isinstance(context, FrameContext) or context.camera.hypothesis is None or period_s is None:
+        if context.camera.hypothesis is None or period_s is None:
             return located
         too_long = context.camera.line_delay_s * context.frame.height / (period_s * SETTINGS.readout_slack)
         if too_long <= 1 and not self._little:
@@ -208,35 +211,40 @@ class _Clip:
         screens = tuple(screen for screen in self._options.screens if screen.slot_rate_hz >= slowest_hz)
         options, found = replace(self._options, screens=screens), None
         if too_long > 1 and screens:
-            found = likely_camera(context.frame, context.corners, options, context.timer)
-        if screens and (self._little or isinstance(found, FrameContext)):
+            found = self._search_at(context, options)
+        if screens and (self._little or isinstance(found, Found)):
             self._options = options
-        if not isinstance(found, FrameContext):
+        if not isinstance(found, Found):
             return located
-        self._little = shows_little(found)
-        return replace(located, context=found)
+        self._little = shows_little(found.best.context)
+        return replace(located, context=found.best.context, found=found)
 
-    def _with_common_clock(self, located: Located, frames: Sequence[Frame]) -> Located:
+    def _search_at(
+        self, context: FrameContext, options: ReceiverOptions, known: FrameContext | None = None
+    ) -> Found | Failure:
+        """Search a frame whose corners are known."""
+        at = replace(options, corners=context.corners)
+        return search(context.frame, at, context.timer, known, quick=False)
+
+    def _with_common_clock(self, located: _Located, frames: Sequence[Frame]) -> _Located:
         """Find the clock that the first frames share: with the first frame's camera, else with the best of the others'.
 
         An estimate from less than a packet may be wrong, in the direction of the readout for instance.
         """
         first = located.context
-        if not isinstance(first, FrameContext):
-            return located
         self._start, chosen = agree(frames, first), first
         if self._start is None and first.camera.hypothesis is not None:
             for context in self._other_cameras(first, frames[1:]):
                 start = agree(frames, context)
                 if start is not None and (self._start is None or start.lead > self._start.lead):
                     self._start, chosen = start, context
-        return replace(located, context=chosen)
+        return located if chosen is first else replace(located, context=chosen, found=None)
 
     def _other_cameras(self, first: FrameContext, frames: Sequence[Frame]) -> Iterator[FrameContext]:
         """The first frame with the cameras that other frames tell."""
         for frame in frames:
-            other = self._with_camera(frame)
-            if isinstance(other, Located) and isinstance(other.context, FrameContext):
+            other = self._locate(frame, Timer())
+            if isinstance(other, _Located):
                 yield replace(other.context, frame=first.frame, corners=first.corners, timer=first.timer)
 
     def _take(self, frame: Frame) -> list[FrameResult]:
@@ -342,22 +350,22 @@ class _Clip:
     def _search(self, frame: Frame, timer: Timer) -> tuple[View | Failure, dict[str, Any] | None]:
         """Receive a frame like a photograph, only the camera taken from before; and what the auto-encoder reports."""
         self._scene_before, self._scene = self._scene, None
-        context = self._context_of(frame, timer)
-        if isinstance(context, Failure):
-            return context, None
-        received = self._with_settled_camera(context)
+        located = self._context_of(frame, timer)
+        if isinstance(located, Failure):
+            return located, None
+        received = self._with_settled_camera(located)
         if isinstance(received, Failure):
             return received, None
         context, acquisition = received.context, received.acquisition
         can_track = self._can_track(context, acquisition)
         again = can_track and self._n_held == SETTINGS.frames_held
-        reception, denoised, report = self._decoded(acquisition, received.reception, again, timer)
+        reception, denoised, report = self._decoded(received, again, timer)
         estimated = self._with_estimated_camera(context, reception)
         if estimated is not None:
             context, acquisition = estimated.context, estimated.acquisition
             can_track = self._can_track(context, acquisition)
             again = can_track and self._n_held == SETTINGS.frames_held
-            reception, denoised, report = self._decoded(acquisition, estimated.reception, again, timer)
+            reception, denoised, report = self._decoded(estimated, again, timer)
         if self._start is None and shows_steady_light(reception):
             return Failure("no_signal", STEADY_LIGHT), None
         if assemble.all_dark(reception.snr):
@@ -382,43 +390,45 @@ class _Clip:
             self._scene = scene
         return view, report
 
-    def _context_of(self, frame: Frame, timer: Timer) -> FrameContext | Failure:
+    def _context_of(self, frame: Frame, timer: Timer) -> _Located | Failure:
         """Where the screen is in a frame, and the camera, known from the frames before where nothing changed."""
         if self._taken_with != _taken_with(frame) or "tracking" not in self._options.skip:
             self._context = None
         found, self._found = self._found, None
-        known = found is not None and found[0] == frame.index
-        located = found[1] if found and known else locate(frame, self._options, timer, self._context)
+        located = found[1] if found is not None and found[0] == frame.index else self._locate(frame, timer)
         if isinstance(located, Failure):
             return located
-        corners, self._certainty = located.outline.corners, located.outline.certainty
+        self._certainty = located.outline.certainty
+        corners = located.outline.corners
         if self._scene_before is not None and self._scene_before.is_at(corners):
             corners = self._scene_before.corners
+            located = _moved_to(located, corners)
         self._corners = corners
         if self._context is None:
-            context = located.context or likely_camera(frame, corners, self._options, timer)
-            if isinstance(context, Failure):
-                return context
-            self._context, self._taken_with = context, _taken_with(frame)
-        return replace(self._context, frame=frame, corners=corners, timer=timer)
+            self._context, self._taken_with = located.context, _taken_with(frame)
+        return replace(located, context=replace(self._context, frame=frame, corners=corners, timer=timer))
 
-    def _with_settled_camera(self, context: FrameContext) -> _Settled | Failure:
+    def _locate(self, frame: Frame, timer: Timer) -> _Located | Failure:
+        """The screen in a frame, with the camera that is known or one that is found with it."""
+        return _located(search(frame, self._options, timer, self._context, quick=False))
+
+    def _with_settled_camera(self, located: _Located) -> _Settled | Failure:
         """The frame's clock; and where its camera was estimated, the camera that its slots tell, from then on."""
-        sampler = sample_columns(context, context.n_columns)
-        acquisition = with_data(context, sampler, self._predicted(context) or acquire(context, sampler))
-        if isinstance(acquisition, Failure):
-            return acquisition
-        if context.camera.hypothesis is None or self._start is not None:
-            return _Settled(context, acquisition)
-        received = receive_unknown(context, acquisition, self._options.skip)
-        return self._settled(received)
-
-    def _settled(self, received: Received) -> _Settled:
-        """What was received, its camera being known from now on."""
-        camera = replace(received.context.camera, hypothesis=None)
-        context = replace(received.context, camera=camera)
-        self._context = context
-        return _Settled(context, received.acquisition, received.reception)
+        context, options = located.context, self._options
+        predicted = self._predicted(context)
+        if predicted is not None:
+            return light_without_data(context, predicted) or _Settled(context, predicted)
+        found = located.found or self._search_at(context, options, context)
+        if isinstance(found, Failure):
+            return found
+        best = found.best
+        if context.camera.hypothesis is None:
+            return _Settled(context, best.acquisition, best.reception)
+        with context.timer("detect"):
+            reception = decode_photograph(best.acquisition, options.skip, best.reception)
+        camera, _ = settle(best.context, best.acquisition, reception)
+        self._context = replace(context, camera=replace(camera, hypothesis=None))
+        return _Settled(self._context, best.acquisition, best.reception, reception)
 
     def _with_estimated_camera(self, context: FrameContext, reception: Reception) -> _Settled | None:
         """A clip's first frame by a camera estimated from it, where that of the profile explains nothing of it.
@@ -430,8 +440,8 @@ class _Clip:
             return None
         before = self._options, self._context
         self._options = replace(self._options, cameras=(), force_camera=False)
-        other = likely_camera(context.frame, context.corners, self._options, context.timer)
-        found = other if isinstance(other, Failure) else self._with_settled_camera(other)
+        located = _located(self._search_at(context, self._options))
+        found = located if isinstance(located, Failure) else self._with_settled_camera(located)
         if isinstance(found, Failure) or not _shows_packets(
             found.reception or initial_pass(found.acquisition), SETTINGS.like_doubt
         ):
@@ -461,21 +471,21 @@ class _Clip:
             self._scene, view.light, view.pose = before, None, None
 
     def _decoded(
-        self, acquisition: Acquisition, reception: Reception | None, again: bool, timer: Timer
+        self, settled: _Settled, again: bool, timer: Timer
     ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
         """What is received at a lock, columns that the auto-encoder changed, and its report.
 
         A quick look that leaves little doubt is enough of a frame that is looked at `again` when the picture is known.
         A reception that there is already needs no other.
         """
-        if reception is None and again and self._options.cae != "always":
-            with timer("detect"):
-                reception = initial_pass(acquisition)
-                if doubtful_columns(reception).size <= SETTINGS.quick_doubt * reception.snr.shape[0]:
-                    return reception, frozenset(), None
+        acquisition, reception = settled.acquisition, settled.reception
         if reception is None:
             with timer("detect"):
-                reception = decode(acquisition, self._options.skip)
+                first = settled.first or initial_pass(acquisition)
+                few_doubtful = doubtful_columns(first).size <= SETTINGS.quick_doubt * first.snr.shape[0]
+                if again and self._options.cae != "always" and few_doubtful:
+                    return first, frozenset(), None
+                reception = decode(acquisition, self._options.skip, first)
         with timer("denoise"):
             return apply_autoencoder(acquisition, reception, self._options)
 
@@ -749,12 +759,21 @@ def _shortest_period_s(frames: Sequence[Frame]) -> float | None:
     return min(passed, default=None)
 
 
-def _moved_to(located: Located, corners: FloatArray) -> Located:
+def _located(found: Found | Failure) -> _Located | Failure:
+    """Where a search found the screen; a failure where it found no camera."""
+    if isinstance(found, Found):
+        return _Located(found.outline, found.best.context, found)
+    if found.outline is None or found.context is None:
+        return found
+    return _Located(found.outline, found.context, found)
+
+
+def _moved_to(located: _Located, corners: FloatArray) -> _Located:
     """The same with the corners elsewhere."""
-    context = located.context
-    if isinstance(context, FrameContext) and corners is not context.corners:
-        context = replace(context, corners=corners)
-    return Located(replace(located.outline, corners=corners), context)
+    if corners is located.context.corners:
+        return located
+    outline = replace(located.outline, corners=corners)
+    return _Located(outline, replace(located.context, corners=corners))
 
 
 def _doubt_of(reception: Reception) -> float:

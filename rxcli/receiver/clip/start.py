@@ -16,7 +16,7 @@ from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sample_columns
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.context import Camera, FrameContext
-from rxcli.receiver.screen_choice import told_apart_by_clock, variants_of
+from rxcli.receiver.search.propose import distinct_screens, variants_of
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.receiver.sync.tracking import LinkTime
 from rxcli.types import Clock, FloatArray, Frame, RowProfiles
@@ -51,7 +51,7 @@ def agree(frames: Sequence[Frame], context: FrameContext) -> Start | None:
     best: Start | None = None
     for n_columns in sorted({screen.columns for screen in context.screens}):
         profiles_of = [sample_columns(replace(context, frame=frame), n_columns).profiles for frame in frames]
-        for screen in (s for s in told_apart_by_clock(context.screens) if s.columns == n_columns):
+        for screen in (s for s in distinct_screens(context.screens) if s.columns == n_columns):
             lead, slot, period = _phase(frames, profiles_of, screen, context.camera)
             if lead > SETTINGS.min_lead and (best is None or lead > best.lead):
                 time = LinkTime(screen.packet_slots, screen.slot_rate_hz)

@@ -1,0 +1,40 @@
+"""Why nothing was received, from what the search saw."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from rxcli.receiver.acquisition import sample_columns
+from rxcli.receiver.context import Failure
+from rxcli.receiver.corners import too_small
+from rxcli.receiver.search.hypothesis import Hypothesis
+from rxcli.receiver.search.nulls import STEADY_LIGHT, is_switched
+from rxcli.receiver.search.propose import Proposer
+
+_NO_HEADER = "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
+NO_HEADERS = (
+    "there are stripes but no packet header where it should be; the screen may show less than one packet (move "
+    "closer), the picture may be merged from several exposures (switch HDR off), or the screen is none of those tried"
+)
+
+
+def why_no_packets(proposer: Proposer, nearest: Hypothesis | None, failure: Failure | None) -> Failure:
+    """Why a screen gave no packets.
+
+    Args:
+        proposer: of the frame.
+        nearest: the likeliest hypothesis; None where no camera was proposed.
+        failure: why there were no cameras.
+    """
+    if nearest is None:
+        return replace(failure or Failure("no_signal", NO_HEADERS), outline=proposer.families()[0])
+    context = proposer.context(nearest)
+    profiles = sample_columns(context, nearest.screen.columns, quick=proposer.quick).profiles
+    if is_switched(context, profiles):
+        message = STEADY_LIGHT
+    elif context.camera.hypothesis is not None:
+        message = failure.message if failure else NO_HEADERS
+    else:
+        shortest = min(context.screens, key=lambda screen: screen.packet_s)
+        message = too_small(context, shortest) or _NO_HEADER
+    return Failure("no_signal", message, outline=nearest.outline, context=context)

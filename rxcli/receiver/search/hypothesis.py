@@ -1,0 +1,87 @@
+"""What a picture may show, and how a hypothesis fared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from rxcli.profiles import ScreenProfile
+from rxcli.receiver.acquisition import Acquisition, ColumnSampler
+from rxcli.receiver.context import Camera, FrameContext, Outline
+from rxcli.receiver.reception import Reception
+from rxcli.types import Clock, FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """What a picture may show. The clock is found, and the columns are read, only when the hypothesis is asked for."""
+
+    outline: Outline
+    #: Which of the outline's rows, 0 the likeliest.
+    rows: int
+    camera: Camera
+    screen: ScreenProfile
+    #: The screen and others that differ only in how often they send a packet, the one that sends it most first.
+    variants: tuple[ScreenProfile, ...]
+    log_prior: float
+    clock: Clock | None = None
+    #: Burst of every copy; None: as the similarity of copies indicates.
+    bursts: tuple[int, ...] | None = None
+    sampler: ColumnSampler | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def corners(self) -> FloatArray:
+        """(4, 2) stored pixels, as a viewer sees the screen from the top left on."""
+        return (self.outline.corners, *self.outline.other_rows)[self.rows]
+
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """Equal for hypotheses that an initial pass cannot tell apart; also the order of ties."""
+        camera = self.camera
+        return (
+            self.outline.family,
+            self.rows,
+            round(camera.line_delay_s * self.screen.slot_rate_hz, 9),
+            camera.reversed,
+            camera.lens is not None,
+            self.screen.packet_slots,
+            self.screen.columns,
+            self.screen.slot_rate_hz,
+            self.bursts or (),
+            self.screen.name,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Scored:
+    """A hypothesis after its initial pass."""
+
+    hypothesis: Hypothesis
+    context: FrameContext
+    acquisition: Acquisition
+    reception: Reception
+    #: Log-likelihood ratio of packets over slots of any kind, for a screen of twenty columns.
+    evidence: float
+    #: Tempered evidence plus log prior: the larger wins.
+    score: float
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """A line of the search's record."""
+
+    hypothesis: Hypothesis
+    evidence: float
+    score: float
+    #: "won"; "lost"; "half": its middle columns left it too far behind for a whole pass; "no clock"; "no data": it
+    #: scored best, but light without data explains it.
+    fate: str
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a search decided."""
+
+    best: Scored
+    #: The outline with the probability that its columns are numbered as the screen's.
+    outline: Outline
+    tried: tuple[Tried, ...]

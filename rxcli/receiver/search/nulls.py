@@ -1,0 +1,81 @@
+"""Light without data: does a waveform without packets, or a single lamp, explain what was found as well?"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rxcli.protocol import PREAMBLE_SLOTS
+from rxcli.receiver import sync
+from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of
+from rxcli.receiver.context import Failure, FrameContext
+from rxcli.receiver.corners import too_small
+from rxcli.receiver.decode import assemble
+from rxcli.receiver.decode.steady import is_alike, periodic_share
+from rxcli.receiver.reception import column_llr, shows_steady_light
+from rxcli.receiver.settings import SETTINGS
+from rxcli.receiver.still import initial_pass
+from rxcli.types import BoolArray, RowProfiles
+
+_NEXT = "point the camera at the screen that sends, or check that it does"
+STEADY_LIGHT = (
+    f"this light is switched on and off steadily (PWM), as lamps and dimmed screens do, and carries no data; {_NEXT}"
+)
+_ONE_LAMP = f"all columns show the same light and no packets in it, as of a single lamp; {_NEXT}"
+
+
+def light_without_data(context: FrameContext, acquisition: Acquisition) -> Failure | None:
+    """Why the light of a screen whose clock was found carries no data; None where it may carry some.
+
+    Independent columns are what the link is made of. Where all are alike they are received as one: a screen that sends
+    the same in all columns still shows headers, equal copies and words of the codebook there.
+    """
+    if all(too_small(context, screen) for screen in context.screens):
+        return None  # No packet fits; and light of few rows repeats itself under some period.
+    with context.timer("detect"):
+        binned = acquisition.binned()
+        samples = sync.sample_slots(binned.profiles, binned.clock, SETTINGS.light_samples)
+        contrast = sync.contrast(samples.light, samples.valid, SETTINGS.light_samples, noise_of(binned.profiles))
+        headers = PREAMBLE_SLOTS / binned.screen.packet_slots
+        if not is_alike(*contrast, headers, SETTINGS.apart_slots * SETTINGS.light_samples):
+            return None
+        reception = initial_pass(_as_one_column(binned))
+        no_header = bool(np.any(assemble.without_header(reception.posteriors.header_llr)))
+        if float(column_llr(reception).max()) > SETTINGS.some_packets and not no_header:
+            return None
+        return Failure("no_signal", STEADY_LIGHT if shows_steady_light(reception) else _ONE_LAMP)
+
+
+def is_switched(context: FrameContext, profiles: RowProfiles) -> bool:
+    """Whether one period explains the light of all columns on their rows, where no clock was found."""
+    if all(too_small(context, screen) for screen in context.screens):
+        return False
+    light, inside = profiles.light, profiles.inside.astype(np.float32)
+    value, weight = sync.contrast(light, inside, SETTINGS.smooth_rows, noise_of(profiles))
+    level = value * (weight > 0)
+    headers = PREAMBLE_SLOTS / min(screen.packet_slots for screen in context.screens)
+    if not is_alike(value, weight, headers):
+        return False
+    level -= level.mean(axis=1, keepdims=True)
+    return periodic_share(level, 2 * SETTINGS.most_period_rows) > SETTINGS.switched_share
+
+
+def _as_one_column(acquisition: Acquisition) -> Acquisition:
+    """The same with every column a strip of one."""
+    sampler = ColumnSampler(_columns_as_strips(acquisition.profiles), is_binned=True)
+    return replace(acquisition, sampler=sampler, clock=replace(acquisition.clock, delay_slots=np.zeros(1)))
+
+
+def _columns_as_strips(profiles: RowProfiles) -> RowProfiles:
+    weight = profiles.inside.astype(np.float32)
+    inside: BoolArray = np.any(profiles.inside, axis=1)
+    light = (profiles.light * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
+    sensor_row = None if profiles.sensor_row is None else profiles.sensor_row.mean(axis=1)[None]
+    return replace(
+        profiles,
+        light=np.asarray(light[None], np.float32),
+        inside=inside[None],
+        count=np.asarray(profiles.count.sum(axis=1)[None], np.float32),
+        sensor_row=sensor_row,
+    )

@@ -1,0 +1,250 @@
+"""Hypotheses with log priors, likeliest first. Nothing is decided here."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rxcli.options import ReceiverOptions
+from rxcli.profiles import ScreenProfile
+from rxcli.receiver import camera as blind
+from rxcli.receiver import sync
+from rxcli.receiver.acquisition import ColumnSampler, noise_of, sample_columns
+from rxcli.receiver.cameras import known_camera
+from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
+from rxcli.receiver.decode import detect
+from rxcli.receiver.reception import Reception, complete_packets, packet_confidence
+from rxcli.receiver.search.hypothesis import Hypothesis, Scored
+from rxcli.receiver.search.outlines import likeliest_of_family
+from rxcli.receiver.search.settings import SETTINGS
+from rxcli.receiver.unknown_camera import propose_cameras, relabelled_camera
+from rxcli.types import Clock, Frame
+
+#: Columns that a clock is sought on first, or the number next to it.
+_USUAL_COLUMNS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Proposer:
+    """Proposes what one frame may show.
+
+    Attributes:
+        frame: the picture.
+        options: screens and cameras.
+        timer: of the frame.
+        outlines: that the screen may have.
+        known: the camera and the screens where these are known from other frames.
+        quick: read developed pictures coarsely, see `sample_columns`.
+    """
+
+    frame: Frame
+    options: ReceiverOptions
+    timer: Timer
+    outlines: tuple[Outline, ...]
+    known: FrameContext | None = None
+    quick: bool = True
+
+    def families(self) -> list[Outline]:
+        """One outline of every family, likeliest first: packets are the same whichever column is the first."""
+        families: dict[int, list[Outline]] = {}
+        for outline in self.outlines:
+            families.setdefault(outline.family, []).append(outline)
+        chosen = [likeliest_of_family(outlines) for outlines in families.values()]
+        return sorted(chosen, key=lambda outline: (-outline.log_odds, outline.family))
+
+    def cameras(self) -> Generator[list[Hypothesis], None, Failure | None]:
+        """Hypotheses camera by camera, the likeliest camera first; returns why there are none, or no more.
+
+        Rows are the same instants wherever the columns are, so the first family that shows any camera speaks for all.
+        """
+        known = self.known.camera if self.known else known_camera(self.frame, self.options)
+        if isinstance(known, Failure):
+            return known
+        if known is not None:
+            for outline in self.families():
+                yield self._of_camera(outline, known, outline.log_odds)
+            return None
+        failure, n_proposed = None, 0
+        usual = _nearest(self.options.screens, _USUAL_COLUMNS).columns
+        for outline in self.families():
+            cameras = propose_cameras(self.frame, outline.corners, self.options, self.timer, usual)
+            try:
+                while True:
+                    log_prior = outline.log_odds - SETTINGS.next_camera * n_proposed
+                    yield self._of_camera(outline, next(cameras), log_prior)
+                    n_proposed += 1
+            except StopIteration as end:
+                failure = failure or end.value
+            if n_proposed:
+                break
+        return failure
+
+    def _of_camera(self, outline: Outline, camera: Camera, log_prior: float) -> list[Hypothesis]:
+        """Hypotheses of one camera: a screen for every clock that it may show."""
+        screens = self._screens()
+        if camera.hypothesis is not None:
+            screens = tuple(one for one in screens if one.packet_slots == camera.hypothesis.packet_slots)
+        groups = _by_clock(_fitting(outline, camera, screens), camera)
+        return [self._hypothesis(outline, camera, _nearest(alike, _USUAL_COLUMNS), log_prior) for alike in groups]
+
+    def _screens(self) -> tuple[ScreenProfile, ...]:
+        return self.known.screens if self.known else self.options.screens
+
+    def _hypothesis(self, outline: Outline, camera: Camera, screen: ScreenProfile, log_prior: float) -> Hypothesis:
+        variants = variants_of(screen, self.options.screens)
+        return Hypothesis(outline, 0, relabelled_camera(camera, screen, self.frame), variants[0], variants, log_prior)
+
+    def context(self, hypothesis: Hypothesis) -> FrameContext:
+        """The frame as a hypothesis has it, with the screens that its camera may show."""
+        camera, screens = hypothesis.camera, self._screens()
+        if camera.hypothesis is not None:
+            own = hypothesis.screen
+            screens = tuple(
+                one for one in screens if (one.slot_rate_hz, one.packet_slots) == (own.slot_rate_hz, own.packet_slots)
+            )
+        return FrameContext(self.frame, hypothesis.corners, camera, screens, self.timer)
+
+    def with_clock(self, hypothesis: Hypothesis) -> Hypothesis | None:
+        """The hypothesis with its columns read and its clock; None where no header shows."""
+        n_columns = hypothesis.screen.columns
+        usual = _nearest((hypothesis.screen, *self.options.screens), _USUAL_COLUMNS).columns
+        # A header shows on columns of any width: narrow ones are read where it does.
+        for n in dict.fromkeys((usual, n_columns)):
+            sampler = sample_columns(self.context(hypothesis), n, quick=self.quick)
+            with self.timer("clock"):
+                clock = _clock(hypothesis, sampler)
+            if clock is None or clock.header_peak_ratio < SETTINGS.min_lead:
+                return None
+        assert clock is not None
+        lead = np.log(clock.header_peak_ratio / SETTINGS.clear_lead)
+        log_prior = hypothesis.log_prior + SETTINGS.lead_weight * min(float(lead), 0.0)
+        kept = hypothesis.bursts is not None and len(hypothesis.bursts) == clock.n_copies
+        bursts = hypothesis.bursts if kept else None
+        return replace(hypothesis, clock=clock, sampler=sampler, bursts=bursts, log_prior=log_prior)
+
+    def siblings(self, scored: Scored) -> Iterator[Hypothesis]:
+        """Hypotheses that differ from a scored one in one thing, with the log prior that this thing changes."""
+        hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, sampler=None, bursts=None)
+        outline, screen, camera = hypothesis.outline, hypothesis.screen, hypothesis.camera
+        for rows in range(1 + len(outline.other_rows)):
+            if rows != hypothesis.rows:
+                yield replace(hypothesis, rows=rows)
+        for other in self.families():
+            if other.family != outline.family:
+                fitting = _of_clock(_fitting(other, camera, self.options.screens), screen, camera)
+                nearest = screen if screen in fitting or not fitting else _nearest(fitting, screen.columns)
+                log_prior = hypothesis.log_prior + other.log_odds - outline.log_odds
+                yield self._hypothesis(other, camera, nearest, log_prior)
+        screens = _fitting(outline, camera, self.options.screens)
+        yield from self._of_other_columns(scored, _of_clock(screens, screen, camera))
+        if _is_clear(scored.reception):
+            return
+        if camera.hypothesis is not None:
+            lengths = _by_clock([one for one in screens if one.packet_slots != screen.packet_slots], camera)
+            for alike in lengths:
+                nearest = _nearest(alike, screen.columns)
+                yield replace(self._hypothesis(outline, camera, nearest, hypothesis.log_prior), rows=hypothesis.rows)
+        yield from self._of_other_bursts(scored)
+
+    def _of_other_columns(self, scored: Scored, screens: list[ScreenProfile]) -> Iterator[Hypothesis]:
+        """Screens of the same clock with other columns, by how similar strips at a distance are."""
+        by_columns = {screen.columns: screen for screen in reversed(screens)}
+        if len(by_columns) < 2:
+            return
+        hypothesis = scored.hypothesis
+        misfit = blind.columns_misfit(
+            scored.acquisition.sampler.binned(), scored.reception.clock, [by_columns[n] for n in by_columns]
+        )
+        own = misfit[hypothesis.screen.columns]
+        for n_columns, screen in by_columns.items():
+            if n_columns != hypothesis.screen.columns:
+                change = SETTINGS.columns_weight * float(np.log(own / misfit[n_columns]))
+                log_prior = hypothesis.log_prior + change
+                sibling = self._hypothesis(hypothesis.outline, scored.context.camera, screen, log_prior)
+                yield replace(sibling, rows=hypothesis.rows)
+
+    def _of_other_bursts(self, scored: Scored) -> Iterator[Hypothesis]:
+        """Other bursts of the same copies, where packets leave doubt."""
+        reception, repeats = scored.reception, scored.acquisition.repeats
+        complete = complete_packets(reception)
+        possible = sync.possible_bursts(reception.clock, detect.slot_llr(reception.metrics), repeats)
+        plain = len(possible) == 1 or possible[0][1] - possible[1][1] > SETTINGS.plain_bursts
+        if complete.any() and plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
+            return
+        for clock, _ in possible:
+            if not np.array_equal(clock.burst, reception.clock.burst):
+                yield replace(
+                    scored.hypothesis,
+                    camera=scored.context.camera,
+                    clock=scored.acquisition.clock,
+                    sampler=scored.acquisition.sampler,
+                    bursts=tuple(clock.burst.tolist()),
+                )
+
+
+def _is_clear(reception: Reception) -> bool:
+    """Whether nearly all columns have a complete packet of high confidence."""
+    confidence = np.where(complete_packets(reception), packet_confidence(reception), 0.0).max(axis=0)
+    return bool((confidence > SETTINGS.clear_confidence).mean() >= SETTINGS.clear_columns)
+
+
+def distinct_screens(screens: Sequence[ScreenProfile]) -> list[ScreenProfile]:
+    """The screens without those that differ only in how often a packet is sent: the one that sends it most."""
+    return [one for one in screens if variants_of(one, screens)[0] is one]
+
+
+def variants_of(screen: ScreenProfile, screens: Sequence[ScreenProfile]) -> tuple[ScreenProfile, ...]:
+    """The screen, and others that differ only in how often a packet is sent; the one that sends it most first."""
+    by_repeats = {one.repeats: one for one in reversed((screen, *screens)) if _shape(one) == _shape(screen)}
+    return tuple(by_repeats[repeats] for repeats in sorted(by_repeats, reverse=True))
+
+
+def _shape(screen: ScreenProfile) -> tuple[float, int, int]:
+    return screen.slot_rate_hz, screen.packet_slots, screen.columns
+
+
+def _nearest(screens: Iterable[ScreenProfile], n_columns: int) -> ScreenProfile:
+    """The screen whose number of columns is nearest."""
+    return min(screens, key=lambda one: (abs(np.log(one.columns / n_columns)), one.columns))
+
+
+def _of_clock(screens: Iterable[ScreenProfile], screen: ScreenProfile, camera: Camera) -> list[ScreenProfile]:
+    """Screens that share the clock of one."""
+    return [one for one in screens if _clock_of(one, camera) == _clock_of(screen, camera)]
+
+
+def _clock_of(screen: ScreenProfile, camera: Camera) -> tuple[float, int]:
+    """What a picture tells screens apart by: the slot rate too, where the camera is known."""
+    return (0.0 if camera.hypothesis is not None else screen.slot_rate_hz), screen.packet_slots
+
+
+def _fitting(outline: Outline, camera: Camera, screens: Iterable[ScreenProfile]) -> list[ScreenProfile]:
+    """Screens with the columns of an outline; of those that an estimated camera cannot tell apart the quickest."""
+    screens = list(screens)
+    fitting = [one for one in screens if one.columns == outline.n_columns] or screens
+    if camera.hypothesis is None:
+        return fitting
+    quickest: dict[tuple[int, int], ScreenProfile] = {}
+    for one in fitting:
+        shape = one.packet_slots, one.columns
+        if shape not in quickest or one.slot_rate_hz > quickest[shape].slot_rate_hz:
+            quickest[shape] = one
+    return list(quickest.values())
+
+
+def _by_clock(screens: Iterable[ScreenProfile], camera: Camera) -> list[list[ScreenProfile]]:
+    """Screens grouped by their clock."""
+    groups: dict[tuple[float, int], list[ScreenProfile]] = {}
+    for screen in screens:
+        groups.setdefault(_clock_of(screen, camera), []).append(screen)
+    return [groups[clock] for clock in sorted(groups)]
+
+
+def _clock(hypothesis: Hypothesis, sampler: ColumnSampler) -> Clock | None:
+    screen, camera = hypothesis.screen, hypothesis.camera
+    pooled = sync.pooled_strips(sampler.binned())
+    rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
+    exposure_slots = camera.exposure_s * screen.slot_rate_hz
+    return sync.find_clock(pooled, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(pooled))

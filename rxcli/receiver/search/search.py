@@ -1,0 +1,233 @@
+"""Best first: the likeliest hypothesis has an initial pass, and what it shows says which comes next."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Generator
+from dataclasses import replace
+
+import numpy as np
+
+from rxcli.options import ReceiverOptions
+from rxcli.receiver.acquisition import Acquisition, ColumnSampler
+from rxcli.receiver.camera import is_linear
+from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
+from rxcli.receiver.sampling import is_coded
+from rxcli.receiver.search import evidence
+from rxcli.receiver.search.explain import why_no_packets
+from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
+from rxcli.receiver.search.nulls import light_without_data
+from rxcli.receiver.search.outlines import numbered, proposed_outlines
+from rxcli.receiver.search.propose import Proposer
+from rxcli.receiver.search.settings import SETTINGS
+from rxcli.receiver.still import initial_pass
+from rxcli.receiver.unknown_camera import settle
+from rxcli.types import Frame
+
+_Cameras = Generator[list[Hypothesis], None, Failure | None]
+#: Less the key, so that a heap gives the likeliest first; ties by identity; a number where that is the same.
+_Entry = tuple[float, tuple[object, ...], int, Hypothesis]
+
+
+def search(
+    frame: Frame,
+    options: ReceiverOptions,
+    timer: Timer,
+    known: FrameContext | None = None,
+    *,
+    quick: bool = True,
+    budget: int = SETTINGS.budget,
+) -> Found | Failure:
+    """Find outline, rows, camera, screen, clock and bursts of a frame.
+
+    Args:
+        frame: the picture.
+        options: screens, cameras, perhaps corners.
+        timer: time is counted there.
+        known: a frame of the same camera, where the camera and the screens are known.
+        quick: read developed pictures coarsely, see `sample_columns`.
+        budget: initial passes, at most.
+    """
+    outlines = proposed_outlines(frame, options, timer)
+    if isinstance(outlines, Failure):
+        return outlines
+    proposer = Proposer(frame, options, timer, tuple(outlines), known, quick)
+    walk = _Walk(proposer, budget)
+    best = walk.run()
+    least = SETTINGS.bail if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
+    if best is None or best.evidence < least:
+        best = walk.best_without_packets()
+    if best is None:
+        return replace(why_no_packets(proposer, walk.nearest, walk.failure), tried=walk.record(None))
+    chosen = replace(
+        numbered(best.hypothesis.outline, outlines, walk.evidence_of), corners=best.hypothesis.corners, other_rows=()
+    )
+    refused = light_without_data(best.context, best.acquisition)
+    if refused is not None:
+        return replace(refused, outline=chosen, context=best.context, tried=walk.record(best, "no data"))
+    return Found(best, chosen, walk.record(best))
+
+
+class _Walk:
+    """One search under way."""
+
+    def __init__(self, proposer: Proposer, budget: int) -> None:
+        self._proposer, self._budget = proposer, budget
+        self._scored: list[Scored] = []
+        self._tried: list[Tried] = []
+        self._asked: set[tuple[object, ...]] = set()
+        self._fresh: list[_Entry] = []
+        self._siblings: list[_Entry] = []
+        #: None when there are no more; the log prior that the next may have.
+        self._cameras: _Cameras | None = proposer.cameras()
+        self._next_prior = np.inf
+        #: Why there are no cameras; and the first hypothesis.
+        self.failure: Failure | None = None
+        self.nearest: Hypothesis | None = None
+
+    def run(self) -> Scored | None:
+        """Score hypotheses, best first, until nothing is near the best or the budget is spent; returns the best."""
+        while len(self._tried) < self._budget and (entry := self._next()) is not None:
+            queue, (key, _, _, hypothesis) = entry
+            if (hypothesis.identity, hypothesis.clock is None) in self._asked:
+                continue
+            self._asked.add((hypothesis.identity, hypothesis.clock is None))
+            if hypothesis.clock is None:
+                found = self._proposer.with_clock(hypothesis)
+                if found is None:
+                    self._tried.append(Tried(hypothesis, 0.0, hypothesis.log_prior, "no clock"))
+                else:
+                    self._push(queue, -key + found.log_prior - hypothesis.log_prior, found)
+                continue
+            self._score(hypothesis)
+            if self._is_hopeless():
+                break
+        best = self._best()
+        return best if best is None or best.evidence < SETTINGS.plain else self._settled(best)
+
+    def _settled(self, best: Scored) -> Scored:
+        """The same with an estimated camera fitted to its slots until that moves the clock no more."""
+        if best.context.camera.hypothesis is None:
+            return best
+        for _ in range(SETTINGS.max_fits):
+            camera, moved_slots = settle(best.context, best.acquisition, best.reception)
+            if moved_slots < SETTINGS.matters_slots:
+                best = replace(best, context=replace(best.context, camera=camera))
+                break
+            again = self._again(best, camera)
+            # A fit under which packets show less was of wrong slots.
+            if again is None or again.evidence < SETTINGS.kept_evidence * best.evidence:
+                break
+            best = again
+        return self._as_light(best)
+
+    def _as_light(self, best: Scored) -> Scored:
+        """With values taken for light where they seem to be, and packets show as well then."""
+        camera = best.context.camera
+        if camera.hypothesis is None or not is_linear(camera.hypothesis.tone) or not is_coded(best.context.frame):
+            return best
+        again = self._again(best, replace(camera, tone="linear"))
+        if again is not None and again.evidence >= best.evidence:
+            return again
+        return replace(best, context=replace(best.context, camera=camera.without_tone()))
+
+    def _again(self, best: Scored, camera: Camera) -> Scored | None:
+        """An initial pass with another camera; None where no clock is found."""
+        hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
+        if hypothesis is None:
+            return None
+        return replace(self._measured(hypothesis, _acquired(hypothesis)), hypothesis=best.hypothesis)
+
+    def best_without_packets(self) -> Scored | None:
+        """Of a frame without packets, the likeliest outline's hypothesis, where the camera is known."""
+        shown = [one for one in self._scored if one.context.camera.hypothesis is None]
+        return max(shown, key=lambda one: (one.hypothesis.outline.log_odds, one.score), default=None)
+
+    def evidence_of(self, family: int) -> float | None:
+        """The most evidence under outlines of a family; None where none was scored."""
+        tried = (one for one in self._tried if one.fate != "no clock" and one.hypothesis.outline.family == family)
+        return max((one.evidence for one in tried), default=None)
+
+    def record(self, best: Scored | None, fate: str = "won") -> tuple[Tried, ...]:
+        """Every hypothesis that was tried, in order, with the fate of the best one."""
+        own = best and best.hypothesis.identity
+        return tuple(replace(one, fate=fate) if one.hypothesis.identity == own else one for one in self._tried)
+
+    def _best(self) -> Scored | None:
+        return max(self._scored, key=lambda one: one.score, default=None)
+
+    def _is_hopeless(self) -> bool:
+        passes = [one.evidence for one in self._tried if one.fate != "no clock"]
+        return len(passes) >= SETTINGS.hopeless_budget and max(passes) < SETTINGS.bail
+
+    def _push(self, queue: list[_Entry], key: float, hypothesis: Hypothesis) -> None:
+        heapq.heappush(queue, (-key, hypothesis.identity, len(self._asked) + len(queue), hypothesis))
+
+    def _next(self) -> tuple[list[_Entry], _Entry] | None:
+        """The queue and the entry that is asked next; None where nothing could come near the best."""
+        best = self._best()
+        if best is not None and self._siblings and -self._siblings[0][0] >= best.score - SETTINGS.reach:
+            return self._siblings, heapq.heappop(self._siblings)
+        if best is not None and best.evidence > SETTINGS.plain:
+            return None
+        while self._cameras is not None and (not self._fresh or self._next_prior > -self._fresh[0][0]):
+            try:
+                proposed = next(self._cameras)
+            except StopIteration as end:
+                self._cameras, self.failure = None, end.value
+                break
+            self._next_prior = proposed[0].log_prior - SETTINGS.next_camera
+            for hypothesis in proposed:
+                self.nearest = self.nearest or hypothesis
+                self._push(self._fresh, hypothesis.log_prior, hypothesis)
+        return (self._fresh, heapq.heappop(self._fresh)) if self._fresh else None
+
+    def _score(self, hypothesis: Hypothesis) -> None:
+        """An initial pass, of the middle columns first where there is a better hypothesis already."""
+        best, acquisition = self._best(), _acquired(hypothesis)
+        if best is not None and hypothesis.screen.columns > SETTINGS.few_columns:
+            half = self._measured(hypothesis, _middle(acquisition))
+            if half.score < best.score - SETTINGS.reach or half.evidence < SETTINGS.bail:
+                self._tried.append(Tried(hypothesis, half.evidence, half.score, "half"))
+                return
+        scored = self._measured(hypothesis, acquisition)
+        if SETTINGS.bail < scored.evidence < SETTINGS.plain:
+            # Packets may show plainly once an estimated camera is fitted: then no other is asked.
+            scored = self._settled(scored)
+        bursts = replace(hypothesis, bursts=tuple(scored.reception.clock.burst.tolist()))
+        self._asked.add((bursts.identity, False))
+        self._scored.append(scored)
+        self._tried.append(Tried(hypothesis, scored.evidence, scored.score, "lost"))
+        if best is None or scored.score > best.score - SETTINGS.reach:
+            for sibling in self._proposer.siblings(scored):
+                self._push(self._siblings, scored.score + sibling.log_prior - hypothesis.log_prior, sibling)
+
+    def _measured(self, hypothesis: Hypothesis, acquisition: Acquisition) -> Scored:
+        with self._proposer.timer("detect"):
+            reception = initial_pass(acquisition)
+            own = evidence.log_evidence(reception)
+            score = evidence.score(reception, acquisition.repeats, own, hypothesis.log_prior)
+        return Scored(hypothesis, self._proposer.context(hypothesis), acquisition, reception, own, score)
+
+
+def _acquired(hypothesis: Hypothesis) -> Acquisition:
+    assert hypothesis.sampler is not None
+    assert hypothesis.clock is not None
+    bursts = None if hypothesis.bursts is None else np.array(hypothesis.bursts)
+    return Acquisition(hypothesis.screen, hypothesis.sampler, hypothesis.clock, hypothesis.variants, bursts)
+
+
+def _middle(acquisition: Acquisition) -> Acquisition:
+    """The middle half of the columns."""
+    n_columns = acquisition.screen.columns
+    part = slice(n_columns // 4, n_columns - n_columns // 4)
+    profiles, rows = acquisition.profiles, acquisition.profiles.sensor_row
+    middle = replace(
+        profiles,
+        light=profiles.light[part],
+        inside=profiles.inside[part],
+        count=profiles.count[part],
+        sensor_row=None if rows is None else rows[part],
+    )
+    clock = replace(acquisition.clock, delay_slots=acquisition.clock.delay_slots[part])
+    return replace(acquisition, sampler=ColumnSampler(middle, acquisition.sampler.is_binned), clock=clock)

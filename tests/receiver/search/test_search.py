@@ -1,0 +1,123 @@
+"""The search: one answer in whatever order hypotheses come, screens as hypotheses, a record of what was tried."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from small_frames import CAMERA, SCREEN, write_frame
+
+from rxcli.ingest import open_source
+from rxcli.lab.benchmark.trial import Trial, simulate_trial
+from rxcli.lab.simulate.scenes import preset
+from rxcli.options import ReceiverOptions
+from rxcli.profiles import CameraProfile, ScreenProfile, parse_profile, shipped_profiles
+from rxcli.receiver.context import Failure, Outline, Timer
+from rxcli.receiver.pipeline import receive_frame
+from rxcli.receiver.search import Found, outlines, search
+from rxcli.types import Frame, FrameResult
+
+SHIPPED = tuple(shipped_profiles(ScreenProfile))
+
+
+def more_screens() -> tuple[ScreenProfile, ...]:
+    """Screens of other columns and rates, as somebody may have them in a folder."""
+    usual = next(screen for screen in SHIPPED if screen.name == "paper-34k6")
+    others = ((10, 20000.0, 24), (12, 34600.0, 24), (24, 17300.0, 11), (40, 8650.0, 5))
+    return tuple(
+        msgspec.structs.replace(usual, name=f"mine-{columns}", columns=columns, slot_rate_hz=rate, payload_symbols=n)
+        for columns, rate, n in others
+    )
+
+
+@lru_cache(maxsize=4)
+def trial_of(screen: str, picture: str = "coffee") -> Trial:
+    scene = preset("phone-plain", screen).scaled(0.3, 0.5, keep_readout=True)
+    return simulate_trial(replace(scene, picture=picture), 3)
+
+
+def payloads_of(result: FrameResult) -> list[tuple[int, str, float]]:
+    return [
+        (column.column, packet.payload, packet.confidence) for column in result.columns for packet in column.packets
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_screens_cameras_and_outlines_does_not_matter(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    trial, rng = trial_of("paper-17k3"), np.random.default_rng(seed)
+    options = replace(trial.options(), screens=(*SHIPPED, *more_screens()))
+    possible = [
+        Outline(trial.corners + np.array([40.0 * k, 0.0]), log_odds=-0.5 * abs(k), family=family)
+        for k in (-1, 0, 1)
+        for family in (0, 1)
+    ]
+    assert options.corners is not None
+    options = replace(options, corners=None)
+
+    def received(order: np.ndarray[Any, Any]) -> list[tuple[int, str, float]]:
+        shuffled = [possible[k] for k in order]
+        monkeypatch.setattr(outlines, "possible_outlines", lambda *_: shuffled)
+        screens = [options.screens[k] for k in rng.permutation(len(options.screens))]
+        return payloads_of(receive_frame(trial.frame, replace(options, screens=tuple(screens))))
+
+    as_listed = received(np.arange(6))
+    assert len(as_listed) > 10
+    assert received(rng.permutation(6)) == as_listed
+
+
+@pytest.mark.parametrize("screen", ["paper-17k3", "paper-34k6", "paper-8k65"])
+@pytest.mark.parametrize("known", [True, False])
+def test_more_screens_in_the_folder_lose_no_packet(screen: str, known: bool) -> None:
+    trial = trial_of(screen)
+    options = replace(trial.options(), screens=SHIPPED, force_camera=known)
+    options = options if known else replace(options, cameras=())
+    alone = receive_frame(trial.frame, options)
+    among = receive_frame(trial.frame, replace(options, screens=(*more_screens(), *SHIPPED)))
+    assert len(payloads_of(alone)) > 10
+    same = {found[:2] for found in payloads_of(among)} & {found[:2] for found in payloads_of(alone)}
+    # An unknown camera is estimated on other columns, so that a packet in doubt may come out otherwise.
+    assert len(same) >= (1.0 if known else 0.9) * len(payloads_of(alone))
+
+
+def test_every_hypothesis_is_recorded_with_its_fate(tmp_path: Path) -> None:
+    write_frame(tmp_path / "small.png", 5)
+    frame = next(iter(open_source(str(tmp_path / "small.png"))))
+    screen, camera = parse_profile(SCREEN, ScreenProfile, "small"), parse_profile(CAMERA, CameraProfile, "camera")
+    corners = np.array([[10, 10], [329, 10], [329, 609], [10, 609]], float)
+    options = ReceiverOptions(
+        screens=(screen, *SHIPPED), cameras=(camera,), force_camera=True, corners=corners, cae="never"
+    )
+    found = search(frame, options, Timer())
+    assert isinstance(found, Found)
+    assert [one.fate for one in found.tried].count("won") == 1
+    won = next(one for one in found.tried if one.fate == "won")
+    assert won.hypothesis.screen.name == "small"
+    assert won.evidence == found.best.evidence > 100
+    assert won.score == max(one.score for one in found.tried)
+
+
+def test_a_refusal_says_what_came_nearest() -> None:
+    rng = np.random.default_rng(2)
+    frame = Frame(rng.integers(90, 110, (620, 340), np.uint8), "noise")
+    corners = np.array([[10, 10], [329, 10], [329, 609], [10, 609]], float)
+    camera = parse_profile(CAMERA, CameraProfile, "camera")
+    found = search(frame, ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners), Timer())
+    if isinstance(found, Found):
+        assert found.best.evidence < 40
+    else:
+        assert isinstance(found, Failure)
+        assert found.outline is not None
+        assert found.context is not None
+        assert found.tried
+
+
+def test_the_budget_bounds_the_passes() -> None:
+    trial = trial_of("paper-17k3")
+    found = search(trial.frame, replace(trial.options(), screens=SHIPPED), Timer(), budget=1)
+    assert isinstance(found, Found)
+    assert len(found.tried) == 1
