@@ -32,13 +32,15 @@ def propose_cameras(
     profiles = sample_columns(context, n_columns, quick=True).profiles
     with timer("blind"):
         strips = _strips(context, profiles)
-    found = blind.propose(strips, options.screens, frame.metadata.exposure_s, may_bend=frame.mosaic is None)
+    # A picture does not tell the slot rate: of screens with packets of one length the quickest stands for all.
+    screens = sorted(options.screens, key=lambda one: -one.slot_rate_hz)
+    found = blind.propose(strips, screens, frame.metadata.exposure_s, may_bend=frame.mosaic is None)
     while True:
         with timer("blind"):
             hypothesis = next(found, None)
         if hypothesis is None:
             return Failure("no_signal", blind.why_not(strips))
-        screen = next(one for one in options.screens if one.packet_slots == hypothesis.packet_slots)
+        screen = next(one for one in screens if one.packet_slots == hypothesis.packet_slots)
         yield _camera(hypothesis, screen.slot_rate_hz, frame, DEFAULT_TONE)
 
 
