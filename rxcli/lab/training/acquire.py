@@ -1,21 +1,14 @@
-"""What the receiver finds of a trial before its auto-encoder is asked."""
+"""Screen and clock of simulated frames, as the receiver finds them."""
 
 from __future__ import annotations
 
 from rxcli.lab.benchmark.trial import Trial
-from rxcli.receiver.acquisition import Acquisition, sample_columns
+from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.context import Failure, Timer
-from rxcli.receiver.outline import find_outline
-from rxcli.receiver.screen_choice import acquire
-from rxcli.receiver.unknown_camera import likely_camera
+from rxcli.receiver.search import search
 
 
 def acquired(trial: Trial, *, quick: bool = True) -> Acquisition | None:
     """Screen and clock of a trial's first frame; None where they are not found. For `quick` see `sample_columns`."""
-    options, timer = trial.options(), Timer()
-    outline = find_outline(trial.frame, options, timer)
-    context = outline if isinstance(outline, Failure) else likely_camera(trial.frame, outline.corners, options, timer)
-    if isinstance(context, Failure):
-        return None
-    found = acquire(context, sample_columns(context, context.n_columns, quick=quick))
-    return None if isinstance(found, Failure) else found
+    found = search(trial.frame, trial.options(), Timer(), quick=quick)
+    return None if isinstance(found, Failure) else found.best.acquisition
