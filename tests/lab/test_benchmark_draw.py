@@ -20,6 +20,7 @@ from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
 from rxcli.lab.simulate.no_data import EVEN_KINDS, NO_DATA_KINDS, STRIPED_KINDS, draw_no_data
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.scenes import preset
+from rxcli.types import Frame
 
 #: What earlier versions drew.
 PHONE = {"picture": "hubble", "turned": False, "rows_per_slot": 4.934242608710645, "blur_px": 0.5571024930222309}
@@ -129,6 +130,18 @@ def test_points_of_sweeps_have_scenes() -> None:
             narrow = point.get("is_binned", True) and "megapixels" not in point
             assert scene.screen.columns == point.get("columns", 20)
             assert not narrow or scene.sensor.width <= scene.screen.columns * 46
+
+
+def test_rows_are_moved_smoothly_and_no_further_than_said() -> None:
+    ramp = np.add.outer(np.arange(200), np.arange(300)).astype(np.uint16) * 10  # a pixel either way is ten levels
+    moves = []
+    for seed in range(20):
+        pixels = draw.warped(Frame(ramp, "ramp"), np.random.default_rng(seed), 6.0).pixels.astype(np.float64)
+        moved = (pixels - ramp)[10:-10, 10:-10] / 10
+        assert np.ptp(moved, axis=1).max() <= 0.2  # rows keep their shape
+        assert np.abs(np.diff(moved[:, 0])).max() < 0.6
+        moves.append(np.abs(moved).max())
+    assert 3 < max(moves) <= 6.1
 
 
 def test_growth_shows_the_same_time_at_any_size() -> None:

@@ -150,10 +150,35 @@ _NARROW_SHARE, _SCREEN_PACKETS = 0.12, 1.25
 
 
 def draw_screen(at: Place) -> Iterator[Case]:
-    """A dark or ordinary picture on a screen anywhere in the frame; cameras are those that a user has."""
+    """A dark or ordinary picture on a screen anywhere in the frame; cameras are those that a user has.
+
+    Point: `warped_px`, by how much software has moved the rows of developed pictures, at most.
+    """
     scene, kind = screen_of(at.seed, at.number)
     dark = () if kind == "photo" else ("dark",)
-    yield _case(simulate_trial(scene, at.number, oracle=at.oracle), ReceiverOptions(), kind, *dark, kind=kind)
+    warped_px = at.point.get("warped_px", 0.0)
+    if warped_px:
+        scene = replace(scene, output="developed")
+    case = _case(simulate_trial(scene, at.number, oracle=at.oracle), ReceiverOptions(), kind, *dark, kind=kind)
+    if warped_px:
+        rng = np.random.default_rng([at.seed, at.number, 29])
+        case = replace(case, source=(warped(case.source[0], rng, warped_px),))
+    yield case
+
+
+def warped(frame: Frame, rng: np.random.Generator, most_px: float) -> Frame:
+    """The frame with its rows moved smoothly, all across or all along the readout, as software that straightens does."""
+    import cv2
+
+    y, x = np.mgrid[: frame.height, : frame.width].astype(np.float32)
+    knots = rng.uniform(-1, 1, int(rng.integers(3, 9)))
+    places = np.linspace(0, knots.size - 1, frame.height)
+    smooth = np.interp(places, np.arange(knots.size), knots)
+    smooth = cv2.GaussianBlur(smooth[:, None], (1, 0), 0, sigmaY=frame.height / (4 * knots.size))
+    moved = (smooth / np.abs(smooth).max() * rng.uniform(0, most_px)).astype(np.float32)
+    x, y = (x + moved, y) if rng.random() < 0.5 else (x, y + moved)
+    pixels: Any = cv2.remap(frame.pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return replace(frame, pixels=pixels)
 
 
 def screen_of(seed: int, number: int) -> tuple[Scene, str]:
