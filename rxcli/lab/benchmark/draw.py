@@ -167,7 +167,7 @@ def draw_screen(at: Place) -> Iterator[Case]:
 
 
 def warped(frame: Frame, rng: np.random.Generator, most_px: float) -> Frame:
-    """The frame with its rows moved smoothly, all across or all along the readout, as software that straightens does."""
+    """The frame with its rows moved smoothly, across or along the readout, as software that straightens does."""
     import cv2
 
     y, x = np.mgrid[: frame.height, : frame.width].astype(np.float32)
