@@ -159,10 +159,11 @@ def draw_screen(at: Place) -> Iterator[Case]:
     warped_px = at.point.get("warped_px", 0.0)
     if warped_px:
         scene = replace(scene, output="developed")
-    case = _case(simulate_trial(scene, at.number, oracle=at.oracle), ReceiverOptions(), kind, *dark, kind=kind)
+    trial = simulate_trial(scene, at.number, oracle=at.oracle)
+    case = _case(trial, ReceiverOptions(), kind, *dark, kind=kind)
     if warped_px:
         rng = np.random.default_rng([at.seed, at.number, 29])
-        case = replace(case, source=(warped(case.source[0], rng, warped_px),))
+        case = replace(case, source=(warped(trial.frame, rng, warped_px),))
     yield case
 
 
