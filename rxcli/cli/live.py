@@ -143,7 +143,8 @@ def _limited(source: LiveSource, n_frames: int | None) -> Generator[Frame, None,
 
 def _writer(json_path: str | None, stack: ExitStack) -> Callable[[FrameResult], None]:
     """What is done with a result: a JSON line for each frame, or a table for those with packets."""
-    from rxcli.results.report import format_frame, format_link, to_json_line
+    from rxcli.results.record import to_json_line
+    from rxcli.results.report import format_frame, format_link
 
     def show(result: FrameResult) -> None:
         for line in format_link(result):

@@ -18,7 +18,8 @@ from rxcli.results.columns import column_rows, packet_rows, text_rows
 from rxcli.results.inspection import Inspection, Trace, inspect_frame
 from rxcli.results.maps import column_map
 from rxcli.results.overlay import picture_of, preview
-from rxcli.results.report import headline, mirror_note, plain, printable
+from rxcli.results.record import plain
+from rxcli.results.report import headline, mirror_note, printable
 from rxcli.types import FloatArray, Frame, FrameResult
 
 #: Told by the first lines of a page that this program wrote.

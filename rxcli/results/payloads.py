@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 from rxcli.outputs import unwritable
+from rxcli.results.columns import packet_rows
 from rxcli.results.report import csv_cell, printable_name
 from rxcli.types import FrameResult
 
+#: Of `packet_rows`, between the source and the confidence, and the names of all columns.
+_KEYS = ("frame", "column", "burst", "payload_bits", "payload")
 _NAMES = ("source", "frame", "column", "burst", "bits", "hex", "confidence")
 
 
@@ -45,19 +48,8 @@ class PayloadWriter:
 
     def write(self, result: FrameResult) -> None:
         """Write the packets of a frame."""
-        self._write(
-            (
-                csv_cell(printable_name(result.source)),
-                result.frame,
-                column.column,
-                "" if packet.burst is None else packet.burst,
-                packet.payload_bits,
-                packet.payload,
-                f"{packet.confidence:.6f}",
-            )
-            for column in result.columns
-            for packet in column.packets
-        )
+        source = csv_cell(printable_name(result.source))
+        self._write((source, *(row[key] for key in _KEYS), f"{row['confidence']:.6f}") for row in packet_rows(result))
 
     def _write(self, rows: Iterable[tuple[object, ...]]) -> None:
         text = io.StringIO(newline="")

@@ -1,27 +1,24 @@
-"""Results as JSON lines for programs and as tables for people."""
+"""Results as tables and sentences for people."""
 
 from __future__ import annotations
 
-import json
 import math
 import textwrap
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from itertools import groupby
-from typing import Any, TypeVar, get_args
+from typing import Any
 
-from rxcli.errors import UsageError, capitalised
+from rxcli.errors import capitalised
+from rxcli.results.record import plain
 from rxcli.types import (
     ColumnResult,
-    ColumnStatus,
     FrameResult,
-    FrameStatus,
     Message,
     ObjectProgress,
     PacketResult,
     ReceivedObject,
 )
 
-_T = TypeVar("_T")
 #: Hex digits of a payload that a table of 80 characters shows.
 _SHOWN_DIGITS = 20
 _STATUS = {
@@ -37,107 +34,6 @@ LEGEND = (
     "payload: hex. *: corrected by the auto-encoder. weak: confidence below 0.5, not counted as received.\n"
     "dark: too little light to try."
 )
-
-
-def to_record(result: FrameResult) -> dict[str, Any]:
-    """The result as plain data in the order of the documented JSON shape; unknown or non-finite values are None."""
-    record: dict[str, Any] = {
-        "source": result.source,
-        "frame": int(result.frame),
-        "time_s": _rounded(result.time_s, 6),
-        "status": result.status,
-    }
-    if result.message is not None:
-        record["message"] = result.message
-    record["screen"] = {"profile": result.screen_profile, "corners": _corners(result), **_numbering(result)}
-    record["camera"] = {
-        "profile": result.camera_profile,
-        "line_delay_s": _significant(result.line_delay_s),
-        "exposure_s": _significant(result.exposure_s),
-    }
-    record["columns"] = [_column_record(column) for column in result.columns]
-    record["timing_ms"] = {stage: _rounded(value, 2) for stage, value in result.timing_ms.items()}
-    return record | _details(result)
-
-
-def _details(result: FrameResult) -> dict[str, Any]:
-    """The parts of a record that stand only where there is something to say."""
-    details: dict[str, Any] = {}
-    if result.estimated:
-        details["estimated"] = {
-            name: [_significant(value), _significant(sigma)] for name, (value, sigma) in result.estimated.items()
-        }
-    if result.skipped:
-        details["skipped"] = plain(result.skipped)
-    if result.denoiser is not None:
-        details["denoiser"] = plain(result.denoiser)
-    if result.messages:
-        details["messages"] = [_message_record(message) for message in result.messages]
-    if result.objects:
-        details["objects"] = [_object_record(received) for received in result.objects]
-    if result.progress:
-        details["objects_incomplete"] = [_progress_record(progress) for progress in result.progress]
-    if result.link_notes:
-        details["link_notes"] = list(result.link_notes)
-    if result.retry:
-        details["retry"] = True
-    return details
-
-
-def _message_record(message: Message) -> dict[str, Any]:
-    record: dict[str, Any] = {"kind": message.kind}
-    if message.text is not None:
-        record["text"] = message.text
-    return record | {"hex": message.data.hex()}
-
-
-def _object_record(received: ReceivedObject) -> dict[str, Any]:
-    return {
-        "name": received.name,
-        "size": received.size,
-        "sha256": received.sha256,
-        "share": 1.0,
-        "blocks": received.n_blocks,
-        "object_id": received.object_id,
-        "path": received.path,
-    }
-
-
-def _progress_record(progress: ObjectProgress) -> dict[str, Any]:
-    return {
-        "object_id": progress.object_id,
-        "container_bytes": progress.container_bytes,
-        "share": _rounded(progress.share, 4),
-        "blocks": progress.n_blocks,
-        "blocks_done": progress.blocks_done,
-        "seconds_left": _rounded(progress.seconds_left, 2),
-    }
-
-
-def _place_of(record: dict[str, Any]) -> tuple[str, int, float]:
-    return str(record["source"]), int(record["frame"]), _number(record["time_s"])
-
-
-def _messages_from(record: dict[str, Any]) -> tuple[Message, ...]:
-    place = _place_of(record)
-    return tuple(Message(m["kind"], bytes.fromhex(m["hex"]), *place) for m in record.get("messages", ()))
-
-
-def _objects_from(record: dict[str, Any]) -> tuple[ReceivedObject, ...]:
-    place = _place_of(record)
-    return tuple(
-        ReceivedObject(o["name"], b"", o["size"], o["sha256"], o["object_id"], o["blocks"], *place, o["path"])
-        for o in record.get("objects", ())
-    )
-
-
-def _progress_from(record: dict[str, Any]) -> tuple[ObjectProgress, ...]:
-    return tuple(
-        ObjectProgress(
-            p["object_id"], p["container_bytes"], p["blocks"], p["blocks_done"], p["share"], p["seconds_left"]
-        )
-        for p in record.get("objects_incomplete", ())
-    )
 
 
 def format_link(result: FrameResult) -> list[str]:
@@ -172,20 +68,6 @@ def format_progress(progress: ObjectProgress) -> str:
     return f"incomplete: {share}, {math.ceil(progress.seconds_left)} more seconds of this clip would do"
 
 
-def _numbering(result: FrameResult) -> dict[str, Any]:
-    """What is not plain of the screen's place: sides that were inferred, and which column is which."""
-    out: dict[str, Any] = {}
-    if result.inferred_sides:
-        out["inferred_sides"] = list(result.inferred_sides)
-    if result.column_certainty < 1:
-        out["column_certainty"] = _rounded(result.column_certainty, 4)
-    if result.column_offset is None:
-        out["column_offset"] = None
-    if result.mirrored is not False:
-        out["mirrored"] = result.mirrored
-    return out
-
-
 def mirror_note(result: FrameResult, option: str = "") -> str:
     """A sentence on which side columns are counted from, where it is not the left; else empty.
 
@@ -199,177 +81,6 @@ def mirror_note(result: FrameResult, option: str = "") -> str:
         more = f" ({option})" if option else ""
         return f"Taken with a front camera. If the picture is mirrored, columns count from its right{more}."
     return ""
-
-
-def _corners(result: FrameResult) -> list[list[float | None]] | None:
-    if result.corners is None:
-        return None
-    return [[_rounded(float(x), 2), _rounded(float(y), 2)] for x, y in result.corners]
-
-
-def _column_record(column: ColumnResult) -> dict[str, Any]:
-    record: dict[str, Any] = {
-        "column": int(column.column),
-        "status": column.status,
-        "w": None if column.w is None else int(column.w),
-        "snr_db": _rounded(column.snr_db, 2),
-        "denoised": bool(column.denoised),
-        "delay_slots": _rounded(column.delay_slots, 3),
-        "packets": [_packet_record(packet) for packet in column.packets],
-    }
-    if column.message is not None:
-        record["message"] = column.message
-    return record
-
-
-def _packet_record(packet: PacketResult) -> dict[str, Any]:
-    record: dict[str, Any] = {
-        "first_row": _rounded(packet.first_row, 2),
-        "copies": _rounded(packet.copies, 3),
-        "payload_bits": int(packet.payload_bits),
-        "payload": packet.payload,
-        "confidence": _rounded(packet.confidence, 6),
-        "bit_errors": None if packet.bit_errors is None else int(packet.bit_errors),
-        "ber_hat": _significant(packet.ber_hat),
-    }
-    if packet.burst is not None:
-        record["burst"] = int(packet.burst)
-    if packet.frames is not None:
-        record["frames"] = [int(frame) for frame in packet.frames]
-    return record
-
-
-def _rounded(value: float | None, digits: int) -> float | None:
-    if value is None or not math.isfinite(value):
-        return None
-    return round(float(value), digits) + 0.0  # no negative zero
-
-
-def _significant(value: float | None) -> float | None:
-    if value is None or not math.isfinite(value):
-        return None
-    return float(f"{value:.7g}")
-
-
-def plain(value: Any) -> Any:
-    """`value` with numpy's scalars and arrays as Python's, and what is not finite as None."""
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return _significant(value)
-    return value
-
-
-def to_json_line(result: FrameResult) -> str:
-    """The result as one line of JSON, without the line's end; ASCII, so that any file name survives."""
-    return json.dumps(to_record(result), allow_nan=False, separators=(", ", ": "))
-
-
-def from_record(record: dict[str, Any]) -> FrameResult:
-    """The result that `to_record` wrote, as far as its rounding goes.
-
-    Raises:
-        UsageError: `record` is not of the documented shape.
-    """
-    import numpy as np
-
-    try:
-        corners, camera = record["screen"]["corners"], record["camera"]
-        return FrameResult(
-            source=_text(record["source"]),
-            frame=_count(record["frame"]),
-            time_s=_number(record["time_s"]),
-            status=_one_of(record["status"], FrameStatus),
-            message=_unless_none(_text, record.get("message")),
-            screen_profile=_unless_none(_text, record["screen"]["profile"]),
-            corners=None if corners is None else np.array(corners, dtype=np.float64).reshape(4, 2),
-            inferred_sides=tuple(str(side) for side in record["screen"].get("inferred_sides", ())),
-            column_certainty=float(record["screen"].get("column_certainty", 1.0)),
-            column_offset=record["screen"].get("column_offset", 0),
-            mirrored=record["screen"].get("mirrored", False),
-            camera_profile=_unless_none(_text, camera["profile"]),
-            line_delay_s=_unless_none(_number, camera["line_delay_s"]),
-            exposure_s=_unless_none(_number, camera["exposure_s"]),
-            estimated={name: (_number(v), _number(s)) for name, (v, s) in record.get("estimated", {}).items()},
-            columns=tuple(_column_from(column) for column in record["columns"]),
-            timing_ms={stage: _number(value) for stage, value in record["timing_ms"].items()},
-            skipped={name: _count(value) for name, value in record.get("skipped", {}).items()},
-            denoiser=_unless_none(dict, record.get("denoiser")),
-            messages=_messages_from(record),
-            objects=_objects_from(record),
-            progress=_progress_from(record),
-            link_notes=tuple(str(note) for note in record.get("link_notes", ())),
-            retry=record.get("retry") is True,
-        )
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-        shown = f"{error!r:.200}"
-        raise UsageError(f"not a result line of `vlc-rx decode --json` ({shown})", "name another file") from None
-
-
-def _column_from(record: dict[str, Any]) -> ColumnResult:
-    return ColumnResult(
-        column=_count(record["column"]),
-        status=_one_of(record["status"], ColumnStatus),
-        w=_unless_none(_count, record["w"]),
-        snr_db=_unless_none(_number, record["snr_db"]),
-        denoised=bool(record["denoised"]),
-        delay_slots=_unless_none(_number, record["delay_slots"]),
-        packets=tuple(_packet_from(packet) for packet in record["packets"]),
-        message=_unless_none(_text, record.get("message")),
-    )
-
-
-def _packet_from(record: dict[str, Any]) -> PacketResult:
-    frames = record.get("frames")
-    if len(_text(record["payload"])) != 2 * -(-_count(record["payload_bits"]) // 8):
-        raise ValueError("payload and payload_bits disagree")
-    return PacketResult(
-        first_row=_number(record["first_row"]),
-        copies=_number(record["copies"]),
-        payload_bits=_count(record["payload_bits"]),
-        payload=_hex(record["payload"]),
-        confidence=_number(record["confidence"]),
-        ber_hat=_number(record["ber_hat"]),
-        bit_errors=_unless_none(_count, record["bit_errors"]),
-        burst=_unless_none(_count, record.get("burst")),
-        frames=None if frames is None else tuple(_count(frame) for frame in frames),
-    )
-
-
-def _number(value: float | None) -> float:
-    if not isinstance(value, (int, float, type(None))):
-        raise TypeError(f"{value!r:.60} is no number")
-    return math.nan if value is None else float(value)
-
-
-def _count(value: Any) -> int:
-    if not isinstance(value, int) or abs(value) >= 1 << 63:
-        raise TypeError(f"{value!r:.60} is no count")
-    return value
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r:.60} is no text")
-    return value
-
-
-def _hex(value: Any) -> str:
-    return bytes.fromhex(_text(value)).hex()
-
-
-def _one_of(value: Any, choices: Any) -> Any:
-    if value not in get_args(choices):
-        raise ValueError(f"{value!r:.60} is none of {', '.join(get_args(choices))}")
-    return value
-
-
-def _unless_none(convert: Callable[[Any], _T], value: Any) -> _T | None:
-    return None if value is None else convert(value)
 
 
 def csv_cell(value: Any) -> Any:

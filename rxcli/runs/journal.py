@@ -19,7 +19,7 @@ from typing import Any, BinaryIO
 
 from rxcli.errors import InputError, UsageError
 from rxcli.outputs import replacing, unwritable
-from rxcli.results.report import from_record, to_record
+from rxcli.results.record import from_record, to_record
 from rxcli.types import FrameResult
 
 try:

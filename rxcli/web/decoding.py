@@ -293,7 +293,8 @@ class _Gathered:
             return refusal("it holds no picture", "send another file")
         from rxcli.results.aim import split_message
         from rxcli.results.columns import column_rows
-        from rxcli.results.report import count_packets, headline, mirror_note, to_record
+        from rxcli.results.record import to_record
+        from rxcli.results.report import count_packets, headline, mirror_note
 
         _, result, picture = self._best
         packets = self._packets

@@ -17,16 +17,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rxcli.errors import ExitCode, InputError, UsageError
+from rxcli.results.record import from_record, to_json_line, to_record
 from rxcli.results.report import (
     format_frame,
     format_table,
-    from_record,
     headline,
     printable,
     printable_name,
     shorten,
-    to_json_line,
-    to_record,
 )
 from rxcli.results.summary import Limits, SourceSummary, exit_code, format_summary, total, write_junit, write_summary
 from rxcli.results.truth import Score

@@ -16,7 +16,7 @@ import pytest
 from fake_receiver import fake_decoder
 
 from rxcli.errors import InputError, UsageError
-from rxcli.results.report import from_record, to_json_line
+from rxcli.results.record import from_record, to_json_line
 from rxcli.runs.batch import Source, collect_sources, decode_here, decode_in_processes, unreadable
 from rxcli.runs.journal import Head, Journal, Lines, recover
 from rxcli.types import FrameResult

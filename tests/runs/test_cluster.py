@@ -20,7 +20,7 @@ from small_frames import write_frame, write_profiles
 
 from rxcli.cli.main import run
 from rxcli.errors import OutputError, UsageError
-from rxcli.results.report import to_json_line
+from rxcli.results.record import to_json_line
 from rxcli.runs import cluster
 from rxcli.runs.batch import Source, decode_here
 from rxcli.runs.cluster import decode_on_cluster

@@ -1,0 +1,181 @@
+"""Results as JSON lines for programs, and back."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import cache
+from typing import Any, get_type_hints
+
+from rxcli.errors import UsageError
+from rxcli.types import ColumnResult, FrameResult, Message, ObjectProgress, PacketResult, ReceivedObject
+
+#: Fields of a record in their order, with the decimals that are written; None: as it is, `_SIGNIFICANT`: seven digits.
+_SIGNIFICANT = -1
+_FRAME = {"source": None, "frame": None, "time_s": 6, "status": None}
+_COLUMN = {"column": None, "status": None, "w": None, "snr_db": 2, "denoised": None, "delay_slots": 3}
+_PACKET = {"first_row": 2, "copies": 3, "payload_bits": None, "payload": None, "confidence": 6, "bit_errors": None}
+_PACKET |= {"ber_hat": _SIGNIFICANT}
+_OBJECT = {"name": None, "size": None, "sha256": None, "share": 4, "n_blocks": None, "object_id": None, "path": None}
+_PROGRESS = {"object_id": None, "container_bytes": None, "share": 4, "n_blocks": None, "blocks_done": None}
+_PROGRESS |= {"seconds_left": 2}
+#: Fields of a result that stand with its screen.
+_OF_SCREEN = ("inferred_sides", "column_certainty", "column_offset", "mirrored")
+
+
+def to_record(result: FrameResult) -> dict[str, Any]:
+    """The result as plain data in the order of the documented JSON shape; unknown or non-finite values are None."""
+    record = _written(result, _FRAME) | _present(result, "message")
+    corners = [] if result.corners is None else [[_rounded(x, 2) for x in corner] for corner in result.corners.tolist()]
+    record["screen"] = {"profile": result.screen_profile, "corners": corners or None, **_numbering(result)}
+    record["camera"] = {
+        "profile": result.camera_profile,
+        **_written(result, {"line_delay_s": _SIGNIFICANT, "exposure_s": _SIGNIFICANT}),
+    }
+    record["columns"] = [
+        _written(column, _COLUMN)
+        | {"packets": [_written(p, _PACKET) | _present(p, "burst", "frames") for p in column.packets]}
+        | _present(column, "message")
+        for column in result.columns
+    ]
+    record["timing_ms"] = {stage: _rounded(value, 2) for stage, value in result.timing_ms.items()}
+    return record | _details(result)
+
+
+def to_json_line(result: FrameResult) -> str:
+    """The result as one line of JSON, without the line's end; ASCII, so that any file name survives."""
+    return json.dumps(to_record(result), allow_nan=False, separators=(", ", ": "))
+
+
+def _details(result: FrameResult) -> dict[str, Any]:
+    """The parts of a record that stand only where there is something to say."""
+    details = {
+        "estimated": result.estimated,
+        "skipped": result.skipped,
+        "denoiser": result.denoiser,
+        "messages": [{"kind": m.kind, **_present(m, "text"), "hex": m.data.hex()} for m in result.messages],
+        "objects": [_blocks(_written(received, _OBJECT)) for received in result.objects],
+        "objects_incomplete": [_blocks(_written(progress, _PROGRESS)) for progress in result.progress],
+        "link_notes": list(result.link_notes),
+        "retry": result.retry,
+    }
+    return {name: plain(value) for name, value in details.items() if value}
+
+
+def _blocks(record: dict[str, Any]) -> dict[str, Any]:
+    return {"blocks" if name == "n_blocks" else name: value for name, value in record.items()}
+
+
+def _numbering(result: FrameResult) -> dict[str, Any]:
+    """What is not plain of the screen's place: sides that were inferred, and which column is which."""
+    out: dict[str, Any] = {}
+    if result.inferred_sides:
+        out["inferred_sides"] = list(result.inferred_sides)
+    if result.column_certainty < 1:
+        out["column_certainty"] = _rounded(result.column_certainty, 4)
+    if result.column_offset is None:
+        out["column_offset"] = None
+    if result.mirrored is not False:
+        out["mirrored"] = result.mirrored
+    return out
+
+
+def _written(value: Any, digits: Mapping[str, int | None]) -> dict[str, Any]:
+    """Fields of a dataclass as they are written."""
+    return {
+        name: plain(item) if n in (None, _SIGNIFICANT) else _rounded(item, n)
+        for name, n, item in ((name, n, getattr(value, name, 1.0)) for name, n in digits.items())
+    }
+
+
+def _present(value: Any, *names: str) -> dict[str, Any]:
+    """Fields of a dataclass that are known."""
+    return {name: plain(getattr(value, name)) for name in names if getattr(value, name) is not None}
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    if value is None or not math.isfinite(value):
+        return None
+    return round(float(value), digits) + 0.0  # no negative zero
+
+
+def plain(value: Any) -> Any:
+    """`value` with numpy's scalars and arrays as Python's, floats of seven digits, and what is not finite as None."""
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return float(f"{value:.7g}") if math.isfinite(value) else None
+    return value
+
+
+def from_record(record: dict[str, Any]) -> FrameResult:
+    """The result that `to_record` wrote, as far as its rounding goes.
+
+    Raises:
+        UsageError: `record` is not of the documented shape.
+    """
+    import numpy as np
+
+    try:
+        screen, camera, corners = record["screen"], record["camera"], record["screen"]["corners"]
+        place = {name: record[name] for name in ("source", "frame", "time_s")}
+        about = {name: screen[name] for name in _OF_SCREEN if name in screen}
+        about |= {"screen_profile": screen["profile"], "camera_profile": camera["profile"]}
+        about |= {name: camera[name] for name in ("line_delay_s", "exposure_s")}
+        about["timing_ms"] = {stage: _number(value) for stage, value in record["timing_ms"].items()}
+        about["estimated"] = {name: [*map(_number, pair)] for name, pair in record.get("estimated", {}).items()}
+        files = [{**o, **place, "n_blocks": o["blocks"]} for o in record.get("objects", ())]
+        under_way = [{**p, "n_blocks": p["blocks"]} for p in record.get("objects_incomplete", ())]
+        messages = [Message(m["kind"], bytes.fromhex(m["hex"]), **place) for m in record.get("messages", ())]
+        result: FrameResult = _read(
+            {**record, **about},
+            FrameResult,
+            corners=None if corners is None else np.array(corners, dtype=np.float64).reshape(4, 2),
+            columns=tuple(_read(c, ColumnResult, packets=tuple(map(_packet, c["packets"]))) for c in record["columns"]),
+            messages=tuple(messages),
+            objects=tuple(_read(file, ReceivedObject, data=b"") for file in files),
+            progress=tuple(_read(file, ObjectProgress) for file in under_way),
+            retry=record.get("retry") is True,
+        )
+        return result
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        shown = f"{error!r:.200}"
+        raise UsageError(f"not a result line of `vlc-rx decode --json` ({shown})", "name another file") from None
+
+
+def _packet(record: dict[str, Any]) -> PacketResult:
+    packet: PacketResult = _read(record, PacketResult)
+    if len(packet.payload_bytes) != -(-packet.payload_bits // 8):
+        raise ValueError("payload and payload_bits disagree")
+    return packet
+
+
+def _read(record: dict[str, Any], kind: Any, **known: Any) -> Any:
+    """A dataclass of the fields of a record by name; null is NaN where a number must stand."""
+    import msgspec
+
+    for field, hint in _hints(kind).items():
+        if field not in known and field in record:
+            value = record[field]
+            if isinstance(value, int) and abs(value) >= 1 << 63:
+                raise ValueError(f"{field} is too large")
+            known[field] = _number(value) if hint is float else msgspec.convert(value, hint)
+    return kind(**known)
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    hints = get_type_hints(kind)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def _number(value: Any) -> float:
+    if not isinstance(value, (int, float, type(None))):
+        raise TypeError(f"{value!r:.60} is no number")
+    return math.nan if value is None else float(value)
