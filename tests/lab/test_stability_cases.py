@@ -27,7 +27,7 @@ from rxcli.protocol import encode_packet, payload_bits
 from rxcli.receiver import sampling
 from rxcli.receiver.decode import detect
 from rxcli.receiver.pipeline import ReceiverOptions, receive
-from rxcli.results.report import to_record
+from rxcli.results.record import to_record
 from rxcli.types import FloatArray, Frame, FrameResult
 
 Change = Callable[[NDArray[Any]], NDArray[Any]]
