@@ -1,7 +1,8 @@
 """A live V4L2 camera in its own pixel formats, always the newest frame.
 
-The kernel interface is used directly: unlike OpenCV it tells why a camera cannot be opened, counts the frames that the
-driver dropped, gives the time of each, refuses a pixel format instead of silently taking another, and sets exposure.
+The kernel interface is used directly. OpenCV hides why a camera cannot be opened, takes another pixel format unasked,
+and gives no times. FFmpeg's input (through PyAV) gives times, but sets neither exposure nor gain, lists modes to its
+log alone, and counts no frames that the driver dropped.
 """
 
 from __future__ import annotations

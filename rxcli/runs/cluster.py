@@ -91,35 +91,33 @@ def _connect(address: str, connect_s: float) -> Client:
 def _problem_at(address: str, connect_s: float) -> str | None:
     """Why no scheduler answers; None where one does. Dask itself would try again and again, and say so at length."""
     outcome: list[str | None] = []
+
+    def ask() -> None:
+        try:
+            kind = asyncio.run(asyncio.wait_for(_kind_at(address), connect_s))
+            outcome.append(None if kind == "Scheduler" else f"that is a {kind}")
+        except TimeoutError:
+            return
+        except Exception as error:  # Dask, its transports and TLS raise some ten unrelated types
+            outcome.append(_first_line(error))
+
     # A name that is looked up in vain, or a server that accepts and is silent, is left behind with its thread.
-    asker = Thread(target=lambda: outcome.append(_asked(address, connect_s)), daemon=True)
+    asker = Thread(target=ask, daemon=True)
     with _silent():
         asker.start()
         asker.join(connect_s)
     return outcome[0] if outcome else f"nothing within {connect_s:g} s"
 
 
-def _asked(address: str, connect_s: float) -> str | None:
+async def _kind_at(address: str) -> str:
+    """What the Dask server at an address says that it is."""
+    from distributed.comm import connect
     from distributed.comm.addressing import get_address_host_port
     from distributed.security import Security
 
-    try:
-        if not 0 < int(get_address_host_port(address, strict=True)[1] or 0) < 1 << 16:
-            return "that is no address with a port"
-        arguments = Security().get_connection_args("client")
-        kind = asyncio.run(asyncio.wait_for(_kind_at(address, arguments), connect_s))
-    except TimeoutError:
-        return f"nothing within {connect_s:g} s"
-    except Exception as error:  # Dask, its transports and TLS raise some ten unrelated types
-        return _first_line(error)
-    return None if kind == "Scheduler" else f"that is a {kind}"
-
-
-async def _kind_at(address: str, arguments: dict[str, Any]) -> str:
-    """What the Dask server at an address says that it is."""
-    from distributed.comm import connect
-
-    comm = await connect(address, **arguments)
+    if not 0 < int(get_address_host_port(address, strict=True)[1] or 0) < 1 << 16:
+        raise ValueError("that is no address with a port")
+    comm = await connect(address, **Security().get_connection_args("client"))
     try:
         await comm.write({"op": "identity", "reply": True})
         answer = await comm.read()

@@ -40,13 +40,6 @@ def environment(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def package_environment(threads: int | None = None) -> dict[str, str]:
-    """The environment of a new Python that imports this package as this one does; None: as many threads as it likes."""
-    root = str(Path(__file__).resolve().parents[2])
-    path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
-    return {**os.environ, "PYTHONPATH": path, **dict.fromkeys(THREAD_VARIABLES if threads else (), str(threads))}
-
-
 def resident_bytes(pid: int | None) -> int:
     """Resident memory of a process, 0 where that cannot be told."""
     try:
