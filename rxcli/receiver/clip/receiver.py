@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
+from rxcli.profiles import ScreenProfile
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.cameras import has_profile
 from rxcli.receiver.clip import results
@@ -227,25 +228,20 @@ class _Clip:
         return search(context.frame, at, context.timer, known, quick=False)
 
     def _with_common_clock(self, located: _Located, frames: Sequence[Frame]) -> _Located:
-        """Find the clock that the first frames share: with the first frame's camera, else with the best of the others'.
+        """Find the clock that the first frames share, with the reading of the first frame's camera that leads.
 
-        An estimate from less than a packet may be wrong, in the direction of the readout for instance.
+        Less than a packet tells rows per slot, but perhaps another screen, or the wrong direction of the readout.
         """
         first = located.context
-        self._start, chosen = agree(frames, first), first
-        if self._start is None and first.camera.hypothesis is not None:
-            for context in self._other_cameras(first, frames[1:]):
-                start = agree(frames, context)
-                if start is not None and (self._start is None or start.lead > self._start.lead):
-                    self._start, chosen = start, context
+        readings = [first]
+        if first.camera.hypothesis is not None:
+            readings += _readings_of(first, self._options.screens)
+        starts = [(agree(frames, reading), reading) for reading in readings]
+        agreed = [(start.lead, start, reading) for start, reading in starts if start is not None]
+        if not agreed:
+            return located
+        _, self._start, chosen = max(agreed, key=lambda one: one[0])
         return located if chosen is first else replace(located, context=chosen, found=None)
-
-    def _other_cameras(self, first: FrameContext, frames: Sequence[Frame]) -> Iterator[FrameContext]:
-        """The first frame with the cameras that other frames tell."""
-        for frame in frames:
-            other = self._locate(frame, Timer())
-            if isinstance(other, _Located):
-                yield replace(other.context, frame=first.frame, corners=first.corners, timer=first.timer)
 
     def _take(self, frame: Frame) -> list[FrameResult]:
         timer = Timer()
@@ -747,6 +743,21 @@ class _Clip:
 def _shape(view: View) -> tuple[int, int]:
     """Columns and slots of a packet: where these differ, another screen is seen."""
     return view.acquisition.screen.columns, view.bursts.clock.packet_slots
+
+
+def _readings_of(context: FrameContext, screens: Sequence[ScreenProfile]) -> Iterator[FrameContext]:
+    """A frame whose camera was estimated, for every screen and direction of readout that its rows may be of."""
+    camera, rate_hz = context.camera, context.screens[0].slot_rate_hz
+    for slot_rate_hz in dict.fromkeys(screen.slot_rate_hz for screen in screens):
+        scale = rate_hz / slot_rate_hz
+        delay_s, exposure_s = scale * camera.line_delay_s, scale * camera.exposure_s
+        alike = tuple(screen for screen in screens if screen.slot_rate_hz == slot_rate_hz)
+        for reverse in (False, True):
+            estimated = {**camera.estimated, "line_delay_s": (delay_s, scale * camera.estimated["line_delay_s"][1])}
+            reading = replace(
+                camera, line_delay_s=delay_s, exposure_s=exposure_s, reversed=reverse, estimated=estimated
+            )
+            yield replace(context, camera=reading, screens=alike)
 
 
 def _shortest_period_s(frames: Sequence[Frame]) -> float | None:
