@@ -34,8 +34,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from small_frames import write_frame, write_profiles
 
-from rxcli.protocol import bits_to_hex, encode_packet, payload_bits
 from rxcli.resources import data_dir
 from rxcli.runs.processes import ONE_THREAD, environment, peak_memory_mb
 
@@ -66,10 +66,14 @@ _KINDS = {
     "gyroflow": 3,
     "baseline": 2,
 }
-#: The drawn screen: height and width of its picture, and what it sends.
-_SIZE, _BORDER, _COLUMN_PX, _ROWS_PER_SLOT = (256, 140), 10, 20, 3
-_COLUMNS, _SYMBOLS, _LIT = 6, 3, 5
 _BLIND_PX = 256
+_LENS = """
+[lens]
+width = 340
+height = 620
+camera_matrix = [[500.0, 0.0, 170.0], [0.0, 500.0, 310.0], [0.0, 0.0, 1.0]]
+dist_coeffs = [0.0, 0.0, 0.0, 0.0, 0.0]
+"""
 _GYROFLOW = {
     "calib_dimension": {"w": 3840, "h": 2160},
     "frame_readout_time": 14.5,
@@ -145,65 +149,23 @@ def _pictures(folder: Path) -> dict[str, _Kind]:
     """The pictures: what is refused at a glance costs little, and what is decoded goes through the whole receiver.
 
     Args:
-        folder: where the profiles of the drawn screen are written.
+        folder: where two small pictures of a screen and its profiles are written.
     """
     import cv2
 
     source = cv2.imread(str(data_dir("sample_frames") / "phone_chelsea_17k3.jpg"))
     assert source is not None
     names = write_profiles(folder)
-    kinds = {"known": _Kind(np.repeat(drawn_screen()[..., None], 3, axis=2), 3, tuple(names))}
+    (folder / "camera.toml").write_text((folder / "camera.toml").read_text() + _LENS)
+    for number in (1, 2):
+        write_frame(folder / f"good{number}.png", number)
+    known = cv2.imread(str(folder / "good1.png"))
+    assert known is not None
+    kinds = {"known": _Kind(known, 3, tuple(names))}
     for name, width, weight in (("blind", _BLIND_PX, 1), ("small", 144, 2), ("thumb", 64, 2)):
         picture = cv2.resize(source, (width, width * 3 // 4), interpolation=cv2.INTER_AREA)[..., ::-1]
         kinds[name] = _Kind(np.ascontiguousarray(picture, np.uint8), weight)
     return kinds
-
-
-def drawn_screen(seed: int = 1) -> NDArray[np.uint8]:
-    """(256, 140) a screen of six columns that fills a picture but for its border; it decodes in no time."""
-    payloads = _payloads(seed)
-    burst = np.stack([np.tile(encode_packet(payload, _LIT), 3) for payload in payloads])
-    light = np.repeat(burst, _ROWS_PER_SLOT, axis=1)[:, : _SIZE[0] - 2 * _BORDER].T
-    picture = np.full(_SIZE, 8, np.uint8)
-    picture[_BORDER:-_BORDER, _BORDER:-_BORDER] = 20 + 180 * np.repeat(light, _COLUMN_PX, axis=1)
-    return picture
-
-
-def _payloads(seed: int) -> NDArray[np.uint8]:
-    rng = np.random.default_rng(seed)
-    return rng.integers(0, 2, (_COLUMNS, payload_bits(_LIT, _SYMBOLS)), dtype=np.uint8)
-
-
-def _truth_of(seed: int) -> dict[str, Any]:
-    payloads = _payloads(seed)
-    return {
-        "capture": "drawn",
-        "columns": _COLUMNS,
-        "payload_symbols": _SYMBOLS,
-        "w": [_LIT] * _COLUMNS,
-        "payload_bits": [payloads.shape[1]] * _COLUMNS,
-        "frames": [{"frame": 0, "bursts": [{"burst": 0, "visible_slots": 80.0}]}],
-        "payload": {"0": [bits_to_hex(payload) for payload in payloads]},
-    }
-
-
-def write_profiles(folder: Path) -> list[str]:
-    """Write the drawn screen's profile and its camera's; returns the options that name them, and its corners."""
-    (height, width), folder_of = _SIZE, folder.joinpath
-    folder_of("screen.toml").write_text(
-        f'format = 1\nkind = "screen"\nname = "drawn"\ncolumns = {_COLUMNS}\nslot_rate_hz = 10000.0\n'
-        f"payload_symbols = {_SYMBOLS}\nlight_spread = 0.45\n"
-    )
-    folder_of("camera.toml").write_text(
-        f'format = 1\nkind = "camera"\nname = "drawn"\ntone = "linear"\n\n[[modes]]\nname = "still"\n'
-        f"width = {width}\nheight = {height}\nline_delay_s = {1e-4 / _ROWS_PER_SLOT}\nexposure_s = 1e-5\n\n"
-        f"[lens]\nwidth = {width}\nheight = {height}\ncamera_matrix = [[200.0, 0.0, 70.0], [0.0, 200.0, 128.0], "
-        "[0.0, 0.0, 1.0]]\ndist_coeffs = [0.0, 0.0, 0.0, 0.0, 0.0]\n"
-    )
-    left, top, right, bottom = _BORDER, _BORDER, width - _BORDER - 1, height - _BORDER - 1
-    corners = [f"{x},{y}" for x, y in ((left, top), (right, top), (right, bottom), (left, bottom))]
-    names = ["--screen", str(folder_of("screen.toml")), "--camera", str(folder_of("camera.toml"))]
-    return [*names, "--corners", *corners]
 
 
 def make_samples(folder: Path, picture: NDArray[np.uint8]) -> dict[str, bytes]:
@@ -297,8 +259,6 @@ class Cases:
     """
 
     def __init__(self, folder: Path) -> None:
-        import cv2
-
         #: Scratch files of this process.
         self.folder = folder / f"work-{os.getpid()}"
         self._home = self.folder / "home"
@@ -314,12 +274,10 @@ class Cases:
             "screen": (self.folder / "screen.toml").read_bytes(),
             "camera": (self.folder / "camera.toml").read_bytes(),
             "shipped": (data_dir("calibration") / "screens" / "paper-17k3.toml").read_bytes(),
-            "truth": json.dumps(_truth_of(1)).encode(),
+            "truth": (self.folder / "good1.truth.json").read_bytes(),
             "config": b'screen = ["paper-17k3"]\ncamera = "phone12"\nworkers = 1\n',
             "gyroflow": json.dumps(_GYROFLOW).encode(),
         }
-        for number in (1, 2):
-            cv2.imwrite(self._good(number), drawn_screen(number))
         self._whole: bytes | None = None
 
     def run(self, seed: int) -> dict[str, Any]:
