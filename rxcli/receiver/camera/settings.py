@@ -73,7 +73,7 @@ class CameraSettings:
     #: How much larger errors are than the spread of the columns' pulls says: neighbours share their light.
     sd_scale: float = 1.8
     #: Chi-square of the four coefficients from which stripes are bent beyond doubt.
-    bent_chi_square: float = 80.0
+    bent_chi_square: float = 30.0
 
     #: Exponents below this are nearer to no tone curve than to sRGB.
     linear_below: float = 1.5
