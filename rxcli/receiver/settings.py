@@ -44,7 +44,7 @@ class WiringSettings:
     some_packets: float = 20.0
     #: Packets and headers, for a screen of twenty columns, of an estimated camera: wrong ones show less than the first
     #: where they show no packets, and hardly ever more than the second, from which no other is looked at.
-    few_packets: float = 60.0
+    few_packets: float = 40.0
     beyond_doubt: float = 400.0
 
     #: Samples a slot on which columns are compared, and by how many slots they may be apart: slats may slant.
