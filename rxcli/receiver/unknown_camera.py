@@ -78,15 +78,7 @@ def settle(context: FrameContext, acquisition: Acquisition, reception: Reception
 def _strips(context: FrameContext, profiles: RowProfiles) -> blind.Strips:
     """Strips from row profiles in the order of time."""
     frame, (n_columns, n_strips, _) = context.frame, profiles.light.shape
-    lens = context.camera.lens
-    outlines = geometry.column_outlines(
-        context.corners,
-        n_columns,
-        n_strips,
-        frame.width,
-        frame.height,
-        None if lens is None or lens.corrected else lens,
-    )
+    outlines = geometry.column_outlines(context.corners, n_columns, n_strips, frame.width, frame.height)
     x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
     return blind.strips_of(profiles, x[:, ::-1] if context.camera.reversed else x, frame.width, frame.height)
 
@@ -96,7 +88,7 @@ def _camera(hypothesis: blind.CameraHypothesis, slot_rate_hz: float, frame: Fram
         profile=None,
         line_delay_s=1 / (hypothesis.rows_per_slot * slot_rate_hz),
         exposure_s=hypothesis.exposure_slots / slot_rate_hz,
-        lens=blind.lens_of(hypothesis.curvature, frame.width, frame.height, corrected=hypothesis.corrected),
+        lens=blind.lens_of(hypothesis.curvature, frame.width, frame.height),
         tone=tone,
         reversed=hypothesis.reversed,
         estimated=blind.summary(hypothesis, slot_rate_hz),

@@ -66,7 +66,6 @@ def _proposed(*rows_per_slot: float) -> list[blind.CameraHypothesis]:
             packet_slots=OPTIONS.screens[0].packet_slots,
             reversed=False,
             curvature=np.zeros(4),
-            corrected=True,
             exposure_slots=0.5,
             score=100.0,
             rows_per_slot_sd=0.01,

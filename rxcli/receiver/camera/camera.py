@@ -14,11 +14,11 @@ from rxcli.types import FloatArray, Lens, RowProfiles
 _COEFFICIENTS = ("k1", "k2", "p1", "p2")
 
 
-def lens_of(curvature: FloatArray, width: int, height: int, *, corrected: bool) -> Lens | None:
-    """The lens of a picture with distortion k1 k2 p1 p2, see `CameraHypothesis`; None where there is none."""
+def lens_of(curvature: FloatArray, width: int, height: int) -> Lens | None:
+    """The lens whose distortion a camera took out, see `CameraHypothesis`; None where stripes are straight."""
     if not curvature.any():
         return None
-    return Lens(_one_width(width, height), np.append(curvature, 0.0), corrected=corrected)
+    return Lens(_one_width(width, height), np.append(curvature, 0.0), corrected=True)
 
 
 def _one_width(width: int, height: int) -> FloatArray:
@@ -55,7 +55,7 @@ def summary(hypothesis: CameraHypothesis, slot_rate_hz: float) -> dict[str, tupl
     if hypothesis.curvature.any():
         values, sds = hypothesis.curvature.tolist(), hypothesis.curvature_sd.tolist()
         out |= {name: (value, sd) for name, value, sd in zip(_COEFFICIENTS, values, sds, strict=True)}
-        out["distortion_corrected"] = (float(hypothesis.corrected), 0.0)
+        out["distortion_corrected"] = (1.0, 0.0)
     if hypothesis.exposure_slots_sd > 0:
         out["exposure_s"] = (hypothesis.exposure_slots / slot_rate_hz, hypothesis.exposure_slots_sd / slot_rate_hz)
     if hypothesis.tone:

@@ -51,9 +51,7 @@ def settle(
         tone: the curve that was undone; None where values are known to follow light.
     """
     model = _Model(joined(strips, max(1, int(clock.rows_per_slot // 4))), lit, light_spread, clock.rows_per_slot)
-    bend = hypothesis.curvature * hypothesis.corrected
-    start = np.concatenate([[clock.row0, clock.rows_per_slot], _turned(bend, hypothesis)])
-    may_bend = may_bend and hypothesis.corrected
+    start = np.concatenate([[clock.row0, clock.rows_per_slot], _turned(hypothesis.curvature, hypothesis)])
     least = hypothesis.stated_exposure_slots
     exposure, exposure_sd = model.exposure(start, max(clock.exposure_slots, least))
     exposure = max(exposure, least)
@@ -68,12 +66,12 @@ def settle(
         hypothesis,
         rows_per_slot=float(values[1]),
         rows_per_slot_sd=float(sd[1]),
+        curvature=_turned(values[2:], hypothesis),
+        curvature_sd=sd[2:],
         exposure_slots=exposure,
         exposure_slots_sd=exposure_sd if exposure > least else 0.0,
         tone=None if tone is None else model.tone(near, tone),
     )
-    if hypothesis.corrected:
-        found = replace(found, curvature=_turned(values[2:], hypothesis), curvature_sd=sd[2:])
     return found, moved
 
 

@@ -9,7 +9,7 @@ complement, so the sign tells the direction of readout.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,10 +33,9 @@ class CameraHypothesis:
     packet_slots: int
     #: True where the picture's rows run against the readout.
     reversed: bool
-    #: (4,) k1 k2 p1 p2 for a focal length of one picture width, 0 where there is no distortion; and whether the camera
-    #: took it out of its picture, whose stripes are bent then. Otherwise the screen's sides are.
+    #: (4,) k1 k2 p1 p2 of the distortion that the camera took out of its picture, for a focal length of one picture
+    #: width; 0 where stripes are straight.
     curvature: FloatArray
-    corrected: bool
     exposure_slots: float
     #: Twice a log-likelihood ratio, roughly, of what stands out over chance.
     score: float
@@ -55,7 +54,6 @@ def propose(
     screens: Sequence[ScreenProfile],
     exposure_s: float | None = None,
     *,
-    distortion: tuple[float, float] | None = None,
     may_bend: bool = True,
 ) -> Iterator[CameraHypothesis]:
     """Cameras that may have taken a picture, best first; a second few, from wider levels, after the first.
@@ -64,8 +62,6 @@ def propose(
         strips: of the picture as it is stored.
         screens: screens that it may show, at least one.
         exposure_s: exposure, None where the file does not state it.
-        distortion: k1 of a lens that bows the screen's sides (focal length of one picture width, k2 = -k1) and its
-            standard deviation; None where the sides may be straight.
         may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
 
     Raises:
@@ -85,21 +81,14 @@ def propose(
         level, weight = levelled(coarse.light, coarse.inside, round(widths * width / coarse.pitch), coarse.noise)
         level *= weight
         if bends is None:
-            # Stripes that are bent beyond doubt say that something else was taken for bowed sides.
-            bends = _bends(coarse, level)[: 1 if distortion else None] if may_bend else [np.zeros(4)]
+            bends = _bends(coarse, level) if may_bend else [np.zeros(4)]
         found = [one for bend in bends for one in _clocks(coarse, level, bend, width, exposures)]
         distinct: list[CameraHypothesis] = []
         for one in sorted(found, key=lambda one: -one.score):
             if len(distinct) < n_proposed and not any(_same(one, other) for other in proposed + distinct):
                 distinct.append(one)
         proposed += distinct
-        yield from (_left_in(one, *distortion) if distortion and not one.curvature.any() else one for one in distinct)
-
-
-def _left_in(hypothesis: CameraHypothesis, k1: float, sd: float) -> CameraHypothesis:
-    """The hypothesis with a lens distortion that is left in the picture."""
-    curvature, curvature_sd = np.array([k1, -k1, 0.0, 0.0]), np.array([sd, sd, 0.0, 0.0])
-    return replace(hypothesis, curvature=curvature, curvature_sd=curvature_sd, corrected=False)
+        yield from distinct
 
 
 def stripe_rows(strips: Strips) -> float:
@@ -174,7 +163,6 @@ def _clocks(
                     packet_slots=length,
                     reversed=bool(is_reversed),
                     curvature=bend,
-                    corrected=True,
                     exposure_slots=exposure or _likely_exposure(width / (rows * pitch)),
                     score=score,
                     # A period that is off by a quarter of a slot over the picture shows as well.

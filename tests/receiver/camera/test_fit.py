@@ -61,7 +61,6 @@ def _hypothesis(curvature: FloatArray, reverse: bool = False) -> blind.CameraHyp
         packet_slots=LENGTH,
         reversed=reverse,
         curvature=0.9 * _as_stored(curvature, reverse),
-        corrected=True,
         exposure_slots=1.3,
         score=300.0,
         rows_per_slot_sd=0.001,
@@ -110,14 +109,6 @@ def test_a_bend_that_is_none_is_taken_out() -> None:
     strips, lit = _strips(np.random.default_rng(12), np.zeros(4))
     found, _ = _settled(strips, replace(_hypothesis(np.zeros(4)), curvature=np.array([0.01, 0.02, 0.0, 0.0])), lit)
     assert not found.curvature.any()
-    assert found.rows_per_slot == pytest.approx(ROWS_PER_SLOT, rel=2e-4)
-
-
-def test_a_distortion_that_is_left_in_the_picture_stays() -> None:
-    strips, lit = _strips(np.random.default_rng(12), np.zeros(4))
-    first = replace(_hypothesis(np.zeros(4)), curvature=np.array([0.1, -0.1, 0.0, 0.0]), corrected=False)
-    found, _ = _settled(strips, first, lit)
-    assert found.curvature is first.curvature
     assert found.rows_per_slot == pytest.approx(ROWS_PER_SLOT, rel=2e-4)
 
 
