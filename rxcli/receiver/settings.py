@@ -9,31 +9,6 @@ from dataclasses import dataclass
 class WiringSettings:
     """Each with its unit and the reason for it."""
 
-    #: What packets say counts so much: the light model is surer than it should be. At most so many outlines are
-    #: received.
-    packets_count: float = 0.08
-    most_looks: int = 6
-    #: Outlines whose packets differ by less than this, nats, show the same; the certainty from which one is likely, and
-    #: that from which its columns' numbers are said to be the screen's.
-    same_packets: float = 40.0
-    likely_certainty: float = 0.5
-    sure_certainty: float = 0.9
-    #: Where no numbering is likely, columns are counted from the left of what is seen, if that is less likely than the
-    #: likeliest by no more than this, log-odds.
-    may_be_log_odds: float = 3.0
-    #: Packets by which other rows must show more, nats.
-    better_rows: float = 10.0
-    #: Columns that look less like packets than this have no light, nats.
-    no_light_nats: float = 25.0
-    #: Headers without symbols count so much.
-    headers_alone: float = 0.1
-
-    #: A refitted camera that moves the clock less than this, slots, anywhere is told but not received with: where
-    #: packets show plainly, and where they do not.
-    matters_slots: float = 0.05
-    max_fits: int = 2
-    #: What is received with a refitted camera shows packets as well as before from this share of the evidence on.
-    kept_evidence: float = 0.9
     #: Packets, all columns together, which show plainly, nats: with a wrong camera they reach 103. It is right then but
     #: for their length, and other outlines are looked at with the screen that shows them alone.
     plain_packets: float = 200.0
@@ -42,10 +17,6 @@ class WiringSettings:
     #: show less than 10, right ones 80. And headers and packets under which an initial pass leaves no hope of any: of
     #: 120 hard pictures that show packets, none had less than 74.
     some_packets: float = 20.0
-    #: Packets and headers, for a screen of twenty columns, of an estimated camera: wrong ones show less than the first
-    #: where they show no packets, and hardly ever more than the second, from which no other is looked at.
-    few_packets: float = 40.0
-    beyond_doubt: float = 400.0
 
     #: Samples a slot on which columns are compared, and by how many slots they may be apart: slats may slant.
     light_samples: int = 2
@@ -65,12 +36,6 @@ class WiringSettings:
     #: A column whose slots are so much likelier packets than any slots, nats, has packets whether its header shows or
     #: not: on wrong clocks columns show 74 at most.
     packets_without_header: float = 100.0
-
-    #: A header peak less than this times the strongest rival is no clock.
-    min_peak_ratio: float = 1.6
-    #: A clock whose slots look so much like packets, and so much more than on any other, nats, needs no further look;
-    #: of two clocks it is the one.
-    plain_structure: float = 60.0
 
     #: Of an outline that is given, or of the picture, so much must be shared by both.
     least_shared: float = 0.002

@@ -4,14 +4,13 @@
 one to the slots that were decoded with it. docs/blind.md explains both.
 """
 
-from rxcli.receiver.camera.advice import stripe_likeness, why_not
+from rxcli.receiver.camera.advice import why_not
 from rxcli.receiver.camera.camera import camera_profile, in_time_order, is_linear, lens_of, summary
 from rxcli.receiver.camera.columns import columns_misfit
-from rxcli.receiver.camera.curvature import curvature_terms, estimate_curvature, straightened
+from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.fit import settle
 from rxcli.receiver.camera.proposals import CameraHypothesis, propose
-from rxcli.receiver.camera.strips import Strips, joined, levelled, strips_of
-from rxcli.receiver.camera.structure import structure_llr
+from rxcli.receiver.camera.strips import Strips, strips_of
 
 __all__ = [
     "CameraHypothesis",
@@ -19,18 +18,12 @@ __all__ = [
     "camera_profile",
     "columns_misfit",
     "curvature_terms",
-    "estimate_curvature",
     "in_time_order",
     "is_linear",
-    "joined",
     "lens_of",
-    "levelled",
     "propose",
     "settle",
-    "straightened",
-    "stripe_likeness",
     "strips_of",
-    "structure_llr",
     "summary",
     "why_not",
 ]

@@ -84,15 +84,6 @@ class CameraSettings:
     tone_bend_sd: float = 0.25
     min_half: float = 0.05
 
-    #: Share of slots that are wrong, as the extremes around them decide; of lit, and of dark slots, the least; of
-    #: symbols in which any number of lit slots is as likely.
-    wrong_slots: float = 0.04
-    min_share: float = 0.1
-    spoiled_symbols: float = 0.05
-    #: The most that repeated packets count, log-likelihood; and how many slots say what one does.
-    max_repeats: float = 40.0
-    slots_as_one: int = 3
-
     #: Rows over which light is levelled to compare strips; likeness of neighbouring strips, 0..1, below which a band of
     #: rows has no stripes; bands; share of them that must have stripes.
     likeness_rows: int = 100

@@ -21,7 +21,7 @@ class SearchSettings:
     #: Below this evidence there are no packets: wrong clocks mostly show less than 10, right ones 80.
     bail: float = 20.0
     #: Below this evidence an estimated camera is none: on a wrong one nothing shows more.
-    few_packets: float = 60.0
+    few_packets: float = 40.0
     #: Fits of an estimated camera at most; slots by which a fit moves the clock, anywhere, from which on the frame is
     #: received with it again; and the share of the evidence that must stay.
     max_fits: int = 2

@@ -136,18 +136,6 @@ def test_bend_terms_are_the_lens_model_at_any_focal_length() -> None:
     np.testing.assert_allclose(scaled @ terms, moved, rtol=1e-9, atol=1e-9)
 
 
-def test_structure_evidence_knows_packets_from_other_bits() -> None:
-    rng = np.random.default_rng(1)
-    bits = [rng.integers(0, 2, payload_bits(w, 11), dtype=np.uint8) for w in (3, 5, 7, 8)]
-    packets = np.stack([np.tile(encode_packet(b, w), 3) for b, w in zip(bits, (3, 5, 7, 8), strict=True)])
-    slots = packets[:, 37:300] + rng.normal(0, 0.15, (4, 263))
-    right = blind.structure_llr(slots, 37, 130)
-    assert right > 100
-    wrong = [(slots, 41, 130), (slots, 37, 260), (1 - slots[:, ::-1], 0, 130), (rng.normal(size=(4, 263)), 37, 130)]
-    assert max(blind.structure_llr(*case) for case in wrong) < 0.8 * right
-    assert blind.structure_llr(rng.normal(size=(4, 263)), 37, 130) < 45
-
-
 def test_an_estimate_can_be_kept_as_a_profile() -> None:
     hypothesis = blind.CameraHypothesis(
         rows_per_slot=5.0,
@@ -251,7 +239,9 @@ def test_columns_are_counted_by_their_width(columns: int) -> None:
         noise_slope=0.0,
     )
     clock = Clock(3.0, 1.0, 260, -0.5, 520, 0, np.zeros(2, np.int64), np.zeros(20), 5.0)
-    assert blind.likely_columns(profiles, clock, screens).columns == columns
+    misfit = blind.columns_misfit(profiles, clock, screens)
+    assert misfit.keys() == {20, 100}
+    assert misfit[columns] < 0.1 * misfit[120 - columns]
 
 
 def test_rows_against_the_readout_are_turned_and_back() -> None:
