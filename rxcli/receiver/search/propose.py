@@ -63,8 +63,7 @@ class Proposer:
         if isinstance(known, Failure):
             return known
         if known is not None:
-            for outline in self.families():
-                yield self._of_camera(outline, known, outline.log_odds)
+            yield self._of_camera(known, 0.0)
             return None
         failure, n_proposed = None, 0
         usual = _nearest(self.options.screens, _USUAL_COLUMNS).columns
@@ -72,8 +71,7 @@ class Proposer:
             cameras = propose_cameras(self.frame, outline.corners, self.options, self.timer, usual)
             try:
                 while True:
-                    log_prior = outline.log_odds - SETTINGS.next_camera * n_proposed
-                    yield self._of_camera(outline, next(cameras), log_prior)
+                    yield self._of_camera(next(cameras), -SETTINGS.next_camera * n_proposed)
                     n_proposed += 1
             except StopIteration as end:
                 failure = failure or end.value
@@ -81,13 +79,17 @@ class Proposer:
                 break
         return failure
 
-    def _of_camera(self, outline: Outline, camera: Camera, log_prior: float) -> list[Hypothesis]:
-        """Hypotheses of one camera: a screen for every clock that it may show."""
-        screens = self._screens()
+    def _of_camera(self, camera: Camera, log_prior: float) -> list[Hypothesis]:
+        """Hypotheses of one camera, the likeliest first: under every outline a screen for every clock."""
+        screens, out = self._screens(), []
         if camera.hypothesis is not None:
             screens = tuple(one for one in screens if one.packet_slots == camera.hypothesis.packet_slots)
-        groups = _by_clock(_fitting(outline, camera, screens), camera)
-        return [self._hypothesis(outline, camera, _nearest(alike, _USUAL_COLUMNS), log_prior) for alike in groups]
+        for outline in self.families():
+            for alike in _by_clock(_fitting(outline, camera, screens), camera):
+                screen = _nearest(alike, _USUAL_COLUMNS)
+                likely = self._hypothesis(outline, camera, screen, log_prior + outline.log_odds)
+                out += [likely, *_of_other_rows(likely)]
+        return sorted(out, key=lambda one: -one.log_prior)
 
     def _screens(self) -> tuple[ScreenProfile, ...]:
         return self.known.screens if self.known else self.options.screens
@@ -128,9 +130,7 @@ class Proposer:
         """Hypotheses that differ from a scored one in one thing, with the log prior that this thing changes."""
         hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, sampler=None, bursts=None)
         outline, screen, camera = hypothesis.outline, hypothesis.screen, hypothesis.camera
-        for rows in range(1 + len(outline.other_rows)):
-            if rows != hypothesis.rows:
-                yield replace(hypothesis, rows=rows)
+        yield from _of_other_rows(hypothesis)
         for other in self.families():
             if other.family != outline.family:
                 fitting = _of_clock(_fitting(other, camera, self.options.screens), screen, camera)
@@ -182,6 +182,14 @@ class Proposer:
                     sampler=scored.acquisition.sampler,
                     bursts=tuple(clock.burst.tolist()),
                 )
+
+
+def _of_other_rows(hypothesis: Hypothesis) -> Iterator[Hypothesis]:
+    """The hypothesis on the other rows that its outline may have."""
+    likely = hypothesis.log_prior + SETTINGS.other_rows * (hypothesis.rows > 0)
+    for rows in range(1 + len(hypothesis.outline.other_rows)):
+        if rows != hypothesis.rows:
+            yield replace(hypothesis, rows=rows, log_prior=likely - SETTINGS.other_rows * (rows > 0))
 
 
 def _is_clear(reception: Reception) -> bool:

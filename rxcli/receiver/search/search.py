@@ -198,7 +198,7 @@ class _Walk:
         self._asked.add((bursts.identity, False))
         self._scored.append(scored)
         self._tried.append(Tried(hypothesis, scored.evidence, scored.score, "lost"))
-        if best is None or scored.score > best.score - SETTINGS.reach:
+        if scored.evidence > SETTINGS.bail and (best is None or scored.score > best.score - SETTINGS.reach):
             for sibling in self._proposer.siblings(scored):
                 self._push(self._siblings, scored.score + sibling.log_prior - hypothesis.log_prior, sibling)
 
