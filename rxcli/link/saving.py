@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
+import uuid
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -43,13 +43,13 @@ def save_object(
             f"{path} is {whose}; {received.name} ({received.size} bytes) was not written",
             "give another folder with --out",
         )
+    hidden = folder / f".vlc-rx-{uuid.uuid4().hex}.part"
     try:
-        with tempfile.NamedTemporaryFile(dir=folder, prefix=".vlc-rx-", delete=False) as file:
-            file.write(received.data)
         try:
-            _put(Path(file.name), path, force)
+            hidden.write_bytes(received.data)
+            _put(hidden, path, force)
         finally:
-            Path(file.name).unlink(missing_ok=True)
+            hidden.unlink(missing_ok=True)
     except FileExistsError:
         raise InputError(
             f"{path} exists and is another file; {received.name} ({received.size} bytes) was not written",
@@ -76,7 +76,6 @@ def save_objects(
 
 
 def _put(written: Path, path: Path, force: bool) -> None:
-    os.chmod(written, 0o666 & ~_umask())
     if force:
         os.replace(written, path)  # replaces a link itself, never what it points to
         return
@@ -87,12 +86,6 @@ def _put(written: Path, path: Path, force: bool) -> None:
     except OSError:  # a file system without links
         with path.open("xb") as file:
             file.write(written.read_bytes())
-
-
-def _umask() -> int:
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask
 
 
 def _is_same(path: Path, received: ReceivedObject) -> bool:

@@ -206,16 +206,18 @@ class Server:
             self._live.start()
 
     async def _stop(self) -> None:
-        if self._live is not None:
-            self._live.close()
-        if hasattr(self, "_sweeper"):
-            self._sweeper.cancel()
-        if hasattr(self, "_runner"):
-            await self._runner.cleanup()
-        self._decoder.close()
-        self._thread.shutdown(wait=True, cancel_futures=True)
-        self._decoder.close()  # what the thread may have started meanwhile
-        shutil.rmtree(self._folder, ignore_errors=True)
+        try:
+            if self._live is not None:
+                self._live.close()
+            if hasattr(self, "_sweeper"):
+                self._sweeper.cancel()
+            if hasattr(self, "_runner"):
+                await self._runner.cleanup()
+        finally:  # whatever becomes of the connections
+            self._decoder.close()
+            self._thread.shutdown(wait=True, cancel_futures=True)
+            self._decoder.close()  # what the thread may have started meanwhile
+            shutil.rmtree(self._folder, ignore_errors=True)
 
     # -- who may ask --------------------------------------------------------------------------------------------------
 
