@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -91,13 +94,10 @@ def test_a_picture_without_its_first_row_gives_the_same_packets(easy: Trial, out
     assert measures.reported_payloads(cropped) == measures.reported_payloads(whole) != set()
 
 
-def test_the_other_kernel_is_another_processs(easy: Trial) -> None:
-    import os
-
-    assert cases._other_kernel().submit(os.getpid).result() != os.getpid()
-    assert cases._other_kernel().submit(os.getenv, "OPENBLAS_CORETYPE").result() == cases.KERNEL
-    record = received(case_of(easy), cases.OTHER_KERNEL)
-    assert record["score"]["error_free"] == record["score"]["expected"]
+def test_another_kernel_is_another_processs(easy: Trial) -> None:
+    here, there = (received(case_of(easy), way) for way in ("receiver", cases.OTHER_KERNEL))
+    assert (here["kernel"], there["kernel"]) == (os.environ.get("OPENBLAS_CORETYPE"), cases.KERNEL)
+    assert there["score"]["error_free"] == there["score"]["expected"]
 
 
 def test_what_a_reception_raises_warns_or_says_wrongly_is_a_problem(
@@ -171,6 +171,14 @@ def test_small_scenes_are_received_without_problems(tmp_path: Path) -> None:
     for number in (3, 4):
         (case,) = draw_small(Place(0, number, {}, tmp_path))
         assert received(case, "receiver")["problems"] == []
+
+
+@pytest.mark.slow
+def test_workers_end_with_the_processes_that_they_started(tmp_path: Path) -> None:
+    command = ["benchmark", "stability", "--count", "2", "--jobs", "2", "--out", str(tmp_path), "--quiet"]
+    done = subprocess.run([sys.executable, "-m", "rxcli.cli.main", *command], timeout=120, check=False)
+    assert done.returncode == 0
+    assert len(load_journal(tmp_path / "stability.journal.jsonl")) == 2
 
 
 def test_a_picture_without_data_that_gave_packets_does_not_pass(tmp_path: Path) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import lru_cache
-from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
@@ -25,7 +25,7 @@ from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.profiles import CameraProfile
 from rxcli.receiver.pipeline import receive
 from rxcli.results.truth import Scorer, Truth
-from rxcli.runs.processes import ONE_THREAD, environment, peak_memory_mb
+from rxcli.runs.processes import ONE_THREAD, environment, peak_memory_mb, start_process
 from rxcli.types import FloatArray, Frame, FrameResult
 
 Record = dict[str, Any]
@@ -115,7 +115,8 @@ def received(case: Case, way: str) -> Record:
     """
     if way == OTHER_KERNEL:
         # A trial stays here: its simulation is large, and no receiver looks at it.
-        return dict(_other_kernel().submit(received, replace(case, trial=None), RECEIVER).result())
+        _other_kernel().send(replace(case, trial=None))
+        return dict(_other_kernel().recv())
     scorer = None if case.truth is None else Scorer(case.truth)
     results: list[FrameResult] = []
     problems: list[str] = []
@@ -135,6 +136,7 @@ def received(case: Case, way: str) -> Record:
         "wall_s": wall_s,
         "stages_ms": dict(stages_ms),
         "mb": peak_memory_mb(),
+        "kernel": os.environ.get("OPENBLAS_CORETYPE"),
         "problems": list(dict.fromkeys(problems)),
         "score": None if scorer is None else asdict(scorer.score()),
         "packets": [packet for result in results for packet in _packets(result, case)],
@@ -143,12 +145,16 @@ def received(case: Case, way: str) -> Record:
 
 
 @lru_cache(maxsize=1)
-def _other_kernel() -> ProcessPoolExecutor:
-    """A process whose matrix library uses `KERNEL`: the library chooses once, when it is loaded."""
-    pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"))
+def _other_kernel() -> Connection:
+    """To a process whose matrix library uses `KERNEL`: the library chooses once, when it is loaded."""
     with environment({**ONE_THREAD, "OPENBLAS_CORETYPE": KERNEL}):
-        pool.submit(int).result()
-    return pool
+        return start_process(_serve)[1]
+
+
+def _serve(connection: Connection) -> None:
+    """Receive what comes until this daemon ends with the process that started it."""
+    while True:
+        connection.send(received(connection.recv(), RECEIVER))
 
 
 def bare(case: Case) -> Record:
