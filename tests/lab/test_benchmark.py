@@ -425,10 +425,10 @@ def test_a_changed_receiver_is_found_out(tmp_path: Path) -> None:
     arguments += ["--out", str(tmp_path / "out"), "--quiet"]
     same = CliRunner().invoke(benchmark, arguments, standalone_mode=False)
     assert same.return_value == 0, same.output
-    report = other / "rxcli" / "results" / "report.py"
-    text = report.read_text()
-    assert '"confidence": _rounded(packet.confidence, 6)' in text
-    report.write_text(text.replace("packet.confidence, 6", "packet.confidence, 1"))
+    record = other / "rxcli" / "results" / "record.py"
+    text = record.read_text()
+    assert '"confidence": 6' in text
+    record.write_text(text.replace('"confidence": 6', '"confidence": 1'))
     changed = CliRunner().invoke(benchmark, arguments, standalone_mode=False)
     assert changed.return_value == 1, changed.output
     assert "confidence: " in changed.output

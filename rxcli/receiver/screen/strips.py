@@ -159,7 +159,9 @@ def _band_passed(light: Float32Array, short: int) -> tuple[Float32Array, int]:
     import cv2
 
     step = (short + 1) // 2 if len(light) >= SETTINGS.many_rows else 1
-    return np.asarray((cv2.blur(light, (1, short)) - cv2.blur(light, (1, 8 * short + 1)))[::step], np.float32), step
+    whole = len(light) // step * step
+    band = cv2.blur(light, (1, short)) - cv2.blur(light, (1, 8 * short + 1))
+    return np.asarray(band[:whole:step], np.float32), step
 
 
 def _short_rows(light: Float32Array) -> int:

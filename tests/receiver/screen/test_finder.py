@@ -343,3 +343,10 @@ def test_useless_pictures_are_named(pixels: NDArray[Any], reason: str) -> None:
 @pytest.mark.parametrize("shape", [(96, 96), (97, 501), (500, 97), (240, 320)])
 def test_small_pictures_do_not_fail(shape: tuple[int, int]) -> None:
     assert not find_outlines(np.random.default_rng(2).integers(0, 256, shape, dtype=np.uint8), [WIDE, NARROW])
+
+
+@pytest.mark.parametrize("height", range(1582, 1586))
+def test_strips_are_read_of_any_height(height: int) -> None:
+    """Only whole steps of rows count: of 1582 rows and steps of three the last one is a part."""
+    noise = np.random.default_rng(1).integers(0, 255, (height, 40), np.uint8)
+    assert read_strips(noise, mosaic_period=2).height == height
