@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from rxcli.receiver.settings import SETTINGS
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, SlotSamples
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Reception:
     """What was received of a frame."""
 
@@ -36,8 +36,22 @@ class Reception:
     cleaned: tuple[SlotSamples, channel.ObservationModel] | None = None
     #: What was skipped: name -> columns.
     skipped: dict[str, int] = field(default_factory=dict)
-    #: What was worked out of it already, see `packet_confidence`; another reception begins anew.
-    kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    @cached_property
+    def column_llr(self) -> FloatArray:
+        """(C,) log-likelihood ratio of each column's slots being packets, over slots that are anything."""
+        packets = self.posteriors.log_evidence - np.log(len(WEIGHTS))
+        share = self.posteriors.w / SLOTS_PER_SYMBOL
+        return np.asarray(packets - detect.free_log_evidence(self.metrics, share))
+
+    @cached_property
+    def packet_confidence(self) -> FloatArray:
+        """(B, C) confidence of packets, the auto-encoder not yet asked."""
+        by_burst = assemble.slot_margin_by_burst(slot_margin(self), self.clock)
+        n_columns, n_strips = self.samples.light.shape[:2]
+        return confidence.confidence(
+            confidence.confidence_features(self.posteriors, by_burst, np.zeros(n_columns, bool), n_strips)
+        )
 
     @property
     def scene(self) -> denoise.DenoiserInput | None:
@@ -56,17 +70,7 @@ def packet_llr(reception: Reception) -> float:
     Copies that differ and words that are not in the codebook speak against it, headers or not.
     """
     # The light model is surer than it should be: a column that fits poorly, or is dark, says nothing.
-    return float(np.logaddexp(column_llr(reception), 0.0).sum())
-
-
-def column_llr(reception: Reception) -> FloatArray:
-    """(C,) log-likelihood ratio of each column's slots being packets, over slots that are anything; found once."""
-    if "llr" not in reception.kept:
-        packets = reception.posteriors.log_evidence - np.log(len(WEIGHTS))
-        share = reception.posteriors.w / SLOTS_PER_SYMBOL
-        reception.kept["llr"] = np.asarray(packets - detect.free_log_evidence(reception.metrics, share))
-    kept: FloatArray = reception.kept["llr"]
-    return kept
+    return float(np.logaddexp(reception.column_llr, 0.0).sum())
 
 
 def packets_are_plain(reception: Reception) -> bool:
@@ -89,7 +93,7 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
     if not out.all() and shows_steady_light(reception):
         return np.ones_like(out)
     if out.any():
-        out &= column_llr(reception) < SETTINGS.packets_without_header
+        out &= reception.column_llr < SETTINGS.packets_without_header
     return out
 
 
@@ -109,7 +113,7 @@ def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
 
 def in_doubt(reception: Reception, certain: float) -> NDArray[np.bool_]:
     """(C,) whether a packet that could be reported has less than the confidence `certain`."""
-    doubtful = (packet_confidence(reception) < certain) & (
+    doubtful = (reception.packet_confidence < certain) & (
         reception.posteriors.log_prob.min(axis=2) < SETTINGS.beyond_doubt_log_prob
     )
     return np.asarray((doubtful & complete_packets(reception)).any(axis=0))
@@ -118,22 +122,6 @@ def in_doubt(reception: Reception, certain: float) -> NDArray[np.bool_]:
 def complete_packets(reception: Reception) -> NDArray[np.bool_]:
     """(B, C) packets that could be reported."""
     return assemble.complete(assemble.slots_observed(reception.samples, reception.clock))
-
-
-def packet_confidence(reception: Reception) -> FloatArray:
-    """(B, C) confidence of packets, the auto-encoder not yet asked; worked out once for a reception."""
-    if "confidence" not in reception.kept:
-        reception.kept["confidence"] = _packet_confidence(reception)
-    kept: FloatArray = reception.kept["confidence"]
-    return kept
-
-
-def _packet_confidence(reception: Reception) -> FloatArray:
-    by_burst = assemble.slot_margin_by_burst(slot_margin(reception), reception.clock)
-    n_columns, n_strips = reception.samples.light.shape[:2]
-    return confidence.confidence(
-        confidence.confidence_features(reception.posteriors, by_burst, np.zeros(n_columns, bool), n_strips)
-    )
 
 
 def best_packet(reception: Reception) -> FloatArray:

@@ -70,13 +70,6 @@ class StillSettings:
     #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least
     #: sure, have their words weighed alone.
     most_shown: int = 58_000
-    #: Bursts are doubted where less than this share of the columns has packets of such a confidence, and where they are
-    #: not so much likelier than others by how alike copies are, nats.
-    clear_columns: float = 0.9
-    clear_confidence: float = 0.9
-    plain_bursts: float = 300.0
-    #: Weight of the copies' similarity: half of it is in the packets' evidence already.
-    copies_weight: float = 0.5
 
 
 SETTINGS, STILL = WiringSettings(), StillSettings()

@@ -22,7 +22,6 @@ from rxcli.receiver.reception import (
     complete_packets,
     dark_columns,
     in_doubt,
-    packet_confidence,
     packet_llr,
     word_log_prob,
 )
@@ -45,7 +44,7 @@ def decode_photograph(acquisition: Acquisition, skip: frozenset[str], first: Rec
 
 def _may_show_packets(first: Reception) -> bool:
     """Whether an initial pass leaves hope of packets; one that is in no doubt is hope enough."""
-    if (packet_confidence(first)[complete_packets(first)] > STILL.doubtful).any():
+    if (first.packet_confidence[complete_packets(first)] > STILL.doubtful).any():
         return True
     return packet_llr(first) + max(float(first.posteriors.header_llr.sum()), 0.0) > SETTINGS.some_packets
 

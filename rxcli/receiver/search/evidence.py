@@ -6,7 +6,7 @@ import numpy as np
 
 from rxcli.receiver import sync
 from rxcli.receiver.decode import detect
-from rxcli.receiver.reception import Reception, column_llr, complete_packets
+from rxcli.receiver.reception import Reception, complete_packets
 from rxcli.receiver.search.settings import SETTINGS
 
 #: Columns of the screen that evidence is scaled to: narrower columns show the same light several times.
@@ -18,7 +18,7 @@ def log_evidence(reception: Reception) -> float:
 
     A column that fits poorly, or is dark, says nothing. Where light is weak, headers come through before symbols do.
     """
-    llr = column_llr(reception)
+    llr = reception.column_llr
     headers = max(float(reception.posteriors.header_llr.sum()), 0.0)
     return _COLUMNS / llr.size * (float(np.logaddexp(llr, 0.0).sum()) + SETTINGS.header_weight * headers)
 

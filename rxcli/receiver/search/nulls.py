@@ -13,7 +13,7 @@ from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.steady import is_alike, periodic_share
-from rxcli.receiver.reception import column_llr, shows_steady_light
+from rxcli.receiver.reception import shows_steady_light
 from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
 from rxcli.types import BoolArray, RowProfiles
@@ -42,7 +42,7 @@ def light_without_data(context: FrameContext, acquisition: Acquisition) -> Failu
             return None
         reception = initial_pass(_as_one_column(binned))
         no_header = bool(np.any(assemble.without_header(reception.posteriors.header_llr)))
-        if float(column_llr(reception).max()) > SETTINGS.some_packets and not no_header:
+        if float(reception.column_llr.max()) > SETTINGS.some_packets and not no_header:
             return None
         return Failure("no_signal", STEADY_LIGHT if shows_steady_light(reception) else _ONE_LAMP)
 

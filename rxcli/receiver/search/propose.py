@@ -15,7 +15,7 @@ from rxcli.receiver.acquisition import ColumnSampler, noise_of, sample_columns
 from rxcli.receiver.cameras import known_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
 from rxcli.receiver.decode import detect
-from rxcli.receiver.reception import Reception, complete_packets, packet_confidence
+from rxcli.receiver.reception import Reception, complete_packets
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.outlines import likeliest_of_family
 from rxcli.receiver.search.settings import SETTINGS
@@ -194,7 +194,7 @@ def _of_other_rows(hypothesis: Hypothesis) -> Iterator[Hypothesis]:
 
 def _is_clear(reception: Reception) -> bool:
     """Whether nearly all columns have a complete packet of high confidence."""
-    confidence = np.where(complete_packets(reception), packet_confidence(reception), 0.0).max(axis=0)
+    confidence = np.where(complete_packets(reception), reception.packet_confidence, 0.0).max(axis=0)
     return bool((confidence > SETTINGS.clear_confidence).mean() >= SETTINGS.clear_columns)
 
 
