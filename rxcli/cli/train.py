@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -32,21 +32,7 @@ CALIBRATION_SAMPLES = 12
     ("--resume", None, False, "Go on from the checkpoint in OUT."),
     ("-q --quiet", None, False, "No progress bars."),
 )
-def train(
-    out: Path,
-    name: str,
-    model_version: int,
-    steps: int,
-    frames: int,
-    held_out: int,
-    strip_width: int,
-    column_width: int,
-    seed: int,
-    cache: Path | None,
-    quantise: bool,
-    resume: bool,
-    quiet: bool,
-) -> None:
+def train(out: Path, **options: Any) -> None:
     """Fit the auto-encoder on simulated scenes and write a model folder to OUT.
 
     Needs the extra `train` (PyTorch on the CPU is enough). The data sets are kept and used again; an interrupted run
@@ -62,24 +48,22 @@ def train(
     from rxcli.lab.training.network import Shape, n_parameters
     from rxcli.outputs import claim_own_folder
 
-    data, progress = cache or out / "data", not quiet
+    data, progress = options["cache"] or out / "data", not options["quiet"]
     claim_own_folder("OUT", out, (fit.CHECKPOINT, "model.toml"))
     claim_own_folder("--cache", data, ("frames-*", "validation"))
-    recipe = fit.Recipe(shape=Shape(strip_width=strip_width, column_width=column_width), steps=steps, seed=seed)
-    samples = dataset.frame_samples(frames, seed, data, progress=progress)
-    held = dataset.validation_samples(held_out, data, progress=progress)
-    network = fit.fit(samples, held, recipe, out, resume=resume, progress=progress)
-    described = {
-        **asdict(recipe),
-        "frames": frames,
-        "held_out": held_out,
-        "parameters": n_parameters(network),
-    }
+    shape = Shape(strip_width=options["strip_width"], column_width=options["column_width"])
+    recipe = fit.Recipe(shape=shape, steps=options["steps"], seed=options["seed"])
+    samples = dataset.frame_samples(options["frames"], options["seed"], data, progress=progress)
+    held = dataset.validation_samples(options["held_out"], data, progress=progress)
+    network = fit.fit(samples, held, recipe, out, resume=options["resume"], progress=progress)
+    described = {**asdict(recipe), **{name: options[name] for name in ("frames", "held_out")}}
+    described["parameters"] = n_parameters(network)
     losses = fit.final_losses(out)
-    calibration = samples[:CALIBRATION_SAMPLES] if quantise else ()
-    card = export.export_model(network, out, name, model_version, described, losses, calibration)
+    calibration = samples[:CALIBRATION_SAMPLES] if options["quantise"] else ()
+    name, version = options["name"], options["model_version"]
+    card = export.export_model(network, out, name, version, described, losses, calibration)
     click.echo(
         f"{out / card.file}: {described['parameters']} parameters, cross-entropy {losses['training_nats']:.4f} nats a "
         f"word in training, {losses['validation_nats']:.4f} on held-out scenes",
-        file=sys.stderr,
+        err=True,
     )

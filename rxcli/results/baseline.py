@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from rxcli.errors import UsageError
+from rxcli.results.record import from_record
 from rxcli.results.report import plural
 from rxcli.types import FrameResult
 
@@ -38,7 +39,10 @@ class Baseline:
 
     def add(self, result: FrameResult) -> None:
         """Count a frame of the run now."""
-        run = self.now.setdefault(_key(result.source), Run())
+        self._count(result, self.now)
+
+    def _count(self, result: FrameResult, runs: dict[str, Run]) -> None:
+        run = runs.setdefault(_key(result.source), Run())
         run.packets |= {
             (column.column, packet.payload)
             for column in result.columns
@@ -46,7 +50,7 @@ class Baseline:
             if packet.confidence >= self.min_confidence
         }
         total = result.timing_ms.get("total", 0.0)
-        run.time_ms += total if total == total else 0.0
+        run.time_ms += total if math.isfinite(total) else 0.0
 
     def missing(self) -> list[str]:
         """Sources of the earlier run that this one had nothing of."""
@@ -77,31 +81,19 @@ def load_baseline(path: Path, min_confidence: float, slower: float) -> Baseline:
     Raises:
         UsageError: it cannot be read, or is none.
     """
-    earlier: dict[str, Run] = {}
+    baseline = Baseline({}, min_confidence, slower)
     try:
         with path.open(encoding="utf-8") as file:
             for number, line in enumerate(file, start=1):
                 try:
-                    _take(json.loads(line), earlier, min_confidence)
-                except (ValueError, ArithmeticError, KeyError, TypeError, AttributeError, RecursionError):
-                    raise UsageError(
-                        f"--baseline {path} line {number}: no result of `vlc-rx decode --json`", "name such a file"
-                    ) from None
+                    baseline._count(from_record(json.loads(line)), baseline.earlier)
+                except (ValueError, RecursionError, UsageError):
+                    reason = f"--baseline {path} line {number}: no result of `vlc-rx decode --json`"
+                    raise UsageError(reason, "name such a file") from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UsageError(f"--baseline {path}: cannot be read ({reason})", "name a file that --json wrote") from None
-    return Baseline(earlier, min_confidence, slower)
-
-
-def _take(record: dict[str, Any], runs: dict[str, Run], min_confidence: float) -> None:
-    run = runs.setdefault(_key(str(record["source"])), Run())
-    run.packets |= {
-        (int(column["column"]), str(packet["payload"]))
-        for column in record["columns"]
-        for packet in column["packets"]
-        if (packet["confidence"] or 0.0) >= min_confidence
-    }
-    run.time_ms += float(record["timing_ms"].get("total") or 0.0)
+    return baseline
 
 
 def _key(source: str) -> str:
