@@ -5,19 +5,18 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-from click.shell_completion import CompletionItem
+
+from rxcli.cli.kinds import AUTO, CAMERA, SCREEN, SHARE, Point
 
 if TYPE_CHECKING:
     from rxcli.options import ReceiverOptions
     from rxcli.outputs import Output, Taken
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-AUTO = "auto"
 
 
 def options(*rows: tuple[Any, ...]) -> Callable[[_F], _F]:
@@ -49,97 +48,21 @@ def _option(kind: Any, default: Any) -> dict[str, Any]:
     return {"type": click.Choice(kind) if isinstance(kind, tuple) else kind, **shown}
 
 
-class _Point(click.ParamType[tuple[float, float]]):
-    """`x,y` in pixels."""
-
-    name = "x,y"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        if isinstance(value, tuple):
-            return value
-        try:
-            x, y = (float(part) for part in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is not two numbers, such as 120.5,80", param, ctx)
-        if not (abs(x) < 1e6 and abs(y) < 1e6):  # written so that NaN fails
-            self.fail(f"{value!r} is no position in a picture", param, ctx)
-        return x, y
-
-
-def _check_skip(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> tuple[str, ...]:
-    from rxcli.options import SKIPS
-
-    for name in names:
-        if name not in SKIPS:
-            raise click.BadParameter(f"{name!r} is not one of {', '.join(SKIPS)}")
-    return names
-
-
-def complete_files(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Names of files and folders, for the shell."""
-    return [CompletionItem(incomplete, type="file")]
-
-
-def _complete_profiles(
-    folder: str, _context: click.Context, _parameter: click.Parameter, incomplete: str
-) -> list[CompletionItem]:
-    from rxcli.resources import profile_dirs
-
-    stems = {path.stem for _, parent in profile_dirs() for path in (parent / folder).glob("*.toml")}
-    names = sorted(name for name in [AUTO, *stems] if name.startswith(incomplete))
-    return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
-
-
-#: Names of profiles, then files, for the shell.
-complete_screens, complete_cameras = (partial(_complete_profiles, folder) for folder in ("screens", "cameras"))
-
-
+_SCREEN_HELP = "Screen profile; may be given several times. [default: auto, the one whose clock fits best]"
+_CAMERA_HELP = "Camera profile; of several, each file takes the one that fits it. [default: auto, all that are known]"
+_CORNERS_HELP = "The screen's corners in stored pixels, top-left first, clockwise as a viewer sees the screen."
+_SKIP_HELP = "Switch off a shortcut: no_screen, no_packets, dark_columns, certain_columns or tracking; several times."
+_MEMORY_HELP = "Memory for the files that are being received; the least complete are dropped."
 #: What `receiver_options` takes.
 receiver_arguments = options(
-    (
-        "--screen=NAME|FILE|auto screens",
-        [str],
-        None,
-        "Screen profile; may be given several times. [default: auto, the one whose clock fits best]",
-        {"shell_complete": complete_screens, "envvar": "VLC_RX_SCREEN"},
-    ),
-    (
-        "--camera=NAME|FILE|auto cameras",
-        [str],
-        None,
-        "Camera profile; of several, each file takes the one that matches its make, model and size. "
-        "[default: auto, all that are known]",
-        {"shell_complete": complete_cameras, "envvar": "VLC_RX_CAMERA"},
-    ),
-    (
-        "--corners",
-        _Point(),
-        None,
-        "The screen's corners in stored pixels, top-left first, clockwise as a viewer sees the screen.",
-        {"nargs": 4, "metavar": "x,y x,y x,y x,y"},
-    ),
+    ("--screen=NAME|FILE|auto screens", [SCREEN], None, _SCREEN_HELP, {"envvar": "VLC_RX_SCREEN"}),
+    ("--camera=NAME|FILE|auto cameras", [CAMERA], None, _CAMERA_HELP, {"envvar": "VLC_RX_CAMERA"}),
+    ("--corners", Point(), None, _CORNERS_HELP, {"nargs": 4, "metavar": "x,y x,y x,y x,y"}),
     ("--mirrored", None, False, "The picture is mirrored, as of some front cameras: count columns from its right."),
     ("--cae", ("auto", "always", "never"), "auto", "When the auto-encoder runs."),
-    (
-        "--min-confidence",
-        click.FloatRange(0, 1),
-        None,
-        "Report only packets of at least this confidence. [default: all]",
-    ),
-    (
-        "--no-skip=NAME",
-        [str],
-        None,
-        "Switch off a shortcut (no_screen, no_packets, dark_columns, certain_columns, tracking); may be given several "
-        "times.",
-        {"callback": _check_skip},
-    ),
-    (
-        "--file-memory=MB file_memory_mb",
-        click.IntRange(1, 1 << 20),
-        512,
-        "Memory for the files that are being received; the least complete are dropped.",
-    ),
+    ("--min-confidence", SHARE, None, "Report only packets of at least this confidence. [default: all]"),
+    ("--no-skip=NAME", [str], None, _SKIP_HELP),
+    ("--file-memory=MB file_memory_mb", click.IntRange(1, 1 << 20), 512, _MEMORY_HELP),
 )
 _RECEIVER = ("screens", "cameras", "corners", "mirrored", "cae", "min_confidence", "no_skip", "file_memory_mb")
 #: For every command that writes files which may be somebody's.

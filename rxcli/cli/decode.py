@@ -17,12 +17,12 @@ import click
 
 from rxcli.cli.common import (
     claim_outputs,
-    complete_files,
     force_argument,
     options,
     receiver_arguments,
     receiver_options,
 )
+from rxcli.cli.kinds import FILE, FOLDER, SHARE, complete_files
 from rxcli.cli.printing import JsonLines, Progress, Table, Writer, print_line, print_text
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from rxcli.types import FrameResult
 
 log = logging.getLogger(__name__)
-_FILE = click.Path(dir_okay=False, path_type=Path, allow_dash=False)
-_FOLDER = click.Path(file_okay=False, path_type=Path)
 #: Options that change nothing of a source's results: where they go, who decodes, what is asked of them.
 _NO_MATTER = frozenset(
     {
@@ -56,39 +54,23 @@ STDIN = "-"
 @options(
     ("--json=FILE|- json_path", str, None, "Write one JSON object a frame, instead of the table."),
     ("--truth=FILE|auto", str, None, "Score against this truth, or the NAME.truth.json beside each file."),
-    ("--max-ber", click.FloatRange(0, 1), None, "Fail a file whose bit error rate is above (needs --truth)."),
-    (
-        "--min-packets",
-        click.IntRange(1),
-        1,
-        "Fail a file with fewer packets; those below --min-confidence (0.5, where it is not given) do not count.",
-    ),
-    ("--baseline=FILE", _FILE, None, "Fail a file that lost packets, or is slower, since this --json run."),
+    ("--max-ber", SHARE, None, "Fail a file whose bit error rate is above (needs --truth)."),
+    ("--min-packets", click.IntRange(1), 1, "Fail a file with fewer packets of --min-confidence (0.5 if not given)."),
+    ("--baseline=FILE", FILE, None, "Fail a file that lost packets, or is slower, since this --json run."),
     ("--slower", click.FloatRange(1), 1.5, "How many times as long as in the --baseline a file may take."),
-    (
-        "--min-packet-confidence",
-        click.FloatRange(0, 1),
-        None,
-        "Fail a file with a packet of lower confidence, which is still reported.",
-    ),
-    ("--junit", _FILE, None, "Write one JUnit test case per file."),
-    ("--summary", _FILE, None, "Write one row per file, as .csv or .parquet."),
+    ("--min-packet-confidence", SHARE, None, "Fail a file with a packet of lower confidence, which is still reported."),
+    ("--junit", FILE, None, "Write one JUnit test case per file."),
+    ("--summary", FILE, None, "Write one row per file, as .csv or .parquet."),
     ("--resume", None, False, "Go on with the run that wrote the file of --json."),
-    (
-        "--workers",
-        click.IntRange(1),
-        1,
-        "Decode in this many processes.",
-        {"show_default": False, "envvar": "VLC_RX_WORKERS"},
-    ),
+    ("--workers", click.IntRange(1), 1, "Decode in this many processes.", {"envvar": "VLC_RX_WORKERS"}),
     ("--cluster=ADDRESS", str, None, "Decode on the Dask cluster whose scheduler is at this address."),
-    ("--dump-dir", _FOLDER, None, "Write the arrays of every stage boundary into this folder."),
-    ("--save-undistorted", _FOLDER, None, "Write every frame without its lens distortion into this folder."),
-    ("--save-camera", _FILE, None, "Write what was estimated of an unknown camera as a profile (TOML)."),
+    ("--dump-dir", FOLDER, None, "Write the arrays of every stage boundary into this folder."),
+    ("--save-undistorted", FOLDER, None, "Write every frame without its lens distortion into this folder."),
+    ("--save-camera", FILE, None, "Write what was estimated of an unknown camera as a profile (TOML)."),
     ("--stop-when-certain", None, False, "Pass over frames of a clip all of whose packets are certain already."),
-    ("--out", _FOLDER, None, "Write files that came whole into this folder, under their own names."),
+    ("--out", FOLDER, None, "Write files that came whole into this folder, under their own names."),
     ("--packets", None, False, "Show every packet of a clip, not only its sum."),
-    ("--payloads", _FILE, None, "Write one row a packet (CSV): where it is from, bits, hex, confidence."),
+    ("--payloads", FILE, None, "Write one row a packet (CSV): where it is from, bits, hex, confidence."),
     ("--quiet", None, False, "No table, no summary, no progress; only why a file failed."),
 )
 @force_argument

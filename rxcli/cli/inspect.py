@@ -13,12 +13,12 @@ import click
 
 from rxcli.cli.common import (
     claim_outputs,
-    complete_files,
     force_argument,
     options,
     receiver_arguments,
     receiver_options,
 )
+from rxcli.cli.kinds import FOLDER, complete_files
 from rxcli.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ _MOST_FRAMES = 240
 @receiver_arguments
 @options(
     ("--frame", click.IntRange(0), None, "Frame of a clip. [default: the one with the most packets]"),
-    ("--out", click.Path(file_okay=False, path_type=Path), None, "Folder to write. [default: ./inspect-NAME]"),
+    ("--out", FOLDER, None, "Folder to write. [default: ./inspect-NAME]"),
     ("--truth=FILE|auto", str, None, "Count wrong bits against this truth."),
 )
 @force_argument

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from rxcli.cli.common import claim_outputs, force_argument, options, receiver_arguments, receiver_options
+from rxcli.cli.kinds import FOLDER, Exposure
 from rxcli.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -27,23 +28,6 @@ if TYPE_CHECKING:
 _TERMINAL_S, _LOG_S = 0.2, 1.0
 #: Characters of a progress bar.
 _BAR = 20
-_FOLDER = click.Path(file_okay=False, path_type=Path)
-
-
-class Exposure(click.ParamType[float]):
-    """Seconds, as a number or a fraction."""
-
-    name = "seconds"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        numerator, _, denominator = str(value).partition("/")
-        try:
-            seconds = float(numerator) / float(denominator or 1)
-        except (ValueError, ZeroDivisionError):
-            self.fail(f"{value!r} is neither seconds nor a fraction such as 1/8000", param, ctx)
-        if not 0 < seconds < 10:
-            self.fail(f"{value} must be between 0 and 10 seconds", param, ctx)
-        return seconds
 
 
 @click.command()
@@ -60,7 +44,7 @@ class Exposure(click.ParamType[float]):
     ("--frames n_frames", click.IntRange(1), None, "Stop after this many frames."),
     ("--duration=SECONDS", click.FloatRange(0, min_open=True), None, "Stop after this time."),
     ("--json=FILE|- json_path", str, None, "Write one JSON object a frame, instead of tables."),
-    ("--out", _FOLDER, None, "Write files that came whole into this folder, under their own names."),
+    ("--out", FOLDER, None, "Write files that came whole into this folder, under their own names."),
     ("--until-complete", None, False, "Stop when a message or a file has come whole."),
     ("--quiet", None, False, "No status line."),
 )

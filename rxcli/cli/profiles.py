@@ -10,14 +10,13 @@ import click
 
 from rxcli.cli.common import (
     claim_outputs,
-    complete_cameras,
-    complete_files,
     force_argument,
     json_output,
     options,
     write_json,
 )
 from rxcli.cli.groups import SuggestingGroup
+from rxcli.cli.kinds import CAMERA, complete_files
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 
 if TYPE_CHECKING:
@@ -111,11 +110,10 @@ def validate(names: tuple[str, ...]) -> int:
 @options(
     (
         "--camera=NAME|FILE cameras",
-        [str],
+        [CAMERA],
         None,
-        "Cameras to choose from; may be given several times. [default: all that are known]",
-        {"shell_complete": complete_cameras},
-    )
+        "A camera to choose from. [default: all that are known]",
+    ),
 )
 @_JSON
 @force_argument

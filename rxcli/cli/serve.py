@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rxcli.cli.common import options, receiver_arguments, receiver_options
-from rxcli.cli.live import Exposure
+from rxcli.cli.kinds import FOLDER, Exposure
 from rxcli.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -19,14 +19,9 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("device", required=False, type=click.Path(path_type=Path))
 @options(
-    (
-        "--host",
-        str,
-        None,
-        "Address to listen at, such as 0.0.0.0 for phones in the same network. [default: this machine alone]",
-    ),
+    ("--host", str, None, "Where to listen: 0.0.0.0 for phones in the same network. [default: this machine alone]"),
     ("--port", click.IntRange(0, 65535), 8017, "0 takes any free one."),
-    ("--keep", click.Path(file_okay=False, path_type=Path), None, "Keep uploads in this folder."),
+    ("--keep", FOLDER, None, "Keep uploads in this folder."),
     ("--max-upload", click.IntRange(1, 4096), 96, "Megabytes a file."),
     ("--exposure", Exposure(), None, "Of the live camera: seconds, or 1/8000. [default: the shortest]"),
     ("--gain", int, None, "Of the live camera, in its own units. [default: as it is]"),

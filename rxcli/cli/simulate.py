@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rxcli.cli.common import claim_outputs, force_argument, options
+from rxcli.cli.kinds import FILE, FOLDER, Exposure
 from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 _STILLS = ("jpeg", "dng", "dng14", "png", "png16", "tiff", "tiff16")
 _CODECS = ("h264", "h264-10", "hevc", "hevc-10", "mjpeg")
+_FORMATS = (*_STILLS, *_CODECS)
 _SUFFIXES = {".jpg": "jpeg", ".jpeg": "jpeg", ".dng": "dng", ".png": "png", ".tif": "tiff", ".tiff": "tiff"}
 _VIDEO_SUFFIXES = {".mp4": "h264", ".mov": "h264", ".mkv": "h264", ".avi": "mjpeg"}
 _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-plain")
@@ -43,15 +45,10 @@ _SCENE_OPTIONS = (
     ("--uri", str, None, "Send this URI."),
     ("--file file_path", click.Path(path_type=Path), None, "Send this file."),
     ("--seed", click.IntRange(0), 0, "Same seed, same pixels."),
-    (
-        "--format=NAME file_format",
-        (*_STILLS, *_CODECS),
-        None,
-        f"Format of OUT, {', '.join((*_STILLS, *_CODECS))}; by its suffix where not given.",
-    ),
+    ("--format=NAME file_format", _FORMATS, None, f"Format of OUT, {', '.join(_FORMATS)}. [default: by its suffix]"),
     ("--w weights", str, "5", "Lit slots of ten: N, a list N,N,..., or 'dimming'."),
     ("--dimming", ("max", "none"), "max", "Local dimming."),
-    ("--exposure exposure_s", str, None, "Exposure in seconds, or as 1/32000.  [default: the preset's]"),
+    ("--exposure exposure_s", Exposure(), None, "Exposure in seconds, or as 1/32000.  [default: the preset's]"),
     ("--electrons", float, None, "Electrons of a green pixel that sees white, in one exposure."),
     ("--iso", click.IntRange(1), None, "ISO written to the file; has no effect on the pixels."),
     ("--roll roll_deg", float, None, "Degrees about the line of sight; 180 for a camera upside down."),
@@ -84,23 +81,13 @@ _SCENE_OPTIONS = (
     ("--hand hand_px", click.FloatRange(0), None, "Hold the camera in a hand: pixels from frame to frame."),
     ("--stabilised", None, False, "With --hand: frames are turned back and cropped, as phones do."),
     ("--clock-error slot_rate_error_ppm", float, None, "Error of the slot rate, ppm."),
-    (
-        "--column-delays",
-        str,
-        None,
-        "Delays of the columns in slots: one number each, or one for the largest random delay.",
-    ),
+    ("--column-delays", str, None, "Delays of the columns in slots: one each, or one for the largest random delay."),
     ("--start-slot", float, None, "Slot of the link at which row 0 starts.  [default: random]"),
     ("--make", str, None, "Camera make written to the file."),
     ("--model", str, None, "Camera model written to the file."),
-    ("--waveforms", click.Path(file_okay=False, path_type=Path), None, "Also write what drives a real screen."),
+    ("--waveforms", FOLDER, None, "Also write what drives a real screen."),
     ("--camera-name", str, None, "Name of the camera in truth and camera profile."),
-    (
-        "--camera-profile",
-        click.Path(dir_okay=False, path_type=Path),
-        None,
-        "Also write a camera profile (TOML) that fits the capture.",
-    ),
+    ("--camera-profile", FILE, None, "Also write a camera profile (TOML) that fits the capture."),
 )
 @click.option(
     "--list",
@@ -230,24 +217,13 @@ def _with_pose(scene: Scene, options: dict[str, Any]) -> Scene:
 
 def _with_light(scene: Scene, options: dict[str, Any]) -> Scene:
     if options["exposure_s"] is not None:
-        scene = replace(scene, exposure_s=_seconds(options["exposure_s"]))
+        scene = replace(scene, exposure_s=options["exposure_s"])
     if options["electrons"] is not None:
         scene = replace(scene, light_e_per_s=options["electrons"] / scene.exposure_s)
     room = _given(options, ("flicker_hz", "lamp"))
     if options["room_e"] is not None:
         room["light_e_per_s"] = options["room_e"] / scene.exposure_s
     return replace(scene, room=replace(scene.room, **room))
-
-
-def _seconds(text: str) -> float:
-    numerator, _, denominator = text.partition("/")
-    try:
-        value = float(numerator) / float(denominator or 1)
-    except (ValueError, ZeroDivisionError):
-        value = nan
-    if not 0 < value < 10:
-        raise UsageError(f"--exposure: {text!r} is no time", "give seconds, or a fraction such as 1/32000")
-    return value
 
 
 def _numbers(text: str, option: str, counts: tuple[int, ...]) -> tuple[float, ...]:

@@ -88,8 +88,8 @@ def load_baseline(path: Path, min_confidence: float, slower: float) -> Baseline:
                 try:
                     baseline._count(from_record(json.loads(line)), baseline.earlier)
                 except (ValueError, RecursionError, UsageError):
-                    reason = f"--baseline {path} line {number}: no result of `vlc-rx decode --json`"
-                    raise UsageError(reason, "name such a file") from None
+                    what = f"--baseline {path} line {number}: no result of `vlc-rx decode --json`"
+                    raise UsageError(what, "name such a file") from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise UsageError(f"--baseline {path}: cannot be read ({reason})", "name a file that --json wrote") from None

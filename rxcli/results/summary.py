@@ -356,8 +356,8 @@ def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) 
 
     suite, kinds = ElementTree.Element("testsuite", name="vlc-rx decode"), Counter[str]()
     for summary in summaries:
-        about = {"name": printable_name(summary.source), "time": f"{summary.time_ms / 1e3:.3f}"}
-        case = ElementTree.SubElement(suite, "testcase", classname="decode", **about)
+        about = {"classname": "decode", "name": printable_name(summary.source), "time": f"{summary.time_ms / 1e3:.3f}"}
+        case = ElementTree.SubElement(suite, "testcase", about)
         failures = summary.failures(limits)
         if failures:  # one a case, as the readers of these files expect it: the worst, with all reasons
             code = worst([code for code, _ in failures])

@@ -70,6 +70,8 @@ def test_help_loads_nothing_heavy() -> None:
         (["decode", "a", "b", "--truth", "t.json"], "--truth t.json is the truth of one file (2 were given)"),
         (["decode", "a", "--screen", "nix"], "no profile 'nix' among screens"),
         (["decode", "a", "--camera", "nix"], "no profile 'nix' among cameras"),
+        (["simulate", "a.jpg", "--exposure", "1/0"], "'1/0' is no time"),
+        (["live", "/dev/video9", "--exposure", "-1"], "'-1' is no time"),
         (["decode", "a", "--no-skip", "nix"], "'nix' is not one of no_screen"),
         (["decode", "a", "--corners", "1,2", "3,4", "5", "6,7"], "'5' is not two numbers, such as 120.5,80"),
         (["decode", "a", "--corners", "1,2", "3,4", "5,nan", "6,7"], "'5,nan' is no position in a picture"),
