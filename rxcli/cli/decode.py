@@ -316,10 +316,10 @@ class _Run:
                         self._keep_estimate(result)
                         self._write_payloads(result)
                         log.info("%s", result_in_words(result))
-                        with progress.bar.external_write_mode():
+                        with progress.hidden():
                             writer.write(result, last)
                         progress.add(result, last)
-                    with progress.bar.external_write_mode():
+                    with progress.hidden():
                         writer.end(summary)
                 finally:
                     self._end(summary, scorer)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, TextIO
 
 import click
@@ -126,6 +127,10 @@ class Progress:
 
     def __exit__(self, *_: object) -> None:
         self.bar.close()
+
+    def hidden(self) -> AbstractContextManager[None]:
+        """A context in which others may write to the terminal; no lock is taken where there is no bar."""
+        return nullcontext() if self.bar.disable else self.bar.external_write_mode()
 
     def add(self, result: FrameResult, last: bool) -> None:
         """Count a result, the last of its source or not."""
