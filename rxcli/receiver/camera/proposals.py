@@ -144,16 +144,20 @@ def _clocks(
     line = _slot_line(columns)
     low, high = (int(_FINE * n_rows / rows) for rows in (longest, shortest))
     lines = _FINE * n_rows / (low + _peaks(line[low : high + 2], SETTINGS.n_lines, 2 * _FINE))
+    # Light exposed for about a slot has a stronger line at twice the rate.
+    twice, harmonics = 2 * lines, _FINE * np.array([1, 2])
     copies = _surprise(correlation, round(2 * SLOTS_PER_SYMBOL * shortest))
     total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
     for length, exposure in exposures.items():
         first, last = (int(rows * length) for rows in (shortest, longest))
         lags = first + _peaks(copies[first : last + 1], SETTINGS.n_copies, max(round(2 * shortest), 1))
-        for rows in np.concatenate([lines, lags / length]).tolist():
+        for rows in np.concatenate([lines, twice[twice < longest], lags / length]).tolist():
             if rows * (length - PREAMBLE_SLOTS) > n_rows:
                 continue  # No payload is in view as a whole.
             common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
-            common += 2 * min(float(np.interp(_FINE * n_rows / rows, np.arange(line.size), line)), SETTINGS.max_line)
+            common += 2 * min(
+                float(np.interp(harmonics * n_rows / rows, np.arange(line.size), line).max()), SETTINGS.max_line
+            )
             for is_reversed, header in enumerate(_header_peaks(total, rows, length)):
                 score = max(header, 0.0) ** 2 + common
                 if score < SETTINGS.min_score:
