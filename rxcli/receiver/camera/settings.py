@@ -66,16 +66,16 @@ class CameraSettings:
     settle_steps: int = 4
     converged_slots: float = 0.03
     #: Exposures around the one known that are compared, as factors.
-    exposure_factors: tuple[float, ...] = (0.7, 0.85, 1.0, 1.17, 1.37)
+    exposure_factors: tuple[float, ...] = (0.75, 1.0, 1.33)
     #: Samples of a slot and strips of a column err alike: so many of them say what one would.
     samples_as_one: float = 10.0
     #: A fit that explains less of the light's local variance, or moves any row by more slots, is none.
     min_explained: float = 0.1
     max_moved_slots: float = 20.0
     #: How much larger errors are than the spread of the columns' pulls says: neighbours share their light.
-    sd_scale: float = 1.8
+    sd_scale: float = 1.6
     #: Chi-square of the four coefficients from which stripes are bent beyond doubt.
-    bent_chi_square: float = 30.0
+    bent_chi_square: float = 40.0
 
     #: Exponents below this are nearer to no tone curve than to sRGB.
     linear_below: float = 1.5

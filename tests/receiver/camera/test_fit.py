@@ -145,3 +145,13 @@ def test_the_file_states_the_least_exposure() -> None:
     assert found.exposure_slots == 2.0
     assert found.exposure_slots_sd == 0.0
     assert "exposure_s" not in blind.summary(found, 17300.0)
+
+
+def test_errors_are_as_large_as_their_standard_deviations() -> None:
+    """Two of three errors should be within one deviation; of twelve, so many as hardly any other scale would give."""
+    within = 0
+    for seed in range(12):
+        strips, lit = _strips(np.random.default_rng(seed), np.zeros(4))
+        found, _ = _settled(strips, _hypothesis(np.zeros(4)), lit)
+        within += abs(found.rows_per_slot - ROWS_PER_SLOT) < found.rows_per_slot_sd
+    assert 4 <= within <= 11
