@@ -218,6 +218,19 @@
     section("Auto-encoder", "A small network that cleans the slots of columns in doubt; corrections are kept where they leave less doubt.", make("p", kept), grid);
   }
 
+  function search() {
+    if (!data.search.length) return;
+    const grid = make("table"), head = make("tr");
+    head.append(...["hypothesis", "prior", "evidence", "score", "fate"].map((name) => make("th", name)));
+    grid.append(head);
+    for (const [hypothesis, ...numbers] of data.search) {
+      const row = make("tr"), fate = numbers.pop();
+      row.append(make("td", hypothesis), ...numbers.map((value) => make("td", value.toFixed(1))), make("td", fate));
+      grid.append(row);
+    }
+    section("Search", "Every hypothesis that was tried. The score is 0.08 of the evidence, with what complete packets add, plus the log prior.", wide(grid));
+  }
+
   function times() {
     const { total, ...stages } = data.times, names = Object.keys(stages), most = Math.max(1e-9, ...Object.values(stages));
     const told = total === undefined ? "" : `${total.toFixed(0)} ms in all.`;
@@ -240,5 +253,6 @@
   }
   confidence();
   encoder();
+  search();
   times();
 })();

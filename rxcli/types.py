@@ -373,6 +373,21 @@ class ObjectProgress:
 
 
 @dataclass(frozen=True, slots=True)
+class SearchStep:
+    """A hypothesis that the search of a photograph tried."""
+
+    #: Screen, columns, rows of the outline, rows per slot, direction of readout and bursts, in words.
+    hypothesis: str
+    log_prior: float
+    #: Log-likelihood ratio of packets over slots of any kind; 0 where there was no clock.
+    evidence: float
+    score: float
+    #: "won"; "lost"; "half": its middle columns left it too far behind for a whole pass; "no clock"; "no data": it
+    #: scored best, but light without data explains it.
+    fate: str
+
+
+@dataclass(frozen=True, slots=True)
 class FrameResult:
     """What became of one frame; `rxcli.results.report` turns it into JSON and tables."""
 
@@ -406,6 +421,8 @@ class FrameResult:
     skipped: dict[str, int] = field(default_factory=dict)
     #: What the auto-encoder did, None where it did not run.
     denoiser: dict[str, Any] | None = None
+    #: Every hypothesis that was tried, in order, of a photograph; never part of a report.
+    search: tuple[SearchStep, ...] = ()
     #: For the link layer, where it was asked for; never part of a report.
     soft_bits: FrameSoftBits | None = None
     #: What the link layer has complete with this frame.

@@ -101,7 +101,8 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
     with timer("detect"):
         reception = decode_photograph(acquisition, options.skip, found.best.reception)
     camera, _ = settle(context, acquisition, reception)
-    result = replace(result, **outline.facts, **camera.facts)
+    tried = tuple(one.step for one in found.tried)
+    result = replace(result, **outline.facts, **camera.facts, search=tried)
     with timer("detect"):
         no_header = headerless(reception)
     with timer("denoise"):
@@ -159,6 +160,7 @@ def failed(result: FrameResult, failure: Failure) -> FrameResult:
     result = replace(result, **facts)
     return replace(
         result,
+        search=tuple(one.step for one in failure.tried),
         status=failure.status,
         message=failure.message,
         skipped={"no_screen": 1} if failure.status == "no_screen" else {},

@@ -69,6 +69,7 @@ def inspection_page(
         and {"corrected": [c.column for c in result.columns if c.denoised], **result.denoiser},
         "times": {name: value for name, value in result.timing_ms.items() if math.isfinite(value)},
         "skipped": result.skipped,
+        "search": [[one.hypothesis, one.log_prior, one.evidence, one.score, one.fate] for one in result.search],
     }
     return fill(data, f"{printable(Path(result.source).name)}: {headline(result).lower()}")
 

@@ -83,7 +83,7 @@ def test_the_page_draws_all_sections_in_a_browser(width: int, tmp_path: Path) ->
             titles = await browser.run("[...document.querySelectorAll('h2')].map((node) => node.textContent).join('|')")
             assert titles == (
                 f"{N_COLUMNS} packets received|The picture|Packets|Light and slots|How clear slots are|"
-                "Is the clock right?|Light of neighbours|Confidence|Time"
+                "Is the clock right?|Light of neighbours|Confidence|Search|Time"
             )
             assert await browser.run("document.querySelectorAll('polygon.ok').length") == N_COLUMNS
             assert await browser.run("document.querySelectorAll('tbody tr').length") >= N_COLUMNS

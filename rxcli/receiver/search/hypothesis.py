@@ -8,7 +8,7 @@ from rxcli.profiles import ScreenProfile
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler
 from rxcli.receiver.context import Camera, FrameContext, Outline
 from rxcli.receiver.reception import Reception
-from rxcli.types import Clock, FloatArray
+from rxcli.types import Clock, FloatArray, SearchStep
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,14 +67,22 @@ class Scored:
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """A line of the search's record."""
+    """A hypothesis that was tried; for the fates see `SearchStep`."""
 
     hypothesis: Hypothesis
     evidence: float
     score: float
-    #: "won"; "lost"; "half": its middle columns left it too far behind for a whole pass; "no clock"; "no data": it
-    #: scored best, but light without data explains it.
     fate: str
+
+    @property
+    def step(self) -> SearchStep:
+        """The same in words, for a result."""
+        own = self.hypothesis
+        rows_per_slot = 1 / (own.camera.line_delay_s * own.screen.slot_rate_hz)
+        parts = [own.screen.name, f"rows {own.rows}", f"{rows_per_slot:.4g} rows per slot"]
+        parts += ["reversed"] if own.camera.reversed else []
+        parts += [f"bursts {' '.join(map(str, own.bursts))}"] if own.bursts else []
+        return SearchStep(", ".join(parts), own.log_prior, self.evidence, self.score, self.fate)
 
 
 @dataclass(frozen=True, slots=True)

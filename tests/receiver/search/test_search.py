@@ -99,6 +99,9 @@ def test_every_hypothesis_is_recorded_with_its_fate(tmp_path: Path) -> None:
     assert won.hypothesis.screen.name == "small"
     assert won.evidence == found.best.evidence > 100
     assert won.score == max(one.score for one in found.tried)
+    result = receive_frame(frame, options)
+    assert [step.fate for step in result.search] == [one.fate for one in found.tried]
+    assert any("small" in step.hypothesis and step.fate == "won" for step in result.search)
 
 
 def test_a_refusal_says_what_came_nearest() -> None:
