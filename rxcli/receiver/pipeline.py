@@ -153,10 +153,9 @@ def _taps(corners: FloatArray, acquisition: Acquisition, reception: Reception) -
 
 def failed(result: FrameResult, failure: Failure) -> FrameResult:
     """A result of which nothing more comes, with the reason."""
-    facts = {
-        **(failure.outline.facts if failure.outline else {}),
-        **(failure.context.camera.facts if failure.context else {}),
-    }
+    # An estimate that shows no packets says nothing of the camera.
+    camera = failure.context.camera if failure.context and failure.context.camera.hypothesis is None else None
+    facts = {**(failure.outline.facts if failure.outline else {}), **(camera.facts if camera else {})}
     result = replace(result, **facts)
     return replace(
         result,

@@ -160,13 +160,19 @@ class _Walk:
         passes = [one.evidence for one in self._tried if one.fate != "no clock"]
         return len(passes) >= SETTINGS.hopeless_budget and max(passes) < SETTINGS.bail
 
+    @staticmethod
+    def _may_be_another_camera(best: Scored | None) -> bool:
+        """Whether the best camera is an estimate that shows no packets yet: other cameras come before its siblings."""
+        return best is not None and best.context.camera.hypothesis is not None and best.evidence < SETTINGS.few_packets
+
     def _push(self, queue: list[_Entry], key: float, hypothesis: Hypothesis) -> None:
         heapq.heappush(queue, (-key, hypothesis.identity, len(self._asked) + len(queue), hypothesis))
 
     def _next(self) -> tuple[list[_Entry], _Entry] | None:
         """The queue and the entry that is asked next; None where nothing could come near the best."""
         best = self._best()
-        if best is not None and self._siblings and -self._siblings[0][0] >= best.score - SETTINGS.reach:
+        near = best is not None and self._siblings and -self._siblings[0][0] >= best.score - SETTINGS.reach
+        if near and not (self._may_be_another_camera(best) and (self._fresh or self._cameras is not None)):
             return self._siblings, heapq.heappop(self._siblings)
         if best is not None and best.evidence > SETTINGS.plain:
             return None
