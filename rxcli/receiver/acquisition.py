@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,6 +82,35 @@ class Acquisition:
         """The same with strips pooled in pairs."""
         return replace(self, sampler=ColumnSampler(self.sampler.binned(), is_binned=True))
 
+    def middle(self) -> Acquisition:
+        """The middle half of the columns."""
+        n_columns, profiles, rows = self.screen.columns, self.profiles, self.profiles.sensor_row
+        part = slice(n_columns // 4, n_columns - n_columns // 4)
+        middle = replace(
+            profiles,
+            light=profiles.light[part],
+            inside=profiles.inside[part],
+            count=profiles.count[part],
+            sensor_row=None if rows is None else rows[part],
+        )
+        clock = replace(self.clock, delay_slots=self.clock.delay_slots[part])
+        return replace(self, sampler=ColumnSampler(middle, self.sampler.is_binned), clock=clock)
+
+    def as_one_column(self) -> Acquisition:
+        """The same with every column a strip of one."""
+        profiles, rows = self.profiles, self.profiles.sensor_row
+        weight = profiles.inside.astype(np.float32)
+        light = (profiles.light * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
+        strips = replace(
+            profiles,
+            light=np.asarray(light[None], np.float32),
+            inside=np.any(profiles.inside, axis=1)[None],
+            count=np.asarray(profiles.count.sum(axis=1)[None], np.float32),
+            sensor_row=None if rows is None else rows.mean(axis=1)[None],
+        )
+        clock = replace(self.clock, delay_slots=np.zeros(1))
+        return replace(self, sampler=ColumnSampler(strips, is_binned=True), clock=clock)
+
     def in_depth(self, columns: NDArray[np.int64]) -> Acquisition:
         """The same with some columns read pixel by pixel, strip by strip."""
         sampler = self.sampler.in_depth(columns)
@@ -123,3 +152,18 @@ def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False
 def noise_of(profiles: RowProfiles) -> float:
     """Standard deviation of a strip's row of no light."""
     return float(np.sqrt(profiles.noise_floor / max(float(np.median(profiles.count)), 1.0)))
+
+
+def distinct_screens(screens: Sequence[ScreenProfile]) -> list[ScreenProfile]:
+    """The screens without those that differ only in how often a packet is sent: the one that sends it most."""
+    return [one for one in screens if variants_of(one, screens)[0] is one]
+
+
+def variants_of(screen: ScreenProfile, screens: Sequence[ScreenProfile]) -> tuple[ScreenProfile, ...]:
+    """The screen, and others that differ only in how often a packet is sent; the one that sends it most first."""
+    by_repeats = {one.repeats: one for one in reversed((screen, *screens)) if _shape(one) == _shape(screen)}
+    return tuple(by_repeats[repeats] for repeats in sorted(by_repeats, reverse=True))
+
+
+def _shape(screen: ScreenProfile) -> tuple[float, int, int]:
+    return screen.slot_rate_hz, screen.packet_slots, screen.columns

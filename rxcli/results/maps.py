@@ -22,10 +22,10 @@ _LOW, _RANGE = 20, 215
 def column_map(frame: Frame) -> dict[str, Any] | None:
     """Coherent strips, with the grid of columns that was found; None for tiny pictures."""
     from rxcli.options import ReceiverOptions
+    from rxcli.receiver.corners import layouts_of
     from rxcli.receiver.screen.find import find_outlines
     from rxcli.receiver.screen.settings import SETTINGS
     from rxcli.receiver.screen.strips import read_strips
-    from rxcli.receiver.search.outlines import layouts_of
 
     if min(frame.width, frame.height) < SETTINGS.min_size_px:
         return None

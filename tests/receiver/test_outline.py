@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.receiver.context import Outline, Timer
+from rxcli.receiver.corners import possible_outlines
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.grid import grid_between
-from rxcli.receiver.search.outlines import likeliest_of_family, numbered, possible_outlines
+from rxcli.receiver.search.outlines import likeliest_of_family, numbered
 from rxcli.types import FloatArray, Frame
 
 HEIGHT, WIDTH, ROWS_PER_SLOT, COLUMNS = 1600, 1200, 10.0, 20

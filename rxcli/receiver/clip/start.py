@@ -13,10 +13,16 @@ import numpy as np
 
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import sync
-from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of, sample_columns
+from rxcli.receiver.acquisition import (
+    Acquisition,
+    ColumnSampler,
+    distinct_screens,
+    noise_of,
+    sample_columns,
+    variants_of,
+)
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.context import Camera, FrameContext
-from rxcli.receiver.search.propose import distinct_screens, variants_of
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.receiver.sync.tracking import LinkTime
 from rxcli.types import Clock, FloatArray, Frame, RowProfiles

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver import sync
-from rxcli.receiver.acquisition import Acquisition, ColumnSampler, noise_of
+from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
@@ -16,7 +14,7 @@ from rxcli.receiver.decode.steady import is_alike, periodic_share
 from rxcli.receiver.reception import shows_steady_light
 from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
-from rxcli.types import BoolArray, RowProfiles
+from rxcli.types import RowProfiles
 
 _NEXT = "point the camera at the screen that sends, or check that it does"
 STEADY_LIGHT = (
@@ -40,7 +38,7 @@ def light_without_data(context: FrameContext, acquisition: Acquisition) -> Failu
         headers = PREAMBLE_SLOTS / binned.screen.packet_slots
         if not is_alike(*contrast, headers, SETTINGS.apart_slots * SETTINGS.light_samples):
             return None
-        reception = initial_pass(_as_one_column(binned))
+        reception = initial_pass(binned.as_one_column())
         no_header = bool(np.any(assemble.without_header(reception.posteriors.header_llr)))
         if float(reception.column_llr.max()) > SETTINGS.some_packets and not no_header:
             return None
@@ -59,23 +57,3 @@ def is_switched(context: FrameContext, profiles: RowProfiles) -> bool:
         return False
     level -= level.mean(axis=1, keepdims=True)
     return periodic_share(level, 2 * SETTINGS.most_period_rows) > SETTINGS.switched_share
-
-
-def _as_one_column(acquisition: Acquisition) -> Acquisition:
-    """The same with every column a strip of one."""
-    sampler = ColumnSampler(_columns_as_strips(acquisition.profiles), is_binned=True)
-    return replace(acquisition, sampler=sampler, clock=replace(acquisition.clock, delay_slots=np.zeros(1)))
-
-
-def _columns_as_strips(profiles: RowProfiles) -> RowProfiles:
-    weight = profiles.inside.astype(np.float32)
-    inside: BoolArray = np.any(profiles.inside, axis=1)
-    light = (profiles.light * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
-    sensor_row = None if profiles.sensor_row is None else profiles.sensor_row.mean(axis=1)[None]
-    return replace(
-        profiles,
-        light=np.asarray(light[None], np.float32),
-        inside=inside[None],
-        count=np.asarray(profiles.count.sum(axis=1)[None], np.float32),
-        sensor_row=sensor_row,
-    )

@@ -1,4 +1,4 @@
-"""Outlines that the screen of a frame may have, and what is known of its columns' numbers once one was chosen."""
+"""Which column is the first: packets do not tell, so the prior of the outlines decides, and says how sure it is."""
 
 from __future__ import annotations
 
@@ -7,72 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rxcli.options import ReceiverOptions
-from rxcli.receiver.cameras import known_lens
-from rxcli.receiver.context import Failure, Outline, Timer
-from rxcli.receiver.corners import (
-    may_fill,
-    outside_the_picture,
-    reason_for_none,
-    turned_pixels,
-    unreadable_orientation,
-    whole_picture,
-)
-from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.find import ColumnLayout, find_outlines
+from rxcli.receiver.context import Outline
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.types import Frame
-
-
-def proposed_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[Outline] | Failure:
-    """Outlines that the screen of a frame may have, at least one; or why there are none."""
-    refused = unreadable_orientation(frame)
-    if refused is not None:
-        return refused
-    if options.corners is not None:
-        with timer("geometry"):
-            return outside_the_picture(options.corners, frame) or [Outline(options.corners)]
-    found = possible_outlines(frame, options, timer)
-    if found:
-        return found
-    reason = turned_pixels(frame, layouts_of(options)) or reason_for_none(frame)  # Pixels may lie on their side.
-    if "no_screen" in options.skip or not may_fill(frame):
-        return Failure("no_screen", f"no screen found: {reason}")
-    return [Outline(whole_picture(frame), inferred=geometry.SIDE_NAMES, column_offset=None)]
-
-
-def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[Outline]:
-    """Outlines that the finder proposes."""
-    layouts = layouts_of(options)
-    period = 1 if frame.mosaic is None else frame.mosaic.pattern.shape[1]
-    with timer("geometry"):
-        found = find_outlines(frame.pixels, layouts, mosaic_period=period, lens=known_lens(frame, options))
-    alone = sum(not one.is_narrow for one in layouts) == 1
-    outlines = [
-        Outline(
-            one.corners[0],
-            inferred=one.unlit_sides,
-            log_odds=one.log_odds,
-            family=one.layout.n_columns,
-            fills=one.fills,
-            other_rows=one.corners[1:],
-            n_columns=None if alone and not one.layout.is_narrow else one.layout.n_columns,
-        )
-        for one in found
-    ]
-    return [_as_viewed(one, frame.metadata.orientation) for one in outlines]
-
-
-def layouts_of(options: ReceiverOptions) -> list[ColumnLayout]:
-    """The columns that screens may have, few first."""
-    layouts = {one.columns: ColumnLayout(one.columns, one.light_spread, one.aspect) for one in options.screens}
-    return [layouts[n] for n in sorted(layouts)]
-
-
-def _as_viewed(outline: Outline, orientation: int) -> Outline:
-    """An outline with its corners in the viewer's order."""
-    corners, *others = (geometry.viewer_order(one, orientation) for one in (outline.corners, *outline.other_rows))
-    return replace(outline, corners=corners, other_rows=tuple(others))
 
 
 def likeliest_of_family(outlines: Sequence[Outline]) -> Outline:

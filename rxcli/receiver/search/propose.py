@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import camera as blind
 from rxcli.receiver import sync
-from rxcli.receiver.acquisition import ColumnSampler, noise_of, sample_columns
+from rxcli.receiver.acquisition import ColumnSampler, noise_of, sample_columns, variants_of
 from rxcli.receiver.cameras import known_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
 from rxcli.receiver.decode import detect
@@ -196,21 +196,6 @@ def _is_clear(reception: Reception) -> bool:
     """Whether nearly all columns have a complete packet of high confidence."""
     confidence = np.where(complete_packets(reception), reception.packet_confidence, 0.0).max(axis=0)
     return bool((confidence > SETTINGS.clear_confidence).mean() >= SETTINGS.clear_columns)
-
-
-def distinct_screens(screens: Sequence[ScreenProfile]) -> list[ScreenProfile]:
-    """The screens without those that differ only in how often a packet is sent: the one that sends it most."""
-    return [one for one in screens if variants_of(one, screens)[0] is one]
-
-
-def variants_of(screen: ScreenProfile, screens: Sequence[ScreenProfile]) -> tuple[ScreenProfile, ...]:
-    """The screen, and others that differ only in how often a packet is sent; the one that sends it most first."""
-    by_repeats = {one.repeats: one for one in reversed((screen, *screens)) if _shape(one) == _shape(screen)}
-    return tuple(by_repeats[repeats] for repeats in sorted(by_repeats, reverse=True))
-
-
-def _shape(screen: ScreenProfile) -> tuple[float, int, int]:
-    return screen.slot_rate_hz, screen.packet_slots, screen.columns
 
 
 def _nearest(screens: Iterable[ScreenProfile], n_columns: int) -> ScreenProfile:

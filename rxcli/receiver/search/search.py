@@ -9,15 +9,16 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.acquisition import Acquisition, ColumnSampler
+from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera import is_linear
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
+from rxcli.receiver.corners import proposed_outlines
 from rxcli.receiver.sampling import is_coded
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.explain import why_no_packets
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
 from rxcli.receiver.search.nulls import light_without_data
-from rxcli.receiver.search.outlines import numbered, proposed_outlines
+from rxcli.receiver.search.outlines import numbered
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
@@ -192,7 +193,7 @@ class _Walk:
         """An initial pass, of the middle columns first where there is a better hypothesis already."""
         best, acquisition = self._best(), _acquired(hypothesis)
         if best is not None and hypothesis.screen.columns > SETTINGS.few_columns:
-            half = self._measured(hypothesis, _middle(acquisition))
+            half = self._measured(hypothesis, acquisition.middle())
             if half.score < best.score - SETTINGS.reach or half.evidence < SETTINGS.bail:
                 self._tried.append(Tried(hypothesis, half.evidence, half.score, "half"))
                 return
@@ -221,19 +222,3 @@ def _acquired(hypothesis: Hypothesis) -> Acquisition:
     assert hypothesis.clock is not None
     bursts = None if hypothesis.bursts is None else np.array(hypothesis.bursts)
     return Acquisition(hypothesis.screen, hypothesis.sampler, hypothesis.clock, hypothesis.variants, bursts)
-
-
-def _middle(acquisition: Acquisition) -> Acquisition:
-    """The middle half of the columns."""
-    n_columns = acquisition.screen.columns
-    part = slice(n_columns // 4, n_columns - n_columns // 4)
-    profiles, rows = acquisition.profiles, acquisition.profiles.sensor_row
-    middle = replace(
-        profiles,
-        light=profiles.light[part],
-        inside=profiles.inside[part],
-        count=profiles.count[part],
-        sensor_row=None if rows is None else rows[part],
-    )
-    clock = replace(acquisition.clock, delay_slots=acquisition.clock.delay_slots[part])
-    return replace(acquisition, sampler=ColumnSampler(middle, acquisition.sampler.is_binned), clock=clock)

@@ -17,9 +17,10 @@ from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, parse_profile, shipped_profiles
+from rxcli.receiver import corners as outlines
 from rxcli.receiver.context import Failure, Outline, Timer
 from rxcli.receiver.pipeline import receive_frame
-from rxcli.receiver.search import Found, outlines, search
+from rxcli.receiver.search import Found, search
 from rxcli.types import Frame, FrameResult
 
 SHIPPED = tuple(shipped_profiles(ScreenProfile))
