@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.combs import find_combs, grid_of_comb
+from rxcli.receiver.screen.combs import Comb, find_combs, grid_of_comb
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import first_columns, light_profile
 from rxcli.receiver.screen.rows import find_rows
@@ -130,7 +130,14 @@ def follow_outline(pixels: Pixels, corners: FloatArray, layout: ColumnLayout) ->
 def wide_grid(strips: Strips, sigma: float) -> Grid | None:
     """The grid of wide columns that explains the strips' light best; None where none stands out."""
     some = strips.blocks(slice(None, None, 2))
-    grids = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in find_combs(strips, sigma)]
+    combs = _possible_combs(strips, sigma)
+    if not combs:
+        return None
+    if combs[0].score > SETTINGS.plain_comb:
+        combs = combs[:1]
+    grids = [grid_of_comb(comb, strips) for comb in combs]
+    if len(grids) > 1:
+        grids = [with_light(some, grid, sigma) for grid in grids]
     best = max(grids, key=lambda one: one.explained + SETTINGS.contrast_weight * one.contrast)
     return _settled(strips, moved_by_waveforms(some, best, sigma, SETTINGS.first_steps), sigma)
 
@@ -144,10 +151,11 @@ def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
     some = strips.blocks(slice(None, None, 2))
     n = some.n_windows
     starts = []
-    for comb in find_combs(strips, sigma):
+    for comb in _possible_combs(strips, sigma):
         part = some.blocks(slice(comb.part * n, (comb.part + 1) * n))
         grid = moved_by_waveforms(part, grid_of_comb(comb, strips), sigma, SETTINGS.narrow_steps)
         starts.append((with_light(part, grid, sigma), float(part.raw_x.mean())))
+    starts = [start for start in starts if start[0].contrast > SETTINGS.min_part_contrast * start[0].explained]
     starts.sort(key=lambda start: -start[0].contrast / max(start[0].explained, 1.0))
     best: Grid | None = None
     for start, middle in starts[: SETTINGS.n_followed]:
@@ -168,6 +176,12 @@ def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
         near = np.flatnonzero(within.any(axis=1))
         grid = moved_by_waveforms(strips.blocks(near), grid, sigma, SETTINGS.narrow_steps, within[near])
     return grid
+
+
+def _possible_combs(strips: Strips, sigma: float) -> list[Comb]:
+    """The combs that are worth a grid; none where the best may be chance."""
+    combs = find_combs(strips, sigma)
+    return combs if combs and combs[0].score > SETTINGS.min_comb else []
 
 
 def _settled(strips: Strips, grid: Grid, sigma: float) -> Grid | None:

@@ -38,7 +38,7 @@ class FinderSettings:
     #: Columns are narrow where coherence this many picture widths apart falls below a share of that nearer by.
     near_widths: float = 0.004
     far_widths: float = 0.018
-    narrow_ratio: float = 0.45
+    narrow_ratio: float = 0.5
     #: Mean coherence of neighbours below which nothing in the picture flickers.
     min_lit: float = 0.02
 
@@ -57,6 +57,9 @@ class FinderSettings:
     pair_distance: float = 0.72
     #: Combs that are tried as grids.
     n_combs: int = 6
+    #: Heights of combs, standard deviations by chance: below the first there is none, from the second on it is right.
+    min_comb: float = 6.0
+    plain_comb: float = 12.0
 
     #: Weight against waveforms of columns that hardly show, strips.
     ridge: float = 0.5

@@ -139,8 +139,15 @@ def shows_narrow_columns(strips: Strips) -> bool:
     """Whether light is coherent nearby and no more a little further on, as that of wide columns is."""
     if float(strips.lit.mean()) < SETTINGS.min_lit:
         return False
-    near, far = (max(round(apart / strips.step), 1) for apart in (SETTINGS.near_widths, SETTINGS.far_widths))
-    return float(strips.coherence(far).mean()) < SETTINGS.narrow_ratio * float(strips.coherence(near).mean())
+    near, far = (_lit_coherence(strips, widths) for widths in (SETTINGS.near_widths, SETTINGS.far_widths))
+    return far < SETTINGS.narrow_ratio * near
+
+
+def _lit_coherence(strips: Strips, widths: float) -> float:
+    """Mean coherence of lit strips some picture widths apart, over what it would be in one column."""
+    distance = max(round(widths / strips.step), 1)
+    share = np.sqrt(strips.lit[:, :-distance] * strips.lit[:, distance:])
+    return float((strips.coherence(distance) * share).sum() / (np.square(share).sum() + TINY))
 
 
 def _row_sums(pixels: Pixels, strip_px: int) -> Float32Array:
@@ -265,8 +272,8 @@ def _smooth(values: Float32Array, strips: int, windows: int) -> Float32Array:
 def _independent_rows(quiet: Float32Array, lit: Float32Array) -> float:
     """Rows of a window that count as independent, by the autocorrelation of the strips that show the stripes best."""
     bright = np.argsort(-lit.mean(axis=0))[: max(int(SETTINGS.bright_share * lit.shape[1]), 1)]
-    strips, rows = quiet[:, :, bright], quiet.shape[1]
-    power = float(np.mean(strips * strips)) + TINY
-    lags = range(1, min(SETTINGS.max_lag, rows // 2))
-    alike = [float(np.mean(strips[:, lag:] * strips[:, :-lag])) / power for lag in lags]
-    return float(rows / (1 + 2 * float(np.sum(np.square(alike)))))
+    some = np.ascontiguousarray(quiet[::4, :, bright])
+    rows = some.shape[1]
+    products = [float(np.vdot(some[:, lag:], some[:, : rows - lag])) for lag in range(min(SETTINGS.max_lag, rows // 2))]
+    alike = np.array(products) * rows / (rows - np.arange(len(products))) / (products[0] + TINY)
+    return float(rows / (1 + 2 * float(np.square(alike[1:]).sum())))
