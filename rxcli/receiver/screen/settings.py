@@ -37,7 +37,7 @@ class FinderSettings:
     max_lag: int = 40
     #: Columns are narrow where coherence this many picture widths apart falls below a share of that nearer by.
     near_widths: float = 0.004
-    far_widths: float = 0.018
+    far_widths: float = 0.02
     narrow_ratio: float = 0.5
     #: Mean coherence of neighbours below which nothing in the picture flickers.
     min_lit: float = 0.02
@@ -85,6 +85,8 @@ class FinderSettings:
     #: Least contrast: as a share of what is explained times the root of the number of rows, and log-likelihood a strip.
     min_contrast: float = 0.95
     min_contrast_per_strip: float = 0.05
+    #: Least contrast of narrow columns in the best part of a picture, a share of what is explained.
+    min_part_contrast: float = 0.05
     #: Log-odds against the likeliest first column down to which another is possible.
     min_log_odds: float = -7.0
 

@@ -84,7 +84,7 @@ def read_strips(pixels: Pixels, mosaic_period: int = 1, lens: Lens | None = None
     """
     height, width = pixels.shape
     wanted = SETTINGS.n_strips if n_parts == 1 else n_parts * SETTINGS.n_fifth_strips
-    strip_px = mosaic_period * max(1, round(width / wanted / mosaic_period))
+    strip_px = _strip_width(width, wanted, mosaic_period)
     light = _row_sums(pixels, strip_px)
     spare = light.shape[1] % n_parts
     light = light[:, spare // 2 :][:, : light.shape[1] - spare]
@@ -126,6 +126,13 @@ def read_strips(pixels: Pixels, mosaic_period: int = 1, lens: Lens | None = None
         height=height,
         lens=lens,
     )
+
+
+def _strip_width(width: int, wanted: int, period: int) -> int:
+    """Whole periods of a mosaic near to one of so many strips; a width that leaves no pixels over spares a copy."""
+    nearest = max(1, round(width / wanted / period))
+    near = sorted(range(max(1, nearest - nearest // 6), nearest + nearest // 6 + 1), key=lambda n: abs(n - nearest))
+    return period * next((n for n in near if width % (n * period) == 0), nearest)
 
 
 def flat_places(points: FloatArray, width: int, height: int, lens: Lens | None) -> tuple[FloatArray, FloatArray]:
