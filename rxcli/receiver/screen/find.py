@@ -200,20 +200,28 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> li
     light = predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), layouts[0].sigma)
     profile = light_profile(strips, light, grid)
     starts = [first_columns(profile, layout.n_columns) for layout in layouts]
-    likeliest = max(float(start.log_odds.max()) for start in starts)
+    odds = np.concatenate([start.log_odds for start in starts])
+    likeliest = float(odds.max())
+    is_plain = (odds > likeliest + SETTINGS.plain_log_odds).sum() == 1
     found: list[OutlineCandidate] = []
     for layout, start in zip(layouts, starts, strict=True):
         likely = np.flatnonzero(start.log_odds > likeliest + SETTINGS.min_log_odds)
         if not likely.size:
             continue
         best = int(start.first[start.log_odds.argmax()])
-        plane, ends = find_rows(strips, light, grid.shifted(best), layout.n_columns, layout.aspect)
-        for number, odds in zip(start.first[likely].tolist(), start.log_odds[likely].tolist(), strict=True):
+        own = grid.shifted(best)
+        if is_plain:
+            # Light beyond the first and last column is none of theirs.
+            n_steps = SETTINGS.last_steps
+            own = moved_by_waveforms(strips, own, layout.sigma, n_steps, n_columns=layout.n_columns)
+        plane, ends = find_rows(strips, light, own, layout.n_columns, layout.aspect)
+        for number, log_odds in zip(start.first[likely].tolist(), start.log_odds[likely].tolist(), strict=True):
             corners = tuple(plane.corners(one, number - best) for one in ends)
             lit = (profile.ends[0] - number, number + layout.n_columns - profile.ends[1])
             unlit = _unlit_sides(corners[0], lit, len(ends) > 1, (strips.width, strips.height))
-            own = grid.shifted(number)
-            found.append(OutlineCandidate(corners, own, layout, odds - likeliest, start.fills, unlit))
+            found.append(
+                OutlineCandidate(corners, own.shifted(number - best), layout, log_odds - likeliest, start.fills, unlit)
+            )
     return sorted(found, key=lambda one: -one.log_odds)
 
 

@@ -75,7 +75,7 @@ class FinderSettings:
     #: Steps on every second window, steps of narrow columns at each reach, and last steps on all windows.
     first_steps: int = 3
     narrow_steps: int = 8
-    last_steps: int = 3
+    last_steps: int = 2
     #: How much further a grid of narrow columns is followed at a time.
     reach_gain: float = 1.6
     #: Grids of narrow columns that are followed, at most.
@@ -89,6 +89,8 @@ class FinderSettings:
     min_part_contrast: float = 0.05
     #: Log-odds against the likeliest first column down to which another is possible.
     min_log_odds: float = -7.0
+    #: Log-odds of the next likely one below which the first column is plain, so that the screen's ends help the grid.
+    plain_log_odds: float = -3.0
 
 
 SETTINGS = FinderSettings()

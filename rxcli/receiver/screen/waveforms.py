@@ -35,15 +35,20 @@ class Mixes:
     sigma: float
 
     @classmethod
-    def of(cls, u: FloatArray, sigma: float) -> Mixes:
-        """The mixes of strips at columns (B, S)."""
-        u = u - np.floor(u.min(axis=1, keepdims=True))
+    def of(cls, u: FloatArray, sigma: float, n_columns: int | None = None) -> Mixes:
+        """The mixes of strips at columns (B, S); with `n_columns`, of a screen that has so many from column 0 on."""
+        first = np.floor(u.min(axis=1, keepdims=True))
+        u = u - first
         n = int(min(np.ceil(u.max()), _MAX_COLUMNS))
         distance = np.minimum(u, n).astype(np.float32)[..., None] - (np.arange(n, dtype=np.float32) + np.float32(0.5))
         share = np.square(distance)
         share *= np.float32(-0.5 / sigma**2)
         np.exp(np.maximum(share, _LEAST_SHARE, out=share), out=share)
-        share /= np.sqrt(_dot(share, share))[..., None]
+        if n_columns is not None:
+            number = first + np.arange(n)
+            share *= ((number >= 0) & (number < n_columns))[:, None]
+            share *= ((u > -first) & (u < n_columns - first))[..., None]
+        share /= np.sqrt(_dot(share, share) + _TINY**2)[..., None]
         return cls(share, distance, sigma)
 
     def slopes(self) -> Float32Array:
@@ -115,7 +120,14 @@ def with_light(strips: Strips, grid: Grid, sigma: float) -> Grid:
     return replace(grid, explained=here, contrast=here - between)
 
 
-def moved_by_waveforms(strips: Strips, grid: Grid, sigma: float, n_steps: int, within: BoolArray | None = None) -> Grid:
+def moved_by_waveforms(
+    strips: Strips,
+    grid: Grid,
+    sigma: float,
+    n_steps: int,
+    within: BoolArray | None = None,
+    n_columns: int | None = None,
+) -> Grid:
     """The grid moved to where its columns' waveforms say that the strips lie.
 
     Args:
@@ -124,10 +136,11 @@ def moved_by_waveforms(strips: Strips, grid: Grid, sigma: float, n_steps: int, w
         sigma: light spread of the screen, column pitches.
         n_steps: steps that it takes.
         within: (B, S) strips that count; all by default.
+        n_columns: of the screen, where the grid counts from its first: light beyond them is none of its columns'.
     """
     numbers = grid.numbers
     for _ in range(n_steps):
-        off, weight = _offsets(strips, Mixes.of(columns_at(numbers, strips.x, strips.y), sigma))
+        off, weight = _offsets(strips, Mixes.of(columns_at(numbers, strips.x, strips.y), sigma, n_columns))
         if within is not None:
             weight = weight * within
         if not weight.any():
