@@ -131,7 +131,7 @@ def read_strips(pixels: Pixels, mosaic_period: int = 1, lens: Lens | None = None
 def _strip_width(width: int, wanted: int, period: int) -> int:
     """Whole periods of a mosaic near to one of so many strips; a width that leaves no pixels over spares a copy."""
     nearest = max(1, round(width / wanted / period))
-    near = sorted(range(max(1, nearest - nearest // 6), nearest + nearest // 6 + 1), key=lambda n: abs(n - nearest))
+    near = range(nearest, nearest - nearest // 10 - 1, -1)
     return period * next((n for n in near if width % (n * period) == 0), nearest)
 
 
