@@ -133,7 +133,8 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
     combs = _possible_combs(strips, sigma)
     if not combs:
         return None
-    if combs[0].score > SETTINGS.plain_comb:
+    next_best = combs[1].score if len(combs) > 1 else 0.0
+    if combs[0].score > max(SETTINGS.plain_comb, SETTINGS.comb_lead * next_best):
         combs = combs[:1]
     grids = [grid_of_comb(comb, strips) for comb in combs]
     if len(grids) > 1:

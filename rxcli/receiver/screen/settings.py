@@ -57,9 +57,11 @@ class FinderSettings:
     pair_distance: float = 0.72
     #: Combs that are tried as grids.
     n_combs: int = 6
-    #: Heights of combs, standard deviations by chance: below the first there is none, from the second on it is right.
+    #: Heights of combs, standard deviations by chance: below the first there is none, from the second on it is right,
+    #: if it is so many times as high as the next one.
     min_comb: float = 6.0
     plain_comb: float = 12.0
+    comb_lead: float = 1.15
 
     #: Weight against waveforms of columns that hardly show, strips.
     ridge: float = 0.5

@@ -174,7 +174,7 @@ def _band_passed(light: Float32Array, short: int) -> tuple[Float32Array, int]:
 
     step = (short + 1) // 2 if len(light) >= SETTINGS.many_rows else 1
     whole = len(light) // step * step
-    band = cv2.blur(light, (1, short)) - cv2.blur(light, (1, 8 * short + 1))
+    band = cv2.blur(light, (1, short)) - cv2.blur(light, (1, 8 * short))
     return np.asarray(band[:whole:step], np.float32), step
 
 
