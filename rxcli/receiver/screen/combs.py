@@ -103,8 +103,9 @@ def _distinct(combs: list[Comb], most: int) -> list[Comb]:
 
 def _combs_of_part(strips: Strips, sigma: float, part: int) -> list[Comb]:
     """The best comb of each pitch."""
-    pitches = np.arange(SETTINGS.min_pitch, SETTINGS.max_pitch, SETTINGS.pitch_step)
     step = strips.step * strips.n_parts
+    most = min(SETTINGS.max_pitch, 1 / (SETTINGS.min_column_strips * step))
+    pitches = np.arange(SETTINGS.min_pitch, most, SETTINGS.pitch_step)
     apart = np.maximum(np.round(SETTINGS.pair_distance / (pitches * step)), 1).astype(np.int64)
     y = strips.raw_y.mean(axis=1) * strips.n_parts
     found: list[Comb] = []

@@ -53,6 +53,8 @@ class FinderSettings:
     max_across: float = 0.2
     max_along: float = 0.3
     corner_step: float = 0.4
+    #: Strips that a column has at least.
+    min_column_strips: float = 4.0
     #: Distance of the pairs of strips that show the comb of borders best.
     pair_distance: float = 0.72
     #: Combs that are tried as grids.
