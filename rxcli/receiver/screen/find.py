@@ -77,6 +77,8 @@ def find_outlines(
     if min(pixels.shape) < SETTINGS.min_size_px:
         return []
     strips = read_strips(pixels, mosaic_period, lens)
+    if strips.lit.shape[1] < SETTINGS.min_strips:
+        return []
     narrow, wide = ([one for one in layouts if one.is_narrow is many] for many in (True, False))
     if narrow and shows_narrow_columns(strips):
         fine = read_strips(pixels, mosaic_period, lens, n_parts=_PARTS)

@@ -11,8 +11,10 @@ class FinderSettings:
 
     #: Smallest picture that is searched, pixels each way.
     min_size_px: int = 96
-    #: Strips across the picture, windows of rows, and strips across each fifth of a picture with narrow columns.
+    #: Strips across the picture, the fewest that tell a grid from noise, windows of rows, and strips across each fifth
+    #: of a picture with narrow columns.
     n_strips: int = 200
+    min_strips: int = 120
     n_windows: int = 16
     n_fifth_strips: int = 150
     #: Rows that are averaged, as a share of the lag at which strips are half as alike as one row apart, least and most;
