@@ -135,13 +135,10 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
     combs = _possible_combs(strips, sigma)
     if not combs:
         return None
-    next_best = combs[1].score if len(combs) > 1 else 0.0
-    if combs[0].score > max(SETTINGS.plain_comb, SETTINGS.comb_lead * next_best):
-        combs = combs[:1]
-    grids = [grid_of_comb(comb, strips) for comb in combs]
-    if len(grids) > 1:
-        grids = [with_light(some, grid, sigma) for grid in grids]
-    best = max(grids, key=lambda one: one.explained + SETTINGS.contrast_weight * one.contrast)
+    best = with_light(some, grid_of_comb(combs[0], strips), sigma)
+    if combs[0].score < SETTINGS.plain_comb or best.contrast < SETTINGS.plain_contrast * best.explained:
+        others = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
+        best = max([best, *others], key=lambda one: one.explained + SETTINGS.contrast_weight * one.contrast)
     return _settled(strips, moved_by_waveforms(some, best, sigma, SETTINGS.first_steps), sigma)
 
 

@@ -59,13 +59,14 @@ class FinderSettings:
     min_column_strips: float = 4.0
     #: Distance of the pairs of strips that show the comb of borders best.
     pair_distance: float = 0.72
-    #: Combs that are tried as grids.
-    n_combs: int = 6
-    #: Heights of combs, standard deviations by chance: below the first there is none, from the second on it is right,
-    #: if it is so many times as high as the next one.
+    #: Combs that are tried as grids: the best of all, and the best of each band of pitches.
+    n_combs: int = 4
+    n_pitch_bands: int = 6
+    #: Heights of combs, standard deviations by chance: below the first there is none, from the second on it is right
+    #: if its contrast is this share of what it explains.
     min_comb: float = 6.0
     plain_comb: float = 12.0
-    comb_lead: float = 1.15
+    plain_contrast: float = 0.15
 
     #: Weight against waveforms of columns that hardly show, strips.
     ridge: float = 0.5
