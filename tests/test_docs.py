@@ -27,7 +27,7 @@ _FILES = {
     **dict.fromkeys(("clip.mp4", "capture.mp4"), "video1080_chelsea_17k3.mp4"),
     **dict.fromkeys(("mycam.toml", "mine.toml", "my.toml"), "phone12.toml"),
 }
-_FOLDERS = ("p777", "p888", "captures", "boards", "lab", "../other", "other")
+_FOLDERS = ("p777", "p888", "w999", "captures", "boards", "lab", "../other", "other")
 #: Commands that run here; of all others the arguments are read, as they need a camera, a board, a lamp or an hour.
 _RUN = ("profiles", "decode sample_frames/", "inspect sample_frames/", "inspect docs/hello.jpg")
 
@@ -64,8 +64,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).mkdir(parents=True, exist_ok=True)
     for name, sample in _FILES.items():
         shutil.copy(ROOT / "sample_frames" / sample, folder / name)
-    for name in ("p777", "p888"):
-        (folder / name / "phones.journal.jsonl").touch()
+    for name in ("p777/phones", "p888/phones", "w999/warped"):
+        (folder / f"{name}.journal.jsonl").touch()
     return folder
 
 

@@ -26,7 +26,7 @@ _PORTRAIT = (5, 6, 7, 8)
 _NO_COLUMNS = "no columns of a modulated backlight were found in the picture"
 _SHOW_COLUMNS = (
     "photograph a screen that sends, from near, with the electronic shutter and a short exposure (1/8000 s), and use "
-    "the picture in its full size; if the picture does show one, give its place with --corners"
+    "the picture in its full size"
 )
 
 

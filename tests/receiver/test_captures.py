@@ -130,7 +130,7 @@ def test_floor(corpus: Corpus, floor: Floor, say: Callable[[str], None]) -> None
 
 @pytest.mark.parametrize("floor", FLOORS, ids=lambda floor: floor.name)
 def test_corners_are_found(corpus: Corpus, floor: Floor) -> None:
-    """Those in the picture, within 0.3 % of the screen's width."""
+    """Those in the picture: across the columns within a third of a column of twenty, along them 4 %."""
     import cv2
 
     received = corpus[floor.name]
@@ -142,23 +142,27 @@ def test_corners_are_found(corpus: Corpus, floor: Floor) -> None:
     assert received.result.corners is not None
     in_picture = ((corners >= 0) & (corners <= [camera["width"] - 1, camera["height"] - 1])).all(axis=1)
     assert in_picture.sum() >= 2
-    off = np.linalg.norm(received.result.corners - corners, axis=1)[in_picture].max()
-    assert off < 0.003 * np.linalg.norm(corners[1] - corners[0])
+    width = float(np.linalg.norm(corners[1] - corners[0]))
+    across = (corners[1] - corners[0]) / width
+    off = (received.result.corners - corners)[in_picture]
+    assert np.abs(off @ across).max() < width / 60
+    assert np.linalg.norm(off, axis=1).max() < 0.04 * width
 
 
-@pytest.mark.parametrize("floor", FLOORS, ids=lambda floor: floor.name)
-def test_confidence_is_not_boasted(corpus: Corpus, floor: Floor) -> None:
-    """Of the packets reported at 0.99 and above, at most a tenth has a wrong bit."""
-    received = corpus[floor.name]
-    shown = [b["burst"] for b in received.truth["frames"][0]["bursts"]]
-    right = [
-        0.0 in received.wrong_shares(c.column, p.payload, p.payload_bits, shown)
-        for c in received.result.columns
-        for p in c.packets
-        if p.confidence >= 0.99
-    ]
-    assert right
-    assert np.mean(right) >= 0.9
+def test_confidence_is_not_boasted(corpus: Corpus) -> None:
+    """Of the packets of all captures reported at 0.99 and above, at most one in fifty has a wrong bit."""
+    right = []
+    for floor in FLOORS:
+        received = corpus[floor.name]
+        shown = [b["burst"] for b in received.truth["frames"][0]["bursts"]]
+        right += [
+            0.0 in received.wrong_shares(c.column, p.payload, p.payload_bits, shown)
+            for c in received.result.columns
+            for p in c.packets
+            if p.confidence >= 0.99
+        ]
+    assert len(right) >= 50
+    assert np.mean(right) >= 0.98
 
 
 def test_mean_ratio_to_the_bound(corpus: Corpus, say: Callable[[str], None]) -> None:

@@ -21,14 +21,15 @@ PWM, CODE = 0, 1
 
 
 def clip_of(kind: str, seed: int, n_frames: int) -> tuple[list[Frame], ReceiverOptions]:
-    """Frames without data, and a camera that reads them out in 20 ms."""
+    """Frames without data, a camera that reads them out in 20 ms, and corners: one light has no columns to be found."""
     made = draw_no_data(kind, np.random.default_rng([999, seed, 23]), n_frames)
     height, width = made.frames[0].shape
     mode = ReadoutMode(name="whole", width=width, height=height, line_delay_s=20e-3 / height, exposure_s=40e-6)
     camera = CameraProfile(name="said", modes=(mode,))
     step_s = made.frame_rows * mode.line_delay_s
     frames = [Frame(pixels, "drawn", number, number * step_s) for number, pixels in enumerate(made.frames)]
-    return frames, ReceiverOptions(cameras=(camera,), force_camera=True)
+    corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float64)
+    return frames, ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners)
 
 
 @pytest.mark.parametrize("n_frames", [1, 3])

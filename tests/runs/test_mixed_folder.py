@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import subprocess
 import sys
 import time
@@ -25,13 +26,18 @@ from rxcli.lab.simulate.files import write_png
 from rxcli.lab.simulate.tiff import write_dng, write_tiff
 from rxcli.lab.simulate.truth import write_truth
 from rxcli.lab.simulate.video import write_video
-from rxcli.runs.processes import package_environment
 
 GOOD = (
     *("a.jpg", "monday/b.png", "monday/roof/c.dng", "tuesday/d.tif", "e.jpeg", "monday/f.mp4"),
     *("monday/roof/g.png", "tuesday/h.dng", "i.tif", "monday/j.jpeg", "monday/roof/k.jpg", "tuesday/l.avi"),
 )
 N_KILLS = 3
+ENVIRONMENT = {
+    **os.environ,
+    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+}
 
 
 def write_good(path: Path, seed: int) -> None:
@@ -127,7 +133,7 @@ def test_killed_and_resumed_runs_give_the_same_results(good: list[Path], tmp_pat
             *profiles,
         ]
         command += ["--truth", "auto", "--json", str(out), "--summary", str(out.with_suffix(".csv")), *more]
-        return subprocess.Popen(command, env=package_environment(1), stderr=subprocess.DEVNULL)
+        return subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.DEVNULL)
 
     whole, killed = tmp_path / "whole.jsonl", tmp_path / "killed.jsonl"
     began = time.monotonic()

@@ -91,7 +91,7 @@ def camera_profile(
             width=width,
             height=height,
             camera_matrix=(top, middle, bottom),
-            dist_coeffs=(*(estimated[name][0] for name in _COEFFICIENTS), 0.0),
+            dist_coeffs=(*(estimated.get(name, (0.0,))[0] for name in _COEFFICIENTS), 0.0),
             distortion_already_corrected=bool(estimated["distortion_corrected"][0]),
         )
     line_delay_s, sd = estimated["line_delay_s"]
