@@ -167,21 +167,13 @@ def _clocks(
                     packet_slots=length,
                     reversed=bool(is_reversed),
                     curvature=bend,
-                    exposure_slots=exposure or _likely_exposure(width / (rows * pitch)),
+                    exposure_slots=exposure or SETTINGS.usual_exposure_slots,
                     score=score,
                     # A period that is off by a quarter of a slot over the picture shows as well.
                     rows_per_slot_sd=rows * rows * pitch / (4 * n_rows),
                     curvature_sd=np.abs(bend) / 4,
                     stated_exposure_slots=exposure,
                 )
-
-
-def _likely_exposure(width_slots: float) -> float:
-    """Exposure, slots, by the half width of the autocorrelation of random slots through it, slots.
-
-    Slots and exposure are boxes; to a few percent the squares of their widths add.
-    """
-    return float(np.clip(np.sqrt(max(4 * width_slots**2 - 1, 0.0)), *SETTINGS.likely_exposures))
 
 
 def _autocorrelation(columns: Float32Array) -> FloatArray:

@@ -29,8 +29,8 @@ class CameraSettings:
     rows_per_width: float = 4.0
     #: Half width of the autocorrelation, slots: from the shortest exposures to those of three slots.
     half_width_slots: tuple[float, float] = (0.45, 1.8)
-    #: Exposures that are likely where the file states none, slots.
-    likely_exposures: tuple[float, float] = (0.5, 3.0)
+    #: Exposure where the file states none, slots: too long a one costs more evidence than too short a one.
+    usual_exposure_slots: float = 1.0
     #: Rows of the shortest slot that can be told from its neighbours.
     min_rows_per_slot: float = 1.15
 

@@ -14,6 +14,7 @@ from rxcli.receiver import sync
 from rxcli.receiver.acquisition import ColumnSampler, noise_of, sample_columns, variants_of
 from rxcli.receiver.cameras import known_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
+from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import detect
 from rxcli.receiver.reception import Reception, complete_packets
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
@@ -145,7 +146,11 @@ class Proposer:
             lengths = _by_clock([one for one in screens if one.packet_slots != screen.packet_slots], camera)
             for alike in lengths:
                 nearest = _nearest(alike, screen.columns)
-                yield replace(self._hypothesis(outline, camera, nearest, hypothesis.log_prior), rows=hypothesis.rows)
+                sibling = replace(
+                    self._hypothesis(outline, camera, nearest, hypothesis.log_prior), rows=hypothesis.rows
+                )
+                if too_small(self.context(sibling), nearest) is None:
+                    yield sibling
         yield from self._of_other_bursts(scored)
 
     def _of_other_columns(self, scored: Scored, screens: list[ScreenProfile]) -> Iterator[Hypothesis]:
