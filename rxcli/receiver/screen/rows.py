@@ -12,6 +12,7 @@ import numpy as np
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen.grid import Grid, columns_at
+from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import Float32Array, FloatArray
 
@@ -40,15 +41,21 @@ class Plane:
 
     @classmethod
     def through(cls, grid: Grid, n_columns: int, aspect: float, row: float) -> Plane:
-        """The plane whose middle lies on a row of the picture; the grid counts from the screen's first column."""
+        """The plane whose middle lies on a row of the picture; the grid counts from the screen's first column.
+
+        Where a flat screen fades into the distance tells its normal, the columns tell its direction across; the one
+        along them stands at right angles to both.
+        """
+        u0, a, b, g, h, _ = grid.numbers
+        focal = SETTINGS.focal_widths if grid.lens is None else grid.lens.camera_matrix[0, 0] / grid.width
+        depth = np.array([g * focal, h * focal, 1.0])
+        normal = depth / np.linalg.norm(depth)
+        across = np.array([(u0 * g + a) * focal, (u0 * h + b) * focal, u0])
+        across -= (across @ normal) * normal
+        c, d, v0 = np.cross(normal, across) * aspect / n_columns / np.array([focal, focal, 1.0])
         x, y = (float(value) for value in grid.flat(_middle_of(grid, n_columns, row)))
-        _, a, b, g, h, _ = grid.numbers
-        below = 1 + g * x + h * y
-        u = (a * x + b * y) / below
-        by_x, by_y = (a - u * g) / below, (b - u * h) / below
-        c = -by_y * aspect / n_columns * below + 0.5 * g
-        d = by_x * aspect / n_columns * below + 0.5 * h
-        return cls(grid, n_columns, float(0.5 * below - c * x - d * y), float(c), float(d))
+        shift = 0.5 - (v0 + c * x + d * y) / (1 + g * x + h * y)
+        return cls(grid, n_columns, float(v0 + shift), float(c + shift * g), float(d + shift * h))
 
     def along(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """(...) v of places of `Strips`."""

@@ -94,6 +94,8 @@ class FinderSettings:
     min_contrast_per_strip: float = 0.05
     #: Least contrast of narrow columns in the best part of a picture, a share of what is explained.
     min_part_contrast: float = 0.05
+    #: Focal length of a camera that no profile describes, picture widths.
+    focal_widths: float = 0.8
     #: Log-odds against the likeliest first column down to which another is possible.
     min_log_odds: float = -7.0
     #: Log-odds of the next likely one below which the first column is plain, so that the screen's ends help the grid.
