@@ -205,9 +205,7 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> li
     is_plain = (odds > likeliest + SETTINGS.plain_log_odds).sum() == 1
     found: list[OutlineCandidate] = []
     for layout, start in zip(layouts, starts, strict=True):
-        likely = np.flatnonzero(start.log_odds > likeliest + SETTINGS.min_log_odds)
-        if not likely.size:
-            continue
+        likely = np.flatnonzero(start.log_odds > start.log_odds.max() + SETTINGS.min_log_odds)
         best = int(start.first[start.log_odds.argmax()])
         own = grid.shifted(best)
         if is_plain:

@@ -136,7 +136,10 @@ class Proposer:
             if other.family != outline.family:
                 fitting = _of_clock(_fitting(other, camera, self.options.screens), screen, camera)
                 nearest = screen if screen in fitting or not fitting else _nearest(fitting, screen.columns)
-                log_prior = hypothesis.log_prior + other.log_odds - outline.log_odds
+                change = other.log_odds - outline.log_odds
+                if other.n_columns != outline.n_columns:
+                    change = max(change, -SETTINGS.other_columns)  # Packets tell how many columns there are.
+                log_prior = hypothesis.log_prior + change
                 yield self._hypothesis(other, camera, nearest, log_prior)
         screens = _fitting(outline, camera, self.options.screens)
         yield from self._of_other_columns(scored, _of_clock(screens, screen, camera))
