@@ -77,8 +77,6 @@ class _Walk:
         self._scored: list[Scored] = []
         self._tried: list[Tried] = []
         self._asked: set[tuple[object, ...]] = set()
-        #: The best hypothesis, and the same measured on its middle columns.
-        self._half: tuple[Scored, Scored] | None = None
         self._fresh: list[_Entry] = []
         self._siblings: list[_Entry] = []
         #: None when there are no more; the log prior that the next may have.
@@ -196,7 +194,7 @@ class _Walk:
         best, acquisition = self._best(), _acquired(hypothesis)
         if best is not None and hypothesis.screen.columns > SETTINGS.few_columns:
             half = self._measured(hypothesis, acquisition.middle())
-            if half.score < self._half_of(best).score - SETTINGS.reach or half.evidence < SETTINGS.bail:
+            if half.score < best.score - SETTINGS.reach or half.evidence < SETTINGS.bail:
                 self._tried.append(Tried(hypothesis, half.evidence, half.score, "half"))
                 return
         scored = self._measured(hypothesis, acquisition)
@@ -210,12 +208,6 @@ class _Walk:
         if scored.evidence > SETTINGS.bail and (best is None or scored.score > best.score - SETTINGS.reach):
             for sibling in self._proposer.siblings(scored):
                 self._push(self._siblings, scored.score + sibling.log_prior - hypothesis.log_prior, sibling)
-
-    def _half_of(self, best: Scored) -> Scored:
-        """The best hypothesis on its middle columns, where others are compared with it."""
-        if self._half is None or self._half[0] is not best:
-            self._half = best, self._measured(best.hypothesis, best.acquisition.middle())
-        return self._half[1]
 
     def _measured(self, hypothesis: Hypothesis, acquisition: Acquisition) -> Scored:
         with self._proposer.timer("detect"):
