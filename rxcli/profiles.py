@@ -31,7 +31,7 @@ Name = Annotated[str, Meta(pattern=f"^{NAME.pattern}$")]
 #: Times of rows and exposures; below a nanosecond nothing is read out.
 Seconds = Annotated[float, Meta(ge=1e-9, lt=1)]
 #: People write less.
-_MOST_BYTES = 1 << 18
+_MAX_BYTES = 1 << 18
 #: Names of the tone curves that `rxcli.receiver.sampling.rows.tone_to_light` can undo.
 ToneName = Literal["linear", "srgb", "bt709", "auto"]
 Triple = tuple[float, float, float]
@@ -255,7 +255,7 @@ def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any
         return _load_file(name) if Path(name).is_file() else _load_by_name(name)
     path = _file_of(name, kind)
     try:
-        text = read_limited(path, _MOST_BYTES).decode("utf-8")
+        text = read_limited(path, _MAX_BYTES).decode("utf-8")
     except FileNotFoundError:
         known = ", ".join(sorted({path.stem for _, path in _profile_files(kind)}))
         raise ProfileError(
@@ -278,7 +278,7 @@ def _file_of(name: str, kind: type[Any]) -> Path:
 def _load_file(name: str) -> ScreenProfile | CameraProfile:
     """A screen or camera profile, by what the file says it is; what else is wrong with it, its loader tells."""
     try:
-        kind = tomllib.loads(read_limited(Path(name), _MOST_BYTES).decode("utf-8")).get("kind")
+        kind = tomllib.loads(read_limited(Path(name), _MAX_BYTES).decode("utf-8")).get("kind")
     except (OSError, ValueError, RecursionError):
         return load_profile(name, ScreenProfile)
     if kind not in ("screen", "camera"):

@@ -20,18 +20,18 @@ def data_dir(name: str) -> Path:
     return installed if installed.is_dir() else _PACKAGE.parent / name
 
 
-def read_limited(path: Path, most_bytes: int) -> bytes:
+def read_limited(path: Path, max_bytes: int) -> bytes:
     """A whole file that people write; a pipe, which may never end, or a file that is absurdly long is none.
 
     Raises:
-        OSError: it cannot be read, is no regular file, or longer than `most_bytes`.
+        OSError: it cannot be read, is no regular file, or longer than `max_bytes`.
         ValueError: the path is none.
     """
     info = path.stat()
     if not stat.S_ISREG(info.st_mode):
         raise OSError(errno.EINVAL, "is no regular file")
-    if info.st_size > most_bytes:
-        raise OSError(errno.EFBIG, f"has {info.st_size} bytes, more than {most_bytes}")
+    if info.st_size > max_bytes:
+        raise OSError(errno.EFBIG, f"has {info.st_size} bytes, more than {max_bytes}")
     return path.read_bytes()
 
 

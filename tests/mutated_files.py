@@ -40,7 +40,7 @@ from rxcli.resources import data_dir
 from rxcli.runs.processes import ONE_THREAD, environment, peak_memory_mb
 
 #: What one process may take: resident memory, and time for one case on a machine of its own.
-MOST_MB, MOST_S = 1500, 60.0
+MAX_MB, MAX_S = 1500, 60.0
 #: Address space of the process, which libraries reserve more of than they use; and waiting on a loaded machine.
 _ADDRESSES_MB, _PATIENCE = 6000, 3
 #: Marks what was written to the file of stderr by others than Python.
@@ -238,13 +238,13 @@ class Verdict:
     problems: dict[str, list[int]] = field(default_factory=dict)
     slowest_s: float = 0.0
     slowest_seed: int = -1
-    most_mb: float = 0.0
+    max_mb: float = 0.0
 
     def add(self, record: dict[str, Any]) -> None:
         """Count one case."""
         self.n += 1
         self.codes[str(record["code"])] += 1
-        self.most_mb = max(self.most_mb, record["mb"])
+        self.max_mb = max(self.max_mb, record["mb"])
         if record["s"] > self.slowest_s:
             self.slowest_s, self.slowest_seed = record["s"], record["seed"]
         for problem in record["problems"]:
@@ -298,9 +298,9 @@ class Cases:
         cpu_s, mb = time.process_time() - cpu, peak_memory_mb()
         if code not in (0, 1, 2, 3):
             problems.append(f"{name}: exit code {code}")
-        if mb > MOST_MB:
+        if mb > MAX_MB:
             problems.append(f"{name}: {mb:.0f} MB")
-        if min(cpu_s, time.monotonic() - began) > MOST_S:
+        if min(cpu_s, time.monotonic() - began) > MAX_S:
             problems.append(f"{name}: {cpu_s:.0f} s")
         problems = [problem[:300].replace(str(self.folder), "") for problem in problems]
         kind = name.rpartition("/")[2]
@@ -445,7 +445,7 @@ def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> Verdic
                 pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin, (folder,))
                 pool.submit(os.getpid).result()
         try:
-            record = pool.submit(_run_case, number).result(_PATIENCE * MOST_S)
+            record = pool.submit(_run_case, number).result(_PATIENCE * MAX_S)
         except (TimeoutError, BrokenProcessPool) as error:
             reason = "the process ended" if isinstance(error, BrokenProcessPool) else "no answer for too long"
             record = {"seed": number, "code": reason, "s": 0.0, "mb": np.inf, "problems": [reason]}
@@ -453,7 +453,7 @@ def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> Verdic
         if record["mb"] == np.inf:
             for process in multiprocessing.active_children():
                 process.kill()
-        if record["mb"] > MOST_MB:
+        if record["mb"] > MAX_MB:
             pool.shutdown()
             pool = None
     if pool is not None:
@@ -489,7 +489,7 @@ def main(arguments: list[str]) -> int:
         print(f"{len(seeds)} cases, such as {seeds[:5]}: {problem}")
     print(
         f"{verdict.n} cases with seeds from {first} on; exit codes {dict(sorted(verdict.codes.items()))}; slowest "
-        f"{verdict.slowest_s:.1f} s (seed {verdict.slowest_seed}); at most {verdict.most_mb:.0f} MB"
+        f"{verdict.slowest_s:.1f} s (seed {verdict.slowest_seed}); at most {verdict.max_mb:.0f} MB"
     )
     return 1 if verdict.problems else 0
 

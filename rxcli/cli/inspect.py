@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rxcli.types import Frame, FrameResult
 
 #: Frames of a clip that its timeline shows.
-_MOST_FRAMES = 240
+_MAX_FRAMES = 240
 
 
 @click.command()
@@ -91,7 +91,7 @@ def _received(
 
     found = truth_for(path, truth)
     scorer = Scorer(load_truth(found)) if found else None
-    n_frames = max(_MOST_FRAMES, (number or 0) + 1)
+    n_frames = max(_MAX_FRAMES, (number or 0) + 1)
     first: list[Frame] = []
     decoder = replace(standard_decoder(options), open_source=lambda name: islice(open_source(name), n_frames))
     frames = _noting(decoder.open_source(path), first)

@@ -12,7 +12,7 @@ from threading import Condition, Thread, get_native_id
 from rxcli.types import Frame
 
 #: What may wait: pixels of so many bytes, and so many frames at least and at most.
-_MOST_BYTES, _LEAST_FRAMES, _MOST_FRAMES = 60_000_000, 2, 16
+_MAX_BYTES, _MIN_FRAMES, _MAX_FRAMES = 60_000_000, 2, 16
 #: How much nicer to others the thread is than the process.
 _NICER = 5
 
@@ -80,7 +80,7 @@ class _Shelf:
     @property
     def _has_room(self) -> bool:
         n = len(self._frames)
-        return n < _LEAST_FRAMES or (n < _MOST_FRAMES and self._bytes < _MOST_BYTES)
+        return n < _MIN_FRAMES or (n < _MAX_FRAMES and self._bytes < _MAX_BYTES)
 
     def take(self) -> Frame | None:
         """Wait for the next frame; None after the last one.

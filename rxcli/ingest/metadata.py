@@ -29,7 +29,7 @@ _HEADER_BYTES = 1 << 20
 #: An EXIF block that fits into a JPEG file; other files could hold longer ones.
 _EXIF_BYTES = 1 << 16
 #: Longer names of makers, models and lenses are none.
-_MOST_CHARACTERS = 200
+_MAX_CHARACTERS = 200
 
 #: What a receiver can use of what files say: field -> name, least, most, unit. A second is thousands of slots.
 _BOUNDS = {
@@ -179,7 +179,7 @@ def _text(value: Any) -> str | None:
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     text = value.split("\0")[0].strip() if isinstance(value, str) else ""
-    return "".join(c for c in text[:_MOST_CHARACTERS] if c.isprintable()) or None
+    return "".join(c for c in text[:_MAX_CHARACTERS] if c.isprintable()) or None
 
 
 def _positive(value: Any) -> float | None:

@@ -39,7 +39,7 @@ _DECODER_THREADS = min((os.cpu_count() or 1) + 2, 16)
 _BYTES_A_PIXEL = 1.5 * (10 + _DECODER_THREADS)
 _TS_SYNC = 0x47
 #: Times of a clip that are believed: a claim of more would be years.
-_MOST_S = 1e6
+_MAX_S = 1e6
 #: FFmpeg opens this one file and nothing that it names: no other protocol, and containers only, no lists of files.
 _FILES_ONLY = {
     "protocol_whitelist": "file",
@@ -192,7 +192,7 @@ def _time_s(stamped: Any, stream: Any, progress: _Progress) -> tuple[float, bool
     That is taken where a file gives no time, or one that does not advance: zeros, or times that run backwards.
     """
     own = float(stamped.pts * stream.time_base) if stamped.pts is not None and stream.time_base else None
-    if own is not None and abs(own) >= _MOST_S:
+    if own is not None and abs(own) >= _MAX_S:
         progress.doubt = progress.doubt or f"a frame's time of {own:.6g} s"
         own = None
     before = progress.stamp_s
@@ -266,7 +266,7 @@ def _ends_early(path: Path, container: Any, stream: Any, progress: _Progress) ->
     if "mp4" in container.format.name:
         return _boxes_end(path) > container.size or any(entry.pos + entry.size > container.size for entry in entries)
     frame_s = 1 / float(stream.average_rate or 30)
-    return progress.last_time_s + _END_TOLERANCE * frame_s < _stated_end_s(container, stream) < _MOST_S
+    return progress.last_time_s + _END_TOLERANCE * frame_s < _stated_end_s(container, stream) < _MAX_S
 
 
 def _ends_within_packet(path: Path) -> bool:

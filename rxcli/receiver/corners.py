@@ -107,12 +107,12 @@ def outside_the_picture(corners: FloatArray, frame: Frame) -> Failure | None:
     picture = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]], np.float32)
     outline = np.asarray(corners, np.float32)
     shared, part = cv2.intersectConvexConvex(outline, picture)
-    if shared <= max(SETTINGS.least_shared * min(cv2.contourArea(outline), frame.width * frame.height), 1.0):
+    if shared <= max(SETTINGS.min_overlap * min(cv2.contourArea(outline), frame.width * frame.height), 1.0):
         return Failure("no_screen", f"the corners that were given lie outside the picture, which has {size}; {hint}")
     n_rows = int(np.ptp(np.asarray(part)[..., 1]))
-    if n_rows < SETTINGS.least_rows:
+    if n_rows < SETTINGS.min_rows:
         reason = (
-            f"the corners that were given leave {n_rows} rows of the picture, and {SETTINGS.least_rows} are the least"
+            f"the corners that were given leave {n_rows} rows of the picture, and {SETTINGS.min_rows} are the least"
         )
         return Failure("no_screen", f"{reason}; {hint}")
     return None
@@ -120,7 +120,7 @@ def outside_the_picture(corners: FloatArray, frame: Frame) -> Failure | None:
 
 def may_fill(frame: Frame) -> bool:
     """Whether a part of a screen that fills the picture could be received at all."""
-    return min(frame.width, frame.height) >= SETTINGS.least_rows
+    return min(frame.width, frame.height) >= SETTINGS.min_rows
 
 
 def whole_picture(frame: Frame) -> FloatArray:

@@ -27,7 +27,7 @@ MAX_MEMORY = 5
 _DARK_FROM = HEADER.index(0, HEADER.index(1))
 _DARK_TO = HEADER.index(1, _DARK_FROM)
 #: A shutter is taken to be open for so many slots at least.
-_LEAST_SLOTS = 1e-3
+_MIN_SLOTS = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,11 +112,11 @@ class Exposure:
             covering = (memory for memory, most in _MEMORY_COVERS.items() if exposure_slots <= most)
             isi_memory = next(covering, MAX_MEMORY)
         n_fine, q = 32, samples_per_slot
-        offsets = ((np.arange(n_fine) + 0.5) / n_fine - 0.5) * max(blur_slots or 1 / q, _LEAST_SLOTS)
+        offsets = ((np.arange(n_fine) + 0.5) / n_fine - 0.5) * max(blur_slots or 1 / q, _MIN_SLOTS)
         centres = -isi_memory / 2 + (np.arange(q) + 0.5) / q
         fine = (centres[:, None] + offsets)[:, None, :]
         slots = np.arange(-isi_memory, 1)[:, None]
-        return Exposure(exposure_shares(fine, slots, max(exposure_slots, _LEAST_SLOTS)).mean(axis=2))
+        return Exposure(exposure_shares(fine, slots, max(exposure_slots, _MIN_SLOTS)).mean(axis=2))
 
     @property
     def isi_memory(self) -> int:

@@ -24,7 +24,7 @@ class WiringSettings:
     #: Rows over which light is smoothed where no clock is known, the longest period of switching then, rows, and the
     #: share of the light that it explains.
     smooth_rows: int = 2
-    most_period_rows: int = 100
+    max_period_rows: int = 100
     switched_share: float = 0.7
 
     #: A column whose symbols have this log probability whatever slots say is not looked at again.
@@ -38,9 +38,9 @@ class WiringSettings:
     packets_without_header: float = 100.0
 
     #: Of an outline that is given, or of the picture, so much must be shared by both.
-    least_shared: float = 0.002
+    min_overlap: float = 0.002
     #: Fewer rows than those that the waves of an unknown camera are sought on tell nothing.
-    least_rows: int = 24
+    min_rows: int = 24
     #: An outline so many times as large as the picture shows it less than one column.
     largest_outline: float = 50.0
 
@@ -69,7 +69,7 @@ class StillSettings:
     hopeless_word_log_prob: float = -1.4
     #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least
     #: sure, have their words weighed alone.
-    most_shown: int = 58_000
+    max_network_slots: int = 58_000
 
 
 SETTINGS, STILL = WiringSettings(), StillSettings()

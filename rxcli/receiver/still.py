@@ -209,7 +209,7 @@ def _worth_showing(reception: Reception, columns: NDArray[np.int64]) -> NDArray[
     """Those of `columns` that the network is shown: the surest, and no more than its time allows."""
     assert reception.cleaned is not None
     n_strips = reception.cleaned[0].light.shape[1]
-    most = max(STILL.most_shown // (n_strips * reception.clock.n_slots), 1)
+    most = max(STILL.max_network_slots // (n_strips * reception.clock.n_slots), 1)
     return np.sort(columns[np.argsort(-best_packet(reception)[columns], kind="stable")[:most]])
 
 

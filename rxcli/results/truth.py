@@ -27,7 +27,7 @@ EXPECTED_LENGTHS = 1.02
 MAX_WRONG_SHARE = 0.25
 
 #: Longer truths than those of hours of video are none.
-_MOST_BYTES = 1 << 28
+_MAX_BYTES = 1 << 28
 
 Count = Annotated[int, Meta(ge=0, lt=1 << 40)]
 
@@ -97,7 +97,7 @@ def load_truth(path: str | Path) -> Truth:
         InputError: it cannot be read, is no JSON, lacks a key, or contradicts itself.
     """
     try:
-        truth = msgspec.json.decode(read_limited(Path(path), _MOST_BYTES), type=Truth)
+        truth = msgspec.json.decode(read_limited(Path(path), _MAX_BYTES), type=Truth)
     except (OSError, ValueError, RecursionError) as error:  # msgspec's own errors are ValueErrors
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: cannot be read as truth ({reason})", "name a NAME.truth.json file") from None

@@ -18,7 +18,7 @@ from rxcli.types import Float32Array, Frame, FrameResult, Lens
 log = logging.getLogger(__name__)
 
 #: Frames that may wait for their result: a clip's come some frames later.
-_MOST_WAITING = 48
+_MAX_WAITING = 48
 
 
 def undistorted(frame: Frame, lens: Lens) -> NDArray[np.uint8]:
@@ -120,7 +120,7 @@ class UndistortedWriter:
             self._write(frame, lens, subfolder)
             return
         self._waiting[frame.source, frame.index] = frame
-        while len(self._waiting) > _MOST_WAITING:
+        while len(self._waiting) > _MAX_WAITING:
             self._give_up(self._waiting.pop(next(iter(self._waiting))))
 
     def finish(self, result: FrameResult, subfolder: str = "") -> None:

@@ -32,7 +32,7 @@ _RETRIES = 3
 #: Tasks in the scheduler's hands at a time: enough for a large cluster, few enough that results do not pile up.
 _IN_FLIGHT = 1024
 #: Bytes of one source's taps: results wait in the memory of the cluster.
-_MOST_TAPPED = 512 << 20
+_MAX_TAPPED = 512 << 20
 #: A tapped file: the option that asks for it, its path below that option's folder, its bytes.
 _Tap = tuple[str, str, bytes]
 _Outcome = tuple[list[FrameResult], list[_Tap]]
@@ -185,8 +185,8 @@ def _collect(scratch: Path, source: Source) -> list[_Tap]:
     """The files below `scratch`."""
     paths = sorted(path for path in scratch.rglob("*") if path.is_file())
     size = sum(path.stat().st_size for path in paths)
-    if size > _MOST_TAPPED:
-        reason = f"{source.name}: its taps take {size >> 20} MB, {_MOST_TAPPED >> 20} are the most that a cluster sends"
+    if size > _MAX_TAPPED:
+        reason = f"{source.name}: its taps take {size >> 20} MB; a cluster sends at most {_MAX_TAPPED >> 20} MB"
         raise OutputError(reason, "decode this file without --cluster")
     found = []
     for path in paths:

@@ -271,8 +271,8 @@ class Server:
             idle.sort(key=lambda c: self._idle_since[id(c)])
             too_many = max(0, len(connections) - bounds.connections)
             for number, connection in enumerate(idle):
-                most_s = bounds.answer_s if _is_taking(connection) else bounds.idle_s
-                if number < too_many or now_s - self._idle_since[id(connection)] > most_s:
+                max_s = bounds.answer_s if _is_taking(connection) else bounds.idle_s
+                if number < too_many or now_s - self._idle_since[id(connection)] > max_s:
                     connection.force_close()
                     if connection.transport is not None:
                         connection.transport.abort()

@@ -45,10 +45,10 @@ def test_an_error_comes_after_the_frames_before_it() -> None:
     assert not threads()
 
 
-@pytest.mark.parametrize(("most_bytes", "waiting"), [(10**9, 16), (1000, 10), (150, 2), (1, 2)])
-def test_no_more_wait_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch, most_bytes: int, waiting: int) -> None:
+@pytest.mark.parametrize(("max_bytes", "waiting"), [(10**9, 16), (1000, 10), (150, 2), (1, 2)])
+def test_no_more_wait_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch, max_bytes: int, waiting: int) -> None:
     """At most so many bytes, or two frames, beside the one that is looked at and the one that waits for room."""
-    monkeypatch.setattr(ahead, "_MOST_BYTES", most_bytes)
+    monkeypatch.setattr(ahead, "_MAX_BYTES", max_bytes)
     log: list[int] = []
     lead = []
     for frame in ahead.read_ahead(frames(200, log)):

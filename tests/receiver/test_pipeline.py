@@ -232,7 +232,7 @@ def test_the_network_is_shown_what_its_time_allows(
             return denoiser.slot_corrections(scene, columns)
 
     monkeypatch.setattr(still, "_denoiser", Recording)
-    monkeypatch.setattr(still, "STILL", replace(still.STILL, most_shown=budget))
+    monkeypatch.setattr(still, "STILL", replace(still.STILL, max_network_slots=budget))
     scene = small_scene("paper-34k6")
     taken = simulate_frame(replace(scene, sensor=replace(scene.sensor, full_scale_e=180.0)), 1)
     report = received(frame_of(taken), options_for(taken)).denoiser

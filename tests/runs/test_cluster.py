@@ -141,9 +141,9 @@ def test_a_worker_names_no_file_elsewhere(tmp_path: Path) -> None:
 
 
 def test_taps_that_are_too_large_to_send(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "_MOST_TAPPED", 1 << 20)
+    monkeypatch.setattr(cluster, "_MAX_TAPPED", 1 << 20)
     (tmp_path / "a.npz").write_bytes(bytes(3 << 20))
-    with pytest.raises(OutputError, match=r"x\.mp4: its taps take 3 MB, 1 are the most"):
+    with pytest.raises(OutputError, match=r"x\.mp4: its taps take 3 MB; a cluster sends at most 1 MB"):
         cluster._collect(tmp_path, Source("x.mp4", "x.mp4"))
 
 

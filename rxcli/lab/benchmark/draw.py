@@ -167,7 +167,7 @@ def draw_screen(at: Place) -> Iterator[Case]:
     yield case
 
 
-def warped(frame: Frame, rng: np.random.Generator, most_px: float) -> Frame:
+def warped(frame: Frame, rng: np.random.Generator, max_px: float) -> Frame:
     """The frame with its rows moved smoothly, across or along the readout, as software that straightens does."""
     import cv2
 
@@ -176,7 +176,7 @@ def warped(frame: Frame, rng: np.random.Generator, most_px: float) -> Frame:
     places = np.linspace(0, knots.size - 1, frame.height)
     smooth = np.interp(places, np.arange(knots.size), knots)
     smooth = cv2.GaussianBlur(smooth[:, None], (1, 0), 0, sigmaY=frame.height / (4 * knots.size))
-    moved = (smooth / np.abs(smooth).max() * rng.uniform(0, most_px)).astype(np.float32)
+    moved = (smooth / np.abs(smooth).max() * rng.uniform(0, max_px)).astype(np.float32)
     x, y = (x + moved, y) if rng.random() < 0.5 else (x, y + moved)
     pixels: Any = cv2.remap(frame.pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return replace(frame, pixels=pixels)

@@ -26,9 +26,9 @@ from rxcli.types import Float32Array, FloatArray, FrameSoftBits
 _MESSAGE_BYTES = 199
 _CRC_BITS = 32
 #: A detector trusts no bit further than this.
-_MOST_LLR = 9.0
+_MAX_LLR = 9.0
 #: Clips begin within so many seconds of an object's start, and last at most so many times what is needed.
-_START_WITHIN_S, _MOST_TIMES = 900.0, 6.0
+_START_WITHIN_S, _MAX_TIMES = 900.0, 6.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +109,7 @@ def detect(
     bits = ((np.arange(1 << k)[:, None] >> np.arange(k - 1, -1, -1)) & 1).astype(np.float32)
     out = np.zeros((*labels.shape, 7), np.float32)
     out[..., :k] = np.log(likely @ bits + 1e-12) - np.log(likely @ (1 - bits) + 1e-12)
-    return np.clip(out, -_MOST_LLR, _MOST_LLR)
+    return np.clip(out, -_MAX_LLR, _MAX_LLR)
 
 
 def _frames(
@@ -120,7 +120,7 @@ def _frames(
     burst_s = screen.packet_s * screen.repeats
     start_s = float(rng.uniform(0, _START_WITHIN_S))
     first = int(start_s / burst_s)
-    for frame in range(_most_frames(point)):
+    for frame in range(_max_frames(point)):
         begin = start_s + frame / point.frame_rate_hz
         end = begin + point.readout / point.frame_rate_hz
         bursts = np.arange(int(begin / burst_s), int(end / burst_s) + 1)
@@ -151,8 +151,8 @@ def _packet_crc_bits(
     return int(right.sum()) * max(k * point.screen.payload_symbols - _CRC_BITS, 0)
 
 
-def _most_frames(point: Transfer) -> int:
+def _max_frames(point: Transfer) -> int:
     screen = point.screen
     rate = bits_per_symbol(point.w) * screen.payload_symbols * point.n_lit / (screen.packet_s * screen.repeats)
     needed_s = 8 * (point.size + 200) / (rate * point.readout) + 0.5
-    return ceil(_MOST_TIMES * needed_s * point.frame_rate_hz) + 40
+    return ceil(_MAX_TIMES * needed_s * point.frame_rate_hz) + 40

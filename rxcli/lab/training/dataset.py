@@ -18,7 +18,7 @@ from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.camera import Exposure
 from rxcli.lab.simulate.scenes import Scene as SimulatedScene
 from rxcli.lab.training.acquire import acquired
-from rxcli.lab.training.fit import MOST_WORDS, UNKNOWN, Sample
+from rxcli.lab.training.fit import MAX_WORDS, UNKNOWN, Sample
 from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_scene
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 from rxcli.receiver.channel import by_burst
@@ -28,9 +28,9 @@ from rxcli.types import Clock, FloatArray
 
 _SCREENS = ("paper-34k6", "paper-17k3")
 #: Columns of a frame that are learned from; more of one picture tell little more.
-_MOST_COLUMNS = 8
+_MAX_COLUMNS = 8
 #: Words are taken to be at most this much less likely than the best, nats.
-_LEAST_SCORE = -60.0
+_MIN_SCORE = -60.0
 #: Streams of random numbers.
 _FRAMES, _VALIDATION = 77, 900_000
 
@@ -92,7 +92,7 @@ def _simulated(simulated: SimulatedScene, seed: int) -> Sample | None:
     slots = sent_slots(trial.capture.exposure, scene.clock)
     if not _headers_fit(slots, scene.clock):
         return None
-    chosen = np.sort(np.random.default_rng(seed).permutation(columns.size)[:_MOST_COLUMNS])
+    chosen = np.sort(np.random.default_rng(seed).permutation(columns.size)[:_MAX_COLUMNS])
     return sample_of(scene, columns[chosen], slots, trial.capture.exposure.link.weights)
 
 
@@ -129,7 +129,7 @@ def sample_of(
         packet_slots=np.array(clock.packet_slots),
         burst=clock.burst,
         w=np.asarray(weights[columns], np.int64),
-        scores=np.stack(scores).reshape(*shape, MOST_WORDS),
+        scores=np.stack(scores).reshape(*shape, MAX_WORDS),
         words=np.stack(words).reshape(shape),
     )
 
@@ -158,7 +158,7 @@ def _word_scores(metrics: FloatArray, sent: NDArray[np.uint8], w: int) -> NDArra
     isi_memory = metrics.shape[0] - sent.size
     words = codebook(w)
     around = np.concatenate([sent, np.array(HEADER[:isi_memory], np.uint8)])
-    out = np.full((len(_payload(sent)), MOST_WORDS), -np.inf)
+    out = np.full((len(_payload(sent)), MAX_WORDS), -np.inf)
     for symbol in range(len(out)):
         at = PREAMBLE_SLOTS + symbol * SLOTS_PER_SYMBOL
         slots = np.repeat(around[None, at - isi_memory : at + SLOTS_PER_SYMBOL + isi_memory], len(words), axis=0)
@@ -167,7 +167,7 @@ def _word_scores(metrics: FloatArray, sent: NDArray[np.uint8], w: int) -> NDArra
         pattern = windows @ (1 << np.arange(isi_memory, -1, -1))
         place = np.arange(at, at + SLOTS_PER_SYMBOL + isi_memory)
         score = metrics[place, pattern].sum(axis=1)
-        out[symbol, : len(words)] = np.maximum(score - score.max(), _LEAST_SCORE)
+        out[symbol, : len(words)] = np.maximum(score - score.max(), _MIN_SCORE)
     return out.astype(np.float16)
 
 

@@ -20,13 +20,13 @@ from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 
 CHECKPOINT = "checkpoint.pt"
 #: Words of the largest codebook, and what stands for a word that is not known.
-MOST_WORDS, UNKNOWN = 128, -1
+MAX_WORDS, UNKNOWN = 128, -1
 _CHECKPOINT_EVERY = 200
 _WEIGHT_DECAY, _LARGEST_GRADIENT = 5e-2, 1.0
 #: The weights that are kept are a mean over about so many steps.
 _AVERAGED_STEPS = 200
 #: Samples of a batch, columns of each, and how often strips are left out of a sample, down to how many.
-_BATCH_SAMPLES, _BATCH_COLUMNS, _THINNED, _LEAST_STRIPS = 2, 4, 0.5, 3
+_BATCH_SAMPLES, _BATCH_COLUMNS, _THINNED, _MIN_STRIPS = 2, 4, 0.5, 3
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Recipe:
 @lru_cache(maxsize=16)
 def _codebook(w: int) -> Tensor:
     """(10, 128) the words of weight `w`, zeros where there are fewer."""
-    words = np.zeros((MOST_WORDS, SLOTS_PER_SYMBOL), np.float32)
+    words = np.zeros((MAX_WORDS, SLOTS_PER_SYMBOL), np.float32)
     words[: len(codebook(w))] = codebook(w)
     return torch.from_numpy(words.T.copy())
 
@@ -84,7 +84,7 @@ def loss_of(network: StripNetwork, sample: Sample, columns: NDArray[np.int64]) -
     scores = torch.from_numpy(sample.scores[:, columns].astype(np.float32)) + payload @ books
     words = torch.from_numpy(sample.words[:, columns])
     each = torch.nn.functional.cross_entropy(
-        scores.reshape(-1, MOST_WORDS), words.reshape(-1), ignore_index=UNKNOWN, reduction="sum"
+        scores.reshape(-1, MAX_WORDS), words.reshape(-1), ignore_index=UNKNOWN, reduction="sum"
     )
     return each / (words != UNKNOWN).sum().clamp(min=1)
 
@@ -112,9 +112,9 @@ def _drawn_loss(network: StripNetwork, samples: Sequence[Sample], rng: np.random
 def _thinned(sample: Sample, rng: np.random.Generator) -> Sample:
     """Now and then a sample without some of its strips: cameras differ in how many there are."""
     n_strips = sample.strips.shape[1]
-    if n_strips <= _LEAST_STRIPS or rng.random() >= _THINNED:
+    if n_strips <= _MIN_STRIPS or rng.random() >= _THINNED:
         return sample
-    left = np.sort(rng.permutation(n_strips)[: int(rng.integers(_LEAST_STRIPS, n_strips))])
+    left = np.sort(rng.permutation(n_strips)[: int(rng.integers(_MIN_STRIPS, n_strips))])
     return replace(sample, strips=sample.strips[:, left])
 
 

@@ -17,7 +17,7 @@ from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 #: Degrees of freedom of the Student-t likelihood; `_density` is written for four.
 _DEGREES = 4.0
 #: Densities are taken to be at least this, so that their logarithm exists.
-_LEAST_DENSITY = np.float32(1e-37)
+_MIN_DENSITY = np.float32(1e-37)
 #: Samples worked on at a time: what fits the cache.
 _SAMPLES_AT_A_TIME = 60_000
 #: NumPy works outside the interpreter's lock; more threads than this gain nothing on a few columns. Of fewer parts
@@ -152,7 +152,7 @@ def _pattern_metrics(part: _Part, prediction: Prediction) -> FloatArray:
         variance *= whole
         variance += floor
         density = _density(part.light[place] - prediction.picture[:, half] * whole, variance).sum(axis=0)
-        np.log(np.maximum(density, _LEAST_DENSITY, out=density), out=density)
+        np.log(np.maximum(density, _MIN_DENSITY, out=density), out=density)
         return np.asarray(np.einsum("csn,csn->cn", density, weight[place]))
 
     return by_pattern(exposure, log_likelihood)

@@ -14,7 +14,7 @@ from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
 #: Words that are alike make no singular system.
-_LEAST_NORM = 1e-3
+_MIN_NORM = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,5 +190,5 @@ def _as_slots(score: FloatArray, words: NDArray[np.uint8]) -> FloatArray:
     """(J, 10) least corrections of single slots that add up to what words (J, K) score against the first of them."""
     wanted = score[:, 1:] - score[:, :1]
     apart = words[:, 1:].astype(np.float64) - words[:, :1]
-    across = apart @ apart.transpose(0, 2, 1) + _LEAST_NORM * np.eye(apart.shape[1])
+    across = apart @ apart.transpose(0, 2, 1) + _MIN_NORM * np.eye(apart.shape[1])
     return np.asarray((np.linalg.solve(across, wanted[..., None]).transpose(0, 2, 1) @ apart)[:, 0])

@@ -39,7 +39,7 @@ class FirstOutline:
     @property
     def settled(self) -> bool:
         """Whether no further frame is asked."""
-        if self._texture is None or len(self._differences) >= SETTINGS.most_searches:
+        if self._texture is None or len(self._differences) >= SETTINGS.max_searches:
             return True
         return len(self._differences) == 2 and bool(
             np.abs(self._differences[1]).max() < SETTINGS.outlines_agree * self._width

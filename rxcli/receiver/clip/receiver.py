@@ -455,7 +455,7 @@ class _Clip:
         """
         before, begun = self._scene_before, self._scene
         self._n_unknown += 1
-        if before is None or begun is None or self._link is None or self._n_unknown > SETTINGS.most_unknown:
+        if before is None or begun is None or self._link is None or self._n_unknown > SETTINGS.max_unknown_frames:
             return
         screen, was = view.acquisition.screen, before.last and before.last.acquisition.screen
         if (
@@ -536,7 +536,7 @@ class _Clip:
             n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)
             if self._n_held and self._link.time.judged and not self._link.judged:
                 self._judge_stamps()
-            if self._link.phase.settled or n_unsettled > SETTINGS.most_waiting:
+            if self._link.phase.settled or n_unsettled > SETTINGS.max_waiting_frames:
                 self._settle_bursts()
                 if self._n_held and len(self._waiting) >= self._n_held:
                     self._receive_first_again(at_last=False)

@@ -80,7 +80,7 @@ class TrackedScreen:
             strips.inside,
             Crosstalk.of(strips.inside.shape[1], acquisition.screen.light_spread),
             black_level,
-            NoiseModel(max(profiles.noise_floor, SETTINGS.least_noise * strips.pixels), profiles.noise_slope).over(
+            NoiseModel(max(profiles.noise_floor, SETTINGS.min_variance * strips.pixels), profiles.noise_slope).over(
                 strips.pixels
             ),
         )
@@ -198,7 +198,7 @@ class TrackedScreen:
         corners = found.corners
         outlines, middles = geometry.quick_outlines(corners, n_columns, n_strips, frame.width, frame.height, self._lens)
         sd = float(np.sqrt(np.diag(found.covariance)[1::2].max()))
-        outlines = replace(outlines, inside=_less_ends(outlines.inside, SETTINGS.least_end + sd))
+        outlines = replace(outlines, inside=_less_ends(outlines.inside, SETTINGS.min_end_rows + sd))
         strips = tracked.moved_map(self._first_pose.map, outlines)
         picture_row = geometry.rows_elsewhere(strips.rows, middles, self._first_middles)
         picture_row -= np.float32(self._first_pose.map.first_row)
@@ -232,7 +232,7 @@ class TrackedScreen:
         return self._view(frame, self.last, time, SETTINGS.misfit, thorough, timer)
 
     def _view(
-        self, frame: Frame, last: View, time: tracking.LinkTime, most_misfit: float, thorough: bool, timer: Timer
+        self, frame: Frame, last: View, time: tracking.LinkTime, max_misfit: float, thorough: bool, timer: Timer
     ) -> View | None:
         """A frame, the screen being where it is thought to be."""
         with timer("sampling"):
@@ -245,7 +245,7 @@ class TrackedScreen:
             if clock is None:
                 return None
         with timer("detect"):
-            refined = self._refined(picture, pose.rows, light, flat, clock, last.isi_memory, most_misfit, thorough)
+            refined = self._refined(picture, pose.rows, light, flat, clock, last.isi_memory, max_misfit, thorough)
             if refined is None:
                 return None
             flat, clock, positions, likelihoods = refined
@@ -271,7 +271,7 @@ class TrackedScreen:
         flat: known_picture.ColumnLight,
         clock: Clock,
         isi_memory: int,
-        most_misfit: float,
+        max_misfit: float,
         thorough: bool,
         known: Float32Array | None = None,
     ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, SlotLikelihoods] | None:
@@ -301,7 +301,7 @@ class TrackedScreen:
             positions = known_picture.row_positions(rows, clock)
             fit = known_picture.fit_response(flat, known_picture.exposures(lit, positions, exposure_slots))
         expected = known_picture.expected_light(lit, positions, exposure_slots, isi_memory, fit.response)
-        judged = picture.judge(flat, expected.light, most_misfit, SETTINGS.frame_share, clock.rows_per_slot)
+        judged = picture.judge(flat, expected.light, max_misfit, SETTINGS.frame_share, clock.rows_per_slot)
         if judged is None:
             return None
         return judged, clock, positions, known_picture.slot_likelihoods(judged, expected, clock, isi_memory)
@@ -321,7 +321,7 @@ class TrackedScreen:
             predicted, contrast = self._shifted(flat, predicted, contrast)
         if contrast <= SETTINGS.good_header:
             predicted, contrast = self._searched(flat, old, time, predicted, contrast)
-        return predicted if contrast >= SETTINGS.least_header else None
+        return predicted if contrast >= SETTINGS.min_header else None
 
     def _searched(
         self,
@@ -358,7 +358,7 @@ class TrackedScreen:
         """
         best, most = clock, contrast
         for step in (-SETTINGS.header_shift, SETTINGS.header_shift):
-            for n in range(1, SETTINGS.most_shifts + 1):
+            for n in range(1, SETTINGS.max_shifts + 1):
                 shifted = replace(clock, row0=clock.row0 + n * step * clock.rows_per_slot)
                 here = self._header(flat, shifted)
                 if here < most:
@@ -455,7 +455,7 @@ class TrackedScreen:
         picture = self._picture.without(own).placed(view.pose.placement)
         flat = picture.solve(view.light)
         clock, rows, most = view.bursts.clock, view.pose.rows, SETTINGS.misfit
-        if known_picture.header_contrast(flat, known_picture.row_positions(rows, clock), clock) < SETTINGS.least_header:
+        if known_picture.header_contrast(flat, known_picture.row_positions(rows, clock), clock) < SETTINGS.min_header:
             return
         refined = self._refined(picture, rows, view.light, flat, clock, view.isi_memory, most, True, known)
         if refined is not None:
@@ -487,7 +487,7 @@ def _retimed(clock: Clock, rows: FloatArray, fit: known_picture.Fit) -> Clock:
 
 def _less_ends(inside: BoolArray, rows: float) -> BoolArray:
     """(C, S, R) strips on the screen, without so many rows at its ends."""
-    n = int(np.ceil(min(rows, SETTINGS.most_end)))
+    n = int(np.ceil(min(rows, SETTINGS.max_end_rows)))
     left = np.zeros_like(inside)
     left[..., n:-n] = inside[..., 2 * n :] & inside[..., : -2 * n]
     return left
@@ -500,7 +500,7 @@ def _map(
     n_columns = acquisition.screen.columns
     if n_strips is None:
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
-        n_strips = min(sampling.strips_per_column(column_px), SETTINGS.most_strips)
+        n_strips = min(sampling.strips_per_column(column_px), SETTINGS.max_strips)
     outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, camera.lens)
     return tracked.map_strips(outlines, frame, lambda coded: sampling.tone_to_light(camera.tone, coded))
 

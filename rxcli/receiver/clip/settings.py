@@ -10,7 +10,7 @@ class ClipSettings:
     """Each with its unit and the reason for it."""
 
     #: Strips of a column, at most: more tell no more of a picture that is known, and take time.
-    most_strips: int = 4
+    max_strips: int = 4
     #: Frames from which a frame is measured without what others that show its bursts have taught of the picture there;
     #: of fewer, too little would be left.
     enough_views: int = 6
@@ -26,8 +26,8 @@ class ClipSettings:
     drift_share: float = 0.7
     #: Rows at the screen's ends that are not counted on where a screen moves, least and most, beside one standard
     #: deviation of the corners. A row beyond the end is dark, whatever the known picture expects there.
-    least_end: float = 1.0
-    most_end: float = 14.0
+    min_end_rows: float = 1.0
+    max_end_rows: float = 14.0
     #: How often a still outline is looked for where the picture does not tell, and looks that make it still.
     look_every: int = 8
     still_looks: int = 3
@@ -50,7 +50,7 @@ class ClipSettings:
     rest_misfit: float = 1.5
     #: Contrast of headers, against full, below which nothing is known any more, and contrast of a frame below which
     #: compression has taken much of it.
-    least_header: float = 0.3
+    min_header: float = 0.3
     faded: float = 0.85
     #: Slots of lateness that are put right, of the clock and of its drift from halfway down to the last row: rows that
     #: are instants drift by 0.02 at most, those that a camera has stretched to hold a picture still by 0.1 to 0.4. How
@@ -64,11 +64,11 @@ class ClipSettings:
     #: Contrast of its headers from which a foretold clock needs no shift; and step and number of shifts tried, slots.
     plain_header: float = 0.8
     header_shift: float = 0.3
-    most_shifts: int = 5
+    max_shifts: int = 5
     #: How much better its headers must show for a clock to be taken instead of the foretold one.
     better_header: float = 0.1
     #: Variance of a strip's light, at least: that of a starved clip's dark parts is none.
-    least_noise: float = 1e-7
+    min_variance: float = 1e-7
 
     #: Frames at the start of a scene that are looked at once more when the picture is known better; how many are waited
     #: for where compression has taken much; and the share of the well lit packets that are then in doubt.
@@ -91,7 +91,7 @@ class ClipSettings:
     same_contrast: float = 3.0
     same_share: float = 0.25
     #: Frames in a row that may be received like photographs before the picture is learned anew.
-    most_unknown: int = 3
+    max_unknown_frames: int = 3
     #: How much longer than from one frame to the next a readout may seem to take: time stamps are rounded.
     readout_slack: float = 1.1
     #: Frames that find their clock together where each shows little.
@@ -99,7 +99,7 @@ class ClipSettings:
     #: Frames that are reported together where nobody asks for results promptly.
     reports_together: int = 4
     #: Frames that may wait until it is clear which copies begin a burst.
-    most_waiting: int = 8
+    max_waiting_frames: int = 8
 
     #: A burst of a column all of whose symbols have at least this log probability is not decoded again.
     certain_log_prob: float = -1e-4
@@ -113,7 +113,7 @@ class ClipSettings:
 
     #: Corners of two searches that differ by less than this, in screen widths, agree; searches where they do not.
     outlines_agree: float = 0.003
-    most_searches: int = 5
+    max_searches: int = 5
 
     #: A frame that shows fewer packets than this finds its clock with others; one that shows more does better alone.
     few_packets: float = 1.05

@@ -126,7 +126,7 @@ def clip_results(
     ]
     held_back = np.zeros(len(snr_db))
     for seen, doubt in zip(whole, doubts, strict=True):
-        surest = np.where(seen & (doubt.ber_hat[0] <= SETTINGS.most_ber_hat), doubt.confidence[0], 0.0)
+        surest = np.where(seen & (doubt.ber_hat[0] <= SETTINGS.max_ber_hat), doubt.confidence[0], 0.0)
         held_back = np.maximum(held_back, surest)
     own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
     of_bursts = [

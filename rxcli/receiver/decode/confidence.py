@@ -21,18 +21,18 @@ _AGAINST_AT_LEAST = 0.5
 #: Features that differ by less are equal, but for their digits.
 _SAME = 1e-4
 #: Doubt that is left in the surest packet, and at most in any, nats: what a log-odds can hold.
-_LEAST_DOUBT, _MOST_DOUBT = 1e-9, 500.0
+_MIN_DOUBT, _MAX_DOUBT = 1e-9, 500.0
 
 
 class _Photographs(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: tuple[float, ...]
-    most_log_odds: float
-    most_average: float
+    max_log_odds: float
+    max_average: float
 
 
 class _Clips(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: tuple[float, ...]
-    most_log_odds: float
+    max_log_odds: float
 
 
 class _WrongBits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -87,7 +87,7 @@ class Doubts:
 
     def reported(self, min_confidence: float) -> BoolArray:
         """(B, C) packets that are sure enough to be reported."""
-        return np.asarray((self.ber_hat <= SETTINGS.most_ber_hat) & (self.confidence >= min_confidence))
+        return np.asarray((self.ber_hat <= SETTINGS.max_ber_hat) & (self.confidence >= min_confidence))
 
 
 def doubts_of(posteriors: BurstPosteriors, confidence_features: FloatArray) -> Doubts:
@@ -135,7 +135,7 @@ def clip_features(burst: BurstInClip) -> FloatArray:
     Beyond a limit surer symbols say nothing more: what errs then is not noise.
     """
     assert burst.against is not None
-    log_odds = np.minimum(_log_odds(burst.posteriors.log_prob.sum(axis=2))[0], confidence_model().clips.most_log_odds)
+    log_odds = np.minimum(_log_odds(burst.posteriors.log_prob.sum(axis=2))[0], confidence_model().clips.max_log_odds)
     return np.stack([np.ones_like(log_odds), log_odds, np.log(burst.against + _AGAINST_AT_LEAST)], axis=1)
 
 
@@ -157,10 +157,10 @@ def confidence_features(
         n_strips: strips of a column in a quick look.
     """
     model = confidence_model().photographs
-    log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), model.most_log_odds)
+    log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), model.max_log_odds)
     against = np.log(_AGAINST_AT_LEAST - np.minimum(slot_margin, 0).sum(axis=2))
     n_heard_slots = np.maximum((slot_margin != 0).sum(axis=2), 1)
-    average = np.log(np.clip(slot_margin.sum(axis=2) / n_heard_slots, 1, model.most_average))
+    average = np.log(np.clip(slot_margin.sum(axis=2) / n_heard_slots, 1, model.max_average))
     strips = np.log(n_strips)
     terms = (1.0, log_odds, denoised, against, average, average * log_odds, strips, strips * log_odds)
     return np.stack([np.broadcast_to(term, log_odds.shape) for term in terms], axis=2).astype(np.float64)
@@ -180,13 +180,13 @@ def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
     model = confidence_model().photographs
     log_odds = np.asarray(confidence_features @ np.array(model.weights))
     posterior, average = confidence_features[..., 1], confidence_features[..., 4]
-    plain = (average > np.log(model.most_average) - _SAME) & (posterior < model.most_log_odds)
+    plain = (average > np.log(model.max_average) - _SAME) & (posterior < model.max_log_odds)
     # Packets more likely wrong than right were never too sure.
     return np.asarray(np.where(plain, np.minimum(log_odds, np.maximum(posterior, 0.0)), log_odds))
 
 
 def _log_odds(log_prob: FloatArray) -> FloatArray:
-    at_most = np.clip(log_prob, -_MOST_DOUBT, -_LEAST_DOUBT)
+    at_most = np.clip(log_prob, -_MAX_DOUBT, -_MIN_DOUBT)
     return np.asarray(at_most - np.log(-np.expm1(at_most)))
 
 

@@ -34,11 +34,11 @@ from rxcli.types import BurstPosteriors, Float32Array, FloatArray
 #: Likelihoods, over that of the likeliest state, are taken to be at least this, so that their logarithm exists.
 _LEAST = 1e-300
 #: The same for words, a logarithm: what float32 holds.
-_LEAST_WORD = -85.0
+_MIN_WORD = -85.0
 #: Probabilities below this are not told apart.
 _TINY = 1e-30
 #: Slots after which likelihoods that shrink are scaled, and the least of a slot, so that none is lost till then.
-_SCALED_AFTER, _LEAST_OF_SLOT = 4, 1e-60
+_SCALED_AFTER, _MIN_SLOT_PROBABILITY = 4, 1e-60
 #: Metrics that are worked on together: more leave the processor's cache, fewer take more calls.
 _AT_ONCE = 250_000
 
@@ -268,7 +268,7 @@ def _trellis(payload: _Payload, w: int) -> _Trellis:
     top = of_words.max(axis=1)
     of_words -= top[:, None]
     # Words add up to one: seven digits are enough, and a fifth of the time.
-    rest = np.exp(np.maximum(of_words, _LEAST_WORD).astype(np.float32))
+    rest = np.exp(np.maximum(of_words, _MIN_WORD).astype(np.float32))
     end, top_end = _over_likeliest(metrics[:, length - isi_memory + np.arange(isi_memory), branches.tail].sum(axis=2))
     start = np.zeros((n, 1 << isi_memory))
     start[:, branches.first_state] = 1.0
@@ -435,7 +435,7 @@ def free_log_evidence(metrics: FloatArray, share: FloatArray) -> FloatArray:
     prior = np.log(np.stack([1 - share, share], axis=1))
     # A pattern is the state, the slots before, and the slot itself; the next state drops the oldest of them.
     by_slot, tops = _over_likeliest(metrics.swapaxes(0, 1) + np.tile(prior, n_patterns // 2))
-    steps = np.maximum(by_slot, _LEAST_OF_SLOT).reshape(-1, n_columns, 2, n_patterns // 4, 2)
+    steps = np.maximum(by_slot, _MIN_SLOT_PROBABILITY).reshape(-1, n_columns, 2, n_patterns // 4, 2)
     log_evidence = tops[..., 0].sum(axis=0)
     state = np.full((n_columns, n_patterns // 2), 2 / n_patterns)
     for number, step in enumerate(steps, 1):

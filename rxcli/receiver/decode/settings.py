@@ -10,7 +10,7 @@ class DecodeSettings:
     """Each with its unit and the reason for it."""
 
     #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
-    most_ber_hat: float = 0.1
+    max_ber_hat: float = 0.1
     #: A photograph none of whose packets reaches this confidence shows none.
     surest_packet: float = 0.1
     #: A weight is reported, and its soft bits count, from this probability on.

@@ -18,7 +18,7 @@ from rxcli.types import BoolArray, Float32Array, FloatArray
 #: Spectra are computed on a grid so many times finer than the light's length resolves.
 _FINER = 4
 #: Pairs of columns that are compared, at most.
-_MOST_PAIRS = 300
+_MAX_PAIRS = 300
 
 
 def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, packet_slots: int) -> bool:
@@ -51,7 +51,7 @@ def is_alike(value: Float32Array, weight: Float32Array, shared: float, reach: in
     first, second = np.triu_indices(n_columns, max(SETTINGS.apart_columns, int(SETTINGS.apart_share * n_columns)))
     if first.size == 0:
         return False
-    some = np.linspace(0, first.size - 1, min(first.size, _MOST_PAIRS)).astype(np.int64)
+    some = np.linspace(0, first.size - 1, min(first.size, _MAX_PAIRS)).astype(np.int64)
     observed = weight > 0
     level = (value - _mean(value, observed)) * observed
     level = level / np.maximum(np.sqrt(np.square(level).sum(axis=1, keepdims=True)), 1e-9)

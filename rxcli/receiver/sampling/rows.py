@@ -32,7 +32,7 @@ _FINE_STEPS = 64
 
 def strips_per_column(column_px: float) -> int:
     """Lateral strips for columns of `column_px` pixels."""
-    return int(np.clip(column_px // SETTINGS.strip_px, 1, SETTINGS.most_strips))
+    return int(np.clip(column_px // SETTINGS.strip_px, 1, SETTINGS.max_strips))
 
 
 def tone_to_light(tone: str, encoded: FloatArray) -> FloatArray:
@@ -271,7 +271,7 @@ def _between_edges(area: NDArray[Any], edges: Float32Array) -> tuple[Float32Arra
     at_edge += ((below.take(left) - above.take(left)).astype(np.float32) - at_edge) * part
     mean, widths = np.diff(at_edge, axis=0), np.diff(position, axis=0)
     enclosed = np.abs(widths)
-    widths[enclosed <= SETTINGS.least_enclosed] = np.inf
+    widths[enclosed <= SETTINGS.min_enclosed] = np.inf
     mean /= widths
     return mean, enclosed
 

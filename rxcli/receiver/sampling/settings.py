@@ -11,7 +11,7 @@ class SamplingSettings:
 
     #: Pixels that a strip should have before a column gets another one, and strips of a column at most.
     strip_px: int = 12
-    most_strips: int = 8
+    max_strips: int = 8
     #: Cells that a strip should have, so that the fractions at its slanted edges are fine.
     cells_per_strip: int = 4
     #: One row in this many is kept for the noise model, and of those as many as hold this many cells, which are sorted
@@ -20,7 +20,7 @@ class SamplingSettings:
     noise_cells: int = 10_000
     noise_bins: int = 24
     #: Edges that enclose less than this many values have no light between them.
-    least_enclosed: float = 0.1
+    min_enclosed: float = 0.1
 
     #: Edges that are this near, pixels, enclose the same light.
     same_edges_px: float = 0.02

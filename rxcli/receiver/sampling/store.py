@@ -13,7 +13,7 @@ from rxcli.receiver.sampling.settings import SETTINGS
 from rxcli.types import Frame, Outlines, RowProfiles
 
 #: Readings of one frame that are kept: of few and of many columns, quick and in depth, and some for outlines in doubt.
-_MOST_KEPT = 4
+_MAX_READINGS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class RowStore:
             reading = _Reading(
                 frame.pixels, tone, quick, replace(outlines, sensor_row=None), replace(profiles, sensor_row=None)
             )
-            self._readings = [*self._readings[-_MOST_KEPT + 1 :], reading]
+            self._readings = [*self._readings[-_MAX_READINGS + 1 :], reading]
         return profiles
 
 

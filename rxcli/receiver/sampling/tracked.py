@@ -21,7 +21,7 @@ from rxcli.receiver.sampling.settings import SETTINGS
 from rxcli.types import BoolArray, Float32Array, FloatArray, Frame, Outlines
 
 #: Pixels of eight bits in a half word, half words whose sum 16 bits hold, and rows that fit the cache at a time.
-_HALF, _MOST_HALVES, _ROWS_AT_A_TIME = 4, 64, 128
+_HALF, _MAX_HALVES, _ROWS_AT_A_TIME = 4, 64, 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def _cells_of(strip_px: float, frame: Frame) -> tuple[int, int]:
     """Width of a cell and cells of a sample: whole half words where there are some, which are added up more quickly."""
     if frame.pixels.dtype != np.uint8:
         return max(int(strip_px * SETTINGS.tracked_cell_share), 1), 1
-    halves = int(np.clip(round(strip_px / SETTINGS.tracked_cells / _HALF), 1, _MOST_HALVES))
+    halves = int(np.clip(round(strip_px / SETTINGS.tracked_cells / _HALF), 1, _MAX_HALVES))
     if strip_px >= SETTINGS.from_halves_px and _has_words(frame, halves * _HALF):
         cell_px = halves * _HALF
     else:

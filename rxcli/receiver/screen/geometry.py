@@ -28,7 +28,7 @@ _OUTLINE_POINTS, _MIDDLE_POINTS = 65, 33
 #: No lens moves a point of the picture by more than this many focal lengths.
 _LARGEST_MOVE = 10.0
 #: The inverse of the lens is found when a step moves no point by this many pixels.
-_LEAST_STEP = 1e-8
+_MIN_STEP = 1e-8
 #: Edges are straight to a thousandth of a pixel over this many rows.
 _KNOT_ROWS = 32
 
@@ -91,7 +91,7 @@ def undistort(points: FloatArray, lens: Lens, iterations: int = 20) -> FloatArra
     for _ in range(iterations):
         step = found + points - distort(found, lens)
         before, found = found, np.where((np.abs(step - points) <= reach).all(axis=-1, keepdims=True), step, points)
-        if np.abs(found - before).max(initial=0.0) < _LEAST_STEP:
+        if np.abs(found - before).max(initial=0.0) < _MIN_STEP:
             break
     return found
 

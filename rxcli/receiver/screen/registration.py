@@ -68,19 +68,19 @@ _OUTLIER = 2.5
 _SHIFT_SD, _AFFINE_SD, _PERSPECTIVE_SD = 0.008, 0.0027, 0.0004
 #: Information below which there is no texture, 1 over pixels squared. Neighbouring cells err alike: that of so many
 #: counts once.
-_LEAST_INFORMATION, _ALIKE_CELLS = 1e-9, 4.0
+_MIN_INFORMATION, _ALIKE_CELLS = 1e-9, 4.0
 #: Parts of the screen, across and down, of which each may err in its own way; and how well an outline that is found in
 #: a frame is known, screen sizes.
 _PARTS, _OUTLINE_SD = (20, 6), 0.002
 #: Standard deviation of the corners in screen sizes, and correlation of the textures, that make it certain where a
 #: screen is.
-_MOST_SD, _LEAST_CORRELATION = 0.0012, 0.35
+_MAX_SD, _MIN_CORRELATION = 0.0012, 0.35
 #: Share of the last frame's motion that the next is expected to repeat.
 _PERSISTENCE = 0.7
 #: Frames from which the texture is learned one by one, and how often from then on.
 _FIRST_FRAMES, _LEARN_EVERY = 10, 4
 #: Weight of the frames before, at most, in frames, in what is known of the texture.
-_MOST_WEIGHT = 40.0
+_MAX_WEIGHT = 40.0
 #: Corners clockwise from the top-left: their u and v.
 _AT_U, _AT_V = np.array([0, 1, 1, 0]), np.array([0, 0, 1, 1])
 #: Points across and down through which the screen is projected.
@@ -106,7 +106,7 @@ class Registration:
     @property
     def tells(self) -> bool:
         """Whether there is texture enough to tell where the screen is, if it is what it was."""
-        return self.sd_px < _MOST_SD * _size(self.corners)
+        return self.sd_px < _MAX_SD * _size(self.corners)
 
     @property
     def certain(self) -> bool:
@@ -116,7 +116,7 @@ class Registration:
     @property
     def fits(self) -> bool:
         """Whether the picture there is the one known, be there ever so little texture."""
-        return self.correlation > _LEAST_CORRELATION
+        return self.correlation > _MIN_CORRELATION
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +252,7 @@ class ScreenTexture:
             return None
         before = self._correlation
         found = self._found(texture, some, (expected, expected), _FINE_ITERATIONS)
-        alike = found.correlation > max(_STILL_CORRELATION * before, _LEAST_CORRELATION)
+        alike = found.correlation > max(_STILL_CORRELATION * before, _MIN_CORRELATION)
         if alike and found.tells:
             return found
         self._correlation = before
@@ -288,7 +288,7 @@ class ScreenTexture:
         found = Registration(self._lens_of(self._plane), covariance, correlation)
         shift, each, size = np.abs(moved.mean(axis=0)).max(), np.sqrt(np.square(moved).mean()), _size(plane)
         near = shift < _STILL_SHIFT * size and each < _STILL_CORNERS * size
-        alike = correlation > max(_STILL_CORRELATION * self._correlation, _LEAST_CORRELATION)
+        alike = correlation > max(_STILL_CORRELATION * self._correlation, _MIN_CORRELATION)
         return found if near and alike and found.tells else None
 
     def with_outline(self, found: Registration, outline: FloatArray, sd: float = _OUTLINE_SD) -> Registration:
@@ -314,7 +314,7 @@ class ScreenTexture:
         value, weight = self._read(self._texture_of(frame), self._plane, self._places)
         total = self._weight + weight
         self._value += (value - self._value) * (weight / np.maximum(total, np.float32(TINY)))
-        self._weight = np.minimum(total, np.float32(_MOST_WEIGHT))
+        self._weight = np.minimum(total, np.float32(_MAX_WEIGHT))
 
     def _known(self) -> _AllKnown:
         """The texture so far."""
@@ -562,9 +562,9 @@ def _scores_of_parts(known: _Known, weighted: Float32Array, per_pixel: FloatArra
 def _sandwich(normal: FloatArray, scores: FloatArray, variance: float, prior: FloatArray) -> FloatArray:
     """(8, 8) covariance of a fit: by the scatter of its parts, not below that of even noise of a `variance`, and no
     larger than the prior allows."""
-    bread = np.linalg.inv(normal + (1e-6 * np.trace(normal) + _LEAST_INFORMATION) * np.eye(8))
+    bread = np.linalg.inv(normal + (1e-6 * np.trace(normal) + _MIN_INFORMATION) * np.eye(8))
     spread = scores - scores.mean(axis=0)
-    noise = _ALIKE_CELLS * variance * (normal + _LEAST_INFORMATION * np.eye(8))
+    noise = _ALIKE_CELLS * variance * (normal + _MIN_INFORMATION * np.eye(8))
     covariance = bread @ (spread.T @ spread + noise) @ bread + 1e-4 * np.eye(8)
     return np.asarray(np.linalg.inv(np.linalg.inv(covariance) + prior))
 

@@ -22,7 +22,7 @@ _LARGEST_STEP = np.array([0.1, 0.3, 0.3, 0.04, 0.04, 0.02])
 _MAX_COLUMNS = 64
 _TINY = np.float32(1e-6)
 #: Logarithm of the least share of a column: products of smaller numbers would take many times the time.
-_LEAST_SHARE = np.float32(-30)
+_MIN_SHARE = np.float32(-30)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Mixes:
         distance = np.minimum(u, n).astype(np.float32)[..., None] - (np.arange(n, dtype=np.float32) + np.float32(0.5))
         share = np.square(distance)
         share *= np.float32(-0.5 / sigma**2)
-        np.exp(np.maximum(share, _LEAST_SHARE, out=share), out=share)
+        np.exp(np.maximum(share, _MIN_SHARE, out=share), out=share)
         if n_columns is not None:
             number = first + np.arange(n)
             share *= ((number >= 0) & (number < n_columns))[:, None]

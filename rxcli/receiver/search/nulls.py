@@ -56,4 +56,4 @@ def is_switched(context: FrameContext, profiles: RowProfiles) -> bool:
     if not is_alike(value, weight, headers):
         return False
     level -= level.mean(axis=1, keepdims=True)
-    return periodic_share(level, 2 * SETTINGS.most_period_rows) > SETTINGS.switched_share
+    return periodic_share(level, 2 * SETTINGS.max_period_rows) > SETTINGS.switched_share

@@ -84,9 +84,9 @@ def resample(
 
 def _bounded(light: Float32Array) -> Float32Array:
     """Light with what no sensor delivers taken as dark: one NaN would spoil every sum after it."""
-    if float(np.abs(light).max(initial=0.0)) <= SETTINGS.most_light:
+    if float(np.abs(light).max(initial=0.0)) <= SETTINGS.max_light:
         return light
-    return np.where(np.abs(light) <= SETTINGS.most_light, light, np.float32(0))
+    return np.where(np.abs(light) <= SETTINGS.max_light, light, np.float32(0))
 
 
 def _shown_rows(inside: BoolArray) -> tuple[IntArray, IntArray]:
@@ -299,7 +299,7 @@ def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> 
     responses = _header_correlation(pooled * (weight / (weight + 1.0)), SETTINGS.search_samples)
     # Twice a correlation less its bound: the log-likelihood ratio, up to a factor, of a header against random slots.
     llr = folded(2 * responses - support, period)
-    reach = int(SETTINGS.most_delay_slots * SETTINGS.search_samples)
+    reach = int(SETTINGS.max_delay_slots * SETTINGS.search_samples)
     wide = reach + SETTINGS.search_samples
     wrapped = np.pad(llr, ((0, 0), (wide, wide)), mode="wrap")
     near = cv2.dilate(wrapped, np.ones((1, 2 * reach + 1), np.uint8))[:, wide : wide + period]
@@ -320,7 +320,7 @@ def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> 
 
 def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slots: int) -> FloatArray:
     """Delay of each column against the common clock, slots; 0 where it cannot be told from none."""
-    reach = int(SETTINGS.most_delay_slots * SETTINGS.search_samples) + 2
+    reach = int(SETTINGS.max_delay_slots * SETTINGS.search_samples) + 2
     template = np.repeat(2.0 * np.array(HEADER) - 1, SETTINGS.search_samples) / (
         SLOTS_PER_SYMBOL * SETTINGS.search_samples
     )
@@ -361,7 +361,7 @@ def corrected(clock: Clock, timing: FloatArray) -> Clock:
     """
     numerator, denominator = timing.sum(axis=0)
     late = (
-        float(np.clip(numerator / denominator, -SETTINGS.most_correction_slots, SETTINGS.most_correction_slots))
+        float(np.clip(numerator / denominator, -SETTINGS.max_correction_slots, SETTINGS.max_correction_slots))
         if denominator > 0
         else 0.0
     )
@@ -371,7 +371,7 @@ def corrected(clock: Clock, timing: FloatArray) -> Clock:
         return moved
     return replace(
         moved,
-        delay_slots=clock.delay_slots - np.clip(own, -SETTINGS.most_correction_slots, SETTINGS.most_correction_slots),
+        delay_slots=clock.delay_slots - np.clip(own, -SETTINGS.max_correction_slots, SETTINGS.max_correction_slots),
     )
 
 

@@ -16,10 +16,10 @@ class SyncSettings:
     #: Contrast that half-convinces, over the noise of a sample.
     contrast_sigmas: float = 8.0
     #: Light beyond this many times white is no measurement.
-    most_light: float = 1e3
+    max_light: float = 1e3
 
     #: Slots by which a column may be late against the others, from the air interface.
-    most_delay_slots: float = 2.0
+    max_delay_slots: float = 2.0
     #: Without delays, no more than this share of the columns seems to be off by more than so many slots.
     many_columns: float = 0.25
     same_delay_slots: float = 0.12
@@ -32,7 +32,7 @@ class SyncSettings:
     #: Weight of the first idea of a column's delay, as information: a standard deviation of a tenth of a slot.
     delay_information: float = 100.0
     #: Largest correction of the clock at a time, slots.
-    most_correction_slots: float = 0.25
+    max_correction_slots: float = 0.25
 
     #: Slots are at most this sure, nats, when copies are compared: what was seen once may be wrong.
     sure_nats: float = 3.0
@@ -42,7 +42,7 @@ class SyncSettings:
     remembered_bursts: int = 4
 
     #: A clock that is off by more than this many slots from where the frames before foretell it is of another time.
-    most_jump_slots: float = 2.0
+    max_jump_slots: float = 2.0
     #: Share of a new measurement in the length of a frame.
     period_share: float = 0.2
     #: Locks by which time stamps are judged, and how often slow motion stretches them, likeliest first.

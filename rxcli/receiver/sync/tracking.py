@@ -52,7 +52,7 @@ class LinkTime:
     @property
     def sure_slots(self) -> float:
         """How far a clock may be from the foretold one: at first by the times, which may be rounded to milliseconds."""
-        return SETTINGS.most_jump_slots if self._period is not None else self.packet_slots / 4
+        return SETTINGS.max_jump_slots if self._period is not None else self.packet_slots / 4
 
     def predict(self, frame: int, time_s: float) -> float | None:
         """Slot of sensor row 0 in a frame, from the locks before; None before the first."""
@@ -76,7 +76,7 @@ class LinkTime:
         else:
             first_copy = round((predicted - inside) / self.packet_slots)
             slot = inside + first_copy * self.packet_slots
-            if self._period is not None and abs(slot - predicted) > SETTINGS.most_jump_slots:
+            if self._period is not None and abs(slot - predicted) > SETTINGS.max_jump_slots:
                 return None
             self._measure(frame, time_s / self.stretch, slot)
         self._last = (frame, time_s / self.stretch, slot)
@@ -89,13 +89,13 @@ class LinkTime:
         """Whether as many frames were locked as time stamps are judged by."""
         return len(self._first) >= SETTINGS.judged_locks
 
-    def stretch_of_stamps(self, least_frame_s: float) -> float | None:
+    def stretch_of_stamps(self, min_frame_s: float) -> float | None:
         """How much longer the stamps of the first locks are than the time was; None where no factor explains them.
 
         The link's own clock shows in the headers, whole packets aside. Stamps that are not even are not judged.
 
         Args:
-            least_frame_s: time that passes from frame to frame at least.
+            min_frame_s: time that passes from frame to frame at least.
         """
         frames, stamps, slots = np.array(self._first).T
         if len(frames) < 3 or np.ptp(frames) == 0:
@@ -108,7 +108,7 @@ class LinkTime:
         for stretch in (1, *SETTINGS.stretches):
             expected = stamp_s / stretch * self.slot_rate_hz
             off = abs((period - expected + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2)
-            if off <= uneven / stretch + SETTINGS.rate_share * expected and stamp_s / stretch > least_frame_s:
+            if off <= uneven / stretch + SETTINGS.rate_share * expected and stamp_s / stretch > min_frame_s:
                 return float(stretch)
         return None
 
@@ -119,7 +119,7 @@ class LinkTime:
             return True
         apart = clock.first_slot - clock.row0 / clock.rows_per_slot - predicted
         return (
-            abs((apart + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2) <= SETTINGS.most_jump_slots
+            abs((apart + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2) <= SETTINGS.max_jump_slots
         )
 
     def clock_at(self, frame: int, time_s: float, like: Clock, n_slots: int, top_row: float) -> Clock | None:

@@ -44,7 +44,7 @@ def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) 
     sign = np.where(place < SLOTS_PER_SYMBOL, 2.0 * np.array(HEADER)[np.minimum(place, SLOTS_PER_SYMBOL - 1)] - 1, 0)
     value, precision = (values.take(rows, axis=1) for values in (observed.value, observed.precision))
     weight = np.abs(sign) * np.minimum(precision, np.float32(SETTINGS.prior_precision))
-    if weight.sum() < SETTINGS.prior_precision * SETTINGS.least_header_rows:
+    if weight.sum() < SETTINGS.prior_precision * SETTINGS.min_header_rows:
         return 1.0
     return float((weight * sign * np.clip(2 * value - 1, -1.5, 1.5)).sum() / weight.sum())
 
@@ -72,7 +72,7 @@ def dark_light(
         for light, rows, on in zip(lights, dark, inside, strict=True)
     ]
     together = np.concatenate(observed, axis=2)
-    few = (~np.isnan(together)).sum(axis=2) < SETTINGS.least_dark_rows
+    few = (~np.isnan(together)).sum(axis=2) < SETTINGS.min_dark_rows
     if together.shape[2] == 0:
         return np.full(together.shape[:2], usual, np.float32)
     together[few] = np.float32(usual)

@@ -254,7 +254,7 @@ class KnownPicture:
         error *= smooth * smooth
         error += np.float32(SETTINGS.seen_error) * self._observed
         error /= total * total
-        error += np.float32(SETTINGS.least_error**2)
+        error += np.float32(SETTINGS.min_error**2)
         return picture, error
 
     def _wide(self) -> Float32Array:
@@ -302,7 +302,7 @@ def _alike(error: Float32Array, precision: Float32Array, rows_per_slot: float) -
     count = told.sum(axis=1)
     of_all = squared.sum() / max(int(count.sum()), 1)
     alike = (squared + SETTINGS.like_others_slots * of_all) / (count + SETTINGS.like_others_slots)
-    return np.asarray(np.maximum(alike, SETTINGS.least_alike_error), np.float32)
+    return np.asarray(np.maximum(alike, SETTINGS.min_correlated_error), np.float32)
 
 
 def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:

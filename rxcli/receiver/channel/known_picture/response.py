@@ -76,7 +76,7 @@ def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
     # Drawn, a little, to no blur.
     usual = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
     fitted = usual + np.linalg.solve(normal + SETTINGS.response_ridge * np.eye(len(usual)), right - normal @ usual)
-    least, most = np.array([*SETTINGS.response_bounds, (-SETTINGS.most_late_slots, SETTINGS.most_late_slots)]).T
+    least, most = np.array([*SETTINGS.response_bounds, (-SETTINGS.max_shift_slots, SETTINGS.max_shift_slots)]).T
     late, drift = np.clip(fitted[3:] / max(fitted[0] + 2 * fitted[1], least[0]), least[3], most[3])
     response = Response(*np.clip(fitted[:3], least[:3], most[:3]).tolist())
     return Fit(response, float(late), float(drift))

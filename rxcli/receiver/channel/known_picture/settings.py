@@ -22,7 +22,7 @@ class KnownPictureSettings:
     around_rows: int = 4
     #: Relative error of a picture taken from the rows around, and of one that was looked at well.
     around_error: float = 0.6
-    least_error: float = 0.02
+    min_error: float = 0.02
     #: Rows in each direction, all strips of a column together, from which the picture is taken where those around were
     #: not lit either; its weight against theirs, and its relative error, which neighbouring rows have in common.
     wide_rows: int = 60
@@ -42,7 +42,7 @@ class KnownPictureSettings:
     #: a column's own; and the least squared error against rows that err each for itself.
     told_precision: float = 0.5
     like_others_slots: float = 20.0
-    least_alike_error: float = 0.9
+    min_correlated_error: float = 0.9
 
     #: What is possible of a response in the middle, at a side, and of its offset; and how much less is likelier.
     response_bounds: tuple[tuple[float, float], ...] = ((0.3, 1.3), (-0.1, 0.35), (-0.2, 0.2))
@@ -54,12 +54,12 @@ class KnownPictureSettings:
     #: Steps of the table of what lies between the groups.
     gain_table: int = 256
     #: Largest correction of the clock at a time, slots.
-    most_late_slots: float = 0.4
+    max_shift_slots: float = 0.4
 
     #: Rows of a strip, over all frames, from which its light where nothing is lit is known.
-    least_dark_rows: int = 12
+    min_dark_rows: int = 12
     #: Rows of a single column's header that must show, that it be judged.
-    least_header_rows: int = 40
+    min_header_rows: int = 40
 
     #: Slots to each side that a blur reaches.
     side_slots: float = 0.5
