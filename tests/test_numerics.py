@@ -31,18 +31,18 @@ def test_slots_are_seen_as_their_mean_over_the_exposure(exposure: float, beyond:
         for row, at in zip(slots, positions, strict=True)
     ]
     light = SlotLight(slots, beyond)
-    np.testing.assert_allclose(light.seen(positions, exposure), wanted, atol=2e-3)
-    alike = light.seen(positions[:1], exposure)
-    np.testing.assert_array_equal(alike[0], light.seen(positions, exposure)[0])
+    np.testing.assert_allclose(light.mean_over(positions, exposure), wanted, atol=2e-3)
+    alike = light.mean_over(positions[:1], exposure)
+    np.testing.assert_array_equal(alike[0], light.mean_over(positions, exposure)[0])
     assert alike.shape == (3, 50)
 
 
 def test_the_slope_is_the_change_with_time() -> None:
     rng = np.random.default_rng(2)
     light, positions, step = SlotLight(rng.random((2, 30)).astype(np.float32)), rng.uniform(2, 28, (2, 40)), 1e-3
-    seen, slope = light.seen_with_slope(positions, 0.8)
-    np.testing.assert_array_equal(seen, light.seen(positions, 0.8))
-    change = (light.seen(positions + step / 2, 0.8) - light.seen(positions - step / 2, 0.8)) / step
+    seen, slope = light.mean_and_slope(positions, 0.8)
+    np.testing.assert_array_equal(seen, light.mean_over(positions, 0.8))
+    change = (light.mean_over(positions + step / 2, 0.8) - light.mean_over(positions - step / 2, 0.8)) / step
     # Where an edge of the exposure crosses that of a slot within the step, both are right.
     assert (np.abs(change - slope) < 0.02).mean() > 0.95
 

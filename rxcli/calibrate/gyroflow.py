@@ -45,7 +45,7 @@ class GyroflowProfile:
     readout_s: float | None
     #: True where the rows are read from the bottom to the top.
     reversed: bool
-    #: Doubts about the readout.
+    #: Quality about the readout.
     notes: tuple[str, ...]
 
 

@@ -131,7 +131,7 @@ def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False
     frame, camera = context.frame, context.camera
     quick = quick and sampling.is_coded(frame)
     n_strips = n_strips_of(context.corners, n_columns)
-    is_binned = quick and n_strips >= sync_settings.many_strips and n_strips % 2 == 0
+    is_binned = quick and n_strips >= sync_settings.min_binned_strips and n_strips % 2 == 0
 
     def read(
         columns: slice, noise: tuple[float, float] | None, n_strips: int = n_strips, quick: bool = False

@@ -47,7 +47,7 @@ class Outline:
         return self.fills and self.column_offset is None and self.certainty < _LIKELY
 
     @property
-    def facts(self) -> dict[str, Any]:
+    def result_fields(self) -> dict[str, Any]:
         """What a result says of it, by the names of its fields."""
         return {
             "corners": self.corners,
@@ -111,7 +111,7 @@ class Camera:
     hypothesis: CameraHypothesis | None = None
 
     @property
-    def facts(self) -> dict[str, Any]:
+    def result_fields(self) -> dict[str, Any]:
         """What a result says of it, by the names of its fields."""
         return {
             "camera_profile": self.profile,
@@ -120,10 +120,10 @@ class Camera:
             "estimated": self.estimated,
         }
 
-    def without_tone(self) -> Camera:
-        """The camera, its tone curve not told."""
-        denoised = {name: found for name, found in self.estimated.items() if name != "tone_exponent"}
-        return replace(self, estimated=denoised)
+    def without_tone_estimate(self) -> Camera:
+        """The camera without its estimated tone curve."""
+        estimated = {name: value for name, value in self.estimated.items() if name != "tone_exponent"}
+        return replace(self, estimated=estimated)
 
 
 @dataclass(frozen=True, slots=True)

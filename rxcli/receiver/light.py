@@ -20,13 +20,13 @@ from rxcli.protocol import HEADER
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: The longest exposure, slots, that each memory of the trellis covers; longer ones have `MAX_MEMORY`.
-_MEMORY_COVERS = {1: 1.3, 3: 2.6}
+_MEMORY_EXPOSURE_SLOTS = {1: 1.3, 3: 2.6}
 #: Longest memory of the trellis; five slots cover an exposure of four.
 MAX_MEMORY = 5
 #: The dark slots in the middle of a header.
 _DARK_FROM = HEADER.index(0, HEADER.index(1))
 _DARK_TO = HEADER.index(1, _DARK_FROM)
-#: A shutter is taken to be open for so many slots at least.
+#: A shutter is take_places to be open for so many slots at least.
 _MIN_SLOTS = 1e-3
 
 
@@ -42,7 +42,7 @@ class NoiseModel:
         """Standard deviation of a sample of no light."""
         return float(np.sqrt(self.floor))
 
-    def over(self, n: float) -> NoiseModel:
+    def of_mean(self, n: float) -> NoiseModel:
         """The noise of the mean of `n` samples."""
         return NoiseModel(self.floor / n, self.slope / n)
 
@@ -50,7 +50,7 @@ class NoiseModel:
         """Variance of samples of some light."""
         return np.maximum(light, np.float32(0)) * np.float32(self.slope) + np.float32(self.floor)
 
-    def through(self, picture: Float32Array, variance: Float32Array, expected: Float32Array) -> Float32Array:
+    def through_picture(self, picture: Float32Array, variance: Float32Array, expected: Float32Array) -> Float32Array:
         """Variance of samples that show `expected` times a picture which is itself known with some variance."""
         out = variance * expected
         out += np.float32(self.slope) * picture
@@ -74,7 +74,7 @@ def exposure_shares(
     return np.asarray(np.maximum(reach, 0) / exposure_slots)
 
 
-def shows_dark_header(places: FloatArray, exposure_slots: float, least: float = 0.0) -> BoolArray:
+def sees_dark_header(places: FloatArray, exposure_slots: float, least: float = 0.0) -> BoolArray:
     """Exposures that see nothing but the three dark slots in the middle of a header.
 
     Args:
@@ -109,7 +109,7 @@ class Exposure:
             blur_slots: width of a further box that light is seen through; None for a sample's own length.
         """
         if isi_memory is None:
-            covering = (memory for memory, most in _MEMORY_COVERS.items() if exposure_slots <= most)
+            covering = (memory for memory, most in _MEMORY_EXPOSURE_SLOTS.items() if exposure_slots <= most)
             isi_memory = next(covering, MAX_MEMORY)
         n_fine, q = 32, samples_per_slot
         offsets = ((np.arange(n_fine) + 0.5) / n_fine - 0.5) * max(blur_slots or 1 / q, _MIN_SLOTS)
@@ -128,7 +128,7 @@ class Exposure:
         """Samples a slot."""
         return int(self.taps.shape[0])
 
-    def seen(self, lit: Float32Array) -> Float32Array:
+    def mean_light(self, lit: Float32Array) -> Float32Array:
         """(C, N * Q) mean of slots (C, N), or of their probabilities, over the exposure; half lit beyond the ends."""
         (n_columns, n_slots), memory, q = lit.shape, self.isi_memory, self.samples_per_slot
         padded = np.full((n_columns, n_slots + 2 * memory), 0.5, np.float32)
@@ -142,7 +142,7 @@ class Exposure:
         return np.ascontiguousarray(out[:, skip : skip + n_slots * q])
 
 
-def light_of_columns(n_strips: int, n_columns: int, light_spread: float) -> FloatArray:
+def column_light(n_strips: int, n_columns: int, light_spread: float) -> FloatArray:
     """(M, C) light of every column in the middles of strips spread evenly over a screen, the most in a strip being 1.
 
     Args:
@@ -238,7 +238,7 @@ class SlotLight:
         self._total = np.zeros_like(self._slots)
         np.cumsum(self._slots[:, :-1], axis=1, out=self._total[:, 1:])
 
-    def seen(self, positions: FloatArray | Float32Array, exposure_slots: float) -> Float32Array:
+    def mean_over(self, positions: FloatArray | Float32Array, exposure_slots: float) -> Float32Array:
         """(C, R) mean over exposures centred at positions (C, R) or, the same for all columns, (1, R), in slots."""
         late, _ = self._until(positions + np.float32(exposure_slots / 2))
         early, _ = self._until(positions - np.float32(exposure_slots / 2))
@@ -246,7 +246,7 @@ class SlotLight:
         late *= np.float32(1 / exposure_slots)
         return late
 
-    def seen_with_slope(
+    def mean_and_slope(
         self, positions: FloatArray | Float32Array, exposure_slots: float
     ) -> tuple[Float32Array, Float32Array]:
         """What is `seen`, and its change per slot of time."""
@@ -259,11 +259,11 @@ class SlotLight:
         """Light up to the instants, and the slots that they fall into."""
         place = np.clip(instants + np.float64(self._BEYOND), 0, self._total.shape[1] - 1.001)
         left = place.astype(np.intp)
-        slots, total = taken(self._slots, left), taken(self._total, left)
+        slots, total = take_places(self._slots, left), take_places(self._total, left)
         return total + slots * (place - left).astype(np.float32), slots
 
 
-def taken(values: NDArray[Any], index: IntArray) -> NDArray[Any]:
+def take_places(values: NDArray[Any], index: IntArray) -> NDArray[Any]:
     """`values` (C, n) at the places (C, R) or, the same for all rows, (1, R)."""
     if index.shape[0] == 1:
         return np.asarray(values.take(index[0], axis=1))

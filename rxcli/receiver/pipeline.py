@@ -102,7 +102,7 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
         reception = decode_photograph(acquisition, options.skip, found.best.reception)
     camera, _ = settle(context, acquisition, reception)
     tried = tuple(one.step for one in found.tried)
-    result = replace(result, **outline.facts, **camera.facts, search=tried)
+    result = replace(result, **outline.result_fields, **camera.result_fields, search=tried)
     with timer("detect"):
         no_header = headerless(reception)
     with timer("denoise"):
@@ -120,7 +120,7 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
         options.min_confidence,
         denoised,
     )
-    columns = assemble.with_doubt(columns, outline.certainty, options.min_confidence)
+    columns = assemble.with_certainty(columns, outline.certainty, options.min_confidence)
     if camera.reversed:
         columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
     result = replace(
@@ -155,7 +155,7 @@ def failed(result: FrameResult, failure: Failure) -> FrameResult:
     """A result of which nothing more comes, with the reason."""
     # An estimate that shows no packets says nothing of the camera.
     camera = failure.context.camera if failure.context and failure.context.camera.hypothesis is None else None
-    facts = {**(failure.outline.facts if failure.outline else {}), **(camera.facts if camera else {})}
+    facts = {**(failure.outline.result_fields if failure.outline else {}), **(camera.result_fields if camera else {})}
     result = replace(result, **facts)
     return replace(
         result,

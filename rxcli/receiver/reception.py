@@ -12,7 +12,7 @@ from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel, sync
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import assemble, confidence, detect
-from rxcli.receiver.decode.soft_bits import of_observed, still_soft_bits
+from rxcli.receiver.decode.soft_bits import assume_unobserved_certain, still_soft_bits
 from rxcli.receiver.decode.steady import is_steady
 from rxcli.receiver.settings import SETTINGS
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, SlotSamples
@@ -73,9 +73,9 @@ def packet_llr(reception: Reception) -> float:
     return float(np.logaddexp(reception.column_llr, 0.0).sum())
 
 
-def packets_are_plain(reception: Reception) -> bool:
+def has_clear_packets(reception: Reception) -> bool:
     """Whether packets show beyond doubt."""
-    return packet_llr(reception) >= SETTINGS.plain_packets
+    return packet_llr(reception) >= SETTINGS.clear_packets_llr
 
 
 def word_log_prob(reception: Reception) -> FloatArray:
@@ -89,11 +89,11 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
     With few rows a slot or at the screen's edge light is not as the model has it, and headers are the first to tell.
     None has any where all the light is a steady periodic waveform.
     """
-    out = assemble.without_header(reception.posteriors.header_llr)
+    out = assemble.find_headerless(reception.posteriors.header_llr)
     if not out.all() and shows_steady_light(reception):
         return np.ones_like(out)
     if out.any():
-        out &= reception.column_llr < SETTINGS.packets_without_header
+        out &= reception.column_llr < SETTINGS.min_headerless_llr
     return out
 
 
@@ -111,7 +111,7 @@ def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
     return np.asarray((2 * n_lit < n_observed) | (n_observed == 0))
 
 
-def in_doubt(reception: Reception, certain: float) -> NDArray[np.bool_]:
+def has_doubtful_packet(reception: Reception, certain: float) -> NDArray[np.bool_]:
     """(C,) whether a packet that could be reported has less than the confidence `certain`."""
     doubtful = (reception.packet_confidence < certain) & (
         reception.posteriors.log_prob.min(axis=2) < SETTINGS.beyond_doubt_log_prob
@@ -124,7 +124,7 @@ def complete_packets(reception: Reception) -> NDArray[np.bool_]:
     return assemble.complete(assemble.slots_observed(reception.samples, reception.clock))
 
 
-def best_packet(reception: Reception) -> FloatArray:
+def best_log_prob(reception: Reception) -> FloatArray:
     """(C,) mean log probability of the symbols of each column's surest packet that could be reported."""
     return np.asarray(
         np.where(complete_packets(reception), reception.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0)
@@ -143,7 +143,7 @@ def soft_bits(
     n_observed = assemble.slots_observed(reception.samples, reception.clock)
     n_columns, n_strips = reception.samples.light.shape[:2]
     features = confidence.confidence_features(
-        of_observed(reception.posteriors, n_observed),
+        assume_unobserved_certain(reception.posteriors, n_observed),
         assemble.slot_margin_by_burst(slot_margin(reception), reception.clock),
         np.isin(np.arange(n_columns), list(denoised)),
         n_strips,

@@ -11,16 +11,16 @@ class WiringSettings:
 
     #: Packets, all columns together, which show plainly, nats: with a wrong camera they reach 103. It is right then but
     #: for their length, and other outlines are looked at with the screen that shows them alone.
-    plain_packets: float = 200.0
+    clear_packets_llr: float = 200.0
     #: Packets at which there may be some, nats: in a column of light without data, or all together where nothing but a
     #: grid says that there is a screen, or where none is received and an estimated camera is to be told. Wrong ones
     #: show less than 10, right ones 80. And headers and packets under which an initial pass leaves no hope of any: of
     #: 120 hard pictures that show packets, none had less than 74.
-    some_packets: float = 20.0
+    min_packets_llr: float = 20.0
 
     #: Samples a slot on which columns are compared, and by how many slots they may be apart: slats may slant.
     light_samples: int = 2
-    apart_slots: int = 10
+    max_column_shift_slots: int = 10
     #: Rows over which light is smoothed where no clock is known, the longest period of switching then, rows, and the
     #: share of the light that it explains.
     smooth_rows: int = 2
@@ -32,10 +32,10 @@ class WiringSettings:
     #: A column whose slots stand out less than this has no light to speak of.
     dark_snr_db: float = -3.0
     #: Weights that a quick look finds this much less likely than the best are dropped, nats.
-    hopeless_weight_nats: float = 20.0
+    weight_margin: float = 20.0
     #: A column whose slots are so much likelier packets than any slots, nats, has packets whether its header shows or
     #: not: on wrong clocks columns show 74 at most.
-    packets_without_header: float = 100.0
+    min_headerless_llr: float = 100.0
 
     #: Of an outline that is given, or of the picture, so much must be shared by both.
     min_overlap: float = 0.002
@@ -65,7 +65,7 @@ class StillSettings:
     beyond_repair_log_prob: float = -0.8
     #: Words of a symbol in doubt that are weighed; none where even the best has less log probability: there is nothing
     #: to choose from.
-    words_weighed: int = 4
+    n_candidate_words: int = 4
     hopeless_word_log_prob: float = -1.4
     #: Slots of strips that the network is shown, at most: it takes most of the time. Columns beyond them, the least
     #: sure, have their words weighed alone.

@@ -18,10 +18,10 @@ from rxcli.receiver.decode import detect
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
 from rxcli.receiver.reception import (
     Reception,
-    best_packet,
+    best_log_prob,
     complete_packets,
     dark_columns,
-    in_doubt,
+    has_doubtful_packet,
     packet_llr,
     word_log_prob,
 )
@@ -46,7 +46,7 @@ def _may_show_packets(first: Reception) -> bool:
     """Whether an initial pass leaves hope of packets; one that is in no doubt is hope enough."""
     if (first.packet_confidence[complete_packets(first)] > STILL.doubtful).any():
         return True
-    return packet_llr(first) + max(float(first.posteriors.header_llr.sum()), 0.0) > SETTINGS.some_packets
+    return packet_llr(first) + max(float(first.posteriors.header_llr.sum()), 0.0) > SETTINGS.min_packets_llr
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | None = None) -> Reception:
@@ -80,7 +80,7 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     samples = sync.sample_slots(acquisition.profiles, clock, STILL.coarse_samples)
     model = _light_model(acquisition, clock, samples)
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
-    first = channel.first_metrics(*contrast, model.exposure)
+    first = channel.initial_metrics(*contrast, model.exposure)
     clock = _in_bursts(acquisition, clock, first)
     lit = clock.on_grid(_first_decision(channel.by_burst(first, clock), model.exposure.isi_memory))
     columns = np.arange(samples.light.shape[0])
@@ -94,13 +94,13 @@ def initial_pass(acquisition: Acquisition) -> Reception:
 def _first_decision(metrics: FloatArray, isi_memory: int) -> Float32Array:
     """(B, C, packet) slots of bursts by the first guess of the metrics; longer exposures need the trellis."""
     if isi_memory == 1:
-        return detect.first_decision_of(metrics)
+        return detect.initial_slot_probability(metrics)
     return detect.detect(metrics, detect.plausible_weights(metrics, 0.0)).lit
 
 
 def doubtful_columns(reception: Reception, beyond_repair: float = -np.inf) -> NDArray[np.int64]:
     """Columns that get a second opinion: in doubt, but not beyond repair."""
-    return np.flatnonzero(in_doubt(reception, STILL.doubtful) & (best_packet(reception) > beyond_repair))
+    return np.flatnonzero(has_doubtful_packet(reception, STILL.doubtful) & (best_log_prob(reception) > beyond_repair))
 
 
 def _coarse(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
@@ -151,7 +151,7 @@ def _view(
     larger *= _rows_per_sample(clock, quick.samples_per_slot) / _rows_per_sample(clock, samples_per_slot)
     model = replace(
         reception.model,
-        noise=reception.model.noise.over(1 / larger),
+        noise=reception.model.noise.of_mean(1 / larger),
         crosstalk=Crosstalk.of(n_strips, acquisition.screen.light_spread),
         exposure=Exposure.of(clock.exposure_slots, samples_per_slot),
     )
@@ -210,7 +210,7 @@ def _worth_showing(reception: Reception, columns: NDArray[np.int64]) -> NDArray[
     assert reception.cleaned is not None
     n_strips = reception.cleaned[0].light.shape[1]
     most = max(STILL.max_network_slots // (n_strips * reception.clock.n_slots), 1)
-    return np.sort(columns[np.argsort(-best_packet(reception)[columns], kind="stable")[:most]])
+    return np.sort(columns[np.argsort(-best_log_prob(reception)[columns], kind="stable")[:most]])
 
 
 def _words_weighed(
@@ -219,9 +219,9 @@ def _words_weighed(
     """Metrics of some columns with the likeliest words of every symbol in doubt weighed as a whole."""
     clock = reception.clock
     bursts = channel.by_burst(metrics, clock)
-    candidates = detect.plausible_weights(bursts, SETTINGS.hopeless_weight_nats)
-    posteriors, doubtful = detect.detect_with_words(
-        bursts, candidates, STILL.doubtful_word_log_prob, STILL.words_weighed
+    candidates = detect.plausible_weights(bursts, SETTINGS.weight_margin)
+    posteriors, doubtful = detect.detect_with_candidates(
+        bursts, candidates, STILL.doubtful_word_log_prob, STILL.n_candidate_words
     )
     samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
     lit = clock.on_grid(reception.posteriors.with_columns(columns, posteriors).lit)
@@ -266,7 +266,7 @@ def _in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> C
 
 def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:
     bursts = channel.by_burst(metrics, clock)
-    return detect.detect(bursts, detect.plausible_weights(bursts, SETTINGS.hopeless_weight_nats))
+    return detect.detect(bursts, detect.plausible_weights(bursts, SETTINGS.weight_margin))
 
 
 def _light_model(acquisition: Acquisition, clock: Clock, samples: SlotSamples) -> channel.ObservationModel:

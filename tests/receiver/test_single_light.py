@@ -12,7 +12,7 @@ from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.no_data import draw_no_data
 from rxcli.lab.simulate.scenes import preset
 from rxcli.profiles import CameraProfile, ReadoutMode
-from rxcli.receiver.decode.steady import is_alike
+from rxcli.receiver.decode.steady import is_common_light
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.types import Frame
 
@@ -73,13 +73,13 @@ def test_columns_are_alike_that_show_one_light() -> None:
     slanted = np.stack([light[k : k + 300] for k in range(20)]).astype(np.float32)
     noisy = slanted + rng.normal(0, 0.5, slanted.shape).astype(np.float32)
     weight = np.ones_like(noisy)
-    assert is_alike(noisy, weight, 0.15, 20)
-    assert not is_alike(noisy, weight, 0.15)
+    assert is_common_light(noisy, weight, 0.15, 20)
+    assert not is_common_light(noisy, weight, 0.15)
     different = rng.normal(size=(20, 300)).astype(np.float32)
     different[:, ::4] = light[:75]
-    assert not is_alike(different, weight, 0.15, 20)
-    assert not is_alike(different[:2], weight[:2], 0.15)
-    assert not is_alike(np.zeros_like(weight), np.zeros_like(weight), 0.15, 20)
+    assert not is_common_light(different, weight, 0.15, 20)
+    assert not is_common_light(different[:2], weight[:2], 0.15)
+    assert not is_common_light(np.zeros_like(weight), np.zeros_like(weight), 0.15, 20)
 
 
 def test_columns_may_have_many_headers_in_common() -> None:
@@ -88,5 +88,5 @@ def test_columns_may_have_many_headers_in_common() -> None:
     light = np.sign(rng.normal(size=(20, 300))).astype(np.float32)
     light[:, np.arange(300) % 5 < 3] = light[0, np.arange(300) % 5 < 3]
     weight = np.ones_like(light)
-    assert is_alike(light, weight, 0.0)
-    assert not is_alike(light, weight, 0.4)
+    assert is_common_light(light, weight, 0.0)
+    assert not is_common_light(light, weight, 0.4)

@@ -22,7 +22,7 @@ from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.decode.detect import detect
 from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.pipeline import receive, receive_frame
-from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime, of_one_memory
+from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime, with_common_memory
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Clock, Float32Array, Frame, FrameResult
 
@@ -376,7 +376,7 @@ def test_known_picture_gives_back_the_columns_light() -> None:
 
     def frame() -> tuple[np.ndarray, np.ndarray]:
         bits = rng.integers(0, 2, (columns, 42)).astype(np.float32)
-        slots = SlotLight(bits).seen(np.arange(rows)[None] / 5 + 0.5, 1.08)
+        slots = SlotLight(bits).mean_over(np.arange(rows)[None] / 5 + 0.5, 1.08)
         light = np.full(picture.shape, black_level)
         for column in range(columns):
             for strip in range(strips):
@@ -402,7 +402,7 @@ def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, r
 
     def frame() -> tuple[Float32Array, Float32Array]:
         bits = rng.integers(0, 2, (columns, rows // 5 + 2)).astype(np.float32)
-        slots = SlotLight(bits).seen(np.arange(rows)[None] / 5 + 0.5, 1.0)
+        slots = SlotLight(bits).mean_over(np.arange(rows)[None] / 5 + 0.5, 1.0)
         return (picture * slots[:, None]).astype(np.float32), slots
 
     for _ in range(20):
@@ -487,7 +487,7 @@ def test_rows_that_were_never_lit_are_not_known() -> None:
 def test_metrics_of_unlike_memories_add_up() -> None:
     rng = np.random.default_rng(3)
     short, long = rng.normal(size=(2, 11, 4)), rng.normal(size=(2, 13, 16))
-    first, second = of_one_memory([short, long])
+    first, second = with_common_memory([short, long])
     assert np.array_equal(second, long)
     slots = rng.integers(0, 2, 16)
     for place in range(11):

@@ -10,7 +10,7 @@ from rxcli.numerics import TINY
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS
 from rxcli.receiver.camera.strips import levelled
-from rxcli.receiver.light import NoiseModel, light_of_columns
+from rxcli.receiver.light import NoiseModel, column_light
 from rxcli.types import BoolArray, Clock, FloatArray, RowProfiles
 
 
@@ -73,6 +73,6 @@ def _mean_likeness(slots: FloatArray, observed: BoolArray, distance: int) -> flo
 
 def _expected_likeness(n_strips: int, reach: int, screen: ScreenProfile) -> FloatArray:
     """(reach - 1,) correlation of strips 1, 2, .. apart, averaged over the screen."""
-    light = light_of_columns(n_strips, screen.columns, screen.light_spread)
+    light = column_light(n_strips, screen.columns, screen.light_spread)
     light /= np.linalg.norm(light, axis=1, keepdims=True)
     return np.array([float((light[:-d] * light[d:]).sum(axis=1).mean()) for d in range(1, reach)])

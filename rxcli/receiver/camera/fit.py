@@ -15,7 +15,7 @@ from rxcli.receiver.camera.curvature import curvature_terms, reversed_curvature
 from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, joined
-from rxcli.receiver.light import SlotLight, light_of_columns
+from rxcli.receiver.light import SlotLight, column_light
 from rxcli.types import Clock, Float32Array, FloatArray
 
 #: Rows over which the bend is straight: of a block of the normal equations.
@@ -104,7 +104,7 @@ class _Model:
     """
 
     def __init__(self, strips: Strips, lit: Float32Array, light_spread: float, rows_per_slot: float) -> None:
-        shares = light_of_columns(strips.light.shape[0], strips.n_columns, light_spread)
+        shares = column_light(strips.light.shape[0], strips.n_columns, light_spread)
         mixed = np.asarray(shares / shares.sum(axis=1, keepdims=True) @ lit, np.float32)
         self.strips = strips
         self._slots = SlotLight(mixed, 0.5)
@@ -128,7 +128,7 @@ class _Model:
     def exposure(self, values: FloatArray, exposure_slots: float) -> tuple[float, float]:
         """The exposure near one that leaves least, and its standard deviation, slots."""
         times, tried = self.times(values), exposure_slots * np.array(SETTINGS.exposure_factors)
-        left = [1 - self._near(self._slots.seen(times, exposure)).explained for exposure in tried.tolist()]
+        left = [1 - self._near(self._slots.mean_over(times, exposure)).explained for exposure in tried.tolist()]
         misfit = np.log(np.maximum(left, TINY))
         at = int(np.clip(misfit.argmin(), 1, tried.size - 2))
         curve, slope, _ = np.polyfit(tried[at - 1 : at + 2], misfit[at - 1 : at + 2], 2)
@@ -141,7 +141,7 @@ class _Model:
         """Gauss-Newton on the first `n_free` values: the row-time map, its covariance, the fit."""
         times = self.times(values)
         for _ in range(SETTINGS.settle_steps):
-            wave, slope = self._slots.seen_with_slope(times, exposure_slots)
+            wave, slope = self._slots.mean_and_slope(times, exposure_slots)
             near = self._near(wave)
             step, covariance = self._step(values, times, near, slope, n_free)
             values = values + step
@@ -202,7 +202,7 @@ class _Model:
         jacobian = np.concatenate([np.full((1, *pull.shape), -1.0), -times[None, :, middle], bend])[:n_free] / values[1]
         flat = jacobian.reshape(n_free, -1)
         prior = np.zeros((6, 6))
-        prior[2:, 2:] = SETTINGS.samples_as_one * _PRECISION
+        prior[2:, 2:] = SETTINGS.samples_per_independent * _PRECISION
         prior = prior[:n_free, :n_free]
         inverse = np.linalg.inv((flat * information.ravel()) @ flat.T + prior + TINY * np.eye(n_free))
         step = np.zeros(6)

@@ -68,7 +68,7 @@ class CameraSettings:
     #: Exposures around the one known that are compared, as factors.
     exposure_factors: tuple[float, ...] = (0.75, 1.0, 1.33)
     #: Samples of a slot and strips of a column err alike: so many of them say what one would.
-    samples_as_one: float = 10.0
+    samples_per_independent: float = 10.0
     #: A fit that explains less of the light's local variance, or moves any row by more slots, is none.
     min_explained: float = 0.1
     max_moved_slots: float = 20.0

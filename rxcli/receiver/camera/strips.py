@@ -61,7 +61,7 @@ def strips_of(profiles: RowProfiles, x: FloatArray, width: int, height: int) -> 
         x=pooled(x).mean(axis=1, dtype=np.float64),
         rows=profiles.rows.astype(np.float64),
         n_columns=n_columns,
-        noise=NoiseModel(profiles.noise_floor, profiles.noise_slope).over(pixels),
+        noise=NoiseModel(profiles.noise_floor, profiles.noise_slope).of_mean(pixels),
         width=width,
         height=height,
     )
@@ -82,7 +82,7 @@ def joined(strips: Strips, n: int) -> Strips:
         inside=(mean(strips.inside) > 0.99).astype(np.float32),
         x=mean(strips.x),
         rows=mean(strips.rows),
-        noise=strips.noise.over(n),
+        noise=strips.noise.of_mean(n),
     )
 
 

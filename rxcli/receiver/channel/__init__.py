@@ -26,7 +26,7 @@ its innovations.
 
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
 from rxcli.receiver.channel.model import ObservationModel, estimate_black_level, estimate_sigma
-from rxcli.receiver.channel.patterns import by_burst, first_metrics, metrics_of
+from rxcli.receiver.channel.patterns import by_burst, initial_metrics, metrics_of
 from rxcli.receiver.channel.words import word_corrections
 
 __all__ = [
@@ -35,7 +35,7 @@ __all__ = [
     "by_burst",
     "estimate_black_level",
     "estimate_sigma",
-    "first_metrics",
+    "initial_metrics",
     "metrics_of",
     "slot_likelihoods",
     "word_corrections",

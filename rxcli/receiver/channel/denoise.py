@@ -135,7 +135,7 @@ def _explain(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Explained:
     sums = PictureSums.of(*(by_place(each, q) for each in (light, whole, valid)))
     prediction = predict_picture(sums, model.noise.floor, SETTINGS.picture_scales, one_sided=False)
     picture = in_time(prediction.at_samples(q))
-    noise = model.noise.through(picture, np.repeat(prediction.variance[0], q, axis=-1), whole)
+    noise = model.noise.through_picture(picture, np.repeat(prediction.variance[0], q, axis=-1), whole)
     scale = np.asarray(valid / np.sqrt(noise), np.float32)
     residual = (light - picture * whole) * scale
     return _Explained(light, expected, scale, picture * expected.own * scale, residual)

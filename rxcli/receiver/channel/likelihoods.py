@@ -105,7 +105,7 @@ class _Part:
 
 
 def _likelihoods(part: _Part, thorough: bool) -> SlotLikelihoods:
-    scales = SETTINGS.picture_scales if thorough else SETTINGS.first_scales
+    scales = SETTINGS.picture_scales if thorough else SETTINGS.initial_scales
     sums = PictureSums.of(part.light, part.whole, part.valid)
     prediction = predict_picture(sums, part.model.noise.floor, scales, one_sided=thorough)
     timing = np.zeros((part.light.shape[1], 2)) if part.slope is None else _timing(part, prediction)
@@ -119,7 +119,7 @@ def _slot_snr(part: _Part, prediction: Prediction) -> Float32Array:
     """
     picture = prediction.picture[0, 1]
     contrast = picture * part.own
-    noise = part.model.noise.through(picture, prediction.variance[0], part.own)
+    noise = part.model.noise.through_picture(picture, prediction.variance[0], part.own)
     ratio = contrast * contrast / noise * part.valid[len(part.valid) // 2]
     return np.asarray(ratio.sum(axis=1) * np.float32(SETTINGS.slot_information))
 
@@ -130,7 +130,7 @@ def _timing(part: _Part, prediction: Prediction) -> FloatArray:
     picture = prediction.at_samples(len(part.light))
     change = picture * part.slope
     residual = part.light - picture * part.whole
-    variance = part.model.noise.through(picture, prediction.variance[0], part.whole)
+    variance = part.model.noise.through_picture(picture, prediction.variance[0], part.whole)
     weight = part.valid / (variance + residual * residual / np.float32(_DEGREES))
     of_columns = (0, 2, 3)
     numerator = (weight * residual * change).sum(axis=of_columns, dtype=np.float64)

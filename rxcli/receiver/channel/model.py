@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.receiver.channel.settings import SETTINGS
-from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, shows_dark_header
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, sees_dark_header
 from rxcli.types import Clock, Float32Array, SlotSamples
 
 
@@ -33,7 +33,7 @@ class ObservationModel:
             slope: whether to tell the change with time as well.
         """
         ahead = np.diff(clock.delay_slots) * self.exposure.samples_per_slot if clock.delay_slots.any() else None
-        shape = self.exposure.seen(lit)
+        shape = self.exposure.mean_light(lit)
         others, own = self.crosstalk.from_neighbours(shape, columns, ahead), self.crosstalk.own
         if not slope:
             return Expected(others, own, shape[columns, None], None)
@@ -74,7 +74,7 @@ def estimate_black_level(samples: SlotSamples, clock: Clock) -> float:
     """Light of a dark slot: the median of what is seen in the middle of the headers' three dark slots."""
     q = samples.samples_per_slot
     places = (np.arange(samples.light.shape[-1]) + 0.5) / q + clock.first_slot
-    dark = shows_dark_header(places % clock.packet_slots, clock.exposure_slots, least=0.5)
+    dark = sees_dark_header(places % clock.packet_slots, clock.exposure_slots, least=0.5)
     observed = samples.light[..., dark][samples.valid[..., dark] > 0]
     return float(np.median(observed)) if observed.size else 0.0
 

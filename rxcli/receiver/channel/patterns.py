@@ -18,7 +18,7 @@ from rxcli.types import Clock, Float32Array, FloatArray
 _NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(8) / 7)
 
 
-def first_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposure) -> FloatArray:
+def initial_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposure) -> FloatArray:
     """First guess of the metrics (C, N + memory, patterns), from contrast alone.
 
     Args:
@@ -28,8 +28,8 @@ def first_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposure
     """
     # Squared errors, so weighted that a slot seen right in all samples has the log-likelihood ratio of the constant.
     q = exposure.samples_per_slot
-    most = np.float32(SETTINGS.first_llr / 4 / q)
-    trust = np.minimum(weight / np.float32(SETTINGS.first_strips), 1) * most
+    most = np.float32(SETTINGS.initial_llr / 4 / q)
+    trust = np.minimum(weight / np.float32(SETTINGS.initial_full_strips), 1) * most
     value = np.clip(pooled, -1.5, 1.5)
 
     def of_level(place: int, level: float) -> Float32Array:

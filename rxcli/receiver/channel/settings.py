@@ -16,13 +16,13 @@ class ChannelSettings:
     dark_light: float = 0.002
     #: Log-likelihood ratio that the first guess gives a slot seen at full contrast, and strips of full contrast from
     #: which on it does.
-    first_llr: float = 8.0
-    first_strips: float = 3.0
+    initial_llr: float = 8.0
+    initial_full_strips: float = 3.0
 
     #: Slots on a side from which the picture is predicted, fine texture to plain sky; a first pass takes those that
     #: suit most.
     picture_scales: tuple[int, ...] = (1, 2, 5, 12)
-    first_scales: tuple[int, ...] = (2, 5)
+    initial_scales: tuple[int, ...] = (2, 5)
     #: Slots over which the error of a prediction is averaged, and bounds of its variance, relative to the picture's
     #: square: the least keeps a plain picture from being sure beyond what crosstalk is known to.
     error_slots: int = 28

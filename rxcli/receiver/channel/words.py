@@ -128,7 +128,7 @@ def _word_levels(
     slots[(at < 0) | (at >= lit.shape[1])] = 0.5
     slots[:, lead : lead + SLOTS_PER_SYMBOL] = words
     skip = model.exposure.isi_memory * q
-    return _paired(model.exposure.seen(slots)[:, skip:-skip])
+    return _paired(model.exposure.mean_light(slots)[:, skip:-skip])
 
 
 def _process_likelihood(

@@ -13,7 +13,7 @@ from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble, detect
 from rxcli.receiver.settings import SETTINGS as receiver_settings
-from rxcli.receiver.sync.tracking import Bursts, of_one_memory
+from rxcli.receiver.sync.tracking import Bursts, with_common_memory
 from rxcli.types import Float32Array, FloatArray, IntArray
 
 
@@ -88,7 +88,7 @@ class BurstReader:
         if self._weights is None or self._weights.shape[0] != self.open.n_columns:
             self._weights = np.zeros((self.open.n_columns, len(WEIGHTS)), bool)
         places = [np.nonzero(wanted) for _, wanted in found]
-        metrics = of_one_memory([self.open.metrics(numbers) for numbers, _ in found])
+        metrics = with_common_memory([self.open.metrics(numbers) for numbers, _ in found])
         weights = [_settled_weights(self._weights, m, wanted) for m, (_, wanted) in zip(metrics, found, strict=True)]
         number = np.concatenate([numbers[burst] for (numbers, _), (burst, _) in zip(found, places, strict=True)])
         column = np.concatenate([c for _, c in places])
@@ -146,7 +146,7 @@ def _settled_weights(before: NDArray[np.bool_], metrics: FloatArray, wanted: NDA
     weights = before.copy()
     unknown = columns[~weights[columns].any(axis=1)]
     if unknown.size:
-        weights[unknown] = detect.plausible_weights(metrics[bursts][:, unknown], receiver_settings.hopeless_weight_nats)
+        weights[unknown] = detect.plausible_weights(metrics[bursts][:, unknown], receiver_settings.weight_margin)
     several = columns[weights[columns].sum(axis=1) > 1]
     if several.size:
         confidence_features = detect.weight_log_evidence(metrics[bursts][:, several], weights[several])

@@ -27,7 +27,7 @@ from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
-from rxcli.receiver.reception import Reception, complete_packets, packets_are_plain, shows_steady_light
+from rxcli.receiver.reception import Reception, complete_packets, has_clear_packets, shows_steady_light
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.nulls import STEADY_LIGHT, light_without_data
 from rxcli.receiver.still import apply_autoencoder, decode, decode_photograph, doubtful_columns, initial_pass
@@ -84,11 +84,11 @@ class _Link:
     def headerless(self, closed: Sequence[tracking.ClosedBurst], n_columns: int) -> BoolArray:
         """(C,) columns that show no headers, in all bursts up to some that are closed."""
         header_llr = np.zeros((1, n_columns)) if self.header_llr is None else self.header_llr
-        most = decode_settings.good_header_nats
+        most = decode_settings.max_header_llr
         for burst in closed:
             header_llr = header_llr + np.clip(burst.posteriors.header_llr, -most, most)
         self.header_llr = header_llr
-        return assemble.without_header(header_llr) if closed else np.zeros(n_columns, bool)
+        return assemble.find_headerless(header_llr) if closed else np.zeros(n_columns, bool)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -277,7 +277,7 @@ class _Clip:
             waiting.view = view
             waiting.result = replace(
                 waiting.result,
-                **view.context.camera.facts,
+                **view.context.camera.result_fields,
                 screen_profile=view.acquisition.screen.name,
                 corners=self._corners,
             )
@@ -574,7 +574,7 @@ class _Clip:
         assert first is not None
         shown = np.ptp(np.flatnonzero(first.acquisition.profiles.inside.any(axis=(0, 1))))
         rate_hz = first.acquisition.screen.slot_rate_hz
-        self._stretch = link.time.stretch_of_stamps(float(shown) / first.bursts.clock.rows_per_slot / rate_hz)
+        self._stretch = link.time.time_stamp_stretch(float(shown) / first.bursts.clock.rows_per_slot / rate_hz)
         if self._stretch == link.time.stretch:
             return
         link.time = tracking.LinkTime(link.time.packet_slots, rate_hz, self._stretch or 1.0)
@@ -720,9 +720,9 @@ class _Clip:
         closed = bursts.open.close(np.setdiff1d(waiting.numbers, going_on))
         ended = results.bursts_of(closed, int(waiting.numbers[0]), view)
         columns = results.columns_of(view, ended, bursts.confidence(going_on), self._options.min_confidence)
-        columns = assemble.with_doubt(columns, self._certainty, self._options.min_confidence)
+        columns = assemble.with_certainty(columns, self._certainty, self._options.min_confidence)
         if self._link is not None:
-            columns = assemble.without_packets(columns, self._link.headerless(closed, len(columns)))
+            columns = assemble.drop_headerless_packets(columns, self._link.headerless(closed, len(columns)))
         if self._options.dump_dir is not None:
             found = results.taps(waiting, view, ended)
             dump_stages(self._options.dump_dir, waiting.result.source, waiting.result.frame, found)
@@ -795,7 +795,7 @@ def _doubt_of(reception: Reception) -> float:
 def _shows_packets(reception: Reception, doubt: float) -> bool:
     """Whether a camera explains a frame: less than a share of the columns is in `doubt` where packets are whole, and
     the slots look like packets where none is."""
-    return _doubt_of(reception) < doubt if complete_packets(reception).any() else packets_are_plain(reception)
+    return _doubt_of(reception) < doubt if complete_packets(reception).any() else has_clear_packets(reception)
 
 
 def _taken_with(frame: Frame) -> tuple[object, ...]:

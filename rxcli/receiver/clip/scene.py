@@ -80,7 +80,7 @@ class TrackedScreen:
             strips.inside,
             Crosstalk.of(strips.inside.shape[1], acquisition.screen.light_spread),
             black_level,
-            NoiseModel(max(profiles.noise_floor, SETTINGS.min_variance * strips.pixels), profiles.noise_slope).over(
+            NoiseModel(max(profiles.noise_floor, SETTINGS.min_variance * strips.pixels), profiles.noise_slope).of_mean(
                 strips.pixels
             ),
         )
@@ -395,7 +395,7 @@ class TrackedScreen:
         self._n_updates += 1
         clock = view.bursts.clock
         positions = known_picture.row_positions(view.pose.rows, clock)
-        slots = SlotLight(lit).seen(positions, clock.exposure_slots)
+        slots = SlotLight(lit).mean_over(positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
         look = known_picture.Look(view.light, slots, trust, view.pose.placement, self._frame_rows(view.pose))
         self._picture.learn(look, forget=forget)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS, bits_per_symbol, indices_to_bits
-from rxcli.receiver.decode.confidence import BurstInClip, Doubts, clip_doubts, confidence_features, doubts_of
+from rxcli.receiver.decode.confidence import BurstInClip, Quality, clip_quality, confidence_features, still_quality
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import (
     BELIEVABLE,
@@ -49,7 +49,7 @@ def column_results(
         snr: (C, N) squared contrast over variance of every slot of the grid.
         samples: the samples, for what was visible.
         slot_margin: (C, N) what the light says for every slot as decided, see `detect.slot_margin`.
-        headerless: (C,) columns that show no packets, whatever was decided of their slots, see `without_header`.
+        headerless: (C,) columns that show no packets, whatever was decided of their slots, see `find_headerless`.
         min_confidence: packets below it are left out.
         denoised: columns in which corrections of the auto-encoder were kept.
     """
@@ -57,7 +57,7 @@ def column_results(
     whole = complete(n_observed)
     was_denoised = np.isin(np.arange(len(snr)), list(denoised))
     by_burst = slot_margin_by_burst(slot_margin, clock)
-    doubts = doubts_of(posteriors, confidence_features(posteriors, by_burst, was_denoised, samples.light.shape[1]))
+    doubts = still_quality(posteriors, confidence_features(posteriors, by_burst, was_denoised, samples.light.shape[1]))
     snr_db = snr_db_of_columns(snr)
     echoing: BoolArray = np.any(echoes(posteriors, snr_db) & whole, axis=0)
     reported = whole & doubts.reported(min_confidence)
@@ -67,7 +67,7 @@ def column_results(
     ]
     held_back = np.where(whole & doubts.reported(0.0) & ~reported, doubts.confidence, 0.0).max(axis=0)
     shown = reported & [not why for why in against]
-    if not (doubts.confidence[shown] >= SETTINGS.surest_packet).any():
+    if not (doubts.confidence[shown] >= SETTINGS.min_best_confidence).any():
         reported = np.zeros_like(reported)  # Light without data: what looks like a packet or two is chance.
     packets = [_Packets.of(burst, clock, posteriors, counted, doubts) for burst, counted in enumerate(n_observed)]
     return tuple(
@@ -79,7 +79,7 @@ def column_results(
             n_observed[:, column],
             () if against[column] else _of_column(packets, reported, column),
             against[column],
-            _held_back(held_back[column], min_confidence),
+            _withheld(held_back[column], min_confidence),
             bool(was_denoised[column]),
         )
         for column, db in enumerate(snr_db)
@@ -94,11 +94,11 @@ def _of_column(packets: Sequence[_Packets], reported: BoolArray, column: int) ->
 def _why_headerless(samples: SlotSamples, column: int) -> str:
     """What may be wrong with a column that shows slots but no header, by whether its light is cut off at white."""
     light = samples.light[column][samples.valid[column] > 0]
-    overexposed = light.size > 0 and float(np.mean(light >= SETTINGS.white)) > SETTINGS.cut_off_share
+    overexposed = light.size > 0 and float(np.mean(light >= SETTINGS.white_level)) > SETTINGS.overexposed_share
     return _HEADERLESS + (_OVEREXPOSED if overexposed else _OTHER_SCREEN)
 
 
-def _held_back(confidence: float, min_confidence: float) -> str | None:
+def _withheld(confidence: float, min_confidence: float) -> str | None:
     """What to say of a column whose surest packet is not sure enough to be reported; None where there is none."""
     if not 0 < confidence < min_confidence:
         return None
@@ -118,7 +118,7 @@ def clip_results(
         min_confidence: packets below it are left out.
     """
     snr_db = snr_db_of_columns(snr)
-    doubts = [clip_doubts(burst) for burst in bursts]
+    doubts = [clip_quality(burst) for burst in bursts]
     whole = [complete(burst.n_observed[None])[0] for burst in bursts]
     reported = [
         (seen & ~echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]).tolist()
@@ -141,7 +141,7 @@ def clip_results(
             if shown[column]
         )
         result = _clip_column(column, clock, bursts, float(going_on[column]), db, packets)
-        if not packets and result.status != "ok" and (message := _held_back(float(held_back[column]), min_confidence)):
+        if not packets and result.status != "ok" and (message := _withheld(float(held_back[column]), min_confidence)):
             result = replace(result, message=message)
         out.append(result)
     return tuple(out)
@@ -251,7 +251,7 @@ def _column_result(
     held_back: str | None,
     denoised: bool,
 ) -> ColumnResult:
-    sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(SETTINGS.sure_weight)
+    sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(SETTINGS.min_weight_probability)
     status = _column_status(packets, snr_db)
     return ColumnResult(
         column=column,
@@ -282,19 +282,19 @@ def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolA
     return np.asarray(two & beside)
 
 
-def without_header(header_llr: FloatArray) -> BoolArray:
+def find_headerless(header_llr: FloatArray) -> BoolArray:
     """(C,) columns whose header does not show; all where the columns together show none: no light, no packet.
 
     Args:
         header_llr: (B, C) of bursts, see `BurstPosteriors`.
     """
     # A glare may spoil one header altogether: a good one elsewhere outweighs it.
-    by_column = np.maximum(header_llr, -SETTINGS.good_header_nats).sum(axis=0)
-    together = np.maximum(by_column, -SETTINGS.good_header_nats).sum() > SETTINGS.headers_nats
-    return np.asarray(by_column < (SETTINGS.contradicted_nats if together else np.inf), bool)
+    by_column = np.maximum(header_llr, -SETTINGS.max_header_llr).sum(axis=0)
+    together = np.maximum(by_column, -SETTINGS.max_header_llr).sum() > SETTINGS.min_total_header_llr
+    return np.asarray(by_column < (SETTINGS.min_header_llr if together else np.inf), bool)
 
 
-def without_packets(columns: tuple[ColumnResult, ...], headerless: BoolArray) -> tuple[ColumnResult, ...]:
+def drop_headerless_packets(columns: tuple[ColumnResult, ...], headerless: BoolArray) -> tuple[ColumnResult, ...]:
     """Columns of a clip, without the packets of those (C,) of which headers say that there are none."""
     message = _HEADERLESS + _OTHER_SCREEN
     return tuple(
@@ -340,7 +340,7 @@ class _Packets:
 
     @classmethod
     def of(
-        cls, burst: int, clock: Clock, posteriors: BurstPosteriors, n_observed: IntArray, doubts: Doubts
+        cls, burst: int, clock: Clock, posteriors: BurstPosteriors, n_observed: IntArray, doubts: Quality
     ) -> _Packets:
         """Of a burst; `n_observed` is (C, packet)."""
         bits = [bits_per_symbol(w) for w in posteriors.w.tolist()]
@@ -391,7 +391,9 @@ def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Arra
     return np.asarray(payload_of[:, None] * slot_margin)
 
 
-def with_doubt(columns: tuple[ColumnResult, ...], certainty: float, min_confidence: float) -> tuple[ColumnResult, ...]:
+def with_certainty(
+    columns: tuple[ColumnResult, ...], certainty: float, min_confidence: float
+) -> tuple[ColumnResult, ...]:
     """Columns whose packets are right with their numbers, which are right with some certainty.
 
     Args:

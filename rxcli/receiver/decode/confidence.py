@@ -17,7 +17,7 @@ from rxcli.resources import data_dir
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
 
 #: What slots say against a packet is taken to be at least this, nats, so that its logarithm exists.
-_AGAINST_AT_LEAST = 0.5
+_MIN_CONTRADICTION = 0.5
 #: Features that differ by less are equal, but for their digits.
 _SAME = 1e-4
 #: Doubt that is left in the surest packet, and at most in any, nats: what a log-odds can hold.
@@ -36,8 +36,8 @@ class _Clips(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class _WrongBits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    at_evens: float
-    share_at_evens: float
+    wrong_bits_at_even_odds: float
+    wrong_share_at_even_odds: float
     exponent: float
 
 
@@ -76,7 +76,7 @@ class BurstInClip:
 
 
 @dataclass(frozen=True, slots=True)
-class Doubts:
+class Quality:
     """How sure the packets of B bursts and C columns are."""
 
     #: (B, C) probability that they are error-free, and expected share of wrong bits.
@@ -90,8 +90,8 @@ class Doubts:
         return np.asarray((self.ber_hat <= SETTINGS.max_ber_hat) & (self.confidence >= min_confidence))
 
 
-def doubts_of(posteriors: BurstPosteriors, confidence_features: FloatArray) -> Doubts:
-    return Doubts(confidence(confidence_features), _share_unsure(posteriors), confidence_features)
+def still_quality(posteriors: BurstPosteriors, confidence_features: FloatArray) -> Quality:
+    return Quality(confidence(confidence_features), _share_unsure(posteriors), confidence_features)
 
 
 def _share_unsure(posteriors: BurstPosteriors) -> FloatArray:
@@ -100,26 +100,26 @@ def _share_unsure(posteriors: BurstPosteriors) -> FloatArray:
     return np.asarray(np.nanmean(unsure, axis=(2, 3)))
 
 
-def clip_doubts(burst: BurstInClip) -> Doubts:
+def clip_quality(burst: BurstInClip) -> Quality:
     """How sure the packets of a burst of a clip are.
 
     Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
     What slots say against the codeword that was decided shows it.
     """
     if burst.confidence_features is not None:
-        return doubts_of(burst.posteriors, burst.confidence_features[None])
+        return still_quality(burst.posteriors, burst.confidence_features[None])
     features = clip_features(burst)[None]
     log_odds = clip_log_odds(burst)
     n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
     ber_hat = np.maximum(_share_unsure(burst.posteriors), wrong_share(log_odds, n_bits))
-    return Doubts(_probability(log_odds), ber_hat, features)
+    return Quality(_probability(log_odds), ber_hat, features)
 
 
 def wrong_share(log_odds: FloatArray, n_bits: IntArray) -> FloatArray:
     """Share of wrong bits to expect in packets that are error-free with some log-odds and have so many bits."""
     model = confidence_model().wrong_bits
-    at_evens = np.maximum(model.at_evens / n_bits, model.share_at_evens)
-    return np.asarray(np.minimum(at_evens * np.exp(-model.exponent * log_odds), 0.5))
+    wrong_bits_at_even_odds = np.maximum(model.wrong_bits_at_even_odds / n_bits, model.wrong_share_at_even_odds)
+    return np.asarray(np.minimum(wrong_bits_at_even_odds * np.exp(-model.exponent * log_odds), 0.5))
 
 
 def clip_log_odds(burst: BurstInClip) -> FloatArray:
@@ -136,7 +136,7 @@ def clip_features(burst: BurstInClip) -> FloatArray:
     """
     assert burst.against is not None
     log_odds = np.minimum(_log_odds(burst.posteriors.log_prob.sum(axis=2))[0], confidence_model().clips.max_log_odds)
-    return np.stack([np.ones_like(log_odds), log_odds, np.log(burst.against + _AGAINST_AT_LEAST)], axis=1)
+    return np.stack([np.ones_like(log_odds), log_odds, np.log(burst.against + _MIN_CONTRADICTION)], axis=1)
 
 
 def confidence_features(
@@ -158,9 +158,9 @@ def confidence_features(
     """
     model = confidence_model().photographs
     log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), model.max_log_odds)
-    against = np.log(_AGAINST_AT_LEAST - np.minimum(slot_margin, 0).sum(axis=2))
-    n_heard_slots = np.maximum((slot_margin != 0).sum(axis=2), 1)
-    average = np.log(np.clip(slot_margin.sum(axis=2) / n_heard_slots, 1, model.max_average))
+    against = np.log(_MIN_CONTRADICTION - np.minimum(slot_margin, 0).sum(axis=2))
+    n_observed_slots = np.maximum((slot_margin != 0).sum(axis=2), 1)
+    average = np.log(np.clip(slot_margin.sum(axis=2) / n_observed_slots, 1, model.max_average))
     strips = np.log(n_strips)
     terms = (1.0, log_odds, denoised, against, average, average * log_odds, strips, strips * log_odds)
     return np.stack([np.broadcast_to(term, log_odds.shape) for term in terms], axis=2).astype(np.float64)

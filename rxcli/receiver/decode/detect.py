@@ -63,7 +63,7 @@ class _Branches:
     #: Patterns of header and dimming symbol, from the first slot whose predecessors are known.
     preamble: NDArray[np.int64]
     #: State that header and dimming symbol end in.
-    first_state: int
+    initial_state: int
     #: (states, memory) patterns of the next header's first slots after each state.
     tail: NDArray[np.int64]
 
@@ -81,7 +81,7 @@ def _states(isi_memory: int) -> NDArray[np.int64]:
 
 
 @lru_cache(maxsize=8)
-def _meeting_patterns(isi_memory: int) -> NDArray[np.int64]:
+def _boundary_patterns(isi_memory: int) -> NDArray[np.int64]:
     """(memory, states * beginnings) pattern at each of a word's first slots, by the state before and these slots."""
     states = _states(isi_memory)
     either = np.concatenate([np.repeat(states, len(states), axis=0), np.tile(states, (len(states), 1))], axis=1)
@@ -116,7 +116,7 @@ def _log_sum(values: FloatArray, axis: int) -> FloatArray:
     return np.asarray((top + np.log(np.exp(values - top).sum(axis=axis, keepdims=True))).squeeze(axis))
 
 
-def _over_few(combine: np.ufunc, values: FloatArray) -> FloatArray:
+def _reduce_short_axis(combine: np.ufunc, values: FloatArray) -> FloatArray:
     """Sum or maximum over a short last axis, where going by slices is quicker than a reduction."""
     total = values[..., 0]
     for number in range(1, values.shape[-1]):
@@ -153,7 +153,7 @@ def _payload_of(metrics: FloatArray) -> _Payload:
     n, length, n_patterns = metrics.shape
     by_packet = metrics[:, PREAMBLE_SLOTS : length - isi_memory].reshape(n, -1, SLOTS_PER_SYMBOL, n_patterns)
     slots = by_packet.swapaxes(0, 1).reshape(-1, SLOTS_PER_SYMBOL, n_patterns)
-    patterns = _meeting_patterns(isi_memory)
+    patterns = _boundary_patterns(isi_memory)
     meeting = slots[:, 0].take(patterns[0], axis=1)
     for slot in range(1, isi_memory):
         meeting += slots[:, slot].take(patterns[slot], axis=1)
@@ -228,9 +228,9 @@ def _hypotheses(payload: _Payload, candidates: NDArray[np.bool_]) -> list[_Hypot
     weights = [w for w in WEIGHTS if columns[w].size]
     trellises = [_trellis(payload.of_packets(packets[:, columns[w]].ravel()), w) for w in weights]
     # One chain for all weights, there and back: symbols come one after the other, whatever else is worked on together.
-    there = np.concatenate([one.transitions() for one in trellises], axis=1)
+    there = np.concatenate([trellis.transitions() for trellis in trellises], axis=1)
     back = there[::-1].swapaxes(2, 3)
-    ends = [np.concatenate([getattr(one, end) for one in trellises]) for end in ("start", "end")]
+    ends = [np.concatenate([getattr(trellis, end) for trellis in trellises]) for end in ("start", "end")]
     states, log_scale = _chain(np.concatenate([there, back], axis=1), np.concatenate(ends))
     n = there.shape[1]
     before, after = states[:, :n], states[::-1, n:]
@@ -271,7 +271,7 @@ def _trellis(payload: _Payload, w: int) -> _Trellis:
     rest = np.exp(np.maximum(of_words, _MIN_WORD).astype(np.float32))
     end, top_end = _over_likeliest(metrics[:, length - isi_memory + np.arange(isi_memory), branches.tail].sum(axis=2))
     start = np.zeros((n, 1 << isi_memory))
-    start[:, branches.first_state] = 1.0
+    start[:, branches.initial_state] = 1.0
     scale = payload.log_scale + top.reshape(n, -1).sum(axis=1) + top_end[:, 0]
     return _Trellis(
         branches,
@@ -302,7 +302,7 @@ def slot_llr(metrics: FloatArray) -> Float32Array:
     """
     isi_memory = _isi_memory_of(metrics)
     n_slots = metrics.shape[-2] - isi_memory
-    likelihood = np.exp((metrics - _over_few(np.maximum, metrics)[..., None]).astype(np.float32))
+    likelihood = np.exp((metrics - _reduce_short_axis(np.maximum, metrics)[..., None]).astype(np.float32))
     sums = np.log(likelihood @ _lit_and_dark(isi_memory) + np.float32(_TINY))
     odds = sums[..., : isi_memory + 1] - sums[..., isi_memory + 1 :]
     return np.asarray(sum(odds[..., age : age + n_slots, age] for age in range(isi_memory + 1)), np.float32)
@@ -330,13 +330,11 @@ def slot_margin(metrics: FloatArray, decided: NDArray[np.bool_]) -> Float32Array
     isi_memory, n_slots = _isi_memory_of(metrics), decided.shape[-1]
     around = [(0, 0)] * (decided.ndim - 1)
     pattern = _pattern_index(np.pad(decided, [*around, (isi_memory, isi_memory)]).astype(np.uint8), isi_memory)
-    slot_margin = np.zeros(decided.shape)
+    margin = np.zeros(decided.shape)
     for age in range(isi_memory + 1):
-        n_observed, shown = metrics[..., age : age + n_slots, :], pattern[..., age : age + n_slots, None]
-        slot_margin += (
-            np.take_along_axis(n_observed, shown, -1) - np.take_along_axis(n_observed, shown ^ (1 << age), -1)
-        )[..., 0]
-    return slot_margin.astype(np.float32)
+        metric, index = metrics[..., age : age + n_slots, :], pattern[..., age : age + n_slots, None]
+        margin += (np.take_along_axis(metric, index, -1) - np.take_along_axis(metric, index ^ (1 << age), -1))[..., 0]
+    return margin.astype(np.float32)
 
 
 def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
@@ -363,7 +361,7 @@ def _symbols_llr(metrics: FloatArray) -> Float32Array:
 
 def _weight_scores(symbols: Float32Array) -> FloatArray:
     """(C, 9) log-likelihood of every weight from the log-likelihood ratios (B, C, symbols, 10) of slots."""
-    symbols = np.clip(symbols, -SETTINGS.sure_nats, SETTINGS.sure_nats)
+    symbols = np.clip(symbols, -SETTINGS.max_slot_llr, SETTINGS.max_slot_llr)
     payload = symbols[:, :, 2:]
     coefficients = np.zeros((*payload.shape[:3], SLOTS_PER_SYMBOL + 1))
     coefficients[..., 0] = 1.0
@@ -374,7 +372,7 @@ def _weight_scores(symbols: Float32Array) -> FloatArray:
     return np.asarray(score + np.cumsum(symbols[:, :, 1], axis=2)[..., : len(WEIGHTS)].sum(axis=0))
 
 
-def first_decision_of(metrics: FloatArray) -> Float32Array:
+def initial_slot_probability(metrics: FloatArray) -> Float32Array:
     """Probability of every slot of B bursts being lit, (B, C, packet), every symbol by itself.
 
     What slots share with their neighbours is told by `slot_llr` alone, so that no trellis is needed; as a start for the
@@ -419,8 +417,8 @@ def _packets(metrics: FloatArray, columns: NDArray[np.int64]) -> FloatArray:
 def _of_weights(hypotheses: list[_Hypothesis], n_columns: int) -> FloatArray:
     """(C, 9) log evidence of every weight, -inf where nobody asked."""
     out = np.full((n_columns, len(WEIGHTS)), -np.inf)
-    for one in hypotheses:
-        out[one.columns, one.w - 1] = one.log_evidence
+    for hypothesis in hypotheses:
+        out[hypothesis.columns, hypothesis.w - 1] = hypothesis.log_evidence
     return out
 
 
@@ -495,7 +493,7 @@ class DoubtfulWords:
     log_prob: FloatArray
 
 
-def detect_with_words(
+def detect_with_candidates(
     metrics: FloatArray, candidates: NDArray[np.bool_], certain: float, most: int
 ) -> tuple[BurstPosteriors, DoubtfulWords]:
     """Weights and symbols as `detect` gives them, and the words between which it was in doubt.
@@ -513,7 +511,7 @@ def detect_with_words(
     found: list[DoubtfulWords] = []
 
     def on_posteriors(w: int, columns: NDArray[np.int64], word: FloatArray) -> None:
-        found.append(_in_doubt(word, w, columns, certain, most))
+        found.append(_doubtful_words(word, w, columns, certain, most))
 
     posteriors = _posteriors(metrics, candidates, on_posteriors)
     return posteriors, DoubtfulWords(
@@ -523,7 +521,7 @@ def detect_with_words(
     )
 
 
-def _in_doubt(word: FloatArray, w: int, columns: NDArray[np.int64], certain: float, most: int) -> DoubtfulWords:
+def _doubtful_words(word: FloatArray, w: int, columns: NDArray[np.int64], certain: float, most: int) -> DoubtfulWords:
     """Symbols in doubt of columns of one weight, from the probability of every word, (B, columns, N, words)."""
     at = np.argwhere(word.max(axis=3) < np.exp(certain))
     doubtful = word[tuple(at.T)]
@@ -595,5 +593,5 @@ def _log_of_best(posterior: FloatArray, best: NDArray[np.int64]) -> FloatArray:
 def _bit_llr(posterior: FloatArray, k: int) -> FloatArray:
     """(..., k) ln p(1)/p(0) from (..., 2**k) probabilities of the codebook indices."""
     bits = (np.arange(1 << k)[:, None] >> np.arange(k - 1, -1, -1)) & 1
-    one, zero = posterior @ bits, posterior @ (1 - bits)
-    return np.asarray(np.log(np.maximum(one, _TINY)) - np.log(np.maximum(zero, _TINY)))
+    p_one, p_zero = posterior @ bits, posterior @ (1 - bits)
+    return np.asarray(np.log(np.maximum(p_one, _TINY)) - np.log(np.maximum(p_zero, _TINY)))

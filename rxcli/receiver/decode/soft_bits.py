@@ -20,7 +20,7 @@ def observed_symbols(n_observed: IntArray) -> BoolArray:
     return np.asarray(payload.reshape(*payload.shape[:-1], -1, SLOTS_PER_SYMBOL).all(axis=-1))
 
 
-def of_observed(posteriors: BurstPosteriors, n_observed: IntArray) -> BurstPosteriors:
+def assume_unobserved_certain(posteriors: BurstPosteriors, n_observed: IntArray) -> BurstPosteriors:
     """The posteriors, symbols that were not observed (B, C, packet) as a whole counted as certain: so a cut packet's
     confidence is that of what is there."""
     return replace(posteriors, log_prob=np.where(observed_symbols(n_observed), posteriors.log_prob, 0.0))
@@ -38,13 +38,13 @@ def llr_limits(posteriors: BurstPosteriors, n_observed: IntArray, log_odds: Floa
     n_bits = np.maximum(known.sum(axis=(2, 3)), 1)
     wrong = wrong_share(log_odds, n_bits)
     own = (known / (1 + np.exp(np.abs(np.nan_to_num(posteriors.bit_llr))))).sum(axis=(2, 3)) / n_bits
-    hidden = np.maximum(wrong - own, SETTINGS.hidden_share * wrong)
-    return np.asarray(np.clip(-np.log(np.maximum(hidden, 1e-9)), 0.0, SETTINGS.sure_bit_nats))
+    hidden = np.maximum(wrong - own, SETTINGS.hidden_error_share * wrong)
+    return np.asarray(np.clip(-np.log(np.maximum(hidden, 1e-9)), 0.0, SETTINGS.max_bit_llr))
 
 
 def limited(posteriors: BurstPosteriors, limits: FloatArray, erased: BoolArray) -> Float32Array:
     """(B, N, C, 7) ratios within the limits (B, C), none of the columns and bursts that are erased, (B, C)."""
-    sure_of_w = posteriors.w_log_prob.max(axis=1) > np.log(SETTINGS.sure_weight)
+    sure_of_w = posteriors.w_log_prob.max(axis=1) > np.log(SETTINGS.min_weight_probability)
     most = np.where(erased | ~sure_of_w, 0.0, limits)[..., None, None]
     llr = np.clip(np.nan_to_num(posteriors.bit_llr), -most, most)
     return np.ascontiguousarray(llr.transpose(0, 2, 1, 3), np.float32)
@@ -78,7 +78,7 @@ def clip_soft_bits(bursts: Sequence[BurstInClip], snr_db: Sequence[float | None]
     parts = []
     for burst in bursts:
         n_observed = burst.n_observed[None]
-        log_odds = clip_log_odds(replace(burst, posteriors=of_observed(burst.posteriors, n_observed)))
+        log_odds = clip_log_odds(replace(burst, posteriors=assume_unobserved_certain(burst.posteriors, n_observed)))
         limits = llr_limits(burst.posteriors, n_observed, log_odds)
         parts.append(limited(burst.posteriors, limits, echoes(burst.posteriors, snr_db)))
     return FrameSoftBits(np.array([burst.number for burst in bursts], np.int64), np.concatenate(parts), epoch)

@@ -16,7 +16,7 @@ from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
 #: Spectra are computed on a grid so many times finer than the light's length resolves.
-_FINER = 4
+_OVERSAMPLING = 4
 #: Pairs of columns that are compared, at most.
 _MAX_PAIRS = 300
 
@@ -36,10 +36,10 @@ def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, pack
     if not level.any():
         return False
     steady = periodic_share(level, packet_slots * samples_per_slot)
-    return steady > SETTINGS.steady_share and steady > _share_of_slots(level, observed, lit, samples_per_slot)
+    return steady > SETTINGS.min_periodic_share and steady > _share_of_slots(level, observed, lit, samples_per_slot)
 
 
-def is_alike(value: Float32Array, weight: Float32Array, shared: float, reach: int = 0) -> bool:
+def is_common_light(value: Float32Array, weight: Float32Array, shared: float, reach: int = 0) -> bool:
     """Whether columns far apart show the same light.
 
     Args:
@@ -48,7 +48,7 @@ def is_alike(value: Float32Array, weight: Float32Array, shared: float, reach: in
         reach: samples by which columns may be later or earlier.
     """
     n_columns, n = value.shape
-    first, second = np.triu_indices(n_columns, max(SETTINGS.apart_columns, int(SETTINGS.apart_share * n_columns)))
+    first, second = np.triu_indices(n_columns, max(SETTINGS.distant_columns, int(SETTINGS.distant_share * n_columns)))
     if first.size == 0:
         return False
     some = np.linspace(0, first.size - 1, min(first.size, _MAX_PAIRS)).astype(np.int64)
@@ -58,7 +58,7 @@ def is_alike(value: Float32Array, weight: Float32Array, shared: float, reach: in
     spectrum = np.fft.rfft(level, n + reach, axis=1)
     moved = np.fft.irfft(spectrum[first[some]] * np.conj(spectrum[second[some]]), n + reach, axis=1)
     likeness = np.concatenate([moved[:, : reach + 1], moved[:, moved.shape[1] - reach :]], axis=1).max(axis=1)
-    return bool(np.median(likeness) > shared + (1 - shared) * SETTINGS.alike)
+    return bool(np.median(likeness) > shared + (1 - shared) * SETTINGS.min_similarity)
 
 
 def _mean(value: Float32Array, observed: BoolArray) -> FloatArray:
@@ -68,13 +68,13 @@ def _mean(value: Float32Array, observed: BoolArray) -> FloatArray:
 def periodic_share(level: FloatArray | Float32Array, packet_samples: int) -> float:
     """Share of the variance of columns (C, n) that one period explains, whatever the waveform of each column."""
     n = level.shape[1]
-    size = 1 << int(np.ceil(np.log2(_FINER * n)))
+    size = 1 << int(np.ceil(np.log2(_OVERSAMPLING * n)))
     power = (np.abs(np.fft.rfft(level, size, axis=1)) ** 2).sum(axis=0) * (2 / (n * float((level**2).sum())))
     # The grid may miss a line by half a step.
     near = np.maximum(power, np.maximum(np.roll(power, 1), np.roll(power, -1)))
-    fundamental = np.arange(int(np.ceil(size / (SETTINGS.steady_longest * packet_samples))), size // 2)
+    fundamental = np.arange(int(np.ceil(size / (SETTINGS.max_period_packets * packet_samples))), size // 2)
     share = np.zeros(fundamental.size)
-    for line in range(1, SETTINGS.steady_lines + 1):
+    for line in range(1, SETTINGS.n_harmonics + 1):
         inside = line * fundamental <= size // 2
         share[inside] += near[line * fundamental[inside]]
     return float(share.max(initial=0.0))
@@ -83,7 +83,7 @@ def periodic_share(level: FloatArray | Float32Array, packet_samples: int) -> flo
 def _share_of_slots(level: FloatArray, observed: BoolArray, lit: Float32Array, samples_per_slot: int) -> float:
     """Share of the variance that the decided slots explain through any exposure; each column has its own."""
     slots = np.repeat(lit, samples_per_slot, axis=1)
-    reach = SETTINGS.reach_slots * samples_per_slot
+    reach = SETTINGS.max_shift_slots * samples_per_slot
     left = 0.0
     for light, shown, column in zip(level, observed, slots, strict=True):
         moved = np.stack([np.ones(column.size), *(np.roll(column, s) for s in range(-reach, reach + 1))], axis=1)[shown]

@@ -10,7 +10,7 @@ from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.decode.steady import is_alike, periodic_share
+from rxcli.receiver.decode.steady import is_common_light, periodic_share
 from rxcli.receiver.reception import shows_steady_light
 from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
@@ -36,11 +36,11 @@ def light_without_data(context: FrameContext, acquisition: Acquisition) -> Failu
         samples = sync.sample_slots(binned.profiles, binned.clock, SETTINGS.light_samples)
         contrast = sync.contrast(samples.light, samples.valid, SETTINGS.light_samples, noise_of(binned.profiles))
         headers = PREAMBLE_SLOTS / binned.screen.packet_slots
-        if not is_alike(*contrast, headers, SETTINGS.apart_slots * SETTINGS.light_samples):
+        if not is_common_light(*contrast, headers, SETTINGS.max_column_shift_slots * SETTINGS.light_samples):
             return None
         reception = initial_pass(binned.as_one_column())
-        no_header = bool(np.any(assemble.without_header(reception.posteriors.header_llr)))
-        if float(reception.column_llr.max()) > SETTINGS.some_packets and not no_header:
+        no_header = bool(np.any(assemble.find_headerless(reception.posteriors.header_llr)))
+        if float(reception.column_llr.max()) > SETTINGS.min_packets_llr and not no_header:
             return None
         return Failure("no_signal", STEADY_LIGHT if shows_steady_light(reception) else _ONE_LAMP)
 
@@ -53,7 +53,7 @@ def is_switched(context: FrameContext, profiles: RowProfiles) -> bool:
     value, weight = sync.contrast(light, inside, SETTINGS.smooth_rows, noise_of(profiles))
     level = value * (weight > 0)
     headers = PREAMBLE_SLOTS / min(screen.packet_slots for screen in context.screens)
-    if not is_alike(value, weight, headers):
+    if not is_common_light(value, weight, headers):
         return False
     level -= level.mean(axis=1, keepdims=True)
     return periodic_share(level, 2 * SETTINGS.max_period_rows) > SETTINGS.switched_share

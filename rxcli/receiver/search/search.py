@@ -130,7 +130,7 @@ class _Walk:
         again = self._again(best, replace(camera, tone="linear"))
         if again is not None and again.evidence >= best.evidence:
             return again
-        return replace(best, context=replace(best.context, camera=camera.without_tone()))
+        return replace(best, context=replace(best.context, camera=camera.without_tone_estimate()))
 
     def _again(self, best: Scored, camera: Camera) -> Scored | None:
         """An initial pass with another camera; None where no clock is found."""

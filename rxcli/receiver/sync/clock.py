@@ -26,7 +26,7 @@ _SMOOTH_SAMPLES = 8
 
 def pooled_strips(profiles: RowProfiles) -> RowProfiles:
     """Profiles of a few strips a column, to search the clock: pooled in pairs where there are four or more."""
-    return binned_strips(profiles) if profiles.light.shape[1] >= SETTINGS.many_strips else profiles
+    return binned_strips(profiles) if profiles.light.shape[1] >= SETTINGS.min_binned_strips else profiles
 
 
 def binned_strips(profiles: RowProfiles) -> RowProfiles:
@@ -223,7 +223,7 @@ def find_clock(
         return None
     delays = _delays(pooled, weight, start, packet_slots)
     many_delays = np.count_nonzero(delays) > delays.size * SETTINGS.many_columns
-    if header_peak_ratio < SETTINGS.sure_lead or many_delays:
+    if header_peak_ratio < SETTINGS.clear_header_lead or many_delays:
         staggered_start, staggered_ratio, staggered_delays = _staggered_comb(
             pooled, weight, packet_slots * SETTINGS.search_samples
         )
@@ -426,7 +426,7 @@ def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> 
         llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
         repeats: how many copies a burst may have.
     """
-    likeness = copy_likeness(llr, clock)
+    likeness = copy_similarity(llr, clock)
     out: dict[bytes, tuple[Clock, float]] = {}
     for n, phase in [(copies, phase) for copies in repeats for phase in range(copies)]:
         burst = (np.arange(clock.n_copies) + phase) // n
@@ -446,14 +446,14 @@ def likely_repeats(clock: Clock, repeats: Sequence[int]) -> int:
     return repeats[0]
 
 
-def copy_likeness(llr: Float32Array, clock: Clock) -> FloatArray:
+def copy_similarity(llr: Float32Array, clock: Clock) -> FloatArray:
     """Log-likelihood ratio of each copy being the same packet as the next, against another one; (n_copies - 1,).
 
     Args:
         llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
         clock: the clock.
     """
-    copies = np.moveaxis(clock.to_copies(np.clip(llr, -SETTINGS.sure_nats, SETTINGS.sure_nats)), 1, 0)
+    copies = np.moveaxis(clock.to_copies(np.clip(llr, -SETTINGS.max_slot_llr, SETTINGS.max_slot_llr)), 1, 0)
     return np.array([likeness(first, second) for first, second in pairwise(copies)])
 
 

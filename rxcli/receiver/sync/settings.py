@@ -11,7 +11,7 @@ class SyncSettings:
 
     #: Strips of a column of which the search, and an initial pass, need but half, and samples a slot while the clock is
     #: sought.
-    many_strips: int = 4
+    min_binned_strips: int = 4
     search_samples: int = 4
     #: Contrast that half-convinces, over the noise of a sample.
     contrast_sigmas: float = 8.0
@@ -26,7 +26,7 @@ class SyncSettings:
     #: Header correlation, added over the copies, that the delay of a single column must win.
     delay_lead: float = 0.3
     #: A lead of the headers below this may be one of columns that are spread in time.
-    sure_lead: float = 2.5
+    clear_header_lead: float = 2.5
     #: Columns without delays differ by less than this many slots (root mean square) in the light model's view.
     same_timing_slots: float = 0.03
     #: Weight of the first idea of a column's delay, as information: a standard deviation of a tenth of a slot.
@@ -35,9 +35,9 @@ class SyncSettings:
     max_correction_slots: float = 0.25
 
     #: Slots are at most this sure, nats, when copies are compared: what was seen once may be wrong.
-    sure_nats: float = 3.0
+    max_slot_llr: float = 3.0
     #: Log-likelihood ratio, nats, that settles the phase of the bursts.
-    settled_nats: float = 12.0
+    settled_llr: float = 12.0
     #: Closed bursts of which it is remembered whether they were certain.
     remembered_bursts: int = 4
 
@@ -46,7 +46,7 @@ class SyncSettings:
     #: Share of a new measurement in the length of a frame.
     period_share: float = 0.2
     #: Locks by which time stamps are judged, and how often slow motion stretches them, likeliest first.
-    judged_locks: int = 5
+    n_judged_clocks: int = 5
     stretches: tuple[int, ...] = (2, 4, 8, 16, 32, 5, 10, 20, 3, 6)
     #: What a clock may be off by from frame to frame: a share, slots, and the error of stamps, seconds; and slots from
     #: which on locks are not on a line and judge nothing.

@@ -80,16 +80,16 @@ class LinkTime:
                 return None
             self._measure(frame, time_s / self.stretch, slot)
         self._last = (frame, time_s / self.stretch, slot)
-        if len(self._first) < SETTINGS.judged_locks:
+        if len(self._first) < SETTINGS.n_judged_clocks:
             self._first.append((frame, time_s, slot))
         return first_copy
 
     @property
     def judged(self) -> bool:
         """Whether as many frames were locked as time stamps are judged by."""
-        return len(self._first) >= SETTINGS.judged_locks
+        return len(self._first) >= SETTINGS.n_judged_clocks
 
-    def stretch_of_stamps(self, min_frame_s: float) -> float | None:
+    def time_stamp_stretch(self, min_frame_s: float) -> float | None:
         """How much longer the stamps of the first locks are than the time was; None where no factor explains them.
 
         The link's own clock shows in the headers, whole packets aside. Stamps that are not even are not judged.
@@ -190,7 +190,7 @@ class BurstPhase:
         if self._score.size == 1:
             return True
         rival, best = np.sort(self._score)[-2:]
-        return bool(best - rival > SETTINGS.settled_nats)
+        return bool(best - rival > SETTINGS.settled_llr)
 
     def burst_of(self, copies: IntArray) -> IntArray:
         """Number of the burst of each copy, by its number in the clip."""
@@ -209,7 +209,7 @@ class BurstPhase:
             first_copy: number of the first one.
             llr: (n_copies, C, packet) log-odds of their slots, 0 where not seen.
         """
-        llr = np.clip(llr, -SETTINGS.sure_nats, SETTINGS.sure_nats)
+        llr = np.clip(llr, -SETTINGS.max_slot_llr, SETTINGS.max_slot_llr)
         for copy, slots in enumerate(llr, first_copy):
             for other in range(copy - self._most + 1, copy):
                 if other in self._copies:
@@ -303,7 +303,7 @@ class Bursts:
                     metrics[burst].copy(), n_observed, [view.frame], np.zeros(n_observed.shape[0], bool), view.tracked
                 )
                 continue
-            have.metrics, added = of_one_memory([have.metrics, metrics[burst]])
+            have.metrics, added = with_common_memory([have.metrics, metrics[burst]])
             have.metrics += added
             have.n_observed = have.n_observed + n_observed
             have.frames.append(view.frame)
@@ -325,7 +325,7 @@ class Bursts:
 
     def metrics(self, numbers: IntArray) -> FloatArray:
         """(B, C, packet + memory, patterns) of open bursts, all frames added."""
-        return np.stack(of_one_memory([self._open[int(n)].metrics for n in numbers]))
+        return np.stack(with_common_memory([self._open[int(n)].metrics for n in numbers]))
 
     def n_observed(self, numbers: IntArray) -> IntArray:
         """(B, C, packet) how often each slot was seen."""
@@ -370,7 +370,7 @@ class Bursts:
         ]
 
 
-def of_one_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:
+def with_common_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:
     """Metrics (..., n + memory, patterns) of several frames, those of shorter memories written as of the longest.
 
     What a sample says of its last slots it says of every pattern that ends with them.

@@ -171,7 +171,7 @@ def test_likelihoods_start_from_nothing_but_contrast() -> None:
     shot_gain = Shot(texture=0.3, sigma=0.005, start_slot=12.3)
     link, now, samples, model = scene(shot_gain, seed=3)
     contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
-    first = slot_odds(channel.first_metrics(*contrast, model.exposure), model.exposure.isi_memory)
+    first = slot_odds(channel.initial_metrics(*contrast, model.exposure), model.exposure.isi_memory)
     lit = true_slots(link, shot_gain, now.n_slots)
     idea = (1 / (1 + np.exp(-first))).astype(np.float32)
     found = channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics
@@ -276,7 +276,7 @@ def test_hostile_light_gives_finite_likelihoods(kind: str, thorough: bool, idea:
     model = model_for(Shot(), sigma, black_level)
     lit = np.full((6, now.n_slots), idea, np.float32)
     contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
-    first = channel.first_metrics(*contrast, model.exposure)
+    first = channel.initial_metrics(*contrast, model.exposure)
     found = channel.slot_likelihoods(samples, now, model, lit, np.arange(6), thorough=thorough)
     for values in (first, found.metrics, found.snr, found.timing):
         assert np.isfinite(values).all()

@@ -78,7 +78,7 @@ def results_of(
 ) -> tuple[ColumnResult, ...]:
     """Results where every slot of the grid has the same support unless told otherwise."""
     was_denoised = np.broadcast_to(np.asarray(slot_margin, np.float32), snr.shape)
-    headerless = assemble.without_header(posteriors.header_llr)
+    headerless = assemble.find_headerless(posteriors.header_llr)
     return assemble.column_results(clock, posteriors, snr, samples, was_denoised, headerless, min_confidence)
 
 

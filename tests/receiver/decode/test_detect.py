@@ -21,8 +21,8 @@ from rxcli.protocol import (
 from rxcli.receiver.channel import metrics_of
 from rxcli.receiver.decode.detect import (
     detect,
-    detect_with_words,
-    first_decision_of,
+    detect_with_candidates,
+    initial_slot_probability,
     plausible_weights,
     slot_margin,
     weight_log_evidence,
@@ -245,7 +245,7 @@ def test_the_first_guess_is_exact_where_slots_are_independent(isi_memory: int) -
     tx = np.stack([packet_and_next(rng.integers(0, 1 << bits_per_symbol(i), (1, 4)), i, 0)[0] for i in w])
     llr = (4 * (2 * tx - 1) + rng.normal(0, 3, (2, *tx.shape))).astype(np.float32)
     metrics = np.stack([metrics_of(burst, isi_memory) for burst in llr])
-    guess = first_decision_of(metrics)
+    guess = initial_slot_probability(metrics)
     found = detect(metrics, np.array(WEIGHTS) == w[:, None])
     np.testing.assert_allclose(guess, found.lit, atol=1e-4)
     assert 0.01 < np.abs(guess[..., 20:] - tx[:, 20:]).mean() < 0.2
@@ -256,7 +256,7 @@ def test_the_first_guess_is_exact_where_slots_are_independent(isi_memory: int) -
 def test_the_first_guess_of_clean_slots_is_what_was_sent(w: int, exposure_slots: float, isi_memory: int) -> None:
     rng = np.random.default_rng([w, isi_memory])
     tx = rng.integers(0, 1 << bits_per_symbol(w), (40, 5))
-    guess = first_decision_of(sent_through(tx, w, box_exposure(exposure_slots, isi_memory), 0.02, rng))
+    guess = initial_slot_probability(sent_through(tx, w, box_exposure(exposure_slots, isi_memory), 0.02, rng))
     sent = packet_and_next(tx, w, 0)
     assert guess.shape == (1, *sent.shape)
     assert np.abs(guess[0] - sent).max() < 0.05
@@ -333,7 +333,7 @@ def test_doubtful_words_are_those_of_the_posterior(isi_memory: int) -> None:
     w = np.array([5, 1, 5])
     candidates = np.zeros((3, 9), bool)
     candidates[np.arange(3), w - 1] = True
-    found, doubtful = detect_with_words(metrics, candidates, -0.3, 4)
+    found, doubtful = detect_with_candidates(metrics, candidates, -0.3, 4)
     places, words, log_prob = doubtful.places, doubtful.words, doubtful.log_prob
     np.testing.assert_array_equal(found.index, detect(metrics, candidates).index)
     at = tuple(places.T)
@@ -371,5 +371,5 @@ def test_no_word_is_doubtful_where_all_are_sure() -> None:
     metrics = np.zeros((1, 2, 41, 4))
     metrics[..., 1::2] = 30.0 * np.tile(codebook(5)[3], 5)[:41, None][:, :1]
     metrics[..., ::2] = -metrics[..., 1::2]
-    _, doubtful = detect_with_words(metrics, only(5, 2), -10.0, 4)
+    _, doubtful = detect_with_candidates(metrics, only(5, 2), -10.0, 4)
     assert [len(part) for part in (doubtful.places, doubtful.words, doubtful.log_prob)] == [0, 0, 0]

@@ -47,7 +47,7 @@ def received(
         exposure=Exposure.of(shot.exposure_slots, Q),
     )
     contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
-    metrics = channel.first_metrics(*contrast, model.exposure)
+    metrics = channel.initial_metrics(*contrast, model.exposure)
     clock_ = sync.assign_bursts(clock_, detect.slot_llr(metrics), (REPEATS,))
     for _ in range(rounds):
         posteriors = detect.detect(channel.by_burst(metrics, clock_))

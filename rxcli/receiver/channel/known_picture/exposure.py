@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.receiver.channel.known_picture.settings import SETTINGS
-from rxcli.receiver.light import SlotLight, exposure_shares, taken
+from rxcli.receiver.light import SlotLight, exposure_shares, take_places
 from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 
@@ -20,7 +20,7 @@ def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> 
         each = np.zeros(len(lit), np.int64)
         each[unsure] = 1 + np.arange(unsure.size)
         doubt = np.concatenate([np.zeros_like(doubt[:1]), doubt[unsure]])
-    trust = np.clip(1 - 8 * SlotLight(doubt).seen(positions, exposure_slots), 0, 1)
+    trust = np.clip(1 - 8 * SlotLight(doubt).mean_over(positions, exposure_slots), 0, 1)
     return np.asarray(trust[each], np.float32)
 
 
@@ -28,8 +28,8 @@ def read_between(values: FloatArray, place: FloatArray) -> FloatArray:
     """`values` (C, n) at the places (C, R) or (1, R), linearly between."""
     place = np.clip(place, 0, values.shape[1] - 1.001)
     left = place.astype(np.intp)
-    low = taken(values, left)
-    return np.asarray(low + (taken(values, left + 1) - low) * (place - left))
+    low = take_places(values, left)
+    return np.asarray(low + (take_places(values, left + 1) - low) * (place - left))
 
 
 def row_positions(rows: FloatArray, clock: Clock) -> FloatArray:

@@ -8,7 +8,7 @@ from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.known_picture.exposure import read_between
 from rxcli.receiver.channel.known_picture.picture import ColumnLight
 from rxcli.receiver.channel.known_picture.settings import SETTINGS
-from rxcli.receiver.light import shows_dark_header
+from rxcli.receiver.light import sees_dark_header
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray
 
 
@@ -51,7 +51,7 @@ def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) 
 
 def header_dark(positions: FloatArray, clock: Clock) -> BoolArray:
     """(C, R) or (1, R) rows that see nothing but the three dark slots in the middle of a header."""
-    return shows_dark_header((positions + clock.first_slot) % clock.packet_slots, clock.exposure_slots)
+    return sees_dark_header((positions + clock.first_slot) % clock.packet_slots, clock.exposure_slots)
 
 
 def dark_light(

@@ -269,7 +269,7 @@ class KnownPicture:
         """Normal equations A m = b of every row, A symmetric with two bands: A = L D L', and the diagonal of A^-1."""
         picture, error = self.picture()
         # Half of what is seen is lit.
-        variance = self._noise.through(picture, picture * picture * error, np.full(1, 0.5, np.float32))
+        variance = self._noise.through_picture(picture, picture * picture * error, np.full(1, 0.5, np.float32))
         if measured is not None:
             variance += measured
         gain = picture * self._inside / variance

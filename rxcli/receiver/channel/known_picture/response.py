@@ -43,7 +43,7 @@ def exposures(lit: Float32Array, positions: FloatArray, exposure_slots: float) -
     # Evenly spread, but not evenly spaced: the rows must not fall on the same part of every slot.
     rows = ((step + (step * _GOLDEN if every > 1 else 0) % 1) * every).astype(np.intp)
     some, side = positions[:, rows], SETTINGS.side_slots
-    seen = SlotLight(lit).seen(np.concatenate([some - side, some, some + side], axis=1), exposure_slots)
+    seen = SlotLight(lit).mean_over(np.concatenate([some - side, some, some + side], axis=1), exposure_slots)
     before, here, after = np.split(seen, 3, axis=1)
     return Exposures(rows, here, before + after, (after - before) * np.float32(0.5 / side))
 
