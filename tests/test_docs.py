@@ -29,7 +29,7 @@ _FILES = {
 }
 _FOLDERS = ("p777", "p888", "w999", "captures", "boards", "lab", "../other", "other")
 #: Commands that run here; of all others the arguments are read, as they need a camera, a board, a lamp or an hour.
-_RUN = ("profiles", "decode sample_frames/", "inspect sample_frames/", "inspect docs/hello.jpg")
+_RUN = ("profiles", "decode sample_frames/", "inspect sample_frames/", "demo")
 
 
 def blocks(page: Path, *languages: str) -> list[str]:
@@ -58,8 +58,6 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the samples, and with what a reader is taken to have."""
     folder = tmp_path_factory.mktemp("desk")
     shutil.copytree(ROOT / "sample_frames", folder / "sample_frames")
-    (folder / "docs").mkdir()
-    shutil.copy(ROOT / "docs" / "hello.jpg", folder / "docs")
     for name in _FOLDERS:
         (folder / name).mkdir(parents=True, exist_ok=True)
     for name, sample in _FILES.items():

@@ -23,6 +23,7 @@ from rxcli.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
     from rxcli.options import ReceiverOptions
+    from rxcli.outputs import Output
     from rxcli.types import Frame, FrameResult
 
 #: Frames of a clip that its timeline shows.
@@ -45,31 +46,63 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
 
     Of a clip, the first frames are received, and one is shown in full.
     """
-    from rxcli.outputs import Output, claim_own_folder, write_whole
-    from rxcli.results.cameras import camera_of, screen_of
-    from rxcli.results.page import MARK, inspection_page
+    from rxcli.outputs import claim_own_folder
     from rxcli.results.report import format_link
 
     folder = out if out is not None else Path(f"inspect-{_stem(path)}")
     page = folder / "index.html"
-    own = re.compile(re.escape(MARK.encode()))
-    claim_outputs([Output("--out", page, own, makes_folder=True)], (path,), (), force)
+    claim_outputs([page_output(folder)], (path,), (), force)
     if folder.exists():  # a new one is made when there is something to put into it
         claim_own_folder("--out", folder, (page.name,), force)
-    configured = receiver_options(options, soft_bits=True)
-    results, picture = _received(path, frame, configured, truth)
-    shown = next(result for result in results if result.frame == picture.index)
-    screen, camera = screen_of(shown, configured.screens), camera_of(picture, shown, configured.cameras)
-    timeline = results if len(results) > 1 else []
-    text = inspection_page(picture, shown, screen, camera, timeline)
-    claim_own_folder("--out", folder, (page.name,), force)
-    write_whole(page, text)
+    results = write_page(path, page, receiver_options(options, soft_bits=True), frame, truth, force)
     for result in results:
         for line in format_link(result):
             click.echo(line, err=True)
     click.echo(page)
     received = any(result.packets for result in results)
     return ExitCode.OK if received else ExitCode.NOT_RECEIVED
+
+
+def page_output(folder: Path) -> Output:
+    """The page in a folder, which may replace an earlier one."""
+    from rxcli.outputs import Output
+    from rxcli.results.page import MARK
+
+    return Output("--out", folder / "index.html", re.compile(re.escape(MARK.encode())), makes_folder=True)
+
+
+def write_page(
+    path: str,
+    page: Path,
+    options: ReceiverOptions,
+    frame: int | None = None,
+    truth: str | None = None,
+    force: bool = False,
+) -> list[FrameResult]:
+    """Receive the photo or clip at `path` and write the page that shows how; results of all its frames.
+
+    Args:
+        path: a photo, or a clip, of which the first frames are received.
+        page: what to write; its folder is made, and is the command's own.
+        options: of the receiver.
+        frame: number of the frame to show; None: the one with the most packets.
+        truth: file with what was sent, "auto" for the one beside `path`, None for none.
+        force: write into a folder of somebody else.
+
+    Raises:
+        InputError: the source cannot be read, or has no such frame.
+    """
+    from rxcli.outputs import claim_own_folder, write_whole
+    from rxcli.results.cameras import camera_of, screen_of
+    from rxcli.results.page import inspection_page
+
+    results, picture = _received(path, frame, options, truth)
+    shown = next(result for result in results if result.frame == picture.index)
+    screen, camera = screen_of(shown, options.screens), camera_of(picture, shown, options.cameras)
+    text = inspection_page(picture, shown, screen, camera, results if len(results) > 1 else [])
+    claim_own_folder("--out", page.parent, (page.name,), force)
+    write_whole(page, text)
+    return results
 
 
 def _stem(path: str) -> str:

@@ -26,6 +26,7 @@ from rxcli.cli.groups import PlainContext, SuggestingGroup
 from rxcli.errors import ExitCode, OutputError, ReceiverError, Terminated
 
 _COMMANDS = {
+    "demo": "Try it without a screen: a simulated photo with a text.",
     "decode": "Texts, files and payloads of photos, clips and folders.",
     "serve": "A page for photos from a phone and for a live camera.",
     "live": "Texts, files and payloads of a V4L2 camera.",
@@ -134,7 +135,7 @@ def _finite_then(callback: Callable[..., Any] | None) -> Callable[..., Any]:
 def cli(context: click.Context) -> None:
     """Receive data that the mini-LED backlight of a display sends to rolling-shutter cameras.
 
-    Try it: vlc-rx decode photo.jpg, or vlc-rx inspect photo.jpg for a page that shows what was seen, or vlc-rx serve
+    Try it: vlc-rx demo. Then vlc-rx decode photo.jpg, or vlc-rx inspect photo.jpg for a page that shows what was seen, or vlc-rx serve
     for photos from a phone.
 
     stdout carries data only; logs and progress go to stderr. Exit codes: 0 every input gave a packet, 1 some input gave

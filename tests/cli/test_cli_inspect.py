@@ -36,15 +36,6 @@ def shown(page: Path) -> dict[str, Any]:
 SAMPLE = Path(__file__).parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
 
 
-def test_a_text_that_came_is_said(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert run(["inspect", str(SAMPLE.parents[1] / "docs" / "hello.jpg"), "--out", str(tmp_path / "page")]) == 0
-    captured = capsys.readouterr()
-    assert captured.out == f"{tmp_path / 'page' / 'index.html'}\n"
-    assert captured.err == "text: Hello! This text came as light.\n"
-    page = tmp_path / "page" / "index.html"
-    assert shown(page)["texts"] == [{"kind": "text", "text": "Hello! This text came as light."}]
-
-
 def test_a_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     payloads = write_frame(tmp_path / "a<b>.png", 1)
     out = tmp_path / "page"

@@ -53,7 +53,7 @@ def test_help_loads_nothing_heavy() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nonsense"], "no command 'nonsense'; there are decode"),
+        (["nonsense"], "no command 'nonsense'; there are demo, decode"),
         (["decoed"], "no command 'decoed'; did you mean 'decode'?; see `vlc-rx --help`"),
         (["calibrate", "lense"], "no command 'lense'; did you mean 'lens'?; see `vlc-rx calibrate --help`"),
         (["decode"], "Missing argument 'PATH...'; see `vlc-rx decode --help`"),
