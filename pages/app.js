@@ -11,7 +11,7 @@
   function show(answer) {
     const columns = answer.columns || [];
     $("result-title").textContent = answer.partial ? `So far: ${answer.headline}` : answer.headline;
-    $("reason").textContent = (answer.reason || "").replace(/^No screen found: (.)/, (_, letter) => letter.toUpperCase()) || (answer.seconds !== undefined
+    $("reason").textContent = answer.reason || (answer.seconds !== undefined
       ? `Read in ${answer.seconds.toFixed(1)} s. Screen: ${answer.screen || "unknown"}. Camera: ${answer.camera || "unknown, estimated from the picture"}.${answer.cut_short ? " Only the beginning of the clip was read." : ""}${answer.mirrored ? ` ${answer.mirrored}` : ""}` : "");
     $("advice").textContent = answer.advice || "";
     $("texts").replaceChildren();

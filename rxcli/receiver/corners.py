@@ -13,7 +13,7 @@ from rxcli.profiles import ScreenProfile
 from rxcli.receiver.cameras import known_lens
 from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.find import ColumnLayout, find_outlines, why_useless
+from rxcli.receiver.screen.find import BRIGHTEN, ColumnLayout, find_outlines, thinned, why_useless
 from rxcli.receiver.settings import SETTINGS
 from rxcli.types import FloatArray, Frame
 
@@ -26,7 +26,7 @@ _PORTRAIT = (5, 6, 7, 8)
 _NO_COLUMNS = "no columns of a modulated backlight were found in the picture"
 _SHOW_COLUMNS = (
     "photograph a screen that sends, from near, with the electronic shutter and a short exposure (1/8000 s), and use "
-    "the picture in its full size"
+    "the picture in its full size; if it shows such a screen, give its --corners"
 )
 
 
@@ -145,7 +145,11 @@ def reason_for_none(frame: Frame) -> str:
     """Why no screen was found in a frame, and what to do."""
     levels = frame.mosaic
     black, white = (frame.black, frame.white) if levels is None else (float(np.mean(levels.black)), levels.white)
-    return "; ".join(why_useless(frame.pixels, black, white) or (_NO_COLUMNS, _SHOW_COLUMNS))
+    useless = why_useless(frame.pixels, black, white)
+    mean = float(thinned(frame.pixels, black, white).mean())
+    if useless is None and mean < SETTINGS.dark_mean:
+        return f"{_NO_COLUMNS}, and it is dark ({max(100 * mean, 0):.0f} % of white on average); {BRIGHTEN}"
+    return "; ".join(useless or (_NO_COLUMNS, _SHOW_COLUMNS))
 
 
 def too_small(context: FrameContext, screen: ScreenProfile) -> str | None:

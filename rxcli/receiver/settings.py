@@ -41,6 +41,8 @@ class WiringSettings:
     min_overlap: float = 0.002
     #: Fewer rows than those that the waves of an unknown camera are sought on tell nothing.
     min_rows: int = 24
+    #: A picture whose mean is below this share of white is called dark where no screen was found in it.
+    dark_mean: float = 0.08
     #: An outline so many times as large as the picture shows it less than one column.
     largest_outline: float = 50.0
 

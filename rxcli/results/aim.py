@@ -151,10 +151,10 @@ class Aim:
 def split_message(result: FrameResult, light: Light | None = None) -> tuple[str, str]:
     """Why nothing was received, and the next step, as two sentences; the second says what the picture's light asks for.
 
-    Messages are `what; next step`, see `rxcli.errors`.
+    Messages are `what; next step`, see `rxcli.errors`; what the headline says already is left out.
     """
     text = printable((result.message or "no packet was found").removeprefix(result.source + ": "))
-    reason, _, advice = text.partition("; ")
+    reason, _, advice = text.removeprefix("no screen found: ").partition("; ")
     if light is not None and result.status != "unreadable" and light.word != "good" and "expos" not in advice:
         more = "expose longer or open the lens" if light.word == "too dark" else "expose shorter"
         reason = f"{reason} (the picture is {light.word})"

@@ -338,7 +338,7 @@ class TestStatus:
         status.update(lost)
         line = capsys.readouterr().err.splitlines()[-1]
         assert line.startswith("no screen | columns 0/0")
-        assert line.endswith("No screen found: it is black. Expose longer.")
+        assert line.endswith("It is black. Expose longer.")
 
     def test_light_and_height_are_told(self, tmp_path: Path) -> None:
         status = Status(LiveSource(tmp_path), quiet=True)

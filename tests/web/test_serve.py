@@ -537,7 +537,7 @@ def test_the_state_says_why_there_is_no_lock_and_what_to_do() -> None:
     state = aim.update(result_of("ok", packets=3), 0.2, 1000)
     assert state.packets_per_s == pytest.approx(30)
     dark = aim.update(result_of("no_screen", "no screen found: nothing; look"), 2.0, 1000, Light(0.001, 0.0))
-    assert dark.reason == "No screen found: nothing (the picture is too dark)."
+    assert dark.reason == "Nothing (the picture is too dark)."
     assert dark.advice == "Expose longer or open the lens; look."
 
 

@@ -21,8 +21,10 @@ from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Pixels, Strips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
-from rxcli.types import FloatArray, Lens
+from rxcli.types import Float32Array, FloatArray, Lens
 
+#: The next step where a picture is too dark.
+BRIGHTEN = "expose longer, raise ISO, or show a brighter picture on the screen"
 #: Parts of a picture that are searched for narrow columns.
 _PARTS = 5
 #: Columns without light beside a side from which on it does not show.
@@ -96,12 +98,18 @@ def why_useless(pixels: Pixels, black: float, white: float) -> tuple[str, str] |
         least = SETTINGS.min_size_px
         size = f"the picture has {width} x {height} pixels, a screen needs at least {least} each way"
         return size, "use the picture in its full size, not a thumbnail or a messenger's copy"
-    sample = (pixels[:: max(1, height // 64), :: max(1, width // 64)] - np.float32(black)) / (white - black)
+    sample = thinned(pixels, black, white)
     if np.mean(sample >= 0.004) < 0.005:
-        return "the picture is black", "expose longer, raise ISO, or show a brighter picture on the screen"
+        return "the picture is black", BRIGHTEN
     if np.mean(sample > 0.98) > 0.99:
         return "the picture is saturated", "expose shorter, or lower ISO"
     return None
+
+
+def thinned(pixels: Pixels, black: float, white: float) -> Float32Array:
+    """Some thousand pixels all over a picture; 0 is black, 1 is white."""
+    steps = (slice(None, None, max(1, size // 64)) for size in pixels.shape)
+    return np.asarray((pixels[*steps] - np.float32(black)) / (white - black), np.float32)
 
 
 def follow_outline(pixels: Pixels, corners: FloatArray, layout: ColumnLayout) -> FloatArray | None:

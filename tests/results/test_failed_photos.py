@@ -1,0 +1,70 @@
+"""Photos that cannot be received say why and what to do: on the terminal, on the page of `serve`, and on inspect's."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import simplejpeg
+
+from rxcli.cli.main import run
+from rxcli.errors import without_commands
+from rxcli.lab.simulate.capture import prepare
+from rxcli.lab.simulate.pictures import load_picture
+from rxcli.lab.simulate.scenes import preset
+from rxcli.options import receiver_options
+from rxcli.web.decoding import answer_for
+
+#: Kind of photo -> a part of the reason, and of the next step.
+PHOTOS = {
+    "too dark": ("it is dark (5 % of white on average)", "expose longer, raise ISO, or show a brighter picture"),
+    "portrait": ("taken in portrait: its stripes run downwards", "use the camera's own file, taken in landscape"),
+    "ordinary": ("no columns of a modulated backlight were found in the picture", "photograph a screen that sends"),
+}
+
+
+def photo(kind: str) -> bytes:
+    """A JPEG as a phone may make it."""
+    scene = preset("phone-plain", "data-17k3").scaled(0.4, keep_readout=True)
+    if kind == "ordinary":
+        picture = load_picture("coffee", 1600, 1200) + np.random.default_rng(1).normal(0, 2, (1200, 1600, 3))
+        return bytes(simplejpeg.encode_jpeg(np.clip(picture, 0, 255).astype(np.uint8), 92))
+    if kind == "too dark":
+        scene = replace(scene.exposed(scene.exposure_s, 1 / 2000), room=replace(scene.room, light_e_per_s=0.0))
+    else:
+        scene = replace(scene, pose=replace(scene.pose, roll_deg=90, fill=0.5))
+    return prepare(scene, 1).frame().jpeg
+
+
+@pytest.mark.parametrize("kind", PHOTOS)
+def test_a_failed_photo_says_why_wherever_it_is_read(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reason, step = PHOTOS[kind]
+    monkeypatch.chdir(tmp_path)
+    Path("photo.jpg").write_bytes(photo(kind))
+
+    assert run(["decode", "photo.jpg"]) == 1
+    shown = capsys.readouterr().out
+    assert f"{reason}; {step}" in shown
+
+    answer = answer_for(Path("photo.jpg"), "the picture", receiver_options(soft_bits=True))
+    assert answer["headline"] == "No screen found"
+    told = answer["reason"], answer["advice"]
+    assert all(part.lower() in text.lower() for part, text in zip((reason, step), told, strict=True)), told
+    assert "no screen found" not in answer["reason"].lower()  # which the headline says
+    assert told == tuple(map(without_commands, told))
+
+    assert run(["inspect", "photo.jpg", "--out", "page"]) == 1
+    found = re.search(r'id="data">(.*?)</script>', Path("page/index.html").read_text())
+    assert found is not None
+    page = json.loads(found[1])
+    assert next(name for name, good in page["steps"] if not good) == "screen found"
+    assert page["notes"] == [answer["reason"]]
+    assert page["advice"].startswith(answer["advice"].rstrip("."))
+    assert ("--corners" in page["advice"]) == ("--corners" in shown) == (kind == "ordinary")
+    assert page["denoiser"] is None
