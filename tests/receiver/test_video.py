@@ -334,15 +334,15 @@ def test_link_time_counts_copies_over_rounded_times(digits: int) -> None:
         if number % 50 == 17:
             continue  # a frame that the camera dropped
         slot = start + number * frame_s * rate
-        copy = time.take(number - number // 50, round(number * frame_s, digits), clock_at(slot))
+        copy = time.update(number - number // 50, round(number * frame_s, digits), clock_at(slot))
         assert copy == int(slot // 70)
 
 
 def test_link_time_tells_another_time() -> None:
     time = LinkTime(70, 8650.0)
     for number in range(5):
-        assert time.take(number, number / 60, clock_at(10 + number * 8650 / 60)) is not None
-    assert time.take(5, 5 / 60, clock_at(10 + 20 + 5 * 8650 / 60)) is None
+        assert time.update(number, number / 60, clock_at(10 + number * 8650 / 60)) is not None
+    assert time.update(5, 5 / 60, clock_at(10 + 20 + 5 * 8650 / 60)) is None
 
 
 def test_burst_phase_from_parts_of_copies_over_frames() -> None:
@@ -359,7 +359,7 @@ def test_burst_phase_from_parts_of_copies_over_frames() -> None:
             reception = (place >= start) & (place < start + 0.8)
             slots = 2.0 * sent[(first + number + 1) // repeats] - 1
             llr[number] = reception * (2.5 * slots + rng.normal(0, 1.5, slots.shape))
-        phase.take(first, llr)
+        phase.update(first, llr)
     assert phase.settled
     copies = np.arange(60)
     assert (phase.burst_of(copies) == (copies + 1) // repeats).all()
@@ -508,7 +508,7 @@ def test_columns_not_yet_tried_are_unknown() -> None:
     bursts.add(FrameBursts(0, 0, clock, metrics[0], shown), np.array([7]), metrics)
     tried = np.array([0, 2])
     found = detect(metrics[:, tried])
-    bursts.note(7, tried, found, np.ones(2, bool))
+    bursts.store(7, tried, found, np.ones(2, bool))
     known = bursts.known(7)
     assert known is not None
     assert (known.index[:, tried] == found.index).all()

@@ -67,7 +67,7 @@ class BurstReader:
             dark = ~certain & (self._dark(waiting.view) & (not dark_too))
             waiting.skip("certain_columns", int(certain.sum()))
             waiting.skip("dark_columns", int(dark.sum()))
-            self.open.looked_at(still_open)
+            self.open.mark_detected(still_open)
             if not (certain | dark).all():
                 found.append((still_open, ~certain & ~dark))
         if found:
@@ -99,7 +99,7 @@ class BurstReader:
         certain = posteriors.log_prob[0].min(axis=1) >= SETTINGS.certain_log_prob
         for one in np.unique(number):
             mine = np.flatnonzero(number == one)
-            self.open.note(int(one), column[mine], posteriors.of_columns(mine), certain[mine])
+            self.open.store(int(one), column[mine], posteriors.of_columns(mine), certain[mine])
         # Weights of columns that were certain are the only ones tried next, until they are not certain any more.
         self._weights[column] = False
         self._weights[column[certain], posteriors.w[certain] - 1] = True

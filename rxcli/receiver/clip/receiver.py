@@ -517,7 +517,7 @@ class _Clip:
         done: list[FrameResult] = []
         known, first_copy = self._link if self._stretch is not None else None, None
         if known is not None and known.shape == _shape(view):
-            first_copy = known.time.take(frame.index, frame.time_s, view.bursts.clock)
+            first_copy = known.time.update(frame.index, frame.time_s, view.bursts.clock)
         if first_copy is None:
             done = self._finish_scene_before() if self._link is not None else []
             first_copy = self._begin_link(view, frame)
@@ -555,7 +555,7 @@ class _Clip:
         self._link = _Link(time, tracking.BurstPhase(view.acquisition.repeats), _shape(view), offset)
         self._epoch += 1
         self._bursts.begin()
-        return time.take(frame.index, frame.time_s, view.bursts.clock)
+        return time.update(frame.index, frame.time_s, view.bursts.clock)
 
     # -- time stamps that are not the time -------------------------------------------------------------------------
 
@@ -589,7 +589,7 @@ class _Clip:
         assert view is not None
         assert link is not None
         clock = view.bursts.clock
-        first_copy = link.time.take(waiting.result.frame, waiting.result.time_s, clock)
+        first_copy = link.time.update(waiting.result.frame, waiting.result.time_s, clock)
         if first_copy is None or self._stretch is None:
             # Frames that stand alone: no copy of one is near any of another.
             first_copy = waiting.result.frame * _FAR_APART
@@ -605,7 +605,7 @@ class _Clip:
         clock = view.bursts.clock
         llr = detect.slot_llr(view.bursts.metrics)
         copies = clock.to_copies(llr).transpose(1, 0, 2) * (view.bursts.shown > 0)
-        self._link.phase.take(view.bursts.first_copy, np.asarray(copies, np.float64))
+        self._link.phase.update(view.bursts.first_copy, np.asarray(copies, np.float64))
 
     def _settle_bursts(self) -> None:
         """Enter all frames that waited for the phase of the bursts."""

@@ -1,4 +1,4 @@
-"""Posteriors to results: packets with confidence, column status, frame status."""
+"""Turn posteriors into results: packets with confidence, column status, frame status."""
 
 from __future__ import annotations
 
@@ -48,28 +48,28 @@ def column_results(
         posteriors: of B bursts and C columns.
         snr: (C, N) squared contrast over variance of every slot of the grid.
         samples: the samples, for what was visible.
-        slot_margin: (C, N) what the light says for every slot as decided, see `detect.slot_margin`.
-        headerless: (C,) columns that show no packets, whatever was decided of their slots, see `find_headerless`.
+        slot_margin: (C, N) see `detect.slot_margin`.
+        headerless: (C,) columns without packets, see `find_headerless`.
         min_confidence: packets below it are left out.
-        denoised: columns in which corrections of the auto-encoder were kept.
+        denoised: columns that were corrected by the auto-encoder.
     """
     n_observed = slots_observed(samples, clock)
     whole = complete(n_observed)
     was_denoised = np.isin(np.arange(len(snr)), list(denoised))
     by_burst = slot_margin_by_burst(slot_margin, clock)
-    doubts = still_quality(posteriors, confidence_features(posteriors, by_burst, was_denoised, samples.light.shape[1]))
+    quality = still_quality(posteriors, confidence_features(posteriors, by_burst, was_denoised, samples.light.shape[1]))
     snr_db = snr_db_of_columns(snr)
     echoing: BoolArray = np.any(echoes(posteriors, snr_db) & whole, axis=0)
-    reported = whole & doubts.reported(min_confidence)
+    reported = whole & quality.reported(min_confidence)
     against = [
-        _why_headerless(samples, column) if headerless[column] else _ECHO if echo else None
+        _headerless_reason(samples, column) if headerless[column] else _ECHO if echo else None
         for column, echo in enumerate(echoing)
     ]
-    held_back = np.where(whole & doubts.reported(0.0) & ~reported, doubts.confidence, 0.0).max(axis=0)
+    withheld = np.where(whole & quality.reported(0.0) & ~reported, quality.confidence, 0.0).max(axis=0)
     shown = reported & [not why for why in against]
-    if not (doubts.confidence[shown] >= SETTINGS.min_best_confidence).any():
-        reported = np.zeros_like(reported)  # Light without data: what looks like a packet or two is chance.
-    packets = [_Packets.of(burst, clock, posteriors, counted, doubts) for burst, counted in enumerate(n_observed)]
+    if not (quality.confidence[shown] >= SETTINGS.min_best_confidence).any():
+        reported = np.zeros_like(reported)  # Light without data: an isolated packet is chance.
+    packets = [_Packets.of(burst, clock, posteriors, counted, quality) for burst, counted in enumerate(n_observed)]
     return tuple(
         _column_result(
             column,
@@ -79,7 +79,7 @@ def column_results(
             n_observed[:, column],
             () if against[column] else _of_column(packets, reported, column),
             against[column],
-            _withheld(held_back[column], min_confidence),
+            _withheld(withheld[column], min_confidence),
             bool(was_denoised[column]),
         )
         for column, db in enumerate(snr_db)
@@ -87,19 +87,19 @@ def column_results(
 
 
 def _of_column(packets: Sequence[_Packets], reported: BoolArray, column: int) -> tuple[PacketResult, ...]:
-    """The packets of a column that are reported, (B, C)."""
-    return tuple(one.result(column) for one, shown in zip(packets, reported[:, column], strict=True) if shown)
+    """Reported packets of a column; `reported` is (B, C)."""
+    return tuple(burst.result(column) for burst, shown in zip(packets, reported[:, column], strict=True) if shown)
 
 
-def _why_headerless(samples: SlotSamples, column: int) -> str:
-    """What may be wrong with a column that shows slots but no header, by whether its light is cut off at white."""
+def _headerless_reason(samples: SlotSamples, column: int) -> str:
+    """Message for a column with slots but without header, which depends on whether it is overexposed."""
     light = samples.light[column][samples.valid[column] > 0]
     overexposed = light.size > 0 and float(np.mean(light >= SETTINGS.white_level)) > SETTINGS.overexposed_share
     return _HEADERLESS + (_OVEREXPOSED if overexposed else _OTHER_SCREEN)
 
 
 def _withheld(confidence: float, min_confidence: float) -> str | None:
-    """What to say of a column whose surest packet is not sure enough to be reported; None where there is none."""
+    """Message for a column whose surest packet is below the minimum confidence, or None."""
     if not 0 < confidence < min_confidence:
         return None
     return f"its packet has a confidence of {confidence:.4f}, below the {min_confidence:g} asked for (--min-confidence)"
@@ -112,36 +112,36 @@ def clip_results(
 
     Args:
         clock: the clock.
-        bursts: those that end in this frame, in time order.
+        bursts: bursts that end in this frame, in time order.
         going_on: (C,) confidence of the best packet that the next frame will report.
         snr: (C, N) squared contrast over variance of every slot of the grid.
         min_confidence: packets below it are left out.
     """
     snr_db = snr_db_of_columns(snr)
-    doubts = [clip_quality(burst) for burst in bursts]
+    qualities = [clip_quality(burst) for burst in bursts]
     whole = [complete(burst.n_observed[None])[0] for burst in bursts]
     reported = [
-        (seen & ~echoes(burst.posteriors, snr_db)[0] & doubt.reported(min_confidence)[0]).tolist()
-        for burst, seen, doubt in zip(bursts, whole, doubts, strict=True)
+        (is_complete & ~echoes(burst.posteriors, snr_db)[0] & quality.reported(min_confidence)[0]).tolist()
+        for burst, is_complete, quality in zip(bursts, whole, qualities, strict=True)
     ]
-    held_back = np.zeros(len(snr_db))
-    for seen, doubt in zip(whole, doubts, strict=True):
-        surest = np.where(seen & (doubt.ber_hat[0] <= SETTINGS.max_ber_hat), doubt.confidence[0], 0.0)
-        held_back = np.maximum(held_back, surest)
+    withheld = np.zeros(len(snr_db))
+    for is_complete, quality in zip(whole, qualities, strict=True):
+        surest = np.where(is_complete & (quality.ber_hat[0] <= SETTINGS.max_ber_hat), quality.confidence[0], 0.0)
+        withheld = np.maximum(withheld, surest)
     own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
-    of_bursts = [
-        _Packets.of(0, clock, burst.posteriors, burst.n_observed, doubt)
-        for burst, clock, doubt in zip(bursts, own, doubts, strict=True)
+    packets_by_burst = [
+        _Packets.of(0, clock, burst.posteriors, burst.n_observed, quality)
+        for burst, clock, quality in zip(bursts, own, qualities, strict=True)
     ]
     out = []
     for column, db in enumerate(snr_db):
         packets = tuple(
             each.result(column, burst.number, burst.frames)
-            for burst, each, shown in zip(bursts, of_bursts, reported, strict=True)
+            for burst, each, shown in zip(bursts, packets_by_burst, reported, strict=True)
             if shown[column]
         )
         result = _clip_column(column, clock, bursts, float(going_on[column]), db, packets)
-        if not packets and result.status != "ok" and (message := _withheld(float(held_back[column]), min_confidence)):
+        if not packets and result.status != "ok" and (message := _withheld(float(withheld[column]), min_confidence)):
             result = replace(result, message=message)
         out.append(result)
     return tuple(out)
@@ -160,7 +160,7 @@ def _clip_column(
         status = "ok"
     message = None
     if not packets:
-        message = _why_none_here(status, snr_db, [burst.n_observed[column] for burst in bursts])
+        message = _clip_reason(status, snr_db, [burst.n_observed[column] for burst in bursts])
     return ColumnResult(
         column=column,
         status=status,
@@ -173,24 +173,24 @@ def _clip_column(
 
 
 def snr_db_of_columns(snr: Float32Array) -> list[float | None]:
-    """Median over the slots of each column that show anything."""
+    """Median signal-to-noise ratio of each column's visible slots, dB; None where nothing is visible."""
     if (snr > 0).all():
         return [float(db) for db in 10 * np.log10(np.maximum(np.median(snr, axis=1), 1e-6))]
     return [_snr_db(column) for column in snr]
 
 
 def _weight_of_best(column: int, packets: Sequence[PacketResult], bursts: Sequence[BurstInClip]) -> int | None:
-    """The weight of a column's surest packet; without one, known picture and compression may feign any."""
+    """Weight of a column's surest packet, or None: without a packet the weight is not reliable."""
     if not packets:
         return None
     number = max(packets, key=lambda packet: packet.confidence).burst
     return next(int(burst.posteriors.w[column]) for burst in bursts if burst.number == number)
 
 
-def _why_none_here(status: ColumnStatus, snr_db: float | None, n_observed: list[IntArray]) -> str:
+def _clip_reason(status: ColumnStatus, snr_db: float | None, n_observed: list[IntArray]) -> str:
     if status == "ok" or not n_observed:
         return "its burst goes on in the next frame and is reported there"
-    return _cut_off(np.stack(n_observed)) or _why_none(status, snr_db)
+    return _incomplete_reason(np.stack(n_observed)) or _light_reason(status, snr_db)
 
 
 def _snr_db(snr: Float32Array) -> float | None:
@@ -199,17 +199,17 @@ def _snr_db(snr: Float32Array) -> float | None:
 
 
 def all_dark(snr: Float32Array) -> bool:
-    """Whether no column has light enough; `snr` is (C, N), squared contrast over variance of every slot."""
+    """Whether no column has enough light; `snr` (C, N) is squared contrast over variance of every slot."""
     return all(db is None or db < SETTINGS.dark_snr_db for db in snr_db_of_columns(snr))
 
 
 def clip_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
-    """`ok` when every lit column has a packet, here or in a frame to come; `partial` when some have none."""
+    """`ok` when every lit column has a packet, here or in a later frame; `partial` when some have none."""
     return "ok" if all(column.status in ("ok", "weak", "dark") for column in columns) else "partial"
 
 
 def why_no_packet(columns: tuple[ColumnResult, ...]) -> str:
-    """What a frame without packets says: why its clearest column has none."""
+    """Message of a frame without packets: the reason of its clearest column."""
     clearest = max(columns, key=lambda column: -np.inf if column.snr_db is None else column.snr_db)
     return f"no column gave a packet; column {clearest.column} is the clearest: {clearest.message}"
 
@@ -224,7 +224,7 @@ def frame_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
 
 
 def slots_observed(samples: SlotSamples, clock: Clock) -> IntArray:
-    """How often the middle of each slot of each burst's packet is on the screen and in the picture, (B, C, packet)."""
+    """(B, C, packet) number of copies in which the middle of each slot is on the screen and in the picture."""
     q = samples.samples_per_slot
     shown = samples.valid[..., q // 2 :: q].max(axis=1) > 0
     by_copy = clock.to_copies(shown.astype(np.int64))
@@ -232,7 +232,7 @@ def slots_observed(samples: SlotSamples, clock: Clock) -> IntArray:
 
 
 def complete(n_observed: IntArray) -> BoolArray:
-    """(B, C) whether every payload slot was seen, so that the packet can be reported.
+    """(B, C) whether every payload slot was observed, so that the packet can be reported.
 
     Args:
         n_observed: (B, C, packet) from `slots_observed`.
@@ -248,7 +248,7 @@ def _column_result(
     n_observed: IntArray,
     packets: tuple[PacketResult, ...],
     against: str | None,
-    held_back: str | None,
+    withheld: str | None,
     denoised: bool,
 ) -> ColumnResult:
     sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(SETTINGS.min_weight_probability)
@@ -261,41 +261,43 @@ def _column_result(
         denoised=denoised,
         delay_slots=float(clock.delay_slots[column]),
         packets=packets,
-        message=None if packets else _cut_off(n_observed) or against or held_back or _why_none(status, snr_db),
+        message=None
+        if packets
+        else _incomplete_reason(n_observed) or against or withheld or _light_reason(status, snr_db),
     )
 
 
 def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolArray:
-    """(B, C) whether a column says word for word what a brighter one beside it says, and no other column does.
+    """(B, C) whether a column repeats the words of a brighter neighbour that no other column sends.
 
-    A column under black shows its neighbour's light, blurred; where all columns send the same, more than two agree.
+    A column under a black picture shows its neighbour's light. If all columns send the same, more than two agree.
     """
     words = np.concatenate(
         [np.broadcast_to(posteriors.w[:, None], (*posteriors.index.shape[:2], 1)), posteriors.index], 2
     )
-    alike = (words[:, :, None] == words[:, None]).all(axis=3)
-    two = alike.sum(axis=2) == 2
+    same_words = (words[:, :, None] == words[:, None]).all(axis=3)
+    two = same_words.sum(axis=2) == 2
     db = np.array([-np.inf if value is None else value for value in snr_db])
     beside = np.zeros(two.shape, bool)
-    beside[:, 1:] |= alike[:, 1:, :-1].diagonal(axis1=1, axis2=2) & (db[1:] < db[:-1])
-    beside[:, :-1] |= alike[:, :-1, 1:].diagonal(axis1=1, axis2=2) & (db[:-1] < db[1:])
+    beside[:, 1:] |= same_words[:, 1:, :-1].diagonal(axis1=1, axis2=2) & (db[1:] < db[:-1])
+    beside[:, :-1] |= same_words[:, :-1, 1:].diagonal(axis1=1, axis2=2) & (db[:-1] < db[1:])
     return np.asarray(two & beside)
 
 
 def find_headerless(header_llr: FloatArray) -> BoolArray:
-    """(C,) columns whose header does not show; all where the columns together show none: no light, no packet.
+    """(C,) columns without a header; all columns if they have none together.
 
     Args:
         header_llr: (B, C) of bursts, see `BurstPosteriors`.
     """
-    # A glare may spoil one header altogether: a good one elsewhere outweighs it.
+    # Glare may hide one header; a good one elsewhere outweighs it.
     by_column = np.maximum(header_llr, -SETTINGS.max_header_llr).sum(axis=0)
     together = np.maximum(by_column, -SETTINGS.max_header_llr).sum() > SETTINGS.min_total_header_llr
     return np.asarray(by_column < (SETTINGS.min_header_llr if together else np.inf), bool)
 
 
 def drop_headerless_packets(columns: tuple[ColumnResult, ...], headerless: BoolArray) -> tuple[ColumnResult, ...]:
-    """Columns of a clip, without the packets of those (C,) of which headers say that there are none."""
+    """Drop the packets of the headerless columns (C,) of a clip."""
     message = _HEADERLESS + _OTHER_SCREEN
     return tuple(
         replace(column, packets=(), w=None, status="no_packet", message=message) if out and column.packets else column
@@ -309,8 +311,8 @@ def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> C
     return "dark" if snr_db is None or snr_db < SETTINGS.dark_snr_db else "no_packet"
 
 
-def _cut_off(n_observed: IntArray) -> str | None:
-    """How much is missing of the packet that is nearest to whole; None where one is. `n_observed` is (B, packet)."""
+def _incomplete_reason(n_observed: IntArray) -> str | None:
+    """Message for a column without a complete packet, or None; `n_observed` is (B, packet)."""
     missing = int((n_observed[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
     if not missing:
         return None
@@ -320,7 +322,7 @@ def _cut_off(n_observed: IntArray) -> str | None:
     )
 
 
-def _why_none(status: ColumnStatus, snr_db: float | None) -> str:
+def _light_reason(status: ColumnStatus, snr_db: float | None) -> str:
     if status == "dark" or snr_db is None:
         return "too little light under this column; show a brighter picture or raise the exposure"
     return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
@@ -328,7 +330,7 @@ def _why_none(status: ColumnStatus, snr_db: float | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Packets:
-    """The packets of one burst, of all columns at once: what each costs alone adds up over a clip."""
+    """The packets of one burst in all columns, computed together because clips have many."""
 
     payload: list[str]
     n_bits: list[int]
@@ -340,9 +342,9 @@ class _Packets:
 
     @classmethod
     def of(
-        cls, burst: int, clock: Clock, posteriors: BurstPosteriors, n_observed: IntArray, doubts: Quality
+        cls, burst: int, clock: Clock, posteriors: BurstPosteriors, n_observed: IntArray, quality: Quality
     ) -> _Packets:
-        """Of a burst; `n_observed` is (C, packet)."""
+        """Collect the packets of a burst; `n_observed` is (C, packet)."""
         bits = [bits_per_symbol(w) for w in posteriors.w.tolist()]
         copy = int((clock.burst == burst).argmax())
         n_symbols = posteriors.index.shape[2]
@@ -351,13 +353,13 @@ class _Packets:
             n_bits=[k * n_symbols for k in bits],
             copies=(n_observed.sum(axis=1) / clock.packet_slots).tolist(),
             first_row=_header_rows(copy, clock).tolist(),
-            confidence=doubts.confidence[burst].tolist(),
-            ber_hat=doubts.ber_hat[burst].tolist(),
-            features=doubts.confidence_features[burst].tolist(),
+            confidence=quality.confidence[burst].tolist(),
+            ber_hat=quality.ber_hat[burst].tolist(),
+            features=quality.confidence_features[burst].tolist(),
         )
 
     def result(self, column: int, number: int | None = None, frames: tuple[int, ...] | None = None) -> PacketResult:
-        """The packet of a column; in clips with the number of its burst and the frames that show it."""
+        """Result of a column's packet; in clips with its burst number and the frames that show it."""
         return PacketResult(
             first_row=self.first_row[column],
             copies=self.copies[column],
@@ -372,7 +374,7 @@ class _Packets:
 
 
 def _payloads(index: IntArray, weights: IntArray) -> list[str]:
-    """Hex of the payload of every column, whose words (C, N) are of the weights (C,)."""
+    """Payload of every column in hex, from codebook indices (C, N) and weights (C,)."""
     payload = [""] * len(index)
     for w in set(weights.tolist()):
         columns = np.flatnonzero(weights == w)
@@ -383,7 +385,7 @@ def _payloads(index: IntArray, weights: IntArray) -> list[str]:
 
 
 def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Array:
-    """(B, C, N) the margins (C, N) of the payload slots of each burst, 0 for the other slots of the grid."""
+    """(B, C, N) margins (C, N) of each burst's payload slots, 0 elsewhere on the grid."""
     slot = np.arange(clock.first_slot, clock.first_slot + clock.n_slots)
     payload = slot % clock.packet_slots >= PREAMBLE_SLOTS
     bursts = np.arange(int(clock.burst.max()) + 1)
@@ -394,7 +396,7 @@ def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Arra
 def with_certainty(
     columns: tuple[ColumnResult, ...], certainty: float, min_confidence: float
 ) -> tuple[ColumnResult, ...]:
-    """Columns whose packets are right with their numbers, which are right with some certainty.
+    """Reduce the confidence of packets by the certainty of the column numbers.
 
     Args:
         columns: results as if their numbers were beyond doubt.
@@ -408,11 +410,11 @@ def with_certainty(
 
 def _doubted(column: ColumnResult, certainty: float, min_confidence: float) -> ColumnResult:
     packets = tuple(replace(packet, confidence=certainty * packet.confidence) for packet in column.packets)
-    kept = tuple(packet for packet in packets if packet.confidence >= min_confidence)
+    reported = tuple(packet for packet in packets if packet.confidence >= min_confidence)
     status = column.status
     if status in ("ok", "weak"):
-        status = _column_status(kept, column.snr_db)
-    return replace(column, packets=kept, status=status)
+        status = _column_status(reported, column.snr_db)
+    return replace(column, packets=reported, status=status)
 
 
 def _header_rows(copy: int, clock: Clock) -> FloatArray:

@@ -1,4 +1,4 @@
-"""How sure packets are: calibrated confidence, and the expected share of wrong bits.
+"""Calibrated confidence of packets, and their expected share of wrong bits.
 
 The weights are fitted data, `models/confidence`.
 """
@@ -16,11 +16,11 @@ from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.resources import data_dir
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
 
-#: What slots say against a packet is taken to be at least this, nats, so that its logarithm exists.
+#: Lower limit of the log-likelihood of slots against a packet, so that its logarithm exists.
 _MIN_CONTRADICTION = 0.5
-#: Features that differ by less are equal, but for their digits.
-_SAME = 1e-4
-#: Doubt that is left in the surest packet, and at most in any, nats: what a log-odds can hold.
+#: Tolerance when features are compared.
+_FEATURE_TOLERANCE = 1e-4
+#: Limits of the negative log probability of a packet, so that its log-odds are finite.
 _MIN_DOUBT, _MAX_DOUBT = 1e-9, 500.0
 
 
@@ -42,7 +42,7 @@ class _WrongBits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ConfidenceModel(msgspec.Struct, frozen=True):
-    """`models/confidence/model.toml`: fitted weights; see the comments there."""
+    """Fitted weights from `models/confidence/model.toml`; the comments there explain them."""
 
     photographs: _Photographs
     clips: _Clips
@@ -51,16 +51,16 @@ class ConfidenceModel(msgspec.Struct, frozen=True):
 
 @lru_cache(maxsize=1)
 def confidence_model() -> ConfidenceModel:
-    """The shipped weights."""
+    """Load the shipped weights."""
     path = data_dir("models") / "confidence" / "model.toml"
     return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), ConfidenceModel)
 
 
 @dataclass(frozen=True, slots=True)
 class BurstInClip:
-    """A burst of a clip, as the last frame that shows it reports it."""
+    """A burst of a clip as reported in the last frame that shows it."""
 
-    #: Number in the clip, and in the clock of the frame.
+    #: Number in the clip, and index in the frame's clock.
     number: int
     index: int
     #: Of this burst alone.
@@ -70,14 +70,14 @@ class BurstInClip:
     frames: tuple[int, ...]
     #: (C, 8) see `confidence_features`; None of tracked frames.
     confidence_features: FloatArray | None
-    #: (C,) log-likelihood against what was decided, of the payload slot that says so most; None where the frames were
-    #: received like photographs.
+    #: (C,) largest log-likelihood of any payload slot against its decision; None where the frames were received like
+    #: photographs.
     against: Float32Array | None
 
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """How sure the packets of B bursts and C columns are."""
+    """Confidence of the packets of B bursts and C columns."""
 
     #: (B, C) probability that they are error-free, and expected share of wrong bits.
     confidence: FloatArray
@@ -86,25 +86,26 @@ class Quality:
     confidence_features: FloatArray
 
     def reported(self, min_confidence: float) -> BoolArray:
-        """(B, C) packets that are sure enough to be reported."""
+        """(B, C) whether a packet is reported."""
         return np.asarray((self.ber_hat <= SETTINGS.max_ber_hat) & (self.confidence >= min_confidence))
 
 
 def still_quality(posteriors: BurstPosteriors, confidence_features: FloatArray) -> Quality:
+    """Confidence of the packets of a photograph."""
     return Quality(confidence(confidence_features), _share_unsure(posteriors), confidence_features)
 
 
 def _share_unsure(posteriors: BurstPosteriors) -> FloatArray:
-    """(B, C) share of the bits that is wrong if each is as sure as it seems."""
-    unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of few bits are filled up with NaN
+    """(B, C) expected share of wrong bits, from the log-likelihood ratios of the bits."""
+    unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of fewer than 7 bits are padded with NaN
     return np.asarray(np.nanmean(unsure, axis=(2, 3)))
 
 
 def clip_quality(burst: BurstInClip) -> Quality:
-    """How sure the packets of a burst of a clip are.
+    """Confidence of the packets of a burst of a clip.
 
-    Known picture and compression err alike over slots and copies, so the likelihoods are surer than they should be.
-    What slots say against the codeword that was decided shows it.
+    Errors of the known picture and of compression are correlated over slots and copies, so the likelihoods are too
+    sure. Slots that contradict the decided codeword reveal it.
     """
     if burst.confidence_features is not None:
         return still_quality(burst.posteriors, burst.confidence_features[None])
@@ -116,7 +117,7 @@ def clip_quality(burst: BurstInClip) -> Quality:
 
 
 def wrong_share(log_odds: FloatArray, n_bits: IntArray) -> FloatArray:
-    """Share of wrong bits to expect in packets that are error-free with some log-odds and have so many bits."""
+    """Expected share of wrong bits of packets of `n_bits`, from their log-odds of being error-free."""
     model = confidence_model().wrong_bits
     wrong_bits_at_even_odds = np.maximum(model.wrong_bits_at_even_odds / n_bits, model.wrong_share_at_even_odds)
     return np.asarray(np.minimum(wrong_bits_at_even_odds * np.exp(-model.exponent * log_odds), 0.5))
@@ -130,9 +131,9 @@ def clip_log_odds(burst: BurstInClip) -> FloatArray:
 
 
 def clip_features(burst: BurstInClip) -> FloatArray:
-    """(C, 3) what the confidence of a tracked burst's packets is made of, in the order of the weights.
+    """(C, 3) features of the confidence of a tracked burst's packets, in the order of the weights.
 
-    Beyond a limit surer symbols say nothing more: what errs then is not noise.
+    The posterior is limited: beyond the limit errors are not due to noise.
     """
     assert burst.against is not None
     log_odds = np.minimum(_log_odds(burst.posteriors.log_prob.sum(axis=2))[0], confidence_model().clips.max_log_odds)
@@ -142,19 +143,19 @@ def clip_features(burst: BurstInClip) -> FloatArray:
 def confidence_features(
     posteriors: BurstPosteriors, slot_margin: Float32Array, denoised: BoolArray, n_strips: int
 ) -> FloatArray:
-    """What the confidence of packets is made of, (B, C, 8), in the order of the weights.
+    """(B, C, 8) features of the confidence of packets, in the order of the weights.
 
-    The light model's likelihoods are tempered, since strips and samples err together; still they are too sure where
-    picture or camera are not as the model has them. There single slots speak against the packet. The weights are a
-    logistic regression on packets of the benchmark's `confidence` and `phones`; whatever changes the
-    likelihoods of the light model or the auto-encoder asks for a new fit.
+    The light model scales its likelihoods down, because errors of strips and samples are correlated. They are still too
+    sure where the picture or the camera deviates from the model; single slots then contradict the packet. The weights
+    are a logistic regression on packets of the benchmark's `confidence` and `phones`. A change to the likelihoods of
+    the light model or to the auto-encoder requires a new fit.
 
     Args:
         posteriors: of B bursts and C columns.
-        slot_margin: (B, C, n) what the light says for payload slots of the packets as decided, nats; 0 where nothing is
-            seen; see `slot_margin_by_burst`.
+        slot_margin: (B, C, n) log-likelihood ratio of the packets' payload slots as decided against the opposite; 0
+            where nothing is visible; see `slot_margin_by_burst`.
         denoised: (C,) whether corrections of the auto-encoder were kept.
-        n_strips: strips of a column in a quick look.
+        n_strips: strips of a column in the initial pass.
     """
     model = confidence_model().photographs
     log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), model.max_log_odds)
@@ -167,21 +168,22 @@ def confidence_features(
 
 
 def confidence(confidence_features: FloatArray) -> FloatArray:
-    """Probability (...) that packets are error-free, from their evidence (..., 8)."""
+    """(...) probability that packets are error-free, from their features (..., 8)."""
     return _probability(confidence_log_odds(confidence_features))
 
 
 def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
-    """Log-odds (...) of packets being error-free, from their evidence (..., 8).
+    """(...) log-odds that packets are error-free, from their features (..., 8).
 
-    Small noisy columns are surer than their posterior, as strips err less together there than it is tempered for. Where
-    slots stand out as far as counts it is not noise that leaves a symbol in doubt: there the posterior is not exceeded.
+    Small noisy columns deserve more confidence than their posterior, because errors of their strips are less correlated
+    than assumed. Where slots have the largest counted margin, noise does not explain a doubtful symbol, and the
+    posterior is an upper limit.
     """
     model = confidence_model().photographs
     log_odds = np.asarray(confidence_features @ np.array(model.weights))
     posterior, average = confidence_features[..., 1], confidence_features[..., 4]
-    plain = (average > np.log(model.max_average) - _SAME) & (posterior < model.max_log_odds)
-    # Packets more likely wrong than right were never too sure.
+    plain = (average > np.log(model.max_average) - _FEATURE_TOLERANCE) & (posterior < model.max_log_odds)
+    # The limit applies only to packets that are more likely right than wrong.
     return np.asarray(np.where(plain, np.minimum(log_odds, np.maximum(posterior, 0.0)), log_odds))
 
 

@@ -1,4 +1,4 @@
-"""Numbers of policy of detection and of what is reported."""
+"""Settings of detection and reporting."""
 
 from __future__ import annotations
 
@@ -7,45 +7,43 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class DecodeSettings:
-    """Each with its unit and the reason for it."""
+    """Thresholds, each with its unit and its reason."""
 
-    #: A packet is reported up to this expected share of wrong bits; at 0.2 some have more than a quarter of them wrong.
+    #: Largest expected share of wrong bits of a reported packet.
     max_ber_hat: float = 0.1
-    #: A photograph none of whose packets reaches this confidence shows none.
+    #: If no packet of a photograph reaches this confidence, none is reported.
     min_best_confidence: float = 0.1
-    #: A weight is reported, and its soft bits count, from this probability on.
+    #: Minimum probability at which a weight is reported and its soft bits are used.
     min_weight_probability: float = 0.99
     #: A column below this signal-to-noise ratio, dB, is too dark to try.
     dark_snr_db: float = 0.0
-    #: Headers of a column, all bursts together, less likely than this against slots that are anything, nats, are none.
+    #: Minimum log-likelihood ratio of a column's headers, all bursts together, against arbitrary slots.
     min_header_llr: float = -2.0
-    #: Together the columns' headers must be this much more likely than slots that are anything, nats; one good header
-    #: gives so many, and a bad one takes no more than a good one gives.
+    #: Minimum log-likelihood ratio of the headers of all columns together, and the largest contribution, positive or
+    #: negative, of one header.
     min_total_header_llr: float = 6.0
     max_header_llr: float = 12.0
-    #: Light of white, and the share of a column's samples from which on its lit slots are cut off there.
+    #: Light of white, and the share of a column's samples at white from which the column counts as overexposed.
     white_level: float = 0.98
     overexposed_share: float = 0.2
 
-    #: Slots are at most this sure, nats, when weights are compared: one bad slot must not decide.
+    #: Limit of a slot's log-likelihood ratio when weights are compared: one bad slot must not decide.
     max_slot_llr: float = 12.0
-    #: No soft bit is surer, nats: of those that look surest in simulated clips 0.05 % are wrong, mostly of symbols that
-    #: a picture's border cuts.
+    #: Limit of a soft bit's log-likelihood ratio: about 0.05 % of the surest bits of simulated clips are wrong, mostly
+    #: in symbols at the picture's border.
     max_bit_llr: float = 7.6
-    #: Where a packet's own ratios expect as many wrong bits as its confidence does, this share of them is taken to hide
-    #: among bits that look sure.
+    #: Minimum share of a packet's expected wrong bits that is attributed to bits with large log-likelihood ratios.
     hidden_error_share: float = 0.1
 
-    #: Steady light: share of its variance that one period explains, from which on it may be a lamp's; packets reach
-    #: 0.5, by repeating. Lines of the period that are added up, and the longest period, packets: a packet sent again
-    #: has lines of its own.
+    #: Minimum share of the variance that one period must explain for light to count as periodic (repeated packets reach
+    #: 0.5), harmonics that are added up, and the longest period, packets.
     min_periodic_share: float = 0.6
     n_harmonics: int = 24
     max_period_packets: float = 0.5
-    #: Slots by which the exposure may move or spread a slot.
+    #: Slots by which the exposure may shift or widen a slot.
     max_shift_slots: int = 2
-    #: Columns this far apart, of all and by number, share no light; and correlation, beyond that of the headers which
-    #: packets have in common, from which they show the same: packets reach 0.4, one light everywhere 0.65 or more.
+    #: Distance from which columns share no light, as a share of the columns and as a number; and the correlation,
+    #: beyond that of the common headers, from which they show one light: packets reach 0.4, a lamp at least 0.65.
     distant_share: float = 1 / 6
     distant_columns: int = 3
     min_similarity: float = 0.59

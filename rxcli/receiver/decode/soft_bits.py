@@ -1,4 +1,4 @@
-"""Soft bits for the link layer: of every packet, whole or cut, no surer than packets of its confidence turn out."""
+"""Soft bits of whole and cut packets for the link layer, limited by the confidence of the packet."""
 
 from __future__ import annotations
 
@@ -15,24 +15,28 @@ from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, Fr
 
 
 def observed_symbols(n_observed: IntArray) -> BoolArray:
-    """(..., N) payload symbols all of whose slots were observed, from counts (..., packet)."""
+    """(..., N) whether all slots of a payload symbol were observed, from counts (..., packet)."""
     payload = n_observed[..., PREAMBLE_SLOTS:] > 0
     return np.asarray(payload.reshape(*payload.shape[:-1], -1, SLOTS_PER_SYMBOL).all(axis=-1))
 
 
 def assume_unobserved_certain(posteriors: BurstPosteriors, n_observed: IntArray) -> BurstPosteriors:
-    """The posteriors, symbols that were not observed (B, C, packet) as a whole counted as certain: so a cut packet's
-    confidence is that of what is there."""
-    return replace(posteriors, log_prob=np.where(observed_symbols(n_observed), posteriors.log_prob, 0.0))
-
-
-def llr_limits(posteriors: BurstPosteriors, n_observed: IntArray, log_odds: FloatArray) -> FloatArray:
-    """(B, C) the most that a ratio of a packet may be.
+    """Count symbols that were not fully observed as certain, so that a cut packet is judged by its visible part.
 
     Args:
         posteriors: of B bursts and C columns.
         n_observed: (B, C, packet).
-        log_odds: (B, C) log-odds of every observed symbol being right, calibrated.
+    """
+    return replace(posteriors, log_prob=np.where(observed_symbols(n_observed), posteriors.log_prob, 0.0))
+
+
+def llr_limits(posteriors: BurstPosteriors, n_observed: IntArray, log_odds: FloatArray) -> FloatArray:
+    """(B, C) upper limit of a packet's log-likelihood ratios.
+
+    Args:
+        posteriors: of B bursts and C columns.
+        n_observed: (B, C, packet).
+        log_odds: (B, C) calibrated log-odds that every observed symbol is right.
     """
     known = observed_symbols(n_observed)[..., None] & ~np.isnan(posteriors.bit_llr)
     n_bits = np.maximum(known.sum(axis=(2, 3)), 1)
@@ -42,11 +46,11 @@ def llr_limits(posteriors: BurstPosteriors, n_observed: IntArray, log_odds: Floa
     return np.asarray(np.clip(-np.log(np.maximum(hidden, 1e-9)), 0.0, SETTINGS.max_bit_llr))
 
 
-def limited(posteriors: BurstPosteriors, limits: FloatArray, erased: BoolArray) -> Float32Array:
-    """(B, N, C, 7) ratios within the limits (B, C), none of the columns and bursts that are erased, (B, C)."""
+def limit_llr(posteriors: BurstPosteriors, limits: FloatArray, erased: BoolArray) -> Float32Array:
+    """(B, N, C, 7) log-likelihood ratios within the limits (B, C); 0 where `erased` (B, C)."""
     sure_of_w = posteriors.w_log_prob.max(axis=1) > np.log(SETTINGS.min_weight_probability)
-    most = np.where(erased | ~sure_of_w, 0.0, limits)[..., None, None]
-    llr = np.clip(np.nan_to_num(posteriors.bit_llr), -most, most)
+    limit = np.where(erased | ~sure_of_w, 0.0, limits)[..., None, None]
+    llr = np.clip(np.nan_to_num(posteriors.bit_llr), -limit, limit)
     return np.ascontiguousarray(llr.transpose(0, 2, 1, 3), np.float32)
 
 
@@ -63,16 +67,16 @@ def still_soft_bits(
         posteriors: of B bursts and C columns.
         n_observed: (B, C, packet).
         confidence_features: (B, C, 8) of what was observed.
-        snr_db: of every column, None where nothing is seen.
+        snr_db: of every column, None where nothing is visible.
         headerless: (C,) columns that show no packets.
     """
     limits = llr_limits(posteriors, n_observed, confidence_log_odds(confidence_features))
     erased = echoes(posteriors, snr_db) | headerless
-    return FrameSoftBits(np.arange(len(n_observed)), limited(posteriors, limits, erased))
+    return FrameSoftBits(np.arange(len(n_observed)), limit_llr(posteriors, limits, erased))
 
 
 def clip_soft_bits(bursts: Sequence[BurstInClip], snr_db: Sequence[float | None], epoch: int) -> FrameSoftBits | None:
-    """The soft bits of the bursts that end in a frame of a clip; None where none does."""
+    """The soft bits of the bursts that end in a frame of a clip, or None."""
     if not bursts:
         return None
     parts = []
@@ -80,5 +84,5 @@ def clip_soft_bits(bursts: Sequence[BurstInClip], snr_db: Sequence[float | None]
         n_observed = burst.n_observed[None]
         log_odds = clip_log_odds(replace(burst, posteriors=assume_unobserved_certain(burst.posteriors, n_observed)))
         limits = llr_limits(burst.posteriors, n_observed, log_odds)
-        parts.append(limited(burst.posteriors, limits, echoes(burst.posteriors, snr_db)))
+        parts.append(limit_llr(burst.posteriors, limits, echoes(burst.posteriors, snr_db)))
     return FrameSoftBits(np.array([burst.number for burst in bursts], np.int64), np.concatenate(parts), epoch)

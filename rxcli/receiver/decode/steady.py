@@ -1,11 +1,11 @@
-"""Light that is switched but says nothing: of lamps, and of screens that are dimmed by switching.
+"""Detect flickering light without data: lamps, and screens dimmed by switching.
 
-A waveform of any period far below a packet's has few free parameters. Where it explains the light, and does so better
-than the slots that were decided, the slots are no evidence of packets. Headers and dimming symbols break every such
-period, so that packets whose payload repeats one symbol are not refused.
+A periodic waveform with a period far below a packet's has few free parameters. If it explains the light better than the
+decided slots, the slots are no evidence of packets. Headers and dimming symbols break every such period, so packets
+whose payload repeats one symbol are not refused.
 
-Columns are independent transmitters. Where all show the same light, it is that of one lamp, and what twenty columns
-say of it counts once.
+Columns are independent transmitters. If all of them show the same light, it comes from one lamp, and their evidence
+counts once.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
-#: Spectra are computed on a grid so many times finer than the light's length resolves.
+#: Oversampling of spectra, relative to the resolution of the light's length.
 _OVERSAMPLING = 4
-#: Pairs of columns that are compared, at most.
+#: Maximum number of column pairs that are compared.
 _MAX_PAIRS = 300
 
 
@@ -26,8 +26,8 @@ def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, pack
 
     Args:
         value: (C, N * Q) light of every column between its extremes, Q samples a slot.
-        weight: (C, N * Q) the weight behind it; 0 where nothing is seen.
-        lit: (C, N) slots as decided, 0..1.
+        weight: (C, N * Q) its weight; 0 where nothing is visible.
+        lit: (C, N) decided slots, 0..1.
         packet_slots: slots of a packet.
     """
     samples_per_slot = value.shape[1] // lit.shape[1]
@@ -40,25 +40,27 @@ def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, pack
 
 
 def is_common_light(value: Float32Array, weight: Float32Array, shared: float, reach: int = 0) -> bool:
-    """Whether columns far apart show the same light.
+    """Whether distant columns show the same light.
 
     Args:
         value, weight: see `is_steady`.
-        shared: part of the light that all columns of a link have in common: the share of the headers.
-        reach: samples by which columns may be later or earlier.
+        shared: share of the light that all columns have in common, i.e. that of the headers.
+        reach: largest shift between columns, samples.
     """
     n_columns, n = value.shape
-    first, second = np.triu_indices(n_columns, max(SETTINGS.distant_columns, int(SETTINGS.distant_share * n_columns)))
-    if first.size == 0:
+    column_a, column_b = np.triu_indices(
+        n_columns, max(SETTINGS.distant_columns, int(SETTINGS.distant_share * n_columns))
+    )
+    if column_a.size == 0:
         return False
-    some = np.linspace(0, first.size - 1, min(first.size, _MAX_PAIRS)).astype(np.int64)
+    chosen = np.linspace(0, column_a.size - 1, min(column_a.size, _MAX_PAIRS)).astype(np.int64)
     observed = weight > 0
     level = (value - _mean(value, observed)) * observed
     level = level / np.maximum(np.sqrt(np.square(level).sum(axis=1, keepdims=True)), 1e-9)
     spectrum = np.fft.rfft(level, n + reach, axis=1)
-    moved = np.fft.irfft(spectrum[first[some]] * np.conj(spectrum[second[some]]), n + reach, axis=1)
-    likeness = np.concatenate([moved[:, : reach + 1], moved[:, moved.shape[1] - reach :]], axis=1).max(axis=1)
-    return bool(np.median(likeness) > shared + (1 - shared) * SETTINGS.min_similarity)
+    moved = np.fft.irfft(spectrum[column_a[chosen]] * np.conj(spectrum[column_b[chosen]]), n + reach, axis=1)
+    similarity = np.concatenate([moved[:, : reach + 1], moved[:, moved.shape[1] - reach :]], axis=1).max(axis=1)
+    return bool(np.median(similarity) > shared + (1 - shared) * SETTINGS.min_similarity)
 
 
 def _mean(value: Float32Array, observed: BoolArray) -> FloatArray:
@@ -66,11 +68,11 @@ def _mean(value: Float32Array, observed: BoolArray) -> FloatArray:
 
 
 def periodic_share(level: FloatArray | Float32Array, packet_samples: int) -> float:
-    """Share of the variance of columns (C, n) that one period explains, whatever the waveform of each column."""
+    """Share of the variance of columns (C, n) that one period explains; each column has its own waveform."""
     n = level.shape[1]
     size = 1 << int(np.ceil(np.log2(_OVERSAMPLING * n)))
     power = (np.abs(np.fft.rfft(level, size, axis=1)) ** 2).sum(axis=0) * (2 / (n * float((level**2).sum())))
-    # The grid may miss a line by half a step.
+    # A line may lie between two grid frequencies.
     near = np.maximum(power, np.maximum(np.roll(power, 1), np.roll(power, -1)))
     fundamental = np.arange(int(np.ceil(size / (SETTINGS.max_period_packets * packet_samples))), size // 2)
     share = np.zeros(fundamental.size)
@@ -81,7 +83,7 @@ def periodic_share(level: FloatArray | Float32Array, packet_samples: int) -> flo
 
 
 def _share_of_slots(level: FloatArray, observed: BoolArray, lit: Float32Array, samples_per_slot: int) -> float:
-    """Share of the variance that the decided slots explain through any exposure; each column has its own."""
+    """Share of the variance that the decided slots explain; each column has its own exposure response."""
     slots = np.repeat(lit, samples_per_slot, axis=1)
     reach = SETTINGS.max_shift_slots * samples_per_slot
     left = 0.0

@@ -1,9 +1,9 @@
 """Slot clock, copies and bursts, from the header and the repeats, jointly over the columns.
 
-Model: all columns send the header 0011100011 at the same instants, so the mean over columns of the light, each strip
-normalised to its local extremes, shows the header at full contrast wherever a packet starts; payloads average out.
-The clock is the start and, where the camera is unknown, the period that collects most of that correlation over all
-visible copies. Copies of one burst are alike, copies of different bursts are not; that finds the burst boundaries.
+Model: all columns send the header 0011100011 at the same instants. Each strip is normalised to its local extremes; the
+mean over the columns then shows the header at full contrast wherever a packet starts, while payloads average out. The
+clock is the start with the largest header correlation over all visible copies. Copies of one burst are equal and copies
+of different bursts are not, which gives the burst boundaries.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from rxcli.protocol import EXTREMES_SLOTS, HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYM
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
-#: Samples whose rows are told by those of the first and of the next after them.
+#: Spacing, in samples, of the nodes between which row positions are interpolated.
 _SMOOTH_SAMPLES = 8
 
 
 def pooled_strips(profiles: RowProfiles) -> RowProfiles:
-    """Profiles of a few strips a column, to search the clock: pooled in pairs where there are four or more."""
+    """Bin strips in pairs for the clock search if a column has at least four."""
     return binned_strips(profiles) if profiles.light.shape[1] >= SETTINGS.min_binned_strips else profiles
 
 
 def binned_strips(profiles: RowProfiles) -> RowProfiles:
-    """Profiles with strips pooled in pairs, for a quick look; the same profiles where their number is odd."""
+    """Bin strips in pairs for the initial pass; an odd number of strips is left as it is."""
     rows, light = profiles.sensor_row, _bounded(profiles.light)
     if light.shape[1] % 2:
         return replace(profiles, light=light)
@@ -44,7 +44,7 @@ def binned_strips(profiles: RowProfiles) -> RowProfiles:
 
 
 def unbinned_strips(profiles: RowProfiles) -> RowProfiles:
-    """Profiles with every strip taken for two of half the pixels; copies."""
+    """Split every strip into two equal ones with half the pixels each."""
     rows = profiles.sensor_row
     return replace(
         profiles,
@@ -58,23 +58,23 @@ def unbinned_strips(profiles: RowProfiles) -> RowProfiles:
 def resample(
     profiles: RowProfiles, row0: float | FloatArray, rows_per_sample: float, n_samples: int
 ) -> tuple[Float32Array, Float32Array]:
-    """Mean light over equal steps of sensor rows.
+    """Resample light to equal steps of sensor rows.
 
     Args:
         profiles: C columns, S strips, R rows.
-        row0: sensor row at which sample 0 starts, of all columns or of each (C,); row r covers r - 0.5 .. r + 0.5.
+        row0: sensor row at which sample 0 starts, common or per column (C,); row r covers r - 0.5 .. r + 0.5.
         rows_per_sample: length of a sample.
-        n_samples: samples.
+        n_samples: number of samples.
 
     Returns:
-        (C, S, n_samples) float32 light, 0 where not valid; and 1 where a sample lies on the screen altogether, else 0.
+        (C, S, n_samples) float32 light, 0 where not valid; and validity, 1 where a sample lies entirely on the screen.
     """
     borders = np.reshape(row0, (-1, 1)) + rows_per_sample * np.arange(n_samples + 1, dtype=np.float64)
     light = _bounded(profiles.light.reshape(-1, profiles.light.shape[-1]))
-    first, stop = _shown_rows(profiles.inside.reshape(light.shape))
+    start, stop = _shown_rows(profiles.inside.reshape(light.shape))
     positions = _row_positions(profiles, borders)
     widths = np.diff(positions, axis=-1)
-    valid = (positions[:, :-1] >= first[:, None]) & (positions[:, 1:] <= stop[:, None]) & (widths > TINY)
+    valid = (positions[:, :-1] >= start[:, None]) & (positions[:, 1:] <= stop[:, None]) & (widths > TINY)
     mean = _integrate(light, positions)
     mean /= np.maximum(widths, TINY)
     mean *= valid
@@ -83,19 +83,19 @@ def resample(
 
 
 def _bounded(light: Float32Array) -> Float32Array:
-    """Light with what no sensor delivers taken as dark: one NaN would spoil every sum after it."""
+    """Replace NaN and impossible light by 0, since one NaN would spoil every sum after it."""
     if float(np.abs(light).max(initial=0.0)) <= SETTINGS.max_light:
         return light
     return np.where(np.abs(light) <= SETTINGS.max_light, light, np.float32(0))
 
 
 def _shown_rows(inside: BoolArray) -> tuple[IntArray, IntArray]:
-    """First row of each strip on the screen, and the one after the last; (n,) each, equal where there is none."""
+    """First row of each strip on the screen, and the row after the last; (n,) each, equal where there is none."""
     n_rows = inside.shape[1]
     any_row = inside.any(axis=1)
-    first = inside.argmax(axis=1)
+    start = inside.argmax(axis=1)
     stop = n_rows - inside[:, ::-1].argmax(axis=1)
-    return first, np.where(any_row, stop, first)
+    return start, np.where(any_row, stop, start)
 
 
 def _row_positions(profiles: RowProfiles, borders: FloatArray) -> FloatArray:
@@ -105,15 +105,15 @@ def _row_positions(profiles: RowProfiles, borders: FloatArray) -> FloatArray:
         out = borders - (profiles.rows[0] - 0.5)
         return np.asarray(np.clip(out if len(out) == 1 else np.repeat(out, n_strips, axis=0), 0, n_rows))
     strips = profiles.sensor_row.reshape(-1, n_rows)
-    # Lenses move rows so smoothly that some borders tell where the others are; strips go straight on at their ends.
+    # Lens distortion is smooth, so positions are interpolated between a few borders and extrapolated linearly.
     few = np.arange(0, borders.shape[1] + _SMOOTH_SAMPLES, _SMOOTH_SAMPLES)
     at_few = borders[:, :1] + few * (borders[:, -1:] - borders[:, :1]) / max(borders.shape[1] - 1, 1)
     at_few = np.broadcast_to(at_few, (profiles.light.shape[0], few.size)).repeat(n_strips, axis=0)
-    # So do some of the rows.
+    # Likewise between a few rows.
     index = np.unique(np.append(np.arange(0, n_rows, _SMOOTH_SAMPLES), n_rows - 1))
     known = strips[:, index].astype(np.float64)
-    first, last = (strips[:, [1]] - strips[:, [0]], strips[:, [-1]] - strips[:, [-2]]) if n_rows > 1 else (1.0, 1.0)
-    rows = np.concatenate([known[:, :1] - n_rows * first, known, known[:, -1:] + n_rows * last], axis=1)
+    before, after = (strips[:, [1]] - strips[:, [0]], strips[:, [-1]] - strips[:, [-2]]) if n_rows > 1 else (1.0, 1.0)
+    rows = np.concatenate([known[:, :1] - n_rows * before, known, known[:, -1:] + n_rows * after], axis=1)
     index = np.concatenate([[-n_rows], index, [2 * n_rows - 1]]) + 0.5
     found = np.stack([np.interp(at, strip, index) for at, strip in zip(at_few, rows, strict=True)])
     between = np.arange(_SMOOTH_SAMPLES) / _SMOOTH_SAMPLES
@@ -144,25 +144,25 @@ def _integrate(values: Float32Array, positions: FloatArray) -> FloatArray:
 def contrast(
     light: Float32Array, valid: Float32Array, samples_per_slot: int, sigma: float
 ) -> tuple[Float32Array, Float32Array]:
-    """Light of each strip between its local extremes, -1 dark to 1 lit, pooled over the strips of a column.
+    """Normalise each strip to its local extremes, -1 dark to 1 lit, and pool the strips of a column.
 
-    The extremes are those of smoothed light, lest noise set them; the light itself is not, because a blur dims single
-    slots.
+    The extremes are taken from smoothed light to suppress noise. The light itself is not smoothed, because a blur dims
+    single slots.
 
     Args:
         light: (C, S, n).
         valid: (C, S, n) 1 or 0.
-        samples_per_slot: samples a slot.
-        sigma: standard deviation of a sample of no light.
+        samples_per_slot: samples per slot.
+        sigma: standard deviation of a dark sample.
 
     Returns:
-        (C, n) float32: pooled value; and the weight behind it, in strips of full contrast.
+        (C, n) float32: pooled value; and its weight, in strips of full contrast.
     """
     import cv2
 
     window = np.ones((1, EXTREMES_SLOTS * samples_per_slot), np.uint8)
     flat = light.reshape(-1, light.shape[-1])
-    # An odd length, lest everything move by half a sample.
+    # An odd length avoids a shift by half a sample.
     smooth = cv2.blur(flat, (samples_per_slot // 2 * 2 + 1, 1)) if samples_per_slot > 1 else flat
     high = cv2.dilate(smooth, window).reshape(light.shape)
     low = cv2.erode(smooth, window).reshape(light.shape)
@@ -180,9 +180,9 @@ def contrast(
 
 
 def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot: int) -> FloatArray:
-    """Correlation of the columns' mean with the header, for a header that starts at each sample; (n,) float64.
+    """(n,) float64 correlation of the columns' mean with a header that starts at each sample.
 
-    A start may lie up to a header before the first sample's end; what is not seen counts as nothing.
+    Slots outside the samples contribute nothing.
     """
     share = weight / (weight + 1.0)
     mean = (pooled * share).sum(axis=0) / max(pooled.shape[0], 1)
@@ -190,7 +190,7 @@ def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot
 
 
 def _header_correlation(values: NDArray[np.floating], samples_per_slot: int) -> FloatArray:
-    """(n, samples) mean of the slots of a header that starts at each sample, dark ones negative; nothing beyond."""
+    """(n, samples) mean over the slots of a header that starts at each sample, dark slots negated."""
     total = np.cumsum(values, axis=1, dtype=np.float64)
     padded = np.pad(total, ((0, 0), (1, 0)))
     length = SLOTS_PER_SYMBOL * samples_per_slot
@@ -200,14 +200,14 @@ def _header_correlation(values: NDArray[np.floating], samples_per_slot: int) -> 
 def find_clock(
     profiles: RowProfiles, rows_per_slot: float, exposure_slots: float, packet_slots: int, sigma: float
 ) -> Clock | None:
-    """Find the clock of a picture whose rows per slot are known, bursts still unknown; None where too little is seen.
+    """Find the clock of a picture with known rows per slot, bursts still unassigned; None if too little is visible.
 
     Args:
         profiles: row profiles of the screen.
-        rows_per_slot: sensor rows a slot.
+        rows_per_slot: sensor rows per slot.
         exposure_slots: exposure in slots.
         packet_slots: slots of a packet.
-        sigma: standard deviation of a strip's row of no light.
+        sigma: standard deviation of a dark row of a strip.
     """
     top, bottom = _row_span(profiles)
     step = rows_per_slot / SETTINGS.search_samples
@@ -249,24 +249,24 @@ def find_clock(
 
 
 def _row_span(profiles: RowProfiles) -> tuple[float, float]:
-    """First and last sensor row that any strip shows, as borders."""
+    """Borders of the top and the bottom sensor row in view of any strip."""
     observed = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
     if observed.size == 0:
         return 0.0, 0.0
-    first, last = int(observed[0]), int(observed[-1])
+    top, bottom = int(observed[0]), int(observed[-1])
     if profiles.sensor_row is None:
-        return float(profiles.rows[first]) - 0.5, float(profiles.rows[last]) + 0.5
-    rows = profiles.sensor_row[:, :, first : last + 1]
-    shown = profiles.inside[:, :, first : last + 1]
+        return float(profiles.rows[top]) - 0.5, float(profiles.rows[bottom]) + 0.5
+    rows = profiles.sensor_row[:, :, top : bottom + 1]
+    shown = profiles.inside[:, :, top : bottom + 1]
     return float(rows[shown].min()) - 0.5, float(rows[shown].max()) + 0.5
 
 
 def header_comb(score: FloatArray, samples_per_slot: int) -> tuple[float, float]:
-    """Start of packets, in samples, that collects most header correlation, and its lead over all that are elsewhere.
+    """Start of packets, in samples, with the largest header correlation, and its ratio to the next rival.
 
     Args:
-        score: (period,) power of the header correlation at every place in a packet, copies added.
-        samples_per_slot: samples a slot.
+        score: (period,) power of the header correlation at each position in a packet, copies added.
+        samples_per_slot: samples per slot.
     """
     best = int(score.argmax())
     if score[best] <= 0:
@@ -277,7 +277,7 @@ def header_comb(score: FloatArray, samples_per_slot: int) -> tuple[float, float]
 
 
 def _rival(score: FloatArray, best: int, samples_per_slot: int, further: int = 0) -> float:
-    """The most of a score that is further from `best` than a quarter of a header, and `further` samples."""
+    """Largest score more than a quarter of a header plus `further` samples away from `best`."""
     period = score.size
     distance = np.abs((np.arange(period) - best + period // 2) % period - period // 2)
     away = score[distance > SLOTS_PER_SYMBOL * samples_per_slot // 4 + further]
@@ -285,9 +285,9 @@ def _rival(score: FloatArray, best: int, samples_per_slot: int, further: int = 0
 
 
 def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> tuple[float, float, FloatArray]:
-    """Start, lead and delays of columns whose headers lie too far apart to be seen in their mean.
+    """Start, lead and delays of columns whose delays are too different for their mean to show a header.
 
-    Each column's own header correlation is folded; the start is where most columns have a peak within reach.
+    Folds each column's own header correlation; the start is where most columns have a peak within reach.
     """
     import cv2
 
@@ -295,10 +295,10 @@ def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> 
     length = SLOTS_PER_SYMBOL * SETTINGS.search_samples
     share = np.pad(weight / (weight + 1.0), ((0, 0), (0, length - 1)))
     total = np.cumsum(np.pad(share, ((0, 0), (1, 0))), axis=1)
-    support = (total[:, length:] - total[:, :-length]) / length
+    bound = (total[:, length:] - total[:, :-length]) / length
     responses = _header_correlation(pooled * (weight / (weight + 1.0)), SETTINGS.search_samples)
-    # Twice a correlation less its bound: the log-likelihood ratio, up to a factor, of a header against random slots.
-    llr = folded(2 * responses - support, period)
+    # Twice the correlation minus its bound is proportional to the log-likelihood ratio against random slots.
+    llr = folded(2 * responses - bound, period)
     reach = int(SETTINGS.max_delay_slots * SETTINGS.search_samples)
     wide = reach + SETTINGS.search_samples
     wrapped = np.pad(llr, ((0, 0), (wide, wide)), mode="wrap")
@@ -319,7 +319,7 @@ def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> 
 
 
 def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slots: int) -> FloatArray:
-    """Delay of each column against the common clock, slots; 0 where it cannot be told from none."""
+    """Delay of each column against the common clock, slots; 0 where it is not significant."""
     reach = int(SETTINGS.max_delay_slots * SETTINGS.search_samples) + 2
     template = np.repeat(2.0 * np.array(HEADER) - 1, SETTINGS.search_samples) / (
         SLOTS_PER_SYMBOL * SETTINGS.search_samples
@@ -353,11 +353,11 @@ def _parabola(score: FloatArray, best: NDArray[np.int64]) -> FloatArray:
 
 
 def corrected(clock: Clock, timing: FloatArray) -> Clock:
-    """The clock moved by what the columns together say of its lateness; delays, where there are any, one by one.
+    """Correct the clock by its mean lateness over the columns, and the columns' delays where there are any.
 
     Args:
         clock: the clock.
-        timing: (C, 2) numerators and denominators of each column's lateness in slots.
+        timing: (C, 2) numerator and denominator of each column's lateness in slots.
     """
     numerator, denominator = timing.sum(axis=0)
     late = (
@@ -378,12 +378,12 @@ def corrected(clock: Clock, timing: FloatArray) -> Clock:
 def sample_slots(
     profiles: RowProfiles, clock: Clock, samples_per_slot: int, columns: IntArray | None = None
 ) -> SlotSamples:
-    """Row profiles on the slot grid of `clock`, each column at its own delay.
+    """Sample row profiles on the slot grid of `clock`, each column at its own delay.
 
     Args:
         profiles: row profiles.
         clock: the clock.
-        samples_per_slot: samples a slot, Q.
+        samples_per_slot: samples per slot, Q.
         columns: columns to sample, all by default.
     """
     step = clock.rows_per_slot / samples_per_slot
@@ -408,36 +408,36 @@ def _of_columns(profiles: RowProfiles, columns: IntArray) -> RowProfiles:
 
 
 def assign_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> Clock:
-    """The clock with its copies assigned to bursts, by the likeness of adjacent copies.
+    """Assign the copies of a clock to bursts by the similarity of adjacent copies.
 
     Args:
         clock: the clock.
-        llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
+        llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not visible.
         repeats: how many copies a burst may have.
     """
     return possible_bursts(clock, llr, repeats)[0][0]
 
 
 def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> list[tuple[Clock, float]]:
-    """The clock with its copies in bursts in every way, and how likely each is, nats; likeliest first.
+    """All assignments of the copies to bursts with their log-likelihood scores, likeliest first.
 
     Args:
         clock: the clock.
-        llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
+        llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not visible.
         repeats: how many copies a burst may have.
     """
-    likeness = copy_similarity(llr, clock)
+    scores = copy_similarity(llr, clock)
     out: dict[bytes, tuple[Clock, float]] = {}
     for n, phase in [(copies, phase) for copies in repeats for phase in range(copies)]:
         burst = (np.arange(clock.n_copies) + phase) // n
-        score = float(np.where(burst[1:] == burst[:-1], likeness, -likeness).sum())
+        score = float(np.where(burst[1:] == burst[:-1], scores, -scores).sum())
         burst -= burst[0]
         out.setdefault(burst.tobytes(), (replace(clock, burst=burst), score))
-    return sorted(out.values(), key=lambda one: -one[1])
+    return sorted(out.values(), key=lambda assignment: -assignment[1])
 
 
 def likely_repeats(clock: Clock, repeats: Sequence[int]) -> int:
-    """The first of `repeats` that bursts as they were told apart can be of."""
+    """The first of `repeats` that is consistent with the assigned bursts."""
     for n in repeats:
         for phase in range(n):
             burst = (np.arange(clock.n_copies) + phase) // n
@@ -447,29 +447,29 @@ def likely_repeats(clock: Clock, repeats: Sequence[int]) -> int:
 
 
 def copy_similarity(llr: Float32Array, clock: Clock) -> FloatArray:
-    """Log-likelihood ratio of each copy being the same packet as the next, against another one; (n_copies - 1,).
+    """(n_copies - 1,) log-likelihood ratio of each copy and the next being the same packet.
 
     Args:
-        llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not seen.
+        llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not visible.
         clock: the clock.
     """
     copies = np.moveaxis(clock.to_copies(np.clip(llr, -SETTINGS.max_slot_llr, SETTINGS.max_slot_llr)), 1, 0)
-    return np.array([likeness(first, second) for first, second in pairwise(copies)])
+    return np.array([similarity(*pair) for pair in pairwise(copies)])
 
 
-def likeness(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
-    """Log-likelihood ratio of two copies being the same packet, against different ones.
+def similarity(copy_a: NDArray[np.floating], copy_b: NDArray[np.floating]) -> float:
+    """Log-likelihood ratio of two copies being the same packet against different ones.
 
-    Two slots that are lit with probabilities p and q are alike with likelihood p q / r + (1 - p)(1 - q) / (1 - r)
-    against two independent ones, r being the column's share of lit slots.
+    Two slots lit with probabilities p and q are equal with likelihood p q / r + (1 - p)(1 - q) / (1 - r) relative to
+    independent slots, where r is the column's share of lit slots.
 
     Args:
-        first: (C, packet) log-likelihood ratios of its slots being lit, 0 where not seen.
-        second: likewise.
+        copy_a: (C, packet) log-likelihood ratio of each slot being lit, 0 where not visible.
+        copy_b: likewise.
     """
-    first, second = first[:, PREAMBLE_SLOTS:], second[:, PREAMBLE_SLOTS:]
-    both = (first != 0) & (second != 0)
-    p, q = 1 / (1 + np.exp(-first)), 1 / (1 + np.exp(-second))
-    share = ((p + q) * both).sum(axis=1, keepdims=True) / np.maximum(2 * both.sum(axis=1, keepdims=True), 1)
+    llr_a, llr_b = copy_a[:, PREAMBLE_SLOTS:], copy_b[:, PREAMBLE_SLOTS:]
+    common = (llr_a != 0) & (llr_b != 0)
+    p, q = 1 / (1 + np.exp(-llr_a)), 1 / (1 + np.exp(-llr_b))
+    share = ((p + q) * common).sum(axis=1, keepdims=True) / np.maximum(2 * common.sum(axis=1, keepdims=True), 1)
     share = np.clip(share, 0.1, 0.9)
-    return float((np.log(p * q / share + (1 - p) * (1 - q) / (1 - share)) * both).sum())
+    return float((np.log(p * q / share + (1 - p) * (1 - q) / (1 - share)) * common).sum())

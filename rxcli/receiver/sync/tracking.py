@@ -1,9 +1,9 @@
-"""The link's time through the frames of a clip, and the bursts that go on from one frame to the next.
+"""Link time through the frames of a clip, and bursts that continue from one frame to the next.
 
-Row r of frame f begins its exposure at t_f + r * line_delay, so a clock that is locked in one frame foretells the next:
-`LinkTime` counts slots from the clip's first lock. Every copy of a packet then has a number that goes on through the
-clip, and with the phase of the bursts (`BurstPhase`) every burst too, those in the gaps between frames included.
-`Bursts` adds up what the frames see of each burst.
+Row r of frame f begins its exposure at t_f + r * line_delay, so the clock of one frame predicts the next. `LinkTime`
+counts slots from the clip's first clock, which numbers every copy of a packet. `BurstPhase` finds the copies that begin
+a burst, which numbers every burst, including those in the gaps between frames. `Bursts` adds up the metrics of each
+burst over the frames.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rxcli.protocol import WEIGHTS, bits_per_symbol
-from rxcli.receiver.sync.clock import likeness
+from rxcli.receiver.sync.clock import similarity
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatArray, IntArray
 
 
 @dataclass(slots=True)
 class LinkTime:
-    """Slots since the start of the first copy seen, counted over the frames."""
+    """Slots since the start of the first visible copy, counted over the frames."""
 
     packet_slots: int
     slot_rate_hz: float
-    #: How much longer the clip's time stamps are than the time was, as those of slow motion.
+    #: Factor by which time stamps are longer than real time, as in slow motion.
     stretch: float = 1.0
-    #: The first locks: frame number, stamp, slot of sensor row 0.
-    _first: list[tuple[int, float, float]] = field(default_factory=list)
-    #: Frame number, time, and slot of sensor row 0 at the last lock.
+    #: The first clocks: frame number, time stamp, slot of sensor row 0.
+    _first_clocks: list[tuple[int, float, float]] = field(default_factory=list)
+    #: The last clock: frame number, time, slot of sensor row 0.
     _last: tuple[int, float, float] | None = None
-    #: Slots from frame to frame, as measured, and its spread.
+    #: Measured slots from frame to frame.
     _period: float | None = None
-    #: Least time between two frames so far.
+    #: Shortest time between two frames so far.
     _frame_s: float = float("inf")
 
     def begin(self, frame: int, time_s: float, slot: float, period: float) -> None:
-        """Start from what several frames agreed on.
+        """Start from a clock and a frame period on which several frames agree.
 
         Args:
             frame: number of a frame.
@@ -51,11 +51,11 @@ class LinkTime:
 
     @property
     def sure_slots(self) -> float:
-        """How far a clock may be from the foretold one: at first by the times, which may be rounded to milliseconds."""
+        """Tolerance of the prediction, slots; wide at first, since time stamps may be rounded to milliseconds."""
         return SETTINGS.max_jump_slots if self._period is not None else self.packet_slots / 4
 
     def predict(self, frame: int, time_s: float) -> float | None:
-        """Slot of sensor row 0 in a frame, from the locks before; None before the first."""
+        """Predict the slot of sensor row 0 in a frame from earlier clocks; None before the first."""
         if self._last is None:
             return None
         time_s /= self.stretch
@@ -64,10 +64,10 @@ class LinkTime:
             return slot + self._period * self._frames_since(number, frame, time_s - at_s)
         return slot + (time_s - at_s) * self.slot_rate_hz
 
-    def take(self, frame: int, time_s: float, clock: Clock) -> int | None:
-        """Enter a locked clock; returns the number of its copy 0, None where it is not of the time told so far.
+    def update(self, frame: int, time_s: float, clock: Clock) -> int | None:
+        """Enter the clock of a frame; return the number of its copy 0, or None if it contradicts the link time.
 
-        `time_s` is the frame's stamp, here as everywhere.
+        `time_s` is the frame's time stamp.
         """
         inside = clock.first_slot - clock.row0 / clock.rows_per_slot
         predicted = self.predict(frame, time_s)
@@ -80,24 +80,24 @@ class LinkTime:
                 return None
             self._measure(frame, time_s / self.stretch, slot)
         self._last = (frame, time_s / self.stretch, slot)
-        if len(self._first) < SETTINGS.n_judged_clocks:
-            self._first.append((frame, time_s, slot))
+        if len(self._first_clocks) < SETTINGS.n_judged_clocks:
+            self._first_clocks.append((frame, time_s, slot))
         return first_copy
 
     @property
     def judged(self) -> bool:
-        """Whether as many frames were locked as time stamps are judged by."""
-        return len(self._first) >= SETTINGS.n_judged_clocks
+        """Whether enough clocks are known to judge the time stamps."""
+        return len(self._first_clocks) >= SETTINGS.n_judged_clocks
 
     def time_stamp_stretch(self, min_frame_s: float) -> float | None:
-        """How much longer the stamps of the first locks are than the time was; None where no factor explains them.
+        """Estimate by how much time stamps are stretched; None if no factor explains them.
 
-        The link's own clock shows in the headers, whole packets aside. Stamps that are not even are not judged.
+        Headers show the link's clock up to whole packets. Uneven time stamps are not judged.
 
         Args:
-            min_frame_s: time that passes from frame to frame at least.
+            min_frame_s: shortest possible time between two frames.
         """
-        frames, stamps, slots = np.array(self._first).T
+        frames, stamps, slots = np.array(self._first_clocks).T
         if len(frames) < 3 or np.ptp(frames) == 0:
             return self.stretch
         period, slots_off = _line(frames, slots)
@@ -113,24 +113,24 @@ class LinkTime:
         return None
 
     def agrees(self, frame: int, time_s: float, clock: Clock) -> bool:
-        """Whether a frame's clock is of the time told so far, whole packets aside."""
+        """Whether a frame's clock agrees with the link time, up to whole packets."""
         predicted = self.predict(frame, time_s)
         if predicted is None or self._period is None:
             return True
-        apart = clock.first_slot - clock.row0 / clock.rows_per_slot - predicted
+        error = clock.first_slot - clock.row0 / clock.rows_per_slot - predicted
         return (
-            abs((apart + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2) <= SETTINGS.max_jump_slots
+            abs((error + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2) <= SETTINGS.max_jump_slots
         )
 
     def clock_at(self, frame: int, time_s: float, like: Clock, n_slots: int, top_row: float) -> Clock | None:
-        """The clock that the frames before foretell.
+        """Predict the clock of a frame from earlier frames.
 
         Args:
             frame: number of the frame.
             time_s: its time.
             like: a clock of an earlier frame.
             n_slots: slots of the grid.
-            top_row: sensor row above which nothing is seen.
+            top_row: sensor row above which nothing is visible.
         """
         predicted = self.predict(frame, time_s)
         if predicted is None:
@@ -146,7 +146,7 @@ class LinkTime:
         )
 
     def _frames_since(self, number: int, frame: int, elapsed_s: float) -> int:
-        """Frame lengths between two frames; frames that the camera dropped have no number, but take time."""
+        """Frame periods between two frames; dropped frames have no number but take time."""
         by_time = round(elapsed_s / self._frame_s) if np.isfinite(self._frame_s) and self._frame_s > 0 else 0
         return max(by_time, frame - number)
 
@@ -164,23 +164,23 @@ class LinkTime:
 
 
 def _line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Slope of a line through points, and how far they are from it at most."""
+    """Slope of a line through points, and their largest distance from it."""
     slope, offset = np.polyfit(x - x[0], y, 1)
     return float(slope), float(np.abs(y - offset - slope * (x - x[0])).max())
 
 
 class BurstPhase:
-    """Which copies begin a burst: copies of one burst are alike, copies of different bursts are not.
+    """Find the copies that begin a burst, by the similarity of copies.
 
     Args:
-        repeats: how many copies a burst has, or may have.
+        repeats: copies of a burst, or the possible numbers.
     """
 
     def __init__(self, repeats: int | Sequence[int]) -> None:
-        several = (repeats,) if isinstance(repeats, int) else tuple(repeats)
-        #: (n, 2) copies of a burst, and phase: what it may be.
-        self._hypotheses = np.array([(n, phase) for n in several for phase in range(n)], np.int64)
-        self._most = max(several)
+        candidates = (repeats,) if isinstance(repeats, int) else tuple(repeats)
+        #: (n, 2) hypotheses: copies of a burst, and phase.
+        self._hypotheses = np.array([(n, phase) for n in candidates for phase in range(n)], np.int64)
+        self._max_repeats = max(candidates)
         self._score = np.zeros(len(self._hypotheses))
         self._copies: dict[int, FloatArray] = {}
 
@@ -199,33 +199,33 @@ class BurstPhase:
 
     @property
     def repeats(self) -> int:
-        """Copies of a burst, as far as is known."""
+        """Likeliest number of copies of a burst."""
         return int(self._hypotheses[int(self._score.argmax()), 0])
 
-    def take(self, first_copy: int, llr: FloatArray) -> None:
-        """Compare the copies of a frame with one another and with those before.
+    def update(self, first_copy: int, llr: FloatArray) -> None:
+        """Compare the copies of a frame with each other and with earlier ones.
 
         Args:
-            first_copy: number of the first one.
-            llr: (n_copies, C, packet) log-odds of their slots, 0 where not seen.
+            first_copy: number of the frame's first copy.
+            llr: (n_copies, C, packet) log-likelihood ratios of their slots being lit, 0 where not visible.
         """
         llr = np.clip(llr, -SETTINGS.max_slot_llr, SETTINGS.max_slot_llr)
         for copy, slots in enumerate(llr, first_copy):
-            for other in range(copy - self._most + 1, copy):
-                if other in self._copies:
-                    self._compare(other, copy, likeness(self._copies[other], slots))
+            for earlier in range(copy - self._max_repeats + 1, copy):
+                if earlier in self._copies:
+                    self._compare(earlier, copy, similarity(self._copies[earlier], slots))
             self._copies[copy] = self._copies[copy] + slots if copy in self._copies else slots
-        self._copies = {c: s for c, s in self._copies.items() if c > first_copy + len(llr) - 1 - self._most}
+        self._copies = {c: s for c, s in self._copies.items() if c > first_copy + len(llr) - 1 - self._max_repeats}
 
-    def _compare(self, first: int, second: int, alike: float) -> None:
+    def _compare(self, copy_a: int, copy_b: int, llr: float) -> None:
         repeats, phases = self._hypotheses.T
-        same = (first + phases) // repeats == (second + phases) // repeats
-        self._score += np.where(same, alike / 2, -alike / 2)
+        same = (copy_a + phases) // repeats == (copy_b + phases) // repeats
+        self._score += np.where(same, llr / 2, -llr / 2)
 
 
 @dataclass(frozen=True, slots=True)
 class FrameBursts:
-    """What a frame sees of its bursts."""
+    """The bursts visible in a frame."""
 
     frame: int
     #: Number of the frame's copy 0 in the clip.
@@ -244,24 +244,24 @@ class _Burst:
     metrics: FloatArray
     n_observed: IntArray
     frames: list[int]
-    #: (C,) columns that need no further look.
+    #: (C,) columns that need no further pass.
     certain: BoolArray
     tracked: bool
     #: Of this burst alone, once detected.
     posteriors: BurstPosteriors | None = None
-    #: Whether frames were added since it was looked at.
+    #: Whether frames were added since the last detection.
     stale: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class ClosedBurst:
-    """A burst with all that the frames saw of it."""
+    """A complete burst, added up over all frames."""
 
     #: Number in the clip.
     number: int
     #: Of this burst alone.
     posteriors: BurstPosteriors
-    #: (C, packet) how often each slot was seen.
+    #: (C, packet) number of observations of each slot.
     n_observed: IntArray
     frames: tuple[int, ...]
     #: (C, packet + memory, patterns) of all frames together.
@@ -271,22 +271,22 @@ class ClosedBurst:
 
 
 class Bursts:
-    """The bursts that are still going on, with what the frames saw of them added up."""
+    """The open bursts, with their metrics added up over the frames."""
 
     def __init__(self) -> None:
         self._open: dict[int, _Burst] = {}
         self._closed = -1
-        #: Columns of the last closed bursts that were certain.
+        #: Certain columns of the last closed bursts.
         self._certain: dict[int, BoolArray] = {}
 
     def settled(self, number: int, lit: BoolArray) -> bool:
-        """Whether all columns that are lit, (C,), are certain of a burst, open or closed."""
+        """Whether all lit columns (C,) of a burst, open or closed, are certain."""
         entry = self._open.get(number)
         certain = entry.certain if entry else self._certain.get(number)
         return certain is not None and bool(certain[lit].all())
 
     def add(self, view: FrameBursts, numbers: IntArray, metrics: FloatArray) -> None:
-        """Take what a frame sees.
+        """Add the bursts of a frame.
 
         Args:
             view: the frame.
@@ -315,11 +315,11 @@ class Bursts:
         return number in self._open
 
     def is_stale(self, number: int) -> bool:
-        """Whether an open burst was added to since it was looked at."""
+        """Whether frames were added to an open burst since its last detection."""
         return number in self._open and self._open[number].stale
 
-    def looked_at(self, numbers: IntArray) -> None:
-        """All that there is to detect of open bursts is detected."""
+    def mark_detected(self, numbers: IntArray) -> None:
+        """Mark open bursts as detected with all frames so far."""
         for number in numbers:
             self._open[int(number)].stale = False
 
@@ -328,12 +328,12 @@ class Bursts:
         return np.stack(with_common_memory([self._open[int(n)].metrics for n in numbers]))
 
     def n_observed(self, numbers: IntArray) -> IntArray:
-        """(B, C, packet) how often each slot was seen."""
+        """(B, C, packet) number of observations of each slot."""
         return np.stack([self._open[int(n)].n_observed for n in numbers])
 
     @property
     def n_columns(self) -> int:
-        """Columns of the open bursts; 0 where none is open."""
+        """Columns of the open bursts; 0 if there are none."""
         return next((entry.n_observed.shape[0] for entry in self._open.values()), 0)
 
     def certain(self, numbers: IntArray) -> BoolArray:
@@ -346,18 +346,18 @@ class Bursts:
         half = np.full(entries[0].n_observed.shape, 0.5, np.float32)
         return np.stack([half if e.posteriors is None else e.posteriors.lit[0] for e in entries])
 
-    def note(self, number: int, columns: IntArray, posteriors: BurstPosteriors, certain: BoolArray) -> None:
-        """Keep what was detected of some columns of an open burst; `certain` is (columns,)."""
+    def store(self, number: int, columns: IntArray, posteriors: BurstPosteriors, certain: BoolArray) -> None:
+        """Store the posteriors of some columns of an open burst; `certain` is (columns,)."""
         entry = self._open[number]
         entry.posteriors = _merged(entry.posteriors, posteriors, columns, entry.n_observed.shape[0])
         entry.certain[columns] = certain
 
     def known(self, number: int) -> BurstPosteriors | None:
-        """What was last detected of an open burst."""
+        """The last posteriors of an open burst."""
         return self._open[number].posteriors
 
     def close(self, numbers: IntArray) -> list[ClosedBurst]:
-        """Take bursts out, in time order; nothing that comes later is added to them, nor to any before."""
+        """Remove bursts in time order; later frames add nothing to them or to earlier ones."""
         if len(numbers):
             self._closed = max(self._closed, int(numbers.max()))
         entries = [(int(n), self._open.pop(int(n), None)) for n in np.sort(numbers)]
@@ -371,9 +371,9 @@ class Bursts:
 
 
 def with_common_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:
-    """Metrics (..., n + memory, patterns) of several frames, those of shorter memories written as of the longest.
+    """Convert metrics (..., n + memory, patterns) of several frames to the longest ISI memory among them.
 
-    What a sample says of its last slots it says of every pattern that ends with them.
+    A metric of a shorter memory applies to every longer pattern that ends with its slots.
     """
     n_patterns = max((some.shape[-1] for some in metrics), default=0)
     n_metrics = max((some.shape[-2] for some in metrics), default=0)
@@ -388,8 +388,8 @@ def with_common_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:
     return [written(some) for some in metrics]
 
 
-def _nothing_known(like: BurstPosteriors, n: int) -> BurstPosteriors:
-    """Posteriors of a burst of `n` columns that no light tells of: all slots, words and weights are alike."""
+def _unobserved(like: BurstPosteriors, n: int) -> BurstPosteriors:
+    """Posteriors of an unobserved burst of `n` columns: all slots, words and weights are equally likely."""
     symbols, slots, weights = like.index.shape[2], like.lit.shape[2], like.w_log_prob.shape[1]
     middle = WEIGHTS[len(WEIGHTS) // 2]
     k = bits_per_symbol(middle)
@@ -408,9 +408,9 @@ def _nothing_known(like: BurstPosteriors, n: int) -> BurstPosteriors:
 
 
 def _merged(before: BurstPosteriors | None, new: BurstPosteriors, columns: IntArray, n: int) -> BurstPosteriors:
-    """One burst's posteriors with some of its `n` columns detected anew."""
+    """Replace the posteriors of some of a burst's `n` columns."""
     if columns.size == n:
         return new
     if before is None:
-        before = _nothing_known(new, n)
+        before = _unobserved(new, n)
     return before.with_columns(columns, new)
