@@ -106,6 +106,16 @@ def stripe_rows(strips: Strips) -> float:
     return width
 
 
+def exposure_of(half_width_slots: float, rows_per_slot: float) -> float:
+    """Exposure, slots, by the half width of the light's autocorrelation.
+
+    Slots of random light give a triangle that is one slot wide at half its height; exposure and developing widen it by
+    boxes, and widths of boxes add up in square.
+    """
+    square = (2 * half_width_slots) ** 2 - 1 - (SETTINGS.mixed_rows / rows_per_slot) ** 2
+    return float(np.sqrt(max(square, SETTINGS.min_exposure_slots**2)))
+
+
 def _half_width(correlation: FloatArray) -> float:
     """Lag at which an autocorrelation is half of that at lag 1; 0 where there is none."""
     top = correlation[1] if correlation.size > 2 else 0.0
@@ -135,9 +145,12 @@ def _clocks(
     strips: Strips, level: Float32Array, bend: FloatArray, width: float, exposures: dict[int, float]
 ) -> Iterator[CameraHypothesis]:
     """Clocks that stand out on stripes of one bend, in any order."""
-    columns = columns_of(straightened(strips, level, bend), strips.n_columns)
+    straight = straightened(strips, level, bend)
+    columns = columns_of(straight, strips.n_columns)
     n_rows, pitch = columns.shape[1], strips.pitch
     correlation = _autocorrelation(columns)
+    # Of the light itself: soft signs have steeper edges.
+    half_width = _half_width(_autocorrelation(straight.reshape(strips.n_columns, -1, n_rows).mean(axis=1)))
     shortest, longest = (width / slots / pitch for slots in reversed(SETTINGS.half_width_slots))
     shortest = max(shortest, SETTINGS.min_rows_per_slot / pitch)
     # The line: places are cycles over the picture, times _FINE.
@@ -167,7 +180,7 @@ def _clocks(
                     packet_slots=length,
                     reversed=bool(is_reversed),
                     curvature=bend,
-                    exposure_slots=exposure or SETTINGS.usual_exposure_slots,
+                    exposure_slots=exposure or exposure_of(half_width / rows, rows * pitch),
                     score=score,
                     # A period that is off by a quarter of a slot over the picture shows as well.
                     rows_per_slot_sd=rows * rows * pitch / (4 * n_rows),

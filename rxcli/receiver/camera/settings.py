@@ -29,8 +29,10 @@ class CameraSettings:
     rows_per_width: float = 4.0
     #: Half width of the autocorrelation, slots: from the shortest exposures to those of three slots.
     half_width_slots: tuple[float, float] = (0.45, 1.8)
-    #: Exposure where the file states none, slots: too long a one costs more evidence than too short a one.
-    usual_exposure_slots: float = 1.0
+    #: Rows that demosaicing, denoising and the lens mix, as the width of a box; and the least exposure that makes a
+    #: difference, slots.
+    mixed_rows: float = 2.0
+    min_exposure_slots: float = 0.4
     #: Rows of the shortest slot that can be told from its neighbours.
     min_rows_per_slot: float = 1.15
 

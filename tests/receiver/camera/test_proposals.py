@@ -31,7 +31,15 @@ SCREENS = tuple(shipped_profiles(ScreenProfile))
 
 
 def phone(
-    screen: str, rows_per_slot: float, height: int, *, corrected: bool, upside_down: bool, k1: float, seed: int
+    screen: str,
+    rows_per_slot: float,
+    height: int,
+    *,
+    corrected: bool = False,
+    upside_down: bool = False,
+    k1: float = 0.0,
+    seed: int = 0,
+    exposure_slots: float = 0.9,
 ) -> tuple[Frame, FloatArray, dict[str, Any]]:
     """A simulated phone's picture, its screen's corners in it, and the truth; upside down: turned by 180 degrees."""
     profile = load_profile(screen, ScreenProfile)
@@ -43,7 +51,7 @@ def phone(
         lens=SimulatedLens(0.8, (k1, -0.5 * k1, 0.0003, -0.0002, 0.0)),
         pose=Pose(fill=0.92, roll_deg=0.6, yaw_deg=2.0, pitch_deg=-1.5),
         isp=Isp(tone="bt709", gain=2.0, sharpen=0.4, denoise_px=0.3, correct_distortion=corrected),
-        exposure_s=0.9 / profile.slot_rate_hz,
+        exposure_s=exposure_slots / profile.slot_rate_hz,
         light_e_per_s=1.4e6 * profile.slot_rate_hz / 20000,
         picture="coffee",
     )
@@ -100,6 +108,14 @@ def test_unknown_phones_are_proposed_and_fitted(
     assert bool(estimated.get("distortion_corrected", (0.0, 0.0))[0]) == corrected
     if corrected:
         assert _bend_error_slots(estimated, corners, truth, upside_down) < 0.05
+
+
+@pytest.mark.parametrize("exposure_slots", [0.5, 1.2, 2.3])
+def test_an_exposure_that_no_file_states_is_proposed_by_the_width_of_the_stripes(exposure_slots: float) -> None:
+    frame, corners, _ = phone("paper-17k3", 4.3, 960, exposure_slots=exposure_slots)
+    best = next(blind.propose(strips_of(frame, corners), SCREENS))
+    assert best.rows_per_slot == pytest.approx(4.3, rel=5e-3)
+    assert best.exposure_slots == pytest.approx(exposure_slots, abs=0.35)
 
 
 def _bend_error_slots(
