@@ -42,7 +42,6 @@ def scene(mode: str, picture: str) -> Scene:
         camera_name="folder",
         n_frames=4 if mode == "clip" else 1,
         frame_rate_hz=30.0,
-        shake_px=0.0,
         output="raw" if mode == "raw" else "developed",
     )
 

@@ -30,7 +30,7 @@ _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-p
 #: Options that are fields of the scene by the same name.
 _SCENE_OPTIONS = (
     *("picture", "dimming", "stabilised", "n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm"),
-    *("blur_px", "lcd_grid", "shake_px", "hand_px", "iso", "make", "model", "camera_name"),
+    *("blur_px", "lcd_grid", "hand_px", "iso", "make", "model", "camera_name"),
 )
 
 
@@ -77,7 +77,6 @@ _SCENE_OPTIONS = (
     ("--frames n_frames", click.IntRange(1), None, "Frames of a clip."),
     ("--frame-rate frame_rate_hz", float, None, "Frames per second of a clip."),
     ("--bit-rate", click.IntRange(1), None, "Bits per second of a clip.  [default: constant quality]"),
-    ("--shake shake_px", float, None, "Hand shake, pixels."),
     ("--hand hand_px", click.FloatRange(0), None, "Hold the camera in a hand: pixels from frame to frame."),
     ("--stabilised", None, False, "With --hand: frames are turned back and cropped, as phones do."),
     ("--clock-error slot_rate_error_ppm", float, None, "Error of the slot rate, ppm."),

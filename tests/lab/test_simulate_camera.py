@@ -189,7 +189,7 @@ def test_same_seed_same_pixels_whatever_the_threads(small: Scene) -> None:
 
 
 def test_frames_of_a_take_do_not_depend_on_their_order(small: Scene) -> None:
-    scene = replace(small, n_frames=3, shake_px=2.0)
+    scene = replace(small, n_frames=3, hand_px=2.0)
     forward = [prepare(scene, 3).frame(n).raw for n in (0, 2)]
     again = prepare(scene, 3)
     np.testing.assert_array_equal(again.frame(2).raw, forward[1])

@@ -14,7 +14,7 @@ from rxcli.lab.simulate.scenes import Change, Scene, preset
 
 def scene_in_hand(hand_px: float = 4.0, n_frames: int = 40) -> Scene:
     scene = preset("video-1080p", "paper-17k3").scaled(0.25, 0.25)
-    return replace(scene, shake_px=0.0, hand_px=hand_px, n_frames=n_frames)
+    return replace(scene, hand_px=hand_px, n_frames=n_frames)
 
 
 def test_a_turn_is_undone() -> None:

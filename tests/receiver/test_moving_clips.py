@@ -34,7 +34,7 @@ Clip = tuple[tuple[Frame, ...], Truth, ReceiverOptions]
 def scene_in_hand(hand_px: float, n_frames: int = N_FRAMES, screen: str = "paper-8k65", **changes: object) -> Scene:
     base = preset("video-1080p", screen).scaled(0.5, 0.5, keep_readout=True)
     pose = replace(base.pose, fill=0.86, roll_deg=0.5)
-    scene = replace(base, picture="coffee", pose=pose, shake_px=0.0, hand_px=hand_px, n_frames=n_frames)
+    scene = replace(base, picture="coffee", pose=pose, hand_px=hand_px, n_frames=n_frames)
     return replace(scene, **changes)  # type: ignore[arg-type]
 
 

@@ -9,9 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from rxcli.lab.benchmark.trial import simulate_trial
-from rxcli.lab.simulate.no_data import draw_no_data
+from rxcli.lab.simulate.capture import prepare
+from rxcli.lab.simulate.no_data import no_data_scene
 from rxcli.lab.simulate.scenes import preset
-from rxcli.profiles import CameraProfile, ReadoutMode
+from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.receiver.decode.steady import is_common_light
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.types import Frame
@@ -21,14 +22,12 @@ PWM, CODE = 0, 1
 
 
 def clip_of(kind: str, seed: int, n_frames: int) -> tuple[list[Frame], ReceiverOptions]:
-    """Frames without data, a camera that reads them out in 20 ms, and corners: one light has no columns to be found."""
-    made = draw_no_data(kind, np.random.default_rng([999, seed, 23]), n_frames)
-    height, width = made.frames[0].shape
-    mode = ReadoutMode(name="whole", width=width, height=height, line_delay_s=20e-3 / height, exposure_s=40e-6)
-    camera = CameraProfile(name="said", modes=(mode,))
-    step_s = made.frame_rows * mode.line_delay_s
-    frames = [Frame(pixels, "drawn", number, number * step_s) for number, pixels in enumerate(made.frames)]
-    corners = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float64)
+    """Frames without data, their camera, and corners: one light has no columns to be found."""
+    scene, _ = no_data_scene(kind, np.random.default_rng([999, seed, 23]), n_frames)
+    take = prepare(scene, seed)
+    captures = [take.frame(number) for number in range(n_frames)]
+    frames = [Frame(one.pixels, "drawn", one.frame, one.time_s) for one in captures]
+    camera, corners = build_camera_profile(scene, captures[0].exposure), captures[0].exposure.corners
     return frames, ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners)
 
 

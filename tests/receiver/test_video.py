@@ -79,7 +79,6 @@ def simulate(
         frame_rate_hz=frame_rate_hz,
         picture=picture,
         pose=replace(scene.pose, corners=corners),
-        shake_px=0.0,
     )
     take = prepare(scene, seed)
     frames = tuple(

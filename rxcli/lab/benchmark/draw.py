@@ -21,7 +21,7 @@ from rxcli.lab.benchmark.trial import SOURCE, Trial, simulate_trial, truth_of
 from rxcli.lab.simulate.capture import Take, prepare
 from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
 from rxcli.lab.simulate.isp import Isp
-from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, draw_no_data
+from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, no_data_scene
 from rxcli.lab.simulate.optics import Lens, Pose, View
 from rxcli.lab.simulate.pictures import PHOTOS, draw_name
 from rxcli.lab.simulate.scenes import Scene, draw_weight, preset, random_scene
@@ -29,7 +29,7 @@ from rxcli.lab.simulate.sensor import Sensor
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.lab.simulate.video import write_video
 from rxcli.options import ReceiverOptions, receiver_options
-from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, load_profile, shipped_profiles
+from rxcli.profiles import ScreenProfile, load_profile, shipped_profiles
 from rxcli.protocol import payload_bits
 from rxcli.results.truth import find_truth, load_truth
 from rxcli.types import FloatArray, Frame
@@ -363,7 +363,7 @@ def _filmed_scene(rng: np.random.Generator, base: Scene) -> Scene:
     picture = draw_name(rng)
     w = 5 if rng.random() < 0.6 else int(rng.integers(3, 8))
     lit = base.exposed(exposure_s, 10 ** rng.uniform(-0.5, 0.2))
-    return replace(lit, picture=picture, w=w, pose=pose, shake_px=0.0)
+    return replace(lit, picture=picture, w=w, pose=pose)
 
 
 def _bit_rate(rng: np.random.Generator, scene: Scene, bits_per_pixel: tuple[float, float]) -> int:
@@ -394,27 +394,20 @@ def _clip(take: Take, path: Path, camera_named: bool, *groups: str) -> Case:
 
 # Pictures without data.
 
-#: Seconds that a named camera takes to read a picture out, and rows that it exposes, whatever the picture shows.
-_READOUT_S, _EXPOSURE_ROWS = (10e-3, 40e-3), (0.5, 12.0)
-
 
 def draw_nodata(at: Place) -> Iterator[Case]:
     """Frames without data, every other one striped; point: `n_frames`, `camera_named`."""
     rng = np.random.default_rng([at.seed, at.number, 23])
-    drawn = draw_no_data(draw_kind(rng, at.number % 2 == 0), rng, at.point.get("n_frames", 1))
-    height, width = drawn.frames[0].shape
-    line_delay_s = float(np.exp(rng.uniform(*np.log(_READOUT_S)))) / height
-    step_s = drawn.frame_rows * line_delay_s
-    frames = tuple(Frame(pixels, SOURCE, index, index * step_s) for index, pixels in enumerate(drawn.frames))
-    options = ReceiverOptions(cameras=())
-    if at.point.get("camera_named"):
-        exposure_s = line_delay_s * float(rng.uniform(*_EXPOSURE_ROWS))
-        mode = ReadoutMode(name="whole", width=width, height=height, line_delay_s=line_delay_s, exposure_s=exposure_s)
-        profile = CameraProfile(format=1, kind="camera", name="named", modes=(mode,))
-        options = ReceiverOptions(cameras=(profile,), force_camera=True)
-    groups = (drawn.kind, *(("striped",) if drawn.kind in STRIPED_KINDS else ()))
-    about = {"kind": drawn.kind, **drawn.about}
-    yield Case(source=frames, options=options, groups=groups, about=about, has_data=False)
+    kind = draw_kind(rng, at.number % 2 == 0)
+    scene, about = no_data_scene(kind, rng, at.point.get("n_frames", 1))
+    take = prepare(scene, at.flat)
+    captures = [take.frame(number, threads=1) for number in range(scene.n_frames)]
+    frames = tuple(Frame(one.pixels, SOURCE, one.frame, one.time_s) for one in captures)
+    named = bool(at.point.get("camera_named"))
+    cameras = (build_camera_profile(scene, captures[0].exposure),) if named else ()
+    options = ReceiverOptions(cameras=cameras, force_camera=named)
+    groups = (kind, *(("striped",) if kind in STRIPED_KINDS else ()))
+    yield Case(source=frames, options=options, groups=groups, about={"kind": kind, **about}, has_data=False)
 
 
 # Sweeps: one thing varies. Sensors are narrowed by binning: the rows, and with them all that concerns time, stay whole;

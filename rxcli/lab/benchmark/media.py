@@ -50,7 +50,6 @@ class Medium:
         return replace(
             scene,
             payload=np.random.default_rng(0).bytes(n_bits // 8),
-            shake_px=0.0,
             n_frames=self.n_frames,
             frame_rate_hz=screen.slot_rate_hz / (screen.packet_slots * screen.repeats * self.bursts_a_frame),
         )

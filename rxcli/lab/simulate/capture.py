@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from rxcli.lab.simulate.bound import Oracle, OracleRecorder
 from rxcli.lab.simulate.camera import Exposure, take_picture
 from rxcli.lab.simulate.isp import develop
 from rxcli.lab.simulate.motion import HandMotion, turned
-from rxcli.lab.simulate.optics import Pose, View, homography
+from rxcli.lab.simulate.optics import View, homography
 from rxcli.lab.simulate.pictures import load_picture, picture_names
 from rxcli.lab.simulate.scenes import Change, Scene
 from rxcli.lab.simulate.tiff import write_dng, write_tiff
@@ -100,8 +100,7 @@ class Take:
         """What frame number `frame` is about to see."""
         scene, time_s = self.scene, frame / self.scene.frame_rate_hz
         sensor = scene.sensor
-        pose = shaken(scene.pose, scene.shake_px, time_s, self.seed, (sensor.width, sensor.height))
-        view = View(scene.screen, scene.lens, pose, sensor.width, sensor.height, sensor.pixel_aspect)
+        view = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect)
         change = max((c for c in scene.changes if c.frame <= frame), key=lambda c: c.frame, default=Change(0))
         return Exposure(
             view=view,
@@ -142,24 +141,6 @@ class Take:
         return build_truth(self.scene, [self.exposure(n) for n in range(self.scene.n_frames)], capture)
 
 
-def shaken(pose: Pose, amplitude_px: float, time_s: float, seed: int, size: tuple[int, int]) -> Pose:
-    """The pose at one instant of a hand-held shot: slow sway and tremor, `amplitude_px` each."""
-    if amplitude_px == 0:
-        return pose
-    rng = np.random.default_rng([seed, 11])
-    frequency, phase = rng.uniform([[0.7], [5.0]], [[1.5], [9.0]], (2, 3)), rng.uniform(0, 2 * np.pi, (2, 3))
-    weight = np.array([[1.0], [0.25]])
-    dx, dy, turn = amplitude_px * (weight * np.sin(2 * np.pi * frequency * time_s + phase)).sum(axis=0)
-    if pose.corners is not None:
-        return replace(pose, corners=tuple((x + dx, y + dy) for x, y in pose.corners))
-    return replace(
-        pose,
-        shift_x=pose.shift_x + dx / size[0],
-        shift_y=pose.shift_y + dy / size[1],
-        roll_deg=pose.roll_deg + np.rad2deg(turn / size[0]),
-    )
-
-
 #: Enlargement after which a stabilised frame shows no border.
 _STABILISED_ZOOM = 1.06
 
@@ -193,7 +174,7 @@ def prepare(scene: Scene, rng: np.random.Generator | int) -> Take:
     rng = np.random.default_rng(rng)
     link_seed, noise_seed = (int(s) for s in rng.integers(0, 2**62, 2))
     drive = _drive(scene)
-    link = Link(scene.screen, drive.weights, link_seed, scene.payload, scene.labels)
+    link = Link(scene.screen, drive.weights, link_seed, scene.payload, scene.labels, scene.waveform)
     start = rng.uniform(_LEAD_SLOTS, link.burst_slots) if scene.start_slot is None else scene.start_slot
     return Take(scene, drive, link, noise_seed, float(start), _delays(scene, rng))
 

@@ -19,7 +19,7 @@ from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.pictures import draw_name
 from rxcli.lab.simulate.sensor import Sensor
-from rxcli.lab.simulate.transmitter import Dimming, LabelSource, Weights
+from rxcli.lab.simulate.transmitter import Dimming, LabelSource, Waveform, Weights
 from rxcli.profiles import ScreenProfile, load_profile
 
 Output = Literal["raw", "developed"]
@@ -49,6 +49,8 @@ class Scene:
     payload: bytes | None = None
     #: Gives labels to send instead, as the link layer has them.
     labels: LabelSource | None = None
+    #: Light 0..1 by slot, the same in all columns, instead of packets.
+    waveform: Waveform | None = None
     sensor: Sensor = field(default_factory=Sensor)
     lens: Lens = field(default_factory=Lens)
     pose: Pose = field(default_factory=Pose)
@@ -70,8 +72,6 @@ class Scene:
     column_delay_slots: float | tuple[float, ...] = 0.0
     n_frames: int = 1
     frame_rate_hz: float = 60.0
-    #: Amplitude of the hand's shake, pixels.
-    shake_px: float = 0.0
     #: How far a hand moves the picture from frame to frame, pixels on average; rows skew meanwhile.
     hand_px: float = 0.0
     #: Whether the camera turns and crops its frames so that the hand's motion does not show.
@@ -134,7 +134,6 @@ class Scene:
             sensor=sensor,
             pose=replace(self.pose, corners=corners),
             blur_px=self.blur_px * sqrt(x * y),
-            shake_px=self.shake_px * sqrt(x * y),
             hand_px=self.hand_px * sqrt(x * y),
         )
 

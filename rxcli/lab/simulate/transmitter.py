@@ -6,6 +6,7 @@ with the receiver.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +30,7 @@ PANEL_LEAKAGE = 1e-3
 LABEL_BITS = 7
 
 Weights = int | tuple[int, ...] | Literal["dimming"]
+Waveform = Callable[[FloatArray], FloatArray]
 Dimming = Literal["max", "none"]
 
 
@@ -166,6 +168,8 @@ class Link:
     message: bytes | None = None
     #: What to send instead of it; None for `message`.
     labels: LabelSource | None = None
+    #: Light 0..1 of all columns alike in slots of these numbers, instead of packets; None for packets.
+    waveform: Waveform | None = None
 
     @property
     def burst_slots(self) -> int:
@@ -205,8 +209,10 @@ class Link:
         bits = self.payload(burst)
         return np.stack([encode_packet(b, int(w)) for b, w in zip(bits, self.weights, strict=True)])
 
-    def slots(self, first: int, stop: int) -> NDArray[np.uint8]:
+    def slots(self, first: int, stop: int) -> NDArray[Any]:
         """(columns, stop - first) 0/1 slots from `first` on; dark before slot 0."""
+        if self.waveform is not None:
+            return np.tile(self.waveform(np.arange(first, stop, dtype=np.float64)), (self.screen.columns, 1))
         bursts = range(max(first, 0) // self.burst_slots, max(stop - 1, 0) // self.burst_slots + 1)
         sent = np.concatenate([np.tile(self.packets(b), self.screen.repeats) for b in bursts], axis=1)
         origin = bursts[0] * self.burst_slots

@@ -17,12 +17,13 @@ from tqdm import tqdm
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.camera import Exposure
 from rxcli.lab.simulate.scenes import Scene as SimulatedScene
-from rxcli.lab.training.acquire import acquired
 from rxcli.lab.training.fit import MAX_WORDS, UNKNOWN, Sample
 from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_scene
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
+from rxcli.receiver.context import Failure, Timer
+from rxcli.receiver.search import search
 from rxcli.receiver.still import decode, doubtful_columns
 from rxcli.types import Clock, FloatArray
 
@@ -82,10 +83,10 @@ def _cached(make: Callable[[int], Sample | None], n: int, folder: Path, what: st
 def _simulated(simulated: SimulatedScene, seed: int) -> Sample | None:
     """One frame as a sample; None where the receiver finds no clock, a wrong one, or nothing doubtful."""
     trial = simulate_trial(simulated, seed)
-    acquisition = acquired(trial)
-    if acquisition is None:
+    found = search(trial.frame, trial.options(), Timer())
+    if isinstance(found, Failure):
         return None
-    reception = decode(acquisition, trial.options().skip)
+    reception = decode(found.best.acquisition, trial.options().skip)
     scene, columns = reception.scene, doubtful_columns(reception)
     if scene is None or not columns.size:
         return None

@@ -14,13 +14,14 @@ import pytest
 
 from rxcli.errors import ProfileError
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
-from rxcli.lab.training.acquire import acquired
 from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
 from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
 from rxcli.receiver import channel, still
 from rxcli.receiver.channel import denoise, metrics_of
 from rxcli.receiver.channel.denoise import COLUMN_FEATURES, STRIP_FEATURES, DenoiserInput, load_denoiser, network_inputs
+from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
+from rxcli.receiver.search import search
 from rxcli.resources import data_dir
 from rxcli.results.truth import Score
 from rxcli.types import Clock, FrameResult, SlotSamples
@@ -442,8 +443,9 @@ def test_the_receiver_goes_on_without_a_broken_model(trials: dict[str, Trial], m
 
 def test_columns_beyond_repair_are_not_asked(trials: dict[str, Trial]) -> None:
     options = trials["hard"].options()
-    lock = acquired(trials["hard"], quick=False)
-    assert lock is not None
+    found = search(trials["hard"].frame, options, Timer(), quick=False)
+    assert not isinstance(found, Failure)
+    lock = found.best.acquisition
     seen = still.decode(lock, options.skip)
     better, kept, report = still.apply_autoencoder(lock, seen, options)
     assert report is not None
