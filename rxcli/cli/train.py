@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from importlib.util import find_spec
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +30,13 @@ CALIBRATION_SAMPLES = 12
     ("--seed", click.IntRange(0), 1, "Same seed, same network."),
     ("--cache", click.Path(file_okay=False, path_type=Path), None, "Folder of the data sets.  [default: OUT/data]"),
     ("--int8/--float quantise", None, True, "Compute in eight-bit integers, or not.", {"show_default": True}),
-    ("--resume", None, False, "Go on from the checkpoint in OUT."),
     ("-q --quiet", None, False, "No progress bars."),
 )
 def train(out: Path, **options: Any) -> None:
     """Fit the auto-encoder on simulated scenes and write a model folder to OUT.
 
-    Needs the extra `train` (PyTorch on the CPU is enough). The data sets are kept and used again; an interrupted run
-    goes on with --resume. OUT gets model.onnx, model.toml, loss.png and the checkpoint.
+    Needs the extra `train` (PyTorch on the CPU is enough). The data sets are kept and used again. OUT gets
+    model.onnx, model.toml and loss.png.
     """
     for package in ("torch", "onnx", "matplotlib"):
         if find_spec(package) is None:
@@ -45,23 +45,24 @@ def train(out: Path, **options: Any) -> None:
 
     claim_folder("OUT", out)
     from rxcli.lab.training import dataset, export, fit
-    from rxcli.lab.training.network import Shape, n_parameters
     from rxcli.outputs import claim_own_folder
 
     data, progress = options["cache"] or out / "data", not options["quiet"]
-    claim_own_folder("OUT", out, (fit.CHECKPOINT, "model.toml"))
+    claim_own_folder("OUT", out, ("model.toml",))
     claim_own_folder("--cache", data, ("frames-*", "validation"))
-    shape = Shape(strip_width=options["strip_width"], column_width=options["column_width"])
+    shape = fit.Shape(strip_width=options["strip_width"], column_width=options["column_width"])
     recipe = fit.Recipe(shape=shape, steps=options["steps"], seed=options["seed"])
     samples = dataset.frame_samples(options["frames"], options["seed"], data, progress=progress)
     held = dataset.validation_samples(options["held_out"], data, progress=progress)
-    network = fit.fit(samples, held, recipe, out, resume=options["resume"], progress=progress)
+    fitted = fit.fit(samples, held, recipe, out, progress=progress)
     described = {**asdict(recipe), **{name: options[name] for name in ("frames", "held_out")}}
-    described["parameters"] = n_parameters(network)
-    losses = fit.final_losses(out)
+    described["parameters"] = fit.n_parameters(fitted.network)
+    losses = dict(zip(("training_nats", "validation_nats"), fitted.history[-1][1:], strict=True))
+    # A NaN of the loss where nothing was held out is written as -1.
+    losses = {name: -1.0 if isnan(loss) else round(loss, 5) for name, loss in losses.items()}
     calibration = samples[:CALIBRATION_SAMPLES] if options["quantise"] else ()
     name, version = options["name"], options["model_version"]
-    card = export.export_model(network, out, name, version, described, losses, calibration)
+    card = export.export_model(fitted.network, out, name, version, described, losses, calibration)
     click.echo(
         f"{out / card.file}: {described['parameters']} parameters, cross-entropy {losses['training_nats']:.4f} nats a "
         f"word in training, {losses['validation_nats']:.4f} on held-out scenes",

@@ -15,13 +15,13 @@ from rxcli.cli.main import run  # noqa: E402
 from rxcli.errors import InputError, ReceiverError  # noqa: E402
 from rxcli.lab.simulate.pictures import PHOTOS  # noqa: E402
 from rxcli.lab.training import dataset, export, fit, scenes  # noqa: E402
-from rxcli.lab.training.network import Shape, StripNetwork, n_parameters  # noqa: E402
+from rxcli.lab.training.fit import Shape, StripNetwork, n_parameters  # noqa: E402
 from rxcli.protocol import HEADER, bits_per_symbol, codebook, encode_packet  # noqa: E402
 from rxcli.receiver.channel.denoise import load_denoiser  # noqa: E402
 
 SMALL = Shape(8, 8, (1, 2), (1, 2))
 #: Its first frame leaves the receiver in doubt.
-SEED = 21
+SEED = 9
 
 
 @pytest.fixture(scope="module")
@@ -128,9 +128,8 @@ def test_data_sets_are_kept_and_made_again_where_damaged(tmp_path: Path) -> None
 def test_fitting_learns(samples: list[fit.Sample], tmp_path: Path) -> None:
     before = fit.mean_loss(StripNetwork(SMALL), samples)
     recipe = fit.Recipe(SMALL, steps=60, learning_rate=1e-2)
-    fit.fit(samples, samples, recipe, tmp_path, progress=False)
-    losses = fit.final_losses(tmp_path)
-    assert losses["validation_nats"] < 0.9 * before
+    history = fit.fit(samples, samples, recipe, tmp_path, progress=False).history
+    assert history[-1][2] < 0.9 * before
     assert (tmp_path / "loss.png").stat().st_size > 1000
 
 
@@ -139,38 +138,10 @@ def test_nothing_is_learned_from_nothing(tmp_path: Path) -> None:
         fit.fit([], [], fit.Recipe(SMALL, steps=1), tmp_path, progress=False)
 
 
-def test_a_resumed_run_ends_where_an_uninterrupted_one_does(
-    samples: list[fit.Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe = fit.Recipe(SMALL, steps=8)
-    whole = fit.fit(samples, [], recipe, tmp_path / "whole", progress=False)
-    monkeypatch.setattr(fit, "_CHECKPOINT_EVERY", 3)
-    calls = iter(range(100))
-    drawn = fit._drawn_loss
-
-    def failing(*arguments: object) -> object:
-        if next(calls) == 5:
-            raise KeyboardInterrupt
-        return drawn(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(fit, "_drawn_loss", failing)
-    with pytest.raises(KeyboardInterrupt):
-        fit.fit(samples, [], recipe, tmp_path / "cut", progress=False)
-    resumed = fit.fit(samples, [], recipe, tmp_path / "cut", resume=True, progress=False)
-    for name, weights in whole.state_dict().items():
-        np.testing.assert_array_equal(resumed.state_dict()[name].numpy(), weights.numpy(), err_msg=name)
-
-
-def test_another_recipe_cannot_be_resumed(samples: list[fit.Sample], tmp_path: Path) -> None:
-    fit.fit(samples, [], fit.Recipe(SMALL, steps=1), tmp_path, progress=False)
-    with pytest.raises(InputError, match="another recipe"):
-        fit.fit(samples, [], fit.Recipe(SMALL, steps=2), tmp_path, resume=True, progress=False)
-    (tmp_path / fit.CHECKPOINT).write_bytes(b"no checkpoint")
-    with pytest.raises(InputError, match="not a checkpoint"):
-        fit.fit(samples, [], fit.Recipe(SMALL, steps=1), tmp_path, resume=True, progress=False)
-    (tmp_path / fit.CHECKPOINT).unlink()
-    with pytest.raises(InputError, match="no checkpoint"):
-        fit.fit(samples, [], fit.Recipe(SMALL, steps=1), tmp_path, resume=True, progress=False)
+def test_equal_recipes_give_equal_weights(samples: list[fit.Sample], tmp_path: Path) -> None:
+    one, two = (fit.fit(samples, [], fit.Recipe(SMALL, steps=4), tmp_path, progress=False) for _ in range(2))
+    for name, weights in one.network.state_dict().items():
+        np.testing.assert_array_equal(two.network.state_dict()[name].numpy(), weights.numpy(), err_msg=name)
 
 
 @pytest.mark.parametrize("shape", [Shape(), SMALL])

@@ -16,8 +16,7 @@ import tomli_w
 import torch
 
 from rxcli.errors import ReceiverError
-from rxcli.lab.training.fit import Sample
-from rxcli.lab.training.network import StripNetwork
+from rxcli.lab.training.fit import Sample, StripNetwork
 from rxcli.receiver.channel.denoise import (
     COLUMN_FEATURES,
     N_COLUMN_FEATURES,

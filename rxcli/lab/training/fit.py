@@ -1,32 +1,88 @@
-"""Fitting: seeded, resumable, with a progress bar and a plot of the loss."""
+"""The network, and its fit: strips, by the same convolutions along time each; pooled; then columns, likewise."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from rxcli.errors import InputError
-from rxcli.lab.training.network import Shape, StripNetwork
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
+from rxcli.receiver.channel.denoise import N_COLUMN_FEATURES, N_STRIP_FEATURES
 
-CHECKPOINT = "checkpoint.pt"
 #: Words of the largest codebook, and what stands for a word that is not known.
 MAX_WORDS, UNKNOWN = 128, -1
-_CHECKPOINT_EVERY = 200
+#: Steps from one point of the plot of the loss to the next.
+_PLOTTED_EVERY = 200
 _WEIGHT_DECAY, _LARGEST_GRADIENT = 5e-2, 1.0
 #: The weights that are kept are a mean over about so many steps.
 _AVERAGED_STEPS = 200
 #: Samples of a batch, columns of each, and how often strips are left out of a sample, down to how many.
 _BATCH_SAMPLES, _BATCH_COLUMNS, _THINNED, _MIN_STRIPS = 2, 4, 0.5, 3
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Size of a network; channels and reach."""
+
+    #: Channels of a strip and of a column.
+    strip_width: int = 32
+    column_width: int = 48
+    #: Dilations of the strip's and of the column's convolutions, in slots.
+    strip_dilations: tuple[int, ...] = (1, 2, 4)
+    column_dilations: tuple[int, ...] = (1, 2, 4, 8)
+
+
+class _Residual(nn.Module):  # type: ignore[misc]
+    def __init__(self, width: int, dilation: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv1d(width, width, 3, padding=dilation, dilation=dilation)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + torch.relu(self.conv(x))
+
+
+class StripNetwork(nn.Module):  # type: ignore[misc]
+    """Corrections of slots from the features of `channel.denoise.network_inputs`; any number of strips and slots."""
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__()
+        self.shape = shape
+        wide, tall = shape.strip_width, shape.column_width
+        self.strip_in = nn.Conv1d(N_STRIP_FEATURES, wide, 3, padding=1)
+        self.strip = nn.Sequential(*(_Residual(wide, d) for d in shape.strip_dilations))
+        self.gate = nn.Conv1d(wide, wide, 1)
+        self.column_in = nn.Conv1d(2 * wide + N_COLUMN_FEATURES, tall, 3, padding=1)
+        self.column = nn.Sequential(*(_Residual(tall, d) for d in shape.column_dilations))
+        self.out = nn.Conv1d(tall, 1, 1)
+        # Before it has learned anything the network corrects nothing.
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, strips: Tensor, columns: Tensor) -> Tensor:
+        """(B, S, F, N) and (B, G, N) to (B, N) corrections."""
+        batch, n_strips, _, n_slots = strips.shape
+        x = torch.relu(self.strip_in(strips.reshape(batch * n_strips, N_STRIP_FEATURES, n_slots)))
+        x = self.strip(x)
+        gate = torch.sigmoid(self.gate(x)).reshape(batch, n_strips, -1, n_slots)
+        x = x.reshape(batch, n_strips, -1, n_slots)
+        # Strips add up like independent observations; the mean of the open ones tells what they agree on.
+        total = (gate * x).sum(dim=1)
+        mean = total / (gate.sum(dim=1) + 0.1)
+        y = torch.relu(self.column_in(torch.cat([total * 0.2, mean, columns], dim=1)))
+        return self.out(self.column(y)).squeeze(1)
+
+
+def n_parameters(network: nn.Module) -> int:
+    """Weights of a network."""
+    return sum(p.numel() for p in network.parameters())
 
 
 @dataclass(frozen=True)
@@ -118,49 +174,43 @@ def _thinned(sample: Sample, rng: np.random.Generator) -> Sample:
     return replace(sample, strips=sample.strips[:, left])
 
 
+@dataclass(frozen=True)
+class Fitted:
+    """A network, its weights averaged over the last steps, and how its loss went."""
+
+    network: StripNetwork
+    #: Step, and cross-entropy of a word in training and on held-out samples (nan of none), nats.
+    history: list[tuple[int, float, float]]
+
+
 def fit(
-    samples: Sequence[Sample],
-    validation: Sequence[Sample],
-    recipe: Recipe,
-    folder: Path,
-    *,
-    resume: bool = False,
-    progress: bool = True,
-) -> StripNetwork:
-    """Fit a network.
+    samples: Sequence[Sample], validation: Sequence[Sample], recipe: Recipe, folder: Path, *, progress: bool = True
+) -> Fitted:
+    """Fit a network; equal recipes and samples give equal weights.
 
     Args:
         samples: what to learn from.
         validation: samples that are not learned from.
         recipe: sizes and steps.
-        folder: gets the checkpoint and the plot of the loss.
-        resume: go on from the checkpoint in `folder`.
+        folder: gets the plot of the loss.
         progress: show a bar on stderr.
 
-    Returns:
-        The network, its weights averaged over the last steps.
-
     Raises:
-        InputError: nothing to learn from; or the checkpoint is missing or of another recipe.
+        InputError: nothing to learn from.
     """
     if not samples:
         raise InputError("no frame gave a doubtful column to learn from", "simulate more with --frames")
     torch.manual_seed(recipe.seed)
     torch.set_num_threads(1)
-    folder.mkdir(parents=True, exist_ok=True)
     network = StripNetwork(recipe.shape)
     averaged = torch.optim.swa_utils.AveragedModel(network, avg_fn=_moving_average)
     optimiser = torch.optim.AdamW(network.parameters(), recipe.learning_rate, weight_decay=_WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, recipe.learning_rate, total_steps=recipe.steps + 1, pct_start=0.1
     )
-    history: list[tuple[int, float, float]] = []
-    parts = {"network": network, "averaged": averaged, "optimiser": optimiser, "schedule": schedule}
-    first = _restore(folder / CHECKPOINT, recipe, parts, history) if resume else 0
-    running = float("nan")
-    for step in tqdm(range(first, recipe.steps), initial=first, total=recipe.steps, disable=not progress, unit="step"):
-        # A generator of its own for every step: a resumed run draws the same batches.
-        loss = _drawn_loss(network, samples, np.random.default_rng([recipe.seed, step]))
+    rng, history, running = np.random.default_rng(recipe.seed), [], float("nan")
+    for step in tqdm(range(1, recipe.steps + 1), disable=not progress, unit="step"):
+        loss = _drawn_loss(network, samples, rng)
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)
@@ -168,13 +218,11 @@ def fit(
         schedule.step()
         averaged.update_parameters(network)
         running = loss.item() if np.isnan(running) else 0.98 * running + 0.02 * loss.item()
-        if (step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == recipe.steps:
-            history.append((step + 1, running, mean_loss(averaged.module, validation)))
-            _save(folder / CHECKPOINT, recipe, step + 1, parts, history)
-    plot_loss(history, folder / "loss.png")
-    mean: StripNetwork = averaged.module
-    mean.eval()
-    return mean
+        if step % _PLOTTED_EVERY == 0 or step == recipe.steps:
+            history.append((step, running, mean_loss(averaged.module, validation)))
+    folder.mkdir(parents=True, exist_ok=True)
+    _plot_loss(history, folder / "loss.png")
+    return Fitted(averaged.module.eval(), history)
 
 
 def _moving_average(averaged: Tensor, current: Tensor, n_averaged: Tensor) -> Tensor:
@@ -190,59 +238,15 @@ def mean_loss(network: StripNetwork, samples: Sequence[Sample]) -> float:
     return float(np.mean(losses)) if losses else float("nan")
 
 
-def _save(path: Path, recipe: Recipe, step: int, parts: dict[str, Any], history: Sequence[Any]) -> None:
-    states = {name: part.state_dict() for name, part in parts.items()}
-    part = path.with_suffix(".part")
-    torch.save({"recipe": asdict(recipe), "step": step, "history": list(history), **states}, part)
-    part.replace(path)
-
-
-def _restore(path: Path, recipe: Recipe, parts: dict[str, Any], history: list[tuple[int, float, float]]) -> int:
-    state = load_checkpoint(path)
-    if state["recipe"] != asdict(recipe):
-        raise InputError(f"{path}: the checkpoint was made by another recipe", "give the same options, or start anew")
-    for name, part in parts.items():
-        part.load_state_dict(state[name])
-    history.extend(tuple(entry) for entry in state["history"])
-    return int(state["step"])
-
-
-def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint; only tensors and plain values are accepted.
-
-    Raises:
-        InputError: missing or not a checkpoint.
-    """
-    try:
-        state = torch.load(path, weights_only=True)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no checkpoint to go on from", "start without --resume") from None
-    except Exception as error:
-        raise InputError(f"{path}: not a checkpoint ({type(error).__name__})", "start without --resume") from None
-    return dict(state)
-
-
-def final_losses(folder: Path) -> dict[str, float]:
-    """Cross-entropy of a word at the end of the run in `folder`, nats; -1 where nothing was held out."""
-    _, training, validation = load_checkpoint(folder / CHECKPOINT)["history"][-1]
-    return {
-        "training_nats": round(training, 5),
-        "validation_nats": -1.0 if np.isnan(validation) else round(validation, 5),
-    }
-
-
-def plot_loss(history: Sequence[tuple[int, float, float]], path: Path) -> None:
+def _plot_loss(history: Sequence[tuple[int, float, float]], path: Path) -> None:
     """Training and validation loss over the steps, as a picture."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    steps, training, validation = np.array(history, np.float64).reshape(-1, 3).T
-    figure, axes = plt.subplots(figsize=(7, 4))
-    axes.plot(steps, training, label="training")
-    axes.plot(steps, validation, label="validation")
+    steps, *losses = np.array(history, np.float64).T
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for label, values in zip(("training", "validation"), losses, strict=True):
+        axes.plot(steps, values, label=label)
     axes.set(xlabel="step", ylabel="cross-entropy of a word, nats", yscale="log")
     axes.legend()
-    figure.savefig(path, dpi=110, bbox_inches="tight")
-    plt.close(figure)
+    figure.savefig(path, dpi=110)
