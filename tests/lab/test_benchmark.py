@@ -18,11 +18,10 @@ from click.testing import CliRunner
 from rxcli.cli.benchmark import benchmark
 from rxcli.errors import InputError, ReceiverError, UsageError
 from rxcli.lab.benchmark import cases, compare, measures, quick, tables, yardsticks
-from rxcli.lab.benchmark.bare import bare_decode
 from rxcli.lab.benchmark.cases import Case, received
 from rxcli.lab.benchmark.draw import Place, binned, draw_nodata, draw_small, scene_at
 from rxcli.lab.benchmark.measures import Group, cluster_interval, logistic_regression, wilson
-from rxcli.lab.benchmark.media import write_known
+from rxcli.lab.benchmark.media import bare_decode, write_known
 from rxcli.lab.benchmark.runner import Run, Task, do, load_journal, scenarios
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
@@ -327,7 +326,7 @@ def test_the_headline_puts_receiver_and_yardsticks_side_by_side() -> None:
     record = _record("sky")
     record["about"]["rate_kbps"] = 42.0
     record["ways"]["paper"] = record["ways"]["bound"]
-    row = quick._errors("sky", [record, record])
+    (row,) = quick._by_label("scene", [record, record], quick._ERRORS)
     assert (row["scene"], row["kb/s"], row["packets"], row["error_free"]) == ("sky", 42.0, 20, 16)
     assert row["receiver"] == row["bound"] == pytest.approx((5 + 77 / 2) / 770)
 

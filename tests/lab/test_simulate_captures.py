@@ -15,8 +15,8 @@ from click.testing import CliRunner
 from rxcli.cli.simulate import simulate
 from rxcli.errors import ReceiverError, UsageError
 from rxcli.lab.simulate.capture import prepare, simulate_frame
+from rxcli.lab.simulate.files import pack_14bit, write_dng
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset
-from rxcli.lab.simulate.tiff import pack_14bit, write_dng
 from rxcli.profiles import CameraProfile, load_profile
 from rxcli.protocol import codebook
 

@@ -14,9 +14,9 @@ import pytest
 from rxcli.ingest import open_source
 from rxcli.ingest.video import _Progress, _time_s
 from rxcli.lab.simulate.capture import Take, prepare
+from rxcli.lab.simulate.files import write_video
 from rxcli.lab.simulate.scenes import Change, Scene, preset
 from rxcli.lab.simulate.truth import build_camera_profile
-from rxcli.lab.simulate.video import write_video
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver.clip.start import Start

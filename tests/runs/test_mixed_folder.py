@@ -22,10 +22,8 @@ from rxcli.errors import ExitCode
 from rxcli.ingest import open_source
 from rxcli.lab.benchmark.media import repeat_clip
 from rxcli.lab.simulate.capture import prepare
-from rxcli.lab.simulate.files import write_png
-from rxcli.lab.simulate.tiff import write_dng, write_tiff
+from rxcli.lab.simulate.files import write_dng, write_png, write_tiff, write_video
 from rxcli.lab.simulate.truth import write_truth
-from rxcli.lab.simulate.video import write_video
 
 GOOD = (
     *("a.jpg", "monday/b.png", "monday/roof/c.dng", "tuesday/d.tif", "e.jpeg", "monday/f.mp4"),

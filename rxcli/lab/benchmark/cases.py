@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from rxcli.ingest import open_source
-from rxcli.lab.benchmark.bare import bare_decode
+from rxcli.lab.benchmark.media import bare_decode
 from rxcli.lab.benchmark.trial import Trial
 from rxcli.lab.benchmark.yardsticks import bound_result, paper_result
 from rxcli.options import SKIPS, ReceiverOptions

@@ -24,7 +24,7 @@ from rxcli.lab.benchmark.cases import Case, Record
 from rxcli.lab.benchmark.draw import DRAWERS, Place
 from rxcli.lab.benchmark.measures import Row
 from rxcli.lab.benchmark.runner import Task
-from rxcli.lab.simulate.tiff import write_dng
+from rxcli.lab.simulate.files import write_dng
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile

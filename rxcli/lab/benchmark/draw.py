@@ -19,15 +19,14 @@ from rxcli.lab.benchmark.cases import Case
 from rxcli.lab.benchmark.media import Medium, camera_path
 from rxcli.lab.benchmark.trial import SOURCE, Trial, simulate_trial, truth_of
 from rxcli.lab.simulate.capture import Take, prepare
-from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
+from rxcli.lab.simulate.files import write_video
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, no_data_scene
 from rxcli.lab.simulate.optics import Lens, Pose, View
-from rxcli.lab.simulate.pictures import PHOTOS, draw_name
+from rxcli.lab.simulate.pictures import DARK_KINDS, PHOTOS, draw_dark_picture, draw_name
 from rxcli.lab.simulate.scenes import Scene, draw_weight, preset, random_scene
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.lab.simulate.truth import build_camera_profile
-from rxcli.lab.simulate.video import write_video
 from rxcli.options import ReceiverOptions, receiver_options
 from rxcli.profiles import ScreenProfile, load_profile, shipped_profiles
 from rxcli.protocol import payload_bits

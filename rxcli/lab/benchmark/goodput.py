@@ -1,8 +1,7 @@
 """Whole transfers over simulated slots: how fast text and files come, byte for byte, from clips that begin anywhere.
 
 Every slot that a frame shows is lit or dark in white noise, every symbol is detected over its codebook, and the ratios
-go to the link layer as the receiver's would. Pixels are left out: they are measured on captures. Beside it stands what
-a CRC in every packet under a perfect erasure code would have delivered from the same frames.
+go to the link layer as the receiver's would. Pixels are left out: they are measured on captures.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from rxcli.types import Float32Array, FloatArray, FrameSoftBits
 
 #: Bytes up to which a transfer is a message.
 _MESSAGE_BYTES = 199
-_CRC_BITS = 32
 #: A detector trusts no bit further than this.
 _MAX_LLR = 9.0
 #: Clips begin within so many seconds of an object's start, and last at most so many times what is needed.
@@ -76,11 +74,10 @@ def transferred(*, seed: Sequence[int], screen: str = "data-34k6", **point: Any)
     small = transfer.size <= _MESSAGE_BYTES
     sending = message(data, "raw") if small else file_object("data.bin", data, mother=transfer.mother)
     receiver = LinkReceiver(transfer.screen.columns, transfer.screen.payload_symbols)
-    visible = crc_bits = 0
+    visible = 0
     exact, seconds, cpu_s = False, 0.0, 0.0
-    for shown, observed, labels in _frames(transfer, sending, rng):
+    for shown, observed in _frames(transfer, sending, rng):
         visible += int(observed.sum()) * transfer.n_lit * bits_per_symbol(transfer.w)
-        crc_bits += _packet_crc_bits(shown, observed, labels, transfer)
         start = time.process_time()
         events = receiver.add(shown)
         cpu_s += time.process_time() - start
@@ -92,8 +89,7 @@ def transferred(*, seed: Sequence[int], screen: str = "data-34k6", **point: Any)
     if not exact:
         return came
     bits = 8 * transfer.size
-    rates = {"kbps": bits / seconds / 1e3, "packet_crc_kbps": crc_bits / seconds / 1e3, "of_visible": bits / visible}
-    return {**came, **rates}
+    return {**came, "kbps": bits / seconds / 1e3, "of_visible": bits / visible}
 
 
 def detect(
@@ -114,8 +110,8 @@ def detect(
 
 def _frames(
     point: Transfer, sending: FileSending | MessageSending, rng: np.random.Generator
-) -> Iterator[tuple[FrameSoftBits, NDArray[np.bool_], NDArray[np.uint8]]]:
-    """Frames of a clip: soft bits, symbols that were observed (B, N), and labels (B, N, C)."""
+) -> Iterator[tuple[FrameSoftBits, NDArray[np.bool_]]]:
+    """Frames of a clip: soft bits, and symbols that were observed (B, N)."""
     screen = point.screen
     burst_s = screen.packet_s * screen.repeats
     start_s = float(rng.uniform(0, _START_WITHIN_S))
@@ -127,7 +123,7 @@ def _frames(
         observed = _observed(bursts, begin, end, screen)
         labels = sending.labels(bursts, screen.columns, screen.payload_symbols)
         llr = detect(labels, point.w, point.snr_db, rng) * observed[:, :, None, None]
-        yield FrameSoftBits(bursts - first, llr, time_s=frame / point.frame_rate_hz, frame=frame), observed, labels
+        yield FrameSoftBits(bursts - first, llr, time_s=frame / point.frame_rate_hz, frame=frame), observed
 
 
 def _observed(bursts: NDArray[np.int64], begin: float, end: float, screen: ScreenProfile) -> NDArray[np.bool_]:
@@ -138,17 +134,6 @@ def _observed(bursts: NDArray[np.int64], begin: float, end: float, screen: Scree
     at = (copy * screen.packet_s)[..., None] + symbol
     inside = (at >= begin) & (at + SLOTS_PER_SYMBOL * slot_s <= end)
     return np.asarray(inside.any(axis=1))
-
-
-def _packet_crc_bits(
-    shown: FrameSoftBits, observed: NDArray[np.bool_], labels: NDArray[np.uint8], point: Transfer
-) -> int:
-    """Bits of whole packets without a wrong bit, less a CRC each."""
-    k = bits_per_symbol(point.w)
-    bits = (labels[..., None] >> np.arange(6, 6 - k, -1)) & 1
-    agree = np.asarray((shown.llr[..., :k] > 0) == bits)
-    right = agree.all(axis=(1, 3)) & observed.all(axis=1, keepdims=True)
-    return int(right.sum()) * max(k * point.screen.payload_symbols - _CRC_BITS, 0)
 
 
 def _max_frames(point: Transfer) -> int:

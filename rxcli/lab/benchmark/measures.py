@@ -185,6 +185,7 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "total_ms": lambda g: 1e3 * min(g.values("wall_s")) / g.cases[0]["n_frames"],
     "real_time": _real_time,
     "stages": _stages,
+    "rate_kbps": lambda g: g.cases[0]["about"]["rate_kbps"],
     "target": lambda g: g.cases[0]["about"].get("target"),
     "status": lambda g: " ".join(dict.fromkeys(map(str, g.values("status")))),
     "rows_within": lambda g: int((g.rows_errors()[0] < ROWS_BOUND).sum()),
@@ -205,7 +206,6 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "kbps_median": _transfers("kbps", median),
     "kbps_worst": lambda g: min(g.values("kbps")) if all(g.values("exact")) else 0.0,
     "of_visible": _transfers("of_visible", np.mean),
-    "packet_crc_kbps": _transfers("packet_crc_kbps", np.mean),
 }
 COMMON = ("n", "expected", "right", "share", "false", "sure", "surely_wrong", "at_most", "calibration", "problems")
 COMMON_COST = ("cpu_s", "over_bare", "mb")

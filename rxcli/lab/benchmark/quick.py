@@ -18,54 +18,55 @@ from rxcli.lab.benchmark.runner import Run, scenarios
 _MEDIA = ("jpeg-26mp", "raw-26mp", "jpeg-26mp-hard", "jpeg-12mp-unknown")
 #: Runs of each medium, and small random scenes.
 _REPEATS, _SCENES = 3, 20
+#: Column of a table -> way and measure.
+_ERRORS = {
+    "kb/s": ("receiver", "rate_kbps"),
+    "packets": ("receiver", "expected"),
+    "receiver": ("receiver", "ber"),
+    "receiver95": ("receiver", "ber95"),
+    "bound": ("bound", "ber"),
+    "paper": ("paper", "ber"),
+    "error_free": ("receiver", "right"),
+    "false": ("receiver", "false"),
+}
+_TIMES = {
+    "bare_ms": ("two threads", "bare_ms"),
+    "total_ms": ("two threads", "total_ms"),
+    "ratio": ("two threads", "over_bare_wall"),
+    "cpu_ratio": ("two threads", "over_bare"),
+    "target": ("two threads", "target"),
+    "status": ("two threads", "status"),
+}
 
 
 def run(how: Run, seed: int, folder: Path) -> list[tuple[str, list[Row]]]:
     """Measure the headline: titles and tables; the media that are timed lie in `folder`."""
-    table = scenarios()
-    speed = {name: point for name, point in table["speed"].points.items() if name in _MEDIA}
-    timed = msgspec.structs.replace(table["speed"], points=speed, ways=("two threads",))
-    watched = msgspec.structs.replace(table["stability"], ways=("receiver",))
-    errors = how(table["quick"].tasks(seed, table["quick"].count, folder), "errors")
-    stability = how(watched.tasks(seed, _SCENES, folder), "stability")
-    times = how(timed.tasks(seed, _REPEATS, folder), "times")
+
+    def records(name: str, count: int, **changes: Any) -> list[Record]:
+        scenario = msgspec.structs.replace(scenarios()[name], **changes)
+        return how(scenario.tasks(seed, count, folder), name)
+
+    speed = {name: point for name, point in scenarios()["speed"].points.items() if name in _MEDIA}
+    errors = _by_label("scene", records("quick", scenarios()["quick"].count), _ERRORS)
+    problems = Group(records("stability", _SCENES, ways=("receiver",)), "receiver", "receiver").problems
+    timed = _by_label("medium", records("speed", _REPEATS, points=speed, ways=("two threads",)), _TIMES)
+    checks = {f"{_SCENES} random scenes": "; ".join(dict.fromkeys(problems)) or "ok"}
+    checks |= {name: f"{ms:.0f} ms" for name, ms in start_times(_REPEATS).items()}
     return [
-        ("bit error rate, lost packets included: receiver, bound, the paper's pipeline", _by_label(errors, _errors)),
-        ("time on two threads, of the wall and of the processor, against the bare decode", _by_label(times, _times)),
-        ("checks", [_check(stability), *({"check": k, "result": f"{ms:.0f} ms"} for k, ms in start_times(3).items())]),
+        ("bit error rate, lost packets included: receiver, bound, the paper's pipeline", errors),
+        ("time on two threads, of the wall and of the processor, against the bare decode", timed),
+        ("checks", [{"check": name, "result": result} for name, result in checks.items()]),
     ]
 
 
-def _by_label(records: list[Record], row: Any) -> list[Row]:
+def _by_label(first: str, records: list[Record], columns: dict[str, tuple[str, str]]) -> list[Row]:
+    """A row for each point of a scenario; see `_ERRORS`."""
     labels = dict.fromkeys(record["groups"][0] for record in records)
-    return [row(label, [record for record in records if record["groups"][0] == label]) for label in labels]
-
-
-def _errors(label: str, cases: list[Record]) -> Row:
-    receiver, bound, paper = (Group(cases, way, "receiver") for way in ("receiver", "bound", "paper"))
-    return {
-        "scene": label,
-        "kb/s": cases[0]["about"]["rate_kbps"],
-        "packets": receiver.score.expected,
-        "receiver": receiver.score.ber,
-        "receiver95": MEASURES["ber95"](receiver),
-        "bound": bound.score.ber,
-        "paper": paper.score.ber,
-        "error_free": receiver.score.error_free,
-        "false": receiver.score.false,
-    }
-
-
-def _times(label: str, cases: list[Record]) -> Row:
-    columns = {"bare_ms": "bare_ms", "total_ms": "total_ms", "ratio": "over_bare_wall", "cpu_ratio": "over_bare"}
-    columns |= {"target": "target", "status": "status"}
-    group = Group(cases, "two threads", "two threads")
-    return {"medium": label, **{name: MEASURES[measure](group) for name, measure in columns.items()}}
-
-
-def _check(records: list[Record]) -> Row:
-    problems = Group(records, "receiver", "receiver").problems
-    return {"check": f"{len(records)} random scenes", "result": "; ".join(dict.fromkeys(problems)) or "ok"}
+    cases = {label: [record for record in records if record["groups"][0] == label] for label in labels}
+    return [
+        {first: label, **{name: MEASURES[measure](Group(mine, way, way)) for name, (way, measure) in columns.items()}}
+        for label, mine in cases.items()
+    ]
 
 
 def start_times(repeats: int) -> dict[str, float]:

@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 
 from rxcli.lab.simulate.bound import Oracle, OracleRecorder
 from rxcli.lab.simulate.camera import Exposure, take_picture
+from rxcli.lab.simulate.files import CODECS, write_dng, write_tiff, write_video
 from rxcli.lab.simulate.isp import develop
 from rxcli.lab.simulate.motion import HandMotion, turned
 from rxcli.lab.simulate.optics import View, homography
 from rxcli.lab.simulate.pictures import load_picture, picture_names
 from rxcli.lab.simulate.scenes import Change, Scene
-from rxcli.lab.simulate.tiff import write_dng, write_tiff
 from rxcli.lab.simulate.transmitter import Dimming, Drive, Link, Weights, drive_screen
 from rxcli.lab.simulate.truth import build_truth
-from rxcli.lab.simulate.video import CODECS, write_video
 from rxcli.profiles import ScreenProfile
 
 FloatArray = NDArray[np.float64]

@@ -1,13 +1,18 @@
-"""Captures as files: JPEG with metadata, DNG, PNG, TIFF, and video through real encoders."""
+"""Captures as files: JPEG with metadata, DNG, PNG, TIFF, and clips through real encoders."""
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.errors import UsageError
 from rxcli.lab.simulate.scenes import Scene
 
 
@@ -47,3 +52,201 @@ def write_png(rgb: NDArray[np.generic], path: Path) -> None:
     ok, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
     assert ok, "PNG takes any picture of 8 or 16 bits"
     path.write_bytes(data.tobytes())
+
+
+#: Tag number, type as tifffile names it, count, value, whether in the first directory alone.
+_Tag = tuple[int, str, int, Any, bool]
+#: tifffile writes no EXIF directory (34665); a tag of the next number keeps its place.
+_PLACEHOLDER = 34666
+
+
+def _rationals(code: int, kind: str, values: Any, denominator: int) -> _Tag:
+    pairs = [Fraction(float(value)).limit_denominator(denominator).as_integer_ratio() for value in np.ravel(values)]
+    return code, kind, len(pairs), tuple(number for pair in pairs for number in pair), True
+
+
+def _camera_tags(scene: Scene) -> list[_Tag]:
+    """Make, model, orientation, and a place for that of the EXIF directory."""
+    named = [(271, "s", 0, scene.make, True), (272, "s", 0, scene.model, True)]
+    return [*named, (274, "H", 1, scene.orientation, True), (_PLACEHOLDER, "I", 1, 0, True)]
+
+
+def _append_exif(path: Path, scene: Scene) -> None:
+    """Write exposure and ISO into an EXIF directory at the end of the file, and its place over the placeholder."""
+    import tifffile
+
+    exposure = Fraction(scene.exposure_s).limit_denominator(1_000_000).as_integer_ratio()
+    with tifffile.TiffFile(path) as written:
+        placeholder = written.pages[0].tags[_PLACEHOLDER].offset
+    with path.open("r+b") as file:
+        at = file.seek(0, 2)
+        file.write(struct.pack("<HHHIIHHIIIII", 2, 33434, 5, 1, at + 30, 34855, 3, 1, scene.iso, 0, *exposure))
+        file.seek(placeholder)
+        file.write(struct.pack("<HHII", _PLACEHOLDER - 1, 4, 1, at))
+
+
+def pack_14bit(values: NDArray[np.uint16]) -> bytes:
+    """Rows of 14-bit numbers, most significant bit first, each row padded to whole bytes."""
+    height, width = values.shape
+    padded = np.zeros((height, -(-width // 4) * 4), np.uint64)
+    padded[:, :width] = values
+    quads = padded.reshape(height, -1, 4)
+    word = (quads[..., 0] << np.uint64(42)) | (quads[..., 1] << np.uint64(28)) | (quads[..., 2] << np.uint64(14))
+    word |= quads[..., 3]
+    packed = word.astype(">u8").view(np.uint8).reshape(height, -1, 8)[..., 1:].reshape(height, -1)
+    return bytes(packed[:, : -(-width * 14 // 8)].tobytes())
+
+
+def write_dng(raw: NDArray[np.uint16], scene: Scene, path: Path, bits: int = 16) -> None:
+    """Write a mosaic as uncompressed DNG.
+
+    Args:
+        raw: (height, width) uint16.
+        scene: whose sensor made it.
+        path: of the file.
+        bits: 16, or 14 for packed numbers.
+    """
+    import tifffile
+
+    sensor = scene.sensor
+    if sensor.pattern is None:
+        raise UsageError("a DNG holds a mosaic, this sensor has none", "use a Bayer or X-Trans sensor")
+    # The matrix from XYZ to the sensor's colours, for the panel's primaries taken as sRGB's.
+    from_xyz = sensor.colour_matrix @ np.array(
+        [[3.2405, -1.5371, -0.4985], [-0.9693, 1.8760, 0.0416], [0.0556, -0.2040, 1.0572]]
+    )
+    tags = [
+        *_camera_tags(scene),
+        (33421, "H", 2, sensor.pattern.shape, True),
+        (33422, "B", sensor.pattern.size, sensor.pattern.tobytes(), True),
+        (50706, "B", 4, b"\1\4\0\0", True),
+        (50707, "B", 4, b"\1\3\0\0", True),
+        (50708, "s", 0, f"{scene.make} {scene.model}", True),
+        (50714, "H", 1, sensor.black_level, True),
+        (50717, "H", 1, sensor.white_level, True),
+        _rationals(50721, "2i", from_xyz, 10_000),
+        _rationals(50728, "2I", sensor.response, 10_000),
+        (50778, "H", 1, 21, True),
+    ]
+    layout: dict[str, Any] = {
+        "photometric": 32803,
+        "rowsperstrip": raw.shape[0],
+        "metadata": None,
+        "software": False,
+        "extratags": tags,
+    }
+    if bits == 16:
+        tifffile.imwrite(path, raw, **layout)
+    else:
+        packed = iter([pack_14bit(raw)])
+        tifffile.imwrite(path, packed, shape=raw.shape, dtype=np.uint16, bitspersample=14, **layout)
+    _append_exif(path, scene)
+
+
+def write_tiff(rgb: NDArray[np.generic], scene: Scene, path: Path) -> None:
+    """Write a developed picture of 8 or 16 bits as uncompressed TIFF."""
+    import tifffile
+
+    tifffile.imwrite(path, rgb, photometric="rgb", metadata=None, extratags=_camera_tags(scene))
+    _append_exif(path, scene)
+
+
+@dataclass(frozen=True)
+class Codec:
+    """How a clip is compressed."""
+
+    #: FFmpeg's encoder and pixel format.
+    encoder: str
+    pixel_format: str
+    #: True where luma uses the whole range of its numbers.
+    full_range: bool = False
+
+    @property
+    def bits(self) -> int:
+        """Bits of a sample."""
+        return 10 if self.pixel_format.endswith("10le") else 8
+
+
+CODECS = {
+    "h264": Codec("libx264", "yuv420p"),
+    "h264-10": Codec("libx264", "yuv420p10le"),
+    "hevc": Codec("libx265", "yuv420p"),
+    "hevc-10": Codec("libx265", "yuv420p10le"),
+    "mjpeg": Codec("mjpeg", "yuvj420p", full_range=True),
+}
+_BT709, _MPEG_RANGE, _JPEG_RANGE = 1, 1, 2
+
+
+def write_video(
+    frames: Iterable[NDArray[np.generic]],
+    path: Path,
+    codec: str,
+    frame_rate_hz: float,
+    bit_rate: int | None = None,
+    preset: str = "veryfast",
+) -> None:
+    """Compress developed pictures into a clip.
+
+    Args:
+        frames: each (height, width, 3), red first, uint8, or uint16 for the codecs of ten bits.
+        path: of the file; its suffix chooses the container.
+        codec: one of `CODECS`.
+        frame_rate_hz: of the clip.
+        bit_rate: bits per second; None for the encoder's constant quality.
+        preset: how much work the encoder does; see x264 and x265.
+
+    Raises:
+        UsageError: unknown codec, or one that this machine's FFmpeg lacks.
+    """
+    import av
+
+    if codec not in CODECS:
+        raise UsageError(f"no codec {codec!r}", f"choose from: {', '.join(CODECS)}")
+    settings = CODECS[codec]
+    rate = Fraction(frame_rate_hz).limit_denominator(1001)
+    with av.open(str(path), "w") as container:
+        stream = None
+        for number, rgb in enumerate(frames):
+            if stream is None:
+                stream = _add_stream(container, settings, rate, rgb.shape, bit_rate, preset)
+            frame = av.VideoFrame.from_ndarray(
+                np.ascontiguousarray(rgb), "rgb24" if rgb.dtype == np.uint8 else "rgb48le"
+            )
+            target_range = _JPEG_RANGE if settings.full_range else _MPEG_RANGE
+            converted = frame.reformat(
+                format=settings.pixel_format,
+                dst_colorspace=_BT709,
+                src_color_range=_JPEG_RANGE,
+                dst_color_range=target_range,
+            )
+            converted.pts, converted.time_base = number, 1 / rate
+            container.mux(stream.encode(converted))
+        if stream is not None:
+            container.mux(stream.encode(None))
+
+
+def _add_stream(
+    container: Any, settings: Codec, rate: Fraction, shape: tuple[int, ...], bit_rate: int | None, preset: str
+) -> Any:
+    import av
+
+    try:
+        stream = container.add_stream(settings.encoder, rate=rate)
+    except (av.error.FFmpegError, ValueError) as error:
+        raise UsageError(
+            f"{settings.encoder}: this FFmpeg cannot encode it ({error})", "choose another codec"
+        ) from None
+    stream.height, stream.width = shape[:2]
+    stream.pix_fmt = settings.pixel_format
+    context = stream.codec_context
+    context.color_range = _JPEG_RANGE if settings.full_range else _MPEG_RANGE
+    context.colorspace = context.color_trc = context.color_primaries = _BT709
+    if bit_rate is not None:
+        stream.bit_rate = bit_rate
+    if settings.encoder != "mjpeg":
+        stream.options = {"preset": preset} | ({} if bit_rate else {"crf": "23"})
+        if settings.encoder == "libx265":
+            # Reordered frames of a clip shorter than the encoder's delay get times that no container takes; and the
+            # encoders in cameras do not reorder either.
+            stream.options = stream.options | {"x265-params": "log-level=error:bframes=0"}
+    return stream

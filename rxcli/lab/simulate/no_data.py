@@ -13,9 +13,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.simulate.dark_pictures import DARK_KINDS, draw_dark_picture
 from rxcli.lab.simulate.optics import Pose
-from rxcli.lab.simulate.pictures import draw_name, load_picture
+from rxcli.lab.simulate.pictures import DARK_KINDS, draw_dark_picture, draw_name, load_picture
 from rxcli.lab.simulate.scenes import Scene, preset
 
 FloatArray = NDArray[np.float64]

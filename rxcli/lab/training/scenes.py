@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.benchmark.draw import phone_of
-from rxcli.lab.simulate.dark_pictures import draw_dark_picture
-from rxcli.lab.simulate.pictures import load_picture
+from rxcli.lab.simulate.pictures import draw_dark_picture, load_picture
 from rxcli.lab.simulate.scenes import Scene, preset
 
 #: scikit-image's pictures that training may use; the others are for validation.
