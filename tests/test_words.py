@@ -75,8 +75,12 @@ PHRASES = {
     r"not (?:yet )?asked": "not used, not requested",
 }
 PHRASE = re.compile(r"\b(?:" + "|".join(PHRASES) + r")\b", re.IGNORECASE)
+CHANNEL = ("__init__", "denoise", "likelihoods", "model", "patterns", "picture", "settings", "words")
 #: What is read: folders and files of `rxcli/`, and pages.
-SOURCES = ("receiver/decode", "receiver/sync")
+SOURCES = (
+    *("receiver/decode", "receiver/sync", "receiver/light.py", "receiver/context.py", "receiver/acquisition.py"),
+    *("receiver/reception.py", *(f"receiver/channel/{name}.py" for name in CHANNEL)),
+)
 PAGES: tuple[str, ...] = ()
 
 

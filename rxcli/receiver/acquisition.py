@@ -1,4 +1,4 @@
-"""Columns sampled, and what travels on once a screen and its clock were found. Part of the wiring."""
+"""Sampled columns, and the acquired screen with its clock. Part of the wiring."""
 
 from __future__ import annotations
 
@@ -19,27 +19,26 @@ from rxcli.types import Clock, FloatArray, IntArray, RowProfiles
 
 @dataclass(frozen=True, slots=True)
 class ColumnSampler:
-    """Row profiles of a screen's columns, and what reads more of them."""
+    """Row profiles of a screen's columns, and a function that reads more of them."""
 
     profiles: RowProfiles
-    #: Whether strips were read in pairs, as a quick look takes them.
+    #: Whether strips were read in pairs, as for an initial pass.
     is_binned: bool = False
-    #: Reads all strips of some columns pixel by pixel, given the noise model, where the profiles are of a quick look;
-    #: None where they are not.
+    #: Reads all strips of some columns pixel by pixel, given the noise model; None if the profiles are complete.
     read: Callable[[slice, tuple[float, float]], RowProfiles] | None = None
 
     @property
     def n_binned_strips(self) -> int:
-        """Strips of a column that a quick look takes: see `sync.binned_strips`."""
+        """Strips of a column in the initial pass, see `sync.binned_strips`."""
         n_strips: int = self.profiles.light.shape[1]
         return n_strips if self.is_binned or n_strips % 2 else n_strips // 2
 
     def binned(self) -> RowProfiles:
-        """The profiles with strips pooled in pairs."""
+        """The profiles with strips binned in pairs."""
         return self.profiles if self.is_binned else sync.binned_strips(self.profiles)
 
     def in_depth(self, columns: NDArray[np.int64]) -> ColumnSampler:
-        """The same with some columns read pixel by pixel, strip by strip."""
+        """Read some columns pixel by pixel, strip by strip."""
         if self.read is None or not columns.size:
             return self
         every = sync.unbinned_strips(self.profiles) if self.is_binned else self.profiles
@@ -60,9 +59,9 @@ class Acquisition:
     screen: ScreenProfile
     sampler: ColumnSampler
     clock: Clock
-    #: The screen, and others that differ from it in how often a packet is sent; the copies are to tell.
+    #: The screen, and screens that differ from it only in the number of copies; the copies decide.
     variants: tuple[ScreenProfile, ...] = ()
-    #: (n_copies,) burst of every copy; None where the light is to tell.
+    #: (n_copies,) burst of every copy; None if it is still to be estimated.
     burst: IntArray | None = None
 
     @property
@@ -71,19 +70,19 @@ class Acquisition:
 
     @property
     def repeats(self) -> tuple[int, ...]:
-        """How many copies a burst may have."""
+        """Possible numbers of copies of a burst."""
         return tuple(screen.repeats for screen in self.variants) or (self.screen.repeats,)
 
     def variant(self, repeats: int) -> ScreenProfile:
-        """The screen that sends a packet so often."""
+        """The screen that sends a packet `repeats` times."""
         return next((screen for screen in self.variants if screen.repeats == repeats), self.screen)
 
     def binned(self) -> Acquisition:
-        """The same with strips pooled in pairs."""
+        """The acquisition with strips binned in pairs."""
         return replace(self, sampler=ColumnSampler(self.sampler.binned(), is_binned=True))
 
     def middle(self) -> Acquisition:
-        """The middle half of the columns."""
+        """The acquisition of the middle half of the columns."""
         n_columns, profiles, rows = self.screen.columns, self.profiles, self.profiles.sensor_row
         part = slice(n_columns // 4, n_columns - n_columns // 4)
         middle = replace(
@@ -97,7 +96,7 @@ class Acquisition:
         return replace(self, sampler=ColumnSampler(middle, self.sampler.is_binned), clock=clock)
 
     def as_one_column(self) -> Acquisition:
-        """The same with every column a strip of one."""
+        """The acquisition with every column as a strip of a single one."""
         profiles, rows = self.profiles, self.profiles.sensor_row
         weight = profiles.inside.astype(np.float32)
         light = (profiles.light * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
@@ -112,21 +111,20 @@ class Acquisition:
         return replace(self, sampler=ColumnSampler(strips, is_binned=True), clock=clock)
 
     def in_depth(self, columns: NDArray[np.int64]) -> Acquisition:
-        """The same with some columns read pixel by pixel, strip by strip."""
+        """Read some columns pixel by pixel, strip by strip."""
         sampler = self.sampler.in_depth(columns)
         return self if sampler is self.sampler else replace(self, sampler=sampler)
 
 
 def n_strips_of(corners: FloatArray, n_columns: int) -> int:
-    """Lateral strips of a column, by its width."""
+    """Number of lateral strips of a column, from its width."""
     return sampling.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
 
 
 def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False) -> ColumnSampler:
-    """Row profiles of a screen of `n_columns` columns, in the order of time.
+    """Sample the row profiles of a screen of `n_columns` columns in order of time.
 
-    With `quick`, columns of developed pictures are read pixel by pixel only when they are asked for, see
-    `ColumnSampler.in_depth`.
+    With `quick`, columns of developed pictures are read pixel by pixel only on request, see `ColumnSampler.in_depth`.
     """
     frame, camera = context.frame, context.camera
     quick = quick and sampling.is_coded(frame)
@@ -150,18 +148,19 @@ def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False
 
 
 def noise_of(profiles: RowProfiles) -> float:
-    """Standard deviation of a strip's row of no light."""
+    """Standard deviation of a dark row of a strip."""
     return float(np.sqrt(profiles.noise_floor / max(float(np.median(profiles.count)), 1.0)))
 
 
 def distinct_screens(screens: Sequence[ScreenProfile]) -> list[ScreenProfile]:
-    """The screens without those that differ only in how often a packet is sent: the one that sends it most."""
-    return [one for one in screens if variants_of(one, screens)[0] is one]
+    """One screen of each group that differs only in the number of copies: the one with the most."""
+    return [screen for screen in screens if variants_of(screen, screens)[0] is screen]
 
 
 def variants_of(screen: ScreenProfile, screens: Sequence[ScreenProfile]) -> tuple[ScreenProfile, ...]:
-    """The screen, and others that differ only in how often a packet is sent; the one that sends it most first."""
-    by_repeats = {one.repeats: one for one in reversed((screen, *screens)) if _shape(one) == _shape(screen)}
+    """The screen and those that differ only in the number of copies, the one with the most copies first."""
+    candidates = reversed((screen, *screens))
+    by_repeats = {candidate.repeats: candidate for candidate in candidates if _shape(candidate) == _shape(screen)}
     return tuple(by_repeats[repeats] for repeats in sorted(by_repeats, reverse=True))
 
 

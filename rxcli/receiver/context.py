@@ -1,4 +1,4 @@
-"""What travels together through the reception of a frame: frame, outline, camera and timer; and failures."""
+"""Data of the reception of a frame: frame, outline, camera and timer; and failures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LIKELY = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """Where the screen is."""
+    """Location of the screen in the picture."""
 
     #: (4, 2) pixels of the stored picture, the viewer's top left first.
     corners: FloatArray
@@ -28,27 +28,27 @@ class Outline:
     certainty: float = 1.0
     #: Sides of the stored picture that show no light.
     inferred: tuple[str, ...] = ()
-    #: Column of the screen that is the first; None where that is not sure, or columns are counted from the left of what
-    #: is seen.
+    #: Screen number of the first column; None if it is uncertain or columns are counted from the left of the visible
+    #: ones.
     column_offset: int | None = 0
     log_odds: float = 0.0
-    #: Outlines of one family are alike but for the first column.
+    #: Outlines of one family differ only in the first column.
     family: int = 0
     #: Whether light reaches to both ends of the picture.
     fills: bool = False
-    #: Corners that it has with other rows, likeliest first.
+    #: Alternative corners with other top and bottom rows, likeliest first.
     other_rows: tuple[FloatArray, ...] = ()
-    #: Columns whose borders were found on it, many of them; None: not asked, or few, of which many may have been taken.
+    #: Number of narrow columns whose borders were found; None if it was not determined or is small.
     n_columns: int | None = None
 
     @property
     def is_counted_from_left(self) -> bool:
-        """Whether no side is in view that tells which column is the first."""
+        """Whether columns are counted from the left because no side of the screen is visible."""
         return self.fills and self.column_offset is None and self.certainty < _LIKELY
 
     @property
     def result_fields(self) -> dict[str, Any]:
-        """What a result says of it, by the names of its fields."""
+        """Fields of a result, by name."""
         return {
             "corners": self.corners,
             "column_certainty": self.certainty,
@@ -59,16 +59,16 @@ class Outline:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """Reception ends here: its status, the reason and the next step."""
+    """End of a reception without packets: status, reason and next step."""
 
     status: Literal["no_screen", "no_signal"]
     message: str
-    #: What was estimated of the camera all the same: name -> (value, standard deviation).
+    #: Estimates of the camera: name -> (value, standard deviation).
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
-    #: The outline and the camera that came nearest.
+    #: The best outline and camera.
     outline: Outline | None = None
     context: FrameContext | None = None
-    #: Every hypothesis that was tried, see `search.Tried`.
+    #: Every hypothesis that was scored, see `search.Tried`.
     tried: tuple[Any, ...] = ()
 
 
@@ -95,9 +95,9 @@ class Timer:
 
 @dataclass(frozen=True, slots=True)
 class Camera:
-    """What is known of the camera that took a frame."""
+    """Camera parameters of a frame."""
 
-    #: None for a camera that was estimated from the frame itself.
+    #: Name of the profile; None for a camera that was estimated from the frame.
     profile: str | None
     line_delay_s: float
     exposure_s: float
@@ -105,14 +105,14 @@ class Camera:
     tone: str
     #: True where the stored rows run against the readout.
     reversed: bool = False
-    #: What was estimated: name -> (value, standard deviation).
+    #: Estimated parameters: name -> (value, standard deviation).
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
-    #: What it was estimated to be, until its slots were fitted; None for a known camera.
+    #: The estimate before decided slots were fitted; None for a known camera.
     hypothesis: CameraHypothesis | None = None
 
     @property
     def result_fields(self) -> dict[str, Any]:
-        """What a result says of it, by the names of its fields."""
+        """Fields of a result, by name."""
         return {
             "camera_profile": self.profile,
             "line_delay_s": self.line_delay_s,
@@ -128,17 +128,17 @@ class Camera:
 
 @dataclass(frozen=True, slots=True)
 class FrameContext:
-    """A frame of which it is known where the screen is and which camera took it."""
+    """A frame with the location of its screen and its camera."""
 
     frame: Frame
     #: (4, 2) image pixels, top-left first, clockwise as a viewer sees the screen.
     corners: FloatArray
     camera: Camera
-    #: Screens that it may be, at least one.
+    #: Candidate screen profiles, at least one.
     screens: tuple[ScreenProfile, ...]
     timer: Timer
 
     @property
     def n_columns(self) -> int:
-        """Columns of the coarsest screen that it may be: those that are read first."""
+        """Columns of the candidate screen with the fewest columns, which is sampled first."""
         return min(screen.columns for screen in self.screens)

@@ -1,10 +1,10 @@
-"""How slots become light: the physics that every room of the receiver shares.
+"""Observation physics shared by all parts of the receiver: how slots become light.
 
-What strip s of column c sees at an exposure centred at g (in slots) is
+Strip s of column c, exposed around the time g (in slots), receives
 
     z = black level + T * (sum over k of K[s, k] * m[c + k](g)) + noise,    m(g) = sum over n of lit[n] * h(g - n)
 
-with T the picture there, K the `Crosstalk`, h a slot seen through the `Exposure`, and noise that grows with light: the
+where T is the local picture, K the `Crosstalk`, h a slot convolved with the `Exposure`, and the noise is that of the
 `NoiseModel`.
 """
 
@@ -19,54 +19,54 @@ from numpy.typing import NDArray
 from rxcli.protocol import HEADER
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
-#: The longest exposure, slots, that each memory of the trellis covers; longer ones have `MAX_MEMORY`.
+#: Longest exposure, slots, that each ISI memory covers; longer exposures use `MAX_MEMORY`.
 _MEMORY_EXPOSURE_SLOTS = {1: 1.3, 3: 2.6}
-#: Longest memory of the trellis; five slots cover an exposure of four.
+#: Longest ISI memory of the trellis; five slots cover an exposure of four.
 MAX_MEMORY = 5
 #: The dark slots in the middle of a header.
 _DARK_FROM = HEADER.index(0, HEADER.index(1))
 _DARK_TO = HEADER.index(1, _DARK_FROM)
-#: A shutter is take_places to be open for so many slots at least.
+#: Shortest exposure and blur, slots.
 _MIN_SLOTS = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """A sample of light x has variance floor + slope * x: read noise and the shot noise of light."""
+    """Read noise and shot noise: the variance of a sample of light x is dark_variance + shot_gain * x."""
 
-    floor: float
-    slope: float
+    dark_variance: float
+    shot_gain: float
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of a sample of no light."""
-        return float(np.sqrt(self.floor))
+        """Standard deviation of a dark sample."""
+        return float(np.sqrt(self.dark_variance))
 
     def of_mean(self, n: float) -> NoiseModel:
-        """The noise of the mean of `n` samples."""
-        return NoiseModel(self.floor / n, self.slope / n)
+        """Noise of the mean of `n` samples."""
+        return NoiseModel(self.dark_variance / n, self.shot_gain / n)
 
     def variance(self, light: Float32Array) -> Float32Array:
-        """Variance of samples of some light."""
-        return np.maximum(light, np.float32(0)) * np.float32(self.slope) + np.float32(self.floor)
+        """Variance of samples of the given light."""
+        return np.maximum(light, np.float32(0)) * np.float32(self.shot_gain) + np.float32(self.dark_variance)
 
     def through_picture(self, picture: Float32Array, variance: Float32Array, expected: Float32Array) -> Float32Array:
-        """Variance of samples that show `expected` times a picture which is itself known with some variance."""
+        """Variance of samples of `expected` times a picture that is known with `variance`."""
         out = variance * expected
-        out += np.float32(self.slope) * picture
+        out += np.float32(self.shot_gain) * picture
         out *= expected
-        out += np.float32(self.floor)
+        out += np.float32(self.dark_variance)
         return out
 
 
 def exposure_shares(
     centre: FloatArray | Float32Array, slots: NDArray[np.integer] | FloatArray | Float32Array, exposure_slots: float
 ) -> FloatArray:
-    """Share of an exposure that falls into each slot.
+    """Share of an exposure in each slot.
 
     Args:
         centre: centre of the exposure, slots.
-        slots: numbers of the slots, which begin there; broadcast against `centre`.
+        slots: start times of the slots, i.e. their numbers; broadcast against `centre`.
         exposure_slots: length of the exposure, slots.
     """
     half = exposure_slots / 2
@@ -74,23 +74,23 @@ def exposure_shares(
     return np.asarray(np.maximum(reach, 0) / exposure_slots)
 
 
-def sees_dark_header(places: FloatArray, exposure_slots: float, least: float = 0.0) -> BoolArray:
-    """Exposures that see nothing but the three dark slots in the middle of a header.
+def sees_dark_header(places: FloatArray, exposure_slots: float, min_reach: float = 0.0) -> BoolArray:
+    """Whether exposures lie entirely in the three dark slots in the middle of a header.
 
     Args:
-        places: their centres, slots from the start of a packet.
-        exposure_slots: their length.
-        least: how far from the middle, slots, they count however long the exposure.
+        places: centres of the exposures, slots from the start of a packet.
+        exposure_slots: length of the exposures, slots.
+        min_reach: distance from the middle, slots, that counts for any exposure.
     """
-    reach = max((_DARK_TO - _DARK_FROM - exposure_slots) / 2, least)
+    reach = max((_DARK_TO - _DARK_FROM - exposure_slots) / 2, min_reach)
     return np.asarray(np.abs(places - (_DARK_FROM + _DARK_TO) / 2) <= reach)
 
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """Slots seen through the exposure on a grid of Q samples a slot.
+    """Response of slots through the exposure, on a grid of Q samples per slot.
 
-    Sample q of metric n has its exposure's centre at n - memory / 2 + (q + 1/2) / Q.
+    The exposure of sample q of metric n is centred at n - memory / 2 + (q + 1/2) / Q.
     """
 
     #: (Q, memory + 1) weight of the slots n - memory .. n in sample q of metric n.
@@ -100,17 +100,18 @@ class Exposure:
     def of(
         exposure_slots: float, samples_per_slot: int, isi_memory: int | None = None, blur_slots: float | None = None
     ) -> Exposure:
-        """An exposure of some slots.
+        """Build the response of an exposure.
 
         Args:
-            exposure_slots: how long the shutter is open.
-            samples_per_slot: samples a slot, Q.
-            isi_memory: slots of memory; None for what covers the exposure.
-            blur_slots: width of a further box that light is seen through; None for a sample's own length.
+            exposure_slots: length of the exposure, slots.
+            samples_per_slot: samples per slot, Q.
+            isi_memory: ISI memory; None for the shortest that covers the exposure.
+            blur_slots: width of a further box filter, slots; None for the length of a sample.
         """
         if isi_memory is None:
-            covering = (memory for memory, most in _MEMORY_EXPOSURE_SLOTS.items() if exposure_slots <= most)
-            isi_memory = next(covering, MAX_MEMORY)
+            isi_memory = next(
+                (n for n, longest in _MEMORY_EXPOSURE_SLOTS.items() if exposure_slots <= longest), MAX_MEMORY
+            )
         n_fine, q = 32, samples_per_slot
         offsets = ((np.arange(n_fine) + 0.5) / n_fine - 0.5) * max(blur_slots or 1 / q, _MIN_SLOTS)
         centres = -isi_memory / 2 + (np.arange(q) + 0.5) / q
@@ -120,7 +121,7 @@ class Exposure:
 
     @property
     def isi_memory(self) -> int:
-        """Slots before a metric's own that it depends on; odd, so that metrics sit between samples."""
+        """Number of earlier slots that a metric depends on; odd, so that metrics lie between samples."""
         return int(self.taps.shape[1]) - 1
 
     @property
@@ -129,26 +130,26 @@ class Exposure:
         return int(self.taps.shape[0])
 
     def mean_light(self, lit: Float32Array) -> Float32Array:
-        """(C, N * Q) mean of slots (C, N), or of their probabilities, over the exposure; half lit beyond the ends."""
-        (n_columns, n_slots), memory, q = lit.shape, self.isi_memory, self.samples_per_slot
-        padded = np.full((n_columns, n_slots + 2 * memory), 0.5, np.float32)
-        padded[:, memory : memory + n_slots] = lit
-        n_metrics = n_slots + memory
+        """(C, N * Q) mean of slots (C, N), or of their probabilities, over the exposure; 0.5 beyond the ends."""
+        (n_columns, n_slots), isi_memory, q = lit.shape, self.isi_memory, self.samples_per_slot
+        padded = np.full((n_columns, n_slots + 2 * isi_memory), 0.5, np.float32)
+        padded[:, isi_memory : isi_memory + n_slots] = lit
+        n_metrics = n_slots + isi_memory
         repeated = np.repeat(padded, q, axis=1)
         out = np.zeros((n_columns, n_metrics * q), np.float32)
         for place, weights in enumerate(self.taps.T.astype(np.float32)):
             out += repeated[:, place * q :][:, : n_metrics * q] * np.tile(weights, n_metrics)
-        skip = memory * q // 2
+        skip = isi_memory * q // 2
         return np.ascontiguousarray(out[:, skip : skip + n_slots * q])
 
 
 def column_light(n_strips: int, n_columns: int, light_spread: float) -> FloatArray:
-    """(M, C) light of every column in the middles of strips spread evenly over a screen, the most in a strip being 1.
+    """(M, C) light of every column at the centres of equal strips of a screen, relative to the brightest in each strip.
 
     Args:
         n_strips: strips of the screen, M.
-        n_columns: its columns.
-        light_spread: sigma of the Gaussian that a column's light falls off with, column pitches.
+        n_columns: columns of the screen, C.
+        light_spread: standard deviation of the Gaussian profile of a column's light, column pitches.
     """
     place = (np.arange(n_strips) + 0.5) / n_strips * n_columns
     square = (place[:, None] - np.arange(n_columns) - 0.5) ** 2
@@ -157,43 +158,43 @@ def column_light(n_strips: int, n_columns: int, light_spread: float) -> FloatArr
 
 @dataclass(frozen=True, slots=True)
 class Crosstalk:
-    """Light that each strip of a column gets from the columns beside it."""
+    """Light of the adjacent columns in each strip of a column."""
 
     #: (S, 3) share of the light of the columns to the left, of the column itself and to the right, in each strip.
     shares: FloatArray
 
     @staticmethod
     def of(n_strips: int, light_spread: float) -> Crosstalk:
-        """That of a screen, for a Gaussian of sigma `light_spread` pitches.
+        """Crosstalk of a Gaussian light profile with a standard deviation of `light_spread` pitches.
 
-        Shares, because the picture takes up any common factor; so a spread of 0 is no crosstalk, not no light.
+        The shares of a strip add up to 1, because the picture contains any common factor.
         """
         fine = 16
         across = (np.arange(n_strips * fine) + 0.5) / (n_strips * fine) - 0.5
         distance = across[:, None] - np.arange(-1, 2)
         exponent = (-(distance**2) / (2 * max(light_spread, 1e-3) ** 2)).reshape(n_strips, -1, 3)
-        # A strip sees the mean over its width: one that is a whole column has twice the crosstalk of its middle.
+        # A strip receives the mean over its width: a strip of a whole column has twice the crosstalk of its centre.
         weight = np.exp(exponent - exponent.max(axis=(1, 2), keepdims=True)).mean(axis=1)
         return Crosstalk(np.asarray(weight / weight.sum(axis=1, keepdims=True)))
 
     @property
     def own(self) -> Float32Array:
-        """(1, S, 1) a column's own share in the light of its strips."""
+        """(1, S, 1) share of a column's own light in its strips."""
         return self.shares[None, :, 1, None].astype(np.float32)
 
     def of_strips(self, strips: slice) -> Crosstalk:
-        """That of some strips."""
+        """Crosstalk of some of the strips."""
         return Crosstalk(self.shares[strips])
 
     def from_neighbours(
         self, light: Float32Array, columns: NDArray[np.int64], ahead: FloatArray | None = None
     ) -> Float32Array:
-        """(len(columns), S, n) what the adjacent columns shed into each strip of some columns.
+        """(len(columns), S, n) light of the adjacent columns in each strip of some columns.
 
         Args:
             light: (C, n) of all columns.
-            columns: those that are asked for.
-            ahead: (C - 1,) how many samples later each column is read than the one before; None where none is.
+            columns: numbers of the columns.
+            ahead: (C - 1,) delay of each column against the previous one, samples; None for no delays.
         """
         left, right = np.zeros_like(light), np.zeros_like(light)
         left[1:], right[:-1] = light[:-1], light[1:]
@@ -203,15 +204,15 @@ class Crosstalk:
         return left[columns, None] * shares[None, :, 0, None] + right[columns, None] * shares[None, :, 2, None]
 
     def against_middle(self) -> Float32Array:
-        """(1, S, 1) a column's own light in each strip against that in the column's middle.
+        """(1, S, 1) a column's own light in each strip relative to its centre.
 
-        A Gaussian's shares tell where in the column the strip lies: their logarithms bend by 1 / sigma**2 and rise by
-        the strip's place over sigma**2.
+        The shares of a Gaussian determine the position of a strip x: the second difference of their logarithms is
+        1 / sigma**2, the first is x / sigma**2.
         """
         log = np.log(np.maximum(self.shares, 1e-12))
-        bend = np.maximum(2 * log[:, 1] - log[:, 0] - log[:, 2], 1e-6)
-        rise = (log[:, 2] - log[:, 0]) / 2
-        return np.asarray(np.exp(-np.square(rise) / (2 * bend)), np.float32)[None, :, None]
+        curvature = np.maximum(2 * log[:, 1] - log[:, 0] - log[:, 2], 1e-6)
+        slope = (log[:, 2] - log[:, 0]) / 2
+        return np.asarray(np.exp(-np.square(slope) / (2 * curvature)), np.float32)[None, :, None]
 
 
 def _shifted(rows: Float32Array, by: FloatArray) -> Float32Array:
@@ -221,14 +222,14 @@ def _shifted(rows: Float32Array, by: FloatArray) -> Float32Array:
 
 
 class SlotLight:
-    """Slots (C, N) as light at any instants: what they add up to between two of them.
+    """Light of slots (C, N), integrated between arbitrary instants.
 
     Args:
-        slots: light of every slot, 0 dark to 1 lit, or the probability of that.
-        beyond: light of the slots before and after; unknown ones are half lit.
+        slots: light of every slot, 0 dark to 1 lit, or the probability that it is lit.
+        beyond: light of the slots before and after; 0.5 if unknown.
     """
 
-    #: Slots before and after that an instant may reach.
+    #: Number of slots before and after.
     _BEYOND = 8
 
     def __init__(self, slots: Float32Array, beyond: float = 0.5) -> None:
@@ -239,7 +240,7 @@ class SlotLight:
         np.cumsum(self._slots[:, :-1], axis=1, out=self._total[:, 1:])
 
     def mean_over(self, positions: FloatArray | Float32Array, exposure_slots: float) -> Float32Array:
-        """(C, R) mean over exposures centred at positions (C, R) or, the same for all columns, (1, R), in slots."""
+        """(C, R) mean over exposures centred at positions (C, R), or common ones (1, R), in slots."""
         late, _ = self._until(positions + np.float32(exposure_slots / 2))
         early, _ = self._until(positions - np.float32(exposure_slots / 2))
         late -= early
@@ -249,14 +250,14 @@ class SlotLight:
     def mean_and_slope(
         self, positions: FloatArray | Float32Array, exposure_slots: float
     ) -> tuple[Float32Array, Float32Array]:
-        """What is `seen`, and its change per slot of time."""
+        """Mean over exposures as in `mean_over`, and its derivative by time, per slot."""
         late, late_slope = self._until(positions + np.float32(exposure_slots / 2))
         early, early_slope = self._until(positions - np.float32(exposure_slots / 2))
         scale = np.float32(1 / exposure_slots)
         return (late - early) * scale, (late_slope - early_slope) * scale
 
     def _until(self, instants: FloatArray | Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Light up to the instants, and the slots that they fall into."""
+        """Light integrated up to the instants, and the slots that contain them."""
         place = np.clip(instants + np.float64(self._BEYOND), 0, self._total.shape[1] - 1.001)
         left = place.astype(np.intp)
         slots, total = take_places(self._slots, left), take_places(self._total, left)
@@ -264,7 +265,7 @@ class SlotLight:
 
 
 def take_places(values: NDArray[Any], index: IntArray) -> NDArray[Any]:
-    """`values` (C, n) at the places (C, R) or, the same for all rows, (1, R)."""
+    """`values` (C, n) at indices (C, R), or common ones (1, R)."""
     if index.shape[0] == 1:
         return np.asarray(values.take(index[0], axis=1))
     return np.asarray(values.ravel().take(index + (np.arange(values.shape[0]) * values.shape[1])[:, None]))

@@ -1,4 +1,4 @@
-"""What was received of a frame on a clock, and what it says of itself: packets, doubt, darkness. Part of the wiring."""
+"""Reception of a frame on a given clock, and its assessment: packets, doubtful columns, dark columns. Wiring."""
 
 from __future__ import annotations
 
@@ -20,33 +20,33 @@ from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame,
 
 @dataclass(frozen=True)
 class Reception:
-    """What was received of a frame."""
+    """Samples, posteriors and metrics of a frame on a given clock."""
 
     clock: Clock
-    #: Of the quick look: strips pooled in pairs.
+    #: Samples of the initial pass: strips binned in pairs.
     samples: SlotSamples
     posteriors: BurstPosteriors
     #: (C, N): squared contrast over variance of every slot.
     snr: Float32Array
-    #: For the samples.
+    #: Observation model of the samples.
     model: channel.ObservationModel
     #: (C, N + memory, patterns).
     metrics: FloatArray
-    #: All strips on the fine grid without the rows' own light, and the model for them; None where nothing was in doubt.
+    #: All strips on the fine grid without row noise, and their model; None if no column was doubtful.
     cleaned: tuple[SlotSamples, channel.ObservationModel] | None = None
-    #: What was skipped: name -> columns.
+    #: Skipped steps: name -> number of columns.
     skipped: dict[str, int] = field(default_factory=dict)
 
     @cached_property
     def column_llr(self) -> FloatArray:
-        """(C,) log-likelihood ratio of each column's slots being packets, over slots that are anything."""
+        """(C,) log-likelihood ratio of each column containing packets against arbitrary slots."""
         packets = self.posteriors.log_evidence - np.log(len(WEIGHTS))
         share = self.posteriors.w / SLOTS_PER_SYMBOL
         return np.asarray(packets - detect.free_log_evidence(self.metrics, share))
 
     @cached_property
     def packet_confidence(self) -> FloatArray:
-        """(B, C) confidence of packets, the auto-encoder not yet asked."""
+        """(B, C) confidence of packets without the auto-encoder."""
         by_burst = assemble.slot_margin_by_burst(slot_margin(self), self.clock)
         n_columns, n_strips = self.samples.light.shape[:2]
         return confidence.confidence(
@@ -55,39 +55,39 @@ class Reception:
 
     @property
     def scene(self) -> denoise.DenoiserInput | None:
-        """What the auto-encoder may be shown; None where nothing was in doubt."""
+        """Input of the auto-encoder; None if no column was doubtful."""
         return None if self.cleaned is None else self.scene_of(*self.cleaned)
 
     def scene_of(self, samples: SlotSamples, model: channel.ObservationModel) -> denoise.DenoiserInput:
-        """Samples of all columns with what was decided of them."""
+        """Samples of all columns with their current decisions."""
         lit = self.clock.on_grid(self.posteriors.lit)
         return denoise.DenoiserInput(samples, self.clock, lit, self.metrics, self.posteriors.w, model)
 
 
 def packet_llr(reception: Reception) -> float:
-    """Log-likelihood ratio of all columns' slots being packets, on the clock they were received with, over any slots.
+    """Log-likelihood ratio of all columns containing packets on this clock, against arbitrary slots.
 
-    Copies that differ and words that are not in the codebook speak against it, headers or not.
+    Copies that differ and words outside the codebook count against packets, as missing headers do.
     """
-    # The light model is surer than it should be: a column that fits poorly, or is dark, says nothing.
+    # The likelihoods are too sure, so a dark column or one that fits poorly must not count against packets.
     return float(np.logaddexp(reception.column_llr, 0.0).sum())
 
 
 def has_clear_packets(reception: Reception) -> bool:
-    """Whether packets show beyond doubt."""
+    """Whether the frame clearly contains packets."""
     return packet_llr(reception) >= SETTINGS.clear_packets_llr
 
 
 def word_log_prob(reception: Reception) -> FloatArray:
-    """(C,) log probability that all words decided of a column are right, as far as the light model is."""
+    """(C,) log probability that all decided words of a column are right, by the light model."""
     return np.asarray(reception.posteriors.log_prob.sum(axis=(0, 2)))
 
 
 def headerless(reception: Reception) -> NDArray[np.bool_]:
-    """(C,) columns that show no packets: no header where it should be, and not so many words of the codebook.
+    """(C,) columns without packets: no header at its place, and few words of the codebook.
 
-    With few rows a slot or at the screen's edge light is not as the model has it, and headers are the first to tell.
-    None has any where all the light is a steady periodic waveform.
+    Few rows per slot and the screen's edge violate the light model, which affects headers first. No column has packets
+    if the light is a periodic waveform.
     """
     out = assemble.find_headerless(reception.posteriors.header_llr)
     if not out.all() and shows_steady_light(reception):
@@ -98,7 +98,7 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
 
 
 def shows_steady_light(reception: Reception) -> bool:
-    """Whether the light is that of a lamp or of a screen that is dimmed by switching."""
+    """Whether the light is that of a lamp or of a screen dimmed by switching."""
     samples, clock = reception.samples, reception.clock
     contrast = sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.noise.sigma)
     lit = clock.on_grid(reception.posteriors.lit)
@@ -106,13 +106,13 @@ def shows_steady_light(reception: Reception) -> bool:
 
 
 def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
-    """(C,) whether a column has too little light for the light model to make anything of it."""
-    n_observed, n_lit = ((snr > least).sum(axis=1) for least in (0.0, 10 ** (SETTINGS.dark_snr_db / 10)))
+    """(C,) whether a column has too little light for the light model."""
+    n_observed, n_lit = ((snr > bound).sum(axis=1) for bound in (0.0, 10 ** (SETTINGS.dark_snr_db / 10)))
     return np.asarray((2 * n_lit < n_observed) | (n_observed == 0))
 
 
 def has_doubtful_packet(reception: Reception, certain: float) -> NDArray[np.bool_]:
-    """(C,) whether a packet that could be reported has less than the confidence `certain`."""
+    """(C,) whether a complete packet has a confidence below `certain`."""
     doubtful = (reception.packet_confidence < certain) & (
         reception.posteriors.log_prob.min(axis=2) < SETTINGS.beyond_doubt_log_prob
     )
@@ -120,26 +120,26 @@ def has_doubtful_packet(reception: Reception, certain: float) -> NDArray[np.bool
 
 
 def complete_packets(reception: Reception) -> NDArray[np.bool_]:
-    """(B, C) packets that could be reported."""
+    """(B, C) packets with all payload slots observed."""
     return assemble.complete(assemble.slots_observed(reception.samples, reception.clock))
 
 
 def best_log_prob(reception: Reception) -> FloatArray:
-    """(C,) mean log probability of the symbols of each column's surest packet that could be reported."""
+    """(C,) mean log probability of the symbols of each column's surest complete packet."""
     return np.asarray(
         np.where(complete_packets(reception), reception.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0)
     )
 
 
 def slot_margin(reception: Reception) -> Float32Array:
-    """(C, N) what the light says for every slot as decided, nats."""
+    """(C, N) log-likelihood ratio of each slot as decided against its opposite."""
     return detect.slot_margin(reception.metrics, reception.clock.on_grid(reception.posteriors.lit) > 0.5)
 
 
 def soft_bits(
     frame: Frame, reception: Reception, no_header: NDArray[np.bool_], denoised: frozenset[int] = frozenset()
 ) -> FrameSoftBits:
-    """What a photograph says of the payload's bits, cut packets included."""
+    """Soft bits of a photograph, including those of cut packets."""
     n_observed = assemble.slots_observed(reception.samples, reception.clock)
     n_columns, n_strips = reception.samples.light.shape[:2]
     features = confidence.confidence_features(

@@ -1,27 +1,27 @@
-"""The light model: picture, crosstalk and exposure, estimated blindly together with the slots.
+"""Light model: picture, crosstalk and exposure, estimated blindly together with the slots.
 
-What strip s of column c sees at exposure centre g (in slots) is
+Strip s of column c, exposed around the time g (in slots), receives
 
-    z = floor + T * (sum over k of K[s, k] * m[c + k](g)),      m(g) = sum over slots n of lit[n] * h(g - n)
+    z = black level + T * (sum over k of K[s, k] * m[c + k](g)),      m(g) = sum over slots n of lit[n] * h(g - n)
 
-with T the picture there (textured, different in every strip), K the light spread from column c + k into the strip
-(smooth, known from the screen), h a slot seen through the exposure (a trapezoid) and m the same for all strips. The
-picture is predicted at every sample from the samples before it, from those after it and from both, never from the slot
-itself. Each prediction is made on several scales at once; the scale that has predicted best thereabouts is taken, and
-its error is the variance of the prediction. The likelihood of a sample is the mixture over the three predictions
-(where the picture has an edge, one side alone tells) of a Student-t density (an edge in one strip must not outweigh
-seven others). The metric of a slot pattern is the sum of its logarithm over strips and samples.
+where T is the local picture (textured, different in every strip), K the crosstalk from column c + k into the strip
+(smooth, known from the screen), h a slot convolved with the exposure (a trapezoid), and m the same for all strips.
 
-The slots themselves are needed to predict the picture, so model and detection are iterated, from a first guess that
-compares every sample to the extremes around it.
+The picture is predicted at every sample from earlier samples, from later samples and from both, never from the slot
+itself. Each prediction uses the scale with the smallest local error, and that error is the variance of the prediction.
+The likelihood of a sample is a mixture over the three predictions, because at an edge of the picture only one side is
+valid. Its density is Student-t, so that an edge in one strip does not outweigh the other strips. The metric of a slot
+pattern is the sum of the log-likelihoods over strips and samples.
 
-These metrics take every slot by itself, the picture being predicted with all others as believed. Where a symbol stays
-in doubt, its likeliest words are weighed as a whole (`word_corrections`): the picture is then a random process along
-time, followed by a Kalman filter through the symbol and the slots around it, and the likelihood of a word is that of
-its innovations.
+The prediction of the picture needs the slots, so model and detection are iterated. The initial metrics compare every
+sample with its local extremes.
 
-`model` holds what is the same all over a frame, `picture` predicts, `likelihoods` compares, `words` weighs words, and
-`patterns` brings slots and metrics from the frame's grid to bursts and back.
+The metrics treat each slot separately, given the current estimate of all other slots. The likeliest words of uncertain
+symbols are then compared as a whole (`word_corrections`): the picture is modelled as a random process in time, a Kalman
+filter runs through the symbol and its neighbouring slots, and the innovations give the likelihood of a word.
+
+`model` holds the parameters of a frame, `picture` predicts the picture, `likelihoods` computes metrics, `words`
+compares words, and `patterns` converts slots and metrics between the frame's grid and bursts.
 """
 
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods

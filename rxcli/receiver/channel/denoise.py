@@ -1,15 +1,14 @@
-"""The convolutional auto-encoder: a second opinion on slots where the light model is unsure.
+"""Convolutional auto-encoder that corrects slots for which the light model is uncertain.
 
-The network is shown a column as the light model left it: the light of every strip, what neighbours and the column
-itself should have shed by the slots believed so far, the picture that follows, what is left unexplained, and how sure
-the light model is of every slot. It says by how much to correct the log-likelihood ratio of each slot. It has been
-fitted so that the words of the code come out right after the correction, so what it returns is just added.
+The input of the network is a column as the light model describes it: the light of every strip, the light predicted for
+the column and its neighbours from the current slots, the residual, and the log-likelihood ratio of every slot. Its
+output is added to that ratio. The network was trained on the likelihood of the correct code words after this addition.
 
-The rows' own light, an offset that all columns share (a sensor row is read out at once), is taken off first: it is what
-the other columns leave unexplained at the same instant.
+Row noise, an offset common to all columns because a sensor row is read out at once, is removed first. It is estimated
+from the residuals of the other columns at the same instant.
 
-One model serves every camera, slot rate, number of columns and number of strips: time is measured in slots, light in
-multiples of the local level or of its noise, strips are treated alike and pooled.
+One model serves every camera, slot rate, number of columns and number of strips: time is in slots, light is relative to
+the local level or to the noise, and all strips pass through the same layers and are pooled.
 """
 
 from __future__ import annotations
@@ -37,30 +36,30 @@ from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.resources import data_dir, onnx_runtime
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
-#: The model that is used unless another is named.
+#: Default model.
 DEFAULT_MODEL = "strips"
 SAMPLES_PER_SLOT = 4
-#: Names of the features of a strip and of a column, in order; a name with `[4]` stands for one feature a sample.
+#: Names of the features of a strip and of a column, in order; a name with `[4]` stands for one feature per sample.
 STRIP_FEATURES = (
     *("log_light[4]", "neighbours[4]", "own[4]", "residual[4]", "contrast[4]"),
     *("valid", "noise", "shot", "share", "exposure", "known"),
 )
 COLUMN_FEATURES = ("known", "phase[10]", "believed", "lent", "weight", "score", "information")
 N_STRIP_FEATURES, N_COLUMN_FEATURES = 26, 16
-#: Largest residual, in standard deviations, as a feature; the network has learned with it.
+#: Limit of residuals in features, standard deviations; the network was trained with it.
 _RESIDUAL_SIGMAS = 4.0
-#: Probabilities below this are not told apart.
+#: Lower limit of probabilities.
 _TINY = 1e-30
 _MAX_MODEL_BYTES = 2_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class DenoiserInput:
-    """What a frame's columns look like to the network; C columns of S strips, N slots of Q samples."""
+    """Input of the network for a frame: C columns of S strips, N slots of Q samples."""
 
     samples: SlotSamples
     clock: Clock
-    #: (C, N) probability that each slot is lit, by the model-based path.
+    #: (C, N) probability that each slot is lit, without the network.
     lit: Float32Array
     #: (C, N + memory, patterns) log-likelihood of every pattern of slots n - memory .. n by the light model.
     metrics: FloatArray
@@ -70,79 +69,79 @@ class DenoiserInput:
 
 
 class Denoiser(Protocol):
-    """Something that corrects what the light model says of slots."""
+    """Interface of a model that corrects slot log-likelihood ratios."""
 
     @property
     def name(self) -> str:
         """Name for reports."""
 
     def slot_corrections(self, scene: DenoiserInput, columns: NDArray[np.int64]) -> Float32Array:
-        """(len(columns), N) what to add to ln p(light | lit) - ln p(light | dark) of every slot of `columns`.
+        """(len(columns), N) values to add to ln p(light | lit) - ln p(light | dark) of every slot of `columns`.
 
-        The scene is one `remove_row_noise`.
+        The scene must have passed `remove_row_noise`.
         """
 
 
 def remove_row_noise(scene: DenoiserInput) -> DenoiserInput:
-    """The scene without the light that a sensor row shows everywhere.
+    """Remove row noise, the light that a sensor row has in common everywhere.
 
-    For every column it is what the other columns leave unexplained at the same instant.
+    It is estimated for every column from the residuals of the other columns at the same instant.
     """
-    some = slice(None, None, SETTINGS.row_strips)
-    thin = replace(scene.samples, light=scene.samples.light[:, some], valid=scene.samples.valid[:, some])
-    model = replace(scene.model, crosstalk=scene.model.crosstalk.of_strips(some))
-    observed = _explain(replace(scene, samples=thin, model=model), np.arange(len(scene.lit)))
+    strips = slice(None, None, SETTINGS.row_strips)
+    thin = replace(scene.samples, light=scene.samples.light[:, strips], valid=scene.samples.valid[:, strips])
+    model = replace(scene.model, crosstalk=scene.model.crosstalk.of_strips(strips))
+    observed = _residuals(replace(scene, samples=thin, model=model), np.arange(len(scene.lit)))
     rows = _row_light(np.clip(observed.residual, -SETTINGS.row_sigmas, SETTINGS.row_sigmas), observed.scale)[:, None]
     samples = replace(scene.samples, light=scene.samples.light - rows * scene.samples.valid)
     return replace(scene, samples=samples)
 
 
 def network_inputs(scene: DenoiserInput, columns: NDArray[np.int64]) -> tuple[Float32Array, Float32Array]:
-    """The input contract.
+    """Compute the features of the input contract.
 
     Args:
-        scene: the frame, `remove_row_noise`.
-        columns: columns to look at, B of them.
+        scene: the frame, after `remove_row_noise`.
+        columns: numbers of the B columns.
 
     Returns:
         (B, S, 26, N) features of the strips, and (B, 16, N) of the columns; float32.
     """
-    observed = _explain(scene, columns)
+    observed = _residuals(scene, columns)
     return _strip_features(scene, observed, columns), _column_features(scene, observed, columns)
 
 
 @dataclass(frozen=True, slots=True)
-class _Explained:
-    """The light of some columns by the slots believed so far, (B, S, n) float32."""
+class _Residuals:
+    """Light, prediction and residual of some columns given the current slots, (B, S, n) float32."""
 
-    #: Light over the floor; 0 where nothing is seen.
+    #: Light above the black level; 0 where nothing is visible.
     light: Float32Array
-    #: Light per unit of picture that the neighbours and the column itself should have shed.
+    #: Predicted light of the neighbours and of the column itself, per unit of picture.
     expected: Expected
-    #: One over the standard deviation of what is left unexplained; 0 where nothing is seen.
+    #: Inverse standard deviation of the residual; 0 where nothing is visible.
     scale: Float32Array
-    #: In standard deviations: what a lit slot adds, and what is left unexplained.
+    #: Contribution of a lit slot, and residual, both in standard deviations.
     contrast: Float32Array
     residual: Float32Array
 
 
-def _explain(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Explained:
+def _residuals(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Residuals:
     model, valid = scene.model, scene.samples.valid[columns]
     light = model.over_black(scene.samples)[columns]
     expected = model.expected(scene.lit, scene.clock, columns)
     whole = expected.whole
     q = scene.samples.samples_per_slot
     sums = PictureSums.of(*(by_place(each, q) for each in (light, whole, valid)))
-    prediction = predict_picture(sums, model.noise.floor, SETTINGS.picture_scales, one_sided=False)
+    prediction = predict_picture(sums, model.noise.dark_variance, SETTINGS.picture_scales, one_sided=False)
     picture = in_time(prediction.at_samples(q))
     noise = model.noise.through_picture(picture, np.repeat(prediction.variance[0], q, axis=-1), whole)
     scale = np.asarray(valid / np.sqrt(noise), np.float32)
     residual = (light - picture * whole) * scale
-    return _Explained(light, expected, scale, picture * expected.own * scale, residual)
+    return _Residuals(light, expected, scale, picture * expected.own * scale, residual)
 
 
 def _row_light(residual: Float32Array, scale: Float32Array) -> Float32Array:
-    """(C, n) light that a row shows everywhere, by what the other columns leave unexplained; shrunk by its own error.
+    """(C, n) row noise estimated from the residuals of the other columns, shrunk by its own error.
 
     Args:
         residual: (C, S, n) in standard deviations.
@@ -151,27 +150,27 @@ def _row_light(residual: Float32Array, scale: Float32Array) -> Float32Array:
     total, weight = (residual * scale).sum(axis=1), (scale * scale).sum(axis=1)
     weight = np.maximum(weight.sum(axis=0) - weight, np.float32(1e-6))
     mean = (total.sum(axis=0) - total) / weight
-    # Strips of a column err alike, so a mean over them is about twice as uncertain as independent ones would make it.
+    # Errors of the strips of a column are correlated, which about doubles the variance of their mean.
     error = 2 / weight
     power = max(float(np.median(mean * mean)) / 0.455 - float(np.median(error)), 0.0)
     return np.asarray(mean * np.float32(power) / (np.float32(power) + error + np.float32(1e-20)), np.float32)
 
 
-def _strip_features(scene: DenoiserInput, observed: _Explained, columns: NDArray[np.int64]) -> Float32Array:
-    """(B, S, 26, N)"""
+def _strip_features(scene: DenoiserInput, observed: _Residuals, columns: NDArray[np.int64]) -> Float32Array:
+    """(B, S, 26, N) features of strips, see `STRIP_FEATURES`."""
     q, sigma = scene.samples.samples_per_slot, np.float32(max(scene.model.noise.sigma, 1e-7))
     valid, light, expected = scene.samples.valid[columns], observed.light, observed.expected
     level = _local_level(light, valid, q)
     base = np.float32(0.02) * level + 2 * sigma
     middle = scene.model.crosstalk.against_middle()
-    # Light was learned from in parts of that in the column's middle.
+    # The network was trained on light relative to the column's centre.
     part = middle / expected.own
     by_sample = (
         np.log((np.maximum(light, 0) + base) / (level + base)),
-        expected.others * part,
+        expected.neighbours * part,
         expected.own * part * expected.shape,
         np.clip(observed.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS),
-        _tamed(observed.contrast),
+        _contrast_feature(observed.contrast),
     )
     shape = (*light.shape[:2], -1, q)
     out = np.empty((*light.shape[:2], N_STRIP_FEATURES, light.shape[-1] // q), np.float32)
@@ -179,7 +178,7 @@ def _strip_features(scene: DenoiserInput, observed: _Explained, columns: NDArray
         out[:, :, number * q : (number + 1) * q] = np.moveaxis(values.reshape(shape), -1, 2)
     by_slot = (
         valid.reshape(shape).mean(axis=-1),
-        *_noise_features(level.reshape(shape)[..., 0], sigma, np.float32(scene.model.noise.slope)),
+        *_noise_features(level.reshape(shape)[..., 0], sigma, np.float32(scene.model.noise.shot_gain)),
         middle,
         np.float32(scene.clock.exposure_slots),
         _known_slots(scene.clock),
@@ -189,12 +188,12 @@ def _strip_features(scene: DenoiserInput, observed: _Explained, columns: NDArray
     return out
 
 
-def _column_features(scene: DenoiserInput, observed: _Explained, columns: NDArray[np.int64]) -> Float32Array:
-    """(B, 16, N)"""
+def _column_features(scene: DenoiserInput, observed: _Residuals, columns: NDArray[np.int64]) -> Float32Array:
+    """(B, 16, N) features of columns, see `COLUMN_FEATURES`."""
     q, clock = scene.samples.samples_per_slot, scene.clock
     lit = np.clip(scene.lit[columns], 1e-5, 1 - 1e-5)
     llr = _slot_llr(scene.metrics[columns], lit)
-    contrast = _tamed(observed.contrast)
+    contrast = _contrast_feature(observed.contrast)
     place = clock.places % SLOTS_PER_SYMBOL
     by_slot = (
         _known_slots(clock),
@@ -211,24 +210,24 @@ def _column_features(scene: DenoiserInput, observed: _Explained, columns: NDArra
     return np.stack([np.broadcast_to(values, shape) for values in by_slot], axis=1).astype(np.float32)
 
 
-def _tamed(contrast: Float32Array) -> Float32Array:
+def _contrast_feature(contrast: Float32Array) -> Float32Array:
     return np.asarray(np.minimum(contrast, np.float32(2 * _RESIDUAL_SIGMAS)) / np.float32(4))
 
 
 def _bounded(residual: Float32Array) -> Float32Array:
-    """The slope of a Student-t log-density of four degrees of freedom: outliers count little."""
+    """Slope of a Student-t log-density with four degrees of freedom, which limits outliers."""
     return np.asarray(residual / (1 + residual * residual / np.float32(4)))
 
 
 def _pooled(values: NDArray[np.floating[Any]], q: int) -> Float32Array:
-    """(B, N) sum over strips and the samples of a slot, as far as they are independent."""
+    """(B, N) sum over strips and the samples of a slot, for the effective number of independent samples."""
     return np.asarray(
         values.sum(axis=1).reshape(values.shape[0], -1, q).sum(axis=2) * np.float32(SETTINGS.slot_information / q)
     )
 
 
 def _slot_llr(metrics: FloatArray, lit: Float32Array) -> Float32Array:
-    """(B, N) log-likelihood ratio of every slot by the light model, the slots around it being lit as believed.
+    """(B, N) log-likelihood ratio of every slot by the light model, given the current estimate of the slots around it.
 
     Args:
         metrics: (B, N + memory, patterns).
@@ -240,7 +239,7 @@ def _slot_llr(metrics: FloatArray, lit: Float32Array) -> Float32Array:
     odds = np.lib.stride_tricks.sliding_window_view(np.log(padded) - np.log1p(-padded), isi_memory + 1, axis=1)
     joint = metrics + odds @ patterns.T
     joint = np.exp(joint - joint.max(axis=2, keepdims=True))
-    # (B, N + memory, memory + 1): posterior odds of each slot of a pattern, against its prior ones.
+    # (B, N + memory, memory + 1): posterior minus prior log-odds of each slot of a pattern.
     gained = np.log(joint @ patterns + _TINY) - np.log(joint @ (1 - patterns) + _TINY) - odds
     return np.asarray(
         sum(gained[:, age : age + n_slots, isi_memory - age] for age in range(isi_memory + 1)), np.float32
@@ -248,28 +247,28 @@ def _slot_llr(metrics: FloatArray, lit: Float32Array) -> Float32Array:
 
 
 def _local_level(light: Float32Array, valid: Float32Array, q: int) -> Float32Array:
-    """(B, S, n) mean light of the valid samples around."""
+    """(B, S, n) local mean light of the valid samples."""
     around = SETTINGS.level_slots * q
     return np.maximum(box_sums(light, around) / np.maximum(box_sums(valid, around), 1), 0)
 
 
 def _noise_features(level: Float32Array, sigma: np.float32, shot_gain: np.float32) -> tuple[Float32Array, Float32Array]:
-    """Noise of a dark and of an average sample against the level, decades."""
+    """Noise of a dark and of an average sample relative to the level, decades."""
     whole = level + sigma
     return np.log10(sigma / whole), np.log10(np.sqrt(sigma * sigma + shot_gain * level) / whole)
 
 
 def _known_slots(clock: Clock) -> Float32Array:
-    """(N,) 1 lit, -1 dark in headers, 0 where nothing is known."""
+    """(N,) 1 lit, -1 dark in headers, 0 elsewhere."""
     signs = np.zeros(clock.packet_slots, np.float32)
     signs[: len(HEADER)] = 2 * np.array(HEADER) - 1
     return signs[clock.places]
 
 
 def payload_observed(scene: DenoiserInput) -> Float32Array:
-    """(C, N) 1 where any part of a payload slot can be seen, else 0.
+    """(C, N) 1 where any part of a payload slot is visible, else 0.
 
-    Only payloads have been learned from: header and dimming symbol are left to the light model.
+    The network was trained on payloads only; header and dimming symbol are left to the light model.
     """
     clock = scene.clock
     payload = clock.places >= PREAMBLE_SLOTS
@@ -278,11 +277,11 @@ def payload_observed(scene: DenoiserInput) -> Float32Array:
 
 
 class Contract(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a model's tensors mean."""
+    """Meaning of a model's tensors."""
 
     version: Literal[2]
     samples_per_slot: Literal[4]
-    #: Names, in order; see `STRIP_FEATURES` and `COLUMN_FEATURES`.
+    #: Names of the features in order; see `STRIP_FEATURES` and `COLUMN_FEATURES`.
     strip_features: tuple[str, ...]
     column_features: tuple[str, ...]
     strips: str = "strips"
@@ -291,7 +290,7 @@ class Contract(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class ModelCard(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`model.toml`: what a model is, how it was made, and what it measured."""
+    """`model.toml`: description, training recipe and figures of a model."""
 
     format: Literal[1]
     kind: Literal["denoiser"]
@@ -307,14 +306,14 @@ class ModelCard(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 def load_denoiser(name_or_path: str = DEFAULT_MODEL, threads: int = 1) -> OnnxDenoiser:
-    """A shipped model by name, or a model folder by path; the file is checked, the session is made when first needed.
+    """Load a shipped model by name, or a model folder by path; the session starts when it is first used.
 
     Args:
-        name_or_path: name of a folder in `models`, or path of one.
+        name_or_path: name of a folder in `models`, or path of a model folder.
         threads: threads of the network.
 
     Raises:
-        ProfileError: missing, malformed, cut, or made for another contract.
+        ProfileError: the model is missing, malformed, truncated, or made for another contract.
     """
     shipped = data_dir("models") / name_or_path
     is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name_or_path) is not None
@@ -352,7 +351,7 @@ def _read_weights(path: Path, card: ModelCard) -> bytes:
 
 
 class OnnxDenoiser:
-    """A network in ONNX Runtime; one call a frame."""
+    """A network in ONNX Runtime, called once per frame."""
 
     def __init__(self, card: ModelCard, weights: bytes, threads: int = 1) -> None:
         self.card = card
@@ -365,12 +364,12 @@ class OnnxDenoiser:
         return f"{self.card.name}-{self.card.version}"
 
     def slot_corrections(self, scene: DenoiserInput, columns: NDArray[np.int64]) -> Float32Array:
-        """(len(columns), N) what to add to ln p(light | lit) - ln p(light | dark) of every slot of `columns`.
+        """(len(columns), N) values to add to ln p(light | lit) - ln p(light | dark) of every slot of `columns`.
 
-        The scene is one `remove_row_noise`.
+        The scene must have passed `remove_row_noise`.
 
         Raises:
-            ProfileError: the file is not the network that its card tells of.
+            ProfileError: the file is not the network described by its card.
         """
         strips, features = network_inputs(scene, columns)
         contract = self.card.contract

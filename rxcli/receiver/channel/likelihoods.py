@@ -1,4 +1,4 @@
-"""The light's likelihood under every pattern of slots, each slot by itself."""
+"""Likelihood of the light for every slot pattern, each slot separately."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
 #: Degrees of freedom of the Student-t likelihood; `_density` is written for four.
 _DEGREES = 4.0
-#: Densities are taken to be at least this, so that their logarithm exists.
+#: Lower limit of densities, so that their logarithm exists.
 _MIN_DENSITY = np.float32(1e-37)
-#: Samples worked on at a time: what fits the cache.
+#: Samples per batch, limited by the cache.
 _SAMPLES_AT_A_TIME = 60_000
-#: NumPy works outside the interpreter's lock; more threads than this gain nothing on a few columns. Of fewer parts
-#: than these threads spend more on waiting for that lock than they gain.
+#: Threads, which gain time because NumPy releases the interpreter's lock; and the number of batches below which
+#: waiting for that lock costs more than threads gain.
 _THREADS, _MANY_PARTS = 2, 4
 
 
 @dataclass(frozen=True, slots=True)
 class SlotLikelihoods:
-    """What the light says of the slots of some columns."""
+    """Log-likelihoods of the slots of some columns."""
 
     #: (C, N + memory, patterns) float64: log-likelihood of every pattern of slots n - memory .. n.
     metrics: FloatArray
-    #: (C, N) float32: (lit minus dark) squared over the noise's variance, of a slot; (C, 1) where all are taken alike.
+    #: (C, N) float32: squared contrast of a slot over its noise variance; (C, 1) if common to all slots.
     snr: Float32Array
-    #: (C, 2) float64: correlation of the residual with its change by the clock, and that change's power; their ratio is
-    #: how many slots the column's clock is late. Empty where the clock was put right before.
+    #: (C, 2) float64: correlation of the residual with its derivative by time, and power of that derivative; their
+    #: ratio is the lateness of the column's clock in slots. Empty if the clock was corrected before.
     timing: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
@@ -47,17 +47,17 @@ def slot_likelihoods(
     thorough: bool = True,
     timing: bool = True,
 ) -> SlotLikelihoods:
-    """Log-likelihood of every slot pattern at every slot, given the present idea of all slots.
+    """Log-likelihood of every slot pattern at every slot, given the current estimate of all slots.
 
     Args:
-        samples: of the columns to look at, S strips, N slots of Q samples.
+        samples: samples of `columns`, S strips, N slots of Q samples.
         clock: the clock.
         model: the light model.
-        lit: (C, N) probability that each slot is lit, of all columns.
-        columns: which columns the samples are of; the result has these alone.
-        thorough: predict the picture from each side too, and on all scales; else from both sides together, on the
-            middle scales, which is several times quicker and enough for a plain picture.
-        timing: ask how late the columns' clocks are; 0 where not.
+        lit: (C, N) probability that each slot is lit, all columns.
+        columns: numbers of the columns in `samples` and in the result.
+        thorough: predict the picture also from each side alone, and on all scales; otherwise from both sides together
+            on the middle scales, which is several times faster and sufficient for a plain picture.
+        timing: compute the lateness of the columns' clocks; 0 otherwise.
     """
     expected, light = model.expected(lit, clock, columns, slope=timing), model.over_black(samples)
 
@@ -82,40 +82,42 @@ def slot_likelihoods(
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """Samples of some columns, those at one place in all slots side by side: (Q, C, S, N) float32 or broadcasting."""
+    """Samples of some columns, ordered by position in the slot: (Q, C, S, N) float32 or broadcastable."""
 
     light: Float32Array
     valid: Float32Array
-    #: Light expected per unit of picture: of the columns beside, of the column itself where it is lit, and of all by
-    #: the present idea of the slots.
-    others: Float32Array
+    #: Predicted light per unit of picture: of the adjacent columns, of the column itself when lit, and of all columns
+    #: given the current estimate of the slots.
+    neighbours: Float32Array
     own: Float32Array
     whole: Float32Array
-    #: Change of the whole by a slot of time; None where it was not asked for.
+    #: Derivative of the total by time, per slot; None unless requested.
     slope: Float32Array | None
     model: ObservationModel
 
     @staticmethod
     def of(light: Float32Array, valid: Float32Array, expected: Expected, model: ObservationModel) -> _Part:
-        """Of samples in order of time, (C, S, n)."""
+        """Reorder samples (C, S, n) in order of time."""
         q = model.exposure.samples_per_slot
-        light, valid, others, shape = (by_place(each, q) for each in (light, valid, expected.others, expected.shape))
+        light, valid, neighbours, shape = (
+            by_place(each, q) for each in (light, valid, expected.neighbours, expected.shape)
+        )
         slope = None if expected.slope is None else by_place(expected.slope, q)
-        return _Part(light, valid, others, expected.own, others + expected.own * shape, slope, model)
+        return _Part(light, valid, neighbours, expected.own, neighbours + expected.own * shape, slope, model)
 
 
 def _likelihoods(part: _Part, thorough: bool) -> SlotLikelihoods:
     scales = SETTINGS.picture_scales if thorough else SETTINGS.initial_scales
     sums = PictureSums.of(part.light, part.whole, part.valid)
-    prediction = predict_picture(sums, part.model.noise.floor, scales, one_sided=thorough)
+    prediction = predict_picture(sums, part.model.noise.dark_variance, scales, one_sided=thorough)
     timing = np.zeros((part.light.shape[1], 2)) if part.slope is None else _timing(part, prediction)
     return SlotLikelihoods(_pattern_metrics(part, prediction), _slot_snr(part, prediction), timing)
 
 
 def _slot_snr(part: _Part, prediction: Prediction) -> Float32Array:
-    """(C, N) squared contrast over variance of a slot, as far as strips and samples are independent.
+    """(C, N) squared contrast over variance of a slot, for the effective number of independent samples.
 
-    A slot's middle tells it: the picture hardly changes within.
+    Evaluated in the middle of the slot, since the picture hardly changes within a slot.
     """
     picture = prediction.picture[0, 1]
     contrast = picture * part.own
@@ -125,7 +127,7 @@ def _slot_snr(part: _Part, prediction: Prediction) -> Float32Array:
 
 
 def _timing(part: _Part, prediction: Prediction) -> FloatArray:
-    """(C, 2) numerator and denominator of each column's lateness: one Gauss-Newton step, samples weighted robustly."""
+    """(C, 2) numerator and denominator of each column's lateness: one robust Gauss-Newton step."""
     assert part.slope is not None
     picture = prediction.at_samples(len(part.light))
     change = picture * part.slope
@@ -141,16 +143,16 @@ def _pattern_metrics(part: _Part, prediction: Prediction) -> FloatArray:
     """Mixture log-likelihoods summed over strips and the samples of a metric; (C, N + memory, patterns)."""
     exposure, noise = part.model.exposure, part.model.noise
     weight = np.float32(SETTINGS.slot_information / exposure.samples_per_slot) * part.valid
-    floor, shot = np.float32(noise.floor), np.float32(noise.slope) * prediction.picture
+    dark_variance, shot_variance = np.float32(noise.dark_variance), np.float32(noise.shot_gain) * prediction.picture
 
     def log_likelihood(place: int, level: float) -> Float32Array:
         half = place * PER_SLOT // exposure.samples_per_slot
-        whole = part.own * np.float32(level) + part.others[place]
-        # As `NoiseModel.through` has it.
+        whole = part.own * np.float32(level) + part.neighbours[place]
+        # Same as `NoiseModel.through_picture`, in place.
         variance = prediction.variance * whole
-        variance += shot[:, half]
+        variance += shot_variance[:, half]
         variance *= whole
-        variance += floor
+        variance += dark_variance
         density = _density(part.light[place] - prediction.picture[:, half] * whole, variance).sum(axis=0)
         np.log(np.maximum(density, _MIN_DENSITY, out=density), out=density)
         return np.asarray(np.einsum("csn,csn->cn", density, weight[place]))
@@ -159,9 +161,9 @@ def _pattern_metrics(part: _Part, prediction: Prediction) -> FloatArray:
 
 
 def _density(residual: Float32Array, variance: Float32Array) -> Float32Array:
-    """Student-t density of residuals, up to a constant; the arrays are worked in.
+    """Student-t density of residuals, up to a constant; overwrites its arguments.
 
-    With four degrees of freedom, variance v and residual r it is v^2 / (v + r^2 / 4)^2.5: a root, and no logarithm.
+    With four degrees of freedom, variance v and residual r it is v^2 / (v + r^2 / 4)^2.5, which needs no logarithm.
     """
     wide = np.square(residual, out=residual)
     wide *= np.float32(1 / _DEGREES)

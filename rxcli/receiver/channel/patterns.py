@@ -1,4 +1,4 @@
-"""Metrics of slot patterns; slots and metrics on the grid of a frame, and by burst."""
+"""Metrics of slot patterns, and their conversion between the grid of a frame and bursts."""
 
 from __future__ import annotations
 
@@ -13,71 +13,71 @@ from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.receiver.light import Exposure
 from rxcli.types import Clock, Float32Array, FloatArray
 
-#: Levels between dark and lit at which samples are asked where patterns have more of them, as with exposures of more
-#: than two slots: a polynomial through Chebyshev's nodes tells the others. Five lose packets of clear pictures.
+#: Chebyshev nodes, light levels between dark and lit, from which the likelihoods of other levels are interpolated. Used
+#: when patterns have more levels than nodes, i.e. for exposures of more than two slots.
 _NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(8) / 7)
 
 
 def initial_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposure) -> FloatArray:
-    """First guess of the metrics (C, N + memory, patterns), from contrast alone.
+    """Initial metrics (C, N + memory, patterns), from contrast alone.
 
     Args:
         pooled: (C, N * Q) light between its local extremes, -1 dark to 1 lit.
-        weight: (C, N * Q) strips of full contrast behind it.
-        exposure: of the samples.
+        weight: (C, N * Q) its weight, in strips of full contrast.
+        exposure: exposure of the samples.
     """
-    # Squared errors, so weighted that a slot seen right in all samples has the log-likelihood ratio of the constant.
+    # Squared errors, weighted so that a slot that fits in all samples has a log-likelihood ratio of `initial_llr`.
     q = exposure.samples_per_slot
-    most = np.float32(SETTINGS.initial_llr / 4 / q)
-    trust = np.minimum(weight / np.float32(SETTINGS.initial_full_strips), 1) * most
+    max_precision = np.float32(SETTINGS.initial_llr / 4 / q)
+    precision = np.minimum(weight / np.float32(SETTINGS.initial_full_strips), 1) * max_precision
     value = np.clip(pooled, -1.5, 1.5)
 
     def of_level(place: int, level: float) -> Float32Array:
-        return np.asarray(-np.square(value[:, place::q] - np.float32(2 * level - 1)) * trust[:, place::q])
+        return np.asarray(-np.square(value[:, place::q] - np.float32(2 * level - 1)) * precision[:, place::q])
 
     return by_pattern(exposure, of_level)
 
 
 def by_pattern(exposure: Exposure, of_level: Callable[[int, float], Float32Array]) -> FloatArray:
-    """(C, N + memory, patterns) sums over the samples of a metric of what they say of every pattern.
+    """(C, N + memory, patterns) log-likelihood of every pattern, summed over the samples of a metric.
 
     Args:
-        exposure: of the samples.
-        of_level: from a place in the slot and a level between dark and lit to what the samples there say of that level,
-            (C, N).
+        exposure: exposure of the samples.
+        of_level: function of the position in the slot and a level between dark and lit; returns the log-likelihood of
+            that level for the samples at that position, (C, N).
     """
-    asked = _asked_levels(exposure.taps.tobytes(), exposure.samples_per_slot)
-    said = [of_level(place, level) for place, level in zip(asked.places, asked.levels, strict=True)]
-    n_columns, n_slots = said[0].shape
-    of_metrics = np.zeros((n_columns, len(said), n_slots + exposure.isi_memory), np.float32)
-    for number, (metric, values) in enumerate(zip(asked.metrics, said, strict=True)):
+    plan = _level_plan(exposure.taps.tobytes(), exposure.samples_per_slot)
+    by_level = [of_level(place, level) for place, level in zip(plan.places, plan.levels, strict=True)]
+    n_columns, n_slots = by_level[0].shape
+    of_metrics = np.zeros((n_columns, len(by_level), n_slots + exposure.isi_memory), np.float32)
+    for number, (metric, values) in enumerate(zip(plan.metrics, by_level, strict=True)):
         of_metrics[:, number, metric : metric + n_slots] = values
-    return np.asarray(of_metrics.swapaxes(1, 2) @ asked.shares, np.float64)
+    return np.asarray(of_metrics.swapaxes(1, 2) @ plan.shares, np.float64)
 
 
 @dataclass(frozen=True, slots=True)
-class _AskedLevels:
-    """Levels at which samples are asked, K of them, and what patterns make of the answers."""
+class _LevelPlan:
+    """K levels at which likelihoods are evaluated, and their combination into patterns."""
 
-    #: (K,) place in the slot, level, and how many metrics later than its slot's first the sample counts.
+    #: (K,) position in the slot, level, and index of the metric relative to the first metric of the slot.
     places: list[int]
     levels: list[float]
     metrics: list[int]
-    #: (K, patterns) share of each answer in the sum of a pattern.
+    #: (K, patterns) weight of each level in a pattern.
     shares: Float32Array
 
 
 @lru_cache(maxsize=32)
-def _asked_levels(taps: bytes, samples_per_slot: int) -> _AskedLevels:
+def _level_plan(taps: bytes, samples_per_slot: int) -> _LevelPlan:
     q = samples_per_slot
     weights = np.frombuffer(taps).reshape(q, -1)
     isi_memory = weights.shape[1] - 1
     # Sample i belongs to metric (i + lead) // q.
     lead = isi_memory * q // 2
-    places, asked, metrics, shares = [], [], [], []
+    places, evaluated, metrics, shares = [], [], [], []
     for place in range(q):
         metric, sample = divmod(place + lead, q)
-        # Many patterns have the same level in a sample, which need be asked but once.
+        # Many patterns have the same level in a sample, which is evaluated once.
         levels, number = np.unique((slot_patterns(isi_memory) @ weights[sample]).round(9), return_inverse=True)
         if levels.size <= _NODES.size:
             share = np.eye(levels.size)[number]
@@ -85,26 +85,26 @@ def _asked_levels(taps: bytes, samples_per_slot: int) -> _AskedLevels:
             levels, share = _NODES, _interpolated(levels)[number]
         places += [place] * levels.size
         metrics += [metric] * levels.size
-        asked += levels.tolist()
+        evaluated += levels.tolist()
         shares.append(share.T)
-    return _AskedLevels(places, asked, metrics, np.concatenate(shares).astype(np.float32))
+    return _LevelPlan(places, evaluated, metrics, np.concatenate(shares).astype(np.float32))
 
 
 def _interpolated(levels: FloatArray) -> FloatArray:
-    """(levels, nodes) shares of what is said at the nodes in the polynomial through them."""
-    others = ~np.eye(_NODES.size, dtype=bool)
-    ratios = (levels[:, None, None] - _NODES) / np.where(others, _NODES[:, None] - _NODES, 1)
-    return np.asarray(np.where(others, ratios, 1).prod(axis=2))
+    """(levels, nodes) Lagrange weights of the nodes at the levels."""
+    off_diagonal = ~np.eye(_NODES.size, dtype=bool)
+    ratios = (levels[:, None, None] - _NODES) / np.where(off_diagonal, _NODES[:, None] - _NODES, 1)
+    return np.asarray(np.where(off_diagonal, ratios, 1).prod(axis=2))
 
 
 def metrics_of(llr: Float32Array, isi_memory: int) -> FloatArray:
-    """Metrics (C, N + memory, patterns) of slots (C, N) that are independent, given their log-likelihood ratios."""
+    """Metrics (C, N + memory, patterns) of independent slots, from their log-likelihood ratios (C, N)."""
     padded = np.pad(llr, ((0, 0), (0, isi_memory)))
     return np.asarray(padded[..., None] / 2 * (2.0 * slot_patterns(isi_memory)[:, -1] - 1))
 
 
 def by_burst(metrics: FloatArray, clock: Clock) -> FloatArray:
-    """Metrics of the grid (C, N + memory, patterns) added over the copies of each burst.
+    """Add the metrics of the grid (C, N + memory, patterns) over the copies of each burst.
 
     Returns:
         (B, C, packet + memory, patterns); see `detect.detect`.

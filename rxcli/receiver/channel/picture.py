@@ -1,4 +1,4 @@
-"""The picture at every slot, predicted from the slots around it."""
+"""Prediction of the picture at every slot from its neighbouring slots."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from rxcli.numerics import box_sums
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Float32Array
 
-#: Keeps a power from zero where no light is seen.
+#: Lower limit of a power, for samples without light.
 _TINY = np.float32(1e-9)
-#: The picture is predicted so many times a slot: exposures that overlap a sample's own say too little against it.
+#: Predictions of the picture per slot: exposures that overlap a sample's own cannot contradict it.
 PER_SLOT = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """The picture from other slots, float32: from both sides and, if asked, from before alone and from after alone."""
+    """Picture predicted from both sides and, optionally, from earlier and from later slots alone; float32."""
 
-    #: (sides, 2, C, S, N) in the first and the second half of every slot.
+    #: (sides, 2, C, S, N) picture in the first and the second half of every slot.
     picture: Float32Array
-    #: (sides, C, S, N) its variance.
+    #: (sides, C, S, N) variance of the picture.
     variance: Float32Array
 
     def at_samples(self, samples_per_slot: int) -> Float32Array:
-        """(Q, C, S, N) the picture from both sides at every sample of a slot."""
+        """(Q, C, S, N) picture predicted from both sides, at every sample of a slot."""
         return np.repeat(self.picture[0], samples_per_slot // PER_SLOT, axis=0)
 
 
 @dataclass(frozen=True, slots=True)
 class PictureSums:
-    """What samples say of the picture, (2, C, S, N) float32 sums over those of each half of a slot that are seen."""
+    """Sufficient statistics of the picture: sums over the valid samples of each half slot, (2, C, S, N) float32."""
 
-    #: Light by what is expected per unit of picture, the square of that, the square of light, and samples.
+    #: Light times prediction per unit of picture, squared prediction, squared light, and number of samples.
     cross: Float32Array
     power: Float32Array
     light: Float32Array
@@ -42,7 +42,7 @@ class PictureSums:
 
     @staticmethod
     def of(light: Float32Array, expected: Float32Array, valid: Float32Array) -> PictureSums:
-        """Those of samples `by_place`; `light` is 0 where not valid."""
+        """Sum over samples ordered `by_place`; `light` is 0 where not valid."""
         weighted = expected * valid
         return PictureSums(
             *(_of_halves(values) for values in (weighted * light, weighted * expected, light * light, valid))
@@ -50,7 +50,7 @@ class PictureSums:
 
 
 def _of_halves(values: Float32Array) -> Float32Array:
-    """(2, ...) sums over the samples (Q, ...) of each half of a slot; adding slices is quicker than a reduction."""
+    """(2, ...) sums over the samples (Q, ...) of each half slot; faster by slices than as a reduction."""
     by_half = values.reshape(PER_SLOT, -1, *values.shape[1:])
     total = by_half[:, 0]
     for sample in range(1, by_half.shape[1]):
@@ -59,41 +59,41 @@ def _of_halves(values: Float32Array) -> Float32Array:
 
 
 def by_place(samples: Float32Array, samples_per_slot: int) -> Float32Array:
-    """(Q, ..., N) samples (..., n) by their place in the slot: those at one place in all slots lie side by side."""
+    """(Q, ..., N) samples (..., n) ordered by position in the slot first."""
     by_slot = samples.reshape(*samples.shape[:-1], -1, samples_per_slot)
     return np.ascontiguousarray(np.moveaxis(by_slot, -1, 0))
 
 
 def in_time(samples: Float32Array) -> Float32Array:
-    """(..., n) samples `by_place` in order of time."""
+    """(..., n) samples in order of time, the inverse of `by_place`."""
     return np.moveaxis(samples, 0, -1).reshape(*samples.shape[1:-1], -1)
 
 
 def predict_picture(sums: PictureSums, noise_floor: float, scales: tuple[int, ...], one_sided: bool) -> Prediction:
-    """The picture from other slots, on each side the best of all scales.
+    """Predict the picture from other slots, with the best scale on each side.
 
     Args:
-        sums: what samples say of it, by the present idea of the slots.
-        noise_floor: variance of a sample of no light.
-        scales: slots on a side from which it is predicted.
-        one_sided: predict from before and from after as well.
+        sums: statistics of the samples, given the current estimate of the slots.
+        noise_floor: variance of a dark sample.
+        scales: numbers of slots on each side from which the picture is predicted.
+        one_sided: predict from earlier and from later slots alone too.
     """
-    floor, margin = np.float32(noise_floor), PER_SLOT * max(scales) + 1
+    dark_variance, margin = np.float32(noise_floor), PER_SLOT * max(scales) + 1
     around = np.stack([in_time(sums.cross), in_time(sums.power)])
     around = np.pad(around, [(0, 0)] * 3 + [(2, margin)])
-    texture = _Texture(sums, floor)
+    texture = _Texture(sums, dark_variance)
     best: Prediction | None = None
     for scale in scales:
         light, observed = _sides(around, PER_SLOT * scale, sums.cross.shape[-1], one_sided)
         picture = np.maximum(light, 0, out=light)
         picture /= observed + np.float32(1e-4)
-        # Which scale is best is asked once a slot.
+        # The scale is chosen once per slot.
         variance = np.square(picture[:, 1]) * texture.of(picture)
-        variance += floor / (observed[:, 1] + np.float32(1e-6))
+        variance += dark_variance / (observed[:, 1] + np.float32(1e-6))
         if best is None:
             best = Prediction(picture, variance)
             continue
-        # Arithmetic picks several times quicker than a masked copy.
+        # Selection by arithmetic is several times faster than a masked copy.
         picture -= best.picture
         picture *= (variance < best.variance)[:, None].astype(np.float32)
         np.add(best.picture, picture, out=best.picture)
@@ -103,14 +103,15 @@ def predict_picture(sums: PictureSums, noise_floor: float, scales: tuple[int, ..
 
 
 def _sides(around: Float32Array, size: int, n_slots: int, one_sided: bool) -> Float32Array:
-    """(2, sides, 2, C, S, N) sums over `size` halves on both sides of every half slot and, if asked, on that before it
-    and on that after; the halves next to it left out.
+    """(2, sides, 2, C, S, N) sums over `size` half slots before and after every half slot.
+
+    The adjacent half slots are left out. The sides are both together and, with `one_sided`, before and after alone.
 
     Args:
-        around: (2, C, S, halves) values in time, two halves of nothing before them and `size` + 1 after.
-        size: halves.
+        around: (2, C, S, half slots) values in time, padded by two zeros before and `size` + 1 after.
+        size: number of half slots.
         n_slots: slots, N.
-        one_sided: whether sides by themselves are asked for.
+        one_sided: whether single sides are requested.
     """
     import cv2
 
@@ -119,7 +120,7 @@ def _sides(around: Float32Array, size: int, n_slots: int, one_sided: bool) -> Fl
     before = np.asarray(summed, np.float32).reshape(around.shape)
     out = np.empty((2, 3 if one_sided else 1, PER_SLOT, *around.shape[1:-1], n_slots), np.float32)
     for half in range(PER_SLOT):
-        early, late = (before[..., first + half :: PER_SLOT][..., :n_slots] for first in (0, size + 3))
+        early, late = (before[..., start + half :: PER_SLOT][..., :n_slots] for start in (0, size + 3))
         np.add(early, late, out=out[:, 0, half])
         if one_sided:
             out[:, 1, half], out[:, 2, half] = early, late
@@ -127,14 +128,14 @@ def _sides(around: Float32Array, size: int, n_slots: int, one_sided: bool) -> Fl
 
 
 class _Texture:
-    """Relative variance of a prediction thereabouts, beyond the noise."""
+    """Local relative variance of a prediction, beyond the noise."""
 
-    def __init__(self, sums: PictureSums, floor: np.float32) -> None:
+    def __init__(self, sums: PictureSums, dark_variance: np.float32) -> None:
         self._sums = sums
         self._light = sums.light.sum(axis=0)
         self._twice = 2 * sums.cross
-        #: What noise adds to an error; of light as faint as that nothing is known.
-        self._noise = floor * _around(sums.count.sum(axis=0)) + _TINY
+        #: Contribution of noise to the error.
+        self._noise = dark_variance * _around(sums.count.sum(axis=0)) + _TINY
 
     def of(self, picture: Float32Array) -> Float32Array:
         """(sides, C, S, N) relative variance of `picture` (sides, 2, C, S, N)."""

@@ -1,4 +1,4 @@
-"""Likely words of symbols in doubt, weighed as a whole."""
+"""Comparison of the likeliest words of uncertain symbols as a whole."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from rxcli.receiver.channel.model import ObservationModel
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
-#: Words that are alike make no singular system.
+#: Regularisation of the equations for words with few differences.
 _MIN_NORM = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class _Halves:
-    """Light of some columns at two samples a slot; (C, S, 2 N) float32."""
+    """Light of some columns at two samples per slot; (C, S, 2 N) float32."""
 
-    #: Light over the floor.
+    #: Light above the black level.
     light: Float32Array
-    #: Mean picture around.
+    #: Local mean picture.
     mean: Float32Array
     #: Light of the adjacent columns per unit of picture.
-    others: Float32Array
-    #: Whether both samples are seen.
+    neighbours: Float32Array
+    #: Whether all samples of the half slot are visible.
     observed: NDArray[np.bool_]
 
 
@@ -40,19 +40,19 @@ def word_corrections(
     places: NDArray[np.int64],
     words: NDArray[np.uint8],
 ) -> Float32Array:
-    """What to add to the log-likelihood ratio of every slot, so that words count as the light as a whole has them.
+    """Corrections of slot log-likelihood ratios by which words score as the light of the whole symbol indicates.
 
     Args:
-        samples: of the columns to look at, S strips, N slots of four samples.
+        samples: samples of `columns`, S strips, N slots of four samples.
         clock: the clock.
         model: the light model.
-        lit: (C, N) probability that each slot is lit, of all columns.
-        columns: which columns the samples are of.
-        places: (J, 3) burst, place in `columns` and number of each symbol in doubt.
-        words: (J, K, 10) its likeliest words, best first.
+        lit: (C, N) probability that each slot is lit, all columns.
+        columns: numbers of the columns in `samples`.
+        places: (J, 3) burst, index in `columns` and symbol number of each uncertain symbol.
+        words: (J, K, 10) likeliest words of each symbol, best first.
 
     Returns:
-        (len(columns), N); 0 for symbols that are not in doubt.
+        (len(columns), N) values to add; 0 for certain symbols.
     """
     out = np.zeros((columns.size, clock.n_slots), np.float32)
     symbol, start = _occurrences(places, clock)
@@ -64,7 +64,7 @@ def word_corrections(
     levels = _word_levels(lit[columns[column]], begin, words[symbol].reshape(-1, SLOTS_PER_SYMBOL), model)
     score = np.zeros(words.shape[:2])
     np.add.at(score, symbol, _process_likelihood(halves, column, begin, levels, model).reshape(-1, n_words))
-    # Both halves of a slot together count as any other number of samples would.
+    # The effective number of samples per slot does not depend on their actual number, here two.
     slots = _as_slots(SETTINGS.slot_information / 2 * score, words)
     _share_among_copies(out, slots, symbol, places[symbol, 1], start)
     return out
@@ -77,7 +77,7 @@ def _share_among_copies(
     column: NDArray[np.int64],
     start: NDArray[np.int64],
 ) -> None:
-    """Put the corrections (J, 10) of symbols on the grid, each shared alike among the copies that show the slot."""
+    """Write the corrections (J, 10) of symbols to the grid, divided equally among the copies that show the slot."""
     at = start[:, None] + np.arange(SLOTS_PER_SYMBOL)
     inside = (at >= 0) & (at < out.shape[1])
     count = np.zeros(slots.shape)
@@ -88,11 +88,11 @@ def _share_among_copies(
 
 
 def _occurrences(places: NDArray[np.int64], clock: Clock) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Of every copy of the symbols on the grid: which symbol, and its first slot."""
+    """Symbol number and first slot of every visible copy of the symbols."""
     symbol, copy = np.nonzero(places[:, :1] == clock.burst)
     start = copy * clock.packet_slots + PREAMBLE_SLOTS + SLOTS_PER_SYMBOL * places[symbol, 2] - clock.first_slot
-    there = (start > -SLOTS_PER_SYMBOL) & (start < clock.n_slots)
-    return symbol[there], start[there]
+    visible = (start > -SLOTS_PER_SYMBOL) & (start < clock.n_slots)
+    return symbol[visible], start[visible]
 
 
 def _halves(
@@ -100,21 +100,21 @@ def _halves(
 ) -> _Halves:
     expected, light, q = model.expected(lit, clock, columns), model.over_black(samples), samples.samples_per_slot
     weight = expected.whole * samples.valid
-    light_around, seen_around = (box_sums(part * weight, SETTINGS.level_slots * q) for part in (light, weight))
-    mean = np.maximum(light_around, np.float32(0)) / np.maximum(seen_around, np.float32(1e-3))
+    light_sum, weight_sum = (box_sums(part * weight, SETTINGS.level_slots * q) for part in (light, weight))
+    mean = np.maximum(light_sum, np.float32(0)) / np.maximum(weight_sum, np.float32(1e-3))
     observed = _paired(samples.valid) > 0.9
-    return _Halves(_paired(light), _paired(mean.astype(np.float32)), _paired(expected.others), observed)
+    return _Halves(_paired(light), _paired(mean.astype(np.float32)), _paired(expected.neighbours), observed)
 
 
 def _paired(values: Float32Array) -> Float32Array:
-    """Means of the two samples of every half of a slot, last axis."""
+    """Mean of the two samples of every half slot, last axis."""
     return np.asarray((values[..., ::2] + values[..., 1::2]) * np.float32(0.5), np.float32)
 
 
 def _word_levels(
     lit: Float32Array, start: NDArray[np.int64], words: NDArray[np.uint8], model: ObservationModel
 ) -> Float32Array:
-    """(R, W) mean of the exposure over a word and the slots around it, as believed, at two samples a slot.
+    """(R, W) light of a word and of the estimated slots around it after the exposure, two samples per slot.
 
     Args:
         lit: (R, N) probability that each slot of the word's column is lit.
@@ -134,14 +134,14 @@ def _word_levels(
 def _process_likelihood(
     halves: _Halves, column: NDArray[np.int64], start: NDArray[np.int64], levels: Float32Array, model: ObservationModel
 ) -> FloatArray:
-    """(R,) log-likelihood of the light by R words, strips added, whatever kind of picture each shows."""
+    """(R,) log-likelihood of R words, added over the strips, each with its likeliest picture processes."""
     n, width = halves.light.shape[2], levels.shape[1]
     at = 2 * (start[:, None] - SETTINGS.around_slots) + np.arange(width)
     index = (column[None, :, None], np.arange(halves.light.shape[1])[None, None], np.clip(at, 0, n - 1).T[:, :, None])
-    # From here on time comes first: (W, R, S).
+    # From here on time is the first axis: (W, R, S).
     mean, observed = halves.mean[index], halves.observed[index] & ((at >= 0) & (at < n)).T[:, :, None]
-    gain = (halves.others[index] + model.crosstalk.own[..., 0] * levels.T[:, :, None]) * mean
-    # Two adjacent samples are interpolated between the same rows.
+    gain = (halves.neighbours[index] + model.crosstalk.own[..., 0] * levels.T[:, :, None]) * mean
+    # The noise is not halved: adjacent samples are interpolated between the same rows.
     noise = model.noise.variance(gain)
     residual = np.where(observed, halves.light[index] - gain, np.float32(0))
     gain = np.where(observed, gain, np.float32(0))
@@ -152,33 +152,33 @@ def _process_likelihood(
 def _innovations(
     residual: Float32Array, gain: Float32Array, noise: Float32Array, kinds: tuple[tuple[float, float], ...]
 ) -> Float32Array:
-    """(kinds, R, S) log-likelihood, up to a constant, of light that follows the picture's deviation from its mean.
+    """(kinds, R, S) log-likelihood, up to a constant, of the picture's deviation from its mean, by a Kalman filter.
 
     Args:
-        residual: (W, R, S) light less that of the mean picture.
-        gain: (W, R, S) light per unit of relative deviation; 0 where nothing is seen.
+        residual: (W, R, S) light minus that of the mean picture.
+        gain: (W, R, S) light per unit of relative deviation; 0 where nothing is visible.
         noise: (W, R, S) variance of the light.
-        kinds: standard deviation of the process, and slots after which it is another one, of every kind of picture.
+        kinds: standard deviation and correlation length in slots of every picture process.
     """
     deviation, length = np.array(kinds, np.float32).T[:, :, None, None]
     keep, power = np.exp(np.float32(-0.5) / length), np.square(deviation)
     state = np.zeros((len(kinds), *residual.shape[1:]), np.float32)
     variance, total = state + power, state.copy()
     for light, slope, error in zip(residual, gain, noise, strict=True):
-        shared = slope * variance
-        crosstalk = shared * slope
-        crosstalk += error
+        covariance = slope * variance
+        innovation_variance = covariance * slope
+        innovation_variance += error
         innovation = light - slope * state
-        step = innovation / crosstalk
+        step = innovation / innovation_variance
         innovation *= step
         total += innovation
-        total += np.log(crosstalk)
-        np.divide(shared, crosstalk, out=crosstalk)
-        step *= shared
+        total += np.log(innovation_variance)
+        np.divide(covariance, innovation_variance, out=innovation_variance)
+        step *= covariance
         state += step
         state *= keep
-        shared *= crosstalk
-        variance -= shared
+        covariance *= innovation_variance
+        variance -= covariance
         variance -= power
         variance *= keep * keep
         variance += power
@@ -187,8 +187,8 @@ def _innovations(
 
 
 def _as_slots(score: FloatArray, words: NDArray[np.uint8]) -> FloatArray:
-    """(J, 10) least corrections of single slots that add up to what words (J, K) score against the first of them."""
+    """(J, 10) smallest slot corrections that add up to the scores of words (J, K) relative to the first word."""
     wanted = score[:, 1:] - score[:, :1]
-    apart = words[:, 1:].astype(np.float64) - words[:, :1]
-    across = apart @ apart.transpose(0, 2, 1) + _MIN_NORM * np.eye(apart.shape[1])
-    return np.asarray((np.linalg.solve(across, wanted[..., None]).transpose(0, 2, 1) @ apart)[:, 0])
+    difference = words[:, 1:].astype(np.float64) - words[:, :1]
+    gram = difference @ difference.transpose(0, 2, 1) + _MIN_NORM * np.eye(difference.shape[1])
+    return np.asarray((np.linalg.solve(gram, wanted[..., None]).transpose(0, 2, 1) @ difference)[:, 0])

@@ -56,7 +56,7 @@ def model_for(shot_gain: Shot, sigma: float, black_level: float) -> channel.Obse
 
 
 def brightened(model: channel.ObservationModel, factor: float) -> channel.ObservationModel:
-    noise = NoiseModel(model.noise.floor * factor**2, model.noise.slope * factor)
+    noise = NoiseModel(model.noise.dark_variance * factor**2, model.noise.shot_gain * factor)
     return replace(model, black_level=model.black_level * factor, noise=noise)
 
 

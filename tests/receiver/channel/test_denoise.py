@@ -227,7 +227,7 @@ def test_only_the_own_belief_and_the_neighbours_are_looked_at(scene: DenoiserInp
 def test_brightness_does_not_matter(scene: DenoiserInput) -> None:
     """Twice the light with twice the noise is the same scene."""
     noise = scene.model.noise
-    brighter = NoiseModel(4 * noise.floor, 2 * noise.slope)
+    brighter = NoiseModel(4 * noise.dark_variance, 2 * noise.shot_gain)
     twice = replace(
         scene,
         samples=replace(scene.samples, light=2 * scene.samples.light),
