@@ -158,7 +158,7 @@ def distinct_screens(screens: Sequence[ScreenProfile]) -> list[ScreenProfile]:
 
 
 def variants_of(screen: ScreenProfile, screens: Sequence[ScreenProfile]) -> tuple[ScreenProfile, ...]:
-    """The screen and those that differ only in the number of copies, the one with the most copies first."""
+    """The screen and its variants with other numbers of copies, the one with the most copies first."""
     candidates = reversed((screen, *screens))
     by_repeats = {candidate.repeats: candidate for candidate in candidates if _shape(candidate) == _shape(screen)}
     return tuple(by_repeats[repeats] for repeats in sorted(by_repeats, reverse=True))
