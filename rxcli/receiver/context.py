@@ -38,6 +38,8 @@ class Outline:
     fills: bool = False
     #: Alternative corners with other top and bottom rows, likeliest first.
     other_rows: tuple[FloatArray, ...] = ()
+    #: Estimated lens that bends the columns; used where the camera has no known lens.
+    lens: Lens | None = None
     #: Number of narrow columns whose borders were found; None if it was not determined or is small.
     n_columns: int | None = None
 

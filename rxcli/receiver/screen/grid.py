@@ -39,6 +39,16 @@ class Grid:
         """Width of a column at the picture's middle, pixels."""
         return float(self.width / self.numbers[1])
 
+    @property
+    def estimated_lens(self) -> Lens | None:
+        """The lens that the radial coefficient stands for; None where the lens is known."""
+        if self.lens is not None:
+            return None
+        radial = self.numbers[5]
+        matrix = np.array([[self.width, 0, (self.width - 1) / 2], [0, self.width, (self.height - 1) / 2], [0, 0, 1.0]])
+        # `distort` goes the other way: the inverse series.
+        return Lens(matrix, np.array([-radial, 3 * radial**2, 0.0, 0.0, 0.0]), corrected=False)
+
     def columns_at(self, points: FloatArray) -> FloatArray:
         """(...) columns of (..., 2) pixels."""
         return columns_at(self.numbers, *flat_places(points, self.width, self.height, self.lens))

@@ -41,8 +41,11 @@ class Strips:
     y: FloatArray
     #: Half the height of a block, picture widths.
     half_height: float
-    #: Height by which the band pass smears light beyond the ends of the screen, both together, picture widths.
-    smear: float
+    #: (W, R) row noise that was projected off the strips of each window of rows.
+    row_noise: Float32Array
+    #: Rows that the band pass averages, and picture rows from one row of `changes` to the next.
+    short_rows: int
+    row_step: int
     #: Independent rows of a block: an incoherent pair of strips has a variance of one over these.
     n_rows: float
     #: Parts of the picture's width: 1, or more where columns are narrow.
@@ -56,6 +59,11 @@ class Strips:
     def n_windows(self) -> int:
         """Windows of rows."""
         return len(self.changes) // self.n_parts
+
+    @property
+    def smear(self) -> float:
+        """Height by which the band pass smears light beyond the ends of the screen, both together, picture widths."""
+        return 8 * self.short_rows / self.width
 
     @property
     def step(self) -> float:
@@ -96,11 +104,11 @@ def read_strips(pixels: Pixels, mosaic_period: int = 1, lens: Lens | None = None
     rows = len(band) // SETTINGS.n_windows
     flat_rows = (np.arange(SETTINGS.n_windows) * rows + (rows - 1) / 2) * step
     points = np.stack(np.meshgrid(x, flat_rows), axis=-1)
-    quiet, lit = _without_row_noise(_windows(band))
+    quiet, lit, noise = _without_row_noise(_windows(band))
     rows_off = _row_offsets(quiet, lit, points, (width, height), step, lens)
     if np.abs(rows_off).max() > SETTINGS.min_bend_rows * step:
         points[..., 1] += rows_off
-        quiet, lit = _without_row_noise(_windows(_straightened(band, rows_off / step)))
+        quiet, lit, noise = _without_row_noise(_windows(_straightened(band, rows_off / step)))
     level = light[: rows * step * SETTINGS.n_windows].reshape(SETTINGS.n_windows, rows * step, -1).mean(axis=1)
 
     def parted(values: NDArray[_Real]) -> NDArray[_Real]:
@@ -119,7 +127,9 @@ def read_strips(pixels: Pixels, mosaic_period: int = 1, lens: Lens | None = None
         x_flat,
         y_flat,
         half_height=rows * step / 2 / width,
-        smear=8 * short / width,
+        row_noise=noise,
+        short_rows=short,
+        row_step=step,
         n_rows=_independent_rows(quiet, lit),
         n_parts=n_parts,
         width=width,
@@ -253,15 +263,15 @@ def _straightened(band: Float32Array, rows_off: FloatArray) -> Float32Array:
     return np.asarray(first + (second - first) * (at - low), np.float32)
 
 
-def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """The changes less what the least coherent strips have in common, and (W, S) how coherent neighbours are then."""
+def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """The changes less what the least coherent strips have in common; (W, S) coherence of neighbours; (W, R) noise."""
     n_dark = max(int(SETTINGS.dark_share * changes.shape[2]), 1)
     dark = np.argsort(_smooth(_neighbours(changes), 5, 1), axis=1)[:, :n_dark]
     noise = np.take_along_axis(changes, dark[:, None], axis=2).mean(axis=2)
     power = np.einsum("wr,wr->w", noise, noise) + np.float32(TINY)
     share = np.einsum("wrs,wr->ws", changes, noise) / power[:, None]
     quiet = changes - noise[..., None] * share[:, None]
-    return quiet, np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1)
+    return quiet, np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1), noise
 
 
 def _neighbours(changes: Float32Array) -> Float32Array:

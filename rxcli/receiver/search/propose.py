@@ -102,6 +102,8 @@ class Proposer:
     def context(self, hypothesis: Hypothesis) -> FrameContext:
         """The frame as a hypothesis has it, with the screens that its camera may show."""
         camera, screens = hypothesis.camera, self._screens()
+        if camera.lens is None:
+            camera = replace(camera, lens=hypothesis.outline.lens)
         if camera.hypothesis is not None:
             own = hypothesis.screen
             screens = tuple(

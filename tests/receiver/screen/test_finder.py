@@ -173,6 +173,19 @@ def test_a_lens_that_is_known_is_taken_off() -> None:
     np.testing.assert_allclose(candidates[0].corners[0], bent, atol=25)
 
 
+def test_columns_that_a_lens_bends_are_read_through_it() -> None:
+    straight = grid_between(CORNERS, 100, (WIDTH, HEIGHT), None)
+    grid = replace(straight, numbers=straight.numbers + np.array([0, 0, 0, 0, 0, 0.04]))
+    corners, lens = grid.pixels_of(np.stack(straight.flat(CORNERS), axis=-1)), grid.estimated_lens
+    assert lens is not None
+    u, v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 7), indexing="ij")
+    points = np.stack([u, v], axis=-1)
+    off = grid.columns_at(geometry.screen_to_picture(points, corners, lens)) - 100 * u
+    assert np.abs(off).max() < 0.02
+    assert np.abs(grid.columns_at(geometry.screen_to_picture(points, corners, None)) - 100 * u).max() > 0.15
+    assert replace(grid, lens=lens).estimated_lens is None
+
+
 def test_a_screen_larger_than_the_picture_shows_no_side() -> None:
     large = np.array([[-160.0, 300.0], [1380.0, 280.0], [1400.0, 1170.0], [-180.0, 1140.0]])
     candidates = find_outlines(draw("white", large), [WIDE])

@@ -20,7 +20,9 @@ from rxcli.profiles import CameraProfile, ScreenProfile, parse_profile, shipped_
 from rxcli.receiver import corners as outlines
 from rxcli.receiver.context import Failure, Outline, Timer
 from rxcli.receiver.pipeline import receive_frame
+from rxcli.receiver.screen import geometry
 from rxcli.receiver.search import Found, search
+from rxcli.receiver.search.propose import Proposer
 from rxcli.types import Frame, FrameResult
 
 SHIPPED = tuple(shipped_profiles(ScreenProfile))
@@ -69,6 +71,18 @@ def test_the_order_of_screens_cameras_and_outlines_does_not_matter(seed: int, mo
     as_listed = received(np.arange(6))
     assert len(as_listed) > 10
     assert received(rng.permutation(6)) == as_listed
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_columns_are_read_through_the_estimated_lens_where_the_camera_has_none(known: bool) -> None:
+    trial = trial_of("paper-17k3")
+    assert trial.camera.lens is not None
+    lens = geometry.lens_for(trial.camera.lens, trial.frame.width, trial.frame.height)
+    outline = Outline(trial.corners, lens=lens)
+    options = trial.options() if known else replace(trial.options(), cameras=(), force_camera=False)
+    proposer = Proposer(trial.frame, options, Timer(), (outline,))
+    camera = proposer.context(next(proposer.cameras())[0]).camera
+    assert (camera.lens is lens) == (not known)
 
 
 @pytest.mark.parametrize("screen", ["paper-17k3", "paper-34k6", "paper-8k65"])
