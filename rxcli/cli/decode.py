@@ -220,9 +220,7 @@ class _Run:
         with ExitStack() as stack:
             journal = self._journal(stack)
             self._write_payloads = self._payloads(stack)
-            done = self._recover() if self._options["resume"] else set()
-            if journal is not None:
-                journal.follow()
+            done = self._recover(journal) if journal is not None and self._options["resume"] else set()
             self._output = writer = self._writer(journal, begun=bool(done))
             try:
                 self._decode([source for source in sources if source.name not in done], writer, len(sources))
@@ -233,12 +231,10 @@ class _Run:
         self._add_missing()
         return worst([*self._conclude(sources), exit_code(self._summaries, self._limits)])
 
-    def _recover(self) -> set[str]:
+    def _recover(self, journal: Journal) -> set[str]:
         """Take the results of an earlier run into the summary; returns the names of its complete sources."""
-        from rxcli.runs.journal import recover
-
         done = set()
-        for name, results in recover(Path(self._options["json_path"]), self._head(), self._files()):
+        for name, results in journal.recover(self._head(), self._files()):
             summary, scorer = self._begin(name)
             for result in results:
                 summary.add(scorer.add(result) if scorer else result)

@@ -10,9 +10,12 @@ import os
 import signal
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from itertools import islice
+from queue import SimpleQueue
+from threading import Lock, Semaphore, Thread
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
 from rxcli.outputs import OUTPUT_MARKER
@@ -33,6 +36,12 @@ Receive = Callable[[Iterable[Frame], Any], Iterator[FrameResult]]
 #: One source with its results, which are to be taken before the next source is asked for.
 Decoded = tuple["Source", Iterator[FrameResult]]
 
+#: Results of one source as they come, an error that ends them, and None behind the last.
+_Results = SimpleQueue[FrameResult | Exception | None]
+_T = TypeVar("_T")
+
+#: Errors that end the run, whatever the source.
+_ENDS_RUN = (UsageError, ProfileError, OutputError)
 #: What these signals mean is decided by the first process; they often come to all at once.
 _FIRST_DECIDES = (signal.SIGINT, signal.SIGTERM)
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
@@ -137,23 +146,23 @@ class Decoder:
             ProfileError: likewise.
             OutputError: taps cannot be written.
         """
-        failure = _Failure(source)
+        problems: list[str] = []
         count = 0
         try:
-            if source.problem:
-                raise InputError(source.problem)
-            for result in self.linked(self.receive(failure.guard(self._frames(source)), self._options_of(source))):
+            for result in self.linked(self.receive(self._frames(source, problems), self._options_of(source))):
                 result = replace(result, source=source.name)
                 if self.after is not None:
                     self.after(result, source.subfolder)
                 yield result
                 count += 1
-        except (UsageError, ProfileError, OutputError):
+        except _ENDS_RUN:
             raise
         except Exception as error:
-            failure.note(error)
-        if failure.message or not count:
-            yield unreadable(source, count, failure.message or f"{source.name}: holds no picture; name another file")
+            problems.append(_problem(error, source))
+        if not (problems or count):
+            problems.append(f"{source.name}: holds no picture; name another file")
+        if problems:
+            yield unreadable(source, count, problems[-1])
 
     def linked(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
         """Results with the messages and files that are complete with them.
@@ -174,16 +183,24 @@ class Decoder:
                 taken = replace(taken, soft_bits=result.soft_bits if alone else None)
             yield taken
 
-    def _frames(self, source: Source) -> Iterator[Frame]:
-        told = False
-        for frame in self.open_source(source.path):
-            frame = replace(frame, source=source.name)  # as the user named it, wherever it is opened
-            if frame.metadata.not_believed and not told:
-                claims, told = ", ".join(frame.metadata.not_believed), True
-                log.warning("%s: not believed, and taken as unknown: %s", source.name, claims)
-            if self.tap is not None:
-                self.tap(frame, source.subfolder)
-            yield frame
+    def _frames(self, source: Source, problems: list[str]) -> Iterator[Frame]:
+        """The frames of a source up to a failure, which joins `problems`: the receiver still gives what it holds."""
+        warned = False
+        try:
+            if source.problem:
+                raise InputError(source.problem)
+            for frame in self.open_source(source.path):
+                frame = replace(frame, source=source.name)  # as the user named it, wherever it is opened
+                if frame.metadata.not_believed and not warned:
+                    claims, warned = ", ".join(frame.metadata.not_believed), True
+                    log.warning("%s: not believed, and taken as unknown: %s", source.name, claims)
+                if self.tap is not None:
+                    self.tap(frame, source.subfolder)
+                yield frame
+        except _ENDS_RUN:
+            raise
+        except Exception as error:
+            problems.append(_problem(error, source))
 
     def _options_of(self, source: Source) -> Any:
         """The options with a place of its own for the source's taps."""
@@ -191,34 +208,15 @@ class Decoder:
         return self.options if folder is None else replace(self.options, dump_dir=folder / source.subfolder)
 
 
-class _Failure:
-    """What went wrong with a source. The receiver behind a guarded iterator still gives what it had got till then."""
-
-    def __init__(self, source: Source) -> None:
-        self._source = source
-        self.message: str | None = None
-
-    def guard(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """The frames up to the failure, which is noted instead of raised."""
-        try:
-            yield from frames
-        except (UsageError, ProfileError, OutputError):
-            raise
-        except Exception as error:
-            self.note(error)
-
-    def note(self, error: Exception) -> None:
-        """Keep the message of `error`; one that is no `ReceiverError` is a bug, whose traceback goes to the log."""
-        name = self._source.name
-        if isinstance(error, ReceiverError):
-            self.message = str(error).replace(self._source.path, name)
-            return
-        if isinstance(error, (OSError, MemoryError)):
-            reason = getattr(error, "strerror", None) or "more memory is needed than there is"
-            self.message = f"{name}: cannot be decoded ({reason}); try it by itself"
-            return
-        log.debug("unexpected error", exc_info=error)
-        self.message = f"internal error ({type(error).__name__}: {error}); run again with --verbose and report it"
+def _problem(error: Exception, source: Source) -> str:
+    """Message of an error in a source; one that is no `ReceiverError` is a bug, whose traceback goes to the log."""
+    if isinstance(error, ReceiverError):
+        return str(error).replace(source.path, source.name)
+    if isinstance(error, (OSError, MemoryError)):
+        reason = getattr(error, "strerror", None) or "more memory is needed than there is"
+        return f"{source.name}: cannot be decoded ({reason}); try it by itself"
+    log.debug("unexpected error", exc_info=error)
+    return f"internal error ({type(error).__name__}: {error}); run again with --verbose and report it"
 
 
 def unreadable(source: Source, frame: int, message: str) -> FrameResult:
@@ -261,159 +259,156 @@ def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded
         yield source, decoder.results(source)
 
 
+def in_order(sources: Iterable[Source], submit: Callable[[Source], _T], n_ahead: int) -> Iterator[tuple[Source, _T]]:
+    """Each source with what `submit` makes of it, which is called for `n_ahead` sources before the first is taken."""
+    waiting = iter(sources)
+    submitted = deque((source, submit(source)) for source in islice(waiting, n_ahead))
+    while submitted:
+        yield submitted.popleft()
+        submitted.extend((source, submit(source)) for source in islice(waiting, 1))
+
+
 def decode_in_processes(sources: Sequence[Source], decoder: Decoder, workers: int) -> Iterator[Decoded]:
     """Decode sources in worker processes; results as from `decode_here`, in the same order.
 
-    The source that a worker had in hand when it died is decoded again, by another worker while all others rest (what
-    ended it may have been the want of memory). A source that ends two workers is unreadable.
+    If a worker dies, another one decodes its source again while all others rest (the first may have died for want of
+    memory). A source that ends two workers is unreadable.
 
     Args:
         sources: what to decode.
         decoder: how; must be picklable.
         workers: number of processes, each of which uses one thread.
     """
-    with _Pool(sources, decoder, min(workers, len(sources))) as pool:
-        for index, source in enumerate(sources):
-            yield source, pool.results(index)
+    with environment(ONE_THREAD), closing(_Pool(decoder, min(workers, len(sources)))) as pool:
+        for source, results in in_order(sources, pool.submit, _AHEAD * workers):
+            yield source, _until_end(results)
+
+
+def _until_end(results: _Results) -> Iterator[FrameResult]:
+    """Results that arrive in a queue, up to a None; an error is raised."""
+    while (result := results.get()) is not None:
+        if isinstance(result, Exception):
+            raise result
+        yield result
+
+
+class _Pool:
+    """Threads that each have a worker process, give it one source after the other, and queue its results."""
+
+    def __init__(self, decoder: Decoder, n_workers: int) -> None:
+        self._decoder = decoder
+        self._n_workers = n_workers
+        self._tasks: SimpleQueue[tuple[Source, _Results] | None] = SimpleQueue()
+        self._may_decode = Semaphore(n_workers)
+        self._lock = Lock()
+        self._workers = [_Worker(decoder) for _ in range(n_workers)]
+        self._closed = False
+        for worker in self._workers:
+            Thread(target=self._serve, args=(worker,), daemon=True).start()
+
+    def submit(self, source: Source) -> _Results:
+        """Have a source decoded; returns the queue of its results, with a None behind the last."""
+        results: _Results = SimpleQueue()
+        self._tasks.put((source, results))
+        return results
+
+    def close(self) -> None:
+        """End the workers, whatever they do."""
+        self._closed = True
+        for worker in self._workers:
+            self._tasks.put(None)
+            worker.close()
+
+    def _serve(self, worker: _Worker) -> None:
+        for source, results in iter(self._tasks.get, None):
+            try:
+                for result in () if self._closed else self._decode(worker, source):
+                    results.put(result)
+            except Exception as error:
+                results.put(error)
+            results.put(None)
+
+    def _decode(self, worker: _Worker, source: Source) -> Iterator[FrameResult]:
+        """Results of a source, if need be in a second attempt, which repeats none of the first."""
+        count = 0
+        for attempt in (self._may_decode, self._alone()):
+            try:
+                with attempt:
+                    for result in islice(worker.results(source), count, None):
+                        yield result
+                        count += 1
+                return
+            except _WorkerDiedError as death:
+                ending = death.args[0]
+            if self._closed:
+                return
+            if attempt is self._may_decode:
+                log.warning("%s: the process that decoded it %s; it is tried again", source.name, ending)
+        message = f"{source.name}: two processes that decoded it died, the last one {ending}; try it by itself"
+        yield replace(unreadable(source, count, message), retry=True)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """While no other worker decodes."""
+        with self._lock:
+            for _ in range(self._n_workers):
+                self._may_decode.acquire()
+        try:
+            yield
+        finally:
+            self._may_decode.release(self._n_workers)
+
+
+class _WorkerDiedError(Exception):
+    """A worker ended with a source in hand; its argument says how."""
 
 
 @dataclass(slots=True)
 class _Worker:
-    process: BaseProcess
-    connection: Connection
-    #: Index of the source in hand, None while idle.
-    index: int | None = None
-    #: Results of that source that another worker has given, and are still to come again.
-    skip: int = 0
-    #: Whether the others rest meanwhile.
-    alone: bool = False
+    """A process that decodes one source after the other; started when it is needed, and again after its death."""
 
+    decoder: Decoder
+    process: BaseProcess | None = None
+    connection: Connection | None = None
+    closed: bool = False
+    lock: Lock = field(default_factory=Lock)
 
-class _Finished:
-    """Sent by a worker after the last result of a source."""
+    def results(self, source: Source) -> Iterator[FrameResult]:
+        """The results of a source as they come.
 
-
-@dataclass(slots=True)
-class _Buffer:
-    """Results of one source that have come and were not taken yet."""
-
-    results: deque[FrameResult] = field(default_factory=deque)
-    #: Results that have come at all.
-    count: int = 0
-    complete: bool = False
-    #: Workers that died with the source in hand.
-    deaths: int = 0
-
-
-class _Pool:
-    def __init__(self, sources: Sequence[Source], decoder: Decoder, n_workers: int) -> None:
-        self._sources = sources
-        self._decoder = decoder
-        self._n_workers = n_workers
-        self._workers: list[_Worker] = []
-        self._buffers: dict[int, _Buffer] = {}
-        self._next = 0
-        self._taking = 0
-        #: Sources whose worker died.
-        self._again: deque[int] = deque()
-
-    def __enter__(self) -> _Pool:
-        self._fill()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        for worker in self._workers:
-            worker.connection.close()
-            worker.process.kill()  # it has nothing of its own, and passes over gentler signals
-        for worker in self._workers:
-            worker.process.join()
-
-    def results(self, index: int) -> Iterator[FrameResult]:
-        self._taking = index
-        self._fill()
-        buffer = self._buffers.setdefault(index, _Buffer())
-        while True:
-            while buffer.results:
-                yield buffer.results.popleft()
-            if buffer.complete:
-                del self._buffers[index]
-                return
-            self._wait()
-
-    def _fill(self) -> None:
-        """Give every idle worker a source, and start workers where some are missing."""
-        if self._again:
-            if all(worker.index is None for worker in self._workers):
-                self._assign(self._workers[0] if self._workers else self._started(), self._again.popleft())
-            return
-        if any(worker.alone for worker in self._workers):
-            return
-        while len(self._workers) < self._n_workers and self._may_assign():
-            self._started()
-        for worker in self._workers:
-            if worker.index is None and self._may_assign():
-                self._assign(worker, self._next)
-                self._next += 1
-
-    def _may_assign(self) -> bool:
-        return self._next < min(len(self._sources), self._taking + _AHEAD * self._n_workers)
-
-    def _started(self) -> _Worker:
-        with environment(ONE_THREAD), _signals_held():
-            self._workers.append(_Worker(*start_process(_work, self._decoder, log_level())))
-        return self._workers[-1]
-
-    def _assign(self, worker: _Worker, index: int) -> None:
-        buffer = self._buffers.setdefault(index, _Buffer())
-        worker.index, worker.skip, worker.alone = index, buffer.count, buffer.deaths > 0
+        Raises:
+            _WorkerDiedError: the process died first.
+            ReceiverError: of the worker.
+        """
+        process, connection = self._started()
         try:
-            worker.connection.send(self._sources[index])
-        except OSError:
-            log.debug("worker %s is gone", worker.process.pid)  # the next wait finds its connection closed
+            connection.send(source)
+            while (message := connection.recv()) is not None:
+                if isinstance(message, Exception):
+                    raise message
+                yield message
+        except (EOFError, OSError):
+            process.join()
+            connection.close()
+            self.process = None
+            raise _WorkerDiedError(_ending(process.exitcode)) from None
 
-    def _wait(self) -> None:
-        """Take what the workers send, waiting for the first of it."""
-        from multiprocessing.connection import wait
+    def _started(self) -> tuple[BaseProcess, Connection]:
+        with self.lock:
+            if self.closed:
+                raise _WorkerDiedError("was ended")
+            if self.process is None or self.connection is None:
+                _hold_signals(signal.SIG_BLOCK)  # in this thread, and in the process until it ignores them
+                self.process, self.connection = start_process(_work, self.decoder, log_level())
+            return self.process, self.connection
 
-        busy = {worker.connection: worker for worker in self._workers if worker.index is not None}
-        for connection in wait(list(busy)):
-            worker = busy[connection]  # type: ignore[index]
-            try:
-                self._take(worker, worker.connection.recv())
-            except (EOFError, ConnectionResetError):
-                self._bury(worker)
-        self._fill()
-
-    def _take(self, worker: _Worker, message: object) -> None:
-        if isinstance(message, Exception):
-            raise message
-        assert worker.index is not None
-        buffer = self._buffers[worker.index]
-        if not isinstance(message, FrameResult):
-            buffer.complete = True
-            worker.index, worker.alone = None, False
-        elif worker.skip:
-            worker.skip -= 1
-        else:
-            buffer.results.append(message)
-            buffer.count += 1
-
-    def _bury(self, worker: _Worker) -> None:
-        """Take a dead worker's source up again, or put it down as unreadable where it is the second to die of it."""
-        worker.connection.close()
-        worker.process.join()
-        self._workers.remove(worker)
-        assert worker.index is not None
-        source, buffer = self._sources[worker.index], self._buffers[worker.index]
-        ending = _ending(worker.process.exitcode)
-        buffer.deaths += 1
-        if buffer.deaths == 1:
-            log.warning("%s: the process that decoded it %s; it is tried again", source.name, ending)
-            self._again.append(worker.index)
-            return
-        message = f"{source.name}: two processes that decoded it died, the last one {ending}; try it by itself"
-        buffer.results.append(replace(unreadable(source, buffer.count, message), retry=True))
-        buffer.complete = True
+    def close(self) -> None:
+        """End the process, which has nothing of its own and ignores gentler signals; none is started any more."""
+        with self.lock:
+            self.closed = True
+            if self.process is not None:
+                self.process.kill()
+                self.process.join()
 
 
 def _ending(exitcode: int | None) -> str:
@@ -423,7 +418,7 @@ def _ending(exitcode: int | None) -> str:
 
 
 def _work(connection: Connection, decoder: Decoder, level: int) -> None:
-    """A worker's life: take a source, send its results, until the other end is closed."""
+    """A worker's life: take a source, send its results and a None, until the other end is closed."""
     for number in _FIRST_DECIDES:
         signal.signal(number, signal.SIG_IGN)
     _hold_signals(signal.SIG_UNBLOCK)
@@ -431,19 +426,15 @@ def _work(connection: Connection, decoder: Decoder, level: int) -> None:
     use_one_thread()
     try:
         while True:
-            _send_results(connection, decoder, connection.recv())
+            source = connection.recv()
+            try:
+                for result in decoder.results(source):
+                    connection.send(result)
+            except ReceiverError as error:
+                connection.send(error)
+            connection.send(None)
     except (EOFError, OSError):
         return
-
-
-def _send_results(connection: Connection, decoder: Decoder, source: Source) -> None:
-    try:
-        for result in decoder.results(source):
-            connection.send(result)
-    except ReceiverError as error:
-        connection.send(error)
-    else:
-        connection.send(_Finished())
 
 
 def log_level() -> int:
@@ -456,16 +447,6 @@ def use_one_thread() -> None:
     import cv2
 
     cv2.setNumThreads(1)
-
-
-@contextmanager
-def _signals_held() -> Iterator[None]:
-    """While a worker starts, which inherits this, signals wait."""
-    _hold_signals(signal.SIG_BLOCK)
-    try:
-        yield
-    finally:
-        _hold_signals(signal.SIG_UNBLOCK)
 
 
 def _hold_signals(how: int) -> None:

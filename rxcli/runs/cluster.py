@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import os
-import time
 import warnings
-from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Thread
@@ -19,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, OutputError, ReceiverError, UsageError
 from rxcli.outputs import PICTURE, TAPS, check_replaceable, make_parent, write_whole
-from rxcli.runs.batch import Decoded, Decoder, Source, unreadable
+from rxcli.runs.batch import Decoded, Decoder, Source, in_order, unreadable
 from rxcli.types import FrameResult
 
 if TYPE_CHECKING:
@@ -31,10 +27,12 @@ log = logging.getLogger(__name__)
 _RETRIES = 3
 #: Tasks in the scheduler's hands at a time: enough for a large cluster, few enough that results do not pile up.
 _IN_FLIGHT = 1024
-#: Bytes of one source's taps: results wait in the memory of the cluster.
+#: Most bytes of one source's taps: results wait in the memory of the cluster.
 _MAX_TAPPED = 512 << 20
-#: A tapped file: the option that asks for it, its path below that option's folder, its bytes.
-_Tap = tuple[str, str, bytes]
+#: Dask is given so much longer to give up by itself, seconds.
+_MARGIN_S = 0.5
+#: A tapped file: its path below the name of the option that asks for it, and its bytes.
+_Tap = tuple[str, bytes]
 _Outcome = tuple[list[FrameResult], list[_Tap]]
 _START_ONE = "start one with `dask scheduler` and name its address, such as tcp://host:8786"
 
@@ -57,14 +55,15 @@ def decode_on_cluster(
         InputError: the scheduler went away, or its workers cannot decode; what was taken till then is complete.
     """
     with _connect(address, connect_s) as client:
-        waiting = iter(sources)
-        flying = deque((source, _submit(client, decoder, source)) for source in islice(waiting, _IN_FLIGHT))
-        while flying:
-            source, future = flying.popleft()
+
+        def submit(source: Source) -> Any:
+            task = replace(source, path=os.path.abspath(source.path))
+            return client.submit(_decode, decoder, task, pure=False, retries=_RETRIES)
+
+        for source, future in in_order(sources, submit, _IN_FLIGHT):
             results, taps = _await(source, future, address)
             _write(taps, decoder)
             yield source, iter(results)
-            flying.extend((following, _submit(client, decoder, following)) for following in islice(waiting, 1))
 
 
 def _connect(address: str, connect_s: float) -> Client:
@@ -72,58 +71,25 @@ def _connect(address: str, connect_s: float) -> Client:
         from distributed import Client
     except ImportError:
         raise UsageError("--cluster needs the package distributed", "pip install '.[cluster]'") from None
-    end_s = time.monotonic() + connect_s
-    problem = _problem_at(address, connect_s)
-    if problem is not None:
-        raise UsageError(f"--cluster: no Dask scheduler answers at {address!r} ({problem})", _START_ONE)
-    try:
-        with _silent():
-            client = Client(address, timeout=max(end_s - time.monotonic(), 0.1), set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise UsageError(
-            f"--cluster: no Dask scheduler answers at {address!r} ({type(error).__name__})", _START_ONE
-        ) from None
+    made: list[Client | Exception] = []
+
+    def connect() -> None:
+        try:
+            made.append(Client(address, timeout=connect_s, set_as_default=False))
+        except Exception as error:  # Dask, its transports and TLS raise some ten unrelated types
+            made.append(error)
+
+    # A name that is looked up in vain, or a server that accepts and is silent, is left behind with its thread.
+    connecting = Thread(target=connect, daemon=True)
+    with _silent():
+        connecting.start()
+        connecting.join(connect_s + _MARGIN_S)
+    client = made[0] if made else TimeoutError(f"nothing within {connect_s:g} s")
+    if isinstance(client, Exception):
+        raise UsageError(f"--cluster: no Dask scheduler answers at {address!r} ({_first_line(client)})", _START_ONE)
     if not client.scheduler_info()["workers"]:
         log.warning("the scheduler at %s has no workers yet; waiting for some (`dask worker %s`)", address, address)
     return client
-
-
-def _problem_at(address: str, connect_s: float) -> str | None:
-    """Why no scheduler answers; None where one does. Dask itself would try again and again, and say so at length."""
-    outcome: list[str | None] = []
-
-    def ask() -> None:
-        try:
-            kind = asyncio.run(asyncio.wait_for(_kind_at(address), connect_s))
-            outcome.append(None if kind == "Scheduler" else f"that is a {kind}")
-        except TimeoutError:
-            return
-        except Exception as error:  # Dask, its transports and TLS raise some ten unrelated types
-            outcome.append(_first_line(error))
-
-    # A name that is looked up in vain, or a server that accepts and is silent, is left behind with its thread.
-    asker = Thread(target=ask, daemon=True)
-    with _silent():
-        asker.start()
-        asker.join(connect_s)
-    return outcome[0] if outcome else f"nothing within {connect_s:g} s"
-
-
-async def _kind_at(address: str) -> str:
-    """What the Dask server at an address says that it is."""
-    from distributed.comm import connect
-    from distributed.comm.addressing import get_address_host_port
-    from distributed.security import Security
-
-    if not 0 < int(get_address_host_port(address, strict=True)[1] or 0) < 1 << 16:
-        raise ValueError("that is no address with a port")
-    comm = await connect(address, **Security().get_connection_args("client"))
-    try:
-        await comm.write({"op": "identity", "reply": True})
-        answer = await comm.read()
-    finally:
-        comm.abort()
-    return str(answer.get("type")) if isinstance(answer, dict) else "server of another kind"
 
 
 def _first_line(error: BaseException) -> str:
@@ -134,30 +100,21 @@ def _first_line(error: BaseException) -> str:
 @contextmanager
 def _silent() -> Iterator[None]:
     """Without the tracebacks that Dask logs of attempts that fail."""
-    loggers = [logging.getLogger(name) for name in ("distributed", "asyncio", "tornado")]
-    levels = [logger.level for logger in loggers]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for logger in loggers:
-            logger.setLevel(logging.CRITICAL + 1)
-        try:
+    logging.disable()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             yield
-        finally:
-            for logger, level in zip(loggers, levels, strict=True):
-                logger.setLevel(level)
-
-
-def _submit(client: Client, decoder: Decoder, source: Source) -> Any:
-    task = replace(source, path=os.path.abspath(source.path))
-    return client.submit(_decode, decoder, task, pure=False, retries=_RETRIES)
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def _decode(decoder: Decoder, source: Source) -> _Outcome:
     """Decode a source on a worker; what is tapped comes back with the results, for the disk may be another one."""
-    if not _folders(decoder):
-        return list(decoder.results(source)), []
     with TemporaryDirectory(prefix="vlc-rx-") as scratch:
-        results = list(_tapping_into(decoder, Path(scratch)).results(source))
+        for option in _folders(decoder):
+            decoder = _tapping_into(decoder, option, Path(scratch) / option)
+        results = list(decoder.results(source))
         return results, _collect(Path(scratch), source)
 
 
@@ -170,15 +127,12 @@ def _folders(decoder: Decoder) -> dict[str, Path]:
     return {option: folder for option, folder in folders.items() if folder is not None}
 
 
-def _tapping_into(decoder: Decoder, scratch: Path) -> Decoder:
-    """The decoder with its taps in folders of `scratch`, called as the options are."""
-    there = {option: scratch / option for option in _folders(decoder)}
-    if "--dump-dir" in there:
-        decoder = replace(decoder, options=replace(decoder.options, dump_dir=there["--dump-dir"]))
-    if "--save-undistorted" in there:
-        tap: Any = decoder.tap
-        decoder = replace(decoder, tap=replace(tap, folder=there["--save-undistorted"]))
-    return decoder
+def _tapping_into(decoder: Decoder, option: str, folder: Path) -> Decoder:
+    """The decoder with the taps of one option in another folder."""
+    if option == "--dump-dir":
+        return replace(decoder, options=replace(decoder.options, dump_dir=folder))
+    tap: Any = decoder.tap
+    return replace(decoder, tap=replace(tap, folder=folder))
 
 
 def _collect(scratch: Path, source: Source) -> list[_Tap]:
@@ -186,13 +140,11 @@ def _collect(scratch: Path, source: Source) -> list[_Tap]:
     paths = sorted(path for path in scratch.rglob("*") if path.is_file())
     size = sum(path.stat().st_size for path in paths)
     if size > _MAX_TAPPED:
-        reason = f"{source.name}: its taps take {size >> 20} MB; a cluster sends at most {_MAX_TAPPED >> 20} MB"
+        reason = (
+            f"{source.name}: its taps take {size >> 20} MB, {_MAX_TAPPED >> 20} are the most that a cluster sends"
+        )
         raise OutputError(reason, "decode this file without --cluster")
-    found = []
-    for path in paths:
-        option, *below = path.relative_to(scratch).parts
-        found.append((option, "/".join(below), path.read_bytes()))
-    return found
+    return [(str(path.relative_to(scratch)), path.read_bytes()) for path in paths]
 
 
 def _write(taps: list[_Tap], decoder: Decoder) -> None:
@@ -203,10 +155,10 @@ def _write(taps: list[_Tap], decoder: Decoder) -> None:
     """
     folders = _folders(decoder)
     looks = {"--dump-dir": TAPS, "--save-undistorted": PICTURE}
-    for option, below, data in taps:
-        folder = folders[option]
-        path = folder / below
-        if not path.resolve().is_relative_to(folder.resolve()):
+    for place, data in taps:
+        option, below = place.split(os.sep, 1)
+        path = folders[option] / below
+        if not path.resolve().is_relative_to(folders[option].resolve()):
             raise OutputError(f"{path}: a worker names a file outside {option}", "look at who joins the cluster")
         make_parent(path)
         check_replaceable(path, looks[option], option)

@@ -153,7 +153,7 @@ def test_resuming_with_other_options_or_changed_files_is_refused(tmp_path: Path,
     assert "--min-confidence was null, is 0.5" in refused("--min-confidence", "0.5")
     assert "--cae was" in refused("--cae", "never")
     os.utime(folder / "1.png", (1, 1))
-    assert f"{folder / '1.png'} has changed (modified was" in refused()
+    assert f"{folder / '1.png'} has changed (modified_s was" in refused()
     write_frame(folder / "1.png", 9)
     assert f"{folder / '1.png'} has changed" in refused()
     (folder / "1.png").unlink()

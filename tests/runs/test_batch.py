@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from fake_receiver import fake_decoder
 from rxcli.errors import InputError, UsageError
 from rxcli.results.record import from_record, to_json_line
 from rxcli.runs.batch import Source, collect_sources, decode_here, decode_in_processes, unreadable
-from rxcli.runs.journal import Head, Journal, Lines, recover
+from rxcli.runs.journal import Head, Journal, Lines
 from rxcli.types import FrameResult
 
 SUFFIXES = frozenset({".jpg", ".mp4"})
@@ -139,51 +140,57 @@ def results_of(names: str) -> list[FrameResult]:
     return found
 
 
-@pytest.mark.parametrize("cut", range(0, 60, 7))
-def test_recover_drops_a_half_line_and_the_source_it_belongs_to(tmp_path: Path, cut: int) -> None:
-    path = tmp_path / "out.jsonl"
-    journal = Journal(path)
-    for result in results_of("aabccc"):
-        journal.write(result)
-    journal.close()
-    whole = path.read_bytes()
-    path.write_bytes(whole[: len(whole) - cut])
-    assert [(name, len(found)) for name, found in recover(path)] == [("a", 2), ("b", 1)]
-    assert path.read_bytes() == b"".join(line for line in whole.splitlines(True)[:3])
-
-
-@pytest.mark.parametrize("names", ["aabccc", "baac", "aacb", "b", "abc"])
-def test_recover_leaves_out_sources_whose_decoder_was_killed(tmp_path: Path, names: str) -> None:
-    """`b` is to be tried again; the others stay as they are, behind what the first line says of the run."""
-    path = tmp_path / "out.jsonl"
+def write_journal(path: Path, names: str) -> bytes:
+    """A journal of one frame per letter of `names`, of which the decoder of `d` was killed."""
     journal, made = Journal(path), Lines(Head("1", {"cae": "auto"}), {})
     found = results_of(names)
     for result, following in zip(found, [*found[1:], None], strict=True):
         made.begin(result.source)
         last = following is None or following.source != result.source
-        journal.append(made.line(replace(result, retry=result.source == "b"), last))
-    kept = [name for name in dict.fromkeys(names) if name != "b"]
-    assert [name for name, _ in recover(path)] == kept
+        journal.append(made.line(replace(result, retry=result.source == "d"), last))
+    journal.close()
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("cut", range(0, 60, 7))
+def test_recover_drops_a_half_line_and_the_source_it_belongs_to(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "out.jsonl"
+    whole = write_journal(path, "aabccc")
+    path.write_bytes(whole[: len(whole) - cut])
+    n_kept = 3 if cut else 6
+    journal = Journal(path, resume=True)
+    assert [(name, len(found)) for name, found in journal.recover()] == [("a", 2), ("b", 1), ("c", 3)][
+        : n_kept // 3 + 1
+    ]
+    journal.close()
+    assert path.read_bytes() == b"".join(whole.splitlines(True)[:n_kept])
+
+
+@pytest.mark.parametrize("names", ["aadccc", "daac", "aacd", "d", "adc"])
+def test_recover_leaves_out_sources_whose_decoder_was_killed(tmp_path: Path, names: str) -> None:
+    """`d` is to be tried again; the others stay as they are, behind what the first line says of the run."""
+    path = tmp_path / "out.jsonl"
+    write_journal(path, names)
+    kept = [name for name in dict.fromkeys(names) if name != "d"]
+    journal = Journal(path, resume=True)
+    assert [name for name, _ in journal.recover()] == kept
     records = [json.loads(line) for line in path.read_text().splitlines()]
-    assert [record["source"] for record in records] == [name for name in names if name != "b"]
+    assert [record["source"] for record in records] == [name for name in names if name != "d"]
     assert ["run" in record for record in records] == [place == 0 for place in range(len(records))]
-    journal.follow()
+    with pytest.raises(UsageError, match="another run"):
+        Journal(path, resume=True)
     journal.append("more")
     journal.close()
     assert path.read_text().endswith("more\n")
     assert [path.name for path in tmp_path.iterdir()] == ["out.jsonl"]
 
 
-def test_recover_of_a_file_that_is_not_there_starts_afresh(tmp_path: Path) -> None:
-    assert list(recover(tmp_path / "none.jsonl")) == []
-
-
 @pytest.mark.parametrize("text", ["hello\nworld\n", "hello", "{}\n", '[1, 2]\n{"source": 3}\n', "null\n"])
 def test_recover_leaves_a_foreign_file_alone(tmp_path: Path, text: str) -> None:
     path = tmp_path / "letter.txt"
     path.write_text(text)
-    with pytest.raises(UsageError, match="line 1"):
-        list(recover(path))
+    with closing(Journal(path, resume=True)) as journal, pytest.raises(UsageError, match="line 1"):
+        list(journal.recover())
     assert path.read_text() == text
 
 
@@ -192,7 +199,7 @@ def test_a_journal_that_cannot_be_written_says_so(tmp_path: Path) -> None:
         Journal(tmp_path / "no such folder" / "out.jsonl")
     full = Journal(Path("/dev/full"))
     with pytest.raises(InputError, match="No space left"):
-        full.write(results_of("a")[0])
+        full.append("a line")
     full.close()
 
 
@@ -201,14 +208,17 @@ import sys
 from pathlib import Path
 from fake_receiver import fake_decoder
 from rxcli.runs.batch import collect_sources, decode_here
-from rxcli.runs.journal import Journal, recover
+from rxcli.runs.batch import with_last
+from rxcli.runs.journal import Head, Journal, Lines
 folder, out = sys.argv[1], Path(sys.argv[2])
-done = {name for name, _ in recover(out)}
 journal = Journal(out, resume=True)
+done = {name for name, _ in journal.recover()}
+lines = Lines(Head("1", {}), {}, begun=bool(done))
 sources = collect_sources([folder], frozenset({".jpg", ".mp4"}))
 for source, results in decode_here([s for s in sources if s.name not in done], fake_decoder()):
-    for result in results:
-        journal.write(result)
+    lines.begin(source.name)
+    for result, last in with_last(results):
+        journal.append(lines.line(result, last))
 """
 
 
@@ -239,4 +249,4 @@ def test_a_run_killed_again_and_again_ends_with_the_same_lines(tmp_path: Path) -
         assert all(from_record(json.loads(line)) for line in text.splitlines())
     assert n_killed >= 3
     assert start_run(folder, out).wait() == 0
-    assert out.read_text().splitlines() == undisturbed
+    assert [to_json_line(from_record(json.loads(line))) for line in out.read_text().splitlines()] == undisturbed

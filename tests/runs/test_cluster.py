@@ -136,7 +136,7 @@ KINDS = (("straight", ".00000.png"), ("taps", "-000000.npz"))
 def test_a_worker_names_no_file_elsewhere(tmp_path: Path) -> None:
     decoder = replace(fake_decoder(), options=SimpleNamespace(dump_dir=tmp_path / "taps"))
     with pytest.raises(OutputError, match="a worker names a file outside --dump-dir"):
-        cluster._write([("--dump-dir", "../other.npz", b"")], decoder)
+        cluster._write([("--dump-dir/../other.npz", b"")], decoder)
     assert not list(tmp_path.iterdir())
 
 
