@@ -140,9 +140,7 @@ def _collect(scratch: Path, source: Source) -> list[_Tap]:
     paths = sorted(path for path in scratch.rglob("*") if path.is_file())
     size = sum(path.stat().st_size for path in paths)
     if size > _MAX_TAPPED:
-        reason = (
-            f"{source.name}: its taps take {size >> 20} MB, {_MAX_TAPPED >> 20} are the most that a cluster sends"
-        )
+        reason = f"{source.name}: its taps take {size >> 20} MB; a cluster sends at most {_MAX_TAPPED >> 20} MB"
         raise OutputError(reason, "decode this file without --cluster")
     return [(str(path.relative_to(scratch)), path.read_bytes()) for path in paths]
 
