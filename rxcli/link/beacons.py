@@ -15,7 +15,10 @@ from rxcli.types import FrameSoftBits, MessageKind
 
 #: Information from which on a beacon is tried, and by how much it must have grown to be tried again, in its bits.
 _TRY_FROM, _TRY_AGAIN, _TRY_UP_TO = 1.02, 0.08, 2.5
-_ITERATIONS, _PATIENCE = 25, 6
+_ITERATIONS, _PATIENCE = 25, ldpc.Patience(6, 0.95)
+#: Information per sent bit from which parity alone shows that there is no codeword, and share of unsatisfied checks
+#: that shows it: half of them are by chance, a quarter of those of a codeword seen so well.
+_WELL_SEEN, _NO_CODEWORD = 0.9, 0.4
 #: Bursts less alike than this, a log-likelihood, are not of one message; so are copies within one.
 _NOT_ALIKE = -8.0
 #: A first look takes only every so manieth column and bit.
@@ -150,7 +153,10 @@ class BeaconSearch:
     def _try(self, now: _Round) -> None:
         if now.found is not None or not self._worth_while(now):
             return
+        n_seen = np.count_nonzero(now.total)
         for layout in self._layouts[len(now.total)]:
+            if n_seen < _TRY_FROM * layout.code.k:
+                continue
             for phase in range(len(now.total)):
                 now.found = self._tried(now, layout, phase)
                 if now.found is not None:
@@ -196,15 +202,19 @@ def read_words(layout: BeaconLayout, buffers: Float32, accept: object = None) ->
     """Decode buffers (n, n_bits) of a layout; None where nothing is found that is as likely as it should be."""
     found: list[bytes | None] = [None] * len(buffers)
     check = unprotect_beacon if accept is None else accept
+    well_seen = information(buffers).mean(axis=1) > _WELL_SEEN
+    unsatisfied = ldpc.sent_parity(layout.code, (buffers > 0).astype(np.uint8))
+    tried = np.flatnonzero(~well_seen | (unsatisfied < _NO_CODEWORD))
 
     def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
         good = np.zeros(places.size, bool)
-        for i, (place, coded) in enumerate(zip(places, np.packbits(bits, axis=1), strict=True)):
+        for i, (place, coded) in enumerate(zip(tried[places], np.packbits(bits, axis=1), strict=True)):
             if check(coded.tobytes()) is not None and is_likely(layout, bits[i], buffers[place]):  # type: ignore[operator]
                 found[place], good[i] = coded.tobytes(), True
         return good
 
-    ldpc.decode(layout.code, ldpc.quantised(buffers), accepted, _ITERATIONS, _PATIENCE)
+    if tried.size:
+        ldpc.decode(layout.code, ldpc.quantised(buffers[tried]), accepted, _ITERATIONS, _PATIENCE)
     return found
 
 

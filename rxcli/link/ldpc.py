@@ -28,6 +28,9 @@ _MAX_MESSAGE = 1000
 #: A ratio of filler bits, which are known.
 _KNOWN = 8000
 
+#: Rows of checks that are enough to tell a codeword from other bits.
+_MAX_CHECKS = 6
+
 Bits = NDArray[np.uint8]
 Edge = tuple[int, int]
 
@@ -150,6 +153,53 @@ def _solve_core(code: Code, coded: Bits) -> None:
                 solved.add(column)
 
 
+def sent_parity(code: Code, bits: Bits) -> NDArray[np.float64]:
+    """Share of the parity checks on sent bits alone that hard decisions leave unsatisfied: about half by chance.
+
+    Args:
+        code: the code.
+        bits: (batch, n) uint8 of 0/1, the first n bits of the buffer.
+
+    Returns:
+        (batch,) 0 where no check is on these bits alone.
+    """
+    batch, n_bits = bits.shape
+    sent = code.k - _PUNCTURED * code.z
+    n_parity = max(n_bits - sent, 0) // code.z
+    checks = _sent_checks(code, n_parity)
+    if not checks or not n_parity:
+        return np.zeros(batch)
+    coded = np.zeros((batch, code.information_columns + n_parity, code.z), np.uint8)
+    flat = coded.reshape(batch, -1)
+    flat[:, _PUNCTURED * code.z : code.k] = bits[:, :sent]
+    flat[:, code.information_columns * code.z :] = bits[:, sent : sent + n_parity * code.z]
+    return np.asarray(np.mean([_sum(coded, list(edges)).mean(axis=1) for edges in checks], axis=0))
+
+
+@cache
+def _sent_checks(code: Code, n_parity: int) -> tuple[tuple[Edge, ...], ...]:
+    """The lightest checks on sent bits of the first parity columns: rows from which the unsent columns are taken off by
+    adding the lightest row that has only that unsent column."""
+    known = code.information_columns + n_parity
+    rows = sorted((row for row in code.rows if max(column for column, _ in row) < known), key=len)
+    unsent = [[column for column, _ in row if column < _PUNCTURED] for row in rows]
+    pivots = {columns[0]: row for row, columns in reversed(list(zip(rows, unsent, strict=True))) if len(columns) == 1}
+    checks = []
+    for row, columns in zip(rows, unsent, strict=True):
+        if row not in pivots.values() and all(column in pivots for column in columns):
+            for column in columns:
+                row = _without(row, column, pivots[column], code.z)
+            checks.append(row)
+    return tuple(sorted(checks, key=len)[:_MAX_CHECKS])
+
+
+def _without(row: tuple[Edge, ...], column: int, pivot: tuple[Edge, ...], z: int) -> tuple[Edge, ...]:
+    """The sum of two rows of checks, the second turned so that a column that both have takes no part."""
+    turn = dict(row)[column] - dict(pivot)[column]
+    both = [*row, *((c, (shift + turn) % z) for c, shift in pivot)]
+    return tuple(edge for edge in both if both.count(edge) == 1)
+
+
 #: Asked of hard decisions: (batch places (n,), information bits (n, k)) -> which of them are accepted, (n,) bool.
 Accept = Callable[[NDArray[np.int64], Bits], NDArray[np.bool_]]
 
@@ -159,8 +209,22 @@ def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
     return np.asarray(np.clip(np.rint(llr / LLR_STEP), -_MAX_INPUT, _MAX_INPUT), np.int8)
 
 
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """When a block is given up as no codeword: the share of checks it leaves unsatisfied does not fall."""
+
+    #: Iterations after which the share is compared with that after the first one.
+    iterations: int
+    #: Share after these over the share after the first one, from which the block is given up.
+    max_ratio: float
+
+
 def decode(
-    code: Code, buffer_llr: NDArray[np.int8], accept: Accept, max_iterations: int = 22, patience: int | None = None
+    code: Code,
+    buffer_llr: NDArray[np.int8],
+    accept: Accept,
+    max_iterations: int = 22,
+    patience: Patience | None = None,
 ) -> NDArray[np.bool_]:
     """Layered normalised min-sum over a batch of blocks, in 16-bit numbers; stops where `accept` says so.
 
@@ -171,8 +235,7 @@ def decode(
         buffer_llr: (batch, M) int8: ln p(1)/p(0) in steps of `LLR_STEP` of the first M bits of the buffer, 0 unseen.
         accept: told the places in the batch and the information bits as they stand after every iteration.
         max_iterations: iterations at most.
-        patience: iterations after which a block is given up whose checks are no better satisfied than by chance; None
-            to go on to the end.
+        patience: when to give a block up; None to go on to the end.
 
     Returns:
         (batch,) which blocks were accepted.
@@ -182,28 +245,29 @@ def decode(
     places = np.arange(buffer_llr.shape[0])
     accepted = np.zeros(places.size, bool)
     still = np.ones(places.size, bool)
+    first_share = np.ones(places.size)
     for iteration in range(1, max_iterations + 1):
         layers.update()
+        if iteration == 1 and patience is not None:
+            first_share = layers.unsatisfied()
         if iteration == 1 and max_iterations > 1:
             continue
         which = np.flatnonzero(still)
         good = accept(places[which], layers.information(which))
         accepted[places[which[good]]] = True
         still[which[good]] = False
-        if iteration == patience:
-            still &= layers.unsatisfied() < _HOPELESS
+        if patience is not None and iteration == patience.iterations:
+            still &= layers.unsatisfied() < patience.max_ratio * first_share
         if not still.any():
             break
         if still.mean() < _CROWDED:
             layers.keep(still)
-            places, still = places[still], still[still]
+            places, first_share, still = places[still], first_share[still], still[still]
     return accepted
 
 
 #: Blocks that are done go along until fewer than this share of the batch are not: to sort them out takes time too.
 _CROWDED = 0.7
-#: Share of checks that a block leaves unsatisfied after some iterations where it is no codeword at all.
-_HOPELESS = 0.33
 
 
 def _decoder_input(code: Code, buffer_llr: NDArray[np.int8], n_rows: int) -> NDArray[np.int16]:

@@ -175,7 +175,8 @@ def _clip_column(
 def snr_db_of_columns(snr: Float32Array) -> list[float | None]:
     """Median signal-to-noise ratio of each column's visible slots, dB; None where nothing is visible."""
     if (snr > 0).all():
-        return [float(db) for db in 10 * np.log10(np.maximum(np.median(snr, axis=1), 1e-6))]
+        median = snr[:, 0] if snr.shape[1] == 1 else np.median(snr, axis=1)
+        return [float(db) for db in 10 * np.log10(np.maximum(median, 1e-6))]
     return [_snr_db(column) for column in snr]
 
 
@@ -275,12 +276,14 @@ def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolA
     words = np.concatenate(
         [np.broadcast_to(posteriors.w[:, None], (*posteriors.index.shape[:2], 1)), posteriors.index], 2
     )
-    same_words = (words[:, :, None] == words[:, None]).all(axis=3)
-    two = same_words.sum(axis=2) == 2
+    like_next = (words[:, 1:] == words[:, :-1]).all(axis=2)
+    beside = np.zeros(words.shape[:2], bool)
+    if not like_next.any():
+        return beside
+    two = (words[:, :, None] == words[:, None]).all(axis=3).sum(axis=2) == 2
     db = np.array([-np.inf if value is None else value for value in snr_db])
-    beside = np.zeros(two.shape, bool)
-    beside[:, 1:] |= same_words[:, 1:, :-1].diagonal(axis1=1, axis2=2) & (db[1:] < db[:-1])
-    beside[:, :-1] |= same_words[:, :-1, 1:].diagonal(axis1=1, axis2=2) & (db[:-1] < db[1:])
+    beside[:, 1:] |= like_next & (db[1:] < db[:-1])
+    beside[:, :-1] |= like_next & (db[:-1] < db[1:])
     return np.asarray(two & beside)
 
 

@@ -97,8 +97,9 @@ def still_quality(posteriors: BurstPosteriors, confidence_features: FloatArray) 
 
 def _share_unsure(posteriors: BurstPosteriors) -> FloatArray:
     """(B, C) expected share of wrong bits, from the log-likelihood ratios of the bits."""
-    unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))  # symbols of fewer than 7 bits are padded with NaN
-    return np.asarray(np.nanmean(unsure, axis=(2, 3)))
+    known = ~np.isnan(posteriors.bit_llr)  # symbols of fewer than 7 bits are padded with NaN
+    unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))
+    return np.asarray(unsure.sum(axis=(2, 3), where=known) / known.sum(axis=(2, 3)))
 
 
 def clip_quality(burst: BurstInClip) -> Quality:
