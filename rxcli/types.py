@@ -94,6 +94,28 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
+class LightPlane:
+    """What is read of a frame, every pixel once: running sums along its rows at the borders of cells of some pixels."""
+
+    #: (N + 1, R) float32: sum of the values left of each border, on every row; a mosaic's are linear light already.
+    sums: Float32Array
+    #: Width of a cell, pixels; N cells across the picture, a last part of a cell left out.
+    cell_px: int
+    #: Pixels of a row.
+    width: int
+    #: Values of black and white.
+    black: float
+    white: float
+    #: Whether values are proportional to light.
+    is_linear: bool
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.sums.shape[1])
+
+
+@dataclass(frozen=True, slots=True)
 class Lens:
     """OpenCV's lens model of one picture, in its own pixels."""
 

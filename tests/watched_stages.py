@@ -12,11 +12,11 @@ from types import ModuleType
 from typing import Any
 
 from rxcli.lab.benchmark.cases import problems_in
-from rxcli.receiver import channel, sampling, sync
+from rxcli.receiver import channel, plane, sync
 from rxcli.receiver.decode import detect
 from rxcli.receiver.screen import geometry
 
-STAGES = (geometry, sampling, sync, channel, detect)
+STAGES = (geometry, plane, sync, channel, detect)
 
 
 @contextmanager

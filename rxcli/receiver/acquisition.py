@@ -2,54 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import camera as blind
-from rxcli.receiver import sampling, sync
+from rxcli.receiver import plane, sync
 from rxcli.receiver.context import FrameContext
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.types import Clock, FloatArray, IntArray, RowProfiles
 
 
 @dataclass(frozen=True, slots=True)
 class ColumnSampler:
-    """Row profiles of a screen's columns, and a function that reads more of them."""
+    """Row profiles of a screen's columns."""
 
     profiles: RowProfiles
-    #: Whether strips were read in pairs, as for an initial pass.
-    is_binned: bool = False
-    #: Reads all strips of some columns pixel by pixel, given the noise model; None if the profiles are complete.
-    read: Callable[[slice, tuple[float, float]], RowProfiles] | None = None
+    #: The same with strips binned in pairs, for the search and an initial pass.
+    binned: RowProfiles
 
-    @property
-    def n_binned_strips(self) -> int:
-        """Strips of a column in the initial pass, see `sync.binned_strips`."""
-        n_strips: int = self.profiles.light.shape[1]
-        return n_strips if self.is_binned or n_strips % 2 else n_strips // 2
-
-    def binned(self) -> RowProfiles:
-        """The profiles with strips binned in pairs."""
-        return self.profiles if self.is_binned else sync.binned_strips(self.profiles)
-
-    def in_depth(self, columns: NDArray[np.int64]) -> ColumnSampler:
-        """Read some columns pixel by pixel, strip by strip."""
-        if self.read is None or not columns.size:
-            return self
-        every = sync.unbinned_strips(self.profiles) if self.is_binned else self.profiles
-        names = [name for name in ("light", "inside", "count", "sensor_row") if getattr(every, name) is not None]
-        arrays = {name: getattr(every, name).copy() for name in names}
-        for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
-            part = slice(int(run[0]), int(run[-1]) + 1)
-            read = self.read(part, (every.noise_floor, every.noise_slope))
-            for name, array in arrays.items():
-                array[part] = getattr(read, name)
-        return ColumnSampler(replace(every, **arrays), read=self.read)
+    @classmethod
+    def of(cls, profiles: RowProfiles) -> ColumnSampler:
+        """Bin the strips of row profiles in pairs."""
+        return cls(profiles, sync.binned_strips(profiles))
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +56,11 @@ class Acquisition:
 
     def binned(self) -> Acquisition:
         """The acquisition with strips binned in pairs."""
-        return replace(self, sampler=ColumnSampler(self.sampler.binned(), is_binned=True))
+        return replace(self, sampler=ColumnSampler(self.sampler.binned, self.sampler.binned))
 
     def middle(self) -> Acquisition:
-        """The acquisition of the middle half of the columns."""
-        n_columns, profiles, rows = self.screen.columns, self.profiles, self.profiles.sensor_row
+        """The acquisition of the middle half of the columns, strips binned in pairs."""
+        n_columns, profiles, rows = self.screen.columns, self.sampler.binned, self.sampler.binned.sensor_row
         part = slice(n_columns // 4, n_columns - n_columns // 4)
         middle = replace(
             profiles,
@@ -93,7 +70,7 @@ class Acquisition:
             sensor_row=None if rows is None else rows[part],
         )
         clock = replace(self.clock, delay_slots=self.clock.delay_slots[part])
-        return replace(self, sampler=ColumnSampler(middle, self.sampler.is_binned), clock=clock)
+        return replace(self, sampler=ColumnSampler(middle, middle), clock=clock)
 
     def as_one_column(self) -> Acquisition:
         """The acquisition with every column as a strip of a single one."""
@@ -108,43 +85,22 @@ class Acquisition:
             sensor_row=None if rows is None else rows.mean(axis=1)[None],
         )
         clock = replace(self.clock, delay_slots=np.zeros(1))
-        return replace(self, sampler=ColumnSampler(strips, is_binned=True), clock=clock)
-
-    def in_depth(self, columns: NDArray[np.int64]) -> Acquisition:
-        """Read some columns pixel by pixel, strip by strip."""
-        sampler = self.sampler.in_depth(columns)
-        return self if sampler is self.sampler else replace(self, sampler=sampler)
+        return replace(self, sampler=ColumnSampler(strips, strips), clock=clock)
 
 
 def n_strips_of(corners: FloatArray, n_columns: int) -> int:
     """Number of lateral strips of a column, from its width."""
-    return sampling.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
+    return plane.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
 
 
-def sample_columns(context: FrameContext, n_columns: int, *, quick: bool = False) -> ColumnSampler:
-    """Sample the row profiles of a screen of `n_columns` columns in order of time.
-
-    With `quick`, columns of developed pictures are read pixel by pixel only on request, see `ColumnSampler.in_depth`.
-    """
-    frame, camera = context.frame, context.camera
-    quick = quick and sampling.is_coded(frame)
-    n_strips = n_strips_of(context.corners, n_columns)
-    is_binned = quick and n_strips >= sync_settings.min_binned_strips and n_strips % 2 == 0
-
-    def read(
-        columns: slice, noise: tuple[float, float] | None, n_strips: int = n_strips, quick: bool = False
-    ) -> RowProfiles:
-        outlines = geometry.column_outlines(
-            context.corners, n_columns, n_strips, frame.width, frame.height, camera.lens, columns
-        )
-        profiles = context.timer.rows.sample(
-            frame, outlines, camera.tone, quick=quick, noise=noise, first_column=columns.start
-        )
-        return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
-
+def sample_columns(context: FrameContext, n_columns: int) -> ColumnSampler:
+    """Sample the row profiles of a screen of `n_columns` columns in order of time."""
+    frame, camera, corners = context.frame, context.camera, context.corners
+    n_strips = n_strips_of(corners, n_columns)
     with context.timer("sampling"):
-        profiles = read(slice(0, n_columns), None, n_strips // 2 if is_binned else n_strips, quick)
-    return ColumnSampler(profiles, is_binned, read if quick else None)
+        outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, camera.lens)
+        profiles = context.timer.planes.sample(frame, outlines, camera.tone)
+        return ColumnSampler.of(blind.in_time_order(profiles, frame.height) if camera.reversed else profiles)
 
 
 def noise_of(profiles: RowProfiles) -> float:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.camera import CameraHypothesis
-from rxcli.receiver.sampling import RowStore
+from rxcli.receiver.plane import PlaneStore
 from rxcli.types import FloatArray, Frame, Lens
 
 DEFAULT_TONE = "srgb"
@@ -75,11 +75,11 @@ class Failure:
 
 
 class Timer:
-    """Wall time by stage; and what was read of the frame's pixels meanwhile."""
+    """Wall time by stage; and the plane that was read of the frame meanwhile."""
 
     def __init__(self) -> None:
         self.timing_ms: dict[str, float] = {}
-        self.rows = RowStore()
+        self.planes = PlaneStore()
         self._start = time.perf_counter()
 
     @contextmanager

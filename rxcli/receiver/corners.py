@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +10,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.cameras import known_lens
 from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
+from rxcli.receiver.plane import turned
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.find import BRIGHTEN, ColumnLayout, find_outlines, thinned, why_useless
 from rxcli.receiver.settings import SETTINGS
@@ -41,7 +40,7 @@ def proposed_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> l
     found = possible_outlines(frame, options, timer)
     if found:
         return found
-    reason = turned_pixels(frame, layouts_of(options)) or reason_for_none(frame)  # Pixels may lie on their side.
+    reason = turned_pixels(frame, options, timer) or reason_for_none(frame)  # Pixels may lie on their side.
     if "no_screen" in options.skip or not may_fill(frame):
         return Failure("no_screen", f"no screen found: {reason}")
     return [Outline(whole_picture(frame), inferred=geometry.SIDE_NAMES, column_offset=None)]
@@ -50,9 +49,8 @@ def proposed_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> l
 def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[Outline]:
     """Outlines that the finder proposes."""
     layouts = layouts_of(options)
-    period = 1 if frame.mosaic is None else frame.mosaic.pattern.shape[1]
     with timer("geometry"):
-        found = find_outlines(frame.pixels, layouts, mosaic_period=period, lens=known_lens(frame, options))
+        found = find_outlines(timer.planes.plane(frame), layouts, known_lens(frame, options))
     alone = sum(not one.is_narrow for one in layouts) == 1
     outlines = [
         Outline(
@@ -131,10 +129,9 @@ def whole_picture(frame: Frame) -> FloatArray:
     return geometry.viewer_order(corners, frame.metadata.orientation)
 
 
-def turned_pixels(frame: Frame, layouts: Sequence[ColumnLayout]) -> str | None:
+def turned_pixels(frame: Frame, options: ReceiverOptions, timer: Timer) -> str | None:
     """What to say of a picture whose pixels lie on their side; None where they do not. Of a clip the first is asked."""
-    turned: Any = np.ascontiguousarray(frame.pixels.T)
-    if frame.index or not find_outlines(turned, layouts):
+    if frame.index or not find_outlines(turned(timer.planes.plane(frame)), layouts_of(options)):
         return None
     return (
         "the picture was turned by 90 degrees after it was taken, or taken in portrait: its stripes run downwards; use "

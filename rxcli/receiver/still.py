@@ -61,8 +61,6 @@ def decode(acquisition: Acquisition, skip: frozenset[str], first: Reception | No
     asked = doubtful_columns(reception) if "certain_columns" in skip else np.arange(reception.snr.shape[0])
     lit = asked[~dark_columns(reception.snr)[asked]] if "dark_columns" in skip else asked
     skipped = {"certain_columns": reception.snr.shape[0] - asked.size, "dark_columns": asked.size - lit.size}
-    if lit.size:
-        acquisition = acquisition.in_depth(lit)
     for look, least in _PASSES:
         columns = np.intersect1d(lit, doubtful_columns(reception, least)) if "certain_columns" in skip else lit
         if columns.size:
@@ -171,7 +169,7 @@ def apply_autoencoder(
     always = options.cae == "always"
     if always:
         columns = np.arange(reception.snr.shape[0])
-        reception = _without_row_noise(acquisition.in_depth(columns), reception, columns)
+        reception = _without_row_noise(acquisition, reception, columns)
     else:
         columns = doubtful_columns(reception, STILL.beyond_repair_log_prob)
     if columns.size == 0 or reception.cleaned is None:

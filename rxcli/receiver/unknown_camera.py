@@ -29,7 +29,7 @@ def propose_cameras(
     """
     unknown = Camera(None, float("nan"), float("nan"), None, DEFAULT_TONE)
     context = FrameContext(frame, corners, unknown, options.screens, timer)
-    profiles = sample_columns(context, n_columns, quick=True).profiles
+    profiles = sample_columns(context, n_columns).profiles
     with timer("blind"):
         strips = _strips(context, profiles)
     # A picture does not tell the slot rate: of screens with packets of one length the quickest stands for all.

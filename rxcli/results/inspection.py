@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.protocol import bits_per_symbol, encode_packet, hex_to_bits
 from rxcli.receiver import camera as blind
-from rxcli.receiver import sampling
+from rxcli.receiver import plane
 from rxcli.receiver.decode import assemble
 from rxcli.results.overlay import outlines_of
 from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, PacketResult, RowProfiles
@@ -73,9 +73,9 @@ def inspect_frame(
     if result.corners is None or not result.line_delay_s or not result.columns:
         return None
     width_px = float(np.linalg.norm(result.corners[1] - result.corners[0])) / screen.columns
-    outlines = outlines_of(result.corners, screen.columns, frame, camera, sampling.strips_per_column(width_px))
+    outlines = outlines_of(result.corners, screen.columns, frame, camera, plane.strips_per_column(width_px))
     tone = "srgb" if camera is None or camera.tone == "auto" else camera.tone
-    profiles, columns = _in_time_order(frame, result, sampling.sample_rows(frame, outlines, tone))
+    profiles, columns = _in_time_order(frame, result, plane.sample_rows(plane.read_plane(frame), outlines, tone))
     rows_per_slot = 1 / (screen.slot_rate_hz * result.line_delay_s)
     exposure_rows = (result.exposure_s or 0.0) / result.line_delay_s
     traces = []

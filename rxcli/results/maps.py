@@ -23,14 +23,15 @@ def column_map(frame: Frame) -> dict[str, Any] | None:
     """Coherent strips, with the grid of columns that was found; None for tiny pictures."""
     from rxcli.options import ReceiverOptions
     from rxcli.receiver.corners import layouts_of
+    from rxcli.receiver.plane import read_plane
     from rxcli.receiver.screen.find import find_outlines
     from rxcli.receiver.screen.settings import SETTINGS
     from rxcli.receiver.screen.strips import read_strips
 
     if min(frame.width, frame.height) < SETTINGS.min_size_px:
         return None
-    period = 1 if frame.mosaic is None else frame.mosaic.pattern.shape[1]
-    found = find_outlines(frame.pixels, layouts_of(ReceiverOptions()), mosaic_period=period)
+    plane = read_plane(frame)
+    found = find_outlines(plane, layouts_of(ReceiverOptions()))
     grids = [one.grid for one in found[:1]]
     scale = _WIDTH / frame.width
     return {
@@ -40,7 +41,7 @@ def column_map(frame: Frame) -> dict[str, Any] | None:
         else "No grid of columns stands out: strips of pixels change alike nowhere.",
         "caption": "Bright: neighbouring strips of pixels change alike from row to row, as they do in front of a "
         "backlight however dark the picture is. Lines: borders of columns, across which they do not.",
-        **_drawn(frame, read_strips(frame.pixels, period).lit),
+        **_drawn(frame, read_strips(plane).lit),
         "grids": [
             {
                 "pitch_px": grid.pitch_px,

@@ -182,7 +182,7 @@ def test_failures_are_one_line(
 
 def test_the_shaded_slots_are_where_the_light_is(tmp_path: Path) -> None:
     """The slots of a right packet, drawn from its first row on, agree with the light under them."""
-    from rxcli.receiver import sampling
+    from rxcli.receiver import plane
     from rxcli.receiver.screen import geometry
 
     write_frame(tmp_path / "a.png", 3)
@@ -192,7 +192,7 @@ def test_the_shaded_slots_are_where_the_light_is(tmp_path: Path) -> None:
     [frame] = open_source(tmp_path / "a.png")
     [result] = receive([frame], options)
     outlines = geometry.column_outlines(options.corners, N_COLUMNS, 1, frame.width, frame.height)
-    profiles = sampling.sample_rows(frame, outlines, "linear")
+    profiles = plane.sample_rows(plane.read_plane(frame), outlines, "linear")
     for column in result.columns:
         assert column.w == W
         rows, light = column_light(profiles, column.column)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,7 +15,7 @@ from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.capture import Capture, simulate_frame
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
-from rxcli.receiver import channel, sampling, still
+from rxcli.receiver import channel, still
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.context import Timer
 from rxcli.receiver.decode import detect
@@ -154,22 +155,37 @@ def test_the_right_screen_among_all_is_told() -> None:
     assert score_of(result, taken).error_free == 20
 
 
-@pytest.mark.parametrize("n_strips", [2, 3, 4, 8])
-def test_columns_in_doubt_are_read_pixel_by_pixel(n_strips: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sampling, "strips_per_column", lambda _: n_strips)
+class CountedPixels(np.ndarray[Any, Any]):
+    """Pixels that count how many of them are taken, and that cannot be computed with as a whole."""
+
+    n_taken = 0
+    __array_ufunc__ = None
+
+    def __getitem__(self, key: Any) -> Any:
+        taken = np.asarray(self)[key]
+        self.n_taken += np.size(taken)
+        return taken
+
+
+def n_reads(frame: Frame, options: ReceiverOptions) -> tuple[float, str]:
+    """How often each pixel of a frame is read on average, and the status."""
+    pixels = frame.pixels.view(CountedPixels)
+    result = received(replace(frame, pixels=pixels), options)
+    return pixels.n_taken / pixels.size, result.status
+
+
+def test_every_pixel_of_a_still_is_read_once() -> None:
     taken = clean()
-    frame, options = frame_of(taken), options_for(taken)
-    founds = [search(frame, options, Timer(), quick=quick) for quick in (True, False)]
-    quick, exact = (found.best.acquisition for found in founds if isinstance(found, Found))
-    assert not np.array_equal(quick.profiles.light, exact.profiles.light)
-    asked = np.array([0, 4, 5, 6, 19])
-    light = quick.in_depth(asked).profiles.light
-    np.testing.assert_allclose(light[asked], exact.profiles.light[asked], atol=1e-3)
-    others = np.setdiff1d(np.arange(20), asked)
-    assert quick.sampler.is_binned == (n_strips >= 4)
-    np.testing.assert_array_equal(light[others], quick.profiles.light[others].repeat(1 + (n_strips >= 4), axis=1))
-    assert quick.in_depth(asked[:0]) is quick
-    assert exact.in_depth(asked) is exact
+    assert n_reads(frame_of(taken), options_for(taken)) == (1.0, "ok")
+    searched = ReceiverOptions(cameras=(), skip=frozenset())
+    assert n_reads(frame_of(taken), searched)[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_every_pixel_of_a_picture_without_a_screen_is_read_once_and_some_for_the_message() -> None:
+    noise = np.random.default_rng(3).integers(0, 255, (400, 600), np.uint8)
+    reads, status = n_reads(Frame(noise, "memory"), ReceiverOptions())
+    assert status == "no_screen"
+    assert 1.0 <= reads < 1.05
 
 
 def test_upside_down() -> None:

@@ -225,7 +225,7 @@ class _Clip:
     ) -> Found | Failure:
         """Search a frame whose corners are known."""
         at = replace(options, corners=context.corners)
-        return search(context.frame, at, context.timer, known, quick=False)
+        return search(context.frame, at, context.timer, known)
 
     def _with_common_clock(self, located: _Located, frames: Sequence[Frame]) -> _Located:
         """Find the clock that the first frames share, with the reading of the first frame's camera that leads.
@@ -406,7 +406,7 @@ class _Clip:
 
     def _locate(self, frame: Frame, timer: Timer) -> _Located | Failure:
         """The screen in a frame, with the camera that is known or one that is found with it."""
-        return _located(search(frame, self._options, timer, self._context, quick=False))
+        return _located(search(frame, self._options, timer, self._context))
 
     def _with_settled_camera(self, located: _Located) -> _Settled | Failure:
         """The frame's clock; and where its camera was estimated, the camera that its slots tell, from then on."""

@@ -17,7 +17,7 @@ from rxcli.types import ColumnResult, Float32Array, FloatArray, IntArray
 
 def bursts_of(closed: Sequence[ClosedBurst], first: int, view: View) -> list[confidence.BurstInClip]:
     """Bursts that end in the frame of a view, for `assemble`; `first` is the number of the frame's first burst."""
-    n_strips = view.acquisition.sampler.n_binned_strips
+    n_strips = view.acquisition.sampler.binned.light.shape[1]
     return [
         confidence.BurstInClip(
             number=burst.number,

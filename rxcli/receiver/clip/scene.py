@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.receiver import sampling, sync
+from rxcli.receiver import plane, sync
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel import SlotLikelihoods, known_picture
 from rxcli.receiver.clip.settings import SETTINGS
@@ -170,7 +170,7 @@ class TrackedScreen:
         stored, order = _stored_order(corners)
         screen = self._begun_with[0].screen
         layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
-        found = follow_outline(frame.pixels, stored, layout)
+        found = follow_outline(plane.read_plane(frame), stored, layout)
         if found is None:
             return None
         outline = found[order]
@@ -500,9 +500,9 @@ def _map(
     n_columns = acquisition.screen.columns
     if n_strips is None:
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
-        n_strips = min(sampling.strips_per_column(column_px), SETTINGS.max_strips)
+        n_strips = min(plane.strips_per_column(column_px), SETTINGS.max_strips)
     outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, camera.lens)
-    return tracked.map_strips(outlines, frame, lambda coded: sampling.tone_to_light(camera.tone, coded))
+    return tracked.map_strips(outlines, frame, lambda coded: plane.tone_to_light(camera.tone, coded))
 
 
 def _shown(inside: NDArray[np.bool_], positions: FloatArray, clock: Clock) -> IntArray:

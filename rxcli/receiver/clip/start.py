@@ -88,7 +88,7 @@ def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:
     n_slots = int(np.ceil((rows[-1] - rows[0] + 1) / rows_per_slot)) + 1
     top = float(profiles.rows[rows[0]]) - 0.5
     clock = start.time.clock_at(frame.index, frame.time_s, template, n_slots, top)
-    return None if clock is None else Acquisition(screen, ColumnSampler(profiles), clock, variants=start.variants)
+    return None if clock is None else Acquisition(screen, ColumnSampler.of(profiles), clock, variants=start.variants)
 
 
 def _phase(

@@ -21,7 +21,7 @@ from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Pixels, Strips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
-from rxcli.types import Float32Array, FloatArray, Lens
+from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
 #: The next step where a picture is too dark.
 BRIGHTEN = "expose longer, raise ISO, or show a brighter picture on the screen"
@@ -66,24 +66,23 @@ class OutlineCandidate:
 
 
 def find_outlines(
-    pixels: Pixels, layouts: Sequence[ColumnLayout], *, mosaic_period: int = 1, lens: Lens | None = None
+    plane: LightPlane, layouts: Sequence[ColumnLayout], lens: Lens | None = None
 ) -> list[OutlineCandidate]:
     """Outlines that the screen in a picture may have, likeliest first; none where no columns show.
 
     Args:
-        pixels: (height, width) uint8 or uint16: luma, or a mosaic.
+        plane: of the picture.
         layouts: that the screen may have.
-        mosaic_period: pixels after which the colours of a mosaic repeat; 1 for luma.
         lens: of the picture, where it is known.
     """
-    if min(pixels.shape) < SETTINGS.min_size_px:
+    if min(plane.width, plane.height) < SETTINGS.min_size_px:
         return []
-    strips = read_strips(pixels, mosaic_period, lens)
+    strips = read_strips(plane, lens)
     if strips.lit.shape[1] < SETTINGS.min_strips:
         return []
     narrow, wide = ([one for one in layouts if one.is_narrow is many] for many in (True, False))
     if narrow and shows_narrow_columns(strips):
-        fine = read_strips(pixels, mosaic_period, lens, n_parts=_PARTS)
+        fine = read_strips(plane, lens, n_parts=_PARTS)
         grid = narrow_grid(fine, narrow[0].sigma)
         if grid is not None:
             return _numbered(fine, grid, narrow)
@@ -112,29 +111,28 @@ def thinned(pixels: Pixels, black: float, white: float) -> Float32Array:
     return np.asarray((pixels[*steps] - np.float32(black)) / (white - black), np.float32)
 
 
-def follow_outline(pixels: Pixels, corners: FloatArray, layout: ColumnLayout) -> FloatArray | None:
+def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout) -> FloatArray | None:
     """The outline of a screen near to where it was one frame earlier; None where it does not show there any more.
 
     Args:
-        pixels: (height, width) luma.
+        plane: of the picture.
         corners: (4, 2) of the frame before, clockwise from the screen's top left in the stored picture.
         layout: of the screen's columns.
     """
-    height, width = pixels.shape
-    if min(pixels.shape) < SETTINGS.min_size_px:
+    if min(plane.width, plane.height) < SETTINGS.min_size_px:
         return None
-    strips = read_strips(pixels, n_parts=_PARTS if layout.is_narrow else 1)
-    n, start = layout.n_columns, grid_between(corners, layout.n_columns, (width, height), None)
+    strips = read_strips(plane, n_parts=_PARTS if layout.is_narrow else 1)
+    n, start = layout.n_columns, grid_between(corners, layout.n_columns, (plane.width, plane.height), None)
     grid = moved_by_waveforms(strips, start, layout.sigma, SETTINGS.first_steps + SETTINGS.last_steps)
     grid = with_light(strips, grid, layout.sigma)
     if not _stands_out(strips, grid):
         return None
     light = predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), layout.sigma)
-    plane, ends = find_rows(strips, light, grid, n, layout.aspect)
+    flat, ends = find_rows(strips, light, grid, n, layout.aspect)
     if len(ends) > 1:  # Bars at its top or bottom: the rows are where they were.
-        before = plane.along_flat(*grid.flat(corners))
+        before = flat.along_flat(*grid.flat(corners))
         ends = [(float(before[:2].mean()), float(before[2:].mean()))]
-    return plane.corners(ends[0])
+    return flat.corners(ends[0])
 
 
 def wide_grid(strips: Strips, sigma: float) -> Grid | None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rxcli.numerics import TINY
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.settings import SETTINGS
-from rxcli.types import Float32Array, FloatArray, Lens
+from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _Real = TypeVar("_Real", np.float32, np.float64)
@@ -81,25 +81,18 @@ class Strips:
         return replace(self, **arrays)
 
 
-def read_strips(pixels: Pixels, mosaic_period: int = 1, lens: Lens | None = None, *, n_parts: int = 1) -> Strips:
-    """Read the strips of a picture; each pixel is read once.
+def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1) -> Strips:
+    """Strips of a picture, from its plane.
 
     Args:
-        pixels: (height, width) uint8 or uint16: luma or mosaic; a tone curve does no harm.
-        mosaic_period: pixels after which the colours of a mosaic repeat; 1 for luma.
+        plane: of the picture; a tone curve does no harm.
         lens: of the picture, where it is known.
         n_parts: parts of the width with strips of their own.
     """
-    height, width = pixels.shape
-    wanted = SETTINGS.n_strips if n_parts == 1 else n_parts * SETTINGS.n_fifth_strips
-    strip_px = _strip_width(width, wanted, mosaic_period)
-    light = _row_sums(pixels, strip_px)
-    spare = light.shape[1] % n_parts
-    light = light[:, spare // 2 :][:, : light.shape[1] - spare]
-    n = light.shape[1]
-    x = (np.arange(n) + spare // 2 + 0.5) * strip_px - 0.5
-    # Rows of a mosaic have colours of their own: their averages hold whole periods.
-    short = _short_rows(light) if mosaic_period == 1 else SETTINGS.max_short_rows
+    width, height = plane.width, plane.height
+    light, x = _light_of_strips(plane, n_parts)
+    n = x.size
+    short = _short_rows(light)
     band, step = _band_passed(light, short)
     rows = len(band) // SETTINGS.n_windows
     flat_rows = (np.arange(SETTINGS.n_windows) * rows + (rows - 1) / 2) * step
@@ -121,7 +114,7 @@ def read_strips(pixels: Pixels, mosaic_period: int = 1, lens: Lens | None = None
     return Strips(
         np.ascontiguousarray(parted(quiet).transpose(0, 2, 1)),
         parted(lit),
-        parted(np.asarray(level / np.float32(strip_px), np.float32)),
+        parted(np.asarray(level, np.float32)),
         raw_x,
         raw_y,
         x_flat,
@@ -138,11 +131,17 @@ def read_strips(pixels: Pixels, mosaic_period: int = 1, lens: Lens | None = None
     )
 
 
-def _strip_width(width: int, wanted: int, period: int) -> int:
-    """Whole periods of a mosaic near to one of so many strips; a width that leaves no pixels over spares a copy."""
-    nearest = max(1, round(width / wanted / period))
-    near = range(nearest, nearest - nearest // 10 - 1, -1)
-    return period * next((n for n in near if width % (n * period) == 0), nearest)
+def _light_of_strips(plane: LightPlane, n_parts: int) -> tuple[Float32Array, FloatArray]:
+    """(R, S) mean values of strips of equal width, as many in every part, and (S,) the middles of the strips."""
+    wanted = SETTINGS.n_strips if n_parts == 1 else n_parts * SETTINGS.n_fifth_strips
+    n_cells = len(plane.sums) - 1
+    cells = max(1, round(n_cells / wanted))
+    n = n_cells // cells // n_parts * n_parts
+    first = (n_cells - n * cells) // 2
+    strip_px = cells * plane.cell_px
+    sums = np.diff(plane.sums[first : first + n * cells + 1 : cells], axis=0)
+    x = first * plane.cell_px + (np.arange(n) + 0.5) * strip_px - 0.5
+    return np.ascontiguousarray(sums.T, np.float32) / np.float32(strip_px), np.asarray(x)
 
 
 def flat_places(points: FloatArray, width: int, height: int, lens: Lens | None) -> tuple[FloatArray, FloatArray]:
@@ -165,17 +164,6 @@ def _lit_coherence(strips: Strips, widths: float) -> float:
     distance = max(round(widths / strips.step), 1)
     share = np.sqrt(strips.lit[:, :-distance] * strips.lit[:, distance:])
     return float((strips.coherence(distance) * share).sum() / (np.square(share).sum() + TINY))
-
-
-def _row_sums(pixels: Pixels, strip_px: int) -> Float32Array:
-    """(rows, strips) sums of the pixels of each strip."""
-    import cv2
-
-    n = pixels.shape[1] // strip_px
-    whole = np.ascontiguousarray(pixels[:, : n * strip_px]).reshape(-1, strip_px)
-    # Sums in whole numbers take half the time, but there are none of 16 bits.
-    depth = cv2.CV_32S if pixels.dtype == np.uint8 else cv2.CV_32F
-    return np.asarray(cv2.reduce(whole, 1, cv2.REDUCE_SUM, dtype=depth).reshape(-1, n), np.float32)
 
 
 def _band_passed(light: Float32Array, short: int) -> tuple[Float32Array, int]:

@@ -37,7 +37,6 @@ class Proposer:
         timer: of the frame.
         outlines: that the screen may have.
         known: the camera and the screens where these are known from other frames.
-        quick: read developed pictures coarsely, see `sample_columns`.
     """
 
     frame: Frame
@@ -45,7 +44,6 @@ class Proposer:
     timer: Timer
     outlines: tuple[Outline, ...]
     known: FrameContext | None = None
-    quick: bool = True
 
     def families(self) -> list[Outline]:
         """One outline of every family, likeliest first: packets are the same whichever column is the first."""
@@ -117,7 +115,7 @@ class Proposer:
         usual = _nearest((hypothesis.screen, *self.options.screens), _USUAL_COLUMNS).columns
         # A header shows on columns of any width: narrow ones are read where it does.
         for n in dict.fromkeys((usual, n_columns)):
-            sampler = sample_columns(self.context(hypothesis), n, quick=self.quick)
+            sampler = sample_columns(self.context(hypothesis), n)
             with self.timer("clock"):
                 clock = _clock(hypothesis, sampler)
             if clock is None or clock.header_peak_ratio < SETTINGS.min_lead:
@@ -165,7 +163,7 @@ class Proposer:
             return
         hypothesis = scored.hypothesis
         misfit = blind.columns_misfit(
-            scored.acquisition.sampler.binned(), scored.reception.clock, [by_columns[n] for n in by_columns]
+            scored.acquisition.sampler.binned, scored.reception.clock, [by_columns[n] for n in by_columns]
         )
         own = misfit[hypothesis.screen.columns]
         for n_columns, screen in by_columns.items():
@@ -247,7 +245,7 @@ def _by_clock(screens: Iterable[ScreenProfile], camera: Camera) -> list[list[Scr
 
 def _clock(hypothesis: Hypothesis, sampler: ColumnSampler) -> Clock | None:
     screen, camera = hypothesis.screen, hypothesis.camera
-    pooled = sync.pooled_strips(sampler.binned())
+    pooled = sync.pooled_strips(sampler.binned)
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
     exposure_slots = camera.exposure_s * screen.slot_rate_hz
     return sync.find_clock(pooled, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(pooled))

@@ -13,7 +13,6 @@ from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera import is_linear
 from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
 from rxcli.receiver.corners import proposed_outlines
-from rxcli.receiver.sampling import is_coded
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.explain import why_no_packets
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
@@ -36,7 +35,6 @@ def search(
     timer: Timer,
     known: FrameContext | None = None,
     *,
-    quick: bool = True,
     budget: int = SETTINGS.budget,
 ) -> Found | Failure:
     """Find outline, rows, camera, screen, clock and bursts of a frame.
@@ -46,13 +44,12 @@ def search(
         options: screens, cameras, perhaps corners.
         timer: time is counted there.
         known: a frame of the same camera, where the camera and the screens are known.
-        quick: read developed pictures coarsely, see `sample_columns`.
         budget: initial passes, at most.
     """
     outlines = proposed_outlines(frame, options, timer)
     if isinstance(outlines, Failure):
         return outlines
-    proposer = Proposer(frame, options, timer, tuple(outlines), known, quick)
+    proposer = Proposer(frame, options, timer, tuple(outlines), known)
     walk = _Walk(proposer, budget)
     best = walk.run()
     least = SETTINGS.bail if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
@@ -125,7 +122,8 @@ class _Walk:
     def _as_light(self, best: Scored) -> Scored:
         """With values taken for light where they seem to be, and packets show as well then."""
         camera = best.context.camera
-        if camera.hypothesis is None or not is_linear(camera.hypothesis.tone) or not is_coded(best.context.frame):
+        frame = best.context.frame
+        if camera.hypothesis is None or not is_linear(camera.hypothesis.tone) or frame.mosaic or frame.linear:
             return best
         again = self._again(best, replace(camera, tone="linear"))
         if again is not None and again.evidence >= best.evidence:

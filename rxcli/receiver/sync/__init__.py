@@ -13,7 +13,6 @@ from rxcli.receiver.sync.clock import (
     possible_bursts,
     resample,
     sample_slots,
-    unbinned_strips,
 )
 
 __all__ = [
@@ -29,5 +28,4 @@ __all__ = [
     "possible_bursts",
     "resample",
     "sample_slots",
-    "unbinned_strips",
 ]

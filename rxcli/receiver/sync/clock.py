@@ -43,18 +43,6 @@ def binned_strips(profiles: RowProfiles) -> RowProfiles:
     )
 
 
-def unbinned_strips(profiles: RowProfiles) -> RowProfiles:
-    """Split every strip into two equal ones with half the pixels each."""
-    rows = profiles.sensor_row
-    return replace(
-        profiles,
-        light=np.repeat(profiles.light, 2, axis=1),
-        inside=np.repeat(profiles.inside, 2, axis=1),
-        sensor_row=None if rows is None else np.repeat(rows, 2, axis=1),
-        count=np.repeat(profiles.count / 2, 2, axis=1),
-    )
-
-
 def resample(
     profiles: RowProfiles, row0: float | FloatArray, rows_per_sample: float, n_samples: int
 ) -> tuple[Float32Array, Float32Array]:

@@ -20,7 +20,7 @@ from rxcli.lab.simulate.sensor import Sensor
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile, shipped_profiles
 from rxcli.protocol import encode_packet, payload_bits
 from rxcli.receiver import camera as blind
-from rxcli.receiver import sampling
+from rxcli.receiver import plane
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.light import NoiseModel
 from rxcli.receiver.pipeline import ReceiverOptions, receive
@@ -71,9 +71,9 @@ def phone(
 def strips_of(frame: Frame, corners: FloatArray, n_columns: int = 20) -> blind.Strips:
     """Strips of a frame as the pipeline makes them."""
     column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
-    n_strips = sampling.strips_per_column(column_px)
+    n_strips = plane.strips_per_column(column_px)
     outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height)
-    profiles = sampling.sample_rows(frame, outlines, "srgb")
+    profiles = plane.sample_rows(plane.read_plane(frame), outlines, "srgb")
     centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
     return blind.strips_of(profiles, centre_x, frame.width, frame.height)
 

@@ -443,7 +443,7 @@ def test_the_receiver_goes_on_without_a_broken_model(trials: dict[str, Trial], m
 
 def test_columns_beyond_repair_are_not_asked(trials: dict[str, Trial]) -> None:
     options = trials["hard"].options()
-    found = search(trials["hard"].frame, options, Timer(), quick=False)
+    found = search(trials["hard"].frame, options, Timer())
     assert not isinstance(found, Failure)
     lock = found.best.acquisition
     seen = still.decode(lock, options.skip)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rxcli.receiver.plane import read_plane
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import find_combs, likeness
 from rxcli.receiver.screen.find import ColumnLayout, OutlineCandidate, find_outlines, follow_outline, why_useless
@@ -19,7 +20,7 @@ from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_p
 from rxcli.receiver.screen.rows import lit_range
 from rxcli.receiver.screen.strips import read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
-from rxcli.types import FloatArray, Lens
+from rxcli.types import FloatArray, Frame, Lens, LightPlane, Mosaic
 
 WIDE, NARROW = ColumnLayout(), ColumnLayout(100, 0.5)
 HEIGHT, WIDTH = 1600, 1200
@@ -81,9 +82,18 @@ def shown(picture: str, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArr
     return (0.15 + 0.85 * (np.sin(23 * u + 9 * v) * np.sin(17 * v - 5 * u) > 0)).astype(np.float32)
 
 
+def drawn(*args: Any, **options: Any) -> LightPlane:
+    """The plane of a picture drawn by `draw`."""
+    return plane_of(draw(*args, **options))
+
+
+def plane_of(pixels: NDArray[Any]) -> LightPlane:
+    return read_plane(Frame(pixels, "memory"))
+
+
 @lru_cache(maxsize=8)
 def found(picture: str) -> list[OutlineCandidate]:
-    return find_outlines(draw(picture), [WIDE])
+    return find_outlines(drawn(picture), [WIDE])
 
 
 def apart(candidate: OutlineCandidate, corners: FloatArray = CORNERS, lens: Lens | None = None) -> FloatArray:
@@ -132,25 +142,27 @@ def test_where_bars_are_other_rows_are_proposed() -> None:
 
 @pytest.mark.parametrize("rows_per_slot", [1.6, 3.0, 8.0])
 def test_slots_of_few_and_of_many_rows(rows_per_slot: float) -> None:
-    candidates = find_outlines(draw("white", rows_per_slot=rows_per_slot), [WIDE])
+    candidates = find_outlines(drawn("white", rows_per_slot=rows_per_slot), [WIDE])
     assert np.abs(apart(candidates[0])).max() < 0.2
 
 
 def test_stripes_that_are_bent_are_straightened() -> None:
-    bent = find_outlines(draw("white", bend=0.3, rows_per_slot=5.0), [WIDE])
+    bent = find_outlines(drawn("white", bend=0.3, rows_per_slot=5.0), [WIDE])
     assert np.abs(apart(bent[0])).max() < 0.2
-    strips = read_strips(draw("white", bend=0.3, rows_per_slot=5.0))
+    strips = read_strips(drawn("white", bend=0.3, rows_per_slot=5.0))
     # The rows of a window follow the stripes: further out at its corner, by what the camera moved them.
     moved = (strips.raw_y[0] - strips.raw_y[0, strips.raw_y.shape[1] // 2]) * WIDTH
     assert moved[0] == pytest.approx(0.3 * 0.625 * (0.25 + 0.0) * WIDTH, rel=0.35)
 
 
-@pytest.mark.parametrize("period", [2, 6])
-def test_a_mosaic_is_searched_over_whole_periods(period: int) -> None:
-    gains = np.random.default_rng(1).uniform(0.3, 1.0, (period, period))
-    tiled = np.tile(gains, (HEIGHT // period + 1, WIDTH // period + 1))[:HEIGHT, :WIDTH]
-    pixels = (draw("white") * tiled * 60 + 1000).astype(np.uint16)
-    candidates = find_outlines(pixels, [WIDE], mosaic_period=period)
+@pytest.mark.parametrize("pattern", [[[0, 1], [1, 2]], [[0, 1, 2], [1, 2, 0], [2, 0, 1]]], ids=["bayer", "all colours"])
+def test_a_screen_is_found_on_a_mosaic(pattern: list[list[int]]) -> None:
+    gains, kinds = (2.0, 1.0, 1.5), np.array(pattern, np.uint8)
+    n = len(kinds)
+    share = 1 / np.array(gains)[np.tile(kinds, (HEIGHT // n + 1, WIDTH // n + 1))[:HEIGHT, :WIDTH]]
+    mosaic = Mosaic(kinds, gains, black=(1000.0, 1000.0, 1000.0), white=16000.0)
+    frame = Frame((draw("white") * share * 50 + 1000).astype(np.uint16), "memory", mosaic=mosaic)
+    candidates = find_outlines(read_plane(frame), [WIDE])
     assert np.abs(apart(candidates[0])).max() < 0.2
 
 
@@ -167,7 +179,7 @@ def test_a_lens_that_is_known_is_taken_off() -> None:
     light = sum(np.exp(-((20 * u - k - 0.5) ** 2) / (2 * 0.45**2)) * sent[:, k, None] for k in range(20))
     light = light * ((u > 0) & (u < 1) & (v > 0) & (v < 1))
     luma = np.clip(150 * light + 12 + rng.normal(0, 4, u.shape), 0, 255).astype(np.uint8)
-    candidates = find_outlines(luma, [WIDE], lens=lens)
+    candidates = find_outlines(plane_of(luma), [WIDE], lens)
     bent = geometry.distort(CORNERS, lens)
     assert np.abs(apart(candidates[0], bent, lens)).max() < 0.35
     np.testing.assert_allclose(candidates[0].corners[0], bent, atol=25)
@@ -188,7 +200,7 @@ def test_columns_that_a_lens_bends_are_read_through_it() -> None:
 
 def test_a_screen_larger_than_the_picture_shows_no_side() -> None:
     large = np.array([[-160.0, 300.0], [1380.0, 280.0], [1400.0, 1170.0], [-180.0, 1140.0]])
-    candidates = find_outlines(draw("white", large), [WIDE])
+    candidates = find_outlines(drawn("white", large), [WIDE])
     assert candidates[0].fills
     assert {"left", "right"} <= set(candidates[0].unlit_sides)
     off = apart(candidates[0], large)
@@ -196,13 +208,13 @@ def test_a_screen_larger_than_the_picture_shows_no_side() -> None:
 
 
 def test_numbers_of_columns_compete() -> None:
-    candidates = find_outlines(draw("white"), [ColumnLayout(10), WIDE, ColumnLayout(40)])
+    candidates = find_outlines(drawn("white"), [ColumnLayout(10), WIDE, ColumnLayout(40)])
     assert candidates[0].layout == WIDE
     assert np.abs(apart(candidates[0])).max() < 0.2
 
 
 def test_the_true_grid_explains_more_than_others_and_is_reached_from_near() -> None:
-    strips, true = read_strips(draw("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
     own = with_light(strips, true, 0.45)
     for factor in (0.8, 0.95, 1.05, 1.3):
         other = with_light(
@@ -215,7 +227,7 @@ def test_the_true_grid_explains_more_than_others_and_is_reached_from_near() -> N
 
 
 def profile_of(picture: str) -> LightProfile:
-    strips, grid = read_strips(draw(picture)), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    strips, grid = read_strips(drawn(picture)), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
     return light_profile(strips, predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), 0.45), grid)
 
 
@@ -258,7 +270,7 @@ def test_likeness_is_the_mean_cosine_of_two_places_light(distance: float) -> Non
 
 def test_coherence_of_independent_strips_is_chance() -> None:
     luma = np.clip(100 + np.random.default_rng(4).normal(0, 10, (HEIGHT, WIDTH)), 0, 255).astype(np.uint8)
-    strips = read_strips(luma)
+    strips = read_strips(plane_of(luma))
     pairs = strips.coherence(7)
     assert abs(float(pairs.mean())) < 0.01
     assert float(pairs.std()) == pytest.approx(strips.n_rows**-0.5, rel=0.3)
@@ -271,7 +283,7 @@ def narrow_film() -> NDArray[np.uint8]:
 
 
 def test_a_hundred_columns_are_found_in_a_film_with_bars() -> None:
-    candidate = find_outlines(narrow_film(), [WIDE, NARROW])[0]
+    candidate = find_outlines(plane_of(narrow_film()), [WIDE, NARROW])[0]
     assert candidate.layout == NARROW
     # The film lies in the middle, and so do its columns.
     assert np.abs(apart(candidate, NARROW_CORNERS)).max() < 0.35
@@ -281,21 +293,21 @@ def test_a_hundred_columns_are_found_in_a_film_with_bars() -> None:
 
 
 def test_wide_columns_are_not_taken_for_narrow_ones() -> None:
-    assert shows_narrow_columns(read_strips(narrow_film()))
-    assert not shows_narrow_columns(read_strips(draw("film")))
+    assert shows_narrow_columns(read_strips(plane_of(narrow_film())))
+    assert not shows_narrow_columns(read_strips(drawn("film")))
 
 
 def test_a_screen_that_moved_a_little_is_followed_and_a_lost_one_is_noticed() -> None:
     before = CORNERS + np.array([6.0, -4.0])
-    followed = follow_outline(draw("blobs"), before, WIDE)
+    followed = follow_outline(drawn("blobs"), before, WIDE)
     assert followed is not None
     np.testing.assert_allclose(followed, CORNERS, atol=16)
-    barred = follow_outline(draw("letterbox"), before, WIDE)
+    barred = follow_outline(drawn("letterbox"), before, WIDE)
     assert barred is not None
     np.testing.assert_allclose(barred[:, 1], before[:, 1], atol=16)
-    assert follow_outline(np.zeros((HEIGHT, WIDTH), np.uint8), before, WIDE) is None
+    assert follow_outline(plane_of(np.zeros((HEIGHT, WIDTH), np.uint8)), before, WIDE) is None
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
-    assert follow_outline(noise, before, WIDE) is None
+    assert follow_outline(plane_of(noise), before, WIDE) is None
 
 
 def without_screen(name: str) -> NDArray[Any]:
@@ -331,7 +343,7 @@ def without_screen(name: str) -> NDArray[Any]:
     ],
 )
 def test_pictures_without_columns_propose_nothing(name: str) -> None:
-    assert not find_outlines(without_screen(name), [WIDE, NARROW])
+    assert not find_outlines(plane_of(without_screen(name)), [WIDE, NARROW])
     assert why_useless(without_screen(name), 0.0, 255.0) is None
 
 
@@ -347,7 +359,7 @@ def test_pictures_without_columns_propose_nothing(name: str) -> None:
     ],
 )
 def test_useless_pictures_are_named(pixels: NDArray[Any], reason: str) -> None:
-    assert not find_outlines(pixels, [WIDE, NARROW])
+    assert not find_outlines(plane_of(pixels), [WIDE, NARROW])
     useless = why_useless(pixels, 0.0, 255.0)
     assert useless is not None
     assert reason in useless[0]
@@ -355,11 +367,12 @@ def test_useless_pictures_are_named(pixels: NDArray[Any], reason: str) -> None:
 
 @pytest.mark.parametrize("shape", [(96, 96), (97, 501), (500, 97), (240, 320)])
 def test_small_pictures_do_not_fail(shape: tuple[int, int]) -> None:
-    assert not find_outlines(np.random.default_rng(2).integers(0, 256, shape, dtype=np.uint8), [WIDE, NARROW])
+    noise = np.random.default_rng(2).integers(0, 256, shape, dtype=np.uint8)
+    assert not find_outlines(plane_of(noise), [WIDE, NARROW])
 
 
 @pytest.mark.parametrize("height", range(1582, 1586))
 def test_strips_are_read_of_any_height(height: int) -> None:
     """Only whole steps of rows count: of 1582 rows and steps of three the last one is a part."""
     noise = np.random.default_rng(1).integers(0, 255, (height, 40), np.uint8)
-    assert read_strips(noise, mosaic_period=2).height == height
+    assert read_strips(plane_of(noise)).height == height

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli.receiver.sampling import rows
-from rxcli.receiver.sampling.rows import is_coded, sample_rows, strips_per_column, tone_to_light
+from rxcli.receiver.plane import read_plane, strips_per_column, tone_to_light
+from rxcli.receiver.plane import sample_rows as sample_plane
 from rxcli.types import Frame, Mosaic, Outlines, RowProfiles
 
 FloatArray = NDArray[np.float64]
@@ -25,6 +25,10 @@ XTRANS = np.array(
     ],
     np.uint8,
 )
+
+
+def sample_rows(frame: Frame, where: Outlines, tone: str) -> RowProfiles:
+    return sample_plane(read_plane(frame), where, tone)
 
 
 def outlines(edges: FloatArray, n_columns: int, first_row: int = 0) -> Outlines:
@@ -55,16 +59,12 @@ def test_a_constant_picture_has_that_light_everywhere(pitch: float, slope: float
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.21, -0.37])
-@pytest.mark.parametrize("quick", [False, True])
-def test_light_that_changes_along_the_rows_only_is_exact(
-    slope: float, quick: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """More pixels than are read at a time, so that the seams between bands are seen."""
-    monkeypatch.setattr(rows, "_BAND_PIXELS", 20_000)
+def test_light_that_changes_along_the_rows_only_is_exact(slope: float) -> None:
+    """More rows than are read at a time, so that the seams between bands are seen."""
     coded = np.random.default_rng(0).integers(30, 256, 300).astype(np.uint8)
     frame = Frame(np.repeat(coded[:, None], 500, axis=1), "memory")
     edges = slanted(7, 250, 120.0, 31.0, slope)
-    found = sample_rows(frame, outlines(edges, 3, first_row=20), "srgb", quick=quick)
+    found = sample_rows(frame, outlines(edges, 3, first_row=20), "srgb")
     light = tone_to_light("srgb", coded[20:270] / 255)
     assert found.rows.tolist() == list(range(20, 270))
     np.testing.assert_allclose(found.light, np.broadcast_to(light, found.light.shape), rtol=2e-4, atol=2e-5)
@@ -137,54 +137,38 @@ def test_unknown_tone() -> None:
         tone_to_light("gamma", np.zeros(1))
 
 
-@pytest.mark.parametrize("quick", [False, True])
 @pytest.mark.parametrize("tone", ["linear", "srgb", "bt709"])
 @pytest.mark.parametrize(
     ("dtype", "black", "white"),
     [(np.uint8, 0.0, 255.0), (np.uint8, 16.0, 235.0), (np.uint16, 0.0, 65535.0), (np.uint16, 64.0, 940.0)],
 )
-def test_levels_of_developed_pictures(dtype: type, black: float, white: float, tone: str, quick: bool) -> None:
+def test_levels_of_developed_pictures(dtype: type, black: float, white: float, tone: str) -> None:
     value = round(black + 0.6 * (white - black))
     frame = Frame(np.full((30, 80), value, dtype), "memory", black=black, white=white)
-    found = sample_rows(frame, outlines(slanted(3, 30, 10.0, 30.0, 0.1), 2), tone, quick=quick)
+    found = sample_rows(frame, outlines(slanted(3, 30, 10.0, 30.0, 0.1), 2), tone)
     share = (value - black) / (white - black)
     expected = float(tone_to_light(tone, np.array([share]))[0])
     np.testing.assert_allclose(found.light, expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("quick", [False, True])
 @pytest.mark.parametrize("value", [0, 3, 250, 255])
-def test_values_beyond_limited_range_are_clipped(value: int, quick: bool) -> None:
+def test_values_beyond_limited_range_are_clipped(value: int) -> None:
     frame = Frame(np.full((30, 80), value, np.uint8), "memory", black=16.0, white=235.0)
-    found = sample_rows(frame, outlines(slanted(3, 30, 10.0, 30.0, 0.1), 2), "srgb", quick=quick)
+    found = sample_rows(frame, outlines(slanted(3, 30, 10.0, 30.0, 0.1), 2), "srgb")
     np.testing.assert_allclose(found.light, 1.0 if value > 200 else 0.0)
 
 
-def test_a_quick_look_keeps_how_the_light_of_a_textured_strip_changes() -> None:
+def test_light_of_a_textured_strip_changes_as_that_of_its_pixels() -> None:
     """The strip's own light is another, its rows' light against one another is the same within a thousandth or two."""
     rng = np.random.default_rng(2)
     exposure = rng.uniform(0.3, 1.0, 120)
     light = rng.uniform(0.1, 0.9, 400)[None] * exposure[:, None]
     coded = 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    frame, where = Frame(np.round(coded).astype(np.uint8), "memory"), outlines(slanted(5, 120, 20.0, 80.0, 0.0), 2)
-    exact, quick = (sample_rows(frame, where, "srgb", quick=q) for q in (False, True))
-    share = quick.light / exact.light
+    frame = Frame(np.round(coded).astype(np.uint8), "memory")
+    found = sample_rows(frame, outlines(slanted(5, 120, 19.5, 80.0, 0.0), 2), "srgb").light.reshape(4, 120)
+    share = found / light[:, 20:340].reshape(120, 4, 80).mean(axis=2).T
     assert 0.85 < share.min() < share.max() < 0.98
-    np.testing.assert_allclose(share, np.broadcast_to(share.mean(axis=2, keepdims=True), share.shape), rtol=0.002)
-    assert (quick.noise_floor, quick.noise_slope) == (exact.noise_floor, exact.noise_slope)
-    np.testing.assert_allclose(quick.count, exact.count, rtol=0.01)
-
-
-def test_no_quick_look_at_what_is_linear() -> None:
-    """A mosaic and linear pictures are read alike; pictures of 16 bits have no table of means."""
-    light = np.random.default_rng(4).random((40, 200))
-    linear = linear16(light)
-    mosaic = mosaic_frame(light, (0.3, 1.0, 0.5), mosaic_of(BAYER, (2.0, 1.0, 1.5)))
-    for frame in (linear, mosaic, replace(linear, linear=False)):
-        assert not is_coded(frame)
-        where = outlines(slanted(5, 40, 20.0, 40.0, 0.1), 2)
-        once, quick = (sample_rows(frame, where, "srgb", quick=q) for q in (False, True))
-        np.testing.assert_array_equal(once.light, quick.light)
+    np.testing.assert_allclose(share, np.broadcast_to(share.mean(axis=1, keepdims=True), share.shape), rtol=0.002)
 
 
 def mosaic_of(pattern: NDArray[np.uint8], gains: tuple[float, float, float]) -> Mosaic:

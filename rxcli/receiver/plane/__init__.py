@@ -1,0 +1,7 @@
+"""Pixels to row profiles: every pixel of a frame is read once, into a plane that everything else is taken from."""
+
+from rxcli.receiver.plane.read import read_plane, turned
+from rxcli.receiver.plane.rows import sample_rows, strips_per_column, tone_to_light
+from rxcli.receiver.plane.store import PlaneStore
+
+__all__ = ["PlaneStore", "read_plane", "sample_rows", "strips_per_column", "tone_to_light", "turned"]

@@ -1,0 +1,118 @@
+"""Read the pixels of a frame, each once, into running sums along the rows.
+
+Pixels are added in cells a few pixels wide as they are stored. A running sum along the row, interpolated between the
+borders of cells, then gives the mean over any part of the row, so that columns of any slant, strips of any width and
+finer strips of narrow columns come from one reading. Sums of 8-bit values are exact.
+
+A mosaic is read without demosaicing: each row's pixels are weighted so that every row measures the same mix of red,
+green and blue, in cells of whole periods of its colours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.receiver.plane.settings import SETTINGS
+from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
+
+#: Rows read at a time: what fits the cache.
+_BAND_ROWS = 64
+
+
+def read_plane(frame: Frame) -> LightPlane:
+    """Read every pixel of a frame."""
+    if frame.mosaic is not None:
+        return _read_mosaic(frame, frame.mosaic)
+    height, width = frame.pixels.shape
+    cell_px = _cell_px(width, 1)
+    n_cells = width // cell_px
+    sums = np.zeros((n_cells + 1, height), np.float32)
+    for top in range(0, height, _BAND_ROWS):
+        band = np.ascontiguousarray(frame.pixels[top : top + _BAND_ROWS, : n_cells * cell_px])
+        sums[1:, top : top + _BAND_ROWS] = _cells(band, cell_px).T
+    return LightPlane(_run(sums), cell_px, width, frame.black, frame.white, is_linear=frame.linear)
+
+
+def turned(plane: LightPlane) -> LightPlane:
+    """The plane of the same picture turned by a quarter, in square pixels of a cell's width."""
+    cells = np.diff(plane.sums, axis=0)
+    size = plane.cell_px
+    n = cells.shape[1] // size
+    sums = np.zeros((n + 1, cells.shape[0]), np.float32)
+    sums[1:] = cells[:, : n * size].reshape(len(cells), n, size).mean(axis=2).T / np.float32(size)
+    return replace(plane, sums=_run(sums), cell_px=1, width=n)
+
+
+def _cell_px(width: int, period: int) -> int:
+    """Width of a cell: a period times a power of two, as many as leave enough cells."""
+    cell_px = period
+    while width // (2 * cell_px) >= SETTINGS.min_cells:
+        cell_px *= 2
+    return cell_px
+
+
+def _run(sums: Float32Array) -> Float32Array:
+    """Running sums over the first axis, in place."""
+    # Four times as quick as numpy.cumsum, which goes down one column at a time.
+    for left, here in pairwise(sums):
+        np.add(left, here, out=here)
+    return sums
+
+
+def _cells(band: NDArray[Any], cell_px: int) -> NDArray[Any]:
+    """(rows, n) sums of `cell_px` neighbouring whole numbers, a power of two: pairs of neighbours as one number."""
+    while cell_px > 1:
+        half = 8 * band.dtype.itemsize
+        pairs = band.view(f"u{2 * band.dtype.itemsize}")
+        band = (pairs & pairs.dtype.type((1 << half) - 1)) + (pairs >> pairs.dtype.type(half))
+        cell_px //= 2
+    return band
+
+
+def _read_mosaic(frame: Frame, mosaic: Mosaic) -> LightPlane:
+    height, width = frame.pixels.shape
+    weights, offsets, is_complete = _mosaic_weights(mosaic)
+    period, n_colours = weights.shape
+    cell_px = _cell_px(width, n_colours)
+    weights = np.tile(weights, (1, cell_px // n_colours))
+    n_cells = width // cell_px
+    sums = np.zeros((n_cells + 1, height), np.float32)
+    for phase in range(min(period, height)):
+        for top in range(phase, height, _BAND_ROWS * period):
+            rows = slice(top, top + _BAND_ROWS * period, period)
+            runs = frame.pixels[rows, : n_cells * cell_px].astype(np.float32).reshape(-1, n_cells, cell_px)
+            sums[1:, rows] = (runs @ weights[phase] - offsets[phase] * np.float32(cell_px)).T
+    if not is_complete:
+        sums = _smooth_rows(sums)
+    return LightPlane(_run(sums), cell_px, width, 0.0, 1.0, is_linear=True)
+
+
+def _mosaic_weights(mosaic: Mosaic) -> tuple[Float32Array, Float32Array, bool]:
+    """Weights (period_y, period_x) and offsets (period_y,) of a pixel that make each row measure the same mix.
+
+    Green counts most, red and blue by the inverse square of their gains, which is near the best signal to noise. A row
+    that lacks a colour (Bayer) cannot measure the mix: its mean is taken as it is, and rows are then smoothed so that
+    each holds both kinds, at the price of one row of blur.
+    """
+    pattern = mosaic.pattern
+    n = pattern.shape[1]
+    present = np.stack([(pattern == colour).sum(axis=1) for colour in range(3)], axis=1)
+    complete = bool((present > 0).all())
+    mix = 1 / np.maximum(np.array(mosaic.gains), 1.0) ** 2
+    share = n * mix / mix.sum() / np.maximum(present, 1) if complete else np.ones(present.shape)
+    black = np.array(mosaic.black)
+    weights = share[np.arange(pattern.shape[0])[:, None], pattern] / (mosaic.white - black.mean())
+    offsets = (weights * black[pattern]).mean(axis=1)
+    return weights.astype(np.float32), offsets.astype(np.float32), complete
+
+
+def _smooth_rows(values: Float32Array) -> Float32Array:
+    import cv2
+
+    kernel, alone = np.array([0.25, 0.5, 0.25], np.float32), np.ones(1, np.float32)
+    return np.asarray(cv2.sepFilter2D(values, -1, kernel, alone, borderType=cv2.BORDER_REFLECT_101), np.float32)

@@ -1,0 +1,137 @@
+"""Plane and outlines to row profiles: the mean linear light of every strip on every row, with its noise.
+
+Coded values are averaged and the mean is made linear. Under a power law that changes how bright a textured strip is,
+but not how its light changes from row to row; room light and the straight part of the tone curve make it a little
+worse, by less than packets show.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.receiver.plane.settings import SETTINGS
+from rxcli.types import Float32Array, FloatArray, LightPlane, Outlines, RowProfiles
+
+#: Steps of a tone curve's table.
+_TONE_STEPS = 1 << 16
+
+
+def strips_per_column(column_px: float) -> int:
+    """Lateral strips for columns of `column_px` pixels."""
+    return int(np.clip(column_px // SETTINGS.strip_px, 1, SETTINGS.max_strips))
+
+
+def tone_to_light(tone: str, encoded: FloatArray) -> FloatArray:
+    """Linear light of developed values, both in 0..1.
+
+    Args:
+        tone: "linear", "srgb" (IEC 61966-2-1) or "bt709" (ITU-R BT.709-6, section 1.2).
+        encoded: values, 0 black and 1 white.
+    """
+    if tone == "linear":
+        return encoded
+    if tone == "srgb":
+        return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    if tone == "bt709":
+        return np.where(encoded < 0.081, encoded / 4.5, ((encoded + 0.099) / 1.099) ** (1 / 0.45))
+    raise ValueError(f"tone must be linear, srgb or bt709 (got {tone!r})")
+
+
+def sample_rows(plane: LightPlane, outlines: Outlines, tone: str) -> RowProfiles:
+    """Mean linear light of every strip on every row.
+
+    Args:
+        plane: of the picture.
+        outlines: where the strips lie.
+        tone: the curve to undo, see `tone_to_light`; a mosaic is linear already.
+    """
+    edges = np.clip((outlines.edges_x + np.float32(0.5)) / np.float32(plane.cell_px), 0, len(plane.sums) - 1)
+    light = np.diff(_sums_at(plane.sums, edges, int(outlines.rows[0])), axis=0)
+    widths = np.diff(edges, axis=0) * np.float32(plane.cell_px)
+    enclosed = np.abs(widths)
+    widths[enclosed <= SETTINGS.min_enclosed * plane.cell_px] = np.inf
+    light /= widths
+    inside = outlines.inside
+    light = _light_of(plane, light, tone).reshape(inside.shape)
+    light *= inside
+    count = np.median(enclosed[:, :: SETTINGS.count_row_step], axis=1)
+    cells = max(int(np.median(count) / (SETTINGS.parts_per_strip * plane.cell_px)), 1)
+    rows = slice(int(outlines.rows[0]), int(outlines.rows[-1]) + 1)
+    sums = plane.sums[int(edges.min()) : int(edges.max()) + 2 : cells, rows]
+    floor, slope = _noise_model(plane, sums, cells * plane.cell_px, tone)
+    return RowProfiles(
+        light=light,
+        inside=inside,
+        rows=outlines.rows,
+        sensor_row=outlines.sensor_row,
+        count=count.reshape(inside.shape[:2]),
+        noise_floor=floor,
+        noise_slope=slope,
+    )
+
+
+def _sums_at(sums: Float32Array, edges: Float32Array, first_row: int) -> Float32Array:
+    """Running sums (N + 1, R) at edges (n, rows) in cells from a first row on, linear between the borders of cells."""
+    height, flat = sums.shape[1], sums.ravel()
+    place = np.minimum(edges, np.float32(len(sums) - 2)).astype(np.intp)
+    part = np.subtract(edges, place, dtype=np.float32)
+    place *= height
+    place += np.arange(first_row, first_row + edges.shape[1])
+    left = flat.take(place)
+    place += height
+    right = flat.take(place)
+    right -= left
+    right *= part
+    left += right
+    return left
+
+
+def _light_of(plane: LightPlane, values: Float32Array, tone: str) -> Float32Array:
+    """Linear light of mean values."""
+    encoded = (values - np.float32(plane.black)) * np.float32(1 / (plane.white - plane.black))
+    if plane.is_linear or tone == "linear":
+        return encoded
+    encoded *= np.float32(_TONE_STEPS)
+    return _tone_table(tone).take((encoded + np.float32(0.5)).astype(np.intp), mode="clip")
+
+
+@lru_cache(maxsize=4)
+def _tone_table(tone: str) -> Float32Array:
+    return tone_to_light(tone, np.arange(_TONE_STEPS + 1) / _TONE_STEPS).astype(np.float32)
+
+
+def _noise_model(plane: LightPlane, sums: Float32Array, part_px: int, tone: str) -> tuple[float, float]:
+    """Variance of a pixel as floor + slope * light, from differences of adjacent parts of strips, `part_px` wide.
+
+    Medians over bins of equal light ignore the picture's edges; a straight line through the bins with floor and slope
+    not below zero.
+    """
+    every = max(sums.shape[1] // SETTINGS.noise_rows, 1)
+    parts = _light_of(plane, np.diff(sums[:, every // 2 :: every], axis=0) / np.float32(part_px), tone)
+    if parts.shape[0] < 2:
+        return 1e-6 * part_px, 0.0
+    difference = np.abs(np.diff(parts, axis=0)).ravel()
+    light = ((parts[1:] + parts[:-1]) / 2).ravel()
+    n_bins = min(SETTINGS.noise_bins, max(1, light.size // 50))
+    # Bins of equal numbers; the few brightest that are left over do not matter.
+    bins = np.argsort(light)[: light.size // n_bins * n_bins].reshape(n_bins, -1)
+    x = np.median(light[bins], axis=1)
+    # For a normal difference of two parts of variance s2: median |d| = 0.6745 sqrt(2 s2).
+    y = np.median(difference[bins], axis=1) ** 2 / (2 * 0.6745**2)
+    return _floor_and_slope(x, part_px * y)
+
+
+def _floor_and_slope(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[float, float]:
+    """Line through bins of light and variance: slope by a median over pairs, weighted by their distance."""
+    run, rise = x[:, None] - x, y[:, None] - y
+    apart = run > 1e-4
+    slopes, weights = rise[apart] / run[apart], run[apart]
+    order = np.argsort(slopes)
+    reached = np.cumsum(weights[order])
+    slope = float(slopes[order[np.searchsorted(reached, reached[-1] / 2)]]) if order.size else 0.0
+    slope = max(slope, 0.0)
+    dark = slice(0, max(1, y.size // 4))
+    return float(max((y[dark] - slope * x[dark]).mean(), 1e-10)), slope

@@ -1,0 +1,107 @@
+"""The plane: sums of pixels, read once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rxcli.receiver.plane import PlaneStore, read_plane, sample_rows, store, turned
+from rxcli.receiver.screen.geometry import column_outlines
+from rxcli.types import Frame, Lens, LightPlane, Outlines
+
+CORNERS = np.array([[10.0, 5.0], [229.0, 7.0], [228.0, 112.0], [11.0, 114.0]])
+CORRECTED = Lens(np.array([[240.0, 0, 120], [0, 240, 60], [0, 0, 1]]), np.array([0.1, -0.1, 0, 0, 0]), corrected=True)
+
+
+def frame_of(width: int = 240, height: int = 120, dtype: Any = np.uint8, seed: int = 0) -> Frame:
+    values = np.random.default_rng(seed).integers(0, np.iinfo(dtype).max, (height, width), dtype)
+    return Frame(values, "memory", white=float(np.iinfo(dtype).max))
+
+
+def outlines(lens: Lens | None = None, shift: float = 0.0) -> Outlines:
+    return column_outlines(CORNERS + np.array([shift, 0.0]), 4, 3, 240, 120, lens)
+
+
+@pytest.mark.parametrize(("width", "cell_px"), [(240, 1), (3001, 2), (6243, 4), (12001, 8)])
+def test_sums_of_8_bits_are_exact(width: int, cell_px: int) -> None:
+    frame = frame_of(width, 7)
+    plane = read_plane(frame)
+    n = width // cell_px
+    assert (plane.cell_px, plane.width, plane.height) == (cell_px, width, 7)
+    expected = np.cumsum(frame.pixels[:, : n * cell_px].astype(np.int64), axis=1)[:, cell_px - 1 :: cell_px]
+    np.testing.assert_array_equal(plane.sums[1:], expected.T)
+    assert not plane.sums[0].any()
+
+
+@pytest.mark.parametrize("width", [240, 6243])
+def test_sums_of_16_bits_are_near(width: int) -> None:
+    frame = frame_of(width, 7, np.uint16)
+    means = np.diff(read_plane(frame).sums, axis=0) / read_plane(frame).cell_px
+    n, cell_px = means.shape[0], read_plane(frame).cell_px
+    expected = frame.pixels[:, : n * cell_px].reshape(7, n, cell_px).mean(axis=2)
+    np.testing.assert_allclose(means, expected.T, atol=10)
+
+
+def test_pixels_that_do_not_lie_side_by_side_are_read_alike() -> None:
+    frame = frame_of(3100, 70)
+    mirrored = replace(frame, pixels=frame.pixels[:, ::-1])
+    same = replace(frame, pixels=np.ascontiguousarray(frame.pixels[:, ::-1]))
+    np.testing.assert_array_equal(read_plane(mirrored).sums, read_plane(same).sums)
+
+
+@pytest.mark.parametrize("width", [300, 3600])
+def test_a_turned_plane_is_that_of_the_turned_picture(width: int) -> None:
+    light = np.repeat(np.repeat(np.random.default_rng(1).integers(0, 255, (30, width // 4), np.uint8), 4, 0), 4, 1)
+    plane = turned(read_plane(Frame(light, "memory")))
+    size = read_plane(Frame(light, "memory")).cell_px
+    expected = light[::size, ::size].T
+    assert (plane.height, plane.width, plane.cell_px) == (*expected.shape, 1)
+    np.testing.assert_allclose(np.diff(plane.sums, axis=0).T, expected, atol=0.01)
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Grows by one whenever pixels are read or an outline is sampled."""
+    seen: list[str] = []
+
+    def counted_read(frame: Frame) -> LightPlane:
+        seen.append("read")
+        return read_plane(frame)
+
+    def counted_sample(*args: Any) -> Any:
+        seen.append("sample")
+        return sample_rows(*args)
+
+    monkeypatch.setattr(store, "read_plane", counted_read)
+    monkeypatch.setattr(store, "sample_rows", counted_sample)
+    return seen
+
+
+def test_an_outline_is_sampled_once_and_its_sensor_rows_are_those_asked_for(reads: list[str]) -> None:
+    frame, planes = frame_of(), PlaneStore()
+    first = planes.sample(frame, outlines(), "srgb")
+    bent = outlines(lens=CORRECTED)
+    again = planes.sample(frame, bent, "srgb")
+    assert reads == ["read", "sample"]
+    assert first.sensor_row is None
+    np.testing.assert_array_equal(again.light, first.light)
+    np.testing.assert_array_equal(again.sensor_row, bent.sensor_row)
+
+
+def test_what_is_elsewhere_or_of_another_tone_is_sampled_from_the_same_plane(reads: list[str]) -> None:
+    frame, planes = frame_of(), PlaneStore()
+    planes.sample(frame, outlines(), "srgb")
+    planes.sample(frame, outlines(shift=1.0), "srgb")
+    planes.sample(frame, outlines(), "linear")
+    assert reads == ["read", "sample", "sample", "sample"]
+
+
+def test_another_frame_is_read_and_the_one_before_forgotten(reads: list[str]) -> None:
+    one, other, planes = frame_of(), frame_of(seed=1), PlaneStore()
+    light = [planes.sample(frame, outlines(), "srgb").light for frame in (one, other, one)]
+    assert reads == ["read", "sample"] * 3
+    np.testing.assert_array_equal(light[0], light[2])
+    assert np.abs(light[0] - light[1]).max() > 0.01
