@@ -21,7 +21,7 @@ class ExitCode(IntEnum):
     TERMINATED = 143
 
 
-#: Where several codes hold, the first of these wins.
+#: Precedence of exit codes, highest first.
 _PRECEDENCE = (
     *(ExitCode.TERMINATED, ExitCode.INTERRUPTED),
     *(ExitCode.USAGE, ExitCode.UNREADABLE, ExitCode.NOT_RECEIVED, ExitCode.OK),
@@ -29,35 +29,35 @@ _PRECEDENCE = (
 
 
 def worst(codes: list[ExitCode]) -> ExitCode:
-    """The exit code of a run in which each of `codes` occurred."""
+    """Exit code of a run in which each of `codes` occurred."""
     return next((code for code in _PRECEDENCE if code in codes), ExitCode.OK)
 
 
-#: What only a reader with a command line can do.
+#: Clauses that only apply to a command line.
 _COMMAND = re.compile(r"--[a-z]|\bpip |vlc-rx ")
 
 
 def without_commands(text: str) -> str:
-    """A message for readers without a command line: parentheses and clauses about options and commands left out."""
+    """Remove parentheses and clauses about options and commands from a message."""
     text = re.sub(r" \([^()]*\)", lambda found: "" if _COMMAND.search(found[0]) else found[0], text)
     clauses = re.split(r"(; |, or )", text)
-    kept = [
+    remaining = [
         (joint, clause)
         for joint, clause in zip(["", *clauses[1::2]], clauses[::2], strict=True)
         if not _COMMAND.search(clause)
     ]
-    return "".join(joint * (n > 0) + clause for n, (joint, clause) in enumerate(kept))
+    return "".join(joint * (n > 0) + clause for n, (joint, clause) in enumerate(remaining))
 
 
 class Terminated(BaseException):
-    """SIGTERM came: the run ends as by Ctrl-C, with what it has so far."""
+    """SIGTERM was received: the run ends as by Ctrl-C, with its results so far."""
 
 
 class ReceiverError(Exception):
-    """An error the user can act on: what, why, and the next step, in one line.
+    """An error that the user can act on, with reason and next step in one line.
 
     Args:
-        message: the thing concerned, the constraint and the value.
+        message: the object, the constraint and the value.
         hint: the next step, as a sentence.
     """
 
@@ -79,7 +79,7 @@ class InputError(ReceiverError):
 
 
 class OutputError(InputError):
-    """A file that cannot be written: the disk is full, for instance. It ends the run, whatever the source in hand."""
+    """A file that cannot be written, for instance on a full disk; it ends the run."""
 
 
 class ProfileError(ReceiverError):

@@ -1,4 +1,4 @@
-"""Maths that stages share; every stage may stand on it."""
+"""Numerical functions shared by all stages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.types import Float32Array, FloatArray
 
-#: Keeps what is divided by, or inverted, from zero: far below any light, weight or variance that says anything.
+#: Lower limit of divisors, far below any significant light, weight or variance.
 TINY = 1e-12
 #: Change of a header's slots, lit 1 and dark -1, at its borders.
 _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
@@ -20,7 +20,7 @@ _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]
 
 @lru_cache(maxsize=1)
 def _blas() -> Any:
-    """The controller of the threads of matrix products; None without threadpoolctl: nothing but slower."""
+    """Controller of the threads of matrix products; None without threadpoolctl, which only costs time."""
     try:
         from threadpoolctl import ThreadpoolController
     except ImportError:
@@ -29,17 +29,16 @@ def _blas() -> Any:
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Matrix products on one thread for a while.
+    """Run matrix products on one thread within the block.
 
-    Ours are small: further threads only wait for the next one, busily, and take from the decoder's what they need. So
-    they double the time that a picture takes of the processor.
+    The products are small, so further threads mostly wait actively and slow down the threads of the decoder.
     """
     controller = _blas()
     return nullcontext() if controller is None else controller.limit(limits=1, user_api="blas")
 
 
 def box_sums(values: Float32Array, half: int) -> Float32Array:
-    """Sum over the samples at most `half` away, nothing beyond the ends; last axis, same shape."""
+    """Sum over the samples at most `half` away along the last axis, zero beyond the ends; same shape."""
     import cv2
 
     flat = np.ascontiguousarray(values.reshape(-1, values.shape[-1]))
@@ -55,18 +54,18 @@ def local_mean(values: Float32Array, window: int) -> Float32Array:
 
 
 def folded(values: NDArray[Any], period: int) -> NDArray[Any]:
-    """(..., period) sums of values (..., n) that lie a period apart: what comes back with it adds up."""
+    """(..., period) sums of values (..., n) over all periods."""
     padded = np.zeros((*values.shape[:-1], -(-values.shape[-1] // period) * period), values.dtype)
     padded[..., : values.shape[-1]] = values
     return np.asarray(padded.reshape(*values.shape[:-1], -1, period).sum(axis=-2))
 
 
 def header_correlation(total: FloatArray, samples_per_slot: int) -> FloatArray:
-    """Mean over the slots of a header that starts at each sample, dark ones counting negative.
+    """Mean over the slots of a header that starts at each sample, dark slots negated.
 
     Args:
-        total: (..., n + 1) running sums at the borders of samples.
-        samples_per_slot: samples a slot.
+        total: (..., n + 1) cumulative sums at the borders of samples.
+        samples_per_slot: samples per slot.
 
     Returns:
         (..., n + 1 - samples of a header), in the samples' unit.

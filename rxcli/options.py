@@ -1,4 +1,4 @@
-"""What the user asks of the receiver."""
+"""Options of the receiver."""
 
 from __future__ import annotations
 
@@ -18,44 +18,44 @@ if TYPE_CHECKING:
     from rxcli.receiver.channel.denoise import Denoiser
 
 CaeMode = Literal["auto", "always", "never"]
-#: Names of the shortcuts that `ReceiverOptions.skip` may hold; every one is counted in the report.
+#: Names of shortcuts for `ReceiverOptions.skip`; the report counts each use.
 SKIPS = ("no_screen", "no_packets", "dark_columns", "certain_columns", "tracking")
-#: In place of a profile's name: all that are known, of which the picture decides.
+#: Instead of a profile's name: try all known profiles and let the picture decide.
 AUTO = "auto"
 _Profile = TypeVar("_Profile", ScreenProfile, CameraProfile)
 
 
 @dataclass(frozen=True, slots=True)
 class ReceiverOptions:
-    """What the user asks of the receiver; picklable, so that worker processes can have it."""
+    """Options of the receiver; picklable for worker processes."""
 
-    #: Screens to try, all shipped ones by default; the one whose clock fits best is taken.
+    #: Screens to try, by default all known ones; the best one is used.
     screens: tuple[ScreenProfile, ...] = field(default_factory=lambda: tuple(shipped_profiles(ScreenProfile)))
-    #: Cameras to choose from by make, model and size, all shipped ones by default; empty: every camera is estimated.
+    #: Cameras to choose from by make, model and size, by default all known ones; empty: estimate every camera.
     cameras: tuple[CameraProfile, ...] = field(default_factory=lambda: tuple(shipped_profiles(CameraProfile)))
-    #: Take `cameras[0]` whatever the file says of itself.
+    #: Use `cameras[0]` for every file, regardless of its metadata.
     force_camera: bool = False
     #: (4, 2) image pixels, top-left first, clockwise as a viewer sees the screen; None: find them.
     corners: FloatArray | None = None
-    #: The picture is mirrored: columns count from its right. Nothing is turned back; `corners` are as they are seen.
+    #: The picture is mirrored, so columns count from its right; `corners` are those of the mirrored picture.
     mirrored: bool = False
     cae: CaeMode = "auto"
     #: Packets below this confidence are not reported.
     min_confidence: float = 0.0
-    #: Shortcuts in use.
+    #: Enabled shortcuts.
     skip: frozenset[str] = field(default_factory=lambda: frozenset(SKIPS))
-    #: Pass over frames of a clip all of whose bursts are certain already.
+    #: Skip frames of a clip that show only bursts that are already certain.
     stop_when_certain: bool = False
-    #: Give the results of a clip's first frames after some frames even where more would leave less doubt: for cameras
-    #: that somebody aims.
+    #: Report the first frames of a clip early instead of waiting for a better picture, as for a camera that is being
+    #: aimed.
     prompt: bool = False
-    #: In place of the shipped auto-encoder; see `rxcli.receiver.channel.denoise.Denoiser`.
+    #: Replacement of the shipped auto-encoder; see `rxcli.receiver.channel.denoise.Denoiser`.
     denoiser: Denoiser | None = None
-    #: Folder for the arrays of every stage boundary; None: none are written.
+    #: Folder for the arrays of every stage boundary, or None.
     dump_dir: Path | None = None
-    #: Whether results carry the payload's soft bits, for the link layer.
+    #: Whether results contain soft bits for the link layer.
     soft_bits: bool = False
-    #: Memory of all files under way, 2^20 bytes; the least complete are dropped.
+    #: Memory limit of all incomplete files, 2^20 bytes; the least complete are dropped.
     file_memory_mb: int = FILE_MEMORY_MB
 
 
@@ -74,10 +74,10 @@ def receiver_options(
     soft_bits: bool = False,
     file_memory_mb: int = FILE_MEMORY_MB,
 ) -> ReceiverOptions:
-    """The receiver's options from names, files or profiles.
+    """Build the receiver's options from names, files or profiles.
 
-    A single camera that is named, not "auto", is taken whatever a file says of itself; of several, and of the shipped
-    ones, each file takes the one that matches its make, model and size.
+    A single named camera is used for every file. If there are several cameras, or "auto", each file uses the one that
+    matches its make, model and size.
 
     Args:
         screens: profile, name of one, TOML file, or several of these; "auto": all shipped ones and the user's own.
@@ -87,11 +87,11 @@ def receiver_options(
         cae: when the auto-encoder runs.
         min_confidence: packets below it are not reported.
         no_skip: shortcuts to switch off, of `SKIPS`.
-        stop_when_certain: pass over frames of a clip all of whose packets are certain already.
-        denoiser: in place of the shipped auto-encoder.
+        stop_when_certain: skip frames of a clip that show only packets that are already certain.
+        denoiser: replacement of the shipped auto-encoder.
         dump_dir: folder for the arrays of every stage boundary.
-        soft_bits: whether results carry the payload's soft bits, for the link layer.
-        file_memory_mb: memory of all files under way, 2^20 bytes; the least complete are dropped.
+        soft_bits: whether results contain soft bits for the link layer.
+        file_memory_mb: memory limit of all incomplete files, 2^20 bytes; the least complete are dropped.
 
     Raises:
         ProfileError: a profile is missing or malformed.
@@ -110,7 +110,7 @@ def receiver_options(
         skip=frozenset(SKIPS) - set(no_skip),
         stop_when_certain=stop_when_certain,
         denoiser=denoiser,
-        # Absolute, for workers may stand in other folders.
+        # Absolute, since workers may run in other folders.
         dump_dir=None if dump_dir is None else Path(dump_dir).absolute(),
         soft_bits=soft_bits,
         file_memory_mb=file_memory_mb,
@@ -124,7 +124,7 @@ def _profiles(
     found: list[_Profile] = []
     for name in names:
         if isinstance(name, kind):
-            # Made anew, so that one changed by `msgspec.structs.replace` is checked too.
+            # Rebuilt, so that a profile changed by `msgspec.structs.replace` is checked too.
             found.append(kind(**msgspec.structs.asdict(name)))
         elif not isinstance(name, str):
             raise UsageError(f"{name!r} is no {kind.__name__}", "give a profile of this kind, its name, or a TOML file")
@@ -144,7 +144,7 @@ def _check_choices(cae: str, min_confidence: float, no_skip: Sequence[str]) -> N
 
 
 def _checked_corners(corners: Any) -> FloatArray:
-    """The corners, where going round them always turns the same way, as it does round a screen seen by a camera."""
+    """Check that the corners form a convex quadrilateral in the right order."""
     found: FloatArray = np.array(corners, dtype=np.float64)
     if found.shape != (4, 2) or not np.all(np.isfinite(found)):
         raise UsageError(f"corners must be four positions (x, y) in stored pixels (got shape {found.shape})")

@@ -1,9 +1,8 @@
-"""Files that a run writes: claimed together before anything is opened, written whole or not at all.
+"""Output files of a run: checked together before any is opened, and written atomically.
 
-`claim` refuses outputs that would destroy something: an input, a profile, another output, a folder, or a file that
-somebody else wrote. `replacing` and `write_whole` write to a hidden neighbour, which takes the name only when it is
-complete, so that a kill or a full disk leaves the old file. Journals, which grow line by line, are the exception
-(`rxcli.runs.journal`).
+`claim` refuses outputs that would destroy an input, a profile, another output, a folder, or a foreign file. `replacing`
+and `write_whole` write to a hidden temporary file and rename it when it is complete, so that a kill or a full disk
+leaves the old file. Journals, which grow line by line, are the exception (`rxcli.runs.journal`).
 """
 
 from __future__ import annotations
@@ -26,20 +25,20 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-#: What another name would mend, and what it would not.
+#: System errors that a different name avoids, and errors of the disk.
 _NAMED_WRONG = frozenset(
     {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP}
 )
 _DISK_FAILS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO})
-#: A folder with a file of this name holds what a command has written, and nothing to decode.
+#: Marker file of folders that a command has written and that contain nothing to decode.
 OUTPUT_MARKER = ".vlc-rx-output"
-#: So much of a file's start and of its end tells whose it is.
-_LOOK_BYTES = 1 << 16
+#: Bytes at a file's start and end by which its origin is recognised.
+_SAMPLED_BYTES = 1 << 16
 #: Signature and IHDR of a PNG (ISO 15948, section 5).
 _PNG_HEADER_BYTES = 33
 
-# What files of ours look like.
-#: Nothing: whatever is there is somebody's.
+# Patterns of the content of own files.
+#: No pattern: every existing file is foreign.
 NEVER = re.compile(rb"(?!)")
 ANYTHING = re.compile(rb"")
 JOURNAL = re.compile(rb'\A\{"source": "[^\n]*?", "frame": \d+, "time_s": ')
@@ -47,13 +46,13 @@ PAYLOADS = re.compile(rb"\Asource,frame,column,burst,")
 CSV_SUMMARY = re.compile(rb"\Asource,exit_code,frames,")
 PARQUET_SUMMARY = re.compile(rb"\APAR1.*frames_failed", re.DOTALL)
 JUNIT = re.compile(rb'<testsuite name="vlc-rx ')
-#: A profile that may be added to, and one that was only ever estimated.
+#: A profile that may be extended, and one that was estimated.
 CAMERA = re.compile(rb'^kind = "camera"', re.MULTILINE)
 ESTIMATED_CAMERA = re.compile(rb'^description = "[^"\n]*estimated', re.MULTILINE)
-# Of `vlc-rx simulate`: truth, camera, what drives a screen.
+# Of `vlc-rx simulate`: truth, camera, transmitter.
 TRUTH = re.compile(rb'"written_by": "vlc-rx simulate"')
 SIMULATED_CAMERA = re.compile(rb'^description = "written by vlc-rx simulate"', re.MULTILINE)
-#: Labels or slots of `vlc-rx encode`, and the line that says their order.
+#: Labels or slots of `vlc-rx encode`, and the line that states their order.
 ENCODED = re.compile(rb"\A\x93NUMPY|\Aburst,symbol,column_0|one row a slot at")
 WAVEFORMS = re.compile(rb"\Acolumn_0|\A\x93NUMPY")
 #: Arrays of the stages (`rxcli.results.dump`).
@@ -65,22 +64,22 @@ PICTURE = re.compile(rb"\A\x89PNG.{29}....tEXtSoftware\0vlc-rx", re.DOTALL)
 
 
 def json_with(*keys: str) -> re.Pattern[bytes]:
-    """What JSON of ours with these keys, in this order, looks like."""
+    """Pattern of own JSON with these keys in this order."""
     return re.compile(rb'\A[\[{].*"' + rb'":.*"'.join(re.escape(key.encode()) for key in keys) + rb'":', re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """One file that a run will write."""
+    """An output file of a run."""
 
-    #: The option that names it, as the user writes it.
+    #: The option that names it.
     option: str
     path: Path
-    #: What an earlier output of the same sort looks like; such a file may be replaced.
+    #: Pattern of earlier outputs of the same kind, which may be replaced.
     ours: re.Pattern[bytes]
-    #: Whether its folder is made where there is none.
+    #: Whether a missing folder is created.
     makes_folder: bool = False
-    #: The way on where an earlier output of the same sort is kept as well; None: it is replaced.
+    #: Next step if an earlier output of the same kind must not be replaced; None: it is replaced.
     way_on: str | None = None
 
     def __str__(self) -> str:
@@ -88,18 +87,18 @@ class Output:
 
 
 class Taken:
-    """Files that a run reads or writes, known by their names, links followed, and by what lies there."""
+    """Files that a run reads or writes, by resolved name and by file identity."""
 
     def __init__(self) -> None:
         self._by: dict[object, str] = {}
 
     def add(self, path: Path, whose: str) -> None:
-        """Take a file for the rest of the run; `whose` says by what, as in "is an input"."""
+        """Reserve a file for the rest of the run; `whose` states its use, as in "is an input"."""
         for key in self._keys(path):
             self._by.setdefault(key, whose)
 
     def by(self, path: Path) -> str | None:
-        """What a file is taken by; None where it is free."""
+        """The use of a reserved file, or None."""
         return next((self._by[key] for key in self._keys(path) if key in self._by), None)
 
     @staticmethod
@@ -113,13 +112,13 @@ def claim(
     profiles: Iterable[str | Path] = (),
     force: bool = False,
 ) -> Taken:
-    """Refuse outputs that would destroy something or cannot be written; what is there is not touched.
+    """Refuse outputs that would destroy something or cannot be written; existing files are not touched.
 
     Args:
         outputs: all files that the run will write.
-        inputs: files that it reads; those that do not exist harm nothing.
-        profiles: profile files that it reads.
-        force: replace files that others wrote, though never an input or a profile of this run.
+        inputs: files that the run reads; missing ones are ignored.
+        profiles: profile files that the run reads.
+        force: replace foreign files, but never an input or a profile of this run.
 
     Returns:
         All files of the run, for outputs whose names are known only when they are written.
@@ -149,7 +148,7 @@ def claim(
 
 
 def claim_folder(option: str, folder: Path) -> None:
-    """Make a folder that a run writes into.
+    """Create a folder that a run writes into.
 
     Raises:
         UsageError: it is a file, or cannot be made or written.
@@ -163,7 +162,7 @@ def claim_folder(option: str, folder: Path) -> None:
 
 
 def _check_writable(output: Output) -> None:
-    """Refuse an output whose folder takes no file, or that is there and may not be changed."""
+    """Refuse an output in a read-only folder, or an existing read-only file."""
     try:
         path = output.path.resolve()
         if path.exists():
@@ -174,27 +173,27 @@ def _check_writable(output: Output) -> None:
 
 
 def _try_to_write(folder: Path) -> None:
-    """Make a file in a folder and remove it: permissions alone do not tell of file systems that are read only."""
+    """Create and remove a file in a folder, since permissions do not show read-only file systems."""
     handle, name = mkstemp(prefix=".vlc-rx-", suffix=".part", dir=folder)
     os.close(handle)
     Path(name).unlink(missing_ok=True)
 
 
 def _refusal(what: str, error: BaseException, step: str) -> ReceiverError:
-    """A usage error, or an output error where the names are right and the disk is not."""
+    """A usage error, or an output error if the disk is to blame."""
     if getattr(error, "errno", None) in _DISK_FAILS:
         return OutputError(f"{what}: cannot be written ({_reason(error)})", "make room, or name another disk")
     return UsageError(f"{what}: cannot be written ({_reason(error)})", step)
 
 
 def claim_own_folder(option: str, folder: Path, known: Iterable[str] = (), force: bool = False) -> None:
-    """Make a folder for nothing but what a command writes, and mark it, so that runs over folders pass over it.
+    """Create a folder for the outputs of one command and mark it, so that runs over folders skip it.
 
     Args:
-        option: that names it.
+        option: the option that names the folder.
         folder: new, empty, or written by the same command before.
-        known: patterns of names that tell a folder which an earlier version has written, without a mark.
-        force: write into somebody else's folder, which gets no mark.
+        known: patterns of file names in unmarked folders of earlier versions.
+        force: write into a foreign folder, which is not marked.
 
     Raises:
         UsageError: it is a file, cannot be made, or holds other files.
@@ -214,7 +213,7 @@ def claim_own_folder(option: str, folder: Path, known: Iterable[str] = (), force
 
 
 def _identity(path: Path) -> object | None:
-    """What two names of one file have in common; None where there is no file."""
+    """Identity of a file independent of its name; None if it does not exist."""
     try:
         info = path.stat()
     except (OSError, ValueError):
@@ -223,7 +222,7 @@ def _identity(path: Path) -> object | None:
 
 
 def _check_place(output: Output) -> None:
-    """Refuse a folder, and a name in no folder."""
+    """Refuse a folder, and a name in a missing folder."""
     path = output.path
     try:
         if path.is_dir():
@@ -235,7 +234,7 @@ def _check_place(output: Output) -> None:
 
 
 def _is_stream(path: Path) -> bool:
-    """Whether `path` is a device or a pipe, of which there is nothing to destroy."""
+    """Whether `path` is a device or a pipe, which holds nothing to destroy."""
     try:
         return path.exists() and not path.is_file()
     except (OSError, ValueError):
@@ -245,16 +244,16 @@ def _is_stream(path: Path) -> bool:
 def _check_ours(output: Output) -> None:
     try:
         with output.path.open("rb") as file:
-            look = file.read(_LOOK_BYTES)
-            rest = file.seek(0, os.SEEK_END) - len(look)
-            file.seek(-min(rest, _LOOK_BYTES), os.SEEK_END)
-            look += file.read() if rest else b""
+            head = file.read(_SAMPLED_BYTES)
+            rest = file.seek(0, os.SEEK_END) - len(head)
+            file.seek(-min(rest, _SAMPLED_BYTES), os.SEEK_END)
+            head += file.read() if rest else b""
     except FileNotFoundError:
         return
     except OSError as error:
         raise UsageError(f"{output}: cannot be looked at ({_reason(error)})", "name another file") from None
-    ours = not look or output.ours.search(look)
-    if look and ours and output.way_on is not None:
+    ours = not head or output.ours.search(head)
+    if head and ours and output.way_on is not None:
         raise UsageError(f"{output}: holds the results of an earlier run", output.way_on)
     if not ours:
         raise UsageError(
@@ -265,9 +264,9 @@ def _check_ours(output: Output) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path to write, with the suffix of `path`; what is there when the block ends well becomes `path`.
+    """Yield a temporary path with the suffix of `path`, which replaces `path` if the block succeeds.
 
-    A device or a pipe is given as it is. A link is followed. Where the block fails, `path` is as it was.
+    A device or a pipe is yielded itself. A link is followed. If the block fails, `path` is unchanged.
 
     Raises:
         OutputError: the file cannot be written; any `OSError` of the block ends so.
@@ -293,7 +292,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file as a whole or not at all.
+    """Write a file atomically.
 
     Raises:
         OutputError: it cannot be written.
@@ -304,7 +303,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def make_parent(path: Path) -> None:
-    """Make the folder that a file is to lie in.
+    """Create the folder of a file.
 
     Raises:
         OutputError: it cannot be made.
@@ -316,25 +315,27 @@ def make_parent(path: Path) -> None:
 
 
 def check_replaceable(path: Path, ours: re.Pattern[bytes], option: str) -> None:
-    """Refuse to replace a file that somebody else wrote, where a name is known only when it is written.
+    """Refuse to replace a foreign file, for names that are known only when they are written.
 
     Raises:
-        OutputError: `path` is there, and does not look like `ours`.
+        OutputError: `path` exists and does not match `ours`.
     """
     try:
         _check_ours(Output(option, path, ours))
     except UsageError as error:
-        told = OutputError(error.message, "name another folder")
-        told.exit_code = error.exit_code
-        raise told from None
+        refusal = OutputError(error.message, "name another folder")
+        refusal.exit_code = error.exit_code
+        raise refusal from None
 
 
 def unwritable(path: Path, error: BaseException) -> OutputError:
-    """The error that says that `path` could not be written, and why; wrong usage unless the disk is to blame."""
-    told = OutputError(f"{path}: cannot be written ({_reason(error)})", "name a file in a folder that can be written")
+    """Error for a `path` that cannot be written, with the reason; a usage error unless the disk is to blame."""
+    refusal = OutputError(
+        f"{path}: cannot be written ({_reason(error)})", "name a file in a folder that can be written"
+    )
     if isinstance(error, OSError) and error.errno in _NAMED_WRONG:
-        told.exit_code = ExitCode.USAGE
-    return told
+        refusal.exit_code = ExitCode.USAGE
+    return refusal
 
 
 def _reason(error: BaseException) -> str:
@@ -342,7 +343,7 @@ def _reason(error: BaseException) -> str:
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:
-    """A PNG of ours: `picture` is (height, width) grey or (height, width, 3) BGR; `PICTURE` knows it again."""
+    """Encode a PNG with the mark `PICTURE`; `picture` is (height, width) grey or (height, width, 3) BGR."""
     import cv2
 
     data = cv2.imencode(".png", picture)[1].tobytes()

@@ -25,12 +25,12 @@ from rxcli.resources import data_dir, profile_dirs, read_limited
 log = logging.getLogger(__name__)
 
 PositiveInt = Annotated[int, Meta(gt=0, le=1_000_000)]
-#: What profiles and modes may be called.
+#: Valid names of profiles and modes.
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 Name = Annotated[str, Meta(pattern=f"^{NAME.pattern}$")]
-#: Times of rows and exposures; below a nanosecond nothing is read out.
+#: Range of line delays and exposures, seconds.
 Seconds = Annotated[float, Meta(ge=1e-9, lt=1)]
-#: People write less.
+#: Longest profile file, bytes.
 _MAX_BYTES = 1 << 18
 #: Names of the tone curves that `rxcli.receiver.sampling.rows.tone_to_light` can undo.
 ToneName = Literal["linear", "srgb", "bt709", "auto"]
@@ -38,10 +38,10 @@ Triple = tuple[float, float, float]
 
 
 class _Checked(msgspec.Struct, frozen=True):
-    """Values that are checked, and made plain, whoever gives them: a file or Python.
+    """Base of profiles, which checks values from files and from Python and converts NumPy types.
 
     Raises:
-        ProfileError: an impossible value.
+        ProfileError: a value is impossible.
     """
 
     def __post_init__(self) -> None:
@@ -57,12 +57,12 @@ class _Checked(msgspec.Struct, frozen=True):
 
 
 def _as_builtin(value: Any) -> Any:
-    """NumPy's scalars and arrays as the numbers that they hold; anything else as text, which is no number."""
+    """Convert NumPy scalars and arrays to numbers, and anything else to text, which fails the check."""
     return value.tolist() if hasattr(value, "tolist") else repr(value)
 
 
 class ScreenProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A screen and what it sends (air interface, section 3)."""
+    """A screen and its signal (air interface, section 3)."""
 
     format: Literal[1] = 1
     kind: Literal["screen"] = "screen"
@@ -76,7 +76,7 @@ class ScreenProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     width_px: PositiveInt = 1366
     height_px: PositiveInt = 768
     segment_rows: Annotated[int, Meta(ge=1, le=1000)] = 8
-    #: Sigma of the Gaussian light spread, in segment pitches.
+    #: Standard deviation of the Gaussian light profile of a segment, segment pitches.
     light_spread: Annotated[float, Meta(ge=0, le=10)] = 0.45
     description: str = ""
 
@@ -97,14 +97,14 @@ class ScreenProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class ReadoutMode(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How one picture format of a camera is read out."""
+    """Readout of one picture format of a camera."""
 
     name: Name
     width: PositiveInt
     height: PositiveInt
     #: Time between the exposure starts of two adjacent rows.
     line_delay_s: Seconds
-    #: Exposure, where the files of this mode do not tell it.
+    #: Exposure of files of this mode that state none.
     exposure_s: Seconds | None = None
     frame_rate_hz: Annotated[float, Meta(gt=0, le=1e5)] | None = None
 
@@ -117,7 +117,7 @@ class LensModel(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True)
     camera_matrix: tuple[Triple, Triple, Triple]
     #: k1 k2 p1 p2 k3, then up to k6, s1..s4, tx ty as OpenCV orders them.
     dist_coeffs: Annotated[tuple[float, ...], Meta(min_length=4, max_length=14)]
-    #: True where the camera has already taken the distortion out of its pictures.
+    #: True if the camera corrects the distortion of its pictures.
     distortion_already_corrected: bool = False
 
     def __post_init__(self) -> None:
@@ -141,11 +141,11 @@ class CameraProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     description: str = ""
 
     def mode_for(self, width: int, height: int) -> ReadoutMode | None:
-        """The readout mode of a picture of `width` x `height`, None where this profile has none."""
+        """The readout mode of a picture of `width` x `height`, or None."""
         return next((mode for mode in self.modes if (mode.width, mode.height) == (width, height)), None)
 
     def matches(self, make: str | None, model: str | None) -> bool:
-        """Whether a file of camera `make` `model` (None: not told) is of this camera."""
+        """Whether a file of camera `make` `model` (None: unknown) is of this camera."""
         if model is None or not self.models:
             return False
         if self.make and make and self.make.casefold() not in make.casefold():
@@ -153,7 +153,7 @@ class CameraProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         return model.strip().casefold() in {name.casefold() for name in self.models}
 
 
-#: Distortion coefficients that any calibration may give, and focal lengths and centres in sizes of the picture.
+#: Largest distortion coefficient of any calibration; largest focal length and centre, picture sizes.
 _LARGEST_COEFFICIENT, _FARTHEST = 1e3, 1e3
 _Profile = TypeVar("_Profile", ScreenProfile, CameraProfile)
 _KINDS: dict[type[Any], str] = {ScreenProfile: "screens", CameraProfile: "cameras"}
@@ -181,7 +181,7 @@ def check_profile(raw: dict[str, Any], kind: type[_Profile], source: str) -> _Pr
     Raises:
         ProfileError: an unknown or missing key, or an impossible value.
     """
-    for key in ("format", "kind"):  # files must have them, though Python need not say them
+    for key in ("format", "kind"):  # required in files, though optional in Python
         if key not in raw:
             raise ProfileError(f"{source}: Object missing required field `{key}`", "correct the file")
     try:
@@ -268,7 +268,7 @@ def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any
 
 
 def _file_of(name: str, kind: type[Any]) -> Path:
-    """The file of a profile that goes by `name`, the user's first; else `name` is a path."""
+    """File of the profile `name`, the user's first; otherwise `name` is a path."""
     if NAME.fullmatch(name) is None:
         return Path(name)
     by_name = (folder / _KINDS[kind] / f"{name}.toml" for _, folder in profile_dirs())
@@ -276,7 +276,7 @@ def _file_of(name: str, kind: type[Any]) -> Path:
 
 
 def _load_file(name: str) -> ScreenProfile | CameraProfile:
-    """A screen or camera profile, by what the file says it is; what else is wrong with it, its loader tells."""
+    """Load a screen or camera profile by the `kind` in the file; the loader reports other errors."""
     try:
         kind = tomllib.loads(read_limited(Path(name), _MAX_BYTES).decode("utf-8")).get("kind")
     except (OSError, ValueError, RecursionError):
@@ -295,7 +295,7 @@ def _load_by_name(name: str) -> ScreenProfile | CameraProfile:
 
 
 def _profile_files(kind: type[Any]) -> list[tuple[str, Path]]:
-    """Files of profiles that go by their names, with where each comes from: the user's, then the shipped ones."""
+    """Files of named profiles with their origin: the user's, then the shipped ones."""
     found: dict[str, tuple[str, Path]] = {}
     for origin, folder in profile_dirs():
         for path in sorted((folder / _KINDS[kind]).glob("*.toml")):
@@ -304,9 +304,9 @@ def _profile_files(kind: type[Any]) -> list[tuple[str, Path]]:
 
 
 def known_profiles(kind: type[_Profile]) -> list[tuple[_Profile, str, Path]]:
-    """All profiles of one kind that go by their names, with origin and file: the user's first, then the shipped ones.
+    """All named profiles of one kind with origin and file: the user's first, then the shipped ones.
 
-    One of the user's that is broken is passed over with a warning: it must not stop what does not need it.
+    A broken profile of the user is skipped with a warning, since most runs do not need it.
     """
     known = []
     for origin, path in _profile_files(kind):
@@ -326,7 +326,7 @@ def shipped_profiles(kind: type[_Profile]) -> list[_Profile]:
 
 
 def dump_profile(profile: ScreenProfile | CameraProfile) -> str:
-    """The profile as TOML text that `parse_profile` reads back."""
+    """Write the profile as TOML text for `parse_profile`."""
     import tomli_w
 
     return tomli_w.dumps(_without_none(msgspec.to_builtins(profile)))
@@ -343,7 +343,7 @@ def _without_none(value: Any) -> Any:
 def match_camera(
     cameras: Iterable[CameraProfile], make: str | None, model: str | None, width: int, height: int
 ) -> CameraProfile | None:
-    """The first camera that matches make and model and has a readout mode for the size; None where none does.
+    """The first camera that matches make and model and has a readout mode for the size, or None.
 
     A body without a lens takes the lens of the first profile of the same camera that has one for this size.
     """

@@ -1,6 +1,6 @@
-"""The air interface: MPPM codebook, packet layout, bit order. Pure; imported by receiver and simulator alike.
+"""Air interface: MPPM codebook, packet layout, bit order. Pure functions, shared by receiver and simulator.
 
-A *slot* is the shortest on/off interval, a *symbol* is ten slots of which `w` are lit, a *packet* is header, dimming
+A *slot* is the shortest on/off interval, a *symbol* is ten slots with `w` lit ones, a *packet* is header, dimming
 symbol and payload symbols, a *burst* is one packet sent several times back to back.
 """
 
@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 SLOTS_PER_SYMBOL = 10
-#: Any window of this many slots holds a lit and a dark one: two symbols meet dark to dark or lit to lit at worst.
+#: Window length, slots, that always contains a lit and a dark slot, whatever the symbols.
 EXTREMES_SLOTS = 2 * SLOTS_PER_SYMBOL - 1
 WEIGHTS = range(1, SLOTS_PER_SYMBOL)
 HEADER: tuple[int, ...] = (0, 0, 1, 1, 1, 0, 0, 0, 1, 1)
-#: Header and dimming symbol: the slots of a packet that carry no payload.
+#: Slots of a packet without payload: header and dimming symbol.
 PREAMBLE_SLOTS = 2 * SLOTS_PER_SYMBOL
 
 
@@ -44,14 +44,14 @@ def codebook(w: int) -> NDArray[np.uint8]:
     return words
 
 
-def slot_patterns(memory: int) -> NDArray[np.uint8]:
-    """All patterns of a slot and its `memory` predecessors, (2**(memory+1), memory+1) uint8, the slot itself last."""
-    values = np.arange(1 << (memory + 1))
-    return ((values[:, None] >> np.arange(memory, -1, -1)) & 1).astype(np.uint8)
+def slot_patterns(isi_memory: int) -> NDArray[np.uint8]:
+    """(2**(memory+1), memory+1) uint8 patterns of a slot and its `isi_memory` predecessors, the slot itself last."""
+    values = np.arange(1 << (isi_memory + 1))
+    return ((values[:, None] >> np.arange(isi_memory, -1, -1)) & 1).astype(np.uint8)
 
 
 def dimming_symbol(w: int) -> NDArray[np.uint8]:
-    """The symbol after the header: `w` lit slots, then dark ones; (10,) uint8."""
+    """(10,) uint8 symbol after the header: `w` lit slots, then dark ones."""
     bits_per_symbol(w)
     return (np.arange(SLOTS_PER_SYMBOL) < w).astype(np.uint8)
 
@@ -81,7 +81,7 @@ def indices_to_bits(indices: NDArray[np.int64], w: int) -> NDArray[np.uint8]:
 
 
 def encode_packet(bits: NDArray[np.uint8], w: int) -> NDArray[np.uint8]:
-    """Slots of one packet carrying payload `bits`; (20 + 10 N,) uint8 of 0/1."""
+    """(20 + 10 N,) uint8 slots of 0/1 of a packet with payload `bits`."""
     payload = codebook(w)[bits_to_indices(bits, w)].ravel()
     return np.concatenate([np.array(HEADER, np.uint8), dimming_symbol(w), payload])
 

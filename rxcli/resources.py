@@ -1,6 +1,6 @@
-"""Where models, profiles and sample frames lie: inside an installed wheel, or beside the package in a checkout.
+"""Locations of models, profiles and sample frames: inside an installed wheel, or beside the package in a checkout.
 
-What a user adds lies in the folder that the system has for it (`platformdirs`), or where `VLC_RX_HOME` says.
+The user's own files are in the system's folder for them (`platformdirs`), or in the folder named by `VLC_RX_HOME`.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ def data_dir(name: str) -> Path:
 
 
 def read_limited(path: Path, max_bytes: int) -> bytes:
-    """A whole file that people write; a pipe, which may never end, or a file that is absurdly long is none.
+    """Read a regular file of limited length, which excludes pipes.
 
     Raises:
-        OSError: it cannot be read, is no regular file, or longer than `max_bytes`.
-        ValueError: the path is none.
+        OSError: the file cannot be read, is not regular, or is longer than `max_bytes`.
+        ValueError: the path is invalid.
     """
     info = path.stat()
     if not stat.S_ISREG(info.st_mode):
@@ -35,29 +35,29 @@ def read_limited(path: Path, max_bytes: int) -> bytes:
     return path.read_bytes()
 
 
-#: Names another folder for the user's profiles and settings.
+#: Environment variable that replaces the folder of the user's profiles and settings.
 HOME_VARIABLE = "VLC_RX_HOME"
 
 
 def user_dir() -> Path:
     """The folder of the user's own profiles (`cameras/`, `screens/`) and `config.toml`; it need not exist."""
-    told = os.environ.get(HOME_VARIABLE)
-    if told:
-        return Path(told)
+    home = os.environ.get(HOME_VARIABLE)
+    if home:
+        return Path(home)
     from platformdirs import user_config_path
 
     return user_config_path("vlc-rx", appauthor=False)
 
 
 def profile_dirs() -> list[tuple[str, Path]]:
-    """Folders that hold `cameras/` and `screens/`, with what each is called; of two of one name the first wins."""
+    """Folders with `cameras/` and `screens/` and their origin; the first profile of a name wins."""
     return [("user", user_dir()), ("shipped", data_dir("calibration"))]
 
 
 def onnx_runtime() -> Any:
-    """The module `onnxruntime`, imported so that it reports nothing to its maker and writes no device id.
+    """Import `onnxruntime` without telemetry and device id.
 
-    It reads the variable once, when it is loaded (its Privacy.md, "Disabling Telemetry").
+    The variable is read once on import (Privacy.md of ONNX Runtime, "Disabling Telemetry").
     """
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime

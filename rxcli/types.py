@@ -1,4 +1,4 @@
-"""The frozen dataclasses that pass between stages.
+"""Frozen dataclasses that pass between stages.
 
 Two conventions hold everywhere. Integer pixel coordinates are pixel centres, x to the right and y downwards in the
 stored picture, which is never rotated. The time of a sensor row is the start of its exposure: row `r` integrates from
@@ -25,7 +25,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """What a file says of its picture; None where it is silent."""
+    """Metadata of a picture file; None where the file states nothing."""
 
     make: str | None = None
     model: str | None = None
@@ -36,7 +36,7 @@ class Metadata:
     focal_length_35mm: float | None = None
     #: EXIF orientation, 1..8; 1 where the file has none.
     orientation: int = 1
-    #: What the file says and no camera does, in words; it is None above.
+    #: Impossible values in the file, in words; the fields above are then None.
     not_believed: tuple[str, ...] = ()
 
     @property
@@ -129,7 +129,7 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class Outlines:
-    """Where each strip of each column lies on the picture, row by row. C columns of S strips, R picture rows."""
+    """Position of each strip of each column on every picture row. C columns of S strips, R picture rows."""
 
     #: (R,) int: picture rows that the screen touches, adjacent and ascending.
     rows: NDArray[np.int64]
@@ -143,7 +143,7 @@ class Outlines:
 
 @dataclass(frozen=True, slots=True)
 class RowProfiles:
-    """Linear light of every strip on every row: all that the later stages see of the picture."""
+    """Linear light of every strip on every row, the only input of the later stages."""
 
     #: (C, S, R) float32: mean light, 1 is white; 0 outside the screen.
     light: Float32Array
@@ -153,9 +153,9 @@ class RowProfiles:
     rows: NDArray[np.int64]
     #: (C, S, R) float64: sensor rows, None where they are `rows`.
     sensor_row: FloatArray | None
-    #: (C, S) float32: pixels behind each mean, median over the rows.
+    #: (C, S) float32: pixels per mean, median over the rows.
     count: Float32Array
-    #: A pixel of light x has variance noise_floor + noise_slope * x.
+    #: The variance of a pixel of light x is noise_floor + noise_slope * x.
     noise_floor: float
     noise_slope: float
 
@@ -167,14 +167,17 @@ class RowProfiles:
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """The link's time on the sensor. Grid slot `n` of column `c` is position `(n + first_slot) % packet_slots` of copy
-    `(n + first_slot) // packet_slots`; a copy is one sending of a packet."""
+    """Time of the link on the sensor.
+
+    Grid slot `n` is position `(n + first_slot) % packet_slots` of copy `(n + first_slot) // packet_slots` in every
+    column; a copy is one transmission of a packet.
+    """
 
     rows_per_slot: float
     #: Exposure in slots.
     exposure_slots: float
     packet_slots: int
-    #: Sensor row whose exposure's centre is the start of grid slot 0 of a column without delay.
+    #: Sensor row whose exposure is centred at the start of grid slot 0 of a column without delay.
     row0: float
     #: Slots of the grid.
     n_slots: int
@@ -184,12 +187,12 @@ class Clock:
     burst: NDArray[np.int64]
     #: (C,) float64: delay of each column, slots.
     delay_slots: FloatArray
-    #: Height of the header peak over the strongest one elsewhere.
+    #: Ratio of the header peak to its strongest rival.
     header_peak_ratio: float
 
     @property
     def n_copies(self) -> int:
-        """Copies that the grid touches."""
+        """Number of copies on the grid."""
         return int(self.burst.size)
 
     @property
@@ -198,20 +201,20 @@ class Clock:
         return np.asarray((np.arange(self.n_slots) + self.first_slot) % self.packet_slots)
 
     def to_copies(self, slots: NDArray[Any]) -> NDArray[Any]:
-        """(..., N) slot values of the grid as (..., n_copies, packet_slots), 0 where the grid does not reach."""
+        """Reshape grid values (..., N) to (..., n_copies, packet_slots), 0 outside the grid."""
         out = np.zeros((*slots.shape[:-1], self.n_copies * self.packet_slots), slots.dtype)
         out[..., self.first_slot : self.first_slot + self.n_slots] = slots
         return out.reshape(*slots.shape[:-1], self.n_copies, self.packet_slots)
 
     def on_grid(self, slots: NDArray[Any]) -> NDArray[Any]:
-        """(C, N) values of the grid's slots from those of bursts (B, C, packet_slots)."""
+        """(C, N) values on the grid from values of bursts (B, C, packet_slots)."""
         copies = slots[self.burst].transpose(1, 0, 2)
         return np.asarray(copies.reshape(copies.shape[0], -1)[:, self.first_slot : self.first_slot + self.n_slots])
 
 
 @dataclass(frozen=True, slots=True)
 class SlotSamples:
-    """Row profiles resampled to Q samples a slot: C columns, S strips, N slots."""
+    """Row profiles resampled to Q samples per slot: C columns, S strips, N slots."""
 
     #: (C, S, N * Q) float32: light, sample i covers (i .. i + 1) / Q slots of exposure centre; 0 where not valid.
     light: Float32Array
@@ -222,13 +225,13 @@ class SlotSamples:
 
 @dataclass(frozen=True, slots=True)
 class BurstPosteriors:
-    """What the detector knows of B bursts of C columns; N payload symbols of up to K bits."""
+    """Posteriors of B bursts of C columns; N payload symbols of up to 7 bits."""
 
     #: (C,) int: weight of each column.
     w: NDArray[np.int64]
     #: (C, 9) float64: log evidence of w = 1..9, normalised to a sum of 1 in probability.
     w_log_prob: FloatArray
-    #: (C,) float64: log evidence of the column's slots being packets, over the weights that were considered.
+    #: (C,) float64: log evidence of packets in the column, summed over the candidate weights.
     log_evidence: FloatArray
     #: (B, C, 20 + 10 N) float32: probability that the slot is lit.
     lit: Float32Array
@@ -238,15 +241,15 @@ class BurstPosteriors:
     log_prob: FloatArray
     #: (B, C, N, 7) float64: ln p(1)/p(0) of the symbol's bits, first bit first; nan where w has fewer bits.
     bit_llr: FloatArray
-    #: (B, C) float64: log-likelihood of the headers as they must be, over slots of any kind; 0 where none is seen.
+    #: (B, C) float64: log-likelihood ratio of the headers against arbitrary slots; 0 where no header is visible.
     header_llr: FloatArray
 
     def of_columns(self, columns: IntArray) -> BurstPosteriors:
-        """Those of some columns."""
+        """Posteriors of some columns."""
         return BurstPosteriors(*(getattr(self, f.name)[_columns_of(f.name, columns)] for f in fields(self)))
 
     def with_columns(self, columns: IntArray, some: BurstPosteriors) -> BurstPosteriors:
-        """All columns, with `some` in the place of those named."""
+        """Replace the posteriors of the named columns by `some`."""
 
         def merged(name: str) -> Any:
             out = getattr(self, name).copy()
@@ -257,7 +260,7 @@ class BurstPosteriors:
 
 
 def _columns_of(name: str, columns: IntArray) -> Any:
-    """Index of some columns in a field of the posteriors; bursts come first in all but the weights and the evidence."""
+    """Index of some columns in a field; bursts are the first axis of all fields but weights and evidence."""
     return columns if name in ("w", "w_log_prob", "log_evidence") else (slice(None), columns)
 
 
@@ -265,7 +268,7 @@ FrameStatus = Literal["ok", "partial", "no_screen", "no_signal", "unreadable"]
 ColumnStatus = Literal["ok", "weak", "dark", "no_packet"]
 
 
-#: A packet of at least this confidence is believed: it counts as received, and its column is not weak.
+#: Minimum confidence of a received packet; a column below it is `weak`.
 BELIEVABLE = 0.5
 
 
@@ -290,7 +293,7 @@ class PacketResult:
     burst: int | None = None
     #: Frames of the clip in which the burst was seen; None for stills.
     frames: tuple[int, ...] | None = None
-    #: What the confidence was made of, see `rxcli.receiver.decode.assemble`; for fits, not for reports.
+    #: Features of the confidence, see `rxcli.receiver.decode.confidence`; for fits, not for reports.
     confidence_features: tuple[float, ...] = ()
 
     @property
@@ -306,7 +309,7 @@ class PacketResult:
 
 @dataclass(frozen=True, slots=True)
 class ColumnResult:
-    """What became of one column."""
+    """Result of one column."""
 
     column: int
     status: ColumnStatus
@@ -316,19 +319,19 @@ class ColumnResult:
     #: Delay against the common clock.
     delay_slots: float | None = None
     packets: tuple[PacketResult, ...] = ()
-    #: Reason and next step where nothing was decoded.
+    #: Reason and next step if nothing was decoded.
     message: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class FrameSoftBits:
-    """What one frame, or one burst, says of the payload's bits: B bursts, N payload symbols, C columns."""
+    """Soft bits of the payload from one frame or one burst: B bursts, N payload symbols, C columns."""
 
     #: (B,) int64 number of every burst in its epoch, ascending.
     burst: NDArray[np.int64]
-    #: (B, N, C, 7) float32 ln p(1)/p(0) of every label's bits, first bit first; 0 or NaN where nothing is known.
+    #: (B, N, C, 7) float32 ln p(1)/p(0) of every label's bits, first bit first; 0 or NaN if unknown.
     llr: Float32Array
-    #: Burst numbers of one epoch count on one clock; those of different epochs cannot be compared.
+    #: Burst numbers of one epoch count on one clock; numbers of different epochs are not comparable.
     epoch: int = 0
     source: str = ""
     frame: int = 0
@@ -340,7 +343,7 @@ MessageKind = Literal["raw", "text", "uri"]
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A short message that came."""
+    """A received short message."""
 
     kind: MessageKind
     data: bytes
@@ -357,11 +360,11 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class ReceivedObject:
-    """A file that came whole; its SHA-256 fits."""
+    """A complete file with a valid SHA-256."""
 
-    #: Safe to be used as a file's name.
+    #: Harmless file name.
     name: str
-    #: Its bytes; empty where a report was read back.
+    #: Content; empty if read back from a report.
     data: bytes
     size: int
     sha256: str
@@ -371,37 +374,37 @@ class ReceivedObject:
     #: Frame in which it was complete.
     frame: int
     time_s: float
-    #: Where it was written, None where it was not.
+    #: Path of the written file, or None.
     path: str | None = None
 
 
-#: Memory of all files that are being received at a time where nothing else is said, 2^20 bytes.
+#: Default memory limit of all incomplete files together, 2^20 bytes.
 FILE_MEMORY_MB = 512
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectProgress:
-    """A file under way."""
+    """Progress of an incomplete file."""
 
     object_id: int
-    #: Bytes of the container, a little more or less than the file's.
+    #: Bytes of the container, which differ a little from the file's.
     container_bytes: int
     n_blocks: int
     blocks_done: int
-    #: Of what must be seen, 0..1.
+    #: Received share of the required information, 0..1.
     share: float
-    #: More seconds of such a clip that would do; None where nothing says how many.
+    #: Estimated remaining seconds of such a clip, or None.
     seconds_left: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class SearchStep:
-    """A hypothesis that the search of a photograph tried."""
+    """A hypothesis scored by the search of a photograph."""
 
     #: Screen, columns, rows of the outline, rows per slot, direction of readout and bursts, in words.
     hypothesis: str
     log_prior: float
-    #: Log-likelihood ratio of packets over slots of any kind; 0 where there was no clock.
+    #: Log-likelihood ratio of packets against arbitrary slots; 0 without a clock.
     evidence: float
     score: float
     #: "won"; "lost"; "half": its middle columns left it too far behind for a whole pass; "no clock"; "no data": it
@@ -411,7 +414,7 @@ class SearchStep:
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """What became of one frame; `rxcli.results.report` turns it into JSON and tables."""
+    """Result of one frame; `rxcli.results.report` converts it to JSON and tables."""
 
     source: str
     frame: int
@@ -422,47 +425,47 @@ class FrameResult:
     screen_profile: str | None = None
     #: (4, 2) image pixels, top-left first, clockwise as a viewer sees the screen.
     corners: FloatArray | None = None
-    #: Probability that the columns are numbered as the screen's; the packets' confidence has it in it.
+    #: Probability that the column numbers are those of the screen; included in the confidence of the packets.
     column_certainty: float = 1.0
-    #: Sides of the stored picture (top, right, bottom, left) that were not seen but inferred.
+    #: Sides of the screen (top, right, bottom, left of the stored picture) that were inferred, not found.
     inferred_sides: tuple[str, ...] = ()
-    #: The screen's column that column 0 of the result is; None where columns are counted from the left of what is seen.
+    #: Screen number of column 0; None if columns are counted from the leftmost visible one.
     column_offset: int | None = 0
-    #: Whether the picture is mirrored, and columns count from its right: on request, or because a text or a file can
-    #: only be read so. None: it may be, for the file names a front camera.
+    #: Whether the picture is mirrored, with columns counted from its right: on request, or because a text or a file
+    #: decoded only that way. None: undecided, since the file names a front camera.
     mirrored: bool | None = False
     camera_profile: str | None = None
     line_delay_s: float | None = None
     exposure_s: float | None = None
-    #: What was estimated blindly of the camera: name -> (value, standard deviation).
+    #: Blind estimates of the camera: name -> (value, standard deviation).
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
     columns: tuple[ColumnResult, ...] = ()
     #: Wall time by stage, milliseconds.
     timing_ms: dict[str, float] = field(default_factory=dict)
-    #: What was skipped: name -> count.
+    #: Skipped steps: name -> count.
     skipped: dict[str, int] = field(default_factory=dict)
-    #: What the auto-encoder did, None where it did not run.
+    #: Report of the auto-encoder; None if it did not run.
     denoiser: dict[str, Any] | None = None
-    #: Every hypothesis that was tried, in order, of a photograph; never part of a report.
+    #: Scored hypotheses of a photograph, in order; never part of a report.
     search: tuple[SearchStep, ...] = ()
-    #: For the link layer, where it was asked for; never part of a report.
+    #: Soft bits for the link layer, on request; never part of a report.
     soft_bits: FrameSoftBits | None = None
-    #: What the link layer has complete with this frame.
+    #: Messages and files completed with this frame.
     messages: tuple[Message, ...] = ()
     objects: tuple[ReceivedObject, ...] = ()
-    #: In the last result of a source: files under way, and sentences about what was refused.
+    #: In the last result of a source: incomplete files, and sentences about refused ones.
     progress: tuple[ObjectProgress, ...] = ()
     link_notes: tuple[str, ...] = ()
-    #: The process that decoded the source was ended from outside: a run that is resumed tries the source again.
+    #: Whether the decoding process was killed; a resumed run then decodes the source again.
     retry: bool = False
 
     @property
     def packets(self) -> tuple[PacketResult, ...]:
-        """Those of all columns."""
+        """Packets of all columns."""
         return tuple(packet for column in self.columns for packet in column.packets)
 
     def with_columns_mirrored(self) -> FrameResult:
-        """The result with its columns, corners and soft bits counted from the other side."""
+        """Count columns, corners and soft bits from the opposite side."""
         soft = self.soft_bits
         return replace(
             self,

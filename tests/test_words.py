@@ -21,7 +21,6 @@ VAGUE_NAMES = {
     "both",
     "bow",
     "either",
-    "evidence",
     "first",
     "floor",
     "foretell",
@@ -79,7 +78,9 @@ CHANNEL = ("__init__", "denoise", "likelihoods", "model", "patterns", "picture",
 #: What is read: folders and files of `rxcli/`, and pages.
 SOURCES = (
     *("receiver/decode", "receiver/sync", "receiver/light.py", "receiver/context.py", "receiver/acquisition.py"),
-    *("receiver/reception.py", *(f"receiver/channel/{name}.py" for name in CHANNEL)),
+    *("link", "types.py", "protocol.py", "profiles.py", "options.py", "errors.py", "resources.py", "numerics.py"),
+    *("outputs.py", "__init__.py", "receiver/reception.py"),
+    *(f"receiver/channel/{name}.py" for name in CHANNEL),
 )
 PAGES: tuple[str, ...] = ()
 

@@ -1,26 +1,25 @@
-"""The link layer: soft bits of packets to messages and files, and back to labels for transmitters.
+"""Link layer: from soft bits of packets to messages and files, and back to labels for transmitters.
 
 Receiving::
 
     receiver = LinkReceiver(columns=20, payload_symbols=24)
-    for soft in frames:                  # `FrameSoftBits`: what one frame, or one burst, says of the payload's bits
+    for soft in frames:                  # `FrameSoftBits`: soft bits of one frame or one burst
         for event in receiver.add(soft): # `Message` or `ReceivedObject`, each once, when it is complete
             ...
-    receiver.finish()                    # tries what is left; again a list of events
+    receiver.finish()                    # decode the rest; again a list of events
     receiver.messages                    # every `Message` so far: kind, text, data
     receiver.objects                     # every `ReceivedObject` so far: name, size, sha256, data
-    receiver.progress                    # every file under way, `ObjectProgress`: blocks, share received
+    receiver.progress                    # every incomplete file, `ObjectProgress`: blocks, share received
 
-`Collector` does this for `FrameResult`s: `collector.add(result)` gives the result with `messages` and `objects` filled
-in (`ReceiverOptions.soft_bits` must be set), `collector.finish(last_result)` adds `progress` and `link_notes`, and
-`rxcli.link.saving.save_object` writes a file.
+`Collector` does this for `FrameResult`s: `collector.add(result)` returns the result with `messages` and `objects`
+filled in (`ReceiverOptions.soft_bits` must be set), `collector.finish(last_result)` adds `progress` and `link_notes`,
+and `rxcli.link.saving.save_object` writes a file.
 
-Sending: `message(...)` and `file_object(...)` give a `Sending`, whose `labels(first, n, N, C)` are what a transmitter
-sends, and `rxcli.link.encoder.slots` makes slots of them. `simulate` uses the same.
+Sending: `message(...)` and `file_object(...)` return a `Sending`. Its `labels(first, n, N, C)` are the labels for the
+transmitter, and `rxcli.link.encoder.packet_slots_of` converts them to slots. `simulate` uses the same functions.
 
-A bit's ratio is ln p(1)/p(0) everywhere, 0 where nothing is known. Burst numbers count through a clip; `epoch` changes
-where the count may have jumped (a new photo, a lost clock). The room stands on the ground alone: it knows nothing of
-pixels.
+The log-likelihood ratio of a bit is ln p(1)/p(0) everywhere, 0 if nothing is known. Burst numbers count through a clip;
+`epoch` changes where the count may have jumped (a new photo, a lost clock). This package knows nothing of pixels.
 """
 
 from __future__ import annotations

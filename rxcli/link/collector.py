@@ -1,4 +1,4 @@
-"""From frames' results to messages and files: soft bits are taken out of them, what they complete is put in."""
+"""Convert the soft bits in frame results to messages and files, and add those to the results."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from rxcli.types import FILE_MEMORY_MB, FrameResult, FrameSoftBits, Message, Obj
 
 
 class Collector:
-    """The link layer of one source, or of photos that are to be combined.
+    """Link layer of one source, or of several photos of one transmission.
 
-    Columns are tried in both directions until one of them gives a text or announces a file: a picture may be mirrored.
+    Columns are tried in both directions until one gives a text or announces a file, since a picture may be mirrored.
 
     Args:
         screens: profiles that results may name.
-        file_memory_mb: bound of all files under way, 2^20 bytes.
+        file_memory_mb: memory limit of all incomplete files, 2^20 bytes.
     """
 
     def __init__(self, screens: Sequence[ScreenProfile], file_memory_mb: int = FILE_MEMORY_MB) -> None:
         self._under_way = FilesUnderWay(file_memory_mb)
         self._shapes = {screen.name: (screen.columns, screen.payload_symbols) for screen in screens}
-        #: By the columns and symbols of a packet, and whether columns are counted from the other side.
+        #: Receivers by columns, payload symbols, and whether columns are counted from the opposite side.
         self._receivers: dict[tuple[int, int, bool], LinkReceiver] = {}
-        #: Whether columns are counted from the other side; None: nothing has come that would say so.
+        #: Whether columns are counted from the opposite side; None until a message or file decides.
         self._turned: bool | None = None
         self._source = ""
 
     def add(self, result: FrameResult) -> FrameResult:
-        """The result with what it completes, and without its soft bits; turned round where the picture is mirrored."""
+        """Replace the soft bits of a result by the messages and files that they complete; mirror it if necessary."""
         soft, result = result.soft_bits, replace(result, soft_bits=None)
-        if result.source != self._source:  # another photo may be of another camera
+        if result.source != self._source:  # the next photo may come from a different camera
             self._source, self._turned = result.source, None
         events: list[Event] = []
         if soft is not None:
@@ -47,7 +47,7 @@ class Collector:
         return with_events(result, events)
 
     def _add_bits(self, soft: FrameSoftBits, screen_profile: str | None, turned: bool) -> list[Event]:
-        """Add the soft bits of a screen, columns counted from one side; returns what they complete."""
+        """Add the soft bits of a screen with columns counted from one side; return completed messages and files."""
         shape = self._shapes.get(screen_profile or "")
         if shape is None or soft.llr.shape[1:3] != shape[::-1]:
             return []
@@ -60,7 +60,7 @@ class Collector:
         return events
 
     def finish(self, last: FrameResult) -> FrameResult:
-        """The last result of the source with what is left, complete or not."""
+        """Add the remaining messages and files, complete or not, to the last result of the source."""
         events = [event for receiver in self._decided for event in receiver.finish()]
         return replace(with_events(last, events), progress=tuple(self.progress), link_notes=tuple(self.notes))
 
@@ -70,17 +70,17 @@ class Collector:
 
     @property
     def progress(self) -> list[ObjectProgress]:
-        """Files under way."""
+        """Progress of incomplete files."""
         return [progress for receiver in self._decided for progress in receiver.progress]
 
     @property
     def notes(self) -> list[str]:
-        """Sentences about what was seen and refused."""
-        return list(dict.fromkeys(note for receiver in self._decided for note in receiver.notes))
+        """Sentences about refused messages and files."""
+        return list(dict.fromkeys(sentence for receiver in self._decided for sentence in receiver.notes))
 
 
 def with_events(result: FrameResult, events: Sequence[Event]) -> FrameResult:
-    """The result with messages and files that are complete with it."""
+    """Add completed messages and files to a result."""
     if not events:
         return result
     return replace(

@@ -1,4 +1,4 @@
-"""What a transmitter has to send: labels, and slots made of them."""
+"""Encoder for transmitters: messages and files to labels, and labels to slots."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from rxcli.link.layout import (
 from rxcli.protocol import HEADER, bits_per_symbol, codebook, dimming_symbol
 from rxcli.types import MessageKind
 
-#: Information of a beacon from which on one photo is enough, in its bits.
+#: Information at which one photo suffices for a beacon, relative to its bits.
 BEACON_NEED = 1.2
 _LABEL_WEIGHTS = 1 << np.arange(LABEL_BITS - 1, -1, -1)
-#: Blocks coded at a time.
+#: Blocks per encoding batch.
 _BATCH = 64
 
 Labels = NDArray[np.uint8]
@@ -68,7 +68,7 @@ class MessageSending:
             )
 
     def usual_bursts(self, columns: int, payload_symbols: int) -> int:
-        """Bursts of a round, after which all comes again."""
+        """Bursts of a round, after which the message repeats."""
         return beacon_layout(len(self.body), columns, payload_symbols).period
 
     def _buffer(self, layout: BeaconLayout) -> NDArray[np.uint8]:
@@ -82,7 +82,7 @@ class MessageSending:
 
 
 def message(text: str | bytes, kind: MessageKind = "text") -> MessageSending:
-    """A text, a URI or raw bytes as a beacon.
+    """Create a beacon from a text, a URI or raw bytes.
 
     Raises:
         UsageError: it is empty, too long, or a text with a zero byte.
@@ -97,7 +97,7 @@ class FileSending:
         container: the packed file.
         object_id: 0..0xFFFD.
         mother: 0, 1, 2 for mother rates 1/1.5, 1/2, 1/3.
-        name: for people.
+        name: name in messages.
 
     Raises:
         UsageError: the object id is reserved or the container too long to announce.
@@ -113,7 +113,7 @@ class FileSending:
         self._coded: NDArray[np.uint8] | None = None
 
     def layout(self, columns: int, payload_symbols: int) -> FileLayout:
-        """Where the bits go on a screen."""
+        """Layout of the bits on a screen."""
         return FileLayout(self.object_id, len(self.container), self.mother, columns, payload_symbols)
 
     def labels(self, bursts: Places, columns: int, payload_symbols: int) -> Labels:
@@ -146,21 +146,21 @@ class FileSending:
             )
 
     def usual_bursts(self, columns: int, payload_symbols: int) -> int:
-        """Bursts in which everything that is coded comes once."""
+        """Bursts of one pass, in which every coded bit is sent once."""
         layout = self.layout(columns, payload_symbols)
         data = -(-layout.n_blocks * layout.n_labels // (columns * payload_symbols))
         return data - (-data // (ANNOUNCEMENT_PERIOD - 1))
 
     @property
     def ready_bits(self) -> float:
-        """Bits of information that a receiver must see before the file is complete."""
+        """Bits of information that a receiver needs for the complete file."""
         layout = self.layout(1, 1)
         return READY[self.mother] * layout.code.k * layout.n_blocks
 
     def _announcement(self, burst: int, columns: int, payload_symbols: int) -> Labels:
         layout = announcement_layout(columns, payload_symbols)
-        told = Announcement(self.mother, self.object_id, len(self.container), burst, self._crc)
-        return _labels(ldpc.encode(layout.code, _bits(told.protected())[None])[0], layout.places[0])
+        announcement = Announcement(self.mother, self.object_id, len(self.container), burst, self._crc)
+        return _labels(ldpc.encode(layout.code, _bits(announcement.protected())[None])[0], layout.places[0])
 
     def _buffers(self, layout: FileLayout) -> NDArray[np.uint8]:
         """(B, bytes) every block's coded bits, packed."""
@@ -186,12 +186,12 @@ class FileSending:
         )
 
 
-#: Something that is sent until it is stopped.
+#: A continuous transmission.
 Sending = MessageSending | FileSending
 
 
 def file_object(name: str, data: bytes, object_id: int | None = None, mother: int = 2) -> FileSending:
-    """A file to be sent; without an id, one that follows from what is sent.
+    """Create a file transmission; the default id is derived from its content.
 
     Raises:
         UsageError: the name or the id cannot be sent.
@@ -234,5 +234,5 @@ def packet_slots_of(labels: Labels, weights: NDArray[np.int64]) -> NDArray[np.ui
 
 
 def visible_bits_of_burst(weights: NDArray[np.int64], payload_symbols: int) -> int:
-    """Bits that one burst carries over all columns of some weights (C,)."""
+    """Payload bits of one burst over all columns with weights (C,)."""
     return payload_symbols * sum(bits_per_symbol(int(w)) for w in weights)

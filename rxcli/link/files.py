@@ -1,4 +1,4 @@
-"""Files: announcements give the count of bursts, and what was seen of every block is added up until all are read."""
+"""Files: find announcements, which number the bursts, and add up the bits of every block until all are decoded."""
 
 from __future__ import annotations
 
@@ -24,40 +24,41 @@ from rxcli.link.sequences import whiten
 from rxcli.link.softbits import (
     INFORMATION_OF_STEPS,
     Float32,
-    alike,
     information,
     log_likelihood,
+    same_bits_llr,
     surprise,
 )
 from rxcli.types import FILE_MEMORY_MB, FrameSoftBits, ObjectProgress
 
 _LN2 = float(np.log(2.0))
-#: Information of an announcement from which on it is tried, in its bits, and the log-likelihood of its copies.
-_TRY_ANNOUNCEMENT, _NOT_ALIKE = 1.02, -8.0
-#: Announcements that are tried at a time, where copies do not tell.
+#: Information at which an announcement is decoded, relative to its bits; and the minimum similarity of its copies.
+_TRY_ANNOUNCEMENT, _MIN_SIMILARITY = 1.02, -8.0
+#: Batch size for announcements whose copies do not decide.
 _ANNOUNCEMENTS_AT_ONCE = 32
-#: Gathered trials that are made one after the other; later only every so manieth is, for most clips send no file.
-_GATHERED_AT_FIRST, _THEN_EVERY = 8, 4
-#: Blocks that are decoded at a time, the share of those left that is enough, and frames after which fewer are.
+#: Batches that are decoded at first, and the spacing afterwards, since most clips send no file.
+_FREE_BATCHES, _THEN_EVERY = 8, 4
+#: Blocks per batch, the share of the remaining blocks that suffices, and frames after which fewer suffice.
 _BLOCKS_AT_ONCE, _SHARE_AT_ONCE, _PATIENT_FRAMES = 32, 0.5, 30
 _ITERATIONS = 25
-#: A block is tried again with so much more information, in its bits.
-_TRY_AGAIN = 0.02
-#: Files of so many blocks learn from the first that are tried, of so many, with how much information it goes.
+#: Increase of information before the next attempt on a block, relative to its bits.
+_RETRY_GAIN = 0.02
+#: Files of at least this many blocks estimate the required information from this many first ones; and the share of
+#: decoded blocks in a batch below which the required information is raised.
 _LEARN_FROM, _PROBES, _FEW = 16, 8, 0.25
-#: A decoded block must be at least so likely, as a share of what was seen.
+#: Minimum log-likelihood of a decoded block, relative to the received information.
 _MIN_LIKELIHOOD = 0.5
-#: Bytes of bursts that wait for an announcement, and bursts that an object that changes may claim back.
+#: Bytes of bursts that wait for an announcement, and bursts that may be reassigned to a new object.
 _MAX_WAITING, _MAX_RECENT = 32 << 20, 96
-#: Bytes of a file that are accepted.
+#: Largest accepted file, bytes.
 MAX_OBJECT_BYTES = 16 << 20
-#: Of a file beside its sums, and what is remembered of changes and refusals at most.
+#: Bytes of a file's state beside its sums, and maximum numbers of stored timelines and notes.
 _STATE_BYTES, _MAX_TIMELINES, _MAX_NOTES = 1 << 14, 16, 20
 
 
 @dataclass(frozen=True, slots=True)
 class _Burst:
-    """A burst that may have to be read again."""
+    """A burst that may have to be reassigned."""
 
     epoch: int
     number: int
@@ -67,24 +68,24 @@ class _Burst:
 
 @dataclass(slots=True, eq=False)
 class FileState:
-    """What is known of one file."""
+    """Reception state of one file."""
 
     announcement: Announcement
     layout: FileLayout
-    #: (B, M) int8 sums of ratios in the decoder's steps.
+    #: (B, M) int8 sums of log-likelihood ratios in the decoder's steps.
     total: NDArray[np.int8]
-    #: (B,) bits of information, and those from which on a block is tried.
+    #: (B,) bits of information, and the threshold for decoding a block.
     known: NDArray[np.float64]
     threshold: NDArray[np.float64]
     blocks: dict[int, bytes] = field(default_factory=dict)
-    #: Information at which blocks were read, in their bits.
+    #: Information at which blocks were decoded, relative to their bits.
     read_at: list[float] = field(default_factory=list)
-    #: Information below which no block is tried, in its bits.
-    least: float = 0.0
+    #: Minimum information for decoding any block, relative to its bits.
+    min_information: float = 0.0
     done: bool = False
-    #: Why it can never be complete.
+    #: Reason why the file can never be complete.
     failure: str | None = None
-    #: Whether it was dropped to make room for others; it begins anew where it is announced again.
+    #: Whether the file was dropped to free memory; it restarts with the next announcement.
     dropped: bool = False
     frames_waited: int = 0
     first_time_s: float | None = None
@@ -92,26 +93,26 @@ class FileState:
 
     @classmethod
     def begin(cls, announcement: Announcement, columns: int, payload_symbols: int) -> FileState:
-        """Nothing received yet."""
+        """Start an empty file."""
         layout = FileLayout(announcement.object_id, announcement.length, announcement.mother, columns, payload_symbols)
         n = layout.n_blocks
-        # Memory that is not touched is not taken, so that a length that lies costs nothing.
+        # The operating system provides memory on first use, so a false length costs nothing.
         total = np.zeros((n, layout.n_bits), np.int8)
         return cls(announcement, layout, total, np.zeros(n), np.full(n, layout.ready))
 
     @property
     def under_way(self) -> bool:
-        """Whether more of it is wanted."""
+        """Whether the file is still incomplete."""
         return not (self.done or self.failure or self.dropped)
 
     @property
     def n_bytes(self) -> int:
-        """Memory that it may take."""
+        """Largest memory use."""
         return self.total.nbytes + self.known.nbytes + self.threshold.nbytes + 2 * self.layout.length + _STATE_BYTES
 
     @property
     def share(self) -> float:
-        """Share received of what must be seen."""
+        """Received share of the required information."""
         if self.done:
             return 1.0
         part = np.minimum(self.known / self.layout.ready, 0.999)
@@ -119,20 +120,20 @@ class FileState:
         return float(part.mean())
 
     def progress(self) -> ObjectProgress:
-        """What is there, and how many seconds more of such a clip would do."""
+        """Received share, and remaining time at the current rate."""
         passed_s = self.last_time_s - self.first_time_s if self.first_time_s is not None else 0.0
         share, layout = self.share, self.layout
         left_s = passed_s * (1 - share) / share if passed_s > 0 and share > 0 else None
         return ObjectProgress(layout.object_id, layout.length, layout.n_blocks, len(self.blocks), share, left_s)
 
     def add(self, bursts: NDArray[np.int64], llr: NDArray[np.int8], sign: int = 1) -> None:
-        """Add data bursts, counted from the object's start; `sign` -1 takes them back."""
+        """Add data bursts, numbered from the object's start; `sign` -1 removes them."""
         blocks, labels, passes = (part.ravel() for part in self.layout.labels(bursts))
         ratios = llr.reshape(-1, LABEL_BITS)
-        seen = np.flatnonzero(ratios.any(axis=1) & self._open()[blocks])
-        block = blocks[seen]
-        place = block[:, None] * self.layout.n_bits + self.layout.bits_of(labels[seen], passes[seen])
-        more = ratios[seen].astype(np.int16) * sign
+        used = np.flatnonzero(ratios.any(axis=1) & self._open()[blocks])
+        block = blocks[used]
+        place = block[:, None] * self.layout.n_bits + self.layout.bits_of(labels[used], passes[used])
+        more = ratios[used].astype(np.int16) * sign
         if not self.layout.all_differ(bursts):
             place, turn = np.unique(place, return_inverse=True)
             more = np.rint(np.bincount(turn.ravel(), more.ravel(), place.size)).astype(np.int16)
@@ -150,7 +151,7 @@ class FileState:
         return still
 
     def ready(self, at_last: bool) -> NDArray[np.int64]:
-        """Blocks to be tried now."""
+        """Blocks with enough information to be decoded."""
         ready = np.flatnonzero((self.known >= self._thresholds(at_last)) & self._open())
         left = self.layout.n_blocks - len(self.blocks)
         if (
@@ -163,19 +164,19 @@ class FileState:
 
     def _thresholds(self, at_last: bool) -> NDArray[np.float64]:
         if at_last:
-            return self.threshold - 2 * _TRY_AGAIN * self.layout.code.k
-        least = self.least
+            return self.threshold - 2 * _RETRY_GAIN * self.layout.code.k
+        required = self.min_information
         if self.layout.n_blocks >= _LEARN_FROM and len(self.read_at) >= _PROBES:
-            least = max(least, float(np.median(self.read_at[-4 * _BLOCKS_AT_ONCE :])) - _TRY_AGAIN)
-        return np.maximum(self.threshold, least * self.layout.code.k)
+            required = max(required, float(np.median(self.read_at[-4 * _BLOCKS_AT_ONCE :])) - _RETRY_GAIN)
+        return np.maximum(self.threshold, required * self.layout.code.k)
 
     def read(self, which: NDArray[np.int64]) -> None:
-        """Decode blocks; where the first fail, the others wait too."""
+        """Decode blocks; if the first ones fail, the rest waits."""
         self.frames_waited = 0
         if self.layout.n_blocks >= _LEARN_FROM and not self.read_at:
-            most = which[np.argsort(-self.known[which])]
-            self._read_batch(most[:_PROBES])
-            which = np.sort(most[_PROBES:])
+            ordered = which[np.argsort(-self.known[which])]
+            self._read_batch(ordered[:_PROBES])
+            which = np.sort(ordered[_PROBES:])
             if not self.read_at:
                 return
         for start in range(0, which.size, _BLOCKS_AT_ONCE):
@@ -201,12 +202,12 @@ class FileState:
         read = ldpc.decode(layout.code, llr, accepted, _ITERATIONS)
         self.read_at += (self.known[which[read]] / layout.code.k).tolist()
         if read.mean() < _FEW:
-            self.least = float(self.known[which].mean()) / layout.code.k + _TRY_AGAIN
+            self.min_information = float(self.known[which].mean()) / layout.code.k + _RETRY_GAIN
         failed = which[~read]
-        self.threshold[failed] = self.known[failed] + _TRY_AGAIN * layout.code.k
+        self.threshold[failed] = self.known[failed] + _RETRY_GAIN * layout.code.k
 
     def unpacked(self) -> Container | None:
-        """The file, where all blocks are read and the hash fits; `failure` says what is wrong."""
+        """The file, if all blocks are decoded and the hash fits; otherwise sets `failure`."""
         if not self.under_way or len(self.blocks) < self.layout.n_blocks:
             return None
         container = b"".join(self.blocks[number] for number in range(self.layout.n_blocks))[: self.layout.length]
@@ -223,17 +224,17 @@ class FileState:
         return found
 
     def release(self) -> None:
-        """Give back the memory of sums and blocks."""
+        """Free the memory of sums and blocks."""
         self.total = np.zeros((0, self.layout.n_bits), np.int8)
         self.known = self.threshold = np.zeros(0)
         self.blocks = {}
 
 
 class FilesUnderWay:
-    """Files that are being received, of all screens of a source: together they take no more than a bound.
+    """Incomplete files of all screens of a source, within a common memory limit.
 
     Args:
-        memory_mb: the bound, 2^20 bytes.
+        memory_mb: memory limit, 2^20 bytes.
     """
 
     def __init__(self, memory_mb: int = FILE_MEMORY_MB) -> None:
@@ -242,22 +243,22 @@ class FilesUnderWay:
         self._n_dropped = 0
 
     def admit(self, file: FileState) -> bool:
-        """Make room for a file by dropping the least complete, of these the oldest; False where it can never fit."""
+        """Free memory for a file by dropping the least complete, oldest first; False if it can never fit."""
         self._files = [known for known in self._files if known.under_way]
         if file.n_bytes > self._max_bytes:
             return False
         while sum(known.n_bytes for known in self._files) + file.n_bytes > self._max_bytes:
-            least = min(self._files, key=lambda known: round(known.share, 2))
-            self._files.remove(least)
-            least.dropped = True
-            least.release()
+            dropped = min(self._files, key=lambda known: round(known.share, 2))
+            self._files.remove(dropped)
+            dropped.dropped = True
+            dropped.release()
             self._n_dropped += 1
         self._files.append(file)
         return True
 
     @property
     def notes(self) -> list[str]:
-        """A sentence about what was dropped."""
+        """A sentence about dropped files."""
         if not self._n_dropped:
             return []
         files = "1 incomplete file was" if self._n_dropped == 1 else f"{self._n_dropped} incomplete files were"
@@ -265,31 +266,31 @@ class FilesUnderWay:
 
 
 def _is_likely(layout: FileLayout, information_bits: NDArray[np.uint8], llr: NDArray[np.int8]) -> bool:
-    """Whether a decoded block agrees with what was seen of its own bits, which any fragment has some of."""
+    """Whether a decoded block agrees with the soft bits of its information part, which every fragment contains."""
     sent = information_bits[layout.code.first_sent :]
-    seen = llr[: sent.size] * ldpc.LLR_STEP
-    return bool(log_likelihood(sent, seen) > _MIN_LIKELIHOOD * _LN2 * information(seen).sum())
+    received = llr[: sent.size] * ldpc.LLR_STEP
+    return bool(log_likelihood(sent, received) > _MIN_LIKELIHOOD * _LN2 * information(received).sum())
 
 
 @dataclass(slots=True, eq=False)
 class _Timeline:
-    """From burst numbers of an epoch to those of an object."""
+    """Mapping from burst numbers of an epoch to those of an object."""
 
     epoch: int
     offset: int
     file: FileState
-    #: The first and the last burst whose announcement says so.
+    #: The first and the last burst with a matching announcement.
     since: int
     until: int
 
 
 class FileSearch:
-    """Finds announcements, and gives bursts to the file that they are of.
+    """Find announcements and assign bursts to their files.
 
     Args:
         columns: C.
         payload_symbols: N.
-        under_way: bounds the memory of all files.
+        under_way: incomplete files, which share a memory limit.
     """
 
     def __init__(self, columns: int, payload_symbols: int, under_way: FilesUnderWay) -> None:
@@ -297,16 +298,16 @@ class FileSearch:
         self._columns, self._payload_symbols = columns, payload_symbols
         self._layout = announcement_layout(columns, payload_symbols)
         self.files: dict[tuple[int, int, int, int], FileState] = {}
-        #: Of every epoch, latest last.
+        #: Timelines of every epoch, latest last.
         self._timelines: dict[int, list[_Timeline]] = {}
         self._waiting: list[_Burst] = []
-        #: With the timeline by which they were added.
+        #: Recent bursts with the timeline by which they were added.
         self._recent: list[tuple[_Timeline, _Burst]] = []
         self._candidates: list[tuple[int, int, Float32]] = []
         self._n_gathered = 0
-        #: Of the frame at hand.
+        #: Bursts of the current frame.
         self._fresh: list[tuple[_Timeline, _Burst]] = []
-        #: Sentences about what was refused.
+        #: Sentences about refused files.
         self.notes: list[str] = []
 
     def knows(self, epoch: int) -> bool:
@@ -314,7 +315,7 @@ class FileSearch:
         return epoch in self._timelines
 
     def add(self, soft: FrameSoftBits, at_last: bool = False) -> list[tuple[FileState, Container]]:
-        """Add bursts; returns the files that they complete."""
+        """Add bursts and return the files that they complete."""
         self._look_for_announcements(soft)
         quantised = ldpc.quantised(soft.llr)
         for number, llr in zip(soft.burst, quantised, strict=True):
@@ -323,7 +324,7 @@ class FileSearch:
         return self._complete(at_last)
 
     def finish(self) -> list[tuple[FileState, Container]]:
-        """Try what is left."""
+        """Decode the remaining announcements and blocks."""
         self._try_gathered()
         self._flush_entered()
         return self._complete(at_last=True)
@@ -333,23 +334,23 @@ class FileSearch:
     def _look_for_announcements(self, soft: FrameSoftBits) -> None:
         for number, llr in zip(soft.burst, soft.llr, strict=True):
             buffer = gathered(self._layout, llr)
-            likeness = alike(buffer, float(surprise(llr).sum(dtype=np.float64)))
-            if likeness < _NOT_ALIKE or information(buffer).sum() < _TRY_ANNOUNCEMENT * self._layout.code.k:
+            similarity = same_bits_llr(buffer, float(surprise(llr).sum(dtype=np.float64)))
+            if similarity < _MIN_SIMILARITY or information(buffer).sum() < _TRY_ANNOUNCEMENT * self._layout.code.k:
                 continue
-            if likeness > -_NOT_ALIKE:
+            if similarity > -_MIN_SIMILARITY:
                 if not self._is_expected(soft.epoch, int(number), buffer):
                     self._try_candidates([(soft.epoch, int(number), buffer)])
             elif not self.knows(soft.epoch):
                 self._candidates.append((soft.epoch, int(number), buffer))
-        # Copies within these are too few to tell. Trials are gathered, for a batch costs little more than a single one.
+        # These have too few copies to decide. A batch costs little more than a single attempt.
         if len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
-            if self._n_gathered < _GATHERED_AT_FIRST or self._n_gathered % _THEN_EVERY == 0:
+            if self._n_gathered < _FREE_BATCHES or self._n_gathered % _THEN_EVERY == 0:
                 self._try_gathered()
             self._n_gathered += 1
             self._candidates.clear()
 
     def _is_expected(self, epoch: int, number: int, buffer: Float32) -> bool:
-        """Whether a burst is the announcement that its timeline has it be."""
+        """Whether a burst is the announcement that its timeline predicts."""
         line = _line_of(self._timelines.get(epoch, []), number)
         burst = 0 if line is None else number + line.offset
         if line is None or burst % ANNOUNCEMENT_PERIOD or burst >= 1 << 32:
@@ -387,16 +388,16 @@ class FileSearch:
             del lines[:-_MAX_TIMELINES]
 
     def _begun(self, announcement: Announcement) -> FileState | None:
-        """A file that was not known; None where it is too long."""
+        """Start a new file; None if it is too long."""
         if announcement.length > MAX_OBJECT_BYTES:
-            self._note(
-                f"a file of {announcement.length} bytes was announced, more than the {MAX_OBJECT_BYTES} that are "
-                "accepted; it was not received"
+            self._add_note(
+                f"a file of {announcement.length} bytes was announced, more than the accepted {MAX_OBJECT_BYTES}; "
+                "it was not received"
             )
             return None
         file = FileState.begin(announcement, self._columns, self._payload_symbols)
         if not self._under_way.admit(file):
-            self._note(
+            self._add_note(
                 f"a file of {announcement.length} bytes was announced, which takes {file.n_bytes >> 20} MB to receive; "
                 "it was not received (--file-memory)"
             )
@@ -405,12 +406,12 @@ class FileSearch:
         self.files[announcement.key] = file
         return file
 
-    def _note(self, sentence: str) -> None:
+    def _add_note(self, sentence: str) -> None:
         if sentence not in self.notes and len(self.notes) < _MAX_NOTES:
             self.notes.append(sentence)
 
     def _claim(self, lines: list[_Timeline]) -> None:
-        """Give a new timeline, the last, what came before its first announcement: what waits, what others took."""
+        """Assign waiting bursts, and some of other files, to the newest timeline."""
         line = lines[-1]
         waiting, self._waiting = self._waiting, []
         mine: list[_Burst] = []
@@ -435,8 +436,8 @@ class FileSearch:
         line = _line_of(self._timelines.get(burst.epoch, []), burst.number)
         if line is None:
             self._waiting.append(burst)
-            most = max(1, _MAX_WAITING // max(burst.llr.size, 1))
-            del self._waiting[:-most]
+            capacity = max(1, _MAX_WAITING // max(burst.llr.size, 1))
+            del self._waiting[:-capacity]
             return
         file = line.file
         file.first_time_s = time_s if file.first_time_s is None else file.first_time_s
@@ -444,7 +445,7 @@ class FileSearch:
         self._fresh.append((line, burst))
 
     def _flush_entered(self) -> None:
-        """Add what a frame showed, all its bursts at once."""
+        """Add all bursts of a frame together."""
         fresh, lines = list(self._fresh), {id(line): line for line, _ in self._fresh}
         self._fresh.clear()
         for key, line in lines.items():
@@ -465,17 +466,19 @@ class FileSearch:
             if container is not None:
                 found.append((file, container))
             elif file.failure:
-                self._note(f"a file of {file.layout.length} bytes came whole but is not what was sent: {file.failure}")
+                self._add_note(
+                    f"a file of {file.layout.length} bytes is complete but not what was sent: {file.failure}"
+                )
         return found
 
 
 def _line_of(lines: list[_Timeline], number: int) -> _Timeline | None:
-    """The latest timeline that a burst can be of; None where there is none, or it may be of either of two."""
+    """The latest timeline that a burst fits; None if there is none or two fit."""
     for place in reversed(range(len(lines))):
         line, earlier = lines[place], lines[place - 1] if place else None
         if number + line.offset < 0 or (earlier is not None and number <= earlier.until):
             continue
-        # Where a file begins, the change of files is known; where it goes on, only its announcements are.
+        # A change of files is certain where a file begins; later only its announcements are.
         begins = earlier is None or -line.offset > earlier.until
         return line if begins or number >= line.since else None
     return None

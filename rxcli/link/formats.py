@@ -1,4 +1,4 @@
-"""What blocks hold: bodies of beacons, announcements, containers. Pure; every rule of acceptance stands here."""
+"""Contents of blocks: bodies of beacons, announcements, containers. Pure functions with all rules of acceptance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rxcli.link.sequences import whiten
 from rxcli.types import MessageKind
 
 KINDS: tuple[MessageKind, ...] = ("raw", "text", "uri")
-#: Bytes of the longest message.
+#: Longest message, bytes.
 MAX_MESSAGE_BYTES = BEACON_LENGTHS[-1] - 1
 _ANNOUNCEMENT = struct.Struct(">BBHIIII")
 _VERSION = 1
@@ -22,31 +22,31 @@ _N_MOTHER_RATES = 3
 _CONTAINER_HEAD = struct.Struct(">4sBBB")
 _CONTAINER_TAIL = struct.Struct(">Q32s")
 _MAGIC, _DEFLATED = b"VLRX", 0x01
-#: Head, a name of one byte, length, hash.
+#: Head, name of one byte, length, hash.
 MIN_CONTAINER_BYTES = _CONTAINER_HEAD.size + 1 + _CONTAINER_TAIL.size
 _MAX_NAME_BYTES = 255
 
 
 def protect(data: bytes, object_id: int, block: int, crc_prefix: bytes = b"") -> bytes:
-    """`data` with its CRC-32 (over `crc_prefix` too), whitened."""
+    """Append the CRC-32 (over `crc_prefix` too) to `data` and whiten both."""
     crc = zlib.crc32(crc_prefix + data)
     return whiten(data + crc.to_bytes(CRC_BYTES, "big"), object_id, block)
 
 
 def unprotect(coded: bytes, object_id: int, block: int) -> bytes | None:
-    """The data of a block as `protect` made it; None where the CRC does not fit."""
+    """Undo `protect`; None if the CRC does not fit."""
     plain = whiten(coded, object_id, block)
     return plain[:-CRC_BYTES] if has_crc(plain) else None
 
 
 def has_crc(plain: bytes, crc_prefix: bytes = b"") -> bool:
-    """Whether a block that is no longer whitened ends with its CRC."""
+    """Whether an unwhitened block ends with its CRC."""
     crc = zlib.crc32(plain[:-CRC_BYTES], zlib.crc32(crc_prefix))
     return crc == int.from_bytes(plain[-CRC_BYTES:], "big")
 
 
 def block_prefix(object_id: int, block: int) -> bytes:
-    """What the CRC of a file's block covers before its data."""
+    """Prefix that the CRC of a file's block covers before its data."""
     return object_id.to_bytes(2, "big") + block.to_bytes(4, "big")
 
 
@@ -54,7 +54,7 @@ def block_prefix(object_id: int, block: int) -> bytes:
 
 
 def beacon_body(kind: MessageKind, data: bytes) -> bytes:
-    """A beacon's body: kind, message, padding.
+    """Build a beacon's body: kind, message, padding.
 
     Raises:
         UsageError: the message is empty, too long, or a text with a zero byte.
@@ -72,7 +72,7 @@ def beacon_body(kind: MessageKind, data: bytes) -> bytes:
 
 
 def parse_beacon(body: bytes) -> tuple[MessageKind, bytes] | None:
-    """Kind and message of a body whose CRC fits; None where it is no message after all."""
+    """Kind and message of a body with a valid CRC; None if it is no message."""
     kind, data = body[0], body[1:]
     if kind >= len(KINDS):
         return None
@@ -93,12 +93,12 @@ def _is_utf8(data: bytes) -> bool:
 
 
 def protect_beacon(body: bytes) -> bytes:
-    """The information of a beacon's codeword."""
+    """Information bits of a beacon's codeword."""
     return protect(body, BEACON_ID, len(body))
 
 
 def unprotect_beacon(coded: bytes) -> tuple[MessageKind, bytes] | None:
-    """Kind and message, None where the information is no beacon's."""
+    """Kind and message, or None if the information is no beacon's."""
     body = unprotect(coded, BEACON_ID, len(coded) - CRC_BYTES)
     return None if body is None else parse_beacon(body)
 
@@ -108,28 +108,28 @@ def unprotect_beacon(coded: bytes) -> tuple[MessageKind, bytes] | None:
 
 @dataclass(frozen=True, slots=True)
 class Announcement:
-    """What burst b of a file says of it."""
+    """Announcement of a file in burst b."""
 
     mother: int
     object_id: int
-    #: Bytes of the container.
+    #: Length of the container, bytes.
     length: int
     burst: int
     container_crc: int
 
     def protected(self) -> bytes:
-        """The information of the announcement's codeword."""
+        """Information bits of the announcement's codeword."""
         body = _ANNOUNCEMENT.pack(_VERSION, self.mother, self.object_id, self.length, self.burst, self.container_crc, 0)
         return protect(body, ANNOUNCEMENT_ID, len(body))
 
     @property
     def key(self) -> tuple[int, int, int, int]:
-        """What is the same in all announcements of one object."""
+        """Fields that are equal in all announcements of one object."""
         return self.object_id, self.length, self.mother, self.container_crc
 
 
 def unprotect_announcement(coded: bytes) -> Announcement | None:
-    """The announcement, None where the information is none or lies about what cannot be."""
+    """The announcement, or None if the information is none or inconsistent."""
     body = unprotect(coded, ANNOUNCEMENT_ID, len(coded) - CRC_BYTES)
     if body is None:
         return None
@@ -145,7 +145,7 @@ def unprotect_announcement(coded: bytes) -> Announcement | None:
 
 
 def pack_container(name: str, data: bytes) -> bytes:
-    """A file as it is sent, deflated where that is shorter.
+    """Pack a file for sending, deflated if that is shorter.
 
     Raises:
         UsageError: the name is empty, holds a folder, or is too long.
@@ -160,14 +160,14 @@ def pack_container(name: str, data: bytes) -> bytes:
 
 
 def pack_parts(name: bytes, length: int, digest: bytes, flags: int, body: bytes) -> bytes:
-    """The bytes of a container from its fields."""
+    """Assemble a container from its fields."""
     head = _CONTAINER_HEAD.pack(_MAGIC, _VERSION, flags, len(name))
     return head + name + _CONTAINER_TAIL.pack(length, digest) + body
 
 
 @dataclass(frozen=True, slots=True)
 class Container:
-    """A file as it came out of its container; the hash fits."""
+    """A file from its container, with a valid hash."""
 
     name: str
     data: bytes
@@ -175,18 +175,18 @@ class Container:
 
 
 class ContainerError(ValueError):
-    """A container that cannot be what was sent, or lies."""
+    """The container is malformed or inconsistent."""
 
 
 def unpack_container(container: bytes, max_bytes: int) -> Container:
-    """The file in a container.
+    """Unpack the file in a container.
 
     Args:
         container: all its bytes.
-        max_bytes: a declared original length above this is refused.
+        max_bytes: largest accepted original length.
 
     Raises:
-        ContainerError: it is malformed, too large, or its SHA-256 does not fit.
+        ContainerError: the container is malformed, too large, or its SHA-256 does not fit.
     """
     if len(container) < MIN_CONTAINER_BYTES:
         raise ContainerError(f"the container has {len(container)} bytes, fewer than any file needs")
@@ -199,10 +199,11 @@ def unpack_container(container: bytes, max_bytes: int) -> Container:
     length, digest = _CONTAINER_TAIL.unpack_from(container, at)
     body = container[at + _CONTAINER_TAIL.size :]
     if length > max_bytes:
-        raise ContainerError(f"the file says it has {length} bytes, more than the {max_bytes} that are accepted")
+        raise ContainerError(f"the file's stated length is {length} bytes, more than the accepted {max_bytes}")
     data = _inflated(body, length) if flags & _DEFLATED else body
     if len(data) != length:
-        raise ContainerError(f"the file says it has {length} bytes and has {'more' if len(data) > length else 'fewer'}")
+        relation = "more" if len(data) > length else "fewer"
+        raise ContainerError(f"the file has {relation} bytes than its stated length of {length}")
     found = hashlib.sha256(data).digest()
     if found != digest:
         raise ContainerError("the file's SHA-256 does not fit")
@@ -211,7 +212,7 @@ def unpack_container(container: bytes, max_bytes: int) -> Container:
 
 
 def _inflated(body: bytes, length: int) -> bytes:
-    """The inflated body, at most one byte more than `length`."""
+    """Inflate the body to at most one byte more than `length`."""
     inflater = zlib.decompressobj(-15)
     try:
         data = inflater.decompress(body, length + 1)
@@ -225,12 +226,12 @@ def _inflated(body: bytes, length: int) -> bytes:
 _DEVICES = frozenset(
     ["con", "prn", "aux", "nul", "conin$", "conout$"] + [f"{d}{n}" for d in ("com", "lpt") for n in "0123456789¹²³"]
 )
-#: Bytes of a name that every file system takes, with room for a number.
+#: Longest name that every file system accepts, with room for a number, bytes.
 _MAX_SAFE_BYTES = 200
 
 
 def safe_name(name: str) -> str:
-    """A name that can do no harm: no folder, no control or bidirectional character, no device, no hidden file."""
+    """Make a name harmless: no folder, no control or bidirectional character, no device, no hidden file."""
     name = name.replace("\\", "/").rsplit("/", 1)[-1]
     name = "".join(c for c in name if unicodedata.category(c) not in ("Cc", "Cf", "Cs", "Zl", "Zp"))
     name = "".join("_" if c in ':*?"<>|' else c for c in name)

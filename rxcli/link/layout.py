@@ -1,4 +1,4 @@
-"""Which bits of which block every payload symbol of every burst carries.
+"""Mapping of code bits to blocks, bursts and payload symbols.
 
 A *label* is the 7 bits of payload symbol (burst b, symbol s, column c); a column of weight w sends the first k(w).
 """
@@ -16,25 +16,25 @@ from rxcli.link.sequences import largest_coprime, splitmix64, stride
 
 LABEL_BITS = 7
 CRC_BYTES = 4
-#: Lengths of a beacon's body, bytes.
+#: Possible lengths of a beacon's body, bytes.
 BEACON_LENGTHS = (8, 20, 32, 64, 128, 200)
 ANNOUNCEMENT_LENGTH = 20
 #: Burst b with b mod 32 = 0 announces the file; the others carry it.
 ANNOUNCEMENT_PERIOD = 32
-#: Bytes of a block of a file without its CRC.
+#: Length of a file's block without its CRC, bytes.
 BLOCK_BYTES = 1052
-#: Object ids that whiten beacons and announcements.
+#: Object ids for the whitening of beacons and announcements.
 BEACON_ID, ANNOUNCEMENT_ID = 0xFFFF, 0xFFFE
 #: Mother rates as the announcement numbers them: coded bits per information bit, in halves.
 _EXPANSION_HALVES = (3, 4, 6)
-#: Information, in bits of a block, from which on it is tried.
+#: Information at which a block is decoded, relative to its bits.
 READY = (1.075, 1.10, 1.14)
 
 Places = NDArray[np.int64]
 
 
 def _rotation(passes: Places) -> Places:
-    """(..., 7) which of a label's seven bits is sent first, second, ... in a pass."""
+    """(..., 7) order in which the seven bits of a label are sent in a pass."""
     return np.asarray((np.arange(LABEL_BITS) + 3 * passes[..., None]) % LABEL_BITS)
 
 
@@ -50,7 +50,7 @@ class BeaconLayout:
 
     @cached_property
     def code(self) -> Code:
-        """The code."""
+        """LDPC code."""
         return nr_code(2, 8 * (self.length + CRC_BYTES))
 
     @cached_property
@@ -73,7 +73,7 @@ class BeaconLayout:
 
     @cached_property
     def places(self) -> Places:
-        """(P, N, C, 7) bit of the buffer that every bit of a round's labels is."""
+        """(P, N, C, 7) buffer position of every bit of a round's labels."""
         unit = np.arange(self.period * self.payload_symbols * self.columns).reshape(
             self.period, self.payload_symbols, self.columns
         )
@@ -83,7 +83,7 @@ class BeaconLayout:
 
 @lru_cache(maxsize=64)
 def beacon_layout(length: int, columns: int, payload_symbols: int, single: bool = False) -> BeaconLayout:
-    """The layout, computed once."""
+    """The cached layout."""
     return BeaconLayout(length, columns, payload_symbols, single)
 
 
@@ -94,7 +94,7 @@ def announcement_layout(columns: int, payload_symbols: int) -> BeaconLayout:
 
 @dataclass(frozen=True)
 class FileLayout:
-    """A container of `length` bytes as object `object_id` on a screen of C columns and N payload symbols."""
+    """Layout of a container of `length` bytes, object `object_id`, on a screen of C columns and N payload symbols."""
 
     object_id: int
     length: int
@@ -129,12 +129,12 @@ class FileLayout:
 
     @cached_property
     def _window(self) -> int:
-        """W: by how much passes may be shifted, labels."""
+        """W: largest shift of passes, labels."""
         return min(self.n_labels, -(-4 * self.payload_symbols * self.columns // self.n_blocks))
 
     @property
     def ready(self) -> float:
-        """Bits of information from which on a block is tried."""
+        """Bits of information at which a block is decoded."""
         return READY[self.mother] * self.code.k
 
     def _first_unit(self, bursts: Places) -> Places:
@@ -142,7 +142,7 @@ class FileLayout:
         return np.asarray(data * (self.payload_symbols * self.columns))
 
     def all_differ(self, bursts: Places) -> bool:
-        """Whether no bit is sent twice in data bursts `bursts`: they lie within one pass."""
+        """Whether data bursts `bursts` lie within one pass, so that no bit is sent twice."""
         unit, per_pass = self._first_unit(bursts), self.n_blocks * self.n_labels
         return bool(unit.min() // per_pass == (unit.max() + self.payload_symbols * self.columns - 1) // per_pass)
 
@@ -157,11 +157,11 @@ class FileLayout:
 
     @staticmethod
     def bits_of(label: Places, number: Places) -> Places:
-        """(..., 7) bits of a block's buffer that labels carry in their passes."""
+        """(..., 7) buffer positions of the bits of labels in their passes."""
         return LABEL_BITS * label[..., None] + _rotation(number)
 
     def places(self, bursts: Places) -> tuple[Places, Places]:
-        """Blocks (n, N, C) and bits of their buffers (n, N, C, 7) of data bursts `bursts` (n,)."""
+        """Blocks (n, N, C) and buffer positions (n, N, C, 7) of data bursts `bursts` (n,)."""
         blocks, label, number = self.labels(bursts)
         return blocks, self.bits_of(label, number)
 

@@ -1,4 +1,4 @@
-"""The quasi-cyclic LDPC codes of 3GPP TS 38.212, section 5.3.2: encoder and layered min-sum decoder.
+"""Quasi-cyclic LDPC codes of 3GPP TS 38.212, section 5.3.2: encoder and layered min-sum decoder.
 
 A code of `k` information bits has base graph 1 or 2 lifted by `z`. Block column c, lane i is coded bit c * z + i; the
 first 2 z bits are never sent and filler bits are known zeros; all others, in order, are the *buffer*.
@@ -15,20 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 _INFORMATION_COLUMNS = {1: 22, 2: 10}
-#: Lifting sizes are a * 2**i up to 384; the place of a is the number of the set.
+#: Lifting sizes are a * 2**i up to 384; the index of a is the number of the set.
 _LIFTING_BASES, _MAX_LIFTING = (2, 3, 5, 7, 9, 11, 13, 15), 384
 _CORE_ROWS = 4
-#: Block columns whose bits are never sent.
+#: Punctured block columns.
 _PUNCTURED = 2
-#: Ratios in the decoder are whole multiples of this; those that come in are limited to 127 of them.
+#: Step of the decoder's log-likelihood ratios; input is limited to 127 steps.
 LLR_STEP = 1 / 8
 _MAX_INPUT = 127
-#: Messages are limited so that the sum of all that meet at a bit (30 at most) stays within 16 bits.
+#: Limit of messages, so that the sum of all messages at a bit (30 at most) stays within 16 bits.
 _MAX_MESSAGE = 1000
-#: A ratio of filler bits, which are known.
+#: Log-likelihood ratio of filler bits, which are known.
 _KNOWN = 8000
 
-#: Rows of checks that are enough to tell a codeword from other bits.
+#: Number of checks that suffice to distinguish a codeword from other bits.
 _MAX_CHECKS = 6
 
 Bits = NDArray[np.uint8]
@@ -37,7 +37,7 @@ Edge = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """One code; rows are lists of (block column, shift)."""
+    """A code; rows are lists of (block column, shift)."""
 
     graph: int
     k: int
@@ -51,12 +51,12 @@ class Code:
 
     @property
     def filler(self) -> int:
-        """Known zeros after the information bits."""
+        """Number of known zeros after the information bits."""
         return self.information_columns * self.z - self.k
 
     @property
     def first_sent(self) -> int:
-        """Information bits before it are never sent; the buffer begins with it."""
+        """First information bit that is sent; the buffer begins with it."""
         return _PUNCTURED * self.z
 
     @property
@@ -70,7 +70,7 @@ class Code:
         return (self.n_columns - _PUNCTURED) * self.z - self.filler
 
     def rows_for(self, buffer_bits: int) -> int:
-        """Rows that the first `buffer_bits` bits of the buffer take part in."""
+        """Rows that involve the first `buffer_bits` bits of the buffer."""
         last = _PUNCTURED * self.z + buffer_bits + self.filler
         return min(len(self.rows), max(_CORE_ROWS, -(-last // self.z) - self.information_columns))
 
@@ -89,10 +89,10 @@ def _lifting(k: int, graph: int) -> tuple[int, int]:
 
 @cache
 def nr_code(graph: int, k: int) -> Code:
-    """The code of base graph 1 or 2 for `k` information bits.
+    """Build the code of base graph 1 or 2 for `k` information bits.
 
     Raises:
-        ValueError: no lifting size holds so many bits, or they are too few to send all but the punctured ones.
+        ValueError: `k` is too large for the lifting sizes, or smaller than the number of punctured bits.
     """
     if not 0 < k <= _INFORMATION_COLUMNS[graph] * _MAX_LIFTING:
         raise ValueError(f"k must be in 1..{_INFORMATION_COLUMNS[graph] * _MAX_LIFTING} for graph {graph} (got {k})")
@@ -107,7 +107,7 @@ def nr_code(graph: int, k: int) -> Code:
 
 
 def encode(code: Code, information: Bits) -> Bits:
-    """The buffers of codewords.
+    """Encode blocks to the buffers of their codewords.
 
     Args:
         code: the code.
@@ -128,7 +128,7 @@ def encode(code: Code, information: Bits) -> Bits:
 
 
 def _sum(coded: Bits, edges: list[Edge]) -> Bits:
-    """(batch, z) what some edges of a row add up to."""
+    """(batch, z) sum over some edges of a row, modulo 2."""
     total = np.zeros((coded.shape[0], coded.shape[2]), np.uint8)
     for column, shift in edges:
         total ^= np.roll(coded[:, column], -shift, axis=1)
@@ -136,7 +136,7 @@ def _sum(coded: Bits, edges: list[Edge]) -> Bits:
 
 
 def _solve_core(code: Code, coded: Bits) -> None:
-    """Fill in the four core parity columns: their sum over the four rows leaves one shift of the first of them."""
+    """Solve for the four core parity columns: the sum of the four rows contains only a shift of the first column."""
     kb = code.information_columns
     core = code.rows[:_CORE_ROWS]
     shifts = [shift for row in core for column, shift in row if column == kb]
@@ -154,14 +154,14 @@ def _solve_core(code: Code, coded: Bits) -> None:
 
 
 def sent_parity(code: Code, bits: Bits) -> NDArray[np.float64]:
-    """Share of the parity checks on sent bits alone that hard decisions leave unsatisfied: about half by chance.
+    """Share of the parity checks on sent bits alone that hard decisions violate: about half by chance.
 
     Args:
         code: the code.
         bits: (batch, n) uint8 of 0/1, the first n bits of the buffer.
 
     Returns:
-        (batch,) 0 where no check is on these bits alone.
+        (batch,) share; 0 if no check involves these bits alone.
     """
     batch, n_bits = bits.shape
     sent = code.k - _PUNCTURED * code.z
@@ -178,8 +178,10 @@ def sent_parity(code: Code, bits: Bits) -> NDArray[np.float64]:
 
 @cache
 def _sent_checks(code: Code, n_parity: int) -> tuple[tuple[Edge, ...], ...]:
-    """The lightest checks on sent bits of the first parity columns: rows from which the unsent columns are taken off by
-    adding the lightest row that has only that unsent column."""
+    """The lightest checks on sent bits of the first parity columns.
+
+    Unsent columns are eliminated from a row by adding the lightest row with only that unsent column.
+    """
     known = code.information_columns + n_parity
     rows = sorted((row for row in code.rows if max(column for column, _ in row) < known), key=len)
     unsent = [[column for column, _ in row if column < _PUNCTURED] for row in rows]
@@ -194,28 +196,28 @@ def _sent_checks(code: Code, n_parity: int) -> tuple[tuple[Edge, ...], ...]:
 
 
 def _without(row: tuple[Edge, ...], column: int, pivot: tuple[Edge, ...], z: int) -> tuple[Edge, ...]:
-    """The sum of two rows of checks, the second turned so that a column that both have takes no part."""
+    """Sum of two rows of checks, the second shifted so that a common column cancels."""
     turn = dict(row)[column] - dict(pivot)[column]
-    both = [*row, *((c, (shift + turn) % z) for c, shift in pivot)]
-    return tuple(edge for edge in both if both.count(edge) == 1)
+    edges = [*row, *((c, (shift + turn) % z) for c, shift in pivot)]
+    return tuple(edge for edge in edges if edges.count(edge) == 1)
 
 
-#: Asked of hard decisions: (batch places (n,), information bits (n, k)) -> which of them are accepted, (n,) bool.
+#: Acceptance test of hard decisions: (batch indices (n,), information bits (n, k)) -> (n,) bool.
 Accept = Callable[[NDArray[np.int64], Bits], NDArray[np.bool_]]
 
 
 def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
-    """Ratios as the decoder takes them, in steps of `LLR_STEP`."""
+    """Quantise log-likelihood ratios to steps of `LLR_STEP`."""
     return np.asarray(np.clip(np.rint(llr / LLR_STEP), -_MAX_INPUT, _MAX_INPUT), np.int8)
 
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """When a block is given up as no codeword: the share of checks it leaves unsatisfied does not fall."""
+    """When a block is given up as no codeword: its share of unsatisfied checks does not fall."""
 
     #: Iterations after which the share is compared with that after the first one.
     iterations: int
-    #: Share after these over the share after the first one, from which the block is given up.
+    #: Ratio of the share after these iterations to that after the first one, above which a block is given up.
     max_ratio: float
 
 
@@ -226,16 +228,16 @@ def decode(
     max_iterations: int = 22,
     patience: Patience | None = None,
 ) -> NDArray[np.bool_]:
-    """Layered normalised min-sum over a batch of blocks, in 16-bit numbers; stops where `accept` says so.
+    """Decode a batch of blocks by layered normalised min-sum in 16-bit numbers, until `accept` accepts them.
 
-    Parity is no stopping rule: bits that were never seen need not satisfy it.
+    Parity is no stopping rule, because bits without observation need not satisfy it.
 
     Args:
         code: the code.
-        buffer_llr: (batch, M) int8: ln p(1)/p(0) in steps of `LLR_STEP` of the first M bits of the buffer, 0 unseen.
-        accept: told the places in the batch and the information bits as they stand after every iteration.
-        max_iterations: iterations at most.
-        patience: when to give a block up; None to go on to the end.
+        buffer_llr: (batch, M) int8: ln p(1)/p(0) in steps of `LLR_STEP` of the first M bits of the buffer, 0 unknown.
+        accept: called after every iteration with batch indices and information bits.
+        max_iterations: maximum number of iterations.
+        patience: when to give up a block; None to use all iterations.
 
     Returns:
         (batch,) which blocks were accepted.
@@ -266,12 +268,12 @@ def decode(
     return accepted
 
 
-#: Blocks that are done go along until fewer than this share of the batch are not: to sort them out takes time too.
+#: Finished blocks are removed when the share of unfinished ones falls below this, since removal costs time.
 _CROWDED = 0.7
 
 
 def _decoder_input(code: Code, buffer_llr: NDArray[np.int8], n_rows: int) -> NDArray[np.int16]:
-    """(block columns, z, batch) int16, ln p(0)/p(1), filler known to be zero."""
+    """(block columns, z, batch) int16 ln p(0)/p(1), with filler bits known to be zero."""
     batch, n_bits = buffer_llr.shape
     kb, z = code.information_columns, code.z
     flat = np.zeros(((kb + n_rows) * z, batch), np.int16)
@@ -283,12 +285,12 @@ def _decoder_input(code: Code, buffer_llr: NDArray[np.int8], n_rows: int) -> NDA
 
 
 class _Layers:
-    """The state of a batch in the decoder.
+    """Decoder state of a batch.
 
     Args:
         code: the code.
         n_rows: rows in use.
-        total: (block columns, z, batch) int16 ratios, ln p(0)/p(1).
+        total: (block columns, z, batch) int16 ln p(0)/p(1).
     """
 
     def __init__(self, code: Code, n_rows: int, total: NDArray[np.int16]) -> None:
@@ -297,13 +299,13 @@ class _Layers:
 
     def _begin(self, total: NDArray[np.int16], messages: list[NDArray[np.int16]]) -> None:
         self._total, self._messages = total, messages
-        # Fresh arrays of this size cost more than what is computed in them.
+        # Allocating arrays of this size costs more than the computation.
         degree = max(len(row) for row in self._rows)
         self._incoming = np.empty((degree, *total.shape[1:]), np.int16)
         self._work = np.empty_like(self._incoming)
 
     def keep(self, blocks: NDArray[np.bool_]) -> None:
-        """Go on with some blocks of the batch."""
+        """Continue with some blocks of the batch."""
         total = np.ascontiguousarray(self._total[:, :, blocks])
         self._begin(total, [np.ascontiguousarray(message[:, :, blocks]) for message in self._messages])
 
@@ -314,7 +316,7 @@ class _Layers:
         return np.asarray(negative.T[blocks, : code.k], np.uint8)
 
     def unsatisfied(self) -> NDArray[np.float64]:
-        """(batch,) share of checks that the hard decisions do not satisfy."""
+        """(batch,) share of checks that the hard decisions violate."""
         count = np.zeros(self._total.shape[2])
         for row in self._rows:
             parity = np.bitwise_xor.reduce(self._gather(row), axis=0) < 0
@@ -329,7 +331,7 @@ class _Layers:
         return incoming
 
     def update(self) -> None:
-        """One iteration: every row of checks in turn sends new messages to its bits."""
+        """Run one iteration: each row of checks in turn sends new messages to its bits."""
         for row, message in zip(self._rows, self._messages, strict=True):
             self._update_row(row, message)
 
@@ -339,8 +341,8 @@ class _Layers:
         parity = np.bitwise_xor.reduce(incoming, axis=0)
         np.abs(incoming, out=work)
         smallest, second = _two_smallest(work)
-        # The smallest goes to all bits but the one that it came from, which gets the second smallest: `work` becomes
-        # -1 where a magnitude is larger than the smallest, else 0, then what is sent, then that with its sign.
+        # The smallest magnitude goes to all bits except its source, which gets the second smallest. `work` becomes -1
+        # where a magnitude is larger than the smallest and 0 elsewhere, then the magnitude sent, then its signed value.
         np.subtract(smallest, work, out=work)
         work >>= 15
         if_smallest = _normalised(second)
@@ -357,7 +359,7 @@ class _Layers:
 
 
 def _two_smallest(magnitude: NDArray[np.int16]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """The smallest along the first axis, and the second smallest (the same where two are)."""
+    """Smallest and second smallest value along the first axis; equal for ties."""
     smallest = np.minimum(magnitude[0], magnitude[1])
     second = np.maximum(magnitude[0], magnitude[1])
     for values in magnitude[2:]:
@@ -367,6 +369,6 @@ def _two_smallest(magnitude: NDArray[np.int16]) -> tuple[NDArray[np.int16], NDAr
 
 
 def _normalised(magnitude: NDArray[np.int16]) -> NDArray[np.int16]:
-    """Three quarters of a message, limited."""
+    """Three quarters of a message, within the limit."""
     limited = np.minimum(magnitude, _MAX_MESSAGE)
     return np.asarray(limited - (limited >> 2), np.int16)

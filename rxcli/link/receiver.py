@@ -1,4 +1,4 @@
-"""The link layer's receiver: soft bits in, messages and files out."""
+"""Link layer receiver: soft bits in, messages and files out."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from rxcli.types import FrameSoftBits, Message, MessageKind, ObjectProgress, Rec
 
 
 class LinkReceiver:
-    """Collects the soft bits of one sending: a clip, a camera, a photo, or photos of one beacon.
+    """Collect the soft bits of one transmission: a clip, a camera, a photo, or photos of one beacon.
 
     Args:
         columns: C.
         payload_symbols: N.
-        under_way: bounds the memory of files, of several receivers where they share it.
+        under_way: incomplete files and their memory limit, which several receivers may share.
     """
 
     def __init__(self, columns: int, payload_symbols: int, under_way: FilesUnderWay | None = None) -> None:
@@ -30,12 +30,12 @@ class LinkReceiver:
         self._beacons = BeaconSearch(columns, payload_symbols)
         self._files = FileSearch(columns, payload_symbols, self._under_way)
         self._last: FrameSoftBits | None = None
-        #: All that came, in order.
+        #: All messages and files, in order.
         self.messages: list[Message] = []
         self.objects: list[ReceivedObject] = []
 
     def add(self, soft: FrameSoftBits) -> list[Event]:
-        """Add what a frame shows; returns what it completes.
+        """Add the soft bits of a frame and return the messages and files that they complete.
 
         Raises:
             ValueError: the shapes do not fit the screen.
@@ -52,7 +52,7 @@ class LinkReceiver:
         return events
 
     def finish(self) -> list[Event]:
-        """Try what is left; nothing more comes."""
+        """Decode the rest at the end of the transmission."""
         if self._last is None:
             return []
         last = self._last
@@ -85,17 +85,17 @@ class LinkReceiver:
 
     @property
     def progress(self) -> list[ObjectProgress]:
-        """Files under way."""
+        """Progress of incomplete files."""
         return [file.progress() for file in self._files.files.values() if file.under_way]
 
     @property
     def notes(self) -> list[str]:
-        """Sentences about what was seen and refused."""
+        """Sentences about refused messages and files."""
         return [*self._files.notes, *self._under_way.notes]
 
 
 def _cleaned(soft: FrameSoftBits) -> FrameSoftBits:
-    """Bursts that show anything, within limits."""
+    """Bursts with any information, with limited ratios."""
     llr = np.clip(np.nan_to_num(soft.llr, nan=0.0, posinf=MAX_LLR, neginf=-MAX_LLR), -MAX_LLR, MAX_LLR)
     shown = llr.any(axis=(1, 2, 3))
     return replace(soft, burst=soft.burst[shown], llr=llr[shown].astype(np.float32))

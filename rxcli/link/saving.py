@@ -1,4 +1,4 @@
-"""Received files on disk: under their own name, in one folder, never over another file unless asked."""
+"""Write received files under their own names to one folder, replacing existing files only on request."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from rxcli.types import FrameResult, ReceivedObject
 def save_object(
     received: ReceivedObject, folder: Path, force: bool = False, taken: Taken | None = None
 ) -> ReceivedObject:
-    """Write a file that came whole; returns it with its path.
+    """Write a complete file and return it with its path.
 
-    It is written beside its place first, so that nobody sees half of it. A file of the same name and content is left
-    as it is.
+    The file is written under a temporary name and renamed, so that a partial file is never visible. An existing file of
+    the same name and content is left as it is.
 
     Args:
         received: the file.
-        folder: where it is written.
-        force: replace another file of its name, though none of this run.
+        folder: output folder.
+        force: replace an existing file of the same name, unless this run wrote it.
         taken: files of this run; the new one is added.
 
     Raises:
-        InputError: another file has its name, or the folder cannot be written.
+        InputError: a different file has its name, or the folder is not writable.
     """
     path = folder / safe_name(received.name)
     taken = Taken() if taken is None else taken
@@ -52,7 +52,7 @@ def save_object(
             hidden.unlink(missing_ok=True)
     except FileExistsError:
         raise InputError(
-            f"{path} exists and is another file; {received.name} ({received.size} bytes) was not written",
+            f"{path} exists with other content; {received.name} ({received.size} bytes) was not written",
             "give --force to overwrite it, or another folder",
         ) from None
     except OSError as error:
@@ -62,22 +62,22 @@ def save_object(
 
 
 def save_objects(
-    result: FrameResult, folder: Path, force: bool, tell: Callable[[str], None], taken: Taken
+    result: FrameResult, folder: Path, force: bool, on_error: Callable[[str], None], taken: Taken
 ) -> FrameResult:
-    """The result with the paths of its files, once they are written; `tell` is given why one could not be."""
+    """Write the files of a result and add their paths to it; reasons of failure go to `on_error`."""
     objects = []
     for received in result.objects:
         try:
             objects.append(save_object(received, folder, force, taken))
         except InputError as error:
             objects.append(received)
-            tell(str(error))
+            on_error(str(error))
     return replace(result, objects=tuple(objects)) if objects else result
 
 
 def _put(written: Path, path: Path, force: bool) -> None:
     if force:
-        os.replace(written, path)  # replaces a link itself, never what it points to
+        os.replace(written, path)  # replaces a link itself, never its target
         return
     try:
         os.link(written, path)

@@ -14,7 +14,7 @@ _MIX_2 = np.uint64(0x94D049BB133111EB)
 
 
 def splitmix64(seeds: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """First output of SplitMix64 from each of `seeds`, any shape."""
+    """First output of SplitMix64 for each of `seeds`, any shape."""
     z = np.asarray(seeds, np.uint64) + _GAMMA
     z = (z ^ (z >> np.uint64(30))) * _MIX_1
     z = (z ^ (z >> np.uint64(27))) * _MIX_2
@@ -22,12 +22,12 @@ def splitmix64(seeds: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def splitmix64_stream(seed: int, n: int) -> NDArray[np.uint64]:
-    """The first `n` outputs from the state `seed`."""
+    """First `n` outputs of SplitMix64 from the state `seed`."""
     return splitmix64(np.uint64(seed) + np.arange(n, dtype=np.uint64) * _GAMMA)
 
 
 def whiten(data: bytes, object_id: int, block: int) -> bytes:
-    """`data` XORed with the whitening sequence of a block of an object; its own inverse."""
+    """XOR `data` with the whitening sequence of a block of an object; its own inverse."""
     words = splitmix64_stream((object_id << 32) | block, -(-len(data) // 8))
     mask = words.astype(">u8").view(np.uint8)[: len(data)]
     return (np.frombuffer(data, np.uint8) ^ mask).tobytes()

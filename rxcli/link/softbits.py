@@ -1,4 +1,4 @@
-"""Sums over soft bits, and what they are worth."""
+"""Sums over soft bits, their similarity and their information."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rxcli.link.ldpc import LLR_STEP
 from rxcli.types import Message, ReceivedObject
 
 Float32 = NDArray[np.float32]
-#: Ratios beyond this are no surer to the decoder.
+#: Limit of log-likelihood ratios in the decoder.
 MAX_LLR = 127 * LLR_STEP
 _LN2 = float(np.log(2.0))
 
@@ -20,34 +20,34 @@ Event = Message | ReceivedObject
 
 
 def surprise(llr: Float32) -> Float32:
-    """ln(1 + e^llr) - ln 2: what sums of ratios are weighed with, see `alike`."""
-    # Single precision does for sums, and has a quick logarithm; log1p has not.
+    """ln(1 + e^llr) - ln 2, a term of `same_bits_llr`."""
+    # Single precision suffices for sums; its logarithm is fast, its log1p is not.
     return np.asarray(np.log(1 + np.exp(-np.abs(llr))) + np.maximum(llr, 0) - np.float32(_LN2), np.float32)
 
 
-def alike(together: Float32, alone: float) -> float:
-    """Log-likelihood that ratios that were added are of the same bits, over bits that differ by chance.
+def same_bits_llr(together: Float32, alone: float) -> float:
+    """Log-likelihood ratio that added soft bits belong to the same bits, against independent bits.
 
     Args:
-        together: the sums.
-        alone: sum of `surprise` of every ratio alone.
+        together: sums of log-likelihood ratios.
+        alone: sum of `surprise` over the separate ratios.
     """
     return float(surprise(together).sum(dtype=np.float64)) - alone
 
 
 def information(llr: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Bits of information that ratios hold, 1 - H2; what contradicts itself holds little."""
+    """Information of log-likelihood ratios, bits: 1 - H2, small where added ratios contradict each other."""
     a = np.minimum(np.abs(np.asarray(llr, np.float64)), 40.0)
     odds = np.exp(-a)
     # H2 of 1 / (1 + e^a), natural logarithm: ln(1 + e^-a) + a / (1 + e^a).
     return np.asarray(1 - (np.log1p(odds) + a * odds / (1 + odds)) / _LN2)
 
 
-#: Bits of information of a ratio in the decoder's steps, at its value as uint8.
+#: Information, bits, of a ratio in the decoder's steps, indexed by its value as uint8.
 INFORMATION_OF_STEPS = information(np.arange(256, dtype=np.uint8).view(np.int8) * LLR_STEP).astype(np.float32)
 
 
 def log_likelihood(bits: NDArray[np.uint8], llr: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Log-likelihood of bits over bits of any kind, summed over the last axis."""
+    """Log-likelihood of bits relative to arbitrary bits, summed over the last axis."""
     signed = np.where(bits > 0, llr, -llr).astype(np.float64)
     return np.asarray((_LN2 - np.log1p(np.exp(-np.abs(signed))) + np.minimum(signed, 0)).sum(axis=-1))

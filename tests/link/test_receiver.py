@@ -330,7 +330,7 @@ def test_files_are_written_once_and_never_over_others(tmp_path: Path) -> None:
     assert (tmp_path / "x.txt").read_bytes() == b"content"
     save_object(received, tmp_path)  # the same content is no conflict
     (tmp_path / "x.txt").write_bytes(b"precious")
-    with pytest.raises(InputError, match="exists and is another file"):
+    with pytest.raises(InputError, match="exists with other content"):
         save_object(received, tmp_path)
     assert (tmp_path / "x.txt").read_bytes() == b"precious"
     save_object(received, tmp_path, force=True)
