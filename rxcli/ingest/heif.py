@@ -96,26 +96,19 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 def _associations(ipma: bytes) -> dict[int, list[int]]:
     """Item -> its properties, numbered from 1 (ISO/IEC 23008-12, section 9.3)."""
-    reader = _Reader(ipma)
-    version, flags = reader.take(1), reader.take(3)
+    stream = io.BytesIO(ipma)
+
+    def take(size: int) -> int:
+        data = stream.read(size)
+        if len(data) < size:
+            raise ValueError("the box is cut")
+        return int.from_bytes(data)
+
+    version, flags = take(1), take(3)
     found: dict[int, list[int]] = {}
-    for _ in range(reader.take(4)):
-        item = reader.take(2 if version == 0 else 4)
+    for _ in range(take(4)):
+        item = take(2 if version == 0 else 4)
         width = 2 if flags & 1 else 1
         mask = 0x7FFF if flags & 1 else 0x7F  # the top bit says "essential"
-        found[item] = [reader.take(width) & mask for _ in range(reader.take(1))]
+        found[item] = [take(width) & mask for _ in range(take(1))]
     return found
-
-
-class _Reader:
-    """Big-endian integers, one after the other."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data, self._at = data, 0
-
-    def take(self, size: int) -> int:
-        """The next integer of `size` bytes."""
-        if self._at + size > len(self._data):
-            raise ValueError("the box is cut")
-        self._at += size
-        return int.from_bytes(self._data[self._at - size : self._at])

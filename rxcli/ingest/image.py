@@ -36,7 +36,9 @@ def read_image(path: Path, kind: Kind) -> Frame:
         return _read_tiff(path)
     data = read_bytes(path)
     if kind == "jpeg":
-        return _frame(path, _read_jpeg(data, path), jpeg_metadata(data))
+        from rxcli.ingest.jpeg import decode_luma
+
+        return _frame(path, decode_luma(data, path), jpeg_metadata(data))
     if kind == "png":
         return _read_png(data, path)
     if kind == "heif":
@@ -49,12 +51,6 @@ def read_image(path: Path, kind: Kind) -> Frame:
 def _frame(path: Path, luma: Luma, metadata: Metadata, linear: bool = False) -> Frame:
     white = float(np.iinfo(luma.dtype).max)
     return Frame(pixels=luma, source=str(path), metadata=metadata, white=white, linear=linear)
-
-
-def _read_jpeg(data: bytes, path: Path) -> NDArray[np.uint8]:
-    from rxcli.ingest.jpeg import decode_luma
-
-    return decode_luma(data, path)
 
 
 def _read_png(data: bytes, path: Path) -> Frame:

@@ -33,13 +33,26 @@ MAX_BYTES = 1_250_000_000
 
 #: Starts of playlists (HLS, FFmpeg's concat, DASH), whatever their names.
 _LIST_MAGIC = (b"#EXTM3U", b"ffconcat", b"<MPD")
-_TIFF_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_RAW_MAGIC = (b"FUJIFILMCCD-RAW", b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FOVb", b"\0MRM", b"II\x1a\0\0\0HEAPCCDR")
 _SUBFILE_TYPE, _PHOTOMETRIC, _MAKE, _DNG_VERSION = 0x00FE, 0x0106, 0x010F, 0xC612
 #: Colour filter array, and linear RAW.
 _RAW_PHOTOMETRICS = (32803, 34892)
-_HEIF_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"mif1", b"hevc", b"hevx", b"msf1"})
-_ISO_BOXES = frozenset({b"moov", b"mdat", b"wide", b"free", b"skip", b"moof", b"pnot"})
+_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"hevc", b"hevx", b"msf1")
+#: What stands at which byte of a file, and the kind that it tells; the first that fits.
+_MAGIC: tuple[tuple[int, tuple[bytes, ...], Kind], ...] = (
+    (0, (b"\xff\xd8\xff",), "jpeg"),
+    (0, (b"\x89PNG\r\n\x1a\n",), "png"),
+    (0, (b"FUJIFILMCCD-RAW", b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FOVb", b"\0MRM"), "raw"),
+    (0, (b"II\x1a\0\0\0HEAPCCDR",), "raw"),
+    (8, (b"CR",), "raw"),
+    (0, (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "tiff"),
+    (0, (b"BM",), "other_image"),
+    (8, (b"WEBP",), "other_image"),
+    (4, (b"ftypcrx ",), "raw"),
+    (4, tuple(b"ftyp" + brand for brand in _HEIF_BRANDS), "heif"),
+    (4, (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"moof", b"pnot"), "video"),
+    (0, (b"\x1a\x45\xdf\xa3",), "video"),  # Matroska
+    (8, (b"AVI",), "video"),
+)
 
 
 def check_file(path: Path) -> Kind | None:
@@ -91,7 +104,8 @@ def read_bytes(path: Path, size: int = -1) -> bytes:
 
 def sniff(head: bytes, suffix: str) -> Kind | None:
     """The kind of a file that starts with `head`; None where neither bytes nor `suffix` tell."""
-    return _by_magic(head) or _by_suffix(suffix)
+    by_name: Kind | None = "raw" if suffix in RAW_SUFFIXES else "video" if suffix in VIDEO_SUFFIXES else None
+    return next((kind for at, starts, kind in _MAGIC if head.startswith(starts, at)), by_name)
 
 
 def check_no_list(path: Path, head: bytes) -> None:
@@ -139,41 +153,6 @@ def check_size(source: object, width: int, height: int, bytes_a_pixel: float = 1
     if needed > MAX_BYTES:
         reason = f"{source}: {width} x {height} pixels would take {needed / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:g}"
         raise InputError(reason, "save it with fewer bits a sample or in grey, if it is no bomb")
-
-
-def _by_magic(head: bytes) -> Kind | None:
-    if head.startswith(b"\xff\xd8\xff"):
-        return "jpeg"
-    if head.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "png"
-    if head.startswith(_RAW_MAGIC) or head[8:10] == b"CR":
-        return "raw"
-    if head.startswith(_TIFF_MAGIC):
-        return "tiff"
-    if head.startswith(b"BM") or (head.startswith(b"RIFF") and head[8:12] == b"WEBP"):
-        return "other_image"
-    return _iso_media(head) or _other_container(head)
-
-
-def _iso_media(head: bytes) -> Kind | None:
-    box, brand = head[4:8], head[8:12]
-    if box == b"ftyp":
-        if brand == b"crx ":
-            return "raw"
-        return "heif" if brand in _HEIF_BRANDS else "video"
-    return "video" if box in _ISO_BOXES else None
-
-
-def _other_container(head: bytes) -> Kind | None:
-    matroska = head.startswith(b"\x1a\x45\xdf\xa3")
-    avi = head.startswith(b"RIFF") and head[8:11] == b"AVI"
-    return "video" if matroska or avi else None
-
-
-def _by_suffix(suffix: str) -> Kind | None:
-    if suffix in RAW_SUFFIXES:
-        return "raw"
-    return "video" if suffix in VIDEO_SUFFIXES else None
 
 
 def reason_of(error: BaseException) -> str:

@@ -13,10 +13,11 @@ import math
 import mmap
 import os
 import select
-import threading
 import time
 from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from fcntl import ioctl
 from pathlib import Path
 from typing import Any
 
@@ -163,7 +164,7 @@ class LiveSource:
         waiting = False
         while True:
             try:
-                with Camera(self._path, self.settings, self.counts, self._idle) as camera:
+                with closing(Camera(self._path, self.settings, self.counts, self._idle)) as camera:
                     self.mode, waiting = camera.mode, False
                     for frame in camera:
                         yield frame
@@ -180,68 +181,46 @@ class LiveSource:
 
 
 class Camera:
-    """One connection to a camera: a context manager and an iterator over its newest frames.
-
-    A thread takes frames from the driver as they come; of those that nobody asked for in time only the last is kept.
+    """One connection to a camera, which is to be closed, and an iterator over its newest frames.
 
     Raises:
         CameraLost: missing, busy, silent or unplugged.
         InputError: no camera, or not in the mode that is asked for.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        settings: CameraSettings,
-        counts: CameraCounts | None = None,
-        on_idle: Callable[[], None] | None = None,
-    ) -> None:
-        self.counts = counts or CameraCounts()
-        self._on_idle = on_idle or (lambda: None)
+    def __init__(self, path: Path, settings: CameraSettings, counts: CameraCounts, on_idle: Callable[[], None]) -> None:
+        self.counts, self._on_idle = counts, on_idle
         self._path, self._settings = path, settings
-        self._descriptor = _open(path)
         self._maps: list[mmap.mmap] = []
-        self._fresh = threading.Condition()
-        self._newest: _Capture | None = None
-        self._failure: InputError | None = None
-        self._running = False
-        self._grabber = threading.Thread(target=self._grab, name=f"grab {path}", daemon=True)
-        try:
-            self._configure()
-        except OSError as error:
-            self.close()
-            raise _failure(path, error) from None
-        except BaseException:
-            self.close()
-            raise
-
-    def __enter__(self) -> Camera:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        #: Number of the last frame that the driver gave.
+        self._sequence: int | None = None
+        with _explained(path):
+            self._descriptor = _open(path)
+            try:
+                self._configure()
+            except BaseException:
+                self.close()
+                raise
 
     def __iter__(self) -> Iterator[Frame]:
-        while True:
-            capture = self._take()
-            luma = self._luma(capture)
-            if luma is None:
-                self.counts.damaged += 1
-                self._on_idle()
-                continue
-            self.counts.delivered += 1
-            yield self._frame(luma, capture.time_s)
+        with _explained(self._path):
+            while True:
+                buffer = self._newest()
+                luma = self._luma(buffer)
+                self._give_back(buffer)
+                if luma is None:
+                    self.counts.damaged += 1
+                    self._on_idle()
+                else:
+                    self.counts.delivered += 1
+                    yield self._frame(luma, buffer.seconds + buffer.microseconds * 1e-6)
 
     def close(self) -> None:
-        """Stop the stream and hand the device back; may be called again."""
-        self._running = False
-        if self._grabber.is_alive():
-            self._grabber.join()
-        if self._descriptor < 0:
-            return
+        """Hand the device back; may be called again."""
         for view in self._maps:
             view.close()
-        os.close(self._descriptor)  # stops the stream and frees its buffers, whatever state it is in
+        if self._descriptor >= 0:
+            os.close(self._descriptor)  # stops the stream and frees its buffers, whatever state it is in
         self._descriptor = -1
 
     # -- setting up ---------------------------------------------------------------------------------------------------
@@ -255,100 +234,76 @@ class Camera:
         self.exposure_s = _set_exposure(self._descriptor, self._settings.exposure_s, self._path)
         _set_gain(self._descriptor, self._settings.gain, self._path)
         self._map_buffers()
-        abi.ioctl(self._descriptor, abi.STREAMON, abi.BufferType(abi.BUF_TYPE_VIDEO_CAPTURE))
+        ioctl(self._descriptor, abi.STREAMON, abi.BufferType(abi.BUF_TYPE_VIDEO_CAPTURE))
         self.counts.connections += 1
-        self._running = True
-        self._grabber.start()
 
     def _map_buffers(self) -> None:
         request = abi.RequestBuffers(count=_N_BUFFERS, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
-        abi.ioctl(self._descriptor, abi.REQBUFS, request)
+        ioctl(self._descriptor, abi.REQBUFS, request)
         for index in range(request.count):
             buffer = _buffer(index)
-            abi.ioctl(self._descriptor, abi.QUERYBUF, buffer)
+            ioctl(self._descriptor, abi.QUERYBUF, buffer)
             self._maps.append(mmap.mmap(self._descriptor, buffer.length, offset=buffer.offset))
-            abi.ioctl(self._descriptor, abi.QBUF, _buffer(index))
+            self._give_back(buffer)
 
     # -- taking frames ------------------------------------------------------------------------------------------------
 
-    def _grab(self) -> None:
-        """Body of the thread."""
-        try:
-            self._grab_until_stopped()
-        except OSError as error:
-            self._fail(_failure(self._path, error))
-        except CameraLost as error:
-            self._fail(error)
-
-    def _grab_until_stopped(self) -> None:
-        heard_s, sequence = time.monotonic(), None
-        while self._running:
-            buffer = self._dequeue()
+    def _newest(self) -> Any:
+        """The newest whole capture, waited for; those before it go back to the driver unseen."""
+        heard_s, newest, n_captures = time.monotonic(), None, 0
+        while True:
+            buffer = self._dequeue(0.0 if newest else _POLL_S)
             if buffer is None:
-                if time.monotonic() - heard_s > self._settings.stall_s:
+                # Where every buffer was filled, the driver had none for what came after: the newest is old.
+                if newest and n_captures != len(self._maps):
+                    return newest
+                if newest:
+                    self._pass_over(newest)
+                    newest, n_captures = None, 0
+                elif (silent_s := time.monotonic() - heard_s) > self._settings.stall_s:
                     reason = f"{self._path}: the camera sent nothing for {self._settings.stall_s:g} s"
                     raise CameraLost(reason, "check its cable, or lower size and rate")
+                elif silent_s > _POLL_S:
+                    self._on_idle()
                 continue
             heard_s = time.monotonic()
-            if sequence is not None:
-                self.counts.dropped += max(0, buffer.sequence - sequence - 1)
-            sequence = buffer.sequence
-            self._offer(buffer)
+            if self._sequence is not None:
+                self.counts.dropped += max(0, buffer.sequence - self._sequence - 1)
+            self._sequence = buffer.sequence
+            if buffer.flags & abi.BUF_FLAG_ERROR:
+                self.counts.damaged += 1
+                self._give_back(buffer)
+                self._on_idle()
+                continue
+            if newest:
+                self._pass_over(newest)
+            newest, n_captures = buffer, n_captures + 1
 
-    def _dequeue(self) -> ctypes.Structure | None:
+    def _dequeue(self, wait_s: float) -> Any:
         """A filled buffer, None where there is none yet."""
-        if not select.select([self._descriptor], [], [], _POLL_S)[0]:
+        if not select.select([self._descriptor], [], [], wait_s)[0]:
             return None
         buffer = _buffer(0)
         try:
-            abi.ioctl(self._descriptor, abi.DQBUF, buffer)
+            ioctl(self._descriptor, abi.DQBUF, buffer)
         except BlockingIOError:
             time.sleep(_NO_DATA_SLEEP_S)
             return None
         return buffer
 
-    def _offer(self, buffer: ctypes.Structure) -> None:
-        """Make a capture the newest; the one that it replaces goes back to the driver unseen."""
-        if buffer.flags & abi.BUF_FLAG_ERROR:
-            self.counts.damaged += 1
-            self._give_back(buffer.index)
-            return
-        time_s = buffer.seconds + buffer.microseconds * 1e-6
-        with self._fresh:
-            passed_over, self._newest = self._newest, _Capture(buffer.index, buffer.bytesused, time_s)
-            self._fresh.notify()
-        if passed_over is not None:
-            self.counts.dropped += 1
-            self._give_back(passed_over.index)
+    def _pass_over(self, buffer: Any) -> None:
+        self.counts.dropped += 1
+        self._give_back(buffer)
 
-    def _take(self) -> _Capture:
-        """The newest capture, waited for; it stays ours until it is given back."""
-        with self._fresh:
-            while self._newest is None:
-                if self._failure is not None:
-                    raise self._failure
-                if not self._fresh.wait(_POLL_S):
-                    self._on_idle()
-            capture, self._newest = self._newest, None
-        return capture
+    def _give_back(self, buffer: Any) -> None:
+        ioctl(self._descriptor, abi.QBUF, _buffer(buffer.index))
 
-    def _fail(self, error: InputError) -> None:
-        with self._fresh:
-            self._failure = error
-            self._fresh.notify()
-
-    def _give_back(self, index: int) -> None:
-        abi.ioctl(self._descriptor, abi.QBUF, _buffer(index))
-
-    def _luma(self, capture: _Capture) -> Luma | None:
-        """A copy of the luma of a capture, whose buffer then goes back to the driver; None where it is damaged."""
-        data = self._maps[capture.index][: capture.bytesused] if self.mode.pixel_format == "MJPG" else None
-        luma = self._layout.luma(self._maps[capture.index]) if data is None else None
-        try:
-            self._give_back(capture.index)
-        except OSError as error:
-            raise _failure(self._path, error) from None
-        return luma if data is None else _decode_jpeg(data, self._path)
+    def _luma(self, buffer: Any) -> Luma | None:
+        """A copy (height, width) of the luma in a buffer; None where it is damaged."""
+        data = self._maps[buffer.index]
+        if self.mode.pixel_format == "MJPG":
+            return _decode_jpeg(data[: buffer.bytesused], self._path)
+        return self._layout.luma(data)
 
     def _frame(self, luma: Luma, time_s: float) -> Frame:
         if self.counts.start_s is None:
@@ -362,15 +317,6 @@ class Camera:
             black=self._layout.black,
             white=self._layout.white,
         )
-
-
-@dataclass(frozen=True, slots=True)
-class _Capture:
-    """A filled buffer that is ours."""
-
-    index: int
-    bytesused: int
-    time_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -400,38 +346,43 @@ def list_modes(path: Path) -> list[Mode]:
     Raises:
         InputError: no camera, missing or busy.
     """
-    descriptor = _open(path)
-    try:
-        _check_capture(descriptor, path)
-        return sorted(_modes(descriptor), key=_merit(None), reverse=True)
-    except OSError as error:
-        raise _failure(path, error) from None
-    finally:
-        os.close(descriptor)
+    with _explained(path):
+        descriptor = _open(path)
+        try:
+            _check_capture(descriptor, path)
+            return sorted(_modes(descriptor), key=_merit(None), reverse=True)
+        finally:
+            os.close(descriptor)
 
 
 def _open(path: Path) -> int:
+    return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Raise errors of system calls as what they mean to a user."""
     try:
-        return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        yield
     except OSError as error:
-        raise _failure(path, error) from None
-
-
-def _failure(path: Path, error: OSError) -> InputError:
-    """What a system call's error means to a user."""
-    if error.errno in (errno.ENOENT, errno.ENXIO):
-        return CameraLost(
-            f"{path}: no such camera", "plug it in, or see `v4l2-ctl --list-devices`; --wait waits for it"
+        kind, reason, step = _FAILURES.get(
+            error.errno or 0, (CameraLost, f"the camera failed ({error.strerror})", _PLUG)
         )
-    if error.errno == errno.ENODEV:
-        return CameraLost(f"{path}: the camera was unplugged", "plug it in again; --wait waits for it")
-    if error.errno == errno.EBUSY:
-        return CameraLost(f"{path}: another program uses the camera", f"close it (`fuser -v {path}` names it)")
-    if error.errno == errno.EACCES:
-        return InputError(f"{path}: permission denied", "add yourself to the group `video` and log in again")
-    if error.errno in (errno.ENOTTY, errno.EINVAL):
-        return InputError(f"{path}: no V4L2 camera, or one that refuses its own mode", "name another /dev/video device")
-    return CameraLost(f"{path}: the camera failed ({error.strerror})", "plug it in again; --wait waits for it")
+        raise kind(f"{path}: {reason}", step.format(path=path)) from None
+
+
+_PLUG = "plug it in again; --wait waits for it"
+_MISSING = "plug it in, or see `v4l2-ctl --list-devices`; --wait waits for it"
+_REFUSED = "no V4L2 camera, or one that refuses its own mode"
+_FAILURES = {
+    errno.ENOENT: (CameraLost, "no such camera", _MISSING),
+    errno.ENXIO: (CameraLost, "no such camera", _MISSING),
+    errno.ENODEV: (CameraLost, "the camera was unplugged", _PLUG),
+    errno.EBUSY: (CameraLost, "another program uses the camera", "close it (`fuser -v {path}` names it)"),
+    errno.EACCES: (InputError, "permission denied", "add yourself to the group `video` and log in again"),
+    errno.ENOTTY: (InputError, _REFUSED, "name another /dev/video device"),
+    errno.EINVAL: (InputError, _REFUSED, "name another /dev/video device"),
+}
 
 
 def _check_capture(descriptor: int, path: Path) -> str:
@@ -441,18 +392,25 @@ def _check_capture(descriptor: int, path: Path) -> str:
         InputError: the device is none that streams pictures.
     """
     capability = abi.Capability()
-    try:
-        abi.ioctl(descriptor, abi.QUERYCAP, capability)
-    except OSError as error:
-        if error.errno in (errno.ENOTTY, errno.EINVAL):
-            raise InputError(f"{path}: is no V4L2 device", "name a camera, such as /dev/video0") from None
-        raise
+    if not _is_known(descriptor, abi.QUERYCAP, capability):
+        raise InputError(f"{path}: is no V4L2 device", "name a camera, such as /dev/video0")
     has_own = capability.capabilities & abi.CAP_DEVICE_CAPS
     able = capability.device_caps if has_own else capability.capabilities
     needed = abi.CAP_VIDEO_CAPTURE | abi.CAP_STREAMING
     if able & needed != needed:
         raise InputError(f"{path}: does not stream pictures", "name the camera's other /dev/video device")
     return bytes(capability.card).decode("utf-8", "replace")
+
+
+def _is_known(descriptor: int, request: int, argument: ctypes.Structure, *refusals: int) -> bool:
+    """Make a system call; whether the driver knows it, and refuses it with none of some further error codes."""
+    try:
+        ioctl(descriptor, request, argument)
+    except OSError as error:
+        if error.errno in (errno.EINVAL, errno.ENOTTY, *refusals):
+            return False
+        raise
+    return True
 
 
 def _modes(descriptor: int) -> list[Mode]:
@@ -497,12 +455,8 @@ def _enumerate(descriptor: int, request: int, structure: Callable[[int], Any]) -
     """What the driver lists, until it says EINVAL; nothing where it cannot list at all."""
     for index in range(1000):
         item = structure(index)
-        try:
-            abi.ioctl(descriptor, request, item)
-        except OSError as error:
-            if error.errno in (errno.EINVAL, errno.ENOTTY):
-                return
-            raise
+        if not _is_known(descriptor, request, item):
+            return
         yield item
 
 
@@ -539,7 +493,7 @@ def _set_format(descriptor: int, mode: Mode, path: Path) -> _Layout:
     form = abi.Format(
         type=abi.BUF_TYPE_VIDEO_CAPTURE, width=mode.width, height=mode.height, pixelformat=code, field=abi.FIELD_NONE
     )
-    abi.ioctl(descriptor, abi.S_FMT, form)
+    ioctl(descriptor, abi.S_FMT, form)
     if form.pixelformat != code:  # a driver may answer with the nearest that it has
         got = abi.fourcc_name(form.pixelformat)
         raise InputError(f"{path}: gives {got} instead of {mode.pixel_format}", "ask for another --format")
@@ -556,13 +510,9 @@ def _set_rate(descriptor: int, fps: float) -> float:
     parameters = abi.StreamParameters(type=abi.BUF_TYPE_VIDEO_CAPTURE)
     if fps > 0:
         parameters.numerator, parameters.denominator = 1000, round(1000 * fps)
-    try:
-        abi.ioctl(descriptor, abi.S_PARM, parameters)
-    except OSError as error:
-        if error.errno in (errno.EINVAL, errno.ENOTTY):
-            return 0.0
-        raise
-    return parameters.denominator / parameters.numerator if parameters.numerator else 0.0
+    if not _is_known(descriptor, abi.S_PARM, parameters) or not parameters.numerator:
+        return 0.0
+    return float(parameters.denominator / parameters.numerator)
 
 
 def _set_exposure(descriptor: int, exposure_s: float | None, path: Path) -> float | None:
@@ -590,19 +540,13 @@ def _set_gain(descriptor: int, gain: int | None, path: Path) -> None:
 
 def _set(descriptor: int, control: int, value: int) -> int | None:
     """Set a control to the nearest value that it can have; the value in effect, None where there is no such control."""
-    try:
-        limits = abi.ControlRange(id=control)
-        abi.ioctl(descriptor, abi.QUERYCTRL, limits)
-        if limits.flags & (abi.CTRL_FLAG_DISABLED | abi.CTRL_FLAG_READ_ONLY):
-            return None
-        state = abi.Control(control, min(max(value, limits.minimum), limits.maximum))
-        abi.ioctl(descriptor, abi.S_CTRL, state)
-        abi.ioctl(descriptor, abi.G_CTRL, state)
-    except OSError as error:
-        if error.errno in (errno.EINVAL, errno.ENOTTY, errno.EACCES, errno.ERANGE):
-            return None
-        raise
-    return int(state.value)
+    limits, refusals = abi.ControlRange(id=control), (errno.EACCES, errno.ERANGE)
+    if not _is_known(descriptor, abi.QUERYCTRL, limits, *refusals):
+        return None
+    state = abi.Control(control, min(max(value, limits.minimum), limits.maximum))
+    able = not limits.flags & (abi.CTRL_FLAG_DISABLED | abi.CTRL_FLAG_READ_ONLY)
+    known = able and all(_is_known(descriptor, call, state, *refusals) for call in (abi.S_CTRL, abi.G_CTRL))
+    return int(state.value) if known else None
 
 
 def _buffer(index: int) -> ctypes.Structure:

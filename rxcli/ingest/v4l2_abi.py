@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import fcntl
 from typing import Any
 
 CAP_VIDEO_CAPTURE, CAP_STREAMING, CAP_DEVICE_CAPS = 0x00000001, 0x04000000, 0x80000000
@@ -23,15 +22,8 @@ EXPOSURE_MANUAL = 1
 EXPOSURE_UNIT_S = 100e-6
 
 #: Letters of `_structure`, as in the module struct; where there is none, a field is a __u32.
-_TYPES: dict[str, Any] = {
-    "": ctypes.c_uint32,
-    "I": ctypes.c_uint32,
-    "i": ctypes.c_int32,
-    "q": ctypes.c_int64,
-    "Q": ctypes.c_uint64,
-    "s": ctypes.c_char,
-    "B": ctypes.c_uint8,
-}
+_TYPES: Any = {"": ctypes.c_uint32, "I": ctypes.c_uint32, "i": ctypes.c_int32, "q": ctypes.c_int64}
+_TYPES |= {"Q": ctypes.c_uint64, "s": ctypes.c_char, "B": ctypes.c_uint8}
 
 
 def _structure(name: str, fields: str) -> type[ctypes.Structure]:
@@ -92,15 +84,6 @@ S_CTRL = _request(_BOTH, 28, Control)
 QUERYCTRL = _request(_BOTH, 36, ControlRange)
 ENUM_FRAMESIZES = _request(_BOTH, 74, FrameSize)
 ENUM_FRAMEINTERVALS = _request(_BOTH, 75, FrameInterval)
-
-
-def ioctl(descriptor: int, request: int, argument: ctypes.Structure) -> None:
-    """One V4L2 system call; `argument` is changed in place.
-
-    Raises:
-        OSError: with the driver's errno.
-    """
-    fcntl.ioctl(descriptor, request, argument, True)
 
 
 def fourcc(name: str) -> int:

@@ -23,7 +23,7 @@ from rxcli.ingest.ahead import read_ahead
 from rxcli.ingest.metadata import clip_metadata
 from rxcli.ingest.orientation import orientation_of_turn
 from rxcli.ingest.sniff import check_size, reason_of
-from rxcli.types import Frame
+from rxcli.types import Frame, Metadata
 
 #: ITU-T H.273: samples use 16..235 of 8 bits, or all of them (FFmpeg's AVCOL_RANGE_JPEG).
 _FULL_RANGE = 2
@@ -69,19 +69,6 @@ class _Progress:
             self.broken_at_s = self.last_time_s
 
 
-@dataclass(frozen=True, slots=True)
-class _Picture:
-    """One decoded frame: luma plane, levels, and time."""
-
-    pixels: NDArray[np.uint8] | NDArray[np.uint16]
-    time_s: float
-    black: float
-    white: float
-    orientation: int = 1
-    #: Whether `time_s` is by the nominal frame rate, for the file's own time does not advance.
-    nominal: bool = False
-
-
 def read_video(path: Path) -> Iterator[Frame]:
     """The whole frames of a clip, in order of presentation; read ahead of the one that is looked at.
 
@@ -114,20 +101,11 @@ def _read(path: Path) -> Generator[Frame, None, None]:
 def _frames(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
     metadata = clip_metadata(dict(container.metadata) | dict(stream.metadata))
     decode = _decode_mjpeg if stream.codec_context.name == "mjpeg" else _decode
-    for index, picture in enumerate(decode(path, container, stream, progress)):
-        progress.last_time_s = picture.time_s
+    for index, frame in enumerate(decode(path, container, stream, progress)):
+        progress.last_time_s = frame.time_s
         if progress.doubt and not metadata.not_believed:
             metadata = replace(metadata, not_believed=(progress.doubt,))
-        yield Frame(
-            pixels=picture.pixels,
-            source=str(path),
-            index=index,
-            time_s=picture.time_s,
-            metadata=replace(metadata, orientation=picture.orientation),
-            black=picture.black,
-            white=picture.white,
-            nominal_time=picture.nominal,
-        )
+        yield replace(frame, index=index, metadata=replace(metadata, orientation=frame.metadata.orientation))
 
 
 def _packets(container: Any, stream: Any, progress: _Progress) -> Iterator[Any]:
@@ -150,7 +128,7 @@ def _packets(container: Any, stream: Any, progress: _Progress) -> Iterator[Any]:
         yield packet
 
 
-def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[_Picture]:
+def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
     import av
 
     codec = stream.codec_context
@@ -165,10 +143,10 @@ def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
             if frame.is_corrupt:
                 progress.damage()
             else:
-                yield _picture(frame, *_time_s(frame, stream, progress))
+                yield _frame(path, frame, *_time_s(frame, stream, progress))
 
 
-def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[_Picture]:
+def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
     from rxcli.ingest.jpeg import decode_luma
 
     limited = stream.codec_context.color_range not in (0, _FULL_RANGE)
@@ -181,7 +159,8 @@ def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) 
             while len(waiting) > (_MJPEG_THREADS if packet is not None else 0):
                 (time_s, nominal), picture = waiting.popleft()
                 try:
-                    yield _Picture(picture.result(), time_s, black, white, nominal=nominal)
+                    pixels = picture.result()
+                    yield Frame(pixels, str(path), 0, time_s, black=black, white=white, nominal_time=nominal)
                 except InputError:
                     progress.damage()
 
@@ -209,19 +188,15 @@ def _frame_s(stream: Any) -> float:
     return 1 / _USUAL_RATE_HZ
 
 
-def _picture(frame: Any, time_s: float, nominal: bool) -> _Picture:
+def _frame(path: Path, frame: Any, time_s: float, nominal: bool) -> Frame:
+    """A frame of FFmpeg's as one of ours, without its number and what the clip says of its camera."""
     if not _has_luma_plane(frame.format):
         frame = frame.reformat(format="gray")
     bits = frame.format.components[0].bits
     black, white = _levels(frame, bits)
-    return _Picture(
-        pixels=_plane(frame.planes[0], frame.width, frame.height, np.uint8 if bits == 8 else np.uint16),
-        time_s=time_s,
-        black=black,
-        white=white,
-        orientation=orientation_of_turn(frame.rotation),
-        nominal=nominal,
-    )
+    pixels = _plane(frame.planes[0], frame.width, frame.height, np.uint8 if bits == 8 else np.uint16)
+    metadata = Metadata(orientation=orientation_of_turn(frame.rotation))
+    return Frame(pixels, str(path), 0, time_s, metadata, black=black, white=white, nominal_time=nominal)
 
 
 def _levels(frame: Any, bits: int) -> tuple[float, float]:

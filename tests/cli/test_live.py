@@ -25,7 +25,7 @@ from rxcli.cli.live import Status, fit_lines, format_status
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode, InputError
 from rxcli.ingest import open_source
-from rxcli.ingest.v4l2 import Camera, CameraCounts, CameraLost, CameraSettings, LiveSource
+from rxcli.ingest.v4l2 import CameraCounts, CameraLost, LiveSource
 from rxcli.profiles import ScreenProfile, dump_profile, load_profile
 from rxcli.results.aim import Aim
 from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
@@ -297,7 +297,7 @@ class TestWithoutCamera:
 
     def test_no_camera(self) -> None:
         with pytest.raises(InputError, match="/dev/null: is no V4L2 device"):
-            Camera(Path("/dev/null"), CameraSettings())
+            next(iter(LiveSource(Path("/dev/null"))))
 
     @pytest.mark.parametrize("arguments", [["--exposure", "soon"], ["--exposure", "0"], ["--format", "RGB3"]])
     def test_bad_usage(self, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -135,11 +135,6 @@ class FakeCamera:
             return -1, error.number
         return 0, 0
 
-    def seconds_to_next_frame(self) -> float:
-        """How long a blocking DQBUF waits."""
-        due = self.started_s + (self.sequence + 1) / self.fps
-        return max(0.0, due - time.monotonic())
-
     # -- identity and controls ----------------------------------------------------------------------------------------
 
     def _check_plugged(self) -> None:
@@ -269,7 +264,8 @@ class FakeCamera:
             self.gone_s = time.monotonic()
             raise DriverError(errno.ENODEV)
         stalled = faults.stall_after is not None and self.n_frames >= faults.stall_after
-        if stalled or not self.queue:
+        early = time.monotonic() < self.started_s + (self.sequence + 1) / self.fps
+        if stalled or early or not self.queue:
             raise DriverError(errno.EAGAIN)
         self.sequence = max(self.sequence + 1, int((time.monotonic() - self.started_s) * self.fps))
         self.n_frames += 1

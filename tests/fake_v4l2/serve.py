@@ -35,7 +35,7 @@ A: dev=81:0\\n
 A: name=Fake camera\\n
 
 """
-_DQBUF, _ENOTTY = 17, 25
+_ENOTTY = 25
 
 
 def load_camera(scene: Path, node: Path) -> FakeCamera:
@@ -51,7 +51,7 @@ def load_camera(scene: Path, node: Path) -> FakeCamera:
 
 
 class Handler:
-    """Hands the ioctls of clients to the camera; a DQBUF is answered when its frame is due."""
+    """Hands the ioctls of clients to the camera."""
 
     def __init__(self, camera: FakeCamera) -> None:
         self.camera = camera
@@ -63,19 +63,11 @@ class Handler:
         if data is None:  # termios and the like, which carry no structure
             client.complete(-1, _ENOTTY)
             return True
-        wait_s = self.camera.seconds_to_next_frame() if request & 0xFF == _DQBUF else 0.0
-        if wait_s > 0:
-            GLib.timeout_add(round(wait_s * 1000) or 1, self._answer, client, data, request, size)
-        else:
-            self._answer(client, data, request, size)
-        return True
-
-    def _answer(self, client: UMockdev.IoctlClient, data: UMockdev.IoctlData, request: int, size: int) -> bool:
         argument = bytearray(data.retrieve())
         result, number = self.camera.ioctl(request, argument)
         data.update(0, bytes(argument[:size]))
         client.complete(result, number)
-        return False  # not again
+        return True
 
 
 def main(scene: Path, command: list[str]) -> int:
