@@ -1,9 +1,10 @@
 "use strict";
 // Draws the report of `vlc-rx inspect` from the data in the page; `rxcli.results.page` says what they are.
 (() => {
-  const { words, make, count, shape, draw, toldOf, showTexts, table, silent, legend } = view;
+  const { words, make, count, folded, shape, draw, toldOf, showTexts, payloads, silent, legend } = view;
   const data = JSON.parse(document.getElementById("data").textContent);
-  const WIDTH = 1000, LEFT = 56, MANY = 24;
+  const LEFT = 56, MANY = 24, PADDING = 34;
+  let WIDTH = 0; // of the charts: as wide as there is room, so that all columns are in view and texts keep their size
   const percent = (share, digits = 0) => `${(100 * share).toFixed(digits)} %`;
   const last = (list) => list[list.length - 1];
 
@@ -25,13 +26,14 @@
     node.append(drawing);
     return node;
   }
-  const chart = (title, height, shapes, told, caption) => section(title, `${told} ${caption}`, wide(svg(height, told, shapes)));
+  const chart = (title, height, shapes, told, caption) => section(title, `${told} ${caption}`, svg(height, told, shapes));
   const label = (x, y, text, anchor = "start", more = {}) => shape("text", { x, y, "text-anchor": anchor, ...more }, text);
   const bar = (x, y, width, height, kind, more = {}) => shape("rect", { x, y, width, height, class: kind, ...more });
   function titled(node, text) { node.append(shape("title", {}, text)); return node; }
-  // Numbers of columns under a chart: all of few, every tenth of many.
+  // Numbers of columns under a chart: all where there is room, else every fifth or tenth.
+  const every = (step) => (step >= 18 ? 1 : step >= 5 ? 5 : 10);
   const numbers = (columns, step, y) => columns
-    .map((column, place) => (columns.length <= MANY || column % 10 === 0 ? label(50 + (place + 0.5) * step, y, column, "middle") : null))
+    .map((column, place) => (column % every(step) === 0 ? label(50 + (place + 0.5) * step, y, column, "middle") : null))
     .filter(Boolean);
 
   function summary() {
@@ -57,7 +59,7 @@
       facts.append(fact);
     }
     const notes = [...data.notes.map((note) => make("p", note)), ...(data.advice ? [make("p", data.advice, "advice")] : [])];
-    section(data.headline, "", texts, make("p", data.source), steps, ...notes, facts);
+    section(data.headline, "", texts, make("p", data.source, "hint"), steps, ...notes, facts);
   }
 
   function photo() {
@@ -65,15 +67,14 @@
     const outlined = data.picture.outlines.length > 0;
     draw(figure, data.picture, outlined ? toldOf(data.columns) : "No columns could be outlined.");
     const caption = "White: the outline of the screen that was found. Colours: what became of each column of its backlight.";
-    const node = section("The picture", outlined ? caption : "", figure, ...(outlined ? [legend()] : []));
+    const node = section("The picture", outlined ? caption : "", figure, ...(outlined ? [legend(data.columns)] : []));
     for (const map of data.maps) {
-      const folded = make("details"), inside = make("figure"), list = make("ul", null, "legend");
+      const inside = make("figure"), list = make("ul", null, "legend");
       draw(inside, map, map.told);
       for (const [number, grid] of (map.grids || []).entries()) {
         list.append(make("li", `Columns ${grid.pitch_px.toFixed(0)} pixels wide`, `grid${number}`));
       }
-      folded.append(make("summary", map.title), inside, make("p", map.caption, "hint"), list);
-      node.append(folded);
+      node.append(folded(map.title, inside, make("p", map.caption, "hint"), list));
     }
   }
 
@@ -95,10 +96,11 @@
   }
 
   function packets() {
-    const parts = [...(data.packets.length ? [table(data.packets)] : []), ...silent(data.columns)];
+    const parts = [...payloads(data.packets), ...silent(data.columns)];
     if (!parts.length) return;
     const scored = data.packets.some((packet) => packet.errors !== null);
-    section("Packets", `Sure: probability that every bit is right. Seen: how often the packet is in view.${scored ? " Wrong bits: against the truth." : ""}`, ...parts);
+    const hint = `Sure: probability that every bit is right. Seen: how often the packet is in view.${scored ? " Wrong bits: against the truth." : ""}`;
+    section("Packets", hint, ...(data.texts.length ? [folded(`Payloads: ${count(data.packets.length, "packet")}`, ...parts)] : parts));
   }
 
   function path(xs, ys) {
@@ -134,12 +136,12 @@
     const total = 6 + known.traces.length * pitch + 22;
     shapes.push(label(50, total - 6, `row ${low.toFixed(0)}`), label(WIDTH, total - 6, `row ${high.toFixed(0)} of the sensor`, "end"));
     const told = `Light of ${count(known.traces.length, "column")} over the sensor's rows; a slot takes ${known.rows_per_slot.toFixed(2)} rows.`;
-    section("Light and slots", `The light of each column from the first row of the picture to the last; a row is an instant. Shaded: slots that were decided to be lit. Green: the light that these slots should give; where it lies on the black line, the decision fits. Red dashes: a packet begins. ${told}`, wide(svg(total, told, shapes)));
+    section("Light and slots", `The light of each column from the first row of the picture to the last; a row is an instant. Shaded: slots that were decided to be lit. Green: the light that these slots should give; where it lies on the black line, the decision fits. Red dashes: a packet begins. ${told}`, svg(total, told, shapes));
   }
 
   // Histogram of slots and eye diagram.
   function clarity(known) {
-    const width = 480, height = 240, [dark, lit] = known.histogram, bins = dark.length, step = width / bins;
+    const width = Math.min(480, WIDTH), height = 240, [dark, lit] = known.histogram, bins = dark.length, step = width / bins;
     const low = -0.4, span = 2, most = Math.max(1, ...dark, ...lit);
     const marks = [[0, "dark"], [1, "lit"]].flatMap(([value, word]) => {
       const at = ((value - low) / span) * width;
@@ -197,12 +199,12 @@
       const packet = mine[place][number], x = 50 + place * step, y = 4 + number * height;
       const cell = titled(bar(x, y, Math.max(step - 1, 0.5), height - 2, `s-${packet ? packet.status : column.status}`, { "fill-opacity": packet ? 0.25 + 0.75 * packet.confidence : 0.25 }),
         `column ${column.column}: ${packet ? packet.confidence.toFixed(4) : "none"}`);
-      const number_ = packet && columns.length <= MANY ? [label(x + step / 2, y + 16, Math.floor(packet.confidence * 100), "middle", { class: "on" })] : [];
+      const number_ = packet && step >= 20 ? [label(x + step / 2, y + 16, Math.floor(packet.confidence * 100), "middle", { class: "on" })] : [];
       return [cell, ...number_];
     }).flat());
     const sure = data.packets.filter((packet) => packet.confidence >= 0.9).length;
     chart("Confidence", deep * height + 24, [...cells, ...numbers(columns, step, deep * height + 18)],
-      `${count(data.packets.length, "packet")}; ${sure} with a confidence of 0.9 or more.`, "Columns across, packets downwards; numbers are percent.");
+      `${count(data.packets.length, "packet")}; ${sure} with a confidence of 0.9 or more.`, `Columns across, packets downwards${step >= 20 ? "; numbers are percent" : ""}.`);
   }
 
   function encoder() {
@@ -233,26 +235,27 @@
 
   function times() {
     const { total, ...stages } = data.times, names = Object.keys(stages), most = Math.max(1e-9, ...Object.values(stages));
-    const told = total === undefined ? "" : `${total.toFixed(0)} ms in all.`;
+    const told = total === undefined ? "" : `${total.toFixed(0)} ms in all.`, all = Math.min(480, WIDTH);
     const bars = names.flatMap((name, place) => {
-      const y = 24 * place, width = (300 * stages[name]) / most;
+      const y = 24 * place, width = ((all - 180) * stages[name]) / most;
       return [label(96, 18 + y, name, "end"), bar(104, 6 + y, width, 16, "bar"), label(110 + width, 18 + y, `${stages[name].toFixed(0)} ms`)];
     });
     const left = Object.entries(data.skipped).map(([name, n]) => `${name.replaceAll("_", " ")} ${n}`).join(", ");
-    section("Time", told, ...(names.length ? [svg(24 * names.length + 8, `Time by stage: ${told}`, bars, 480, "small")] : []),
+    section("Time", told, ...(names.length ? [svg(24 * names.length + 8, `Time by stage: ${told}`, bars, all, "small")] : []),
       make("p", left ? `Left out because the picture did not need it: ${left}.` : "Nothing was left out."));
   }
 
-  summary();
-  photo();
-  timeline();
-  packets();
-  if (data.inspection) {
-    traces(data.inspection);
-    if (data.inspection.received) for (const part of [clarity, residuals, crosstalk]) part(data.inspection);
+  function drawAll() {
+    const width = Math.max(280, document.querySelector("main").getBoundingClientRect().width - 2 * PADDING);
+    if (Math.abs(width - WIDTH) < 1) return;
+    WIDTH = width;
+    document.querySelector("main").replaceChildren();
+    for (const part of [summary, photo, timeline, packets]) part();
+    if (data.inspection) traces(data.inspection);
+    if (data.inspection && data.inspection.received) for (const part of [clarity, residuals, crosstalk]) part(data.inspection);
+    for (const part of [confidence, encoder, search, times]) part();
   }
-  confidence();
-  encoder();
-  search();
-  times();
+
+  drawAll();
+  addEventListener("resize", drawAll);
 })();

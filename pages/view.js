@@ -10,7 +10,13 @@ const view = (() => {
     return node;
   }
 
-  function count(number, noun) { return `${number} ${noun}${number === 1 ? "" : "s"}`; }
+  function count(number, noun, nouns = `${noun}s`) { return `${number} ${number === 1 ? noun : nouns}`; }
+
+  function folded(title, ...parts) {
+    const node = make("details");
+    node.append(make("summary", title), ...parts);
+    return node;
+  }
 
   // -- a picture with outlines over it ---------------------------------------------------------------------------
   const SVG = "http://www.w3.org/2000/svg";
@@ -74,11 +80,20 @@ const view = (() => {
     }
   }
 
+  // Files of which parts have come.
+  function underWay(files, advice) {
+    return files.map((file) => {
+      const line = make("p"), bar = make("progress");
+      bar.value = file.share;
+      bar.setAttribute("aria-label", "Part of the file that has come");
+      line.append(bar, ` ${Math.floor(100 * file.share)} % of a file of about ${count(file.bytes, "byte")}. ${advice}`);
+      return line;
+    });
+  }
+
   // -- packets ---------------------------------------------------------------------------------------------------
   // Title, kind of cell, text, and whether the packets have it.
   const cells = [
-    ["Time", "number", (p) => `${p.time_s.toFixed(2)} s`, (p) => p.burst !== null],
-    ["Burst", "number", (p) => p.burst, (p) => p.burst !== null],
     ["Column", "number", (p) => p.column, () => true],
     ["Sure", "number", (p) => `${(Math.floor(p.confidence * 1000) / 10).toFixed(1)} %`, () => true],
     ["Seen", "number", (p) => (p.copies === null ? "" : p.copies.toFixed(2)), () => true],
@@ -86,9 +101,20 @@ const view = (() => {
     ["Payload", "mono", (p) => p.payload, () => true],
   ];
 
-  function table(packets, caption) {
+  // A table of a photo's packets; a table for each burst of a clip, of which the first is open.
+  function payloads(packets) {
+    const bursts = new Map();
+    for (const packet of packets) bursts.set(packet.burst, [...(bursts.get(packet.burst) || []), packet]);
+    return [...bursts].map(([burst, list], place) => {
+      if (burst === null) return table(list);
+      const node = folded(`Burst ${burst} at ${list[0].time_s.toFixed(2)} s: ${count(list.length, "packet")}`, table(list));
+      node.open = place === 0;
+      return node;
+    });
+  }
+
+  function table(packets) {
     const grid = make("table");
-    if (caption) grid.append(make("caption", caption));
     const shown = cells.filter(([, , , has]) => packets.some(has));
     const head = make("tr");
     for (const [title, kind] of shown) {
@@ -120,12 +146,15 @@ const view = (() => {
     return [make("h3", "Columns without a packet"), list];
   }
 
-  function legend() {
+  // The colours that columns have in a picture.
+  function legend(columns) {
     const list = make("ul", null, "legend");
     list.setAttribute("aria-label", "Colours of the columns");
-    for (const [kind, word] of Object.entries(words)) list.append(make("li", word, kind));
+    for (const [kind, word] of Object.entries(words)) {
+      if (columns.some((column) => column.status === kind)) list.append(make("li", word, kind));
+    }
     return list;
   }
 
-  return { words, make, count, shape, draw, toldOf, showTexts, table, silent, legend };
+  return { words, make, count, folded, shape, draw, toldOf, showTexts, underWay, payloads, silent, legend };
 })();

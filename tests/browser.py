@@ -36,12 +36,9 @@ class Browser:
         self._home = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
         assert CHROMIUM is not None
         flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"]
-        flags += [
-            "--remote-debugging-port=0",
-            "--mute-audio",
-            "--hide-scrollbars",
-            f"--user-data-dir={self._home.name}",
-        ]
+        flags += ["--disable-quic", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
+        flags += ["--remote-debugging-port=0", "--mute-audio", "--hide-scrollbars"]
+        flags += [f"--user-data-dir={self._home.name}"]
         self._process = subprocess.Popen(
             [CHROMIUM, *flags, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
@@ -123,18 +120,17 @@ class Browser:
             await asyncio.sleep(0.03)
         return time.monotonic() - start_s
 
-    async def choose(self, selector: str, path: Path) -> None:
-        """Choose a file, as a person does with the dialogue."""
+    async def choose(self, selector: str, *paths: Path) -> None:
+        """Choose files, as a person does with the dialogue."""
         root = (await self.call("DOM.getDocument"))["root"]["nodeId"]
         node = (await self.call("DOM.querySelector", nodeId=root, selector=selector))["nodeId"]
-        await self.call("DOM.setFileInputFiles", files=[str(path)], nodeId=node)
+        await self.call("DOM.setFileInputFiles", files=[str(path) for path in paths], nodeId=node)
 
     async def press(self, key: str, code: int) -> None:
         """Press a key."""
         for kind in ("keyDown", "keyUp"):
             await self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
 
-    async def picture(self, path: Path, whole: bool = True) -> None:
-        """Write what the page looks like as PNG."""
-        data = await self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
-        path.write_bytes(base64.b64decode(data["data"]))
+    async def shot(self, **how: Any) -> bytes:
+        """What the page looks like, in the format that is asked for."""
+        return base64.b64decode((await self.call("Page.captureScreenshot", **how))["data"])

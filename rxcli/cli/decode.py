@@ -189,7 +189,7 @@ class _Run:
     """One run over many sources: where results go, and what is kept for the summary."""
 
     def __init__(self, decoder: Decoder, options: dict[str, Any], taken: Taken) -> None:
-        from rxcli.link.collector import Collector
+        from rxcli.link.collector import PhotoCollector
         from rxcli.results.summary import Limits
 
         self._decoder = decoder
@@ -199,8 +199,7 @@ class _Run:
         self._limits = Limits(options["max_ber"], options["min_packets"], options["min_packet_confidence"])
         self._summaries: list[SourceSummary] = []
         self._to_stdout = options["json_path"] == "-"
-        self._photos = Collector(decoder.link_screens, decoder.file_memory_mb)
-        self._n_photos = 0
+        self._photos = PhotoCollector(decoder.link_screens, decoder.file_memory_mb)
         self._write_payloads: Callable[[FrameResult], None] = lambda result: None
         #: The frame with the most packets of those whose camera was estimated.
         self._estimated: FrameResult | None = None
@@ -297,7 +296,7 @@ class _Run:
                 try:
                     for result, last in with_last(results):
                         result = scorer.add(result) if scorer else result
-                        result = self._combined(result)
+                        result = self._photos.add(result)
                         if self._options["out"]:
                             result = save_objects(
                                 result,
@@ -319,14 +318,6 @@ class _Run:
                         writer.end(summary)
                 finally:
                     self._end(summary, scorer)
-
-    def _combined(self, result: FrameResult) -> FrameResult:
-        """The result of a photograph with what it and those before it show together."""
-        if result.soft_bits is None:
-            return result
-        self._n_photos += 1
-        soft = replace(result.soft_bits, epoch=self._n_photos, source=result.source)
-        return self._photos.add(replace(result, soft_bits=soft))
 
     def _decoded(self, sources: list[Source]) -> Iterator[Decoded]:
         from rxcli.runs.batch import decode_here, decode_in_processes

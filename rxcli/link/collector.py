@@ -79,6 +79,33 @@ class Collector:
         return list(dict.fromkeys(sentence for receiver in self._decided for sentence in receiver.notes))
 
 
+class PhotoCollector:
+    """Photos of one sender, received together: what one shows in part, another may complete.
+
+    Args:
+        screens: profiles that results may name.
+        file_memory_mb: bound of all files under way, 2^20 bytes.
+    """
+
+    def __init__(self, screens: Sequence[ScreenProfile], file_memory_mb: int = FILE_MEMORY_MB) -> None:
+        self._collector = Collector(screens, file_memory_mb)
+        #: Photos so far, without those that gave a text or a file alone.
+        self.n_photos = 0
+
+    def add(self, result: FrameResult) -> FrameResult:
+        """The result of a photo with what it and those before it complete; one without soft bits is left as it is."""
+        if result.soft_bits is None:
+            return result
+        self.n_photos += 1
+        soft = replace(result.soft_bits, epoch=self.n_photos, source=result.source)
+        return self._collector.add(replace(result, soft_bits=soft))
+
+    @property
+    def progress(self) -> list[ObjectProgress]:
+        """Files under way."""
+        return self._collector.progress
+
+
 def with_events(result: FrameResult, events: Sequence[Event]) -> FrameResult:
     """Add completed messages and files to a result."""
     if not events:

@@ -92,7 +92,7 @@ def _facts(frame: Frame, result: FrameResult) -> dict[str, str]:
         "Picture": f"{frame.width} x {frame.height}",
         "Light": light_of(frame).word,
         "Screen": result.screen_profile or "not found",
-        "Camera": result.camera_profile or ("estimated from the picture" if result.line_delay_s else "unknown"),
+        "Camera": result.camera_profile or ("estimated" if result.line_delay_s else "unknown"),
     }
     share = height_share(result.corners, frame.height)
     if share is not None:

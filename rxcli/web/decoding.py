@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
+from collections import OrderedDict
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,13 +14,14 @@ from rxcli.errors import InputError, capitalised, sentence, without_commands
 from rxcli.runs.processes import resident_bytes, start_process
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from multiprocessing.connection import Connection
     from multiprocessing.process import BaseProcess
 
+    from rxcli.link.collector import PhotoCollector
     from rxcli.options import ReceiverOptions
     from rxcli.results.overlay import Preview
-    from rxcli.types import Frame, FrameResult
+    from rxcli.types import Frame, FrameResult, ObjectProgress
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +33,10 @@ _MAX_PACKETS = 2000
 #: What was received of a clip so far is told after so many seconds at the earliest.
 _PARTIAL_S = 0.4
 _POLL_S = 0.05
+#: Pages whose photos add up at a time, the latest ones, and the memory of the files under way of each.
+_SESSIONS, _SESSION_MB = 8, 32
+#: Width of the picture on the page, and small copies of frames that are kept for results that come some frames later.
+_WIDTH_PX, _KEPT = 1000, 40
 #: Address space of the process: far more than it uses, far less than would hurt the machine.
 _ADDRESS_SPACE = 6 << 30
 
@@ -78,20 +84,23 @@ class DecodingProcess:
         """Number of the process, None where there is none."""
         return self._process.pid if self._process is not None else None
 
-    def decode(self, path: Path, name: str, tell: Callable[[dict[str, Any]], None] | None = None) -> dict[str, Any]:
+    def decode(
+        self, path: Path, name: str, tell: Callable[[dict[str, Any]], None] | None = None, session: str = ""
+    ) -> dict[str, Any]:
         """What became of the file at `path`, as plain data for the page; a failure is an answer like any other.
 
         Args:
             path: the file.
             name: what messages call it.
             tell: given, from time to time, the answer so far of a clip that is still being read.
+            session: photos of one session add up; empty: this one stands alone.
         """
         if self._process is None or not self._process.is_alive():
             self.close()
             self.start()
         assert self._connection is not None
         try:
-            self._connection.send((str(path), name))
+            self._connection.send((str(path), name, session))
             return self._answer(tell)
         except _EndedError as ended:
             reason, step = ended.args
@@ -140,13 +149,31 @@ def _work(connection: Connection, options: ReceiverOptions, folder: Path | None)
         signal.signal(number, signal.SIG_IGN)
     _confine()
     _warm_up(options)
+    sessions: OrderedDict[str, PhotoCollector] = OrderedDict()
     try:
         while True:
-            path, name = connection.recv()
-            connection.send(answer_for(Path(path), name, options, connection.send))
+            path, name, session = connection.recv()
+            photos = _photos_of(session, sessions, options)
+            connection.send(answer_for(Path(path), name, options, connection.send, photos))
     except (EOFError, OSError):
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _photos_of(
+    session: str, sessions: OrderedDict[str, PhotoCollector], options: ReceiverOptions
+) -> PhotoCollector | None:
+    """What the photos of a session have given so far; None where none are added up."""
+    from rxcli.link.collector import PhotoCollector
+
+    if not session:
+        return None
+    if session not in sessions:
+        sessions[session] = PhotoCollector(options.screens, min(options.file_memory_mb, _SESSION_MB))
+    sessions.move_to_end(session)
+    if len(sessions) > _SESSIONS:
+        sessions.popitem(last=False)
+    return sessions[session]
 
 
 def _confine() -> None:
@@ -178,29 +205,38 @@ def _warm_up(options: ReceiverOptions) -> None:
 
 
 def answer_for(
-    path: Path, name: str, options: ReceiverOptions, tell: Callable[[dict[str, Any]], None] | None = None
+    path: Path,
+    name: str,
+    options: ReceiverOptions,
+    tell: Callable[[dict[str, Any]], None] | None = None,
+    photos: PhotoCollector | None = None,
 ) -> dict[str, Any]:
-    """The answer for one file; see `DecodingProcess.decode`."""
+    """The answer for one file; see `DecodingProcess.decode`. A photo is added to `photos`."""
     from rxcli.runs.batch import Source, standard_decoder
 
     started_s = time.monotonic()
-    frames = _Frames(time.process_time() + _CLIP_S)
     try:
         _check_pixels(path)
     except InputError as error:
         return refusal(error.message, error.hint)
-    decoder = standard_decoder(options, frames.tap)
-    gathered, told_s = _Gathered(frames, options), started_s
+    gathered, told_s = _Gathered(options, time.process_time() + _CLIP_S), started_s
+    decoder = standard_decoder(options, gathered.tap)
     try:
         for result in decoder.results(Source(name, str(path))):
-            gathered.add(_without(result, path))
+            gathered.add(_without(photos.add(result) if photos else result, path))
             if tell is not None and gathered.has_news and time.monotonic() - told_s > _PARTIAL_S:
                 tell(gathered.answer() | {"name": name, "partial": True})
                 told_s = time.monotonic()
         answer = gathered.answer()
     except MemoryError:
         return refusal("it takes too much memory", "try a smaller picture")
-    return answer | {"name": name, "seconds": round(time.monotonic() - started_s, 2)}
+    together = _files(photos.progress) if photos else None
+    return answer | {"name": name, "seconds": round(time.monotonic() - started_s, 2), "together": together}
+
+
+def _files(progress: Iterable[ObjectProgress]) -> list[dict[str, Any]]:
+    """Files under way, of a clip or of photos together."""
+    return [{"share": one.share, "bytes": one.container_bytes} for one in progress]
 
 
 def _without(result: FrameResult, path: Path) -> FrameResult:
@@ -230,72 +266,91 @@ def _check_pixels(path: Path) -> None:
         )
 
 
-class _Frames:
-    """Sees every frame before it is received: keeps those that may be shown, and ends a clip in good time."""
+class Previews:
+    """Sees every frame before it is received, and keeps small copies of the last ones.
 
-    def __init__(self, end_s: float) -> None:
-        self._end_s = end_s
-        self._kept: dict[int, Frame] = {}
-        self.cut_short = False
+    Args:
+        width_px: of a copy, at most about.
+        quality: of its JPEG.
+    """
+
+    def __init__(self, width_px: int, quality: int = 80) -> None:
+        self._width_px, self._quality = width_px, quality
+        self._kept: dict[int, Preview] = {}
+        #: The newest.
+        self.frame: Frame | None = None
 
     def tap(self, frame: Frame, _name: str) -> None:
-        if time.process_time() > self._end_s and frame.index:
-            self.cut_short = True
-            raise InputError("only the beginning of the clip was read", "send a shorter one for the rest")
-        self._kept[frame.index] = frame
-        while len(self._kept) > 40:  # results come some frames later than frames
+        """Look at the next frame."""
+        from rxcli.results.overlay import preview
+
+        self.frame = frame
+        self._kept[frame.index] = preview(frame, self._width_px)
+        while len(self._kept) > _KEPT:
             del self._kept[min(self._kept)]
 
-    def take(self, index: int) -> Frame | None:
-        """The frame of a result, if it is still there."""
-        return self._kept.get(index)
+    def picture(self, result: FrameResult, options: ReceiverOptions) -> dict[str, Any] | None:
+        """The picture of a result as JPEG with outlines in its pixels; None where it is not kept any more."""
+        from rxcli.results.cameras import camera_of, screen_of
+        from rxcli.results.overlay import picture_of
+
+        small = self._kept.get(result.frame)
+        if small is None or self.frame is None:
+            return None
+        camera = camera_of(self.frame, result, options.cameras)
+        return picture_of(result, self.frame, small, screen_of(result, options.screens), camera, self._quality)
 
 
-class _Gathered:
-    """All results of a source as one answer, shown with the frame that gave most."""
+class _Gathered(Previews):
+    """All results of a source as one answer, shown with the frame that gave most; ends a clip in good time."""
 
-    def __init__(self, frames: _Frames, options: ReceiverOptions) -> None:
-        self._frames, self._options = frames, options
-        self._best: tuple[int, FrameResult, dict[str, Any]] | None = None
+    def __init__(self, options: ReceiverOptions, end_s: float) -> None:
+        super().__init__(_WIDTH_PX)
+        self._options, self._end_s = options, end_s
+        self._best: tuple[int, FrameResult, dict[str, Any] | None] | None = None
         self._packets: list[dict[str, Any]] = []
         self._texts: list[dict[str, Any]] = []
+        self._files: list[dict[str, Any]] = []
         self._n_frames = self._n_received = self._n_unsure = 0
+        self._cut_short = False
         #: Whether packets or texts came in a frame that is not the first since the last answer.
         self.has_news = False
 
+    def tap(self, frame: Frame, name: str) -> None:
+        """Look at the next frame; where a clip has cost too much time it ends here."""
+        if time.process_time() > self._end_s and frame.index:
+            self._cut_short = True
+            raise InputError("only the beginning of the clip was read", "send a shorter one for the rest")
+        super().tap(frame, name)
+
     def add(self, result: FrameResult) -> None:
         """Take the next result."""
-        if self._frames.cut_short and result.status == "unreadable":
-            return
-        self._n_frames += 1
         from rxcli.results.columns import packet_rows, text_rows
 
+        if self._cut_short and result.status == "unreadable":
+            return
+        self._n_frames += 1
         texts, found = text_rows(result), packet_rows(result)
         self._texts += texts
+        self._files = _files(result.progress)
         received = sum(packet.is_believable for packet in result.packets)
         self._n_received += received
         self._n_unsure += len(result.packets) - received
         self._packets += found[: _MAX_PACKETS - len(self._packets)]
         self.has_news = result.frame > 0 and (self.has_news or bool(texts or found))
         if self._best is None or len(found) > self._best[0]:
-            self._best = len(found), result, self._picture(result)
-
-    def _picture(self, result: FrameResult) -> dict[str, Any]:
-        from rxcli.results.overlay import preview
-
-        frame = self._frames.take(result.frame)
-        return {} if frame is None else {"picture": picture_of(result, frame, preview(frame), self._options)}
+            self._best = len(found), result, self.picture(result, self._options)
 
     def answer(self) -> dict[str, Any]:
         """What is known so far."""
-        self.has_news = False
-        if self._best is None:
-            return refusal("it holds no picture", "send another file")
         from rxcli.results.aim import split_message
         from rxcli.results.columns import column_rows
         from rxcli.results.record import to_record
         from rxcli.results.report import count_packets, headline, mirror_note
 
+        self.has_news = False
+        if self._best is None:
+            return refusal("it holds no picture", "send another file")
         _, result, picture = self._best
         packets = self._packets
         reason, advice = ("", "") if packets else split_message(result)
@@ -309,23 +364,13 @@ class _Gathered:
             "advice": advice,
             "mirrored": mirror_note(result),
             "texts": list(self._texts),
+            "files": list(self._files),
             "packets": list(packets),
             "n_frames": self._n_frames,
-            "cut_short": self._frames.cut_short,
+            "cut_short": self._cut_short,
             "screen": result.screen_profile,
             "camera": result.camera_profile,
             "columns": columns,
             "record": to_record(result),
-            **picture,
+            "picture": picture,
         }
-
-
-def picture_of(
-    result: FrameResult, frame: Frame, small: Preview, options: ReceiverOptions, quality: int = 80
-) -> dict[str, Any]:
-    """The small copy of a frame as JPEG, and outlines in its pixels."""
-    from rxcli.results import overlay
-    from rxcli.results.cameras import camera_of, screen_of
-
-    screen, camera = screen_of(result, options.screens), camera_of(frame, result, options.cameras)
-    return overlay.picture_of(result, frame, small, screen, camera, quality)

@@ -21,16 +21,13 @@ if TYPE_CHECKING:
     from rxcli.ingest.v4l2 import CameraSettings
     from rxcli.options import ReceiverOptions
     from rxcli.results.aim import AimState
-    from rxcli.results.overlay import Preview
-    from rxcli.types import Frame, FrameResult
+    from rxcli.types import FrameResult
 
 log = logging.getLogger(__name__)
 
 #: Events a second at most, and the width of their pictures: what a phone on a poor network can follow.
 _EVENTS_PER_S = 8.0
 _WIDTH_PX = 720
-#: Previews kept for results that come some frames later.
-_KEPT = 40
 _RESTART_S = 2.0
 #: Texts and packets that a page which is opened later still gets.
 _HISTORY = 50
@@ -115,11 +112,12 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
         frames: of one camera, without end; where it has `counts`, dropped and damaged ones are told too.
         options: of the receiver.
     """
-    from rxcli.results.aim import Aim
+    from rxcli.results.aim import Aim, light_of
     from rxcli.results.columns import packet_rows, text_rows
     from rxcli.runs.batch import Source, standard_decoder
+    from rxcli.web.decoding import Previews
 
-    watched, aim = _Watched(), Aim()
+    watched, aim = Previews(_WIDTH_PX, quality=70), Aim()
     prompt = replace(options, prompt=True)
     decoder = replace(standard_decoder(prompt, watched.tap), open_source=lambda path: frames)
     packets: deque[dict[str, Any]] = deque(maxlen=_HISTORY)
@@ -146,7 +144,9 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
     for received in decoder.results(Source("camera", "camera")):
         result = replace(received, message=received.message and without_commands(received.message))
         now_s = time.monotonic()
-        unsent = result, aim.update(result, now_s, watched.height, watched.light)
+        newest = watched.frame
+        height, light = (newest.height, light_of(newest)) if newest is not None else (1, None)
+        unsent = result, aim.update(result, now_s, height, light)
         packets.extend(packet_rows(result))
         texts += text_rows(result)
         if now_s - last_s >= 1 / _EVENTS_PER_S or texts or result.status == "unreadable":
@@ -154,36 +154,3 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
             last_s, unsent = now_s, None
     if unsent is not None:
         yield event(*unsent)
-
-
-class _Watched:
-    """Sees every frame before it is received, and keeps small copies of the last ones."""
-
-    def __init__(self) -> None:
-        from rxcli.results.aim import Light
-
-        self._previews: dict[int, Preview] = {}
-        self._frame: Frame | None = None
-        self.light: Light | None = None
-
-    def tap(self, frame: Frame, _name: str) -> None:
-        from rxcli.results.aim import light_of
-        from rxcli.results.overlay import preview
-
-        self._frame, self.light = frame, light_of(frame)
-        self._previews[frame.index] = preview(frame, _WIDTH_PX)
-        while len(self._previews) > _KEPT:
-            del self._previews[min(self._previews)]
-
-    @property
-    def height(self) -> int:
-        return self._frame.height if self._frame is not None else 1
-
-    def picture(self, result: FrameResult, options: ReceiverOptions) -> dict[str, Any] | None:
-        """The picture of a result with its outlines, in its pixels."""
-        from rxcli.web.decoding import picture_of
-
-        small = self._previews.get(result.frame)
-        if small is None or self._frame is None:
-            return None
-        return picture_of(result, self._frame, small, options, quality=70)

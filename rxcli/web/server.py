@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
+import itertools
 import json
 import logging
 import shutil
@@ -53,6 +54,8 @@ _HEADERS = {
 }
 #: A line of JSON for every answer: what is known so far, and at last the whole.
 _LINES = "application/x-ndjson"
+#: Header that photos which are to add up have in common.
+_SESSION, _SESSION_CHARACTERS = "X-Session", 64
 _LOCAL = ("127.0.0.1", "localhost", "::1", "[::1]")
 _CHUNK = 1 << 16
 _SWEEP_S = 2.0
@@ -150,6 +153,8 @@ class Server:
         self._watchers: dict[asyncio.Queue[str], web.Request] = {}
         self._history: deque[str] = deque(maxlen=20)
         self._idle_since: dict[int, float] = {}
+        #: Of pictures: photos that add up need names of their own.
+        self._numbers = itertools.count(1)
         self._live: Any = None
         #: The port, once the server runs.
         self.port = site.port
@@ -346,7 +351,8 @@ class Server:
     def _decode_for(self, request: web.Request, path: Path, tell: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
         if request.transport is None or request.transport.is_closing():
             return refusal("nobody waits for the answer", "send it again")
-        return self._decoder.decode(path, "the picture", tell)
+        session = request.headers.get(_SESSION, "")[:_SESSION_CHARACTERS]
+        return self._decoder.decode(path, f"picture {next(self._numbers)}", tell, session)
 
     def _tell_places(self) -> None:
         """Tell all but the first how many are before them."""

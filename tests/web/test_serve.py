@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import io
 import itertools
@@ -17,7 +18,8 @@ import tempfile
 import threading
 import time
 import zlib
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -36,12 +38,22 @@ from browser import CHROMIUM, Browser  # noqa: E402
 
 from rxcli.cli.main import run  # noqa: E402
 from rxcli.ingest import open_source  # noqa: E402
+from rxcli.lab.benchmark.goodput import detect  # noqa: E402
+from rxcli.link.encoder import message  # noqa: E402
 from rxcli.options import ReceiverOptions, receiver_options  # noqa: E402
+from rxcli.profiles import ScreenProfile, load_profile  # noqa: E402
 from rxcli.results.aim import Aim, Light, light_of  # noqa: E402
 from rxcli.results.columns import text_rows  # noqa: E402
 from rxcli.runs.processes import resident_bytes  # noqa: E402
-from rxcli.types import ColumnResult, FrameResult, Message, PacketResult, ReceivedObject  # noqa: E402
-from rxcli.web.decoding import DecodingProcess, Limits, answer_for  # noqa: E402
+from rxcli.types import (  # noqa: E402
+    ColumnResult,
+    FrameResult,
+    FrameSoftBits,
+    Message,
+    PacketResult,
+    ReceivedObject,
+)
+from rxcli.web.decoding import DecodingProcess, Limits, _photos_of, answer_for  # noqa: E402
 from rxcli.web.live import live_events  # noqa: E402
 from rxcli.web.server import Bounds, Server, Site  # noqa: E402
 
@@ -118,6 +130,49 @@ def test_the_page_speaks_of_no_options_of_a_command_line(tmp_path: Path) -> None
     answer = answer_for(tmp_path / "a.png", "a.png", receiver_options())
     assert answer["advice"]
     assert "--" not in json.dumps(answer)
+
+
+def test_photos_of_a_session_add_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photos none of which shows enough of a text give it together; those of another session do not help."""
+    screen, rng = load_profile("data-17k3", ScreenProfile), np.random.default_rng(6)
+    n = screen.payload_symbols
+    options, sending = receiver_options(screens=screen, soft_bits=True), message("z" * 150)
+
+    def results(*_: Any) -> Iterator[FrameResult]:
+        llr = detect(sending.labels(rng.integers(0, 100, 1), 20, n), 5, (7.0,) * 20, rng)
+        llr[:, rng.permutation(n)[n // 2 :]] = 0
+        soft = FrameSoftBits(np.arange(1), llr)
+        yield replace(result_of("partial", packets=1), screen_profile=screen.name, soft_bits=soft)
+
+    monkeypatch.setattr("rxcli.runs.batch.Decoder.results", results)
+    sessions: OrderedDict[str, Any] = OrderedDict()
+
+    def texts(session: str) -> list[str]:
+        photos = _photos_of(session, sessions, options)
+        answer = answer_for(tmp_path / "a.jpg", "a", options, photos=photos)
+        return [item["text"] for item in answer["texts"]]
+
+    came = [texts("mine") for _ in range(12)]
+    assert came[0] == []
+    assert [text for photo in came for text in photo] == ["z" * 150]
+    assert texts("another") == texts("") == []
+    for number in range(20):
+        texts(str(number))
+    assert len(sessions) == 8  # the latest
+    assert "mine" not in sessions
+
+
+def test_the_page_names_its_session(options: ReceiverOptions, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(DecodingProcess, "decode", lambda _self, *more: asked.append(more) or {"status": "ok"})
+
+    async def work(server: Server, client: Any) -> None:
+        for session in ("", "ab12", "x" * 999):
+            await post(server, client, b"hello", headers={"X-Session": session})
+
+    serving(Site(options, port=0), work)
+    assert [more[3] for more in asked] == ["", "ab12", "x" * 64]
+    assert len({more[1] for more in asked}) == 3  # pictures that add up have names of their own
 
 
 def test_a_clip_is_answered_by_and_by() -> None:
@@ -585,8 +640,7 @@ async def page(site: Site, **how: Any) -> AsyncIterator[tuple[Server, Browser]]:
 
 
 @needs_chromium
-@pytest.mark.parametrize("dark", [False, True])
-def test_a_phone_sends_the_samples_and_a_bad_file(dark: bool, tmp_path: Path) -> None:
+def test_a_phone_sends_the_samples_and_a_bad_file(tmp_path: Path) -> None:
     (tmp_path / "bad.jpg").write_bytes(b"\xff\xd8\xff nothing")
     expected = {
         SAMPLES / "phone_chelsea_17k3.jpg": ("20 packets received", 20),
@@ -597,20 +651,65 @@ def test_a_phone_sends_the_samples_and_a_bad_file(dark: bool, tmp_path: Path) ->
     profiles = tuple(str(SAMPLES / f"{name}.toml") for name in ("phone12", "xs10-small", "video1080"))
 
     async def body() -> None:
-        async with page(Site(receiver_options(cameras=profiles), port=0), dark=dark) as (_, browser):
+        async with page(Site(receiver_options(cameras=profiles), port=0)) as (_, browser):
             for path, (title, n_outlines) in expected.items():
                 await browser.run("document.getElementById('result').hidden = true")  # a bad file answers at once
                 await browser.choose("#file", path)
-                first_s = await browser.until("!document.getElementById('result').hidden")
-                whole_s = await browser.until("document.getElementById('progress').textContent === ''")
-                print(f"{path.name}: first answer after {first_s:.2f} s, whole {whole_s:.2f} s later")
+                await browser.until("!document.getElementById('result').hidden")
+                await browser.until("document.getElementById('progress').textContent === ''")
                 assert await browser.run("document.getElementById('result-title').textContent") == title
                 assert await browser.run("document.activeElement.id") == "result-title"
-                assert (
-                    await browser.run("document.querySelectorAll('#picture polygon:not(.corners)').length")
-                    == n_outlines
-                )
+                drawn = await browser.run("document.querySelectorAll('#picture polygon:not(.corners)').length")
+                assert drawn == n_outlines
+                if path.suffix == ".mp4":  # a table for each burst, with its time
+                    bursts = await browser.run(
+                        "[...document.querySelectorAll('#payloads summary')].map(n => n.innerText)"
+                    )
+                    assert bursts[-18:-16] == ["Burst 1 at 0.02 s: 20 packets", "Burst 2 at 0.03 s: 20 packets"]
+                    assert await browser.run("document.querySelectorAll('#payloads tbody tr').length") == 360
                 assert await browser.run("document.documentElement.scrollWidth <= innerWidth")
+            assert browser.complaints == []
+
+    asyncio.run(body())
+
+
+@needs_chromium
+def test_files_that_are_dropped_queue_with_their_thumbnails(tmp_path: Path, options: ReceiverOptions) -> None:
+    """One after the other is read; each can be looked at again; starting over forgets them."""
+    write_frame(tmp_path / "a.png", 3)
+    (tmp_path / "b.png").write_bytes(b"nothing")
+    data = {path.name: base64.b64encode(path.read_bytes()).decode() for path in sorted(tmp_path.glob("*.png"))}
+    drop = """(async (files) => {
+      const dropped = new DataTransfer();
+      for (const [name, data] of Object.entries(files)) {
+        dropped.items.add(new File([await (await fetch("data:image/png;base64," + data)).blob()], name));
+      }
+      document.getElementById("drop").dispatchEvent(new DragEvent("drop", { dataTransfer: dropped, bubbles: true }));
+    })(%s)"""
+
+    async def body() -> None:
+        async with Server(Site(options, port=0)) as server, Browser() as browser:
+            await browser.call("Page.setBypassCSP", enabled=True)  # for the test's own files
+            await browser.open(server.address)
+            assert await browser.run("document.getElementById('drop').innerText.includes('photos')")
+            await browser.run(drop % json.dumps(data))
+            await browser.until("document.querySelectorAll('.entry:enabled').length === 2")
+            states = await browser.run("[...document.querySelectorAll('.entry')].map((node) => node.innerText)")
+            assert [state.split("\n")[-2:] for state in states] == [
+                ["a.png", f"{N_COLUMNS} packets received"],
+                ["b.png", "The file could not be read"],
+            ]
+            assert await browser.run("document.querySelectorAll('.thumb img').length") == 1
+            assert await browser.run("document.querySelector('[aria-current=true] .name').textContent") == "b.png"
+            await browser.run("document.querySelector('.entry').click()")
+            title = await browser.run("document.getElementById('result-title').textContent")
+            assert title == f"{N_COLUMNS} packets received"
+            told = await browser.run("document.getElementById('together').innerText")
+            assert "Photos sent from this page are combined" in told
+            assert "So far: 1 photo, 0 texts and files." in told
+            await browser.run("document.getElementById('again').click()")
+            assert await browser.run("document.querySelectorAll('.entry').length") == 0
+            assert await browser.run("document.getElementById('result').hidden")
             assert browser.complaints == []
 
     asyncio.run(body())
@@ -628,8 +727,8 @@ def test_the_page_is_for_keyboards_and_screen_readers(options: ReceiverOptions) 
                 for node in tree["nodes"]
                 if not node["ignored"]
             }
-            assert ("heading", "A photo") in named
-            assert any(role == "button" and name and "Take or choose a photo" in name for role, name in named), named
+            assert ("heading", "Photos") in named
+            assert any(role == "button" and name and "Take or choose photos" in name for role, name in named), named
             assert not {role for role, name in named if role in ("button", "link", "image") and not name}
             assert await browser.run("document.documentElement.lang") == "en"
             for scheme in ("light", "dark"):
