@@ -25,7 +25,7 @@ _PORTRAIT = (5, 6, 7, 8)
 _NO_COLUMNS = "no columns of a modulated backlight were found in the picture"
 _SHOW_COLUMNS = (
     "photograph a screen that sends, from near, with the electronic shutter and a short exposure (1/8000 s), and use "
-    "the picture in its full size; if it shows such a screen, give its --corners"
+    "the picture in its full size"
 )
 
 
