@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from itertools import permutations
 from pathlib import Path
 
 import pytest
@@ -37,11 +36,10 @@ def test_samples_decode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 
 def test_results_depend_on_neither_order_nor_workers_nor_earlier_runs(tmp_path: Path) -> None:
-    """Byte for byte, but for the times: in three orders in one process, and with 1, 2 and 4 workers."""
+    """Byte for byte, but for the times: in two orders in one process, and with two workers."""
     samples = [str(data_dir("sample_frames") / name) for name in FLOORS]
-    orders = [list(order) for order in permutations(samples)][::2]
     results = []
-    for number, (order, workers) in enumerate([*((order, 1) for order in orders), (samples, 2), (samples, 4)]):
+    for number, (order, workers) in enumerate([(samples, 1), (samples[::-1], 1), (samples, 2)]):
         out = tmp_path / f"{number}.jsonl"
         assert run(["decode", *order, "--json", str(out), "--quiet", "--workers", str(workers)]) == ExitCode.OK
         lines = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()]
