@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import tomllib
 from dataclasses import replace
 from functools import partial
 from math import isfinite, nan
@@ -28,10 +30,7 @@ _VIDEO_SUFFIXES = {".mp4": "h264", ".mov": "h264", ".mkv": "h264", ".avi": "mjpe
 _PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-plain")
 
 #: Options that are fields of the scene by the same name.
-_SCENE_OPTIONS = (
-    *("picture", "dimming", "stabilised", "n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm"),
-    *("blur_px", "lcd_grid", "hand_px", "iso", "make", "model", "camera_name"),
-)
+_SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm", "hand_px")
 
 
 @click.command()
@@ -47,45 +46,27 @@ _SCENE_OPTIONS = (
     ("--seed", click.IntRange(0), 0, "Same seed, same pixels."),
     ("--format=NAME file_format", _FORMATS, None, f"Format of OUT, {', '.join(_FORMATS)}. [default: by its suffix]"),
     ("--w weights", str, "5", "Lit slots of ten: N, a list N,N,..., or 'dimming'."),
-    ("--dimming", ("max", "none"), "max", "Local dimming."),
     ("--exposure exposure_s", Exposure(), None, "Exposure in seconds, or as 1/32000.  [default: the preset's]"),
     ("--electrons", float, None, "Electrons of a green pixel that sees white, in one exposure."),
-    ("--iso", click.IntRange(1), None, "ISO written to the file; has no effect on the pixels."),
     ("--roll roll_deg", float, None, "Degrees about the line of sight; 180 for a camera upside down."),
-    ("--yaw yaw_deg", float, None, "Degrees about the vertical."),
-    ("--pitch pitch_deg", float, None, "Degrees about the horizontal."),
-    ("--distance distance_mm", float, None, "Distance of the screen in millimetres."),
     ("--fill", float, None, "Share of the picture's width that the screen fills, instead of a distance."),
-    ("--focal focal_widths", float, None, "Focal length in picture widths."),
-    ("--distortion", str, None, "Lens distortion k1,k2,p1,p2,k3."),
     ("--corners", str, None, "The screen's corners x,y,x,y,x,y,x,y on the sensor, instead of a pose."),
-    ("--orientation", click.IntRange(1, 8), None, "EXIF orientation.  [default: 1, or 3 for a roll of 180]"),
-    ("--blur blur_px", float, None, "Focus blur, standard deviation in pixels."),
-    ("--lcd-grid", click.FloatRange(0, 1), None, "Depth of the panel's pixel structure."),
-    ("--room-light room_e", float, None, "Electrons of a green pixel that sees white paper by the room's light."),
-    ("--flicker flicker_hz", float, None, "Flicker of the room's light in Hz (100 or 120)."),
-    ("--reflection lamp", float, None, "A lamp mirrored in the panel, against white paper."),
     ("--scale", click.FloatRange(0.02, 4), None, "Scale the sensor; rows and time shown scale with it."),
     ("--keep-readout/--keep-line-delay", None, False, "With --scale: keep the time of the whole readout."),
-    ("--cfa", ("bayer", "xtrans", "rgb"), None, "Colour filter array."),
-    ("--tone", ("srgb", "bt709", "gamma", "linear"), None, "Tone curve of developed pictures."),
-    ("--quality", click.IntRange(1, 100), None, "JPEG quality."),
-    ("--subsampling", ("444", "422", "420"), None, "JPEG colour subsampling."),
-    ("--sharpen", click.FloatRange(0, 5), None, "Strength of sharpening."),
-    ("--denoise denoise_px", click.FloatRange(0, 10), None, "Noise reduction, pixels."),
-    ("--correct/--no-correct correct_distortion", None, None, "Take the lens's distortion out in the camera."),
     ("--frames n_frames", click.IntRange(1), None, "Frames of a clip."),
     ("--frame-rate frame_rate_hz", float, None, "Frames per second of a clip."),
     ("--bit-rate", click.IntRange(1), None, "Bits per second of a clip.  [default: constant quality]"),
     ("--hand hand_px", click.FloatRange(0), None, "Hold the camera in a hand: pixels from frame to frame."),
-    ("--stabilised", None, False, "With --hand: frames are turned back and cropped, as phones do."),
     ("--clock-error slot_rate_error_ppm", float, None, "Error of the slot rate, ppm."),
     ("--column-delays", str, None, "Delays of the columns in slots: one each, or one for the largest random delay."),
     ("--start-slot", float, None, "Slot of the link at which row 0 starts.  [default: random]"),
-    ("--make", str, None, "Camera make written to the file."),
-    ("--model", str, None, "Camera model written to the file."),
+    (
+        "--set fields",
+        [str],
+        None,
+        "A field of the preset, as isp.quality=85; may be given several times.",
+    ),
     ("--waveforms", FOLDER, None, "Also write what drives a real screen."),
-    ("--camera-name", str, None, "Name of the camera in truth and camera profile."),
     ("--camera-profile", FILE, None, "Also write a camera profile (TOML) that fits the capture."),
 )
 @click.option(
@@ -156,38 +137,48 @@ def _format_of(out: Path) -> str:
 
 def _scene(options: dict[str, Any], file_format: str) -> Scene:
     """The preset with what the options change."""
-    from rxcli.lab.simulate.scenes import preset
+    from rxcli.lab.simulate.scenes import preset, with_fields
 
     scene = preset(options["preset"], options["screen"])
-    sent: dict[str, Any] = {
-        "w": _weights(options["weights"]),
-        "payload": _payload(options["payload"]),
-        "labels": _labels(options),
-    }
-    scene = replace(scene, **_given(options, _SCENE_OPTIONS), **sent)
-    scene = _with_light(_with_pose(scene, options), options)
-    isp = _given(options, ("tone", "quality", "subsampling", "sharpen", "denoise_px", "correct_distortion"))
-    sensor = _given(options, ("cfa",))
-    scene = replace(scene, isp=replace(scene.isp, **isp), sensor=replace(scene.sensor, **sensor))
+    for text in options["fields"]:
+        scene = with_fields(scene, _table(text))
+    scene = replace(
+        scene, w=_weights(options["weights"]), payload=_payload(options["payload"]), labels=_labels(options)
+    )
+    scene = replace(scene, **_given(options, _SCENE_OPTIONS))
+    scene = _with_pose(scene, options)
+    if options["exposure_s"] is not None:
+        scene = replace(scene, exposure_s=options["exposure_s"])
+    if options["electrons"] is not None:
+        scene = replace(scene, light_e_per_s=options["electrons"] / scene.exposure_s)
     if options["column_delays"] is not None:
         delays = _numbers(options["column_delays"], "--column-delays", (1, scene.screen.columns))
         scene = replace(scene, column_delay_slots=delays if len(delays) > 1 else delays[0])
     if options["scale"] is not None:
         scene = scene.scaled(options["scale"], keep_readout=options["keep_readout"])
-    return _for_format(scene, file_format, options)
+    return _for_format(scene, file_format)
 
 
-def _for_format(scene: Scene, file_format: str, options: dict[str, Any]) -> Scene:
+def _table(text: str) -> dict[str, Any]:
+    """FIELD=VALUE as a table of TOML; a text needs no quotes."""
+    name, _, value = text.partition("=")
+    for toml in (value, json.dumps(value)):
+        try:
+            return tomllib.loads(f"{name} = {toml}")
+        except tomllib.TOMLDecodeError:
+            continue
+    raise UsageError(f"--set {text}: not FIELD=VALUE", "name a field of the preset, as in isp.quality=85")
+
+
+def _for_format(scene: Scene, file_format: str) -> Scene:
     if file_format.startswith("dng"):
         if scene.sensor.cfa == "rgb":
-            raise UsageError("a DNG holds a mosaic, this sensor has none", "add --cfa bayer or --cfa xtrans")
+            raise UsageError("a DNG holds a mosaic, this sensor has none", "add --set sensor.cfa=bayer")
         # LibRaw crops a known Fujifilm model to the area it knows; a synthetic make keeps every pixel.
-        scene = replace(
-            scene, output="raw", make=options["make"] or "Synthetic", model=options["model"] or scene.camera_name
-        )
-    if file_format in _STILLS:
-        scene = replace(scene, n_frames=1)
-    return scene
+        if scene.make == "FUJIFILM":
+            scene = replace(scene, make="Synthetic", model=scene.camera_name)
+        scene = replace(scene, output="raw")
+    return replace(scene, n_frames=1) if file_format in _STILLS else scene
 
 
 def _given(options: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
@@ -195,34 +186,14 @@ def _given(options: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _with_pose(scene: Scene, options: dict[str, Any]) -> Scene:
-    lens, pose = scene.lens, scene.pose
-    if options["focal_widths"] is not None:
-        lens = replace(lens, focal_widths=options["focal_widths"])
-    if options["distortion"] is not None:
-        k1, k2, p1, p2, k3 = _numbers(options["distortion"], "--distortion", (5,))
-        lens = replace(lens, distortion=(k1, k2, p1, p2, k3))
-    pose = replace(pose, **_given(options, ("roll_deg", "yaw_deg", "pitch_deg", "fill")))
-    if options["distance_mm"] is not None:
-        pose = replace(pose, fill=lens.focal_widths * scene.screen.width_mm / options["distance_mm"])
-    if pose.fill <= 0 or lens.focal_widths <= 0:
-        raise UsageError("--fill, --distance and --focal must be positive", "give positive numbers")
+    pose = replace(scene.pose, **_given(options, ("roll_deg", "fill")))
+    if pose.fill <= 0:
+        raise UsageError(f"--fill must be positive (got {pose.fill})", "give a positive number")
     if options["corners"] is not None:
         values = _numbers(options["corners"], "--corners", (8,))
         pose = replace(pose, corners=tuple(zip(values[::2], values[1::2], strict=True)))
-    turned = abs((pose.roll_deg + 180) % 360 - 180) > 90
-    orientation = options["orientation"] or (3 if turned else 1)
-    return replace(scene, lens=lens, pose=pose, orientation=orientation)
-
-
-def _with_light(scene: Scene, options: dict[str, Any]) -> Scene:
-    if options["exposure_s"] is not None:
-        scene = replace(scene, exposure_s=options["exposure_s"])
-    if options["electrons"] is not None:
-        scene = replace(scene, light_e_per_s=options["electrons"] / scene.exposure_s)
-    room = _given(options, ("flicker_hz", "lamp"))
-    if options["room_e"] is not None:
-        room["light_e_per_s"] = options["room_e"] / scene.exposure_s
-    return replace(scene, room=replace(scene.room, **room))
+    is_turned = abs((pose.roll_deg + 180) % 360 - 180) > 90
+    return replace(scene, pose=pose, orientation=3 if is_turned else scene.orientation)
 
 
 def _numbers(text: str, option: str, counts: tuple[int, ...]) -> tuple[float, ...]:

@@ -172,6 +172,13 @@ def test_command_writes_capture_and_truth(tmp_path: Path) -> None:
     assert truth["w"] == [4] * 20
     assert truth["orientation"] == 3
     assert truth["payload"]["0"][0].startswith("00ff00ff")
+    fields = {"pose.yaw_deg": "5", "camera_name": "mine", "lens.distortion": "[0.1, 0, 0, 0, 0]", "orientation": "8"}
+    changed = run(
+        str(tmp_path / "b.jpg"), *SMALL, *(part for field in fields.items() for part in ("--set", "=".join(field)))
+    )
+    assert changed.exit_code == 0, changed.output
+    other = json.loads((tmp_path / "b.truth.json").read_text())
+    assert (other["camera"]["name"], other["camera"]["dist_coeffs"][0], other["orientation"]) == ("mine", 0.1, 8)
     first = out.read_bytes()
     run(str(out), *SMALL, "--start-slot", "20", "--payload", "hex:00ff", "--w", "4", "--roll", "180")
     assert out.read_bytes() == first
@@ -224,7 +231,10 @@ def test_command_writes_clips_through_real_encoders(tmp_path: Path, name: str, c
         (["a.jpg", "--corners", "1,2,3"], "takes 8 numbers"),
         (["a.jpg", "--screen", "nope"], "no profile"),
         (["a.jpg", "--picture", "nope.png"], "no such picture"),
-        (["a.dng", "--preset", "video-1080p"], "no.* has none|has none"),
+        (["a.dng", "--preset", "video-1080p"], "has none"),
+        (["a.jpg", "--set", "isp.colour=3"], "isp.colour: no such field"),
+        (["a.jpg", "--set", "sensor.cfa=foveon"], "sensor.cfa = 'foveon': Invalid enum value"),
+        (["a.jpg", "--set", "isp quality"], "not FIELD=VALUE"),
     ],
 )
 def test_mistakes_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], message: str) -> None:

@@ -297,19 +297,18 @@ def fitted_weights(packets: Sequence[Record]) -> dict[int, list[float]]:
 
 
 def logistic_regression(terms: FloatArray, right: NDArray[np.bool_]) -> FloatArray:
-    """Weights (k,) that make outcomes (n,) likeliest given terms (n, k), by Newton's method.
+    """Weights (k,) that make outcomes (n,) likeliest given terms (n, k).
 
     A tiny pull towards 0 keeps them finite where the outcomes can be separated.
     """
-    weights = np.zeros(terms.shape[1])
-    for _ in range(100):
-        p = 1 / (1 + np.exp(-np.clip(terms @ weights, -50, 50)))
-        gradient = terms.T @ (right - p) - 1e-3 * weights
-        step = np.linalg.solve((terms.T * (p * (1 - p))) @ terms + 1e-3 * np.eye(weights.size), gradient)
-        weights = weights + np.clip(step, -1, 1)
-        if np.abs(step).max() < 1e-9:
-            break
-    return weights
+    from scipy.optimize import minimize
+
+    signed = np.where(right, -1.0, 1.0)[:, None] * terms
+
+    def cost(weights: FloatArray) -> float:
+        return float(np.logaddexp(0, signed @ weights).sum() + 5e-4 * weights @ weights)
+
+    return np.asarray(minimize(cost, np.zeros(terms.shape[1])).x, np.float64)
 
 
 # Intervals.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import sqrt
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
 
 import msgspec
 import numpy as np
@@ -140,7 +141,6 @@ class Scene:
 
 #: Names of presets, in order.
 PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-plain")
-_PARTS: dict[str, type] = {"sensor": Sensor, "lens": Lens, "pose": Pose, "room": Room, "isp": Isp}
 
 
 @lru_cache(maxsize=1)
@@ -149,8 +149,7 @@ def _presets() -> dict[str, dict[str, Any]]:
     text = Path(__file__).with_name("presets.toml").read_text(encoding="utf-8")
     found: dict[str, dict[str, Any]] = {}
     for name, table in tomllib.loads(text).items():
-        own = {key: msgspec.convert(value, _PARTS[key]) if key in _PARTS else value for key, value in table.items()}
-        found[name] = {**found.get(own.pop("like", ""), {}), **own}
+        found[name] = {**found.get(table.pop("like", ""), {}), **table}
     return found
 
 
@@ -168,7 +167,32 @@ def preset(name: str, screen: str | ScreenProfile = "paper-34k6") -> Scene:
     if name not in PRESETS:
         raise UsageError(f"no preset {name!r}", f"choose from: {', '.join(PRESETS)}")
     profile = screen if isinstance(screen, ScreenProfile) else load_profile(screen, ScreenProfile)
-    return Scene(profile, **_presets()[name])
+    return with_fields(Scene(profile), _presets()[name])
+
+
+def with_fields(scene: Scene, table: Mapping[str, Any]) -> Scene:
+    """The scene with some fields set; those of its sensor, lens, pose, room and isp in tables of their own.
+
+    Raises:
+        UsageError: no such field, or no such value for it.
+    """
+    return _set_fields(scene, table, "")
+
+
+def _set_fields(part: Any, table: Mapping[str, Any], place: str) -> Any:
+    """A part of a scene, or the scene, with some fields set; `place` is its name and a dot."""
+    kinds, values = get_type_hints(type(part)), {}
+    for name, value in table.items():
+        if name not in kinds:
+            raise UsageError(f"{place}{name}: no such field", f"choose from: {', '.join(kinds)}")
+        try:
+            is_part = isinstance(value, dict)
+            values[name] = (
+                _set_fields(getattr(part, name), value, f"{name}.") if is_part else msgspec.convert(value, kinds[name])
+            )
+        except (msgspec.ValidationError, TypeError) as error:
+            raise UsageError(f"{place}{name} = {value!r}: {error}", "see docs/simulator.md") from None
+    return replace(part, **values)
 
 
 def random_scene(rng: np.random.Generator) -> Scene:

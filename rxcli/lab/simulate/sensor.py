@@ -12,21 +12,10 @@ from numpy.typing import NDArray
 Float32Array = NDArray[np.float32]
 Cfa = Literal["bayer", "xtrans", "rgb"]
 
-#: Colours (0 red, 1 green, 2 blue) of the arrays' unit cells; "rgb" senses all three in every pixel.
-PATTERNS: dict[str, NDArray[np.uint8]] = {
-    "bayer": np.array([[0, 1], [1, 2]], np.uint8),
-    "xtrans": np.array(
-        [
-            [1, 1, 0, 1, 1, 2],
-            [1, 1, 2, 1, 1, 0],
-            [2, 0, 1, 0, 2, 1],
-            [1, 1, 2, 1, 1, 0],
-            [1, 1, 0, 1, 1, 2],
-            [0, 2, 1, 2, 0, 1],
-        ],
-        np.uint8,
-    ),
-}
+#: Unit cells of the colour filter arrays, row by row; "rgb" senses all three colours in every pixel.
+_CELLS = {"bayer": ("RG", "GB"), "xtrans": ("GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB", "RBGBRG")}
+#: The same as numbers: 0 red, 1 green, 2 blue.
+PATTERNS = {name: np.array([["RGB".index(c) for c in row] for row in rows], np.uint8) for name, rows in _CELLS.items()}
 
 #: Below this mean, shot noise is drawn from the Poisson distribution itself; above, a Gaussian differs from it by less
 #: than the read noise.
