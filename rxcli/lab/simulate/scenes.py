@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import sqrt
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Any, Literal, TypeVar, get_type_hints
 
 import msgspec
 import numpy as np
@@ -170,29 +170,32 @@ def preset(name: str, screen: str | ScreenProfile = "paper-34k6") -> Scene:
     return with_fields(Scene(profile), _presets()[name])
 
 
-def with_fields(scene: Scene, table: Mapping[str, Any]) -> Scene:
-    """The scene with some fields set; those of its sensor, lens, pose, room and isp in tables of their own.
+Part = TypeVar("Part")
+
+
+def with_fields(part: Part, table: Mapping[str, Any], place: str = "") -> Part:
+    """A scene, or a part of one, with some fields set; those of a scene's parts stand in tables of their own.
+
+    Args:
+        part: scene, sensor, lens, pose, room or isp.
+        table: fields as TOML has them.
+        place: the part's name and a dot; nothing for a scene.
 
     Raises:
         UsageError: no such field, or no such value for it.
     """
-    return _set_fields(scene, table, "")
-
-
-def _set_fields(part: Any, table: Mapping[str, Any], place: str) -> Any:
-    """A part of a scene, or the scene, with some fields set; `place` is its name and a dot."""
-    kinds, values = get_type_hints(type(part)), {}
+    kinds, values = get_type_hints(type(part)), dict[str, Any]()
     for name, value in table.items():
         if name not in kinds:
             raise UsageError(f"{place}{name}: no such field", f"choose from: {', '.join(kinds)}")
         try:
             is_part = isinstance(value, dict)
-            values[name] = (
-                _set_fields(getattr(part, name), value, f"{name}.") if is_part else msgspec.convert(value, kinds[name])
-            )
+            old = getattr(part, name)
+            values[name] = with_fields(old, value, f"{name}.") if is_part else msgspec.convert(value, kinds[name])
         except (msgspec.ValidationError, TypeError) as error:
             raise UsageError(f"{place}{name} = {value!r}: {error}", "see docs/simulator.md") from None
-    return replace(part, **values)
+    changed: Part = replace(part, **values)  # type: ignore[type-var]
+    return changed
 
 
 def random_scene(rng: np.random.Generator) -> Scene:
