@@ -1,8 +1,9 @@
-"""Draw docs/story.jpg, the first picture of the README: from a photo to a text, with what the receiver found.
+"""Draw docs/story.jpg, the first picture of the README: from a photo to payloads.
 
     python docs/draw_story.py docs/story.jpg
 
-The photo is simulated. It shows a screen that sends `MESSAGE`, 77 bits a column from the left to the right.
+The photo is simulated. Its screen sends `MESSAGE` as raw payloads in ASCII, 77 bits per column from left to right. The
+link layer sends texts differently: coded, and spread over all columns.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def photo(folder: Path) -> rxcli.Frame:
 
 
 def draw(frame: rxcli.Frame) -> Figure:
-    """Photo; stripes, light, slots and bits of one column; the text of all of them."""
+    """Photo; stripes, light, slots and bits of one column; the payloads of all columns."""
     result, taps = rxcli.tap(frame)
     assert taps is not None
     figure = Figure(figsize=(13, 6.6), layout="constrained")
@@ -104,7 +105,7 @@ def _draw_stripes(axes: Axes, frame: rxcli.Frame, taps: rxcli.Taps, rows: tuple[
     cut = frame.pixels[first:last, round(max(x[0])) : round(min(x[1]))].T
     axes.imshow(cut, cmap="gray", aspect="auto", extent=(0, _n_slots(), 0, 1), vmax=np.percentile(cut, 99.5))
     axes.set_title(
-        "2  Stripes: one column, turned. Each row of the picture is another instant.", loc="left", fontsize=11
+        "2  Stripes: one column, rotated. Each row of the picture is a different instant.", loc="left", fontsize=11
     )
     axes.set(xticks=[], yticks=[])
 
@@ -117,9 +118,7 @@ def _draw_light(axes: Axes, taps: rxcli.Taps, rows: tuple[float, float]) -> None
         if lit:
             axes.axvspan(number, number + 1, color=_ORANGE, alpha=0.3, linewidth=0)
     axes.plot(at[shown], light[shown], color="black", linewidth=1)
-    axes.set_title(
-        "3  Light over time, and the slots that the receiver takes for lit (shaded).", loc="left", fontsize=11
-    )
+    axes.set_title("3  Light over time, and the slots that were decided as lit (shaded).", loc="left", fontsize=11)
     axes.set(xlim=(0, _n_slots()), xticks=[], yticks=[])
 
 
@@ -152,7 +151,7 @@ def _draw_bits(axes: Axes, taps: rxcli.Taps, column: rxcli.ColumnResult) -> None
     for number, symbol in enumerate(bits):
         text = "".join(map(str, symbol))
         axes.text(25 + 10 * number, 0.5, text, ha="center", va="center", fontsize=11, family="monospace", color=_BLUE)
-    confidence = f"5  Bits: seven a symbol. The packet's confidence is {column.packets[0].confidence:.3f}."
+    confidence = f"5  Bits: seven per symbol. The packet's confidence is {column.packets[0].confidence:.3f}."
     axes.set_title(confidence, loc="left", fontsize=11, pad=2)
     _bare(axes)
 
@@ -163,7 +162,9 @@ def _draw_text(axes: Axes, result: rxcli.FrameResult) -> None:
     text = np.packbits(bits)[:192].tobytes().decode("ascii")
     assert text.rstrip() == MESSAGE.decode()
     axes.set_title(
-        "6  Text: the bits of all columns, one after the other (orange: from this column).", loc="left", fontsize=11
+        "6  Payloads of all columns; this sender wrote ASCII into the raw bits (orange: from this column).",
+        loc="left",
+        fontsize=11,
     )
     before, own, after = text[:77], text[77:86], text[86:].rstrip()
     style: dict[str, Any] = {"fontsize": 11.5, "family": "monospace", "va": "center"}

@@ -82,7 +82,13 @@ SOURCES = (
     *("outputs.py", "__init__.py", "receiver/reception.py"),
     *(f"receiver/channel/{name}.py" for name in CHANNEL),
 )
-PAGES: tuple[str, ...] = ()
+PAGES = (
+    *("README.md", "sample_frames/README.md", "docs/README.md", "docs/architecture.md", "docs/auto_encoder.md"),
+    *("docs/calibration.md", "docs/ci.md", "docs/folders.md", "docs/glossary.md", "docs/link.md", "docs/python.md"),
+    *("docs/simulator.md", "docs/usage.md"),
+)
+#: Limits of a page's words and of the documentation's, code aside, and of the README's lines.
+MAX_PAGE_WORDS, MAX_WORDS, MAX_README_LINES = 1500, 20_000, 120
 
 
 def files(*places: str) -> list[Path]:
@@ -146,13 +152,22 @@ def test_names_and_prose_of_code(path: Path) -> None:
     assert not list(faults_of(path))
 
 
+def text_of(page: Path) -> str:
+    """A page without its blocks of code."""
+    return re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_prose_of_pages(page: str) -> None:
-    text = (ROOT / page).read_text(encoding="utf-8")
-    paragraphs = [
-        " ".join(paragraph.split()) for paragraph in re.sub(r"```.*?```", "", text, flags=re.DOTALL).split("\n\n")
-    ]
+    paragraphs = [" ".join(paragraph.split()) for paragraph in text_of(ROOT / page).split("\n\n")]
     assert not [(match[0], paragraph) for paragraph in paragraphs for match in PHRASE.finditer(paragraph)]
+
+
+def test_pages_are_short() -> None:
+    words = {page.name: len(re.findall(r"\S*\w\S*", text_of(page))) for page in (ROOT / "docs").glob("*.md")}
+    assert sum(words.values()) <= MAX_WORDS
+    assert not {name: count for name, count in words.items() if count > MAX_PAGE_WORDS and name != "video.md"}
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= MAX_README_LINES
 
 
 def test_terms_of_the_glossary_are_used() -> None:
