@@ -80,20 +80,20 @@ class Collector:
 
 
 class PhotoCollector:
-    """Photos of one sender, received together: what one shows in part, another may complete.
+    """Link layer of several photos of one transmission, which complete each other.
 
     Args:
         screens: profiles that results may name.
-        file_memory_mb: bound of all files under way, 2^20 bytes.
+        file_memory_mb: memory limit of all incomplete files, 2^20 bytes.
     """
 
     def __init__(self, screens: Sequence[ScreenProfile], file_memory_mb: int = FILE_MEMORY_MB) -> None:
         self._collector = Collector(screens, file_memory_mb)
-        #: Photos so far, without those that gave a text or a file alone.
+        #: Number of photos that were incomplete on their own.
         self.n_photos = 0
 
     def add(self, result: FrameResult) -> FrameResult:
-        """The result of a photo with what it and those before it complete; one without soft bits is left as it is."""
+        """Add the messages and files that a photo completes; a result without soft bits is unchanged."""
         if result.soft_bits is None:
             return result
         self.n_photos += 1
@@ -102,7 +102,7 @@ class PhotoCollector:
 
     @property
     def progress(self) -> list[ObjectProgress]:
-        """Files under way."""
+        """Progress of incomplete files."""
         return self._collector.progress
 
 
