@@ -17,15 +17,14 @@ from click.testing import CliRunner
 
 from rxcli.cli.benchmark import benchmark
 from rxcli.errors import InputError, ReceiverError, UsageError
-from rxcli.lab.benchmark import cases, compare, measures, quick, tables, yardsticks
+from rxcli.lab.benchmark import cases, compare, measures, quick, tables
 from rxcli.lab.benchmark.cases import Case, received
-from rxcli.lab.benchmark.draw import Place, binned, draw_nodata, draw_small, scene_at
+from rxcli.lab.benchmark.draw import Place, binned, draw_nodata
 from rxcli.lab.benchmark.measures import Group, cluster_interval, logistic_regression, wilson
 from rxcli.lab.benchmark.media import bare_decode, write_known
 from rxcli.lab.benchmark.runner import Run, Task, do, load_journal, scenarios
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
-from rxcli.protocol import encode_packet, payload_bits
 from rxcli.types import FrameResult
 
 
@@ -59,20 +58,6 @@ def test_the_bound_is_no_magic(easy: Trial) -> None:
     score = Group([{"ways": {"bound": received(case_of(simulate_trial(dark, 3, oracle=True)), "bound")}}], "bound", "")
     assert score.score.ber is not None
     assert score.score.ber > 0.25
-
-
-def test_paper_reads_packets_between_two_headers() -> None:
-    rng = np.random.default_rng(0)
-    screen = scene_at(payload_symbols=5).screen
-    payload = rng.integers(0, 2, payload_bits(4, 5)).astype(np.uint8)
-    lit = np.repeat(np.tile(encode_packet(payload, 4), 2)[:-20], 6)
-    starts, agreement = yardsticks.find_headers(lit.astype(bool), 6.0)
-    assert 0 in np.round(starts)
-    assert agreement.max() == 1
-    # The second header is cut off: two are needed.
-    assert list(yardsticks._between_headers(lit[: 70 * 6], 6.0, screen)) == []
-    found = list(yardsticks._between_headers(lit, 6.0, screen))
-    assert [packet.payload for packet in found] == [np.packbits(payload).tobytes().hex()]
 
 
 def test_changes_that_nobody_sees_are_as_small_as_said(easy: Trial) -> None:
@@ -164,12 +149,6 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
     path.write_text("no journal\n")
     with pytest.raises(InputError, match="line 1 is no journal entry"):
         load_journal(path)
-
-
-def test_small_scenes_are_received_without_problems(tmp_path: Path) -> None:
-    for number in (3, 4):
-        (case,) = draw_small(Place(0, number, {}, tmp_path))
-        assert received(case, "receiver")["problems"] == []
 
 
 @pytest.mark.slow
@@ -367,12 +346,6 @@ def test_mistakes_are_told(arguments: list[str], message: str) -> None:
     result = CliRunner().invoke(benchmark, arguments)
     assert result.exit_code == 2
     assert message in result.output
-
-
-def test_without_a_command_help_is_shown() -> None:
-    result = CliRunner().invoke(benchmark, [])
-    assert result.exit_code == 0
-    assert "stability" in result.output
 
 
 # Two checkouts.

@@ -61,13 +61,6 @@ def test_straight_view_has_the_size_that_was_asked() -> None:
     assert view.pixels_per_height == pytest.approx(3600 / screen.aspect)
 
 
-def test_upside_down_turns_the_corners_round() -> None:
-    screen = load_profile("paper-34k6", ScreenProfile)
-    corners = View(screen, Lens(1.5), Pose(fill=0.9, roll_deg=180), 4000, 3000).corners
-    assert corners[0, 0] > corners[1, 0]
-    assert corners[0, 1] > corners[3, 1]
-
-
 def test_given_corners_are_met_through_the_lens() -> None:
     screen = load_profile("paper-34k6", ScreenProfile)
     corners = ((211.0, 300.5), (3800.0, 280.0), (3700.0, 2600.0), (250.0, 2500.0))
@@ -136,12 +129,6 @@ def test_mosaic_is_anchored_at_the_sensors_first_pixel(cfa: str) -> None:
     planes = np.broadcast_to(np.arange(3, dtype=np.float32), (14, 20, 3))
     expected = np.tile(pattern, (20, 20))[5 : 5 + 14, :20]
     np.testing.assert_array_equal(pick_colours(np.ascontiguousarray(planes), pattern, 5), expected)
-
-
-def test_xtrans_has_twenty_greens_of_thirty_six_and_red_and_blue_alike() -> None:
-    assert np.bincount(PATTERNS["xtrans"].ravel()).tolist() == [8, 20, 8]
-    # Every row and every column holds all three colours: what the array is known for.
-    assert all(len(set(line)) == 3 for line in [*PATTERNS["xtrans"].tolist(), *PATTERNS["xtrans"].T.tolist()])
 
 
 def test_rendered_light_is_the_model_written_out(small: Scene) -> None:

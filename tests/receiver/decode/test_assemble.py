@@ -155,18 +155,6 @@ def test_packets_below_the_confidence_asked_for(min_confidence: float, n_packets
     assert [len(c.packets) for c in columns] == [n_packets] * 2
 
 
-@pytest.mark.parametrize(
-    ("probability", "status"), [(0.99, "ok"), (0.9, "ok"), (0.7, None), (0.93, "ok"), (0.55, "no_packet")]
-)
-def test_status_follows_the_confidence(probability: float, status: str | None) -> None:
-    """Below a half: weak, or nothing where too many bits are uncertain."""
-    posteriors = posteriors_of([5, 5], indices([5, 5]), probability=probability)
-    (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120), samples_of(120), 0)
-    assert first.status == status or (status is None and first.status in {"weak", "no_packet"})
-    for packet in first.packets:
-        assert packet.ber_hat <= 0.2
-
-
 def test_a_packet_of_low_confidence_is_weak_and_counts_beside_a_surer_one_alone() -> None:
     """Where no packet of a photograph is likely what looks like packets is chance."""
     posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.95)

@@ -224,13 +224,6 @@ def test_the_true_weight_is_never_dropped(w: int, exposure_slots: float, isi_mem
         assert kept[:, w - 1].all()
 
 
-@pytest.mark.parametrize("w", WEIGHTS)
-def test_the_weight_is_found(w: int) -> None:
-    rng = np.random.default_rng(w)
-    tx = rng.integers(0, 1 << bits_per_symbol(w), (100, 5))
-    assert (detect(sent_through(tx, w, box_exposure(1.08, 1), 0.3, rng)).w == w).all()
-
-
 def test_hopeless_weights_are_dropped_and_a_wide_margin_keeps_all() -> None:
     rng = np.random.default_rng(0)
     metrics = sent_through(rng.integers(0, 128, (20, 11)), 5, WHITE, 0.1, rng)
@@ -249,17 +242,6 @@ def test_the_first_guess_is_exact_where_slots_are_independent(isi_memory: int) -
     found = detect(metrics, np.array(WEIGHTS) == w[:, None])
     np.testing.assert_allclose(guess, found.lit, atol=1e-4)
     assert 0.01 < np.abs(guess[..., 20:] - tx[:, 20:]).mean() < 0.2
-
-
-@pytest.mark.parametrize(("exposure_slots", "isi_memory"), [(0.4, 1), (1.08, 1), (1.3, 1)])
-@pytest.mark.parametrize("w", WEIGHTS)
-def test_the_first_guess_of_clean_slots_is_what_was_sent(w: int, exposure_slots: float, isi_memory: int) -> None:
-    rng = np.random.default_rng([w, isi_memory])
-    tx = rng.integers(0, 1 << bits_per_symbol(w), (40, 5))
-    guess = initial_slot_probability(sent_through(tx, w, box_exposure(exposure_slots, isi_memory), 0.02, rng))
-    sent = packet_and_next(tx, w, 0)
-    assert guess.shape == (1, *sent.shape)
-    assert np.abs(guess[0] - sent).max() < 0.05
 
 
 @pytest.mark.parametrize("isi_memory", [1, 3])
@@ -310,13 +292,6 @@ def test_extreme_metrics_give_finite_posteriors(kind: str, isi_memory: int) -> N
             k = bits_per_symbol(int(w))
             assert np.isfinite(found.bit_llr[:, column, :, :k]).all()
             assert (found.index[:, column] < 1 << k).all()
-
-
-def test_nothing_seen_is_nothing_known() -> None:
-    found = detect(np.zeros((1, 1, 71, 4)), only(5))
-    np.testing.assert_allclose(found.bit_llr, 0, atol=1e-5)
-    np.testing.assert_allclose(np.exp(found.log_prob), 1 / 128, rtol=1e-4)
-    np.testing.assert_allclose(np.exp(detect(np.zeros((1, 1, 71, 4))).w_log_prob), 1 / 9, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
