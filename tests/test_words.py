@@ -32,7 +32,6 @@ VAGUE_NAMES = {
     "in_pairs",
     "kept",
     "lesson",
-    "lock",
     "look",
     "look_again",
     "looks",
@@ -56,7 +55,7 @@ VAGUE_NAMES = {
     "without_row_light",
 }
 #: Beginnings and ends of names that have a standard form: `min_`, `max_`, `_weight`, `_llr`.
-VAGUE_PARTS = re.compile(r"^(least|most|say_of)_|_nats$|(^|_)(told|foretold|heard|weighed|nats)(_|$)")
+VAGUE_PARTS = re.compile(r"^(least(?!_squares)|most|say_of)_|_nats$|(^|_)(told|foretold|heard|weighed|nats)(_|$)")
 #: Glue and coined words, with what to write instead.
 PHRASES = {
     r"so many(?:eth|ieth)?": "a number, or `this many`",
@@ -79,7 +78,7 @@ CHANNEL = ("__init__", "denoise", "likelihoods", "model", "patterns", "picture",
 SOURCES = (
     *("receiver/decode", "receiver/sync", "receiver/light.py", "receiver/context.py", "receiver/acquisition.py"),
     *("link", "types.py", "protocol.py", "profiles.py", "options.py", "errors.py", "resources.py", "numerics.py"),
-    *("outputs.py", "__init__.py", "receiver/reception.py"),
+    *("outputs.py", "__init__.py", "receiver/reception.py", "calibrate", "ingest", "runs"),
     *(f"receiver/channel/{name}.py" for name in CHANNEL),
 )
 PAGES = (

@@ -23,12 +23,12 @@ _BINS = 64
 
 @dataclass(frozen=True, slots=True)
 class ExposureEstimate:
-    """Exposure, or why there is none."""
+    """Exposure, or the reason why there is none."""
 
     exposure_s: float | None
     #: 95 % confidence interval, from the edges' blur alone.
     interval_s: tuple[float, float] | None
-    note: str
+    comment: str
 
 
 def estimate_exposure(
@@ -49,23 +49,25 @@ def estimate_exposure(
         profile: (n,) the values fitted, proportional to light.
         line_delay_s: time between rows.
         exif_exposure_s: exposure in the file.
-        tone_known: whether the profile is surely proportional to light; if not, the interval includes what a display's
-            tone curve would give.
+        tone_known: whether the profile is known to be proportional to light; if not, the interval includes the result
+            for a display's tone curve.
     """
     found = _from_wave(fit, profile, line_delay_s, exif_exposure_s)
     if tone_known or found.interval_s is None:
         return found
     encoded = np.clip(profile, 0, None) ** (1 / 2.2)
-    other_fit = fit_periodic(encoded, fit.frequency, fit.first_row)
-    other = _from_wave(other_fit, encoded, line_delay_s, exif_exposure_s) if other_fit else found
-    low, high = zip(found.interval_s, other.interval_s or found.interval_s, strict=True)
-    return replace(found, interval_s=(min(low), max(high)), note=f"{found.note}; the picture's tone curve is not known")
+    linear_fit = fit_periodic(encoded, fit.frequency, fit.first_row)
+    linear = _from_wave(linear_fit, encoded, line_delay_s, exif_exposure_s) if linear_fit else found
+    low, high = zip(found.interval_s, linear.interval_s or found.interval_s, strict=True)
+    return replace(
+        found, interval_s=(min(low), max(high)), comment=f"{found.comment}; the picture's tone curve is not known"
+    )
 
 
 def _from_wave(
     fit: PeriodicFit, profile: FloatArray, line_delay_s: float, exif_exposure_s: float | None
 ) -> ExposureEstimate:
-    """Exposure from values taken to be light."""
+    """Exposure from values assumed proportional to light."""
     usable = fit.envelope > 0.2 * fit.envelope.max()
     wave = ((profile - fit.mean) / np.where(usable, fit.envelope, 1))[usable]
     phase = np.asarray((fit.frequency * (fit.first_row + np.flatnonzero(usable) - fit.origin)) % 1, np.float64)
@@ -87,18 +89,18 @@ def _from_wave(
     if edge < max(_MIN_EDGE_ROWS * fit.frequency, 3 * edge_sd):
         longest = (edge + Z95 * edge_sd) * period_s
         return ExposureEstimate(None, None, f"edges too sharp to be measured: the exposure is below {longest:.2g} s")
-    part, sd, note = edge, edge_sd, "taken to be shorter than the lamp's flash and pause"
+    part, sd, comment = edge, edge_sd, "taken to be shorter than the lamp's flash and pause"
     if exif_exposure_s is not None:
         parts = [(edge, edge_sd), (lit, lit_sd), (1 - lit, lit_sd)]
         nearest = min(parts, key=lambda p: abs(np.log(p[0] * period_s / exif_exposure_s)))
         agrees = abs(np.log(nearest[0] * period_s / exif_exposure_s)) <= np.log(_EXIF_RATIO)
         part, sd = nearest if agrees else (edge, edge_sd)
         agreement = (
-            "agrees with the file's {:.4g} s" if agrees else "the file says {:.4g} s, which the edges contradict"
+            "agrees with the file's {:.4g} s" if agrees else "the file states {:.4g} s, which the edges contradict"
         )
-        note = agreement.format(exif_exposure_s)
+        comment = agreement.format(exif_exposure_s)
     interval = max(part - Z95 * sd, 0.0) * period_s, (part + Z95 * sd) * period_s
-    return ExposureEstimate(part * period_s, interval, note)
+    return ExposureEstimate(part * period_s, interval, comment)
 
 
 def _start(phase: FloatArray, wave: FloatArray) -> list[float] | None:

@@ -1,4 +1,4 @@
-"""Frames as the calibrations want them: light for stripes, grey pictures for boards."""
+"""Conversion of frames for calibration: light for stripes, grey pictures for boards."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _GREEN = 1
 
 
 def light_of(frame: Frame) -> Float32Array:
-    """(height, width) values proportional to light, as far as the file tells: 0 black, 1 white.
+    """(height, width) values proportional to light, as far as the file states: 0 black, 1 white.
 
     Of a mosaic the green pixels of each row stand for the whole row: rows are not mixed, and a coloured lamp makes no
     pattern. A developed picture is taken to have the sRGB tone curve.

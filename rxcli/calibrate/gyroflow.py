@@ -127,22 +127,26 @@ def _rays(
 
 
 def _readout(raw: dict[str, Any]) -> tuple[float | None, bool, tuple[str, ...]]:
-    """The readout in the profile, seconds, whether it runs upwards, and what speaks against it."""
+    """Readout in the profile, seconds, whether it runs upwards, and warnings."""
     if raw.get("global_shutter") is True:
-        return None, False, ("the profile says that the shutter is global: such a camera sees no stripes",)
-    told, direction, rate = raw.get("frame_readout_time"), raw.get("frame_readout_direction"), _positive(raw.get("fps"))
-    value = _positive(abs(told)) if isinstance(told, (int, float)) and not isinstance(told, bool) else None
-    if value is None or told is None:
-        return None, False, ("the profile tells no readout",)
+        return None, False, ("the profile states a global shutter, which produces no stripes",)
+    stated, direction, rate = (
+        raw.get("frame_readout_time"),
+        raw.get("frame_readout_direction"),
+        _positive(raw.get("fps")),
+    )
+    value = _positive(abs(stated)) if isinstance(stated, (int, float)) and not isinstance(stated, bool) else None
+    if value is None or stated is None:
+        return None, False, ("the profile states no readout",)
     if direction in ("LeftToRight", "RightToLeft"):
-        return None, False, ("the profile says that columns are read one after the other, which is not supported",)
-    upwards = told < 0 or direction == "BottomToTop"
+        return None, False, ("the profile states a readout by columns, which is not supported",)
+    upwards = stated < 0 or direction == "BottomToTop"
     if rate is not None and value > 1.02e3 / rate:
-        reason = f"a readout of {told:g} ms cannot be at {rate:g} frames/s: one takes {1e3 / rate:.2f} ms at most"
+        reason = f"a readout of {stated:g} ms is impossible at {rate:g} frames/s: it is at most {1e3 / rate:.2f} ms"
         return None, upwards, (reason,)
     notes = ["a user typed in the readout, and it may be wrong: check it with --photo, or `calibrate shutter`"]
     if upwards:
-        notes.append("the profile says that rows are read from the bottom to the top")
+        notes.append("the profile states a readout from the bottom to the top")
     return value * 1e-3, upwards, tuple(notes)
 
 

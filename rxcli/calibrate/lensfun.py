@@ -38,7 +38,7 @@ def lens_from_database(metadata: Metadata, width: int, height: int) -> LensfunMo
     """The lens model of a picture's camera, lens and focal length.
 
     Args:
-        metadata: make, model, lens and focal length, as the file tells them or the user does.
+        metadata: make, model, lens and focal length, from the file or the user.
         width: of the stored picture, pixels.
         height: of the stored picture, pixels.
 
@@ -55,7 +55,7 @@ def lens_from_database(metadata: Metadata, width: int, height: int) -> LensfunMo
     focal_mm = metadata.focal_length_mm
     if not metadata.model or not focal_mm:
         raise UsageError(
-            "the file tells no camera model or no focal length", "give --camera-model, --lens and --focal-length"
+            "the file states no camera model or no focal length", "give --camera-model, --lens and --focal-length"
         )
     database = lensfunpy.Database()
     camera = _find_camera(database, metadata)

@@ -21,7 +21,7 @@ _SEARCH_HARMONICS = 12
 _HARMONICS = (1, 2, 3, 5, 7, 10, 14, 20, 28)
 #: Numbers of slow terms tried, and the most of them while the number of harmonics is chosen.
 _SLOW_TERMS, _AMPLE_SLOW = (2, 3, 4, 6, 8, 11, 16), 8
-#: Highest frequency searched, cycles per row: beyond it a period cannot be told from its alias.
+#: Highest frequency searched, cycles per row: beyond it a period is not distinguishable from its alias.
 MAX_FREQUENCY = 0.45
 #: Share of the variance that a harmonic must explain to pay for itself in the search.
 _PRICE = 0.01
@@ -69,16 +69,16 @@ class PeriodicFit:
         """Parameters of the model."""
         return 2 * self.n_slow + 2 * self.cosines.size
 
-    def beats(self, other: PeriodicFit) -> bool:
+    def beats(self, rival: PeriodicFit) -> bool:
         """Whether this fit is better by the Bayesian information criterion, as coloured noise allows.
 
         The richer fit's residual gives the number of independent values; counting all of them would let harmonics
         follow slow noise.
         """
-        richer = self if self.n_parameters >= other.n_parameters else other
-        ours, theirs = (float(fit.residual @ fit.residual) + 1e-300 for fit in (self, other))
+        richer = self if self.n_parameters >= rival.n_parameters else rival
+        ours, theirs = (float(fit.residual @ fit.residual) + 1e-300 for fit in (self, rival))
         gain = float(np.log(theirs / ours)) * _independent(richer.residual)
-        return gain > (self.n_parameters - other.n_parameters) * float(np.log(self.mean.size))
+        return gain > (self.n_parameters - rival.n_parameters) * float(np.log(self.mean.size))
 
     def waveform(self, rows: FloatArray) -> FloatArray:
         """The periodic part at `rows`, in units of the profile where the envelope is 1."""
@@ -145,16 +145,14 @@ def search(profiles: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     ]
 
 
-def _best_harmonics(
-    lines: FloatArray, n: int, first: int, last: int, min_score: float
-) -> tuple[FloatArray, FloatArray]:
+def _best_harmonics(lines: FloatArray, n: int, low: int, high: int, min_score: float) -> tuple[FloatArray, FloatArray]:
     """Frequency (k,) between two bins whose harmonics hold most of the power of `lines` (k, F), and its score (k,).
 
     The lines are those of profiles of `n` rows.
     """
     # A Hann line has an equivalent width of 1.5 bins before the oversampling.
     share = lines / (lines.sum(axis=1, keepdims=True) / (1.5 * _PAD) + _LINE_POWER)
-    grid = np.arange(first, min(max(last, first) + 1, lines.shape[1]))
+    grid = np.arange(low, min(max(high, low) + 1, lines.shape[1]))
     total, best = np.zeros((len(lines), grid.size)), np.zeros((len(lines), grid.size))
     for harmonic in range(1, _SEARCH_HARMONICS + 1):
         inside = grid * harmonic < lines.shape[1]
@@ -222,8 +220,8 @@ def fit_periodic(
         return best
     # Over a few periods the envelope trades against the frequency, an error that the residual does not show.
     richer = [_fit_near(profile, frequency, n_harmonics, best.n_slow + extra, first_row) for extra in (1, 2)]
-    spread = max((abs(fit.frequency - best.frequency) for fit in richer if fit), default=0.0)
-    return replace(best, frequency_sd=float(np.hypot(best.frequency_sd, spread)))
+    deviation = max((abs(fit.frequency - best.frequency) for fit in richer if fit), default=0.0)
+    return replace(best, frequency_sd=float(np.hypot(best.frequency_sd, deviation)))
 
 
 def _fit_near(

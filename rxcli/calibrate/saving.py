@@ -1,4 +1,4 @@
-"""What a calibration found, put into a camera profile on disk."""
+"""Store the result of a calibration in a camera profile on disk."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rxcli.types import Metadata
 
 
 def profile_to_extend(path: Path, metadata: Metadata | None = None) -> CameraProfile:
-    """The profile at `path`, or an empty one named after it, for the camera that `metadata` tells.
+    """The profile at `path`, or an empty one named after it, for the camera in `metadata`.
 
     Raises:
         ProfileError: there is a file, but no camera profile in it.
@@ -31,7 +31,7 @@ def profile_to_extend(path: Path, metadata: Metadata | None = None) -> CameraPro
 
 
 def with_lens(profile: CameraProfile, lens: LensModel, lens_name: str | None = None) -> CameraProfile:
-    """The profile with its lens replaced; `lens_name`, as files tell it, is added to its names."""
+    """The profile with its lens replaced; `lens_name`, as in metadata of files, is added to its names."""
     names = profile.lens_models
     if lens_name and lens_name not in names:
         names = (*names, lens_name)

@@ -53,7 +53,7 @@ class Stripes:
     fit: PeriodicFit
     #: (n,) summed profile, picture units.
     profile: FloatArray
-    #: The picture's number, and the given frequency that fits the common line delay; None where none does.
+    #: The picture's number, and the given frequency that fits the common line delay, or None.
     picture: int = 0
     frequency_hz: float | None = None
 
@@ -136,7 +136,7 @@ def find_stripes(picture: Picture, axis: Axis | None = None, window: Box | None 
     for along in (axis,) if axis else ("rows", "columns"):
         found = by_axis[along] = _find_in(picture, window, along)
         for spot in spots:
-            if any(2 * _common_area(spot, other.bounds) >= _common_area(spot, spot) for other in found):
+            if any(2 * _common_area(spot, lamp.bounds) >= _common_area(spot, spot) for lamp in found):
                 continue
             for lamp in _find_in(picture, spot, along):
                 overlap = (5 * _common_area(lamp.bounds, s.bounds) >= min(lamp.area_px, s.area_px) for s in found)
@@ -145,8 +145,8 @@ def find_stripes(picture: Picture, axis: Axis | None = None, window: Box | None 
     return max(by_axis.items(), key=lambda item: _evidence(item[1]))
 
 
-def _common_area(one: Box, other: Box) -> int:
-    across, down = (min(one[i + 2], other[i + 2]) - max(one[i], other[i]) for i in (0, 1))
+def _common_area(box_a: Box, box_b: Box) -> int:
+    across, down = (min(box_a[i + 2], box_b[i + 2]) - max(box_a[i], box_b[i]) for i in (0, 1))
     return max(across, 0) * max(down, 0)
 
 
@@ -168,11 +168,11 @@ def _find_in(picture: Picture, box: Box, axis: Axis) -> list[Stripes]:
     while len(found) < _MAX_LAMPS and (lamp := _clearest_lamp(strips, free)):
         members, fit, taken = lamp
         free &= ~taken
-        across, first, last = np.flatnonzero(members), fit.first_row, fit.first_row + fit.mean.size
+        across, top, bottom = np.flatnonzero(members), fit.first_row, fit.first_row + fit.mean.size
         left, right = int(edges[across[0]]), int(edges[across[-1] + 1])
-        x0, y0, x1, y1 = (left, first, right, last) if axis == "rows" else (first, left, last, right)
+        x0, y0, x1, y1 = (left, top, right, bottom) if axis == "rows" else (top, left, bottom, right)
         bounds = (x0 + box[0], y0 + box[1], x1 + box[0], y1 + box[1])
-        found.append(Stripes(bounds, fit, np.asarray(strips[members, first:last].mean(axis=0))))
+        found.append(Stripes(bounds, fit, np.asarray(strips[members, top:bottom].mean(axis=0))))
     return found
 
 
@@ -215,18 +215,18 @@ def _seed(strips: FloatArray, free: BoolArray) -> PeriodicFit | None:
     n = strips.shape[1]
     candidates = []
     for length in (n, n // 2, n // 4):
-        for first in range(0, n - length + 1, max(length // 2, 1)) if length >= _MIN_SIDE else ():
-            rows = slice(first, first + length)
+        for start in range(0, n - length + 1, max(length // 2, 1)) if length >= _MIN_SIDE else ():
+            rows = slice(start, start + length)
             groups = _groups(strips[:, rows], np.asarray(free[:, rows].all(axis=1)))
             for few, (frequencies, scores) in enumerate(search(groups) if len(groups) else ()):
                 at = int(np.argmax(scores))
                 # Among equally clear windows the longer one determines the frequency better.
                 worth = float(scores[at] * np.log(length))
-                candidates.append((few, -worth, float(frequencies[at]), groups[at], first))
+                candidates.append((few, -worth, float(frequencies[at]), groups[at], start))
     for few in (0, 1):
         best = sorted((c[1:] for c in candidates if c[0] == few and c[1] < 0), key=lambda c: c[0])
-        for _, frequency, profile, first in best[:3]:
-            fit = fit_fundamental(profile, frequency, first)
+        for _, frequency, profile, start in best[:3]:
+            fit = fit_fundamental(profile, frequency, start)
             if fit is not None and fit.significant:
                 return fit
     return None
@@ -235,9 +235,9 @@ def _seed(strips: FloatArray, free: BoolArray) -> PeriodicFit | None:
 def _groups(strips: FloatArray, usable: BoolArray) -> FloatArray:
     """Means over runs of 1, 4 and all strips, where all of a run is usable and not flat."""
     runs = [
-        slice(first, first + size)
+        slice(start, start + size)
         for size in sorted({1, 4, len(strips)})
-        for first in range(0, len(strips) - size + 1, max(size // 2, 1))
+        for start in range(0, len(strips) - size + 1, max(size // 2, 1))
     ]
     means = [strips[run].mean(axis=0) for run in runs if usable[run].all()]
     groups: FloatArray = np.array(means, np.float64).reshape(len(means), strips.shape[1])
@@ -255,9 +255,9 @@ def _follow(strips: FloatArray, free: BoolArray, fit: PeriodicFit) -> tuple[np.n
     blocks = np.linspace(0, n, max(int(n / length), 1) + 1).astype(int)
     template = fit.waveform(np.arange(n, dtype=np.float64))
     shares = np.zeros((len(strips), blocks.size - 1))
-    for block, (first, last) in enumerate(pairwise(blocks.tolist())):
-        share = explained_share(strips[:, first:last], template[first:last])
-        shares[:, block] = np.where(free[:, first:last].all(axis=1), share, 0)
+    for block, (start, stop) in enumerate(pairwise(blocks.tolist())):
+        share = explained_share(strips[:, start:stop], template[start:stop])
+        shares[:, block] = np.where(free[:, start:stop].all(axis=1), share, 0)
     return blocks, shares
 
 
@@ -296,16 +296,16 @@ def calibrate_shutter(
     by_picture = [find_stripes(picture, axis, box) for picture in pictures]
     axes: tuple[Axis, Axis] = ("rows", "columns")
     along = max(axes, key=lambda a: sum(_evidence(found) for of, found in by_picture if of == a))
-    seen = [replace(s, picture=i) for i, (of, found) in enumerate(by_picture) if of == along for s in found]
-    if not seen:
+    regions = [replace(s, picture=i) for i, (of, found) in enumerate(by_picture) if of == along for s in found]
+    if not regions:
         where = "the picture" if len(pictures) == 1 else f"any of {len(pictures)} pictures"
         raise ReceiverError(
             f"no stripes of a blinking lamp in {where}",
             "let the lamp fill more of the frame, shorten the exposure to well below half a period, and use the "
             "electronic shutter with HDR and flicker reduction off",
         )
-    reference = _common_line_delay(seen, frequencies_hz)
-    lamps = [replace(s, frequency_hz=_match(s, frequencies_hz, reference)) for s in seen]
+    reference = _common_line_delay(regions, frequencies_hz)
+    lamps = [replace(s, frequency_hz=_match(s, frequencies_hz, reference)) for s in regions]
     used = [(lamp, lamp.frequency_hz) for lamp in lamps if lamp.frequency_hz]
     value, sd = weighted_mean(
         [lamp.fit.frequency / hz for lamp, hz in used], [lamp.fit.frequency_sd / hz for lamp, hz in used]
@@ -323,7 +323,7 @@ def calibrate_shutter(
     )
 
 
-def _common_line_delay(seen: list[Stripes], frequencies_hz: Sequence[float]) -> float:
+def _common_line_delay(regions: list[Stripes], frequencies_hz: Sequence[float]) -> float:
     """The line delay under which most of the light is of a given frequency.
 
     Every pairing of a region with a frequency proposes one. A proposal's weight is the number of given frequencies that
@@ -333,14 +333,14 @@ def _common_line_delay(seen: list[Stripes], frequencies_hz: Sequence[float]) -> 
         ReceiverError: several frequencies are given, and the regions fit them in more than one way.
     """
     proposals = []
-    for line_delay_s in (1 / (hz * s.period_px) for s in seen for hz in frequencies_hz):
-        matches = [(s, match) for s in seen if (match := _match(s, frequencies_hz, line_delay_s))]
+    for line_delay_s in (1 / (hz * s.period_px) for s in regions for hz in frequencies_hz):
+        matches = [(s, match) for s in regions if (match := _match(s, frequencies_hz, line_delay_s))]
         weight = sum(s.area_px * s.fit.explained for s, _ in matches)
         proposals.append((len({match for _, match in matches}), weight, line_delay_s))
     n_used, weight, chosen = max(proposals)
     rivals = [p for p in proposals if p[0] == n_used and abs(np.log(p[2] / chosen)) > _SAME_LINE_DELAY]
     if len(set(frequencies_hz)) > 1 and any(p[1] > weight / 2 for p in rivals):
-        periods = ", ".join(f"{period:.4g}" for period in sorted(s.period_px for s in seen))
+        periods = ", ".join(f"{period:.4g}" for period in sorted(s.period_px for s in regions))
         raise ReceiverError(
             f"the lamps that were found (periods of {periods} px) fit the frequencies given in more than one "
             f"way: {chosen * 1e6:.4g} or {max(rivals)[2] * 1e6:.4g} us a row",

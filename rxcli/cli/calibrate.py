@@ -319,7 +319,7 @@ def _shutter_report(result: ShutterCalibration) -> tuple[dict[str, Any], list[tu
     exposure = result.exposure
     record: dict[str, Any] = {key: getattr(result, key) for key in keys}
     record |= {"height": result.shape[0], "width": result.shape[1], "exposure_s": exposure.exposure_s}
-    record |= {"exposure_interval_s": exposure.interval_s, "exposure_note": exposure.note}
+    record |= {"exposure_interval_s": exposure.interval_s, "exposure_note": exposure.comment}
     record["lamps"] = [
         {key: getattr(lamp, key) for key in of_lamp} | {key: getattr(lamp.fit, key) for key in of_fit}
         for lamp in result.lamps
@@ -331,7 +331,7 @@ def _shutter_report(result: ShutterCalibration) -> tuple[dict[str, Any], list[tu
         ("readout", f"{readout} ms over {result.n_lines} {result.axis} (95 %: {' to '.join(interval)})"),
         ("line delay", f"{delay} us (95 %: {' to '.join(around)})"),
         ("periods", f"{result.periods:.2f}"),
-        ("exposure", f"{exposed} ({exposure.note})"),
+        ("exposure", f"{exposed} ({exposure.comment})"),
     ]
     for lamp in result.lamps:
         frequency = "unknown frequency" if lamp.frequency_hz is None else f"{lamp.frequency_hz:g} Hz"

@@ -1,4 +1,4 @@
-"""Files and cameras -> frames: luma or sensor mosaic as stored, with what the file says of it.
+"""Files and cameras -> frames: luma or sensor mosaic as stored, with the metadata of the file.
 
 Readers are imported when a file of their kind comes, because each brings a heavy library.
 """
@@ -25,16 +25,16 @@ __all__ = ["KNOWN_SUFFIXES", "open_source"]
 
 
 def open_source(path: str | Path) -> Iterator[Frame]:
-    """The frames of a photo, RAW file, clip or V4L2 device, in order; opened when the first one is asked for.
+    """Yield the frames of a photo, RAW file, clip or V4L2 device; the source is opened with the first frame.
 
     Args:
-        path: any file; its content decides what it is, so that a wrong suffix does no harm.
+        path: any file; its content decides the format, not its suffix.
 
     Yields:
         One frame of a still, every whole frame of a clip, frames without end of a device.
 
     Raises:
-        InputError: it cannot be read, or, after the frames before the break, it breaks off.
+        InputError: the source cannot be read, or breaks off (after the whole frames before the break).
     """
     path = Path(path)
     kind = check_file(path) or _kind(path)

@@ -1,4 +1,4 @@
-"""Frames read ahead in a thread of their own, so that the decoder need not wait for whoever receives them."""
+"""Read frames ahead in a separate thread, so that file decoding does not wait for the receiver."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from threading import Event, Semaphore, Thread, get_native_id
 
 from rxcli.types import Frame
 
-#: What may wait: pixels of so many bytes, and so many frames at least and at most.
+#: Limits of the queue: bytes of pixels, and minimum and maximum number of frames.
 _MAX_BYTES, _MIN_FRAMES, _MAX_FRAMES = 60_000_000, 2, 16
-#: How much nicer to others the thread is than the process.
+#: Increase of the thread's nice value over that of the process.
 _NICER = 5
 
 
 def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:
-    """The same frames, and then the same exception; those to come are fetched while one is looked at.
+    """Yield the same frames, and then the same exception, while later frames are fetched in a thread.
 
     Args:
-        frames: run to its end, or closed, in a thread of its own.
+        frames: generator, which is exhausted or closed in that thread.
     """
     items: SimpleQueue[Frame | BaseException | None] = SimpleQueue()
     room, closed = Semaphore(_MIN_FRAMES), Event()
@@ -58,9 +58,9 @@ def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, N
 
 
 def _give_way() -> None:
-    """Let this thread, and those that a decoder starts from it, come after the one that looks at the frames.
+    """Lower the priority of this thread and of the decoder threads that it starts.
 
-    On as many cores as a decoder fills by itself, each frame otherwise has to wait among those that come after it.
+    Otherwise a decoder that fills all cores delays the reception of the frame before.
     """
     if sys.platform == "linux":  # elsewhere priorities are those of whole processes
         me = get_native_id()

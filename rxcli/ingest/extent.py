@@ -1,7 +1,7 @@
-"""Whether the directories of a TIFF or RAW file are those of a whole file.
+"""Check whether the directories of a TIFF or RAW file are consistent with its length.
 
-LibRaw fills what a cut file lacks with anything and says nothing, or writes to stderr; and every library reads what
-directories claim as often as they claim it, so that a megabyte can keep it busy for minutes. So this is asked before.
+LibRaw fills the missing part of a truncated file with arbitrary values, without an error. Every library reads the data
+that directories claim, however often they claim them, so a file of a megabyte can keep it busy for minutes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _SUB_DIRECTORIES, _EXIF, _GPS, _INTEROPERABILITY = 330, 34665, 34853, 40965
 _POINTERS = (_SUB_DIRECTORIES, _EXIF, _GPS, _INTEROPERABILITY)
 #: Offsets and lengths of the picture's strips, and of its tiles.
 _PARTS = ((273, 279), (324, 325))
-#: TIFF 6.0, section 2, and BigTIFF: bytes of a value by its type; struct codes of those that hold offsets or lengths.
+#: TIFF 6.0, section 2, and BigTIFF: bytes of a value by its type; struct codes of types for offsets or lengths.
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 _TYPES = {3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
 #: No camera writes more; damaged files point in circles.
@@ -47,7 +47,7 @@ def claims_too_much(file: BinaryIO) -> bool:
 
 
 def bytes_claimed(file: BinaryIO) -> int:
-    """The least length in bytes that a RAW file must have, by its own directories; 0 where they do not tell."""
+    """Minimum length in bytes of a RAW file by its own directories; 0 if they do not determine it."""
     head = file.read(128)
     if head.startswith(b"FUJIFILMCCD-RAW") and len(head) >= 108:
         offset, length = struct.unpack_from(">II", head, 100)
@@ -58,7 +58,7 @@ def bytes_claimed(file: BinaryIO) -> int:
 
 
 def _end(file: BinaryIO, directory: Directory, order: str) -> int:
-    """Where the last strip or tile of a directory ends."""
+    """End of the last strip or tile of a directory, bytes."""
     values = {tag: _values(file, directory, tag, order) for pair in _PARTS for tag in pair}
     ends = [a + n for at, size in _PARTS for a, n in zip(values[at], values[size], strict=False)]
     return max(ends, default=0)
@@ -69,16 +69,16 @@ def _order(head: bytes) -> str:
 
 
 def _directories(file: BinaryIO, head: bytes) -> Iterator[Directory]:
-    """The directories of a TIFF-like file, those that others point to among them, up to the first broken one."""
+    """The directories of a TIFF-like file, including nested ones, up to the first broken one."""
     with suppress(struct.error):
         order, big = _order(head), head[2:4] in _BIG
         count, entry, offset = (order + form for form in (("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")))
-        waiting, seen = [(struct.unpack_from(offset, head, 8 if big else 4)[0], True)], set[int]()
-        while waiting and len(seen) < _MAX_DIRECTORIES:
+        waiting, visited = [(struct.unpack_from(offset, head, 8 if big else 4)[0], True)], set[int]()
+        while waiting and len(visited) < _MAX_DIRECTORIES:
             at, in_chain = waiting.pop()
-            if not at or at in seen:
+            if not at or at in visited:
                 continue
-            seen.add(at)
+            visited.add(at)
             file.seek(at)
             (n_entries,) = struct.unpack(count, file.read(struct.calcsize(count)))
             if n_entries > _MAX_ENTRIES:

@@ -1,7 +1,7 @@
 """HEIC pictures through the optional extra `heic`.
 
-libheif turns and mirrors pixels as the file's `irot` and `imir` properties say, and offers no way not to; so the
-properties are read here (ISO/IEC 23008-12, section 6.5) and the turn is undone: rows must stay in readout order.
+libheif rotates and mirrors pixels by the file's `irot` and `imir` properties and offers no alternative. The properties
+are read here (ISO/IEC 23008-12, section 6.5) to undo this, because rows must stay in readout order.
 """
 
 from __future__ import annotations
@@ -98,17 +98,17 @@ def _associations(ipma: bytes) -> dict[int, list[int]]:
     """Item -> its properties, numbered from 1 (ISO/IEC 23008-12, section 9.3)."""
     stream = io.BytesIO(ipma)
 
-    def take(size: int) -> int:
+    def unsigned(size: int) -> int:
         data = stream.read(size)
         if len(data) < size:
             raise ValueError("the box is cut")
         return int.from_bytes(data)
 
-    version, flags = take(1), take(3)
+    version, flags = unsigned(1), unsigned(3)
     found: dict[int, list[int]] = {}
-    for _ in range(take(4)):
-        item = take(2 if version == 0 else 4)
+    for _ in range(unsigned(4)):
+        item = unsigned(2 if version == 0 else 4)
         width = 2 if flags & 1 else 1
-        mask = 0x7FFF if flags & 1 else 0x7F  # the top bit says "essential"
-        found[item] = [take(width) & mask for _ in range(take(1))]
+        mask = 0x7FFF if flags & 1 else 0x7F  # the top bit means "essential"
+        found[item] = [unsigned(width) & mask for _ in range(unsigned(1))]
     return found

@@ -27,7 +27,7 @@ from rxcli.types import Frame, Metadata
 
 
 def read_image(path: Path, kind: Kind) -> Frame:
-    """The one frame of a developed picture; `kind` as `rxcli.ingest.sniff` tells it.
+    """Read the frame of a developed picture; `kind` is that of `rxcli.ingest.sniff`.
 
     Raises:
         InputError: cut, damaged, too large, of a kind that needs an extra, or no picture.

@@ -28,7 +28,7 @@ def decode_luma(data: Any, source: object) -> NDArray[np.uint8]:
         source: names the picture in messages.
 
     Raises:
-        InputError: cut, damaged, or no JPEG; says how many rows are there.
+        InputError: truncated (with the number of rows), damaged, or no JPEG.
     """
     import simplejpeg
 
@@ -43,15 +43,15 @@ def decode_luma(data: Any, source: object) -> NDArray[np.uint8]:
     try:
         return _gray(data)
     except _FAULTS as error:
-        return _second_look(data, reason_of(error), source)
+        return _decode_damaged(data, reason_of(error), source)
 
 
 def _frame_of(data: Any) -> tuple[float, bool]:
     """Bytes a pixel that decoding takes, and whether all of it is one scan.
 
     Luma, and the coefficients of all components where they come in several scans. ITU-T T.81, B.2.2: the frame header's
-    marker tells the process, its sixth byte the number of components; B.2.3: the first byte of a scan's header is how
-    many of them it has.
+    marker identifies the process, its sixth byte is the number of components; B.2.3: the first byte of a scan's header
+    is the number of its components.
     """
     at, data, held, n_components, is_progressive = 2, memoryview(data), 1.0, 0, False
     while at + 10 <= len(data) and data[at] == 0xFF:
@@ -72,8 +72,8 @@ def _gray(data: Any, strict: bool = True) -> NDArray[np.uint8]:
     return luma
 
 
-def _second_look(data: Any, reason: str, source: object) -> NDArray[np.uint8]:
-    """Accept harmless padding; say of anything else what is left of the picture."""
+def _decode_damaged(data: Any, reason: str, source: object) -> NDArray[np.uint8]:
+    """Accept harmless padding; report any other damage with the number of rows present."""
     try:
         luma = _gray(data, strict=False)
     except _FAULTS:

@@ -1,7 +1,7 @@
-"""What files say of their pictures: exposure, ISO, make, model, lens, focal length, orientation.
+"""Metadata of picture files: exposure, ISO, make, model, lens, focal length, orientation.
 
 Pillow parses EXIF from bytes found without opening the picture (0.2 ms; RAF included, whose EXIF is that of the JPEG
-inside). Nothing here ever fails a frame: what is missing, broken or absurd is None.
+inside). Missing, broken or absurd values are None and never fail a frame.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rxcli.types import Metadata
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
 _EXPOSURE, _SENSITIVITY, _RECOMMENDED_INDEX, _ISO_SPEED = 0x829A, 0x8827, 0x8832, 0x8833
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
-#: The 16-bit sensitivity tag says this where the ISO does not fit; the longer tags then have it.
+#: Value of the 16-bit sensitivity tag if the ISO does not fit; longer tags then hold it.
 _ISO_OVERFLOW = 65535
 #: Enough of a file for its directories, where they must be copied.
 _HEADER_BYTES = 1 << 20
@@ -31,7 +31,7 @@ _EXIF_BYTES = 1 << 16
 #: Longer names of makers, models and lenses are none.
 _MAX_CHARACTERS = 200
 
-#: What a receiver can use of what files say: field -> name, least, most, unit. A second is thousands of slots.
+#: Plausible ranges: field -> name, minimum, maximum, unit. An exposure of a second is thousands of slots.
 _BOUNDS = {
     "exposure_s": ("exposure", 1e-7, 1.0, "s"),
     "iso": ("ISO", 0.1, 1e8, ""),
@@ -76,7 +76,7 @@ def raw_metadata(path: Path) -> Metadata:
 
 
 def clip_metadata(tags: Mapping[str, str]) -> Metadata:
-    """Metadata of a clip from the tags of its container, which tell the camera but not the exposure."""
+    """Metadata of a clip from the tags of its container, which state the camera but not the exposure."""
     lower = {name.lower(): value for name, value in tags.items()}
 
     def text(*names: str) -> str | None:
@@ -89,7 +89,7 @@ def clip_metadata(tags: Mapping[str, str]) -> Metadata:
 
 
 def believed(metadata: Metadata) -> Metadata:
-    """The metadata without what no receiver can use, which is named in `not_believed` instead."""
+    """Remove implausible values and list them in `not_believed`."""
     doubts = {}
     for field, (name, least, most, unit) in _BOUNDS.items():
         value = getattr(metadata, field)
@@ -101,10 +101,10 @@ def believed(metadata: Metadata) -> Metadata:
     return replace(metadata, not_believed=(*metadata.not_believed, *doubts.values()), **unknown)
 
 
-def merge(first: Metadata, second: Metadata) -> Metadata:
-    """`first`, with its unknown fields taken from `second`."""
-    unknown = {field.name: getattr(second, field.name) for field in fields(first) if getattr(first, field.name) is None}
-    return replace(first, **unknown)
+def merge(metadata: Metadata, fallback: Metadata) -> Metadata:
+    """Fill the unknown fields of `metadata` from `fallback`."""
+    unknown = {f.name: getattr(fallback, f.name) for f in fields(metadata) if getattr(metadata, f.name) is None}
+    return replace(metadata, **unknown)
 
 
 def _raw_metadata(file: BinaryIO) -> Metadata:

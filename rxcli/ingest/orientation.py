@@ -42,8 +42,8 @@ def as_stored(viewed: NDArray[_T], orientation: int) -> NDArray[_T]:
 def orientation_of(transform: Callable[[NDArray[np.int64]], NDArray[np.int64]]) -> int:
     """The orientation that turns pictures as `transform` (a composition of turns and mirrors) does."""
     probe = np.arange(6).reshape(2, 3)
-    seen = transform(probe)
-    return next(o for o in _TURNS if np.array_equal(as_viewed(probe, o), seen))
+    transformed = transform(probe)
+    return next(o for o in _TURNS if np.array_equal(as_viewed(probe, o), transformed))
 
 
 def orientation_of_turn(degrees_ccw: float) -> int:

@@ -1,4 +1,4 @@
-"""Without the lines that libpng, libtiff and LibRaw write to stderr by themselves: what matters comes as an error."""
+"""Suppression of the messages of libpng, libtiff and LibRaw on stderr; errors are raised anyway."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _LOCK = Lock()
 
 @contextmanager
 def quiet_libraries() -> Iterator[None]:
-    """While this lasts, nothing that is written to the file descriptor of stderr is seen; one thread at a time."""
+    """Discard all output to the file descriptor of stderr within the block; one thread at a time."""
     with _LOCK:
         try:
-            kept = os.dup(2)
+            original = os.dup(2)
         except OSError:  # there is no stderr
             yield
             return
@@ -28,5 +28,5 @@ def quiet_libraries() -> Iterator[None]:
             os.close(null)
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(original, 2)
+            os.close(original)

@@ -93,7 +93,7 @@ def _mosaic(raw: Any, top: int, left: int, path: Path) -> Mosaic:
 
 
 def _channel_colours(raw: Any, path: Path) -> NDArray[np.uint8]:
-    """(4,) colour (0 red, 1 green, 2 blue) of LibRaw's channels, two of which are green in a Bayer mosaic."""
+    """(4,) colour (0 red, 1 green, 2 blue) of LibRaw's channels; a Bayer mosaic has two green ones."""
     colours = ["RGB".find(chr(letter)) for letter in raw.color_desc[:4]]
     if min(colours) < 0:
         reason = (
@@ -130,7 +130,7 @@ def _gains(raw: Any) -> tuple[float, float, float]:
 
 
 def _white(raw: Any, black: float) -> float:
-    """The lowest level at which a channel saturates, as far as the file tells."""
+    """The lowest level at which a channel saturates, as far as the file states it."""
     levels = [float(level) for level in raw.camera_white_level_per_channel or () if level > black]
     return min([*levels, float(raw.white_level) if raw.white_level > black else float(np.iinfo(np.uint16).max)])
 
@@ -145,19 +145,19 @@ def _linear_frame(path: Path, pixels: NDArray[np.uint16], raw: Any, metadata: Me
 
 
 def _metadata(path: Path, raw: Any) -> Metadata:
-    """What the file's EXIF says, completed by what LibRaw knows."""
-    exif, other = raw_metadata(path), raw.other
+    """Metadata from EXIF, completed by LibRaw."""
+    exif, capture = raw_metadata(path), raw.other
     libraw = Metadata(
         lens=raw.lens.model.strip() or None,
-        exposure_s=other.shutter_speed if other.shutter_speed > 0 else None,
-        iso=other.iso_speed if other.iso_speed > 0 else None,
-        focal_length_mm=other.focal_length if other.focal_length > 0 else None,
+        exposure_s=capture.shutter_speed if capture.shutter_speed > 0 else None,
+        iso=capture.iso_speed if capture.iso_speed > 0 else None,
+        focal_length_mm=capture.focal_length if capture.focal_length > 0 else None,
     )
     orientation = exif.orientation if exif.orientation != 1 else _FLIP_ORIENTATION.get(raw.sizes.flip, 1)
     return replace(merge(exif, believed(libraw)), orientation=orientation)
 
 
 def _libraw_reason(error: BaseException) -> str:
-    """LibRaw's own words, which come as bytes."""
+    """Error message of LibRaw, which comes as bytes."""
     detail = error.args[0] if error.args else ""
     return detail.decode("ascii", "replace") if isinstance(detail, bytes) else reason_of(error)

@@ -1,4 +1,4 @@
-"""What a file is, from its first bytes; its name only decides where the bytes leave it open."""
+"""Identify the kind of a file from its first bytes, or from its suffix if they are ambiguous."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".m
 #: Suffixes, lower case with their dot, of the files that are looked at in folders.
 KNOWN_SUFFIXES = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
 
-#: Bytes that `sniff` wants to see: enough for the file type box of ISO media.
+#: Bytes that `sniff` needs: enough for the file type box of ISO media.
 HEAD_BYTES = 64
 #: No camera makes larger pictures; what claims to be larger is damaged or a decompression bomb.
 MAX_PIXELS = 400_000_000
@@ -37,7 +37,7 @@ _SUBFILE_TYPE, _PHOTOMETRIC, _MAKE, _DNG_VERSION = 0x00FE, 0x0106, 0x010F, 0xC61
 #: Colour filter array, and linear RAW.
 _RAW_PHOTOMETRICS = (32803, 34892)
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"hevc", b"hevx", b"msf1")
-#: What stands at which byte of a file, and the kind that it tells; the first that fits.
+#: Signatures: offset, bytes and kind; the first match decides.
 _MAGIC: tuple[tuple[int, tuple[bytes, ...], Kind], ...] = (
     (0, (b"\xff\xd8\xff",), "jpeg"),
     (0, (b"\x89PNG\r\n\x1a\n",), "png"),
@@ -103,7 +103,7 @@ def read_bytes(path: Path, size: int = -1) -> bytes:
 
 
 def sniff(head: bytes, suffix: str) -> Kind | None:
-    """The kind of a file that starts with `head`; None where neither bytes nor `suffix` tell."""
+    """The kind of a file that starts with `head`; None if neither bytes nor `suffix` identify it."""
     by_name: Kind | None = "raw" if suffix in RAW_SUFFIXES else "video" if suffix in VIDEO_SUFFIXES else None
     return next((kind for at, starts, kind in _MAGIC if head.startswith(starts, at)), by_name)
 
@@ -156,6 +156,6 @@ def check_size(source: object, width: int, height: int, bytes_a_pixel: float = 1
 
 
 def reason_of(error: BaseException) -> str:
-    """What an exception says, in one short line."""
+    """Message of an exception in one short line."""
     text = getattr(error, "strerror", None) or " ".join(str(part) for part in error.args) or type(error).__name__
     return " ".join(str(text).split())[:160]

@@ -31,7 +31,7 @@ from rxcli.types import Frame, Metadata
 Luma = NDArray[np.uint8] | NDArray[np.uint16]
 
 _N_BUFFERS = 4
-#: Where the rate is not asked for: at least this, so that an aimed camera answers at once.
+#: Minimum frame rate if none is requested, so that an aimed camera responds at once.
 _USUAL_FPS = 24.0
 _POLL_S = 0.1
 _RETRY_S = 0.5
@@ -47,7 +47,7 @@ class PixelFormat:
     step: int = 1
     start: int = 0
     white: int = 255
-    #: Whether the samples are luma of YCbCr, whose levels the driver tells.
+    #: Whether the samples are luma of YCbCr, whose levels the driver reports.
     ycbcr: bool = False
 
 
@@ -66,7 +66,7 @@ PIXEL_FORMATS = {
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """What is asked of a camera; None: the best it has."""
+    """Requested mode and controls of a camera; None: the best available."""
 
     width: int | None = None
     height: int | None = None
@@ -90,7 +90,7 @@ class Mode:
     pixel_format: str
     width: int
     height: int
-    #: Highest rate, 0 where the driver does not tell.
+    #: Highest rate, 0 if the driver does not report it.
     fps: float
 
     def __str__(self) -> str:
@@ -100,7 +100,7 @@ class Mode:
 
 @dataclass(slots=True)
 class CameraCounts:
-    """What became of the frames that the sensor took, over all connections."""
+    """Counts of captured, dropped and damaged frames over all connections."""
 
     delivered: int = 0
     #: Passed over because the receiver was still busy, here or in the driver.
@@ -124,10 +124,10 @@ class LiveSource:
 
     Args:
         path: the device, `/dev/video0`.
-        settings: what is asked of it.
-        on_lost: told the reason when waiting begins.
-        duration_s: frames end so long after the first is asked for, whether any came or not; None: never.
-        on_idle: called now and then while no whole frame comes.
+        settings: requested mode and controls.
+        on_lost: called with the reason when waiting begins.
+        duration_s: time limit from the request of the first frame, seconds; None: no limit.
+        on_idle: called regularly while no whole frame arrives.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class Camera:
 
     def _newest(self) -> Any:
         """The newest whole capture, waited for; those before it go back to the driver unseen."""
-        heard_s, newest, n_captures = time.monotonic(), None, 0
+        last_frame_s, newest, n_captures = time.monotonic(), None, 0
         while True:
             buffer = self._dequeue(0.0 if newest else _POLL_S)
             if buffer is None:
@@ -260,13 +260,13 @@ class Camera:
                 if newest:
                     self._pass_over(newest)
                     newest, n_captures = None, 0
-                elif (silent_s := time.monotonic() - heard_s) > self._settings.stall_s:
+                elif (silent_s := time.monotonic() - last_frame_s) > self._settings.stall_s:
                     reason = f"{self._path}: the camera sent nothing for {self._settings.stall_s:g} s"
                     raise CameraLost(reason, "check its cable, or lower size and rate")
                 elif silent_s > _POLL_S:
                     self._on_idle()
                 continue
-            heard_s = time.monotonic()
+            last_frame_s = time.monotonic()
             if self._sequence is not None:
                 self.counts.dropped += max(0, buffer.sequence - self._sequence - 1)
             self._sequence = buffer.sequence
@@ -452,7 +452,7 @@ def _top_rate(descriptor: int, code: int, width: int, height: int) -> float:
 
 
 def _enumerate(descriptor: int, request: int, structure: Callable[[int], Any]) -> Iterator[Any]:
-    """What the driver lists, until it says EINVAL; nothing where it cannot list at all."""
+    """Enumerate entries of the driver until EINVAL; empty if it cannot enumerate."""
     for index in range(1000):
         item = structure(index)
         if not _is_known(descriptor, request, item):
@@ -475,7 +475,7 @@ def _choose(modes: list[Mode], settings: CameraSettings, path: Path) -> Mode:
     """The best mode that fulfils what is asked for.
 
     Raises:
-        InputError: there is none; says which there are.
+        InputError: there is none; the message lists the available modes.
     """
     fitting = [mode for mode in modes if settings.pixel_format in (None, mode.pixel_format)]
     fitting = [mode for mode in fitting if settings.width in (None, mode.width)]
@@ -506,7 +506,7 @@ def _set_format(descriptor: int, mode: Mode, path: Path) -> _Layout:
 
 
 def _set_rate(descriptor: int, fps: float) -> float:
-    """Ask for a frame rate; the one that the camera takes, 0 where it does not tell."""
+    """Ask for a frame rate; returns the actual one, 0 if it is not reported."""
     parameters = abi.StreamParameters(type=abi.BUF_TYPE_VIDEO_CAPTURE)
     if fps > 0:
         parameters.numerator, parameters.denominator = 1000, round(1000 * fps)
@@ -516,7 +516,7 @@ def _set_rate(descriptor: int, fps: float) -> float:
 
 
 def _set_exposure(descriptor: int, exposure_s: float | None, path: Path) -> float | None:
-    """Fix the exposure, as short as it can be where none is asked for; the one in effect, None where it is unknown.
+    """Fix the exposure, the shortest if none is requested; returns the actual one, or None.
 
     Raises:
         InputError: one is asked for and the camera has no such control.

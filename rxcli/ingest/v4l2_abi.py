@@ -69,21 +69,21 @@ def _request(direction: int, number: int, structure: type[ctypes.Structure]) -> 
     return direction << 30 | ctypes.sizeof(structure) << 16 | ord("V") << 8 | number
 
 
-_WRITE, _READ, _BOTH = 1, 2, 3
+_WRITE, _READ, _READ_WRITE = 1, 2, 3
 QUERYCAP = _request(_READ, 0, Capability)
-ENUM_FMT = _request(_BOTH, 2, FormatDescription)
-S_FMT = _request(_BOTH, 5, Format)
-REQBUFS = _request(_BOTH, 8, RequestBuffers)
-QUERYBUF = _request(_BOTH, 9, Buffer)
-QBUF = _request(_BOTH, 15, Buffer)
-DQBUF = _request(_BOTH, 17, Buffer)
+ENUM_FMT = _request(_READ_WRITE, 2, FormatDescription)
+S_FMT = _request(_READ_WRITE, 5, Format)
+REQBUFS = _request(_READ_WRITE, 8, RequestBuffers)
+QUERYBUF = _request(_READ_WRITE, 9, Buffer)
+QBUF = _request(_READ_WRITE, 15, Buffer)
+DQBUF = _request(_READ_WRITE, 17, Buffer)
 STREAMON = _request(_WRITE, 18, BufferType)
-S_PARM = _request(_BOTH, 22, StreamParameters)
-G_CTRL = _request(_BOTH, 27, Control)
-S_CTRL = _request(_BOTH, 28, Control)
-QUERYCTRL = _request(_BOTH, 36, ControlRange)
-ENUM_FRAMESIZES = _request(_BOTH, 74, FrameSize)
-ENUM_FRAMEINTERVALS = _request(_BOTH, 75, FrameInterval)
+S_PARM = _request(_READ_WRITE, 22, StreamParameters)
+G_CTRL = _request(_READ_WRITE, 27, Control)
+S_CTRL = _request(_READ_WRITE, 28, Control)
+QUERYCTRL = _request(_READ_WRITE, 36, ControlRange)
+ENUM_FRAMESIZES = _request(_READ_WRITE, 74, FrameSize)
+ENUM_FRAMEINTERVALS = _request(_READ_WRITE, 75, FrameInterval)
 
 
 def fourcc(name: str) -> int:

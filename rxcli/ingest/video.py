@@ -49,7 +49,7 @@ _FILES_ONLY = {
 
 @dataclass(slots=True)
 class _Progress:
-    """What has gone through, to tell at the end whether the clip was whole."""
+    """Progress of reading, which shows at the end whether the clip was complete."""
 
     n_packets: int = 0
     last_time_s: float = 0.0
@@ -181,7 +181,7 @@ def _time_s(stamped: Any, stream: Any, progress: _Progress) -> tuple[float, bool
 
 
 def _frame_s(stream: Any) -> float:
-    """Nominal time from frame to frame: by the codec, by the container, or by guess."""
+    """Nominal time from frame to frame: by the codec, by the container, or by default."""
     for rate in (stream.codec_context.framerate, stream.guessed_rate, stream.average_rate):
         if rate and _RATES_HZ[0] <= float(rate) <= _RATES_HZ[1]:
             return 1 / float(rate)
@@ -189,7 +189,7 @@ def _frame_s(stream: Any) -> float:
 
 
 def _frame(path: Path, frame: Any, time_s: float, nominal: bool) -> Frame:
-    """A frame of FFmpeg's as one of ours, without its number and what the clip says of its camera."""
+    """Convert a frame of FFmpeg, without its number and the metadata of the clip."""
     if not _has_luma_plane(frame.format):
         frame = frame.reformat(format="gray")
     bits = frame.format.components[0].bits
@@ -251,8 +251,8 @@ def _ends_within_packet(path: Path) -> bool:
     """
     with path.open("rb") as file:
         head, length = file.read(1024), file.seek(0, os.SEEK_END)
-    for size, first in ((188, 0), (192, 4), (204, 0)):
-        if len(head) > first + size and head[first] == head[first + size] == _TS_SYNC:
+    for size, offset in ((188, 0), (192, 4), (204, 0)):
+        if len(head) > offset + size and head[offset] == head[offset + size] == _TS_SYNC:
             return length % size != 0
     return False
 
@@ -272,7 +272,7 @@ def _boxes_end(path: Path) -> int:
 
 
 def _stated_end_s(container: Any, stream: Any) -> float:
-    """End of the last frame as the container states it; 0 where it does not say, or may say it of the sound only."""
+    """End of the last frame as the container states it; 0 if it states none, or possibly only that of the sound."""
     if stream.duration is not None:
         return float(stream.duration * stream.time_base)
     sole = container.duration is not None and len(container.streams) == 1

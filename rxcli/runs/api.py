@@ -53,10 +53,10 @@ class Receiver:
 
         Args:
             picture: path of a photograph or RAW file; or (height, width) array of grey values as the camera stores
-                them, uint8 or uint16; or a `Frame`, which also tells exposure, levels and whether values follow light.
+                them, uint8 or uint16; or a `Frame` with exposure, levels and whether values are proportional to light.
 
         Returns:
-            Its result. That nothing was received is a status with a message, not an exception.
+            Its result. A failed reception is a status with a message, not an exception.
 
         Raises:
             InputError: the file cannot be read.
@@ -68,7 +68,7 @@ class Receiver:
     def receive(self, source: str | Path | Iterable[Picture]) -> Iterator[FrameResult]:
         """Receive a clip, a device, a photograph, or frames in order of time; one result a frame, in order.
 
-        What one frame teaches is used in the next, so a result may come some frames late. A packet stands in the last
+        Results are delayed by some frames, because later frames improve earlier ones. A packet is reported in the last
         frame that shows it.
 
         Args:
@@ -125,12 +125,12 @@ def _frame_of(picture: Picture) -> Frame:
         return frame_of_array(picture)
     frames = open_source(picture)
     with closing(frames):  # type: ignore[type-var]  # a generator
-        first = next(frames, None)
-        if first is None:
+        frame = next(frames, None)
+        if frame is None:
             raise InputError(f"{picture}: no frame in it", "check the file")
         if next(frames, None) is not None:
             raise UsageError(f"{picture}: more than one frame", "use receive, which takes clips")
-    return first
+    return frame
 
 
 def frame_of_array(pixels: NDArray[Any]) -> Frame:

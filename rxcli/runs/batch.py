@@ -1,6 +1,6 @@
-"""Many sources: which files there are, and decoding them here or in worker processes.
+"""Many sources: collect files, and decode them here or in worker processes.
 
-Results come source by source in the order of the input, whoever decodes them; `rxcli.runs.journal` keeps them.
+Results come source by source in the order of the input in either case; `rxcli.runs.journal` keeps them.
 """
 
 from __future__ import annotations
@@ -277,7 +277,7 @@ def decode_in_processes(sources: Sequence[Source], decoder: Decoder, workers: in
     Args:
         sources: what to decode.
         decoder: how; must be picklable.
-        workers: number of processes, each of which uses one thread.
+        workers: number of processes with one thread each.
     """
     with environment(ONE_THREAD), closing(_Pool(decoder, min(workers, len(sources)))) as pool:
         for source, results in in_order(sources, pool.submit, _AHEAD * workers):
@@ -360,7 +360,7 @@ class _Pool:
 
 
 class _WorkerDiedError(Exception):
-    """A worker ended with a source in hand; its argument says how."""
+    """A worker died while decoding a source; the argument describes how."""
 
 
 @dataclass(slots=True)
@@ -418,7 +418,7 @@ def _ending(exitcode: int | None) -> str:
 
 
 def _work(connection: Connection, decoder: Decoder, level: int) -> None:
-    """A worker's life: take a source, send its results and a None, until the other end is closed."""
+    """Worker loop: receive a source, send its results and a None, until the connection closes."""
     for number in _FIRST_DECIDES:
         signal.signal(number, signal.SIG_IGN)
     _hold_signals(signal.SIG_UNBLOCK)

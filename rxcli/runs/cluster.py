@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 _RETRIES = 3
 #: Tasks in the scheduler's hands at a time: enough for a large cluster, few enough that results do not pile up.
 _IN_FLIGHT = 1024
-#: Most bytes of one source's taps: results wait in the memory of the cluster.
+#: Maximum bytes of one source's taps, which wait in the memory of the cluster.
 _MAX_TAPPED = 512 << 20
 #: Dask is given so much longer to give up by itself, seconds.
 _MARGIN_S = 0.5
@@ -146,20 +146,20 @@ def _collect(scratch: Path, source: Source) -> list[_Tap]:
 
 
 def _write(taps: list[_Tap], decoder: Decoder) -> None:
-    """Write what was tapped where the options say.
+    """Write the taps to the folders of the options.
 
     Raises:
         OutputError: it cannot be written, or somebody else's file is there.
     """
     folders = _folders(decoder)
-    looks = {"--dump-dir": TAPS, "--save-undistorted": PICTURE}
+    patterns = {"--dump-dir": TAPS, "--save-undistorted": PICTURE}
     for place, data in taps:
         option, below = place.split(os.sep, 1)
         path = folders[option] / below
         if not path.resolve().is_relative_to(folders[option].resolve()):
             raise OutputError(f"{path}: a worker names a file outside {option}", "look at who joins the cluster")
         make_parent(path)
-        check_replaceable(path, looks[option], option)
+        check_replaceable(path, patterns[option], option)
         write_whole(path, data)
 
 

@@ -1,10 +1,9 @@
-"""The file of JSON lines as its own journal: what it holds whenever the process ends, and going on from there.
+"""Journal of a run: a file of JSON lines from which a killed run can be resumed.
 
-Every line is written whole, at once, and sources follow one another, so after a kill only the last source can be
-incomplete. `Journal.recover` drops it, and sources whose decoder was killed, and the run goes on behind the rest. The
-first line says under `run` which version wrote the file with which options; the first line of every source says under
-`file` how long the file was and when it was written; its last line says `last`. A run with other options or changed
-files is refused.
+Every line is written in one call, and sources follow one another, so after a kill only the last source can be
+incomplete. `Journal.recover` drops it, and sources whose decoder was killed, and the run continues after the rest. The
+first line holds version and options under `run`, the first line of every source length and time of its file under
+`file`, and its last line `last`. Resuming with other options or changed files is refused.
 """
 
 from __future__ import annotations
@@ -28,23 +27,23 @@ try:
 except ImportError:  # no such locks on this system
     fcntl = None  # type: ignore[assignment]
 
-#: What every line of results starts with, so that half of one is told from a foreign file.
+#: Start of every line of results, which distinguishes a truncated line from a foreign file.
 _LINE_START = b'{"source": "'
 _ANOTHER = "name the file that --json wrote before"
 
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """What results depend on beside the files."""
+    """Version and options of a run, on which results depend beside the files."""
 
     version: str
     #: Option -> value, as JSON has it.
     options: dict[str, Any]
 
     def differences(self, record: object) -> list[str]:
-        """What is not as the first line of an earlier run says."""
+        """Differences from the first line of an earlier run."""
         if not isinstance(record, dict) or not isinstance(record.get("options"), dict):
-            return ["it does not say with which options it was written"]
+            return ["it does not state the options of its run"]
         before: dict[str, Any] = record["options"]
         pairs: dict[str, tuple[Any, Any]] = {"version": (record.get("version"), self.version)}
         for name in sorted({*before, *self.options}):
@@ -164,11 +163,11 @@ class Journal:
     ) -> Iterator[tuple[str, list[FrameResult]]]:
         """Give the complete sources of an earlier run, then leave only them in the file. Exhaust it before `append`.
 
-        The last source may be incomplete, and is dropped; so are sources that say `retry`, wherever they stand.
+        The last source may be incomplete, and is dropped; so are sources marked `retry`.
 
         Args:
             head: of the run that goes on; None: not compared.
-            paths: name of a source -> where it is opened, of those that the run is asked for; the others are kept.
+            paths: name -> path of the sources of this run; other sources are kept.
 
         Raises:
             UsageError: the file is no output of `vlc-rx decode --json`, or was written with other options or of other
@@ -194,7 +193,7 @@ class Journal:
                 if record.get("last") is not True:
                     continue
                 if not any(result.retry for result in results):
-                    if out.tell() == 0 and run is not None:  # the first line of all keeps what it says of the run
+                    if out.tell() == 0 and run is not None:  # the first line keeps the record of the run
                         lines[0] = json.dumps({**json.loads(lines[0]), "run": run}).encode() + b"\n"
                     out.writelines(lines)
                     yield results[0].source, results
@@ -247,11 +246,11 @@ def _changes(source: str, facts: object, paths: Mapping[str, str]) -> list[str]:
     """How the file of a source differs from what it was."""
     if source not in paths:
         return []
-    before, now = facts if isinstance(facts, dict) else {}, file_facts(paths[source]) or {}
-    changed = next((name for name in ("bytes", "modified_s") if before.get(name) != now.get(name)), None)
+    before, current = facts if isinstance(facts, dict) else {}, file_facts(paths[source]) or {}
+    changed = next((name for name in ("bytes", "modified_s") if before.get(name) != current.get(name)), None)
     if changed is None:
         return []
-    return [f"{source} has changed ({changed} was {before.get(changed)!r}, is {now.get(changed)})"]
+    return [f"{source} has changed ({changed} was {before.get(changed)!r}, is {current.get(changed)})"]
 
 
 def _result(record: dict[str, Any], place: str) -> FrameResult:

@@ -1,4 +1,4 @@
-"""Other processes: the environment that they are started with, and the memory that they take."""
+"""Child processes: their environment and their memory."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def environment(values: Mapping[str, str]) -> Iterator[None]:
 
 
 def resident_bytes(pid: int | None) -> int:
-    """Resident memory of a process, 0 where that cannot be told."""
+    """Resident memory of a process, 0 if unknown."""
     try:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):

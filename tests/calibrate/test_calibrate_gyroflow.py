@@ -70,9 +70,9 @@ def test_other_sizes(tmp_path: Path) -> None:
         ({}, 0.0145, False, "may be wrong"),
         ({"frame_readout_time": -14.5}, 0.0145, True, "from the bottom to the top"),
         ({"frame_readout_direction": "BottomToTop"}, 0.0145, True, "from the bottom to the top"),
-        ({"frame_readout_time": 40.0}, None, False, "cannot be at 30 frames/s"),
-        ({"frame_readout_time": None}, None, False, "tells no readout"),
-        ({"global_shutter": True}, None, False, "the shutter is global"),
+        ({"frame_readout_time": 40.0}, None, False, "impossible at 30 frames/s"),
+        ({"frame_readout_time": None}, None, False, "states no readout"),
+        ({"global_shutter": True}, None, False, "a global shutter"),
     ],
 )
 def test_the_readout_is_a_hint(

@@ -241,7 +241,7 @@ def test_exposure_from_the_edges(on_s: float | None, exposure_s: float, exif_s: 
     picture = exposed(light, np.random.default_rng(11), gain=2.0 if on_s == 1e-4 else 0.6)
     found = calibrate_shutter([picture], [800], exif_exposure_s=exif_s).exposure
     assert found.exposure_s == (expected_s and pytest.approx(expected_s, rel=0.05))
-    assert found.note
+    assert found.comment
     if found.exposure_s is not None:
         assert found.interval_s is not None
         assert found.interval_s[0] < found.exposure_s < found.interval_s[1]
