@@ -19,7 +19,7 @@ from rxcli.lab.simulate.scenes import Change, Scene, preset
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.receiver.clip.start import Start
+from rxcli.receiver.clip.acquiring import Start
 from rxcli.receiver.context import FrameContext
 from rxcli.receiver.pipeline import receive
 from rxcli.receiver.screen.registration import ScreenTexture
@@ -291,7 +291,7 @@ def test_a_common_clock_that_does_not_fit_a_frame_is_dropped(monkeypatch: pytest
         return Start(screen, (screen,), time, 2.0)
 
     monkeypatch.setattr("rxcli.receiver.clip.receiver.shows_little", lambda _: True)
-    monkeypatch.setattr("rxcli.receiver.clip.receiver.agree", wrong)
+    monkeypatch.setattr("rxcli.receiver.clip.camera.agree", wrong)
     monkeypatch.setattr("rxcli.receiver.clip.receiver.acquisition_at", lambda *_: None)
     results, score = received(clip)
     right = score.error_free + score.extra_error_free

@@ -203,11 +203,11 @@ def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypa
     def threads() -> list[int]:
         return [library["num_threads"] for library in blas.info() if _is_numpys(library)]
 
-    def take(_clip: object, _frame: Frame) -> list[object]:
+    def step(state: object, _frame: Frame) -> tuple[object, list[object]]:
         inside.append(threads())
-        return [None]
+        return state, [None]
 
-    monkeypatch.setattr("rxcli.receiver.clip.receiver._Clip.take", take)
+    monkeypatch.setattr("rxcli.receiver.clip.receiver.step", step)
     with blas.limit(limits=2, user_api="blas"):
         if max(threads(), default=0) < 2:
             pytest.skip("this numpy's BLAS has one thread")
@@ -250,7 +250,7 @@ def test_another_scene_is_searched_anew(clip: Clip) -> None:
 
 def test_another_scene_while_frames_are_held_back(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
     """The frames held back are looked at again by their own picture, and leave that of the new scene alone."""
-    monkeypatch.setattr("rxcli.receiver.clip.receiver.SETTINGS", replace(SETTINGS, much_doubt=-1.0))
+    monkeypatch.setattr("rxcli.receiver.clip.ledger.SETTINGS", replace(SETTINGS, much_doubt=-1.0))
     other = simulate(8, 8, "chelsea")
     moved = tuple(replace(frame, index=6 + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames))
     got = list(receive((*clip.frames[:6], *moved), clip.options))
@@ -265,7 +265,7 @@ def test_frames_before_and_after_an_occlusion_are_looked_at_again(clip: Clip, mo
         measured.append([view.bursts.frame for view in views])
 
     monkeypatch.setattr("rxcli.receiver.clip.scene.TrackedScreen.measure_again", measure_again)
-    monkeypatch.setattr("rxcli.receiver.clip.receiver.SETTINGS", replace(SETTINGS, too_much_doubt=1.0))
+    monkeypatch.setattr("rxcli.receiver.clip.ledger.SETTINGS", replace(SETTINGS, too_much_doubt=1.0))
     dark = replace(clip.frames[3], pixels=np.full_like(clip.frames[3].pixels, 2))
     got = list(receive((*clip.frames[:3], dark, *clip.frames[4:]), clip.options))
     assert [result.frame for result in got] == [frame.index for frame in clip.frames]

@@ -1,0 +1,475 @@
+"""The account of a clip: link time, bursts that go on, and frames whose results wait for them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from rxcli.options import ReceiverOptions
+from rxcli.protocol import PREAMBLE_SLOTS
+from rxcli.receiver.clip.acquiring import Start
+from rxcli.receiver.clip.bursts import BurstReader
+from rxcli.receiver.clip.scene import TrackedScreen
+from rxcli.receiver.clip.settings import SETTINGS
+from rxcli.receiver.clip.views import View, Waiting
+from rxcli.receiver.context import Timer
+from rxcli.receiver.decode import assemble, confidence, detect
+from rxcli.receiver.decode.settings import SETTINGS as decode_settings
+from rxcli.receiver.decode.soft_bits import clip_soft_bits
+from rxcli.receiver.sync import tracking
+from rxcli.results.dump import dump_stages
+from rxcli.types import (
+    BoolArray,
+    ColumnResult,
+    Float32Array,
+    FloatArray,
+    Frame,
+    FrameResult,
+    FrameSoftBits,
+    IntArray,
+)
+
+_SLOW_MOTION = "slow motion: time stamps are {:g} times as long as the link's time, which was taken"
+_RETIMED = (
+    "the clip's time stamps do not fit the link's time, as after a change of its speed: each frame is received alone; "
+    "give the clip as the camera recorded it"
+)
+#: Difference of the copies of two frames that have none in common.
+_SEPARATE_COPIES = 1 << 12
+
+
+@dataclass(slots=True, eq=False)
+class _Link:
+    """The link's time, as long as it is not lost."""
+
+    time: tracking.LinkTime
+    phase: tracking.BurstPhase
+    #: Columns and slots of a packet.
+    shape: tuple[int, int]
+    #: Number of burst 0 of this time in the clip.
+    offset: int
+    last_time_s: float
+    #: Whether time stamps were compared with the link's time.
+    stamps_judged: bool = False
+    #: (1, C) log-likelihood ratio of the headers of all bursts so far; None before any.
+    header_llr: FloatArray | None = None
+
+    def headerless(self, closed: Sequence[tracking.ClosedBurst], n_columns: int) -> BoolArray:
+        """Add closed bursts; returns (C,) the columns that have shown no headers."""
+        header_llr = np.zeros((1, n_columns)) if self.header_llr is None else self.header_llr
+        limit = decode_settings.max_header_llr
+        for burst in closed:
+            header_llr = header_llr + np.clip(burst.posteriors.header_llr, -limit, limit)
+        self.header_llr = header_llr
+        return assemble.find_headerless(header_llr) if closed else np.zeros(n_columns, bool)
+
+
+class Ledger:
+    """Bursts and results of a clip.
+
+    The first frames of a scene are held back and measured again when its picture is known better; other results wait
+    for the end of their bursts.
+
+    Args:
+        options: of the receiver.
+    """
+
+    def __init__(self, options: ReceiverOptions) -> None:
+        self._options = options
+        self._waiting: deque[Waiting] = deque()
+        self._bursts = BurstReader(options.skip)
+        self._link: _Link | None = None
+        self._next_number = 0
+        #: How much longer time stamps are than the time was; None where that cannot be told, and frames stand alone.
+        self._stretch: float | None = 1.0
+        #: Counts the starts of the link's time: burst numbers of different ones cannot be compared.
+        self._epoch = 0
+        #: The scene of the frames that wait; None where they are not tracked.
+        self._scene: TrackedScreen | None = None
+        #: The clock that the first frames agreed on, where each shows little.
+        self.start: Start | None = None
+        #: Probability that the screen's columns are numbered right.
+        self.certainty = 1.0
+        self._hold_first()
+
+    def _hold_first(self) -> None:
+        """Hold back the first frames of a scene."""
+        self._hold(SETTINGS.frames_held if "tracking" in self._options.skip else 0)
+
+    def _hold(self, n_frames: int) -> None:
+        """Hold back so many frames; 0 from then on."""
+        self._n_held = n_frames
+        self._bursts.dark_too = n_frames > 0
+
+    @property
+    def holds_first(self) -> bool:
+        """Whether frames are held back that will be measured again in any case."""
+        return self._n_held == SETTINGS.frames_held
+
+    @property
+    def holds_more(self) -> bool:
+        """Whether further frames are held back, because compression has taken much of the first ones."""
+        return self._n_held == SETTINGS.frames_held_long
+
+    @property
+    def time(self) -> tracking.LinkTime | None:
+        """The link's time; None before the first frame."""
+        return self._link.time if self._link is not None else None
+
+    @property
+    def message(self) -> str | None:
+        """What there is to say of the clip's time stamps."""
+        if self._stretch is None:
+            return _RETIMED
+        return _SLOW_MOTION.format(self._stretch) if self._stretch != 1 else None
+
+    def has_certain_bursts(self, frame: Frame, scene: TrackedScreen) -> bool:
+        """Whether all bursts that a frame should show are certain in all lit columns."""
+        link = self._link
+        if link is None or scene.last is None or not link.phase.settled or self._n_held:
+            return False
+        last, (top, bottom) = scene.last, scene.rows[[0, -1]]
+        slot, rows_per_slot = link.time.predict(frame.index, frame.time_s), last.acquisition.clock.rows_per_slot
+        if slot is None:
+            return False
+        ends = (slot + np.array([top, bottom]) / rows_per_slot) // link.time.packet_slots
+        numbers = np.unique(link.phase.burst_of(np.arange(ends[0], ends[1] + 1).astype(np.int64))) + link.offset
+        lit = np.median(last.snr, axis=1) >= 1.0
+        return bool(lit.any()) and all(self._bursts.open.settled(int(number), lit) for number in numbers)
+
+    def add(self, waiting: Waiting, *, scene_ends: bool = False) -> list[FrameResult]:
+        """Add a frame without packets; returns the results that are complete, all of them where the scene ends."""
+        self._waiting.append(waiting)
+        return self._finish_scene() if scene_ends else self._ready()
+
+    def enter(
+        self, waiting: Waiting, view: View, scene: TrackedScreen | None, frame: Frame, timer: Timer
+    ) -> list[FrameResult]:
+        """Enter a received frame; returns the results that are complete.
+
+        Args:
+            waiting: the frame, to which the view is given.
+            view: what was received of it.
+            scene: that the frame belongs to; None where it is not tracked.
+            frame: the frame.
+            timer: time is counted there.
+        """
+        done, first_copy = self._first_copy(view, frame)
+        waiting.view = view
+        self._scene = scene
+        assert self._link is not None
+        self._link.last_time_s = frame.time_s
+        view.bursts = replace(view.bursts, first_copy=first_copy)
+        self._waiting.append(waiting)
+        with timer("detect"):
+            if not self._link.phase.settled:
+                self._compare(view)
+            n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)
+            if self._n_held and self._link.time.judged and not self._link.stamps_judged:
+                self._judge_stamps()
+            if self._link.phase.settled or n_unsettled > SETTINGS.max_waiting_frames:
+                self._settle_bursts()
+                if self._n_held and len(self._waiting) >= self._n_held:
+                    self._receive_first_again(at_last=False)
+        return done + self._ready()
+
+    def _first_copy(self, view: View, frame: Frame) -> tuple[list[FrameResult], int]:
+        """Number of the frame's first copy; where it does not fit the link's time, that ends, with the results of its
+        scene, and begins anew."""
+        if self._link is not None and self._stretch is not None and self._link.shape == _shape(view):
+            first_copy = self._link.time.update(frame.index, frame.time_s, view.bursts.clock)
+            if first_copy is not None:
+                return [], first_copy
+        done = self._finish_scene() if self._link is not None else []
+        first_copy = self._begin_link(view, frame)
+        if first_copy is None:
+            # The clock that the first frames seemed to share is not this frame's.
+            self.start = None
+            first_copy = self._begin_link(view, frame)
+        assert first_copy is not None
+        return done, first_copy
+
+    def _begin_link(self, view: View, frame: Frame) -> int | None:
+        """Begin the link's time anew; returns the number of the frame's first copy in it, None where it fits none."""
+        screen = view.acquisition.screen
+        offset = self._next_number
+        stretch = self._stretch or 1.0
+        if self._link is not None and offset:
+            passed_s = (frame.time_s - self._link.last_time_s) / stretch
+            offset += int(passed_s / (screen.packet_s * self._link.phase.repeats))
+        time = tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
+        time = self.start.time if self.start else time
+        phase = tracking.BurstPhase(view.acquisition.repeats)
+        self._link = _Link(time, phase, _shape(view), offset, frame.time_s)
+        self._epoch += 1
+        self._bursts.begin()
+        return time.update(frame.index, frame.time_s, view.bursts.clock)
+
+    def _judge_stamps(self) -> None:
+        """Whether the stamps of the first frames are the time; where they are not, those frames are entered anew."""
+        link, waiting = self._link, [w for w in self._waiting if w.view is not None]
+        assert link is not None
+        link.stamps_judged = True
+        first = waiting[0].view
+        assert first is not None
+        shown = np.ptp(np.flatnonzero(first.acquisition.profiles.inside.any(axis=(0, 1))))
+        rate_hz = first.acquisition.screen.slot_rate_hz
+        self._stretch = link.time.time_stamp_stretch(float(shown) / first.bursts.clock.rows_per_slot / rate_hz)
+        if self._stretch == link.time.stretch:
+            return
+        link.time = tracking.LinkTime(link.time.packet_slots, rate_hz, self._stretch or 1.0)
+        link.phase = tracking.BurstPhase(first.acquisition.repeats)
+        link.stamps_judged = True
+        self._bursts.begin()
+        for each in waiting:
+            self._enter_anew(each)
+
+    def _enter_anew(self, waiting: Waiting) -> None:
+        view, link = waiting.view, self._link
+        assert view is not None
+        assert link is not None
+        clock = view.bursts.clock
+        first_copy = link.time.update(waiting.result.frame, waiting.result.time_s, clock)
+        if first_copy is None or self._stretch is None:
+            # Frames that stand alone: no copy of one is near any of another.
+            first_copy = waiting.result.frame * _SEPARATE_COPIES
+        clock = replace(clock, burst=np.arange(clock.n_copies))
+        view.bursts = replace(view.bursts, first_copy=first_copy, clock=clock)
+        waiting.numbers = None
+        waiting.result = replace(waiting.result, message=self.message)
+        self._compare(view)
+
+    def _compare(self, view: View) -> None:
+        """What the frame says of the phase of the bursts."""
+        assert self._link is not None
+        clock = view.bursts.clock
+        llr = detect.slot_llr(view.bursts.metrics)
+        copies = clock.to_copies(llr).transpose(1, 0, 2) * (view.bursts.shown > 0)
+        self._link.phase.update(view.bursts.first_copy, np.asarray(copies, np.float64))
+
+    def _settle_bursts(self) -> None:
+        """Enter all frames that waited for the phase of the bursts."""
+        for waiting in self._waiting:
+            if waiting.view is not None and waiting.numbers is None:
+                self._detect(waiting)
+
+    def _detect(self, waiting: Waiting) -> None:
+        """Add a frame to its bursts, and learn from it; they are detected when somebody asks what they say."""
+        numbers, view = self._add(waiting), waiting.view
+        if "certain_columns" not in self._options.skip or self._options.stop_when_certain:
+            self._bursts.detect_stale(waiting)
+        tracked = view is not None and view.flat is not None and self._bursts.open.is_open(int(numbers[-1]))
+        if self._scene is not None and view is not None and tracked:
+            self._scene.take(view, lambda: self._bursts.lit(waiting))
+
+    def _add(self, waiting: Waiting) -> IntArray:
+        """Add a frame to its bursts; returns their numbers."""
+        view, link = waiting.view, self._link
+        assert view is not None
+        assert link is not None
+        clock = view.bursts.clock
+        bursts = link.phase.burst_of(view.bursts.first_copy + np.arange(clock.n_copies))
+        numbers = np.unique(bursts)
+        view.bursts = replace(view.bursts, clock=replace(clock, burst=bursts - numbers[0]))
+        waiting.numbers = numbers + link.offset
+        self._next_number = max(self._next_number, int(waiting.numbers[-1]) + 1)
+        self._bursts.add(view, waiting.numbers)
+        return waiting.numbers
+
+    # -- a second pass over the first frames -------------------------------------------------------------------------
+
+    def _receive_first_again(self, at_last: bool) -> None:
+        """The first frames once more: by then it is known better what is on the screen.
+
+        Where that leaves doubt, more frames are waited for, unless it is `at_last` or results are wanted promptly.
+        """
+        held = [
+            w for w in self._waiting if w.view is not None and w.numbers is not None and self._can_receive_again(w.view)
+        ]
+        may_wait = self._n_held < SETTINGS.frames_held_long and not at_last and not self._options.prompt
+        if len(held) > 1 and not (may_wait and self._doubt(held) > SETTINGS.too_much_doubt):
+            for _ in range(SETTINGS.looks_again if len(held) <= SETTINGS.frames_held else 1):
+                self._measure_again(held)
+                self._detect_again()
+        self._hold(SETTINGS.frames_held_long if may_wait and self._doubt(held) > SETTINGS.much_doubt else 0)
+
+    def _doubt(self, held: list[Waiting]) -> float:
+        """Share of the well lit packets of some frames that is in doubt."""
+        doubtful, whole = np.sum([self._bursts.doubts(waiting) for waiting in held], axis=0) if held else (0, 0)
+        return float(doubtful / max(whole, 1))
+
+    def _can_receive_again(self, view: View) -> bool:
+        return self._scene is not None and self._scene.can_measure_again(view)
+
+    def _measure_again(self, held: list[Waiting]) -> None:
+        """Learn the picture anew from all frames held, and measure those in doubt by what the others say of it."""
+        assert self._scene is not None
+        self._bursts.detect_stale(*held)
+        known = [self._bursts.lit(waiting) for waiting in held]
+        doubtful = [len(held) <= SETTINGS.frames_held or self._bursts.doubts(waiting)[0] > 0 for waiting in held]
+        numbers = [w.numbers for w in held if w.numbers is not None]
+        self._scene.measure_again([w.view for w in held if w.view is not None], known, numbers, doubtful)
+
+    def _detect_again(self) -> None:
+        """The bursts of all frames that wait, each once: in the last frame that shows it."""
+        self._bursts.begin()
+        waiting = [w for w in self._waiting if w.view is not None and w.numbers is not None]
+        numbers = [self._add(w) for w in waiting]
+        after = [*numbers[1:], numbers[0][:0]]
+        ended = [np.setdiff1d(mine, following) for mine, following in zip(numbers, after, strict=True)]
+        self._bursts.detect(list(zip(waiting, ended, strict=True)), dark_too=False)
+        tracked = [w.view for w in waiting if w.view is not None and w.view.flat is not None]
+        if self._scene is not None and tracked:
+            self._scene.last = tracked[-1]
+
+    # -- results ---------------------------------------------------------------------------------------------------
+
+    def _finish_scene(self) -> list[FrameResult]:
+        """The results of a scene that is over, by what was known of it."""
+        done = self.finish()
+        self._scene = None
+        self._hold_first()
+        return done
+
+    def finish(self) -> list[FrameResult]:
+        """The results still held back."""
+        if self._link is not None:
+            self._settle_bursts()
+        if self._n_held:
+            self._receive_first_again(at_last=True)
+        done = self._ready(at_last=True)
+        done += [self._report(waiting, None) for waiting in self._waiting]
+        self._waiting.clear()
+        return done
+
+    def _ready(self, at_last: bool = False) -> list[FrameResult]:
+        """Results of the frames whose bursts all ended, oldest first: of some together, for that takes less time each,
+        unless it is `at_last` or results are wanted promptly."""
+        n_ended = 0 if self._n_held else self._n_ended()
+        if n_ended < (1 if at_last or self._options.prompt else SETTINGS.reports_together):
+            return []
+        seen = [w for w in islice(self._waiting, n_ended) if w.view is not None]
+        self._bursts.detect_stale(*seen)
+        done = []
+        for _ in range(n_ended):
+            first = self._waiting.popleft()
+            done.append(self._report(first, self._waiting[0] if self._waiting else None))
+        return done
+
+    def _n_ended(self) -> int:
+        """How many of the frames that wait, from the oldest on, can be reported."""
+        for place, first in enumerate(self._waiting):
+            if first.view is not None:
+                following = self._waiting[place + 1] if place + 1 < len(self._waiting) else None
+                if following is None or first.numbers is None:
+                    return place
+                if following.view is not None and following.numbers is None:
+                    return place
+        return len(self._waiting)
+
+    def _report(self, waiting: Waiting, following: Waiting | None) -> FrameResult:
+        view, bursts = waiting.view, self._bursts
+        if view is None or waiting.numbers is None:
+            return waiting.result
+        bursts.detect_stale(waiting)
+        going_on = waiting.numbers[:0]
+        if following is not None and following.numbers is not None:
+            going_on = np.intersect1d(waiting.numbers, following.numbers)
+        closed = bursts.open.close(np.setdiff1d(waiting.numbers, going_on))
+        ended = _bursts_of(closed, int(waiting.numbers[0]), view)
+        columns = _columns_of(view, ended, bursts.confidence(going_on), self._options.min_confidence)
+        columns = assemble.with_certainty(columns, self.certainty, self._options.min_confidence)
+        if self._link is not None:
+            columns = assemble.drop_headerless_packets(columns, self._link.headerless(closed, len(columns)))
+        if self._options.dump_dir is not None:
+            found = _taps(waiting, view, ended)
+            dump_stages(self._options.dump_dir, waiting.result.source, waiting.result.frame, found)
+        result = replace(waiting.result, columns=columns, status=assemble.clip_status(columns))
+        if self._link is not None:
+            result = replace(result, screen_profile=view.acquisition.variant(self._link.phase.repeats).name)
+        return replace(result, soft_bits=self._soft_bits(result, view, ended)) if self._options.soft_bits else result
+
+    def _soft_bits(
+        self, result: FrameResult, view: View, ended: Sequence[confidence.BurstInClip]
+    ) -> FrameSoftBits | None:
+        soft = clip_soft_bits(ended, assemble.snr_db_of_columns(view.snr), self._epoch)
+        if soft is None:
+            return None
+        return replace(soft, source=result.source, frame=result.frame, time_s=result.time_s)
+
+
+def _shape(view: View) -> tuple[int, int]:
+    """Columns and slots of a packet: where these differ, another screen is seen."""
+    return view.acquisition.screen.columns, view.bursts.clock.packet_slots
+
+
+def _bursts_of(closed: Sequence[tracking.ClosedBurst], first: int, view: View) -> list[confidence.BurstInClip]:
+    """Bursts that end in the frame of a view, for `assemble`; `first` is the number of the frame's first burst."""
+    n_strips = view.acquisition.sampler.binned.light.shape[1]
+    return [
+        confidence.BurstInClip(
+            number=burst.number,
+            index=int(burst.number - first),
+            posteriors=burst.posteriors,
+            n_observed=burst.n_observed,
+            frames=burst.frames,
+            confidence_features=None if burst.tracked else _confidence_features(burst, n_strips),
+            against=_against(burst),
+        )
+        for burst in closed
+    ]
+
+
+def _columns_of(
+    view: View, ended: Sequence[confidence.BurstInClip], later: Float32Array | None, min_confidence: float
+) -> tuple[ColumnResult, ...]:
+    """Results of a frame's columns.
+
+    Args:
+        view: the frame.
+        ended: bursts that end in it.
+        later: (C,) confidence of the best packet that the next frame will report; None where it reports none.
+        min_confidence: packets below it are left out.
+    """
+    sure = np.zeros(view.snr.shape[0], np.float32) if later is None else later
+    columns = assemble.clip_results(view.bursts.clock, ended, sure, view.snr, min_confidence)
+    if view.denoised:
+        columns = tuple(replace(c, denoised=c.column in view.denoised) for c in columns)
+    return tuple(assemble.in_stored_rows(c, view.height) for c in columns) if view.context.camera.reversed else columns
+
+
+def _taps(waiting: Waiting, view: View, ended: Sequence[confidence.BurstInClip]) -> dict[str, Any]:
+    """What is written of a frame: as of a photograph, but strips as tracking samples them, and bursts that end here."""
+    found: dict[str, Any] = {"geometry.corners": waiting.result.corners, "clock": view.bursts.clock}
+    if view.light is not None and view.pose is not None:
+        rows = view.pose.rows.astype(np.int64)
+        found |= {"sampling.light": view.light, "sampling.inside": view.pose.map.inside, "sampling.rows": rows}
+    else:
+        found["sampling"] = view.acquisition.profiles
+    numbers: IntArray = np.array([burst.number for burst in ended], np.int64)
+    found |= {"channel.metrics": view.bursts.metrics, "bursts.shown": view.bursts.shown}
+    found |= {"bursts.number": waiting.numbers, "bursts.ended": numbers}
+    return found | {f"detect.{burst.number}": burst.posteriors for burst in ended}
+
+
+def _confidence_features(burst: tracking.ClosedBurst, n_strips: int) -> FloatArray:
+    """(C, 8) what the confidence of packets is made of, all copies and frames together."""
+    slot_margin = detect.slot_margin(burst.metrics[None], burst.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
+    confidence_features = confidence.confidence_features(
+        burst.posteriors, slot_margin, np.zeros(slot_margin.shape[1], bool), n_strips
+    )
+    return np.asarray(confidence_features[0])
+
+
+def _against(burst: tracking.ClosedBurst) -> Float32Array | None:
+    """(C,) log-likelihood against what was decided of the payload slot that says so most; None for photographs."""
+    if not burst.tracked:
+        return None
+    llr = detect.slot_llr(burst.metrics[None])[0, :, PREAMBLE_SLOTS:]
+    decided = np.sign(burst.posteriors.lit[0, :, PREAMBLE_SLOTS:] - 0.5)
+    return np.asarray(np.maximum(-llr * decided, 0).max(axis=1), np.float32)
