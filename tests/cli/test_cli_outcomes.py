@@ -119,7 +119,7 @@ def test_a_received_file_replaces_nothing_of_its_run(
     def decoder(options: Any, *_: Any) -> Decoder:
         return Decoder(options, open_source, receive)
 
-    monkeypatch.setattr("rxcli.runs.batch.standard_decoder", decoder)
+    monkeypatch.setattr("rxcli.cli.decode.standard_decoder", decoder)
     (folder / "old.txt").write_text("of another run")
     before = {name: (folder / name).read_bytes() for name in ("0.png", "0.truth.json")}
     outputs = ("--json", folder / "j.jsonl", "--summary", folder / "s.csv", "--truth", "auto", "--out", folder)
