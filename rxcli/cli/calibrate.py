@@ -7,19 +7,25 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from rxcli.calibrate.frames import gray_of, light_of
+from rxcli.calibrate.gyroflow import load_gyroflow
+from rxcli.calibrate.lens import Board, GrayImage, Rejected, calibrate_lens, find_boards
+from rxcli.calibrate.lensfun import lens_from_database
+from rxcli.calibrate.picture import write_residuals
+from rxcli.calibrate.saving import profile_to_extend, with_lens, with_mode, write_profile
+from rxcli.calibrate.shutter import ShutterCalibration, calibrate_shutter
 from rxcli.cli.common import claim_outputs, force_argument, json_output, options, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    from rxcli.calibrate.lens import GrayImage, Rejected
-    from rxcli.calibrate.shutter import ShutterCalibration
-    from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
-    from rxcli.types import Frame, Metadata
+from rxcli.ingest import KNOWN_SUFFIXES, open_source
+from rxcli.outputs import CAMERA, PICTURE, Output
+from rxcli.profiles import NAME, CameraProfile, LensModel, ReadoutMode, ScreenProfile, load_profile
+from rxcli.resources import user_dir
+from rxcli.types import Frame, Metadata
 
 _FILE = click.Path(dir_okay=False, path_type=Path)
 _PATH = click.Path(path_type=Path)
@@ -49,9 +55,6 @@ class _Results:
     """
 
     def __init__(self, given: dict[str, Any]) -> None:
-        from rxcli.profiles import NAME
-        from rxcli.resources import user_dir
-
         save, name, self._json_path, self._force = (given.pop(key) for key in ("save", "name", "json_path", "force"))
         if name is not None and save is not None:
             raise UsageError("--save and --name both say where the profile goes", "give one of them")
@@ -68,8 +71,6 @@ class _Results:
             screen: name or file of a profile that it reads.
             picture: that it writes.
         """
-        from rxcli.outputs import CAMERA, PICTURE, Output
-
         profile = None if self._target is None else Output("--save", self._target, CAMERA, makes_folder=True)
         drawn = None if picture is None else Output("--picture", picture, PICTURE)
         claim_outputs([json_output(self._json_path, *json_keys), profile, drawn], read, (screen,), self._force)
@@ -89,8 +90,6 @@ class _Results:
             metadata: the camera of a new profile.
             extend: adds the result to a profile.
         """
-        from rxcli.calibrate.saving import profile_to_extend, write_profile
-
         if self._target is not None:
             write_profile(extend(profile_to_extend(self._target, metadata)), self._target)
             lines = [*lines, ("written", str(self._target))]
@@ -111,8 +110,6 @@ def _integers(option: str, text: str, separator: str, example: str) -> tuple[int
 
 def _files(paths: tuple[Path, ...]) -> list[Path]:
     """The files named, and those of known suffix in the folders named."""
-    from rxcli.ingest import KNOWN_SUFFIXES
-
     files: list[Path] = []
     for path in paths:
         inside = sorted(p for p in path.rglob("*") if p.is_file() and p.suffix.lower() in KNOWN_SUFFIXES)
@@ -154,9 +151,6 @@ class _BoardReader:
         self.metadata: Metadata | None = None
 
     def read(self, paths: list[Path]) -> Iterator[tuple[str, GrayImage]]:
-        from rxcli.calibrate.frames import gray_of
-        from rxcli.calibrate.lens import Rejected
-        from rxcli.ingest import open_source
 
         for path in paths:
             try:
@@ -184,10 +178,6 @@ def lens(paths: tuple[Path, ...], board_size: str, every: int, picture: Path | N
 
     Pictures are taken as stored, never rotated. Fill the frame out to its corners and tilt the board both ways.
     """
-    from rxcli.calibrate.lens import Board, calibrate_lens, find_boards
-    from rxcli.calibrate.picture import write_residuals
-    from rxcli.calibrate.saving import with_lens
-
     wanted = _Results(given)
     columns, rows = _integers("--board", board_size, "[xX]", "9x6")
     board, files = Board(columns, rows, **given), _files(paths)
@@ -247,10 +237,6 @@ def shutter(
 
     Let the lamp fill much of the frame, out of focus, with an exposure well below half a period.
     """
-    from rxcli.calibrate.frames import light_of
-    from rxcli.calibrate.saving import with_mode
-    from rxcli.calibrate.shutter import calibrate_shutter
-
     if bool(frequencies) == bool(screen):
         raise UsageError("either --frequency or --screen is needed", "say what the lamp blinks at, as --frequency 1000")
     for value, option, limit in (*((f, "--frequency", 1e7) for f in frequencies), (exposure_s, "--exposure", 1)):
@@ -278,8 +264,6 @@ def shutter(
 
 def _frames(paths: list[Path], n: int) -> list[Frame]:
     """Stills, and up to `n` frames of each clip, five apart, so that each shows the lamp anew; all of one size."""
-    from rxcli.ingest import open_source
-
     frames = [frame for path in paths for frame in islice(open_source(path), 0, 5 * n, 5)]
     sizes = sorted({f"{frame.width}x{frame.height}" for frame in frames})
     if len(sizes) > 1:
@@ -291,15 +275,12 @@ def _frames(paths: list[Path], n: int) -> list[Frame]:
 
 def _measure_screen(frames: list[Frame], screen: str, axis: Any = "rows") -> ShutterCalibration:
     from rxcli.calibrate.slots import calibrate_slots
-    from rxcli.profiles import ScreenProfile, load_profile
 
     return calibrate_slots(frames, load_profile(screen, ScreenProfile), axis)
 
 
 def _mode(result: ShutterCalibration, name: str | None = None) -> ReadoutMode:
     """The readout mode that was measured."""
-    from rxcli.profiles import NAME, ReadoutMode
-
     if result.axis == "columns":
         raise UsageError(
             "the readout runs along the columns: the stored picture was rotated, and profiles hold stored rows",
@@ -351,10 +332,6 @@ def _shutter_report(result: ShutterCalibration) -> tuple[dict[str, Any], list[tu
 @force_argument
 def lensfun(path: Path, **given: Any) -> None:
     """Lens model of the picture PATH from the lensfun database, by camera, lens and focal length (extra [lensfun])."""
-    from rxcli.calibrate.lensfun import lens_from_database
-    from rxcli.calibrate.saving import with_lens
-    from rxcli.ingest import open_source
-
     wanted = _Results(given)
     wanted.claim([path], "camera", "lens", "camera_matrix")
     frame = next(open_source(path))
@@ -382,10 +359,6 @@ def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | Non
     A user typed in the readout of such a profile. It is written only where it is measured on a picture of a known
     screen (--photo and --screen), and then as measured.
     """
-    from rxcli.calibrate.gyroflow import load_gyroflow
-    from rxcli.calibrate.saving import with_lens, with_mode
-    from rxcli.types import Metadata
-
     if (photo is None) != (screen is None):
         raise UsageError("--photo and --screen belong together", "give both, or neither")
     wanted = _Results(given)

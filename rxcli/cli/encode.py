@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import numpy as np
+from numpy.typing import NDArray
 
 from rxcli.cli.common import claim_outputs, force_argument, options
+from rxcli.cli.sending import sending_of
 from rxcli.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from rxcli.link.encoder import Sending
-    from rxcli.profiles import ScreenProfile
+from rxcli.link.encoder import FileSending, Sending, packet_slots_of, visible_bits_of_burst
+from rxcli.outputs import ENCODED, Output
+from rxcli.profiles import ScreenProfile, load_profile
+from rxcli.results.report import plural
 
 _RATES = {"1/1.5": 0, "1/2": 1, "1/3": 2}
 #: Bursts that are computed at a time.
@@ -44,22 +45,20 @@ _USUAL_READOUT = 0.61
 @force_argument
 def encode(path: Path | None, out: Path, **options: Any) -> None:
     """Encode the file PATH, a text or a URI as labels, or slots, for a transmitter."""
-    from rxcli.cli.sending import sending_of
-    from rxcli.profiles import ScreenProfile, load_profile
-
     screen = load_profile(options["screen"], ScreenProfile)
     _check(out, options)
     _claim(path, out, options)
     sending = sending_of(path, options["text"], options["uri"], _RATES[options["mother"]], options["object_id"])
     n_bursts = _n_bursts(options, sending, screen)
-    weights = _weights(options["weights"], n_bursts, screen.columns)
-    for row in weights:
+    plan = _Plan(sending, screen, _weights(options["weights"], n_bursts, screen.columns), n_bursts, out)
+    for row in plan.weights:
         sending.check(row, screen.payload_symbols)
+    write = plan.write_csv if out.suffix == ".csv" else plan.write_slots if options["slots"] else plan.write_labels
     try:
-        _write(sending, screen, weights, n_bursts, out, as_slots=options["slots"])
+        write()
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror or error})", "name another file") from None
-    click.echo(_summary(sending, screen, weights, n_bursts, out), err=True)
+    click.echo(plan.summary(), err=True)
 
 
 def _check(out: Path, options: dict[str, Any]) -> None:
@@ -73,8 +72,6 @@ def _check(out: Path, options: dict[str, Any]) -> None:
 
 def _claim(path: Path | None, out: Path, options: dict[str, Any]) -> None:
     """Refuse outputs that would destroy something."""
-    from rxcli.outputs import ENCODED, Output
-
     found = [Output("--out", out, ENCODED)]
     if options["slots"]:
         found.append(Output("--slots", _readme_of(out), ENCODED))
@@ -98,8 +95,6 @@ def _n_bursts(options: dict[str, Any], sending: Sending, screen: ScreenProfile) 
 
 def _weights(text: str, n_bursts: int, columns: int) -> NDArray[np.int64]:
     """(n_bursts or 1, columns) weights."""
-    import numpy as np
-
     try:
         values = np.asarray(_weight_values(text), np.int64)
         weights = np.broadcast_to(values, (values.shape[0] if values.ndim == 2 else 1, columns))
@@ -126,97 +121,69 @@ def _weight_values(text: str) -> Any:
         raise InputError(f"--weights {text}: cannot be read ({error.strerror})", "name a JSON file") from None
 
 
-def _write(
-    sending: Sending,
-    screen: ScreenProfile,
-    weights: NDArray[np.int64],
-    n_bursts: int,
-    out: Path,
-    *,
-    as_slots: bool,
-) -> None:
-    chunks = _label_chunks(sending, screen, n_bursts)
-    if out.suffix == ".csv":
-        _write_csv(chunks, screen, out)
-    elif as_slots:
-        _write_slots(chunks, screen, weights, n_bursts, out)
-    else:
-        _write_labels(chunks, screen, n_bursts, out)
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """What is sent, and the file that it is written to."""
 
+    sending: Sending
+    screen: ScreenProfile
+    #: (n_bursts or 1, columns) lit slots of ten.
+    weights: NDArray[np.int64]
+    n_bursts: int
+    out: Path
 
-def _label_chunks(sending: Sending, screen: ScreenProfile, n_bursts: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    import numpy as np
+    def _chunks(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """First burst and labels (bursts, symbols, columns) of some bursts at a time."""
+        for first in range(0, self.n_bursts, _CHUNK):
+            bursts = np.arange(first, min(first + _CHUNK, self.n_bursts))
+            yield first, self.sending.labels(bursts, self.screen.columns, self.screen.payload_symbols)
 
-    for first in range(0, n_bursts, _CHUNK):
-        bursts = np.arange(first, min(first + _CHUNK, n_bursts))
-        yield first, sending.labels(bursts, screen.columns, screen.payload_symbols)
+    def write_labels(self) -> None:
+        """Write labels as an array."""
+        shape = (self.n_bursts, self.screen.payload_symbols, self.screen.columns)
+        target = np.lib.format.open_memmap(self.out, "w+", np.uint8, shape)
+        for first, labels in self._chunks():
+            target[first : first + len(labels)] = labels
+        target.flush()
 
+    def write_csv(self) -> None:
+        """Write labels as text, one row a symbol."""
+        with self.out.open("w", encoding="utf-8") as file:
+            file.write("burst,symbol," + ",".join(f"column_{c}" for c in range(self.screen.columns)) + "\n")
+            for first, labels in self._chunks():
+                for burst, symbols in enumerate(labels, first):
+                    for symbol, row in enumerate(symbols):
+                        file.write(f"{burst},{symbol},{','.join(map(str, row))}\n")
 
-def _write_labels(
-    chunks: Iterator[tuple[int, NDArray[np.uint8]]], screen: ScreenProfile, n_bursts: int, out: Path
-) -> None:
-    import numpy as np
-
-    shape = (n_bursts, screen.payload_symbols, screen.columns)
-    target = np.lib.format.open_memmap(out, "w+", np.uint8, shape)
-    for first, labels in chunks:
-        target[first : first + len(labels)] = labels
-    target.flush()
-
-
-def _write_csv(chunks: Iterator[tuple[int, NDArray[np.uint8]]], screen: ScreenProfile, out: Path) -> None:
-    with out.open("w", encoding="utf-8") as file:
-        file.write("burst,symbol," + ",".join(f"column_{c}" for c in range(screen.columns)) + "\n")
-        for first, labels in chunks:
-            for burst, symbols in enumerate(labels, first):
-                for symbol, row in enumerate(symbols):
-                    file.write(f"{burst},{symbol},{','.join(map(str, row))}\n")
-
-
-def _write_slots(
-    chunks: Iterator[tuple[int, NDArray[np.uint8]]],
-    screen: ScreenProfile,
-    weights: NDArray[np.int64],
-    n_bursts: int,
-    out: Path,
-) -> None:
-    import numpy as np
-
-    from rxcli.link.encoder import packet_slots_of
-
-    burst_slots, width = screen.packet_slots * screen.repeats, -(-screen.columns // 8)
-    target = np.lib.format.open_memmap(out, "w+", np.uint8, (n_bursts * burst_slots, width))
-    for first, labels in chunks:
-        mine = weights if len(weights) == 1 else weights[first : first + len(labels)]
-        packets = np.packbits(packet_slots_of(labels, mine).transpose(0, 2, 1), axis=2)
-        repeated = np.tile(packets, (1, screen.repeats, 1)).reshape(-1, width)
-        target[first * burst_slots : first * burst_slots + len(repeated)] = repeated
-    target.flush()
-    _readme_of(out).write_text(
-        f"{out.name}: uint8 ({n_bursts * burst_slots}, {width}); one row a slot at {screen.slot_rate_hz:g} Hz, first "
-        f"sent first; {screen.columns} columns as bits, column 0 (the viewer's leftmost) is the most significant bit "
-        "of the first byte; 1 is lit.\n",
-        encoding="utf-8",
-    )
-
-
-def _summary(
-    sending: Sending,
-    screen: ScreenProfile,
-    weights: NDArray[np.int64],
-    n_bursts: int,
-    out: Path,
-) -> str:
-    from rxcli.link.encoder import FileSending, visible_bits_of_burst
-
-    burst_s = screen.packet_s * screen.repeats
-    many = "s" * (n_bursts > 1)
-    lines = [f"{out}: {sending.summary}; {n_bursts} burst{many} of {screen.name}, {n_bursts * burst_s:.3g} s"]
-    bits = sum(visible_bits_of_burst(row, screen.payload_symbols) for row in weights) / len(weights)
-    if isinstance(sending, FileSending):
-        needed = sending.ready_bits / (bits * 31 / 32) * burst_s / _USUAL_READOUT
-        lines.append(
-            f"a camera that sees all columns for {_USUAL_READOUT:.0%} of the time needs about {needed:.1f} s, and an "
-            f"announcement, which comes every {32 * burst_s:.2g} s; send on until it has come"
+    def write_slots(self) -> None:
+        """Write slots as an array of bits, and beside it a text that says their order."""
+        screen, out = self.screen, self.out
+        burst_slots, width = screen.packet_slots * screen.repeats, -(-screen.columns // 8)
+        target = np.lib.format.open_memmap(out, "w+", np.uint8, (self.n_bursts * burst_slots, width))
+        for first, labels in self._chunks():
+            weights = self.weights if len(self.weights) == 1 else self.weights[first : first + len(labels)]
+            packets = np.packbits(packet_slots_of(labels, weights).transpose(0, 2, 1), axis=2)
+            repeated = np.tile(packets, (1, screen.repeats, 1)).reshape(-1, width)
+            target[first * burst_slots : first * burst_slots + len(repeated)] = repeated
+        target.flush()
+        _readme_of(out).write_text(
+            f"{out.name}: uint8 ({len(target)}, {width}); one row a slot at {screen.slot_rate_hz:g} Hz, first sent "
+            f"first; {screen.columns} columns as bits, column 0 (the viewer's leftmost) is the most significant bit of "
+            "the first byte; 1 is lit.\n",
+            encoding="utf-8",
         )
-    return "\n".join(lines)
+
+    def summary(self) -> str:
+        """What is sent, and how long a camera needs for a file."""
+        screen, weights = self.screen, self.weights
+        burst_s = screen.packet_s * screen.repeats
+        sent = f"{plural(self.n_bursts, 'burst')} of {screen.name}, {self.n_bursts * burst_s:.3g} s"
+        lines = [f"{self.out}: {self.sending.summary}; {sent}"]
+        if isinstance(self.sending, FileSending):
+            bits = sum(visible_bits_of_burst(row, screen.payload_symbols) for row in weights) / len(weights)
+            needed = self.sending.ready_bits / (bits * 31 / 32) * burst_s / _USUAL_READOUT
+            lines.append(
+                f"a camera that sees all columns for {_USUAL_READOUT:.0%} of the time needs about {needed:.1f} s, and "
+                f"an announcement, which comes every {32 * burst_s:.2g} s; send on until it has come"
+            )
+        return "\n".join(lines)

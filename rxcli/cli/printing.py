@@ -6,16 +6,15 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 import click
 
 from rxcli.cli.terminal import for_terminal
-
-if TYPE_CHECKING:
-    from rxcli.results.summary import SourceSummary
-    from rxcli.runs.journal import Lines
-    from rxcli.types import FrameResult
+from rxcli.results.report import format_frame, format_link, plural, table_header, table_rows
+from rxcli.results.summary import SourceSummary, format_clip
+from rxcli.runs.journal import Lines
+from rxcli.types import FrameResult
 
 #: Seconds between two lines of progress where stderr is no terminal.
 _EVERY_S = 10.0
@@ -54,8 +53,6 @@ class Table(Writer):
 
     def write(self, result: FrameResult, last: bool) -> None:
         """Print what came with the frame."""
-        from rxcli.results.report import format_frame, format_link, table_header, table_rows
-
         self._clip |= not last
         for line in format_link(result):
             print_text(line)
@@ -70,8 +67,6 @@ class Table(Writer):
 
     def end(self, summary: SourceSummary) -> None:
         """Print the line of a clip."""
-        from rxcli.results.summary import format_clip
-
         if self._clip:
             print_text(format_clip(summary) + "\n")
 
@@ -112,6 +107,7 @@ class Progress:
     """
 
     def __init__(self, n_total: int, n_done: int, quiet: bool) -> None:
+
         from tqdm import tqdm
 
         self._total, self._done, self._before = n_total, n_done, n_done
@@ -146,7 +142,6 @@ class Progress:
             click.echo(f"vlc-rx: {self.line(now_s - self._start_s)}", err=True)
 
     def _so_far(self) -> str:
-        from rxcli.results.report import plural
 
         frames, packets, came = self._counts
         return f"{plural(frames, 'frame')}, {plural(packets, 'packet')}, {came} texts and files"

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import msgspec
 
 from rxcli.cli.common import (
     claim_outputs,
@@ -17,11 +18,12 @@ from rxcli.cli.common import (
 )
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.cli.kinds import CAMERA, complete_files
+from rxcli.cli.terminal import for_terminal
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
-
-if TYPE_CHECKING:
-    from rxcli.profiles import CameraProfile, ScreenProfile
-    from rxcli.types import Frame
+from rxcli.ingest import open_source
+from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, known_profiles, load_profile, match_camera
+from rxcli.resources import user_dir
+from rxcli.types import Frame
 
 _JSON = options(("--json=FILE|- json_path", click.Path(allow_dash=True), None, "Write JSON."))
 
@@ -40,8 +42,6 @@ def profiles(context: click.Context) -> None:
 def list_profiles(json_path: str | None, force: bool) -> None:
     """List the profiles that go by their names: the user's own and the shipped ones."""
     claim_outputs([json_output(json_path, "screens", "cameras")], force=force)
-    from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles
-    from rxcli.resources import user_dir
 
     screens, cameras = known_profiles(ScreenProfile), known_profiles(CameraProfile)
     if json_path is not None:
@@ -61,7 +61,6 @@ def list_profiles(json_path: str | None, force: bool) -> None:
 
 
 def _say_profile(kind: str, name: str, origin: str, about: str, description: str) -> None:
-    from rxcli.cli.terminal import for_terminal
 
     line = f"{kind}  {name:<16} {origin:<8} {about}" + (f"; {description}" if description else "")
     click.echo(for_terminal(line, sys.stdout))
@@ -78,7 +77,6 @@ def _listed(profile: ScreenProfile | CameraProfile, origin: str, path: Path) -> 
 def show(name: str, json_path: str | None, force: bool) -> None:
     """Show the profile NAME, one that is known or a TOML file."""
     claim_outputs([json_output(json_path, "format", "kind", "name")], profiles=(name,), force=force)
-    from rxcli.profiles import dump_profile, load_profile
 
     profile = load_profile(name)
     if json_path is not None:
@@ -91,8 +89,6 @@ def show(name: str, json_path: str | None, force: bool) -> None:
 @click.argument("names", nargs=-1, metavar="[NAME|FILE]...")
 def validate(names: tuple[str, ...]) -> int:
     """Check profiles: those named, or all that are known. Exit code 2 where one is wrong."""
-    from rxcli.profiles import load_profile
-
     codes = []
     for name in names or _known_names():
         try:
@@ -120,7 +116,6 @@ def validate(names: tuple[str, ...]) -> int:
 def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | None, force: bool) -> int:
     """Say which camera profile each file would get, and why."""
     claim_outputs([json_output(json_path, "source", "camera", "reason")], paths, cameras, force)
-    from rxcli.profiles import CameraProfile, known_profiles, load_profile
 
     known = [load_profile(name, CameraProfile) for name in cameras]
     known = known or [profile for profile, _, _ in known_profiles(CameraProfile)]
@@ -140,20 +135,17 @@ def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | No
 
 
 def _builtins(profile: ScreenProfile | CameraProfile) -> Any:
-    import msgspec
 
     return msgspec.to_builtins(profile)
 
 
 def _known_names() -> list[str]:
-    from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles
 
     screens, cameras = known_profiles(ScreenProfile), known_profiles(CameraProfile)
     return [*(screen.name for screen, _, _ in screens), *(camera.name for camera, _, _ in cameras)]
 
 
 def _first_frame(path: Path) -> Frame:
-    from rxcli.ingest import open_source
 
     if path.is_dir():
         raise UsageError(f"{path} is a folder", "name the files in it")
@@ -164,8 +156,6 @@ def _first_frame(path: Path) -> Frame:
 
 def _choice(frame: Frame, path: Path, cameras: list[CameraProfile]) -> dict[str, Any]:
     """The profile that the file gets and the reason, with what decided it."""
-    from rxcli.profiles import match_camera
-
     told = frame.metadata
     found = match_camera(cameras, told.make, told.model, frame.width, frame.height)
     mode = found.mode_for(frame.width, frame.height) if found else None

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rxcli.errors import InputError, UsageError
-
-if TYPE_CHECKING:
-    from rxcli.link.encoder import FileSending, MessageSending
+from rxcli.link.encoder import FileSending, MessageSending, file_object, message
+from rxcli.link.formats import MAX_MESSAGE_BYTES
 
 #: Name under which a text goes that is too long for a message.
 _TEXT_NAME = "message.txt"
@@ -24,9 +22,6 @@ def sending_of(
         UsageError: nothing, or more than one thing, is given, or it cannot be sent.
         InputError: the file cannot be read.
     """
-    from rxcli.link.encoder import file_object, message
-    from rxcli.link.formats import MAX_MESSAGE_BYTES
-
     given = [value for value in (path, text, uri) if value is not None]
     if len(given) != 1:
         raise UsageError(f"one of PATH, --text and --uri is needed ({len(given)} were given)", "give one of them")
