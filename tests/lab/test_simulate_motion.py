@@ -60,9 +60,9 @@ def test_rows_skew_while_the_camera_moves() -> None:
 def test_steps_of_exposure_and_focus() -> None:
     changes = (Change(2, light=0.5), Change(4, blur_px=3.0))
     take = prepare(replace(scene_in_hand(0.0, 6), changes=changes), 1)
-    light = [take.exposure(n).light_e_per_s / take.scene.light_e_per_s for n in range(6)]
+    light = [take.exposure(n).scene.light_e_per_s / take.scene.light_e_per_s for n in range(6)]
     assert light == [1, 1, 0.5, 0.5, 1, 1]
-    assert [take.exposure(n).blur_px == 3.0 for n in range(6)] == [False] * 4 + [True] * 2
+    assert [take.exposure(n).scene.blur_px == 3.0 for n in range(6)] == [False] * 4 + [True] * 2
 
 
 def test_a_stabilised_clip_stays_where_it_is() -> None:
@@ -72,7 +72,7 @@ def test_a_stabilised_clip_stays_where_it_is() -> None:
     for number in range(0, 8, 2):
         exposure = take.exposure(number)
         x, y = exposure.screen_to_pixels(np.array([[0.5, 0.5]]))[0]
-        columns, rows = np.arange(exposure.sensor.width), np.arange(exposure.sensor.height)
+        columns, rows = np.arange(exposure.scene.sensor.width), np.arange(exposure.scene.sensor.height)
         dot = np.exp(-((columns - x) ** 2 + (rows[:, None] - y) ** 2) / 18.0)
         picture = np.repeat((200 * dot).astype(np.uint8)[..., None], 3, axis=2)
         steady = stabilised(picture, exposure)[..., 0].astype(float)

@@ -114,13 +114,13 @@ class OracleRecorder:
     """Gathers an `Oracle` while bands are read out."""
 
     def __init__(self, exposure: Exposure) -> None:
-        shape = (exposure.sensor.height, exposure.link.screen.columns)
+        shape = (exposure.scene.sensor.height, exposure.link.screen.columns)
         self._exposure = exposure
         self._information, self._noise = np.zeros(shape), np.zeros(shape)
 
     def visit(self, band: Band, electrons: Float32Array) -> None:
         """Take in one band of expected and read electrons."""
-        sensor, pitch = self._exposure.sensor, self._exposure.grid_pitch
+        sensor, pitch = self._exposure.scene.sensor, self._exposure.grid_pitch
         mean = band.mean_e
         variance = mean + np.float32(sensor.read_noise_e**2) + (np.float32(sensor.prnu) * mean) ** 2
         gain2 = _cells(band.picture**2 / variance, pitch)

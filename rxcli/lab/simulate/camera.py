@@ -11,15 +11,19 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
 from rxcli.lab.simulate.optics import CORNERS, View, between_nodes, grid_nodes, project
-from rxcli.lab.simulate.sensor import Sensor, count_electrons, pick_colours, repeat_gains, to_raw
+from rxcli.lab.simulate.sensor import count_electrons, pick_colours, repeat_gains, to_raw
 from rxcli.lab.simulate.shutter import flicker, lit_share
 from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
+
+if TYPE_CHECKING:
+    from rxcli.lab.simulate.scenes import Scene
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -57,20 +61,11 @@ class Room:
 class Exposure:
     """One picture to be taken: scene, clock and light, ready to be computed band by band."""
 
+    #: What is shown and taken, with the light and focus of this picture.
+    scene: Scene
     view: View
     drive: Drive
     link: Link
-    sensor: Sensor
-    room: Room
-    exposure_s: float
-    #: Electrons per second of a green pixel that sees white at the screen's full average light.
-    light_e_per_s: float
-    #: Standard deviation of the focus blur, sensor pixels.
-    blur_px: float
-    #: Depth of the panel's pixel structure, 0..1.
-    lcd_grid: float
-    #: Loss of light in the picture's corners, 0..1.
-    vignetting: float
     #: Slot of the common clock at which row 0 starts to integrate.
     start_slot: float
     #: Slots a second, error included.
@@ -85,8 +80,8 @@ class Exposure:
     @cached_property
     def row_start_slots(self) -> FloatArray:
         """(height,) slot of the common clock at which every row starts to integrate."""
-        rows = np.arange(self.sensor.height, dtype=np.float64)
-        return np.asarray(self.start_slot + rows * (self.sensor.line_delay_s * self.slot_rate_hz))
+        rows = np.arange(self.scene.sensor.height, dtype=np.float64)
+        return np.asarray(self.start_slot + rows * (self.scene.sensor.line_delay_s * self.slot_rate_hz))
 
     def pixels_to_screen(self, pixels: FloatArray) -> FloatArray:
         """Screen places (u, v) of sensor places (..., 2), each row at the middle of its own exposure."""
@@ -113,12 +108,12 @@ class Exposure:
     def _motion_of_rows(self, rows: FloatArray) -> FloatArray:
         """(..., 4) how far the camera has moved when the rows are in the middle of their exposure."""
         assert self.motion is not None
-        return self.motion.at(self.start_s + rows * self.sensor.line_delay_s + self.exposure_s / 2)
+        return self.motion.at(self.start_s + rows * self.scene.sensor.line_delay_s + self.scene.exposure_s / 2)
 
     @property
     def exposure_slots(self) -> float:
         """Exposure in slots."""
-        return self.exposure_s * self.slot_rate_hz
+        return self.scene.exposure_s * self.slot_rate_hz
 
     @cached_property
     def lit(self) -> FloatArray:
@@ -136,9 +131,9 @@ class Exposure:
     @cached_property
     def room_rows(self) -> FloatArray:
         """(height,) electrons of a green pixel that sees white paper in the room's light."""
-        starts = self.start_s + np.arange(self.sensor.height, dtype=np.float64) * self.sensor.line_delay_s
-        wave = flicker(starts, self.exposure_s, self.room.flicker_hz, self.room.flicker_depth, 0.0)
-        return wave * (self.room.light_e_per_s * self.exposure_s)
+        starts = self.start_s + np.arange(self.scene.sensor.height, dtype=np.float64) * self.scene.sensor.line_delay_s
+        wave = flicker(starts, self.scene.exposure_s, self.scene.room.flicker_hz, self.scene.room.flicker_depth, 0.0)
+        return wave * (self.scene.room.light_e_per_s * self.scene.exposure_s)
 
     @cached_property
     def grid_pitch(self) -> int:
@@ -161,7 +156,7 @@ class Exposure:
     def texture_scale(self) -> tuple[int, int]:
         """Texture pixels per panel pixel, down and across: three where its colour stripes can be resolved, else one."""
         magnification = self.view.pixels_per_width / self.drive.grey.shape[1]
-        return (3, 3) if self.lcd_grid > 0 and magnification > 1.2 else (1, 1)
+        return (3, 3) if self.scene.lcd_grid > 0 and magnification > 1.2 else (1, 1)
 
 
 def panel_texture(exposure: Exposure) -> Float32Array:
@@ -172,12 +167,12 @@ def panel_texture(exposure: Exposure) -> Float32Array:
     light = exposure.drive.transmittance
     fine = np.repeat(np.repeat(light, down, axis=0), across, axis=1)
     if across > 1:
-        _draw_pixel_structure(fine, exposure.lcd_grid)
-    sensed = cv2.transform(fine, exposure.sensor.colour_matrix.astype(np.float32))
+        _draw_pixel_structure(fine, exposure.scene.lcd_grid)
+    sensed = cv2.transform(fine, exposure.scene.sensor.colour_matrix.astype(np.float32))
     m = _TEXTURE_MARGIN
     sensed = cv2.copyMakeBorder(sensed, m, m, m, m, cv2.BORDER_CONSTANT, value=0)
     # A sensor pixel is a box of side 1, whose variance 1/12 the Gaussian takes along.
-    sigma_px = np.sqrt(exposure.blur_px**2 + 1 / 12)
+    sigma_px = np.sqrt(exposure.scene.blur_px**2 + 1 / 12)
     per_pixel = (
         light.shape[1] * across / exposure.view.pixels_per_width,
         light.shape[0] * down / exposure.view.pixels_per_height,
@@ -209,7 +204,7 @@ def column_light(exposure: Exposure, x: FloatArray, y: FloatArray) -> Float32Arr
     screen = exposure.link.screen
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
     place = exposure.pixels_to_screen(pixels)
-    gain = exposure.light_e_per_s * exposure.exposure_s * _vignette(exposure, pixels)
+    gain = exposure.scene.light_e_per_s * exposure.scene.exposure_s * _vignette(exposure, pixels)
     along = light_spread(place[..., 1], screen.segment_rows, screen.light_spread) @ exposure.drive.lit_light
     along *= light_spread(place[..., 0], screen.columns, screen.light_spread)
     along *= gain[..., None]
@@ -217,9 +212,9 @@ def column_light(exposure: Exposure, x: FloatArray, y: FloatArray) -> Float32Arr
 
 
 def _vignette(exposure: Exposure, pixels: FloatArray) -> FloatArray:
-    half = np.array([exposure.sensor.width, exposure.sensor.height]) / 2
+    half = np.array([exposure.scene.sensor.width, exposure.scene.sensor.height]) / 2
     radius2 = (((pixels - half) / half) ** 2).sum(axis=-1) / 2
-    return np.asarray(1 - exposure.vignetting * radius2)
+    return np.asarray(1 - exposure.scene.vignetting * radius2)
 
 
 def bands(height: int) -> Iterator[tuple[int, int]]:
@@ -249,10 +244,10 @@ class Band:
 
 def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
     """Expected light of the sensor rows `top` to `bottom`."""
-    height, width = bottom - top, exposure.sensor.width
+    height, width = bottom - top, exposure.scene.sensor.width
     columns, texture_x, texture_y = _texture_places(exposure, top, bottom)
     picture = _look_up(exposure.texture, texture_x, texture_y)
-    picture = pick_colours(picture, exposure.sensor.pattern, top)
+    picture = pick_colours(picture, exposure.scene.sensor.pattern, top)
     backlight = np.empty((height, width), np.float32)
     _enlarge_across(_backlight_nodes(exposure, columns, top, bottom), exposure.grid_pitch, backlight)
     return Band(top, picture, backlight, _room_light(exposure, top, bottom))
@@ -261,14 +256,14 @@ def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
 def _texture_places(exposure: Exposure, top: int, bottom: int) -> tuple[FloatArray, Float32Array, Float32Array]:
     """Nodes across, and for every pixel the place in the texture, interpolated between nodes."""
     pitch = 16
-    x, y = grid_nodes(exposure.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
+    x, y = grid_nodes(exposure.scene.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
     place = exposure.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
     down, across = exposure.texture_scale
     panel_height, panel_width = exposure.drive.grey.shape[:2]
     scale = np.array([panel_width * across, panel_height * down])
     nodes = np.clip(place * scale - 0.5 + _TEXTURE_MARGIN, -1e4, 1e5).astype(np.float32)
-    inner = between_nodes(nodes, pitch, bottom - top, exposure.sensor.width)
-    return grid_nodes(exposure.sensor.width, exposure.grid_pitch), inner[..., 0], inner[..., 1]
+    inner = between_nodes(nodes, pitch, bottom - top, exposure.scene.sensor.width)
+    return grid_nodes(exposure.scene.sensor.width, exposure.grid_pitch), inner[..., 0], inner[..., 1]
 
 
 def _look_up(texture: Float32Array, x: Float32Array, y: Float32Array) -> Float32Array:
@@ -303,8 +298,8 @@ def _enlarge_across(nodes: Float32Array, pitch: int, out: Float32Array) -> None:
 def _room_light(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     """Electrons of the room's light, from walls, bezel, panel and a mirrored lamp."""
     seen = _room_seen(exposure, top, bottom) * exposure.room_rows[top:bottom, None].astype(np.float32)
-    response = np.array(exposure.sensor.response, np.float32)
-    pattern = exposure.sensor.pattern
+    response = np.array(exposure.scene.sensor.response, np.float32)
+    pattern = exposure.scene.sensor.pattern
     if pattern is None:
         return np.asarray(seen[..., None] * response)
     cell = response[pattern][:, np.arange(seen.shape[1]) % pattern.shape[1]]
@@ -314,8 +309,8 @@ def _room_light(exposure: Exposure, top: int, bottom: int) -> Float32Array:
 
 def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     """(rows, width) share of the room's light that every pixel sees, against white paper."""
-    pitch, room, screen = 8, exposure.room, exposure.link.screen
-    x, y = grid_nodes(exposure.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
+    pitch, room, screen = 8, exposure.scene.room, exposure.link.screen
+    x, y = grid_nodes(exposure.scene.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
     place = exposure.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
     # Pixels outside the screen's edge, negative inside; edges are ramps two nodes wide, as the grid can carry them.
     beyond = ((np.abs(place - 0.5) - 0.5) * [1.0, 1 / screen.aspect]).max(axis=-1) * exposure.view.pixels_per_width
@@ -325,7 +320,7 @@ def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     panel = room.panel_reflectance + room.lamp * np.exp(-0.5 * (from_lamp**2).sum(axis=-1) / room.lamp_size**2)
     frame = room.bezel_reflectance + (room.wall_reflectance - room.bezel_reflectance) * on_wall
     seen = (panel + (frame - panel) * off_panel).astype(np.float32)
-    return between_nodes(seen, pitch, bottom - top, exposure.sensor.width)
+    return between_nodes(seen, pitch, bottom - top, exposure.scene.sensor.width)
 
 
 BandVisitor = Callable[[Band, Float32Array], None]
@@ -345,7 +340,7 @@ def take_picture(
     Returns:
         (height, width) uint16 mosaic, or (height, width, 3) where the sensor has no filter array.
     """
-    sensor = exposure.sensor
+    sensor = exposure.scene.sensor
     shape = (sensor.height, sensor.width) if sensor.pattern is not None else (sensor.height, sensor.width, 3)
     raw = np.empty(shape, np.uint16)
     gains = sensor.pixel_gains()

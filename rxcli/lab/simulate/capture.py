@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -98,26 +98,13 @@ class Take:
     def exposure(self, frame: int = 0) -> Exposure:
         """What frame number `frame` is about to see."""
         scene, time_s = self.scene, frame / self.scene.frame_rate_hz
-        sensor = scene.sensor
-        view = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect)
         change = max((c for c in scene.changes if c.frame <= frame), key=lambda c: c.frame, default=Change(0))
-        return Exposure(
-            view=view,
-            drive=self.drive,
-            link=self.link,
-            sensor=sensor,
-            room=scene.room,
-            exposure_s=scene.exposure_s,
-            light_e_per_s=scene.light_e_per_s * change.light,
-            blur_px=scene.blur_px if change.blur_px is None else change.blur_px,
-            lcd_grid=scene.lcd_grid,
-            vignetting=scene.vignetting,
-            start_slot=self.start_slot + time_s * self.slot_rate_hz,
-            slot_rate_hz=self.slot_rate_hz,
-            delays=self.delays,
-            start_s=time_s,
-            motion=self._motion(view),
-        )
+        blur_px = scene.blur_px if change.blur_px is None else change.blur_px
+        scene = replace(scene, light_e_per_s=scene.light_e_per_s * change.light, blur_px=blur_px)
+        sensor, start_slot = scene.sensor, self.start_slot + time_s * self.slot_rate_hz
+        view = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect)
+        clock = start_slot, self.slot_rate_hz, self.delays, time_s
+        return Exposure(scene, view, self.drive, self.link, *clock, motion=self._motion(view))
 
     def _motion(self, view: View) -> HandMotion | None:
         if not self.scene.hand_px:
@@ -153,7 +140,7 @@ def stabilised(picture: NDArray[Any], exposure: Exposure) -> NDArray[Any]:
 
     if exposure.motion is None:
         return picture
-    sensor, matrix = exposure.sensor, exposure.view.camera_matrix
+    sensor, matrix = exposure.scene.sensor, exposure.view.camera_matrix
     middle_s = exposure.start_s + sensor.height / 2 * sensor.line_delay_s
     square = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]) * 0.2
     seen = turned(square, exposure.motion.at(np.full(4, middle_s)))

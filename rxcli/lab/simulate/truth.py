@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 def visible_bursts(exposure: Exposure) -> list[dict[str, Any]]:
     """Bursts on the rows between the screen's highest and lowest corner, with the slots seen of each."""
-    heights = exposure.corners[:, 1]
-    top, bottom = max(int(np.floor(heights.min())), 0), min(int(np.ceil(heights.max())), exposure.sensor.height - 1)
+    heights, sensor = exposure.corners[:, 1], exposure.scene.sensor
+    top, bottom = max(int(np.floor(heights.min())), 0), min(int(np.ceil(heights.max())), sensor.height - 1)
     if top >= bottom:
         return []
-    rate = exposure.sensor.line_delay_s * exposure.slot_rate_hz
+    rate = sensor.line_delay_s * exposure.slot_rate_hz
     begin, end = exposure.start_slot + top * rate, exposure.start_slot + bottom * rate
     length = exposure.link.burst_slots
     bursts = []

@@ -174,7 +174,7 @@ def _word_scores(metrics: FloatArray, sent: NDArray[np.uint8], w: int) -> NDArra
 
 def sent_slots(exposure: Exposure, clock: Clock) -> NDArray[np.uint8]:
     """(C, N) what was sent in every slot of the receiver's grid."""
-    slots_per_row = exposure.sensor.line_delay_s * exposure.slot_rate_hz
+    slots_per_row = exposure.scene.sensor.line_delay_s * exposure.slot_rate_hz
     rows = clock.row0 + clock.delay_slots * clock.rows_per_slot
     centre = exposure.start_slot + rows * slots_per_row + exposure.exposure_slots / 2
     first = np.rint(centre - exposure.delays).astype(np.int64)
