@@ -11,19 +11,16 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
 from rxcli.lab.simulate.optics import CORNERS, View, between_nodes, grid_nodes, project
+from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.sensor import count_electrons, pick_colours, repeat_gains, to_raw
 from rxcli.lab.simulate.shutter import flicker, lit_share
 from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
-
-if TYPE_CHECKING:
-    from rxcli.lab.simulate.scenes import Scene
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -37,24 +34,6 @@ _TEXTURE_MARGIN = 12
 _MOTION_ROUNDS = 4
 #: Breadth of the dark frame around the panel, in screen widths.
 _BEZEL_WIDTHS = 0.035
-
-
-@dataclass(frozen=True)
-class Room:
-    """Light that does not come from the screen, in electrons per second of a green pixel seeing white paper."""
-
-    light_e_per_s: float = 0.0
-    #: Mains flicker: twice 50 or 60 Hz, and its depth 0..1.
-    flicker_hz: float = 100.0
-    flicker_depth: float = 0.3
-    #: Share of the room's light that the dark panel throws back.
-    panel_reflectance: float = 0.12
-    wall_reflectance: float = 0.3
-    bezel_reflectance: float = 0.03
-    #: A lamp mirrored in the panel: its strength against white paper, and its place (u, v) and size (in screen widths).
-    lamp: float = 0.0
-    lamp_place: tuple[float, float] = (0.7, 0.3)
-    lamp_size: float = 0.12
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import UsageError
-from rxcli.lab.simulate.camera import Room
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.pictures import draw_name
@@ -24,6 +23,24 @@ from rxcli.lab.simulate.transmitter import Dimming, LabelSource, Waveform, Weigh
 from rxcli.profiles import ScreenProfile, load_profile
 
 Output = Literal["raw", "developed"]
+
+
+@dataclass(frozen=True)
+class Room:
+    """Light that does not come from the screen, in electrons per second of a green pixel seeing white paper."""
+
+    light_e_per_s: float = 0.0
+    #: Mains flicker: twice 50 or 60 Hz, and its depth 0..1.
+    flicker_hz: float = 100.0
+    flicker_depth: float = 0.3
+    #: Share of the room's light that the dark panel throws back.
+    panel_reflectance: float = 0.12
+    wall_reflectance: float = 0.3
+    bezel_reflectance: float = 0.03
+    #: A lamp mirrored in the panel: its strength against white paper, and its place (u, v) and size (in screen widths).
+    lamp: float = 0.0
+    lamp_place: tuple[float, float] = (0.7, 0.3)
+    lamp_size: float = 0.12
 
 
 @dataclass(frozen=True)
