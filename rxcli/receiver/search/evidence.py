@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from rxcli.numerics import TINY
+from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver import sync
+from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.decode import detect
 from rxcli.receiver.reception import Reception, complete_packets
 from rxcli.receiver.search.settings import SETTINGS
@@ -23,21 +26,32 @@ def log_evidence(reception: Reception) -> float:
     return _COLUMNS / llr.size * (float(np.logaddexp(llr, 0.0).sum()) + SETTINGS.header_weight * headers)
 
 
-def score(reception: Reception, repeats: tuple[int, ...], evidence: float, log_prior: float) -> float:
+def score(reception: Reception, acquisition: Acquisition, evidence: float, log_prior: float) -> float:
     """Tempered evidence plus log prior; a complete packet and similar copies add to it.
 
     Args:
-        reception: initial pass.
-        repeats: copies that a burst may have.
+        reception: initial pass, of all columns or of some.
+        acquisition: what it was of.
         evidence: see `log_evidence`.
         log_prior: of the hypothesis.
     """
+    packets = acquisition.screen.columns / _COLUMNS * distinct_share(reception)
     complete = bool(complete_packets(reception).any())
     similarity = 0.0
     if complete:
         clock = reception.clock
-        possible = sync.possible_bursts(clock, detect.slot_llr(reception.metrics), repeats)
+        possible = sync.possible_bursts(clock, detect.slot_llr(reception.metrics), acquisition.repeats)
         own = [likeness for other, likeness in possible if np.array_equal(other.burst, clock.burst)]
         similarity = (own[0] if own else possible[-1][1]) - possible[0][1]
     gain = SETTINGS.complete_packet * complete + SETTINGS.copies_weight * similarity
-    return SETTINGS.temper * (evidence + gain) + log_prior
+    return SETTINGS.temper * (packets * evidence + gain) + log_prior
+
+
+def distinct_share(reception: Reception) -> float:
+    """Share of the columns' slots that say more than their neighbour's: too narrow columns show one packet often."""
+    slots = reception.posteriors.lit[..., PREAMBLE_SLOTS:].transpose(1, 0, 2).reshape(reception.snr.shape[0], -1)
+    if len(slots) < 2:
+        return 1.0
+    slots = slots - slots.mean(axis=1, keepdims=True)
+    slots /= np.linalg.norm(slots, axis=1, keepdims=True) + TINY
+    return 1 - max(float((slots[1:] * slots[:-1]).sum(axis=1).mean()), 0.0)

@@ -70,8 +70,9 @@ class Proposer:
             cameras = propose_cameras(self.frame, outline.corners, self.options, self.timer, usual)
             try:
                 while True:
-                    yield self._of_camera(next(cameras), -SETTINGS.next_camera * n_proposed)
-                    n_proposed += 1
+                    if hypotheses := self._of_camera(next(cameras), -SETTINGS.next_camera * n_proposed):
+                        yield hypotheses
+                        n_proposed += 1
             except StopIteration as end:
                 failure = failure or end.value
             if n_proposed:
@@ -86,8 +87,8 @@ class Proposer:
         for outline in self.families():
             for alike in _by_clock(_fitting(outline, camera, screens), camera):
                 screen = _nearest(alike, _USUAL_COLUMNS)
-                likely = self._hypothesis(outline, camera, screen, log_prior + outline.log_odds)
-                out += [likely, *_of_other_rows(likely)]
+                likely = self._hypothesis(outline, camera, screen, log_prior + SETTINGS.temper * outline.log_odds)
+                out += [likely, *(_of_other_rows(likely) if outline is self.families()[0] else ())]
         return sorted(out, key=lambda one: -one.log_prior)
 
     def _screens(self) -> tuple[ScreenProfile, ...]:
@@ -135,12 +136,9 @@ class Proposer:
         for other in self.families():
             if other.family != outline.family:
                 fitting = _of_clock(_fitting(other, camera, self.options.screens), screen, camera)
-                nearest = screen if screen in fitting or not fitting else _nearest(fitting, screen.columns)
-                change = other.log_odds - outline.log_odds
-                if other.n_columns != outline.n_columns:
-                    change = max(change, -SETTINGS.other_columns)  # Packets tell how many columns there are.
-                log_prior = hypothesis.log_prior + change
-                yield self._hypothesis(other, camera, nearest, log_prior)
+                if fitting:
+                    log_prior = hypothesis.log_prior + SETTINGS.temper * (other.log_odds - outline.log_odds)
+                    yield self._hypothesis(other, camera, _nearest(fitting, screen.columns), log_prior)
         screens = _fitting(outline, camera, self.options.screens)
         yield from self._of_other_columns(scored, _of_clock(screens, screen, camera))
         if _is_clear(scored.reception):
@@ -223,8 +221,7 @@ def _clock_of(screen: ScreenProfile, camera: Camera) -> tuple[float, int]:
 
 def _fitting(outline: Outline, camera: Camera, screens: Iterable[ScreenProfile]) -> list[ScreenProfile]:
     """Screens with the columns of an outline; of those that an estimated camera cannot tell apart the quickest."""
-    screens = list(screens)
-    fitting = [one for one in screens if one.columns == outline.n_columns] or screens
+    fitting = [one for one in screens if outline.n_columns in (None, one.columns)]
     if camera.hypothesis is None:
         return fitting
     quickest: dict[tuple[int, int], ScreenProfile] = {}

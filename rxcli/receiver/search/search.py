@@ -101,7 +101,8 @@ class _Walk:
             if self._is_hopeless():
                 break
         best = self._best()
-        return best if best is None or best.evidence < SETTINGS.plain else self._settled(best)
+        was_settled = best is not None and SETTINGS.bail < best.evidence < SETTINGS.plain
+        return best if best is None or was_settled else self._settled(best)
 
     def _settled(self, best: Scored) -> Scored:
         """The same with an estimated camera fitted to its slots until that moves the clock no more."""
@@ -192,7 +193,7 @@ class _Walk:
         best, acquisition = self._best(), _acquired(hypothesis)
         if best is not None and hypothesis.screen.columns > SETTINGS.few_columns:
             half = self._measured(hypothesis, acquisition.middle())
-            if half.score < best.score - SETTINGS.reach or half.evidence < SETTINGS.bail:
+            if half.score < best.score - SETTINGS.reach or half.evidence < min(SETTINGS.bail, best.evidence):
                 self._tried.append(Tried(hypothesis, half.evidence, half.score, "half"))
                 return
         scored = self._measured(hypothesis, acquisition)
@@ -211,7 +212,7 @@ class _Walk:
         with self._proposer.timer("detect"):
             reception = initial_pass(acquisition)
             own = evidence.log_evidence(reception)
-            score = evidence.score(reception, acquisition.repeats, own, hypothesis.log_prior)
+            score = evidence.score(reception, acquisition, own, hypothesis.log_prior)
         return Scored(hypothesis, self._proposer.context(hypothesis), acquisition, reception, own, score)
 
 

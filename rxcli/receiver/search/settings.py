@@ -38,11 +38,9 @@ class SearchSettings:
     clear_lead: float = 3.0
     lead_weight: float = 2.0
     min_lead: float = 1.6
-    #: Log prior that each further camera loses, and rows that are not the outline's likeliest; and, at most, another
-    #: number of columns.
+    #: Log prior that each further camera loses, and rows that are not the outline's likeliest.
     next_camera: float = 0.5
     other_rows: float = 0.8
-    other_columns: float = 2.0
     #: Log prior lost per e-fold of the misfit of a number of columns.
     columns_weight: float = 4.0
     #: Evidence by which packets of outlines may differ and still be the same packets.
