@@ -37,11 +37,12 @@ def propose_cameras(
     found = blind.propose(strips, screens, frame.metadata.exposure_s, may_bend=frame.mosaic is None)
     while True:
         with timer("blind"):
-            hypothesis = next(found, None)
-        if hypothesis is None:
+            some = next(found, None)
+        if some is None:
             return Failure("no_signal", blind.why_not(strips))
-        screen = next(one for one in screens if one.packet_slots == hypothesis.packet_slots)
-        yield _camera(hypothesis, screen.slot_rate_hz, frame, DEFAULT_TONE)
+        for hypothesis in sorted(some, key=lambda one: (-one.score, one.rows_per_slot, one.reversed)):
+            screen = next(one for one in screens if one.packet_slots == hypothesis.packet_slots)
+            yield _camera(hypothesis, screen.slot_rate_hz, frame, DEFAULT_TONE)
 
 
 def relabelled_camera(camera: Camera, screen: ScreenProfile, frame: Frame) -> Camera:

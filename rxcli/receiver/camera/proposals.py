@@ -55,8 +55,8 @@ def propose(
     exposure_s: float | None = None,
     *,
     may_bend: bool = True,
-) -> Iterator[CameraHypothesis]:
-    """Cameras that may have taken a picture, best first; a second few, from wider levels, after the first.
+) -> Iterator[list[CameraHypothesis]]:
+    """Cameras that may have taken a picture, the best few; then a second few, from wider levels.
 
     Args:
         strips: of the picture as it is stored.
@@ -88,7 +88,7 @@ def propose(
             if len(distinct) < n_proposed and not any(_same(one, other) for other in proposed + distinct):
                 distinct.append(one)
         proposed += distinct
-        yield from distinct
+        yield distinct
 
 
 def stripe_rows(strips: Strips) -> float:

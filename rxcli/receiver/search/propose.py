@@ -80,16 +80,16 @@ class Proposer:
         return failure
 
     def _of_camera(self, camera: Camera, log_prior: float) -> list[Hypothesis]:
-        """Hypotheses of one camera, the likeliest first: under every outline a screen for every clock."""
-        screens, out = self._screens(), []
+        """Hypotheses of one camera: a screen for every outline and clock; the likeliest outline on other rows too."""
+        screens, families, out = self._screens(), self.families(), []
         if camera.hypothesis is not None:
             screens = tuple(one for one in screens if one.packet_slots == camera.hypothesis.packet_slots)
-        for outline in self.families():
+        for outline in families:
             for alike in _by_clock(_fitting(outline, camera, screens), camera):
                 screen = _nearest(alike, _USUAL_COLUMNS)
                 likely = self._hypothesis(outline, camera, screen, log_prior + SETTINGS.temper * outline.log_odds)
-                out += [likely, *(_of_other_rows(likely) if outline is self.families()[0] else ())]
-        return sorted(out, key=lambda one: -one.log_prior)
+                out += [likely, *(_of_other_rows(likely) if outline is families[0] else ())]
+        return out
 
     def _screens(self) -> tuple[ScreenProfile, ...]:
         return self.known.screens if self.known else self.options.screens

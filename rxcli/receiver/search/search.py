@@ -182,9 +182,10 @@ class _Walk:
             except StopIteration as end:
                 self._cameras, self.failure = None, end.value
                 break
-            self._next_prior = proposed[0].log_prior - SETTINGS.next_camera
+            likeliest = min(proposed, key=lambda one: (-one.log_prior, one.identity))
+            self.nearest = self.nearest or likeliest
+            self._next_prior = likeliest.log_prior - SETTINGS.next_camera
             for hypothesis in proposed:
-                self.nearest = self.nearest or hypothesis
                 self._push(self._fresh, hypothesis.log_prior, hypothesis)
         return (self._fresh, heapq.heappop(self._fresh)) if self._fresh else None
 

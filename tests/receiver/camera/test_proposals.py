@@ -93,7 +93,7 @@ def test_unknown_phones_are_proposed_and_fitted(
     frame, corners, truth = phone(
         screen, rows_per_slot, height, corrected=corrected, upside_down=upside_down, k1=k1, seed=height
     )
-    proposed = list(blind.propose(strips_of(frame, corners), SCREENS))
+    proposed = [one for some in blind.propose(strips_of(frame, corners), SCREENS) for one in some]
     assert 0 < len(proposed) <= sum(SETTINGS.n_proposed)
     right = [one for one in proposed if one.packet_slots == 20 + 10 * truth["payload_symbols"]]
     right = [one for one in right if one.reversed == upside_down]
@@ -113,7 +113,7 @@ def test_unknown_phones_are_proposed_and_fitted(
 @pytest.mark.parametrize("exposure_slots", [0.5, 1.2, 2.3])
 def test_an_exposure_that_no_file_states_is_proposed_by_the_width_of_the_stripes(exposure_slots: float) -> None:
     frame, corners, _ = phone("paper-17k3", 4.3, 960, exposure_slots=exposure_slots)
-    best = next(blind.propose(strips_of(frame, corners), SCREENS))
+    best = next(blind.propose(strips_of(frame, corners), SCREENS))[0]
     assert best.rows_per_slot == pytest.approx(4.3, rel=5e-3)
     assert best.exposure_slots == pytest.approx(exposure_slots, abs=0.35)
 
@@ -218,16 +218,16 @@ def test_pictures_that_cannot_work_are_named(kind: str, words: str) -> None:
 
 
 def test_pictures_without_stripes_propose_nothing() -> None:
-    assert not list(blind.propose(_flat_strips(np.zeros((40, 400))), SCREENS))
+    assert not any(blind.propose(_flat_strips(np.zeros((40, 400))), SCREENS))
     rng = np.random.default_rng(4)
-    assert not list(blind.propose(_flat_strips(rng.normal(0.3, 0.002, (40, 400))), SCREENS))
+    assert not any(blind.propose(_flat_strips(rng.normal(0.3, 0.002, (40, 400))), SCREENS))
 
 
 def test_stripes_of_a_mosaic_are_not_bent() -> None:
     frame, corners, _ = phone("paper-17k3", 3.4, 960, corrected=True, upside_down=False, k1=0.2, seed=3)
     strips = strips_of(frame, corners)
-    assert next(blind.propose(strips, SCREENS)).curvature.any()
-    assert not any(one.curvature.any() for one in blind.propose(strips, SCREENS, may_bend=False))
+    assert next(blind.propose(strips, SCREENS))[0].curvature.any()
+    assert not any(one.curvature.any() for some in blind.propose(strips, SCREENS, may_bend=False) for one in some)
 
 
 def test_no_screens_is_a_mistake_of_the_caller() -> None:

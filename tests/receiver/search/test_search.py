@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -17,11 +19,13 @@ from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, parse_profile, shipped_profiles
+from rxcli.receiver import camera as blind
 from rxcli.receiver import corners as outlines
 from rxcli.receiver.context import Failure, Outline, Timer
 from rxcli.receiver.pipeline import receive_frame
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.search import Found, search
+from rxcli.receiver.search.evidence import distinct_share
 from rxcli.receiver.search.propose import Proposer
 from rxcli.types import Frame, FrameResult
 
@@ -50,27 +54,41 @@ def payloads_of(result: FrameResult) -> list[tuple[int, str, float]]:
     ]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_order_of_screens_cameras_and_outlines_does_not_matter(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("seed", range(2))
+def test_the_order_of_proposals_screens_and_cameras_does_not_matter(
+    seed: int, known: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     trial, rng = trial_of("paper-17k3"), np.random.default_rng(seed)
-    options = replace(trial.options(), screens=(*SHIPPED, *more_screens()))
+    others = tuple(msgspec.structs.replace(trial.camera, name=f"other-{k}", make="Other") for k in range(3))
+    options = ReceiverOptions(screens=(*SHIPPED, *more_screens()), cameras=(*others, *((trial.camera,) * known)))
     possible = [
         Outline(trial.corners + np.array([40.0 * k, 0.0]), log_odds=-0.5 * abs(k), family=family)
         for k in (-1, 0, 1)
         for family in (0, 1)
     ]
-    assert options.corners is not None
-    options = replace(options, corners=None)
+    of_camera, siblings, propose = Proposer._of_camera, Proposer.siblings, blind.propose
 
-    def received(order: np.ndarray[Any, Any]) -> list[tuple[int, str, float]]:
-        shuffled = [possible[k] for k in order]
-        monkeypatch.setattr(outlines, "possible_outlines", lambda *_: shuffled)
-        screens = [options.screens[k] for k in rng.permutation(len(options.screens))]
-        return payloads_of(receive_frame(trial.frame, replace(options, screens=tuple(screens))))
+    def shuffled(some: Iterable[Any]) -> list[Any]:
+        some = list(some)
+        return [some[k] for k in rng.permutation(len(some))]
 
-    as_listed = received(np.arange(6))
-    assert len(as_listed) > 10
-    assert received(rng.permutation(6)) == as_listed
+    def received(order: Callable[[Iterable[Any]], list[Any]]) -> tuple[FrameResult, list[tuple[int, str, float]]]:
+        monkeypatch.setattr(outlines, "possible_outlines", lambda *_: order(possible))
+        monkeypatch.setattr(Proposer, "_of_camera", lambda *given: order(of_camera(*given)))
+        monkeypatch.setattr(Proposer, "siblings", lambda *given: order(siblings(*given)))
+        monkeypatch.setattr(blind, "propose", lambda *given, **named: map(order, propose(*given, **named)))
+        screens, cameras = tuple(order(options.screens)), tuple(order(options.cameras))
+        result = receive_frame(trial.frame, replace(options, screens=screens, cameras=cameras))
+        return result, payloads_of(result)
+
+    as_listed, packets = received(list)
+    assert (as_listed.camera_profile == trial.camera.name) == known
+    assert len(packets) > 10
+    result, again = received(shuffled)
+    assert again == packets
+    assert result.search == as_listed.search
+    assert result.estimated == as_listed.estimated
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -97,6 +115,27 @@ def test_more_screens_in_the_folder_lose_no_packet(screen: str, known: bool) -> 
     same = {found[:2] for found in payloads_of(among)} & {found[:2] for found in payloads_of(alone)}
     # An unknown camera is estimated on other columns, so that a packet in doubt may come out otherwise.
     assert len(same) >= (1.0 if known else 0.9) * len(payloads_of(alone))
+
+
+def test_outlines_are_read_as_screens_of_their_columns() -> None:
+    trial = trial_of("paper-17k3")
+    possible = tuple(
+        Outline(trial.corners, log_odds=-n / 10, family=n, n_columns=n, other_rows=(trial.corners + 3.0,))
+        for n in (20, 24, 50)
+    )
+    options = replace(trial.options(), screens=(*SHIPPED, *more_screens()))
+    proposer = Proposer(trial.frame, options, Timer(), possible)
+    hypotheses = next(proposer.cameras())
+    assert {one.outline.family for one in hypotheses} == {20, 24}
+    assert all(one.screen.columns == one.outline.n_columns for one in hypotheses)
+    assert {one.outline.family for one in hypotheses if one.rows} == {20}
+
+
+@pytest.mark.parametrize(("repeats", "share"), [(1, 1.0), (2, 0.5), (5, 0.2)])
+def test_columns_that_repeat_their_neighbour_say_nothing_more(repeats: int, share: float) -> None:
+    lit = np.random.default_rng(repeats).random((2, 100 // repeats, 260)).repeat(repeats, axis=1) > 0.5
+    reception: Any = SimpleNamespace(posteriors=SimpleNamespace(lit=lit.astype(np.float32)), snr=np.zeros((100, 1)))
+    assert distinct_share(reception) == pytest.approx(share, abs=0.02)
 
 
 def test_every_hypothesis_is_recorded_with_its_fate(tmp_path: Path) -> None:
