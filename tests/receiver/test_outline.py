@@ -97,9 +97,11 @@ def test_what_packets_do_not_tell_stays_in_doubt() -> None:
 
 def test_packets_tell_between_families() -> None:
     candidates = [Outline(CORNERS, log_odds=-2.0), Outline(moved(1), log_odds=-2.0), Outline(moved(3), family=1)]
-    own = numbered(candidates[0], candidates, {0: 500.0, 1: 60.0}.get)
+    own = numbered(candidates[0], candidates, {0: 60.0, 1: 20.0}.get)
     assert own.certainty == pytest.approx(0.5, abs=1e-9)
-    assert numbered(candidates[0], candidates, {0: 500.0, 1: 480.0}.get).certainty < 0.15
+    rival = numbered(candidates[0], candidates, {0: 60.0, 1: 58.0}.get)
+    assert rival.certainty == pytest.approx(0.5 / (1 + np.exp(-2)))
+    assert numbered(candidates[0], candidates, {0: 60.0}.get).certainty == own.certainty
 
 
 @pytest.mark.parametrize(("odds", "offset"), [(3.5, 0), (1.0, None)])

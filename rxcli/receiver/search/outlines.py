@@ -24,24 +24,23 @@ def likeliest_of_family(outlines: Sequence[Outline]) -> Outline:
     return best
 
 
-def numbered(own: Outline, outlines: Sequence[Outline], evidence_of: Callable[[int], float | None]) -> Outline:
+def numbered(own: Outline, outlines: Sequence[Outline], score_of: Callable[[int], float | None]) -> Outline:
     """An outline with the probability that its columns are numbered as the screen's.
 
-    Packets do not depend on which column is the first, so within a family the prior alone decides.
+    Packets do not depend on which column is the first, so within a family the prior alone decides; between families
+    the scores do.
 
     Args:
         own: the outline that was chosen.
         outlines: all that were proposed.
-        evidence_of: the most evidence seen under outlines of a family, None where none was scored.
+        score_of: the best score under outlines of a family, None where none was near enough to be tried.
     """
-    evidence = {one.family: evidence_of(one.family) for one in outlines}
-    known = {family: value for family, value in evidence.items() if value is not None}
-    most = max(known.values(), default=0.0)
-    lost = {family: max(most - value - SETTINGS.same_packets, 0.0) for family, value in known.items()}
-    least = max(lost.values(), default=0.0)
-    odds = np.array([one.log_odds - SETTINGS.temper * lost.get(one.family, least) for one in outlines])
-    mine = own.log_odds - SETTINGS.temper * lost.get(own.family, least)
-    certainty = 1 / float(np.exp(np.sort(odds) - mine).sum())
+    alike = np.array([one.log_odds for one in outlines if one.family == own.family])
+    scores = np.array([score for family in {one.family for one in outlines} if (score := score_of(family)) is not None])
+    mine = score_of(own.family)
+    certainty = 1 / float(np.exp(np.sort(alike) - own.log_odds).sum())
+    if mine is not None:
+        certainty /= float(np.exp(np.sort(scores) - mine).sum())
     return replace(
         own, certainty=certainty, column_offset=own.column_offset if certainty >= SETTINGS.sure_certainty else None
     )

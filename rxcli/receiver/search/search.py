@@ -58,7 +58,7 @@ def search(
     if best is None:
         return replace(why_no_packets(proposer, walk.nearest, walk.failure), tried=walk.record(None))
     chosen = replace(
-        numbered(best.hypothesis.outline, outlines, walk.evidence_of), corners=best.hypothesis.corners, other_rows=()
+        numbered(best.hypothesis.outline, outlines, walk.score_of), corners=best.hypothesis.corners, other_rows=()
     )
     refused = light_without_data(best.context, best.acquisition)
     if refused is not None:
@@ -143,10 +143,10 @@ class _Walk:
         shown = [one for one in self._scored if one.context.camera.hypothesis is None]
         return max(shown, key=lambda one: (one.hypothesis.outline.log_odds, one.score), default=None)
 
-    def evidence_of(self, family: int) -> float | None:
-        """The most evidence under outlines of a family; None where none was scored."""
+    def score_of(self, family: int) -> float | None:
+        """The best score under outlines of a family; None where none was tried."""
         tried = (one for one in self._tried if one.fate != "no clock" and one.hypothesis.outline.family == family)
-        return max((one.evidence for one in tried), default=None)
+        return max((one.score for one in tried), default=None)
 
     def record(self, best: Scored | None, fate: str = "won") -> tuple[Tried, ...]:
         """Every hypothesis that was tried, in order, with the fate of the best one."""

@@ -43,8 +43,6 @@ class SearchSettings:
     other_rows: float = 0.8
     #: Log prior lost per e-fold of the misfit of a number of columns.
     columns_weight: float = 4.0
-    #: Evidence by which packets of outlines may differ and still be the same packets.
-    same_packets: float = 40.0
     #: Bursts are settled where this share of the columns has packets of such confidence, or where the similarity of
     #: copies leads by so much log-likelihood.
     clear_columns: float = 0.9
