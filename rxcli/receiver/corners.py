@@ -131,7 +131,8 @@ def whole_picture(frame: Frame) -> FloatArray:
 
 def turned_pixels(frame: Frame, options: ReceiverOptions, timer: Timer) -> str | None:
     """What to say of a picture whose pixels lie on their side; None where they do not. Of a clip the first is asked."""
-    if frame.index or not find_outlines(turned(timer.planes.plane(frame)), layouts_of(options)):
+    wide = [layout for layout in layouts_of(options) if not layout.is_narrow]
+    if frame.index or not find_outlines(turned(timer.planes.plane(frame)), wide):
         return None
     return (
         "the picture was turned by 90 degrees after it was taken, or taken in portrait: its stripes run downwards; use "

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,12 +71,7 @@ def find_combs(strips: Strips, sigma: float) -> list[Comb]:
     for part in range(n_parts):
         own = strips.blocks(slice(part * n_windows, (part + 1) * n_windows))
         combs = sorted(_combs_of_part(own, sigma, part), key=lambda one: -one.score)
-        if n_parts == 1 and combs:
-            pitches = np.geomspace(SETTINGS.min_pitch, SETTINGS.max_pitch, SETTINGS.n_pitch_bands + 1)
-            bands = [[one for one in combs if low <= one.pitch < high] for low, high in pairwise(pitches.tolist())]
-            found += _distinct([*_distinct(combs, SETTINGS.n_combs), *(band[0] for band in bands if band)])
-        else:
-            found += combs[:1]
+        found += _distinct(combs, SETTINGS.n_combs if n_parts == 1 else 1)
     return sorted(found, key=lambda one: -one.score)
 
 
@@ -97,7 +91,7 @@ def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
     return Grid(numbers, strips.width, strips.height, strips.lens)
 
 
-def _distinct(combs: list[Comb], most: int = 99) -> list[Comb]:
+def _distinct(combs: list[Comb], most: int) -> list[Comb]:
     chosen: list[Comb] = []
     for comb in combs:
         if len(chosen) == most:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import Comb, find_combs, grid_of_comb
@@ -19,7 +20,7 @@ from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import first_columns, light_profile
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.settings import SETTINGS
-from rxcli.receiver.screen.strips import Pixels, Strips, read_strips, shows_narrow_columns
+from rxcli.receiver.screen.strips import Strips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
 from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
@@ -90,7 +91,7 @@ def find_outlines(
     return [] if grid is None else _numbered(strips, grid, wide)
 
 
-def why_useless(pixels: Pixels, black: float, white: float) -> tuple[str, str] | None:
+def why_useless(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white: float) -> tuple[str, str] | None:
     """Why a picture cannot show a screen at all, and what to do; None where it can."""
     height, width = pixels.shape
     if min(height, width) < SETTINGS.min_size_px:
@@ -105,7 +106,7 @@ def why_useless(pixels: Pixels, black: float, white: float) -> tuple[str, str] |
     return None
 
 
-def thinned(pixels: Pixels, black: float, white: float) -> Float32Array:
+def thinned(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white: float) -> Float32Array:
     """Some thousand pixels all over a picture; 0 is black, 1 is white."""
     steps = (slice(None, None, max(1, size // 64)) for size in pixels.shape)
     return np.asarray((pixels[*steps] - np.float32(black)) / (white - black), np.float32)
@@ -151,26 +152,19 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
 def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
     """The grid of narrow columns; None where none stands out.
 
-    Each part of the picture gives a grid, which is followed over the whole width. One that slips by a column on the way
-    ends anywhere, the right ones all end at the same place: the search stops once two do.
+    Each part of the picture gives a grid. The one with the clearest borders is followed over the whole width.
     """
     some = strips.blocks(slice(None, None, 2))
     n = some.n_windows
-    starts = []
+    best: tuple[float, Grid, float] | None = None
     for comb in _possible_combs(strips, sigma):
         part = some.blocks(slice(comb.part * n, (comb.part + 1) * n))
         grid = moved_by_waveforms(part, grid_of_comb(comb, strips), sigma, SETTINGS.narrow_steps)
-        starts.append((with_light(part, grid, sigma), float(part.raw_x.mean())))
-    starts = [start for start in starts if start[0].contrast > SETTINGS.min_part_contrast * start[0].explained]
-    starts.sort(key=lambda start: -start[0].contrast / max(start[0].explained, 1.0))
-    best: Grid | None = None
-    for start, middle in starts[: SETTINGS.n_followed]:
-        grid = with_light(some, _followed(some, start, middle, sigma), sigma)
-        if best is not None and abs(grid.contrast - best.contrast) < SETTINGS.same_contrast * best.contrast:
-            break
-        if best is None or grid.contrast > best.contrast:
-            best = grid
-    return None if best is None else _settled(strips, best, sigma)
+        grid = with_light(part, grid, sigma)
+        clearness = grid.contrast / max(grid.explained, 1.0)
+        if clearness > (best[0] if best else SETTINGS.min_part_contrast):
+            best = clearness, grid, float(part.raw_x.mean())
+    return None if best is None else _settled(strips, _followed(some, *best[1:], sigma), sigma)
 
 
 def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:

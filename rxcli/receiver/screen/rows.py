@@ -26,7 +26,6 @@ _FEW_STRIPS = 0.5
 _LIT_SHARE = 0.18
 #: Missing height, a share, below which the light is taken for the whole screen.
 _WHOLE = 0.07
-_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +108,8 @@ def find_rows(
     row = float((by_block * strips.raw_y.mean(axis=1)).sum() / max(float(by_block.sum()), TINY)) * strips.width
     row += (strips.height - 1) / 2
     parts = _PartLight.of(strips, light, grid, n_columns)
-    for _ in range(_ROUNDS):
-        plane = Plane.through(grid, n_columns, aspect, row)
-        longest = 1 + strips.smear * abs(plane.d)
-        top, bottom = _unsmeared(lit_range(*parts.along(plane), longest), longest)
-        row = float(plane.pixels(np.array([[n_columns / 2, (top + bottom) / 2]]))[0, 1])
+    plane = Plane.through(grid, n_columns, aspect, row)
+    top, bottom = lit_range(*parts.along(plane))
     missing = 1 - (bottom - top)
     if missing < _WHOLE:
         # A little more than the screen costs less than rows that are left out.
@@ -133,12 +129,6 @@ def lit_range(v: FloatArray, light: FloatArray, longest: float = 1.0) -> tuple[f
         start = int((gain[n:] - gain[:-n]).argmax())
         end = start + n
     return float(v[0] + (start - 0.5) * step), float(v[0] + (end - 0.5) * step)
-
-
-def _unsmeared(ends: tuple[float, float], longest: float) -> tuple[float, float]:
-    """The ends of light without what the band pass adds at both, where it seems higher than the screen."""
-    smear = min(max(ends[1] - ends[0] - 1, 0.0), longest - 1)
-    return ends[0] + smear / 2, ends[1] - smear / 2
 
 
 @dataclass(frozen=True, slots=True)

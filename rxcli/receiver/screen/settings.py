@@ -18,20 +18,11 @@ class FinderSettings:
     n_windows: int = 16
     n_fifth_strips: int = 150
     #: Rows that are averaged, as a share of the lag at which strips are half as alike as one row apart, least and most;
-    #: one of so many strips is asked. Of pictures of more rows than the last, about two rows of an average are kept.
+    #: one of so many strips is asked.
     short_share: float = 0.8
     min_short_rows: int = 2
     max_short_rows: int = 6
-    sampled_strips: int = 4
-    many_rows: int = 1500
-    #: Standard deviations at which changes of light are clipped: larger ones are edges of the picture.
-    clip_sd: float = 2.5
-    #: Largest bend of stripes, and how many are tried; distance of the strips that tell it; kept rows of bend that are
-    #: worth straightening.
-    max_bend: float = 0.4
-    n_bends: int = 41
-    bend_strips: int = 3
-    min_bend_rows: float = 0.5
+    sampled_strips: int = 8
     #: Share of the strips, the least coherent, that show the sensor's row noise; share that shows the stripes best.
     dark_share: float = 0.3
     bright_share: float = 0.2
@@ -59,9 +50,8 @@ class FinderSettings:
     min_column_strips: float = 4.0
     #: Distance of the pairs of strips that show the comb of borders best.
     pair_distance: float = 0.72
-    #: Combs that are tried as grids: the best of all, and the best of each band of pitches.
+    #: Combs that are tried as grids.
     n_combs: int = 4
-    n_pitch_bands: int = 6
     #: Heights of combs, standard deviations by chance: below the first there is none, from the second on it is right
     #: if its contrast is this share of what it explains.
     min_comb: float = 6.0
@@ -81,14 +71,10 @@ class FinderSettings:
     contrast_weight: float = 3.0
     #: Steps on every second window, steps of narrow columns at each reach, and last steps on all windows.
     first_steps: int = 3
-    narrow_steps: int = 8
+    narrow_steps: int = 5
     last_steps: int = 2
     #: How much further a grid of narrow columns is followed at a time.
     reach_gain: float = 1.6
-    #: Grids of narrow columns that are followed, at most.
-    n_followed: int = 3
-    #: Relative difference of contrast up to which two grids are one.
-    same_contrast: float = 0.02
     #: Least contrast: as a share of what is explained times the root of the number of rows, and log-likelihood a strip.
     min_contrast: float = 0.95
     min_contrast_per_strip: float = 0.05

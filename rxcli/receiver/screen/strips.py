@@ -19,7 +19,6 @@ from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
-Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 _Real = TypeVar("_Real", np.float32, np.float64)
 
 
@@ -41,11 +40,6 @@ class Strips:
     y: FloatArray
     #: Half the height of a block, picture widths.
     half_height: float
-    #: (W, R) row noise that was projected off the strips of each window of rows.
-    row_noise: Float32Array
-    #: Rows that the band pass averages, and picture rows from one row of `changes` to the next.
-    short_rows: int
-    row_step: int
     #: Independent rows of a block: an incoherent pair of strips has a variance of one over these.
     n_rows: float
     #: Parts of the picture's width: 1, or more where columns are narrow.
@@ -59,11 +53,6 @@ class Strips:
     def n_windows(self) -> int:
         """Windows of rows."""
         return len(self.changes) // self.n_parts
-
-    @property
-    def smear(self) -> float:
-        """Height by which the band pass smears light beyond the ends of the screen, both together, picture widths."""
-        return 8 * self.short_rows / self.width
 
     @property
     def step(self) -> float:
@@ -89,40 +78,32 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
         lens: of the picture, where it is known.
         n_parts: parts of the width with strips of their own.
     """
-    width, height = plane.width, plane.height
+    width, height, n_windows = plane.width, plane.height, SETTINGS.n_windows
     light, x = _light_of_strips(plane, n_parts)
-    n = x.size
     short = _short_rows(light)
-    band, step = _band_passed(light, short)
-    rows = len(band) // SETTINGS.n_windows
-    flat_rows = (np.arange(SETTINGS.n_windows) * rows + (rows - 1) / 2) * step
-    points = np.stack(np.meshgrid(x, flat_rows), axis=-1)
-    quiet, lit, noise = _without_row_noise(_windows(band))
-    rows_off = _row_offsets(quiet, lit, points, (width, height), step, lens)
-    if np.abs(rows_off).max() > SETTINGS.min_bend_rows * step:
-        points[..., 1] += rows_off
-        quiet, lit, noise = _without_row_noise(_windows(_straightened(band, rows_off / step)))
-    level = light[: rows * step * SETTINGS.n_windows].reshape(SETTINGS.n_windows, rows * step, -1).mean(axis=1)
+    band = _band_passed(light, short)
+    rows = band.shape[1] // n_windows
+    middles = (np.arange(n_windows) * rows + (rows - 1) / 2) * short
+    points = np.stack(np.meshgrid(x, middles), axis=-1)
+    quiet, lit = _without_row_noise(_windows(band))
+    level = light[:, : rows * short * n_windows].reshape(x.size, n_windows, rows * short).mean(axis=2).T
 
     def parted(values: NDArray[_Real]) -> NDArray[_Real]:
-        """(W, ..., S) as (parts x W, ..., S / parts)."""
-        split = values.reshape(*values.shape[:-1], n_parts, n // n_parts)
-        return np.moveaxis(split, -2, 0).reshape(-1, *values.shape[1:-1], n // n_parts)
+        """(W, S, ...) as (parts x W, S / parts, ...)."""
+        split = values.reshape(n_windows, n_parts, -1, *values.shape[2:])
+        return np.concatenate(np.moveaxis(split, 1, 0))
 
     raw_x, raw_y = (parted(values) for values in flat_places(points, width, height, None))
     x_flat, y_flat = (parted(values) for values in flat_places(points, width, height, lens))
     return Strips(
-        np.ascontiguousarray(parted(quiet).transpose(0, 2, 1)),
+        parted(quiet),
         parted(lit),
         parted(np.asarray(level, np.float32)),
         raw_x,
         raw_y,
         x_flat,
         y_flat,
-        half_height=rows * step / 2 / width,
-        row_noise=noise,
-        short_rows=short,
-        row_step=step,
+        half_height=rows * short / 2 / width,
         n_rows=_independent_rows(quiet, lit),
         n_parts=n_parts,
         width=width,
@@ -132,16 +113,15 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
 
 
 def _light_of_strips(plane: LightPlane, n_parts: int) -> tuple[Float32Array, FloatArray]:
-    """(R, S) mean values of strips of equal width, as many in every part, and (S,) the middles of the strips."""
+    """(S, R) mean values of strips of equal width, as many in every part, and (S,) the middles of the strips."""
     wanted = SETTINGS.n_strips if n_parts == 1 else n_parts * SETTINGS.n_fifth_strips
     n_cells = len(plane.sums) - 1
     cells = max(1, round(n_cells / wanted))
     n = n_cells // cells // n_parts * n_parts
     first = (n_cells - n * cells) // 2
-    strip_px = cells * plane.cell_px
-    sums = np.diff(plane.sums[first : first + n * cells + 1 : cells], axis=0)
-    x = first * plane.cell_px + (np.arange(n) + 0.5) * strip_px - 0.5
-    return np.ascontiguousarray(sums.T, np.float32) / np.float32(strip_px), np.asarray(x)
+    light = np.diff(plane.sums[first : first + n * cells + 1 : cells], axis=0)
+    light /= np.float32(cells * plane.cell_px)
+    return light, np.asarray((first + (np.arange(n) + 0.5) * cells) * plane.cell_px - 0.5)
 
 
 def flat_places(points: FloatArray, width: int, height: int, lens: Lens | None) -> tuple[FloatArray, FloatArray]:
@@ -166,14 +146,12 @@ def _lit_coherence(strips: Strips, widths: float) -> float:
     return float((strips.coherence(distance) * share).sum() / (np.square(share).sum() + TINY))
 
 
-def _band_passed(light: Float32Array, short: int) -> tuple[Float32Array, int]:
-    """Light averaged over a few rows less its mean over many; every how manieth row is kept."""
+def _band_passed(light: Float32Array, short: int) -> Float32Array:
+    """(S, R / short) light averaged over a few rows less its mean over many."""
     import cv2
 
-    step = (short + 1) // 2 if len(light) >= SETTINGS.many_rows else 1
-    whole = len(light) // step * step
-    band = cv2.blur(light, (1, short)) - cv2.blur(light, (1, 8 * short))
-    return np.asarray(band[:whole:step], np.float32), step
+    whole = light.shape[1] // short * short
+    return np.asarray((cv2.blur(light, (short, 1)) - cv2.blur(light, (8 * short, 1)))[:, :whole:short], np.float32)
 
 
 def _short_rows(light: Float32Array) -> int:
@@ -181,11 +159,10 @@ def _short_rows(light: Float32Array) -> int:
     import cv2
 
     most, every = SETTINGS.max_short_rows, SETTINGS.sampled_strips
-    some = np.stack([light[:, ::every][:, : light.shape[1] // every], light[:, 1::every][:, : light.shape[1] // every]])
-    one, other = (part / (part.mean() + np.float32(TINY)) for part in some)
-    one, other = (part - cv2.blur(part, (1, 8 * most + 1)) for part in (one, other))
+    one, other = (light[first::every][: len(light) // every] for first in (0, 1))
+    one, other = (part - cv2.blur(part, (8 * most + 1, 1)) for part in (one, other))
     n_lags = 2 * most
-    alike = [float(np.vdot(one[: len(one) - lag], other[lag:])) for lag in range(1, n_lags)]
+    alike = [float(np.einsum("sr,sr->", one[:, :-lag], other[:, lag:])) for lag in range(1, n_lags)]
     # White row noise has no part in lags from 1 on.
     below = [lag for lag, value in enumerate(alike, 1) if value < alike[0] / 2]
     half_lag = below[0] if below else n_lags
@@ -193,78 +170,27 @@ def _short_rows(light: Float32Array) -> int:
 
 
 def _windows(band: Float32Array) -> Float32Array:
-    """(W, R, S) windows of rows, each strip clipped and scaled to a mean square of one."""
-    rows = len(band) // SETTINGS.n_windows
-    changes = band[: SETTINGS.n_windows * rows].reshape(SETTINGS.n_windows, rows, -1)
-    rms = np.sqrt(np.einsum("wrs,wrs->ws", changes, changes) / rows)[:, None] + np.float32(TINY)
-    changes = np.clip(changes / rms, -SETTINGS.clip_sd, SETTINGS.clip_sd)
-    changes /= np.sqrt(np.einsum("wrs,wrs->ws", changes, changes) / rows)[:, None] + np.float32(TINY)
-    return np.asarray(changes, np.float32)
+    """(W, S, R) windows of rows, each strip scaled to a mean square of one."""
+    rows = band.shape[1] // SETTINGS.n_windows
+    changes = band[:, : SETTINGS.n_windows * rows].reshape(len(band), SETTINGS.n_windows, rows).swapaxes(0, 1)
+    power = np.einsum("wsr,wsr->ws", changes, changes)
+    return np.asarray(changes / (np.sqrt(power / np.float32(rows)) + np.float32(TINY))[..., None], np.float32)
 
 
-def _row_offsets(
-    changes: Float32Array,
-    lit: Float32Array,
-    points: FloatArray,
-    size: tuple[int, int],
-    step: int,
-    lens: Lens | None,
-) -> FloatArray:
-    """(W, S) rows by which stripes lie below where the middle column of the picture has them.
-
-    A picture that was corrected in the camera has bent stripes: the sensor row of a place is y (1 + bend r^2), offsets
-    from the middle over the width. The lag at which strips some way apart are alike tells the bend.
-    """
-    if lens is not None and not lens.corrected:
-        return np.zeros(points.shape[:2])
-    x, y = flat_places(points, *size, None)
-    if lens is not None:
-        return points[..., 1] - geometry.distort(points, lens)[..., 1]
-    distance, bends = SETTINGS.bend_strips, np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, SETTINGS.n_bends)
-    some = slice(None, -distance, 2), slice(distance, None, 2)
-    mid_x = (x[:, some[0]] + x[:, some[1]]) / 2
-    # Strips on the right see the same instant so many kept rows further up for each unit of bend.
-    slope = -2 * mid_x * y[:, some[0]] * (x[:, some[1]] - x[:, some[0]]) * size[0] / step
-    n_lags = int(np.ceil(np.abs(slope).max() * SETTINGS.max_bend)) + 1
-    here, there = changes[:, n_lags:-n_lags, some[0]], np.ascontiguousarray(changes[:, :, some[1]])
-    n = here.shape[1]
-    alike = np.stack([np.einsum("wrs,wrs->ws", here, there[:, lag : lag + n]) for lag in range(2 * n_lags + 1)])
-    lags = slope[..., None] * bends + n_lags
-    low = np.floor(lags).astype(np.int64)
-    first, second = (np.take_along_axis(alike.transpose(1, 2, 0), low + more, axis=2) for more in (0, 1))
-    score = ((first + (second - first) * (lags - low)) * lit[:, some[0], None]).sum(axis=(0, 1))
-    bend = float(bends[int(score.argmax())])
-    return np.asarray(-bend * y * (x * x + y * y) * size[0])
-
-
-def _straightened(band: Float32Array, rows_off: FloatArray) -> Float32Array:
-    """Band-passed light (rows, S) with each strip read `rows_off` (W, S) kept rows further down."""
-    rows = len(band) // SETTINGS.n_windows
-    centres = np.arange(SETTINGS.n_windows) * rows + (rows - 1) / 2
-    place = np.arange(len(band), dtype=np.float64)
-    between = np.clip((place - centres[0]) / rows, 0, SETTINGS.n_windows - 1 - 1e-9)
-    low = between.astype(np.int64)
-    off = rows_off[low] + (rows_off[low + 1] - rows_off[low]) * (between - low)[:, None]
-    at = np.clip(place[:, None] + off, 0, len(band) - 1.001)
-    low = at.astype(np.int64)
-    first, second = (np.take_along_axis(band, low + more, axis=0) for more in (0, 1))
-    return np.asarray(first + (second - first) * (at - low), np.float32)
-
-
-def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """The changes less what the least coherent strips have in common; (W, S) coherence of neighbours; (W, R) noise."""
-    n_dark = max(int(SETTINGS.dark_share * changes.shape[2]), 1)
+def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """The changes less what the least coherent strips have in common, and (W, S) how coherent neighbours are then."""
+    n_dark = max(int(SETTINGS.dark_share * changes.shape[1]), 1)
     dark = np.argsort(_smooth(_neighbours(changes), 5, 1), axis=1)[:, :n_dark]
-    noise = np.take_along_axis(changes, dark[:, None], axis=2).mean(axis=2)
+    noise = np.take_along_axis(changes, dark[..., None], axis=1).mean(axis=1)
     power = np.einsum("wr,wr->w", noise, noise) + np.float32(TINY)
-    share = np.einsum("wrs,wr->ws", changes, noise) / power[:, None]
-    quiet = changes - noise[..., None] * share[:, None]
-    return quiet, np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1), noise
+    share = np.einsum("wsr,wr->ws", changes, noise) / power[:, None]
+    quiet = changes - share[..., None] * noise[:, None]
+    return quiet, np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1)
 
 
 def _neighbours(changes: Float32Array) -> Float32Array:
     """(W, S) coherence of the strips on either side of each strip."""
-    beside = np.einsum("wrs,wrs->ws", changes[:, :, 2:], changes[:, :, :-2]) / np.float32(changes.shape[1])
+    beside = np.einsum("wsr,wsr->ws", changes[:, 2:], changes[:, :-2]) / np.float32(changes.shape[2])
     return np.pad(beside, ((0, 0), (1, 1)), mode="edge")
 
 
@@ -277,8 +203,9 @@ def _smooth(values: Float32Array, strips: int, windows: int) -> Float32Array:
 def _independent_rows(quiet: Float32Array, lit: Float32Array) -> float:
     """Rows of a window that count as independent, by the autocorrelation of the strips that show the stripes best."""
     bright = np.argsort(-lit.mean(axis=0))[: max(int(SETTINGS.bright_share * lit.shape[1]), 1)]
-    some = np.ascontiguousarray(quiet[::4, :, bright])
-    rows = some.shape[1]
-    products = [float(np.vdot(some[:, lag:], some[:, : rows - lag])) for lag in range(min(SETTINGS.max_lag, rows // 2))]
-    alike = np.array(products) * rows / (rows - np.arange(len(products))) / (products[0] + TINY)
+    some = quiet[::4, bright]
+    rows = some.shape[2]
+    lags = range(min(SETTINGS.max_lag, (rows + 1) // 2))
+    products = np.array([float(np.einsum("wsr,wsr->", some[..., lag:], some[..., : rows - lag])) for lag in lags])
+    alike = products * rows / (rows - np.arange(len(lags))) / (products[0] + TINY)
     return float(rows / (1 + 2 * float(np.square(alike[1:]).sum())))
