@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache
 from typing import Any
@@ -20,7 +21,9 @@ _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]
 
 @lru_cache(maxsize=1)
 def _blas() -> Any:
-    """Controller of the threads of matrix products; None without threadpoolctl, which only costs time."""
+    """Controller of the threads of matrix products; None where there is one anyway, or no threadpoolctl."""
+    if os.environ.get("OPENBLAS_NUM_THREADS") == "1" and "openblas" in str(np.show_config(mode="dicts")):
+        return None
     try:
         from threadpoolctl import ThreadpoolController
     except ImportError:

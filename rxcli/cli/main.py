@@ -6,6 +6,7 @@ same reason.
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import logging
@@ -153,7 +154,9 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _reserve_standard_streams()
     signal.signal(signal.SIGTERM, _terminate)
-    sys.exit(run(sys.argv[1:]))
+    code = run(sys.argv[1:])
+    gc.freeze()  # else the interpreter looks for garbage among all objects once more before it ends
+    sys.exit(code)
 
 
 def _terminate(_number: int, _frame: object) -> None:

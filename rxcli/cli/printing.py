@@ -18,6 +18,8 @@ from rxcli.types import FrameResult
 
 #: Seconds between two lines of progress where stderr is no terminal.
 _EVERY_S = 10.0
+#: Seconds after which a terminal gets a bar.
+_DELAY_S = 0.5
 
 
 class Writer:
@@ -107,26 +109,24 @@ class Progress:
     """
 
     def __init__(self, n_total: int, n_done: int, quiet: bool) -> None:
-
-        from tqdm import tqdm
-
         self._total, self._done, self._before = n_total, n_done, n_done
         self._counts = [0, 0, 0]  # frames, packets, files and texts
         self._start_s = self._said_s = time.monotonic()
         self._prints = not quiet and not _is_terminal(sys.stderr)
-        hidden = quiet or self._prints
-        form: dict[str, Any] = {"unit": "source", "file": sys.stderr, "leave": False, "delay": 0.5}
-        self.bar = tqdm(total=n_total, initial=n_done, disable=hidden, **form)
+        self._hidden = quiet or self._prints
+        #: Made when it has something to show: one photo is decoded before its package is loaded.
+        self.bar: Any = None
 
     def __enter__(self) -> Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.bar.close()
+        if self.bar is not None:
+            self.bar.close()
 
     def hidden(self) -> AbstractContextManager[None]:
         """A context in which others may write to the terminal; no lock is taken where there is no bar."""
-        return nullcontext() if self.bar.disable else self.bar.external_write_mode()
+        return nullcontext() if self.bar is None else self.bar.external_write_mode()
 
     def add(self, result: FrameResult, last: bool) -> None:
         """Count a result, the last of its source or not."""
@@ -134,15 +134,24 @@ class Progress:
         received = sum(packet.is_believable for packet in result.packets)
         self._counts = [sum(pair) for pair in zip(self._counts, (1, received, came), strict=True)]
         self._done += last
-        self.bar.set_postfix_str(self._so_far(), refresh=False)
-        self.bar.update(int(last))
         now_s = time.monotonic()
         if self._prints and now_s - self._said_s >= _EVERY_S:
             self._said_s = now_s
             click.echo(f"vlc-rx: {self.line(now_s - self._start_s)}", err=True)
+        if not self._hidden and self._done < self._total and now_s - self._start_s > _DELAY_S:
+            self._show()
+
+    def _show(self) -> None:
+        """Draw the bar, if it is time."""
+        from tqdm import tqdm
+
+        if self.bar is None:
+            form: dict[str, Any] = {"unit": "source", "file": sys.stderr, "leave": False}
+            self.bar = tqdm(total=self._total, initial=self._done, **form)
+        self.bar.set_postfix_str(self._so_far(), refresh=False)
+        self.bar.update(self._done - self.bar.n)
 
     def _so_far(self) -> str:
-
         frames, packets, came = self._counts
         return f"{plural(frames, 'frame')}, {plural(packets, 'packet')}, {came} texts and files"
 

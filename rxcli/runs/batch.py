@@ -12,7 +12,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from importlib import import_module
+from itertools import chain, islice
 from queue import SimpleQueue
 from threading import Lock, Semaphore, Thread
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -247,10 +248,23 @@ def standard_decoder(
 ) -> Decoder:
     """The decoder that reads files and receives them."""
     from rxcli.ingest import open_source
-    from rxcli.receiver.pipeline import receive
 
     screens = options.screens if options.soft_bits else ()
-    return Decoder(options, open_source, receive, tap, after, screens, options.file_memory_mb)
+    return Decoder(options, open_source, _receive, tap, after, screens, options.file_memory_mb)
+
+
+def _receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
+    """Receive frames; the receiver is loaded while the first one is read."""
+    loading = Thread(target=import_module, args=("rxcli.receiver.pipeline",), daemon=True)
+    loading.start()
+    frames = iter(frames)
+    try:
+        first = list(islice(frames, 1))
+    finally:
+        loading.join()
+    from rxcli.receiver.pipeline import receive
+
+    yield from receive(chain(first, frames), options)
 
 
 def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded]:

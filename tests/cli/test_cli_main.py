@@ -50,6 +50,18 @@ def test_help_loads_nothing_heavy() -> None:
     assert not loaded & {"numpy", "msgspec", "cv2", "av", "rawpy", "onnxruntime", "tqdm", "rxcli.receiver.pipeline"}
 
 
+def test_one_photo_loads_only_what_it_needs() -> None:
+    """Half of its time is the loading of packages."""
+    sample = Path(__file__).resolve().parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
+    code = f"import sys; from rxcli.cli.main import run; run(['decode', {str(sample)!r}]); print(*sys.modules)"
+    environment = ENVIRONMENT | {"OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    loaded = set(done.stdout.splitlines()[-1].split())
+    assert "rxcli.receiver.pipeline" in loaded
+    unused = {"tqdm", "email", "scipy", "av", "rawpy", "skimage", "tifffile", "threadpoolctl"}
+    assert not loaded & unused
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

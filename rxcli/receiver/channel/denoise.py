@@ -13,7 +13,6 @@ the local level or to the noise, and all strips pass through the same layers and
 
 from __future__ import annotations
 
-import hashlib
 import re
 import tomllib
 from collections.abc import Sequence
@@ -345,6 +344,8 @@ def _read_weights(path: Path, card: ModelCard) -> bytes:
         data = path.read_bytes()
     except OSError as error:
         raise ProfileError(f"{path}: cannot be read ({error.strerror})", hint) from None
+    import hashlib  # loads OpenSSL, which pictures without columns in doubt do without
+
     if hashlib.sha256(data).hexdigest() != card.sha256:
         raise ProfileError(f"{path}: does not match the checksum in model.toml; it is cut or of another model", hint)
     return data
