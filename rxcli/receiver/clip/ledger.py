@@ -112,11 +112,6 @@ class Ledger:
         return self._n_held == SETTINGS.frames_held
 
     @property
-    def holds_more(self) -> bool:
-        """Whether further frames are held back, because compression has taken much of the first ones."""
-        return self._n_held == SETTINGS.frames_held_long
-
-    @property
     def time(self) -> tracking.LinkTime | None:
         """The link's time; None before the first frame."""
         return self._link.time if self._link is not None else None
@@ -293,9 +288,8 @@ class Ledger:
         ]
         may_wait = self._n_held < SETTINGS.frames_held_long and not at_last and not self._options.prompt
         if len(held) > 1 and not (may_wait and self._doubt(held) > SETTINGS.too_much_doubt):
-            for _ in range(SETTINGS.looks_again if len(held) <= SETTINGS.frames_held else 1):
-                self._measure_again(held)
-                self._detect_again()
+            self._measure_again(held)
+            self._detect_again()
         self._hold(SETTINGS.frames_held_long if may_wait and self._doubt(held) > SETTINGS.much_doubt else 0)
 
     def _doubt(self, held: list[Waiting]) -> float:

@@ -13,7 +13,7 @@ from rxcli.receiver.channel.known_picture.exposure import expected_light, row_po
 from rxcli.receiver.channel.known_picture.header import dark_light, first_decision, header_contrast, header_dark
 from rxcli.receiver.channel.known_picture.metrics import slot_likelihoods
 from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Look, Placement
-from rxcli.receiver.channel.known_picture.response import Fit, equalized, exposures, fit_response
+from rxcli.receiver.channel.known_picture.response import Fit, exposures, fit_response
 
 __all__ = [
     "ColumnLight",
@@ -22,7 +22,6 @@ __all__ = [
     "Look",
     "Placement",
     "dark_light",
-    "equalized",
     "expected_light",
     "exposures",
     "first_decision",

@@ -47,12 +47,6 @@ class KnownPictureSettings:
     #: What is possible of a response in the middle, at a side, and of its offset; and how much less is likelier.
     response_bounds: tuple[tuple[float, float], ...] = ((0.3, 1.3), (-0.1, 0.35), (-0.2, 0.2))
     response_ridge: float = 1e-4
-    #: Groups of rows by their precision, and the contrast that compression may leave of theirs.
-    gain_groups: int = 8
-    gain_bounds: tuple[float, float] = (0.15, 1.3)
-    gain_ridge: float = 1e-3
-    #: Steps of the table of what lies between the groups.
-    gain_table: int = 256
     #: Largest correction of the clock at a time, slots.
     max_shift_slots: float = 0.4
 
