@@ -13,7 +13,7 @@ from rxcli.outputs import PICTURE, check_replaceable, encode_png, make_parent, w
 from rxcli.profiles import CameraProfile, match_camera
 from rxcli.receiver.screen.geometry import lens_for
 from rxcli.results.cameras import camera_of
-from rxcli.types import Float32Array, Frame, FrameResult, Lens
+from rxcli.types import Float32Array, Frame, FrameResult, Lens, Mosaic
 
 log = logging.getLogger(__name__)
 
@@ -43,56 +43,29 @@ def grey_levels(frame: Frame, step: int = 1) -> NDArray[np.uint8]:
         frame: a picture as stored.
         step: only every so many rows and columns, as if taken from the whole.
     """
-    black, white = (frame.black, frame.white) if frame.mosaic is None else (0.0, 1.0)
-    pixels = frame.pixels[::step, ::step]
-    values = _mosaic_grey(frame, step) if frame.mosaic is not None else pixels.astype(np.float32)
+    mosaic = frame.mosaic
+    black, white = (frame.black, frame.white) if mosaic is None else (0.0, 1.0)
+    pixels = frame.pixels[::step, ::step].astype(np.float32) if mosaic is None else _mosaic_grey(frame.pixels, mosaic)
+    values = pixels if mosaic is None else pixels[::step, ::step]
     share = np.clip((values - black) / (white - black), 0, 1)
-    if frame.linear or frame.mosaic is not None:
+    if frame.linear or mosaic is not None:
         share **= 1 / 2.2
     levels: NDArray[np.uint8] = np.round(255 * share).astype(np.uint8)
     return levels
 
 
-def _mosaic_grey(frame: Frame, step: int) -> NDArray[np.float32]:
+def _mosaic_grey(pixels: NDArray[np.uint8] | NDArray[np.uint16], mosaic: Mosaic) -> Float32Array:
     """The mosaic's colours on one scale, 0 to 1, averaged over three by three pixels to hide its pattern."""
     import cv2
 
-    mosaic = frame.mosaic
-    assert mosaic is not None
     black, gains = np.array(mosaic.black, np.float32), np.array(mosaic.gains, np.float32)
     scale = gains / (np.float32(mosaic.white) - black)
-    if step > 1:
-        return _sparse_grey(frame.pixels, mosaic.pattern, black, scale, step)
     height, width = mosaic.pattern.shape
-    values = np.empty(frame.pixels.shape, np.float32)
+    values = np.empty(pixels.shape, np.float32)
     for y, x in np.ndindex(height, width):
         colour = int(mosaic.pattern[y, x])
-        values[y::height, x::width] = (frame.pixels[y::height, x::width] - black[colour]) * scale[colour]
+        values[y::height, x::width] = (pixels[y::height, x::width] - black[colour]) * scale[colour]
     return np.asarray(cv2.blur(values, (3, 3)), np.float32)
-
-
-def _sparse_grey(
-    pixels: NDArray[np.uint8] | NDArray[np.uint16],
-    pattern: NDArray[np.uint8],
-    black: Float32Array,
-    scale: Float32Array,
-    step: int,
-) -> NDArray[np.float32]:
-    """Every so many rows and columns of the mosaic's grey; the pixels between are not touched."""
-    rows, columns = (_neighbours(size, step) for size in pixels.shape)
-    total = np.zeros((rows.shape[1], columns.shape[1]), np.float32)
-    for y in rows:
-        for x in columns:
-            colour = pattern[np.ix_(y % pattern.shape[0], x % pattern.shape[1])]
-            total += (pixels[np.ix_(y, x)] - black[colour]) * scale[colour]
-    return total / np.float32(9)
-
-
-def _neighbours(size: int, step: int) -> NDArray[np.intp]:
-    """(3, n) the place before, of and after every so many of `size`, mirrored at the ends."""
-    places = np.arange(0, size, step) + np.arange(-1, 2)[:, None]
-    last = max(size - 1, 0)
-    return np.asarray(np.abs(last - np.abs(last - np.abs(places))).clip(0, last), np.intp)
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,8 +22,8 @@ import pytest
 from small_frames import N_COLUMNS, W, write_frame, write_profiles
 
 from rxcli.cli.main import run
-from rxcli.results.undistort import UndistortedWriter, grey_levels
-from rxcli.types import Frame, FrameResult, Mosaic
+from rxcli.results.undistort import UndistortedWriter
+from rxcli.types import Frame, FrameResult
 
 Decode = Callable[..., tuple[int, str, str]]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
@@ -358,19 +358,6 @@ def test_a_frame_without_a_profile_waits_for_the_lens_that_is_estimated(
     straight = border(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
     assert np.ptp(border(bent)) >= 6
     assert np.ptp(straight) <= 1
-
-
-@pytest.mark.parametrize("step", [2, 5, 7])
-def test_sparse_grey_levels_are_those_of_the_whole_picture(step: int) -> None:
-    rng = np.random.default_rng(step)
-    pixels = rng.integers(900, 5000, (61, 83)).astype(np.uint16)
-    pattern = np.array([[1, 0, 1], [2, 1, 0]], np.uint8)
-    for frame in (
-        Frame(pixels, "a", mosaic=Mosaic(pattern, (2.0, 1.0, 1.5), (1000.0,) * 3, 5000.0)),
-        Frame((pixels >> 5).astype(np.uint8), "a"),
-    ):
-        whole, sparse = grey_levels(frame)[::step, ::step].astype(int), grey_levels(frame, step).astype(int)
-        assert np.abs(whole - sparse).max() <= 1  # the order of a sum
 
 
 def test_worker_processes_change_nothing_but_the_time(tmp_path: Path, decode: Decode) -> None:
