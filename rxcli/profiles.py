@@ -169,9 +169,8 @@ def parse_profile(text: str, kind: type[_Profile], source: str) -> _Profile:
         raw = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers of thousands of digits, and brackets in brackets
         reason = f"{error!s:.200}" if str(error) else type(error).__name__
-        raise ProfileError(
-            f"{source}: not valid TOML ({reason})", "correct the file, or name a shipped profile"
-        ) from None
+        hint = "correct the file, or name a shipped profile"
+        raise ProfileError(f"{source}: not valid TOML ({reason})", hint) from None
     return check_profile(raw, kind, source)
 
 
@@ -251,20 +250,18 @@ def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any
         ProfileError: no such profile, unreadable, or malformed.
     """
     name = str(name_or_path)
-    if kind is None:
-        return _load_file(name) if Path(name).is_file() else _load_by_name(name)
-    path = _file_of(name, kind)
+    kinds = tuple(_KINDS) if kind is None else (kind,)
+    path = next((path for path in (_file_of(name, kind) for kind in kinds) if path != Path(name)), Path(name))
     try:
         text = read_limited(path, _MAX_BYTES).decode("utf-8")
     except FileNotFoundError:
-        known = ", ".join(sorted({path.stem for _, path in _profile_files(kind)}))
-        raise ProfileError(
-            f"no profile {name!r} among {_KINDS[kind]}", f"name a TOML file or one of: {known}"
-        ) from None
+        known = ", ".join(sorted({path.stem for kind in kinds for _, path in _profile_files(kind)}))
+        among = " and ".join(_KINDS[kind] for kind in kinds)
+        raise ProfileError(f"no profile {name!r} among {among}", f"name a TOML file or one of: {known}") from None
     except (OSError, UnicodeDecodeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ProfileError(f"{name}: cannot be read as a profile ({reason})", "name a TOML file") from None
-    return parse_profile(text, kind, name)
+    return parse_profile(text, kind or _kind_of(text, name), name)
 
 
 def _file_of(name: str, kind: type[Any]) -> Path:
@@ -275,23 +272,15 @@ def _file_of(name: str, kind: type[Any]) -> Path:
     return next((path for path in by_name if path.is_file()), Path(name))
 
 
-def _load_file(name: str) -> ScreenProfile | CameraProfile:
-    """Load a screen or camera profile by the `kind` in the file; the loader reports other errors."""
+def _kind_of(text: str, name: str) -> type[Any]:
+    """The `kind` in a profile's text; any where it is no TOML, which the parser reports."""
     try:
-        kind = tomllib.loads(read_limited(Path(name), _MAX_BYTES).decode("utf-8")).get("kind")
-    except (OSError, ValueError, RecursionError):
-        return load_profile(name, ScreenProfile)
+        kind = tomllib.loads(text).get("kind")
+    except (ValueError, RecursionError):
+        return ScreenProfile
     if kind not in ("screen", "camera"):
         raise ProfileError(f"{name}: kind must be 'screen' or 'camera' (got {kind!r})", "correct the file")
-    return load_profile(name, CameraProfile) if kind == "camera" else load_profile(name, ScreenProfile)
-
-
-def _load_by_name(name: str) -> ScreenProfile | CameraProfile:
-    for kind in (ScreenProfile, CameraProfile):
-        if _file_of(name, kind) != Path(name):
-            return load_profile(name, kind)
-    names = ", ".join(path.stem for kind in (ScreenProfile, CameraProfile) for _, path in _profile_files(kind))
-    raise ProfileError(f"no profile {name!r}", f"name a TOML file or one of: {names}")
+    return CameraProfile if kind == "camera" else ScreenProfile
 
 
 def _profile_files(kind: type[Any]) -> list[tuple[str, Path]]:

@@ -9,13 +9,7 @@ from typing import Any
 import click
 import msgspec
 
-from rxcli.cli.common import (
-    claim_outputs,
-    force_argument,
-    json_output,
-    options,
-    write_json,
-)
+from rxcli.cli.common import claim_outputs, force_argument, json_output, options, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.cli.kinds import CAMERA, complete_files
 from rxcli.cli.terminal import for_terminal
@@ -45,10 +39,8 @@ def list_profiles(json_path: str | None, force: bool) -> None:
 
     screens, cameras = known_profiles(ScreenProfile), known_profiles(CameraProfile)
     if json_path is not None:
-        write_json(
-            {"screens": [_listed(*known) for known in screens], "cameras": [_listed(*known) for known in cameras]},
-            json_path,
-        )
+        known: dict[str, Any] = {"screens": screens, "cameras": cameras}
+        write_json({kind: [_listed(*one) for one in profiles] for kind, profiles in known.items()}, json_path)
     if json_path == "-":
         return
     for screen, origin, _ in screens:
@@ -67,7 +59,7 @@ def _say_profile(kind: str, name: str, origin: str, about: str, description: str
 
 
 def _listed(profile: ScreenProfile | CameraProfile, origin: str, path: Path) -> Any:
-    return {**_builtins(profile), "origin": origin, "path": str(path)}
+    return {**msgspec.to_builtins(profile), "origin": origin, "path": str(path)}
 
 
 @profiles.command()
@@ -80,7 +72,7 @@ def show(name: str, json_path: str | None, force: bool) -> None:
 
     profile = load_profile(name)
     if json_path is not None:
-        write_json(_builtins(profile), json_path)
+        write_json(msgspec.to_builtins(profile), json_path)
     if json_path != "-":
         click.echo(dump_profile(profile), nl=False)
 
@@ -103,14 +95,7 @@ def validate(names: tuple[str, ...]) -> int:
 
 @profiles.command()
 @click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path), shell_complete=complete_files)
-@options(
-    (
-        "--camera=NAME|FILE cameras",
-        [CAMERA],
-        None,
-        "A camera to choose from. [default: all that are known]",
-    ),
-)
+@options(("--camera=NAME|FILE cameras", [CAMERA], None, "A camera to choose from. [default: all that are known]"))
 @_JSON
 @force_argument
 def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | None, force: bool) -> int:
@@ -134,11 +119,6 @@ def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | No
     return worst(codes)
 
 
-def _builtins(profile: ScreenProfile | CameraProfile) -> Any:
-
-    return msgspec.to_builtins(profile)
-
-
 def _known_names() -> list[str]:
 
     screens, cameras = known_profiles(ScreenProfile), known_profiles(CameraProfile)
@@ -146,12 +126,12 @@ def _known_names() -> list[str]:
 
 
 def _first_frame(path: Path) -> Frame:
-
     if path.is_dir():
         raise UsageError(f"{path} is a folder", "name the files in it")
-    for frame in open_source(path):
-        return frame
-    raise InputError(f"{path}: no frame in it", "check the file")
+    frame = next(open_source(path), None)
+    if frame is None:
+        raise InputError(f"{path}: no frame in it", "check the file")
+    return frame
 
 
 def _choice(frame: Frame, path: Path, cameras: list[CameraProfile]) -> dict[str, Any]:
@@ -161,11 +141,8 @@ def _choice(frame: Frame, path: Path, cameras: list[CameraProfile]) -> dict[str,
     mode = found.mode_for(frame.width, frame.height) if found else None
     return {
         "source": str(path),
-        "make": told.make,
-        "model": told.model,
-        "lens": told.lens,
-        "width": frame.width,
-        "height": frame.height,
+        **{name: getattr(told, name) for name in ("make", "model", "lens")},
+        **{name: getattr(frame, name) for name in ("width", "height")},
         "camera": found.name if found else None,
         "mode": mode.name if mode else None,
         "line_delay_s": mode.line_delay_s if mode else None,

@@ -10,14 +10,7 @@ from typing import Any
 
 from rxcli.errors import capitalised
 from rxcli.results.record import plain
-from rxcli.types import (
-    ColumnResult,
-    FrameResult,
-    Message,
-    ObjectProgress,
-    PacketResult,
-    ReceivedObject,
-)
+from rxcli.types import ColumnResult, FrameResult, Message, ObjectProgress, PacketResult, ReceivedObject
 
 #: Hex digits of a payload that a table of 80 characters shows.
 _SHOWN_DIGITS = 20
