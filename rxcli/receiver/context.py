@@ -11,6 +11,7 @@ from typing import Any, Literal
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.camera import CameraHypothesis
 from rxcli.receiver.plane import PlaneStore
+from rxcli.receiver.screen.strips import Strips
 from rxcli.types import FloatArray, Frame, Lens
 
 DEFAULT_TONE = "srgb"
@@ -38,6 +39,8 @@ class Outline:
     fills: bool = False
     #: Alternative corners with other top and bottom rows, likeliest first.
     other_rows: tuple[FloatArray, ...] = ()
+    #: Strips of the picture on which it was found; None where it was given.
+    strips: Strips | None = field(default=None, repr=False, compare=False)
     #: Estimated lens that bends the columns; used where the camera has no known lens.
     lens: Lens | None = None
     #: Number of narrow columns whose borders were found; None if it was not determined or is small.

@@ -60,6 +60,7 @@ def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> l
             family=one.layout.n_columns,
             fills=one.fills,
             other_rows=one.corners[1:],
+            strips=one.strips,
             lens=one.grid.estimated_lens,
             n_columns=None if alone and not one.layout.is_narrow else one.layout.n_columns,
         )

@@ -55,6 +55,8 @@ class OutlineCandidate:
     #: (4, 2) pixels of the stored picture, clockwise from the screen's top left there: one for every extent of its rows
     #: that may be, likeliest first.
     corners: tuple[FloatArray, ...]
+    #: Strips of the picture on which it was found.
+    strips: Strips
     #: Its columns count from the screen's first.
     grid: Grid
     layout: ColumnLayout
@@ -217,9 +219,8 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> li
             corners = tuple(plane.corners(one, number - best) for one in ends)
             lit = (profile.ends[0] - number, number + layout.n_columns - profile.ends[1])
             unlit = _unlit_sides(corners[0], lit, len(ends) > 1, (strips.width, strips.height))
-            found.append(
-                OutlineCandidate(corners, own.shifted(number - best), layout, log_odds - likeliest, start.fills, unlit)
-            )
+            counted, odds_lost = own.shifted(number - best), log_odds - likeliest
+            found.append(OutlineCandidate(corners, strips, counted, layout, odds_lost, start.fills, unlit))
     return sorted(found, key=lambda one: -one.log_odds)
 
 

@@ -82,6 +82,11 @@ class FinderSettings:
     min_part_contrast: float = 0.05
     #: Focal length of a camera that no profile describes, picture widths.
     focal_widths: float = 0.8
+    #: Gauss-Newton steps by decided slots, and standard deviations of the finder's columns before: shift and widths in
+    #: screen widths, and perspective.
+    pose_steps: int = 2
+    pose_sd: float = 0.0025
+    pose_tilt_sd: float = 0.01
     #: Log-odds against the likeliest first column down to which another is possible.
     min_log_odds: float = -7.0
     #: Log-odds of the next likely one below which the first column is plain, so that the screen's ends help the grid.

@@ -32,6 +32,8 @@ class Mixes:
     #: (B, S, K) shares of the columns in the strips' light, of unit length, and how far off each column's middle lies.
     share: Float32Array
     distance: Float32Array
+    #: (B, 1) column of the grid from which a block's are counted.
+    first: FloatArray
     sigma: float
 
     @classmethod
@@ -49,7 +51,7 @@ class Mixes:
             share *= ((number >= 0) & (number < n_columns))[:, None]
             share *= ((u > -first) & (u < n_columns - first))[..., None]
         share /= np.sqrt(_dot(share, share) + _TINY**2)[..., None]
-        return cls(share, distance, sigma)
+        return cls(share, distance, first, sigma)
 
     def slopes(self) -> Float32Array:
         """(B, S, K) derivatives of the shares by the strips' places, columns."""
@@ -86,11 +88,10 @@ class _Predicted:
     power: Float32Array
 
     @classmethod
-    def of(cls, light: Strips, mixes: Mixes, known: int) -> _Predicted:
-        """What the even strips (0) predict of the odd ones, or these (1) of them."""
-        waves = _waveforms(light, mixes, known)
-        turned, asked = waves.transpose(0, 2, 1), light.changes[:, 1 - known :: 2]
-        return cls(np.matmul(waves, turned), np.matmul(asked, turned), _dot(asked, asked))
+    def of(cls, waves: Float32Array, changes: Float32Array) -> _Predicted:
+        """Waveforms (B, K, R) and the changes of strips (B, S, R) that they predict."""
+        turned = waves.transpose(0, 2, 1)
+        return cls(np.matmul(waves, turned), np.matmul(changes, turned), _dot(changes, changes))
 
 
 def predicted_light(strips: Strips, u: FloatArray, sigma: float) -> Float32Array:
@@ -106,7 +107,10 @@ def explained_light(strips: Strips, u: FloatArray, sigma: float) -> float:
     """Log-likelihood that strips at columns (B, S) gain by what the other strips' waveforms predict of them."""
     total, mixes = 0.0, Mixes.of(u, sigma)
     for known, asked in ((0, 1), (1, 0)):
-        predicted, own = _Predicted.of(strips, mixes, known), mixes.share[:, asked::2]
+        predicted, own = (
+            _Predicted.of(_waveforms(strips, mixes, known), strips.changes[:, asked::2]),
+            mixes.share[:, asked::2],
+        )
         power = _dot(np.matmul(own, predicted.waves), own) * predicted.power + _TINY
         similarity = np.maximum(_dot(own, predicted.strips), 0) ** 2 / power
         total -= 0.5 * strips.n_rows * float(np.log1p(-np.minimum(similarity, np.float32(0.999))).sum())
@@ -156,12 +160,24 @@ def _offsets(strips: Strips, mixes: Mixes) -> tuple[FloatArray, FloatArray]:
     off, precision = np.zeros(strips.x.shape), np.zeros(strips.x.shape)
     slope, n = mixes.slopes(), strips.changes.shape[2]
     for known, asked in ((0, 1), (1, 0)):
-        predicted = _Predicted.of(strips, mixes, known)
+        predicted = _Predicted.of(_waveforms(strips, mixes, known), strips.changes[:, asked::2])
         found = _offsets_of(predicted, mixes.share[:, asked::2], slope[:, asked::2], n)
         off[:, asked::2], precision[:, asked::2] = found
-    precision *= strips.n_rows / n
+    return off, _robust(off, precision * strips.n_rows / n)
+
+
+def offsets_of_known(strips: Strips, mixes: Mixes, waves: Float32Array) -> tuple[FloatArray, FloatArray]:
+    """(B, S) how far each strip lies from where a grid has it by known waveforms (B, K, R), and the precision."""
+    n = strips.changes.shape[2]
+    predicted = _Predicted.of(waves, strips.changes)
+    off, precision = _offsets_of(predicted, mixes.share, mixes.slopes(), n)
+    return np.asarray(off, np.float64), _robust(off, np.asarray(precision * strips.n_rows / n, np.float64))
+
+
+def _robust(off: FloatArray | Float32Array, precision: FloatArray) -> FloatArray:
+    """The precision of offsets, less of those that are large for it."""
     limit = SETTINGS.huber_sd / np.sqrt(np.maximum(precision, 1e-9))
-    return off, precision / np.maximum(np.abs(off) / limit, 1.0)
+    return np.asarray(precision / np.maximum(np.abs(off) / limit, 1.0))
 
 
 def _offsets_of(

@@ -11,8 +11,9 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera import is_linear
-from rxcli.receiver.context import Camera, Failure, FrameContext, Timer
+from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
 from rxcli.receiver.corners import proposed_outlines
+from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.explain import why_no_packets
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
@@ -22,7 +23,7 @@ from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
 from rxcli.receiver.unknown_camera import settle
-from rxcli.types import Frame
+from rxcli.types import FloatArray, Frame
 
 _Cameras = Generator[list[Hypothesis], None, Failure | None]
 #: Less the key, so that a heap gives the likeliest first; ties by identity; a number where that is the same.
@@ -63,7 +64,24 @@ def search(
     refused = light_without_data(best.context, best.acquisition)
     if refused is not None:
         return replace(refused, outline=chosen, context=best.context, tried=walk.record(best, "no data"))
+    chosen = replace(chosen, corners=_corners_by_slots(chosen, best))
     return Found(best, chosen, walk.record(best))
+
+
+def _corners_by_slots(outline: Outline, best: Scored) -> FloatArray:
+    """Corners of an outline where the decided slots have its columns, if there are packets."""
+    context, reception, screen = best.context, best.reception, best.acquisition.screen
+    if outline.strips is None or best.evidence < SETTINGS.plain:
+        return outline.corners
+    return corners_by_slots(
+        outline.strips,
+        outline.corners,
+        screen.light_spread,
+        reception.clock,
+        reception.clock.on_grid(reception.posteriors.lit),
+        context.camera.lens or outline.lens,
+        is_reversed=context.camera.reversed,
+    )
 
 
 class _Walk:

@@ -40,7 +40,7 @@ class SearchSettings:
     min_lead: float = 1.6
     #: Log prior that each further camera loses, and rows that are not the outline's likeliest.
     next_camera: float = 0.5
-    other_rows: float = 0.8
+    other_rows: float = 2.5
     #: Log prior lost per e-fold of the misfit of a number of columns.
     columns_weight: float = 4.0
     #: Bursts are settled where this share of the columns has packets of such confidence, or where the similarity of

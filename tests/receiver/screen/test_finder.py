@@ -17,10 +17,11 @@ from rxcli.receiver.screen.combs import find_combs, likeness
 from rxcli.receiver.screen.find import ColumnLayout, OutlineCandidate, find_outlines, follow_outline, why_useless
 from rxcli.receiver.screen.grid import columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
+from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.screen.rows import lit_range
 from rxcli.receiver.screen.strips import read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
-from rxcli.types import FloatArray, Frame, Lens, LightPlane, Mosaic
+from rxcli.types import Clock, FloatArray, Frame, Lens, LightPlane, Mosaic
 
 WIDE, NARROW = ColumnLayout(), ColumnLayout(100, 0.5)
 HEIGHT, WIDTH = 1600, 1200
@@ -193,6 +194,24 @@ def test_columns_that_a_lens_bends_are_read_through_it() -> None:
     assert np.abs(off).max() < 0.02
     assert np.abs(grid.columns_at(geometry.screen_to_picture(points, corners, None)) - 100 * u).max() > 0.15
     assert replace(grid, lens=lens).estimated_lens is None
+
+
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_decided_slots_move_the_columns_to_their_place(is_turned: bool) -> None:
+    strips = read_strips(plane_of(draw("letterbox")))
+    n_slots = HEIGHT // 10 + 40
+    sent = np.random.default_rng(0).integers(0, 2, (n_slots, 26)).astype(np.float32)
+    clock = Clock(10.0, 0.1, n_slots, -200.5, n_slots, 0, np.zeros(1, np.int64), np.zeros(20), 1.0)
+    along = (CORNERS[1] - CORNERS[0]) / 20
+    before = CORNERS + np.outer([-0.3, 0.2, 0.3, -0.1], along)
+    lit = sent[:, 3:23].T
+    if is_turned:  # Corners and columns are a viewer's, who sees the stored picture upside down.
+        before, lit = before[[2, 3, 0, 1]], lit[::-1]
+    corners = corners_by_slots(strips, before, 0.47, clock, np.ascontiguousarray(lit), None)
+    corners = corners[[2, 3, 0, 1]] if is_turned else corners
+    off = (corners - CORNERS) @ along / (along @ along)
+    assert np.abs(off).max() < 0.1
+    assert np.abs((corners - CORNERS)[:, 1]).max() < 12
 
 
 def test_a_screen_larger_than_the_picture_shows_no_side() -> None:

@@ -1,0 +1,112 @@
+"""The columns of a screen where their decided slots show best.
+
+The finder places columns by waveforms that are estimated from the same strips. Decided slots are waveforms of which the
+light is known, so a regression of every strip on those of its columns gives how far the strip lies from where the grid
+has it, and all strips together move the grid. Sides and corners follow the columns; top and bottom stay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rxcli.receiver.light import SlotLight
+from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_slopes
+from rxcli.receiver.screen.rows import Plane
+from rxcli.receiver.screen.settings import SETTINGS
+from rxcli.receiver.screen.strips import Strips
+from rxcli.receiver.screen.waveforms import Mixes, offsets_of_known
+from rxcli.types import Clock, Float32Array, FloatArray, Lens
+
+#: Changes of light below which waves are dark: products of smaller numbers would take many times the time.
+_MIN_WAVE = 1e-3
+
+
+def corners_by_slots(
+    strips: Strips,
+    corners: FloatArray,
+    sigma: float,
+    clock: Clock,
+    lit: Float32Array,
+    lens: Lens | None,
+    *,
+    is_reversed: bool = False,
+) -> FloatArray:
+    """(4, 2) corners with the columns between them moved to where their slots show.
+
+    Args:
+        strips: of the picture.
+        corners: (4, 2) pixels, right to some tenths of a column.
+        sigma: light spread of the screen, column pitches.
+        clock: on which the slots stand.
+        lit: (C, N) probability that each slot of the clock's grid is lit.
+        lens: of the picture, known or estimated.
+        is_reversed: whether the stored rows run against the readout.
+    """
+    n_columns = len(lit)
+    start = _start(strips, corners, n_columns, lens)
+    column = columns_at(start.numbers, strips.x, strips.y)
+    waves = _waves(strips, column, clock, lit, lens, is_reversed)
+    numbers, sd = start.numbers, SETTINGS.pose_sd * n_columns
+    # The lens is as the columns were read through it.
+    prior = np.array([sd, sd, sd, SETTINGS.pose_tilt_sd, SETTINGS.pose_tilt_sd, 1e-6]) ** -2.0
+    slopes = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
+    for _ in range(SETTINGS.pose_steps):
+        mixes = Mixes.of(columns_at(numbers, strips.x, strips.y), sigma, n_columns)
+        columns = np.clip(mixes.first.astype(np.int64) + np.arange(mixes.share.shape[2]), 0, n_columns - 1)
+        windows = np.tile(np.arange(strips.n_windows), strips.n_parts)
+        off, weight = offsets_of_known(strips, mixes, waves[windows[:, None], columns])
+        normal = (slopes * weight.ravel()) @ slopes.T + np.diag(prior)
+        gradient = slopes @ (weight * off).ravel() - prior * (numbers - start.numbers)
+        numbers = numbers + np.linalg.solve(normal, gradient)
+    return _corners(replace(start, numbers=numbers), corners, n_columns)
+
+
+def _start(strips: Strips, corners: FloatArray, n_columns: int, lens: Lens | None) -> Grid:
+    """The grid between corners, counted as a viewer counts; the radial coefficient is that of an estimated lens."""
+    grid = grid_between(corners, n_columns, (strips.width, strips.height), lens)
+    if strips.lens is not None or lens is None or lens.corrected:
+        return replace(grid, lens=strips.lens)
+    return replace(grid, lens=None, numbers=grid.numbers - np.array([0, 0, 0, 0, 0, lens.dist_coeffs[0]]))
+
+
+def _waves(
+    strips: Strips, column: FloatArray, clock: Clock, lit: Float32Array, lens: Lens | None, is_reversed: bool
+) -> Float32Array:
+    """(W, C, R) changes of the columns' light on the rows of strips at columns (B, S), as the strips have them."""
+    n_windows, n_rows, n_columns = strips.n_windows, strips.changes.shape[2], len(lit)
+    places = np.stack([strips.raw_x, strips.raw_y], axis=-1) * strips.width
+    places += (np.array([strips.width, strips.height]) - 1) / 2
+    sensor_row = (places if lens is None or not lens.corrected else geometry.distort(places, lens))[..., 1]
+    rows = (np.arange(n_windows * n_rows) * strips.row_step).reshape(n_windows, n_rows)
+    windows = np.tile(np.arange(n_windows), strips.n_parts)[:, None]
+    inside = (column > 0) & (column < n_columns)
+    cell = (np.clip(column, 0, n_columns - 1).astype(np.int64) * n_windows + windows)[inside]
+    total = np.bincount(cell, (sensor_row - rows.mean(axis=1)[windows])[inside], n_columns * n_windows)
+    off = total / np.maximum(np.bincount(cell, minlength=total.size), 1)
+    at = (rows + off.reshape(n_columns, n_windows, 1)).reshape(n_columns, -1)
+    at = strips.height - 1 - at if is_reversed else at
+    light, short = SlotLight(lit), strips.short_rows
+    waves = [
+        light.mean_over(
+            # A box of an even number of rows has its middle between two of them.
+            (at - 0.5 * (n % 2 == 0) - clock.row0) / clock.rows_per_slot - clock.delay_slots[:, None],
+            float(np.hypot(clock.exposure_slots, n / clock.rows_per_slot)),
+        )
+        for n in (short, 8 * short)
+    ]
+    changes = (waves[0] - waves[1]).reshape(n_columns, n_windows, n_rows).transpose(1, 0, 2)
+    noise = strips.row_noise / (np.linalg.norm(strips.row_noise, axis=1, keepdims=True) + np.float32(1e-12))
+    # What was projected off the strips is projected off the waves.
+    changes = changes - np.einsum("wcr,wr->wc", changes, noise)[..., None] * noise[:, None]
+    return np.asarray(np.where(np.abs(changes) < _MIN_WAVE, 0, changes), np.float32)
+
+
+def _corners(grid: Grid, before: FloatArray, n_columns: int) -> FloatArray:
+    """Corners on a grid's first and last column, with top and bottom as near as can be to where they were."""
+    x, y = grid.flat(before)
+    below = 1 + grid.numbers[3] * x + grid.numbers[4] * y
+    v0, c, d = np.linalg.lstsq(np.stack([np.ones(4), x, y], axis=1), np.array([0, 0, 1, 1]) * below)[0].tolist()
+    return Plane(grid, n_columns, v0, c, d).corners((0.0, 1.0))
