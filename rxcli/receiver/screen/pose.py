@@ -1,8 +1,8 @@
-"""The columns of a screen where their decided slots show best.
+"""Refine the columns of a screen with decided slots.
 
-The finder places columns by waveforms that are estimated from the same strips. Decided slots are waveforms of which the
-light is known, so a regression of every strip on those of its columns gives how far the strip lies from where the grid
-has it, and all strips together move the grid. Sides and corners follow the columns; top and bottom stay.
+The finder estimates waveforms from the same strips that it places. Decided slots are known waveforms. A regression of
+each strip on the slots of its columns gives the strip's distance from its place in the grid; all strips together move
+the grid. The corners follow the columns; top and bottom stay as near as can be to where they were.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ def corners_by_slots(
     *,
     is_reversed: bool = False,
 ) -> FloatArray:
-    """(4, 2) corners with the columns between them moved to where their slots show.
+    """Move corners to where the decided slots have the columns; returns (4, 2) pixels.
 
     Args:
         strips: of the picture.
-        corners: (4, 2) pixels, right to some tenths of a column.
+        corners: (4, 2) pixels in the viewer's order, right to some tenths of a column.
         sigma: light spread of the screen, column pitches.
-        clock: on which the slots stand.
+        clock: of the slots.
         lit: (C, N) probability that each slot of the clock's grid is lit.
         lens: of the picture, known or estimated.
         is_reversed: whether the stored rows run against the readout.
@@ -65,7 +65,7 @@ def corners_by_slots(
 
 
 def _start(strips: Strips, corners: FloatArray, n_columns: int, lens: Lens | None) -> Grid:
-    """The grid between corners, counted as a viewer counts; the radial coefficient is that of an estimated lens."""
+    """Grid between corners, columns in the viewer's order; an estimated lens becomes its radial coefficient."""
     grid = grid_between(corners, n_columns, (strips.width, strips.height), lens)
     if strips.lens is not None or lens is None or lens.corrected:
         return replace(grid, lens=strips.lens)
@@ -75,37 +75,37 @@ def _start(strips: Strips, corners: FloatArray, n_columns: int, lens: Lens | Non
 def _waves(
     strips: Strips, column: FloatArray, clock: Clock, lit: Float32Array, lens: Lens | None, is_reversed: bool
 ) -> Float32Array:
-    """(W, C, R) changes of the columns' light on the rows of strips at columns (B, S), as the strips have them."""
+    """Band-passed light of the columns (W, C, R) on the rows of strips at columns (B, S)."""
     n_windows, n_rows, n_columns = strips.n_windows, strips.changes.shape[2], len(lit)
     places = np.stack([strips.raw_x, strips.raw_y], axis=-1) * strips.width
     places += (np.array([strips.width, strips.height]) - 1) / 2
     sensor_row = (places if lens is None or not lens.corrected else geometry.distort(places, lens))[..., 1]
-    rows = (np.arange(n_windows * n_rows) * strips.row_step).reshape(n_windows, n_rows)
+    rows = (np.arange(n_windows * n_rows) * strips.short_rows).reshape(n_windows, n_rows)
     windows = np.tile(np.arange(n_windows), strips.n_parts)[:, None]
     inside = (column > 0) & (column < n_columns)
     cell = (np.clip(column, 0, n_columns - 1).astype(np.int64) * n_windows + windows)[inside]
     total = np.bincount(cell, (sensor_row - rows.mean(axis=1)[windows])[inside], n_columns * n_windows)
     off = total / np.maximum(np.bincount(cell, minlength=total.size), 1)
     at = (rows + off.reshape(n_columns, n_windows, 1)).reshape(n_columns, -1)
-    at = strips.height - 1 - at if is_reversed else at
-    light, short = SlotLight(lit), strips.short_rows
-    waves = [
-        light.mean_over(
-            # A box of an even number of rows has its middle between two of them.
-            (at - 0.5 * (n % 2 == 0) - clock.row0) / clock.rows_per_slot - clock.delay_slots[:, None],
-            float(np.hypot(clock.exposure_slots, n / clock.rows_per_slot)),
-        )
-        for n in (short, 8 * short)
-    ]
-    changes = (waves[0] - waves[1]).reshape(n_columns, n_windows, n_rows).transpose(1, 0, 2)
+    light = SlotLight(lit)
+
+    def mean(n: int) -> Float32Array:
+        """Light over `n` rows; an even number of rows is centred half a row higher."""
+        middle = at - 0.5 * (n % 2 == 0)
+        row = strips.height - 1 - middle if is_reversed else middle
+        slot = (row - clock.row0) / clock.rows_per_slot - clock.delay_slots[:, None]
+        return light.mean_over(slot, float(np.hypot(clock.exposure_slots, n / clock.rows_per_slot)))
+
+    changes = mean(strips.short_rows) - mean(8 * strips.short_rows)
+    changes = changes.reshape(n_columns, n_windows, n_rows).transpose(1, 0, 2)
     noise = strips.row_noise / (np.linalg.norm(strips.row_noise, axis=1, keepdims=True) + np.float32(1e-12))
-    # What was projected off the strips is projected off the waves.
+    # The row noise is projected off the strips, so it is projected off the waves.
     changes = changes - np.einsum("wcr,wr->wc", changes, noise)[..., None] * noise[:, None]
     return np.asarray(np.where(np.abs(changes) < _MIN_WAVE, 0, changes), np.float32)
 
 
 def _corners(grid: Grid, before: FloatArray, n_columns: int) -> FloatArray:
-    """Corners on a grid's first and last column, with top and bottom as near as can be to where they were."""
+    """Corners on the outer borders of a grid, with top and bottom nearest to where they were."""
     x, y = grid.flat(before)
     below = 1 + grid.numbers[3] * x + grid.numbers[4] * y
     v0, c, d = np.linalg.lstsq(np.stack([np.ones(4), x, y], axis=1), np.array([0, 0, 1, 1]) * below)[0].tolist()

@@ -40,6 +40,10 @@ class Strips:
     y: FloatArray
     #: Half the height of a block, picture widths.
     half_height: float
+    #: (W, R) row noise that was projected off the strips of each window of rows.
+    row_noise: Float32Array
+    #: Rows that the band pass averages: picture rows from one row of `changes` to the next.
+    short_rows: int
     #: Independent rows of a block: an incoherent pair of strips has a variance of one over these.
     n_rows: float
     #: Parts of the picture's width: 1, or more where columns are narrow.
@@ -85,7 +89,7 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
     rows = band.shape[1] // n_windows
     middles = (np.arange(n_windows) * rows + (rows - 1) / 2) * short
     points = np.stack(np.meshgrid(x, middles), axis=-1)
-    quiet, lit = _without_row_noise(_windows(band))
+    quiet, lit, noise = _without_row_noise(_windows(band))
     level = light[:, : rows * short * n_windows].reshape(x.size, n_windows, rows * short).mean(axis=2).T
 
     def parted(values: NDArray[_Real]) -> NDArray[_Real]:
@@ -104,6 +108,8 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
         x_flat,
         y_flat,
         half_height=rows * short / 2 / width,
+        row_noise=noise,
+        short_rows=short,
         n_rows=_independent_rows(quiet, lit),
         n_parts=n_parts,
         width=width,
@@ -177,15 +183,15 @@ def _windows(band: Float32Array) -> Float32Array:
     return np.asarray(changes / (np.sqrt(power / np.float32(rows)) + np.float32(TINY))[..., None], np.float32)
 
 
-def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """The changes less what the least coherent strips have in common, and (W, S) how coherent neighbours are then."""
+def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """The changes less what the least coherent strips have in common; (W, S) coherence of neighbours; (W, R) noise."""
     n_dark = max(int(SETTINGS.dark_share * changes.shape[1]), 1)
     dark = np.argsort(_smooth(_neighbours(changes), 5, 1), axis=1)[:, :n_dark]
     noise = np.take_along_axis(changes, dark[..., None], axis=1).mean(axis=1)
     power = np.einsum("wr,wr->w", noise, noise) + np.float32(TINY)
     share = np.einsum("wsr,wr->ws", changes, noise) / power[:, None]
     quiet = changes - share[..., None] * noise[:, None]
-    return quiet, np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1)
+    return quiet, np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1), noise
 
 
 def _neighbours(changes: Float32Array) -> Float32Array:
