@@ -1,4 +1,4 @@
-"""From a frame to what was sent: screen, sampling, camera, sync, channel, decode, one room each.
+"""Receiver: from a frame to packets by screen, plane, camera, sync, channel and decode.
 
-`pipeline.receive_frame` reads as the block diagram; `still` and `clip` say in which order the stages are taken.
+`pipeline.receive_frame` reads as the block diagram; `still` and `clip` run the stages of photographs and clips.
 """

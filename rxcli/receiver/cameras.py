@@ -1,4 +1,4 @@
-"""The camera of a frame as a profile describes it. Part of the wiring."""
+"""Camera of a frame from its profile. Part of the wiring."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def has_profile(frame: Frame, options: ReceiverOptions) -> bool:
 
 
 def known_camera(frame: Frame, options: ReceiverOptions) -> Camera | Failure | None:
-    """The camera by its profile; None where no profile fits."""
+    """Camera from the matching profile, or None."""
     meta = frame.metadata
     profile = (
         options.cameras[0]
@@ -39,7 +39,7 @@ def known_camera(frame: Frame, options: ReceiverOptions) -> Camera | Failure | N
 
 
 def known_lens(frame: Frame, options: ReceiverOptions) -> Lens | None:
-    """The lens by the camera's profile, or None."""
+    """Lens from the matching camera profile, or None."""
     known = known_camera(frame, options)
     return known.lens if isinstance(known, Camera) else None
 

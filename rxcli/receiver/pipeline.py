@@ -1,7 +1,7 @@
-"""The wiring of the receiver: `receive_frame` reads as the block diagram.
+"""Wiring of the receiver: `receive_frame` reads as the block diagram.
 
-`search` finds the screen, its camera and its clock, `still` turns light model and detection, and `clip` carries over
-from frame to frame what is known.
+`search` finds the screen, its camera and its clock, `still` alternates light model and detection, and `clip` carries
+knowledge from frame to frame.
 """
 
 from __future__ import annotations
@@ -31,32 +31,32 @@ __all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "failed", "receive", "receive_
 
 
 _COUNTED_FROM_LEFT = (
-    "no side of the screen is in view: columns are counted from the left of what is seen; take one side into view to "
+    "no side of the screen is in view: columns are counted from the leftmost visible one; take one side into view to "
     "have the screen's numbers"
 )
 
 
 def receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
-    """Receive the frames of one source, in order; one result a frame, in order.
+    """Receive the frames of one source; yields one result per frame, in order.
 
-    A clip's result may come some frames later than the frame, because a packet stands in the last frame that shows it.
+    Results of a clip are delayed by some frames, because a packet is reported in the last frame that shows it.
     """
     options = _in_total_order(options)
     with closing(_iterator(frames)) as source:
-        first = next(source, None)
-        if first is None:
+        frame_0 = next(source, None)
+        if frame_0 is None:
             return
         try:
-            second = next(source, None)
+            frame_1 = next(source, None)
         except Exception:
-            yield receive_frame(first, options)
+            yield receive_frame(frame_0, options)
             raise
-        if second is None:
-            yield receive_frame(first, options)
+        if frame_1 is None:
+            yield receive_frame(frame_0, options)
             return
         from rxcli.receiver.clip import receive_clip
 
-        for result in receive_clip(chain((first, second), source), options):
+        for result in receive_clip(chain((frame_0, frame_1), source), options):
             yield result.with_columns_mirrored() if options.mirrored else result
 
 
@@ -66,9 +66,9 @@ def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
 
 
 def _in_total_order(options: ReceiverOptions) -> ReceiverOptions:
-    """The same with profiles in an order of their own, so that a result does not depend on how they were listed."""
-    screens = sorted(options.screens, key=lambda one: (one.columns, -one.slot_rate_hz, one.packet_slots, one.name))
-    cameras = options.cameras if options.force_camera else tuple(sorted(options.cameras, key=lambda one: one.name))
+    """Sort the profiles, so that a result does not depend on their order."""
+    screens = sorted(options.screens, key=lambda s: (s.columns, -s.slot_rate_hz, s.packet_slots, s.name))
+    cameras = options.cameras if options.force_camera else tuple(sorted(options.cameras, key=lambda c: c.name))
     return replace(options, screens=tuple(screens), cameras=cameras)
 
 
@@ -84,7 +84,7 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
 
 
 def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str | None:
-    """Why nothing was received, and where a single screen was tried, that it may be the wrong one."""
+    """Message of a failure; if only one screen was tried, it names that screen."""
     if result.status != "no_signal" or result.message is None or len(screens) != 1:
         return result.message
     return f"{result.message}; only the screen {screens[0].name} was tried (--screen auto tries all)"
@@ -97,11 +97,11 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
     if isinstance(found, Failure):
         return failed(result, found)
     outline, context, acquisition = found.outline, found.best.context, found.best.acquisition
-    # Channel and decode, in turn: slot metrics to symbols, and what they say of the picture.
+    # Channel and decode, in turn: metrics of slots to symbols, and symbols to the picture.
     with timer("detect"):
         reception = decode_photograph(acquisition, options.skip, found.best.reception)
     camera, _ = settle(context, acquisition, reception)
-    tried = tuple(one.step for one in found.tried)
+    tried = tuple(tried.step for tried in found.tried)
     result = replace(result, **outline.result_fields, **camera.result_fields, search=tried)
     with timer("detect"):
         no_header = headerless(reception)
@@ -140,7 +140,7 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
 
 
 def _taps(corners: FloatArray, acquisition: Acquisition, reception: Reception) -> dict[str, Any]:
-    """The arrays at the boundaries of the stages, by stage."""
+    """Arrays at the stage boundaries, by stage."""
     return {
         "geometry.corners": corners,
         "sampling": acquisition.profiles,
@@ -152,14 +152,14 @@ def _taps(corners: FloatArray, acquisition: Acquisition, reception: Reception) -
 
 
 def failed(result: FrameResult, failure: Failure) -> FrameResult:
-    """A result of which nothing more comes, with the reason."""
-    # An estimate that shows no packets says nothing of the camera.
+    """Result of a failed reception with its reason."""
+    # An estimated camera without packets is not reliable.
     camera = failure.context.camera if failure.context and failure.context.camera.hypothesis is None else None
     facts = {**(failure.outline.result_fields if failure.outline else {}), **(camera.result_fields if camera else {})}
     result = replace(result, **facts)
     return replace(
         result,
-        search=tuple(one.step for one in failure.tried),
+        search=tuple(tried.step for tried in failure.tried),
         status=failure.status,
         message=failure.message,
         skipped={"no_screen": 1} if failure.status == "no_screen" else {},

@@ -1,4 +1,4 @@
-"""Cameras that no profile describes: proposed from the picture, and fitted to decoded slots. Part of the wiring."""
+"""Cameras without a profile: proposed from the picture and fitted to decoded slots. Part of the wiring."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from rxcli.types import FloatArray, Frame, RowProfiles
 def propose_cameras(
     frame: Frame, corners: FloatArray, options: ReceiverOptions, timer: Timer, n_columns: int
 ) -> Generator[Camera, None, Failure]:
-    """Cameras that may have taken a frame, likeliest first; at the end, why there are no others.
+    """Propose cameras of a frame, likeliest first; returns the reason if there are no others.
 
     Args:
         frame: the picture.
         corners: (4, 2) of the screen.
         options: screens.
-        timer: time is counted there as cameras are asked for.
-        n_columns: columns of the screen that are read.
+        timer: counts the time of each proposal.
+        n_columns: number of columns of the screen.
     """
     unknown = Camera(None, float("nan"), float("nan"), None, DEFAULT_TONE)
     context = FrameContext(frame, corners, unknown, options.screens, timer)
     profiles = sample_columns(context, n_columns).profiles
     with timer("blind"):
         strips = _strips(context, profiles)
-    # A picture does not tell the slot rate: of screens with packets of one length the quickest stands for all.
-    screens = sorted(options.screens, key=lambda one: -one.slot_rate_hz)
+    # A picture does not show the slot rate: the fastest screen represents all with the same packet length.
+    screens = sorted(options.screens, key=lambda screen: -screen.slot_rate_hz)
     found = blind.propose(strips, screens, frame.metadata.exposure_s, may_bend=frame.mosaic is None)
     while True:
         with timer("blind"):
-            some = next(found, None)
-        if some is None:
+            hypotheses = next(found, None)
+        if hypotheses is None:
             return Failure("no_signal", blind.why_not(strips))
-        for hypothesis in sorted(some, key=lambda one: (-one.score, one.rows_per_slot, one.reversed)):
-            screen = next(one for one in screens if one.packet_slots == hypothesis.packet_slots)
+        for hypothesis in sorted(hypotheses, key=lambda h: (-h.score, h.rows_per_slot, h.reversed)):
+            screen = next(s for s in screens if s.packet_slots == hypothesis.packet_slots)
             yield _camera(hypothesis, screen.slot_rate_hz, frame, DEFAULT_TONE)
 
 
 def relabelled_camera(camera: Camera, screen: ScreenProfile, frame: Frame) -> Camera:
-    """An estimated camera as one that took this screen: a picture shows rows per slot, a screen has the slot rate."""
+    """Convert an estimated camera to the slot rate of a screen, since a picture only shows rows per slot."""
     hypothesis, rate = camera.hypothesis, screen.slot_rate_hz
     if hypothesis is None:
         return camera
@@ -58,7 +58,7 @@ def relabelled_camera(camera: Camera, screen: ScreenProfile, frame: Frame) -> Ca
 
 
 def settle(context: FrameContext, acquisition: Acquisition, reception: Reception) -> tuple[Camera, float]:
-    """An estimated camera fitted to decoded slots; and how far that moves the clock anywhere, slots."""
+    """Fit an estimated camera to decoded slots; also return the largest shift of the clock, slots."""
     camera, screen, frame = context.camera, acquisition.screen, context.frame
     if camera.hypothesis is None:
         return camera, 0.0
@@ -77,7 +77,7 @@ def settle(context: FrameContext, acquisition: Acquisition, reception: Reception
 
 
 def _strips(context: FrameContext, profiles: RowProfiles) -> blind.Strips:
-    """Strips from row profiles in the order of time."""
+    """Convert row profiles to strips in order of time."""
     frame, (n_columns, n_strips, _) = context.frame, profiles.light.shape
     outlines = geometry.column_outlines(context.corners, n_columns, n_strips, frame.width, frame.height)
     x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2

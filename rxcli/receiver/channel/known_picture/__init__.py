@@ -1,12 +1,12 @@
-"""Slots through a picture that is known from the frames before.
+"""Slot likelihoods for a picture that is known from earlier frames.
 
-What strip s of column c sees on a row is z = floor + T * sum over k of K[s, k] * m[c + k], with T the picture, K the
-light spread and m the exposure-averaged slots of the columns (see `channel`). In a clip T is known: the sum over
-frames of z against what was expected. Then all columns' m of a row are one small linear system, solved for all rows at
-once: no crosstalk is left, strips are pooled by what they tell, and every column is a single series with a precision.
+Strip s of column c receives on a row z = black level + T * sum over k of K[s, k] * m[c + k], with T the picture, K the
+crosstalk and m the exposure-averaged slots of the columns (see `channel`). In a clip T is estimated from earlier
+frames. The m of all columns on a row then solve a small linear system, for all rows at once. This removes crosstalk,
+weights strips by their information, and gives each column as a single series with a precision.
 
-`picture` learns and solves, `exposure` says what slots give through an exposure, `response` what compression leaves of
-it, `header` where headers show, and `metrics` makes of it all the likelihoods of slots that detection needs.
+`picture` estimates T and solves for m, `exposure` applies the exposure to slots, `response` fits the effect of
+compression, `header` measures the contrast of headers, and `metrics` computes slot log-likelihoods.
 """
 
 from rxcli.receiver.channel.known_picture.exposure import expected_light, row_positions, trusted

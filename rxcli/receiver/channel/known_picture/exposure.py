@@ -1,4 +1,4 @@
-"""Slots seen through the exposure of rows."""
+"""Slots after the exposure of rows."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 
 def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
-    """(C, R) 0..1 how far rows can be learned from whose slots are lit with probability `lit`; see `SlotLight`."""
+    """(C, R) reliability 0..1 of rows for learning, from the probabilities `lit` of their slots; see `SlotLight`."""
     doubt = lit * (1 - lit)
     each: IntArray = np.arange(len(lit))
-    if len(positions) == 1:  # columns without doubt are alike
+    if len(positions) == 1:  # equal for all certain columns
         unsure = np.flatnonzero(doubt.max(axis=1) > SETTINGS.sure_probability)
         each = np.zeros(len(lit), np.int64)
         each[unsure] = 1 + np.arange(unsure.size)
@@ -25,7 +25,7 @@ def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> 
 
 
 def read_between(values: FloatArray, place: FloatArray) -> FloatArray:
-    """`values` (C, n) at the places (C, R) or (1, R), linearly between."""
+    """Interpolate `values` (C, n) linearly at positions (C, R) or (1, R)."""
     place = np.clip(place, 0, values.shape[1] - 1.001)
     left = place.astype(np.intp)
     low = take_places(values, left)
@@ -33,7 +33,7 @@ def read_between(values: FloatArray, place: FloatArray) -> FloatArray:
 
 
 def row_positions(rows: FloatArray, clock: Clock) -> FloatArray:
-    """Exposure's centre of each row in slots of the grid, (C, R), or (1, R) where no column is delayed."""
+    """Centre of the exposure of each row in grid slots, (C, R), or (1, R) if no column is delayed."""
     common = (rows - clock.row0) / clock.rows_per_slot
     if not clock.delay_slots.any():
         return np.asarray(common)[None]
@@ -42,8 +42,10 @@ def row_positions(rows: FloatArray, clock: Clock) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What a camera and its compression make of the exposed slots m: offset + centre m(g) + side (m(g - h) + m(g + h)),
-    h being half a slot. Compression blurs stripes, frame by frame as its bits last."""
+    """Response of camera and compression to the exposed slots m: offset + centre m(g) + side (m(g - h) + m(g + h)).
+
+    h is half a slot. Compression blurs stripes differently in every frame.
+    """
 
     centre: float = 1.0
     side: float = 0.0
@@ -52,17 +54,17 @@ class Response:
 
 @dataclass(frozen=True, slots=True)
 class SlotView:
-    """What rows see of the slots around them, columns being alike."""
+    """Weights of the slots around each row, for columns with equal delay."""
 
     #: (R,) metric that each row belongs to.
     metric: IntArray
-    #: (memory + 3, R) share of each of the slots metric - memory - 1 .. metric + 1 in a row's light: of those that the
-    #: metric is about, and of one to each side that a blur reaches.
+    #: (memory + 3, R) share of each of the slots metric - memory - 1 .. metric + 1 in a row's light: the slots of the
+    #: metric, and one more on each side for blur.
     share: Float32Array
 
     @classmethod
     def of(cls, centre: FloatArray, exposure_slots: float, isi_memory: int, response: Response) -> SlotView:
-        """Of rows whose exposure's centre is at `centre` (R,), slots."""
+        """Compute the weights for rows with exposures centred at `centre` (R,), slots."""
         metric = np.floor(centre + isi_memory / 2).astype(np.int64)
         place = (centre - metric).astype(np.float32)
         slots = np.arange(-isi_memory - 1, 2, dtype=np.float32)[:, None]
@@ -73,40 +75,40 @@ class SlotView:
         return cls(metric, np.asarray(share, np.float32))
 
     def light(self, lit: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """(C, R) each: light of the slots `lit` (C, N) that the metrics are about, and of those beside them."""
+        """(C, R) each: light of the slots `lit` (C, N) inside and outside the metrics of the rows."""
         n_slots, reach = lit.shape[1], len(self.share)
         padded = np.full((len(lit), n_slots + 2 * reach), 0.5, np.float32)
         padded[:, reach : reach + n_slots] = lit
-        first = np.clip(self.metric + 2, 0, n_slots + reach)
-        parts = [padded.take(first + place, axis=1) * share for place, share in enumerate(self.share)]
+        start = np.clip(self.metric + 2, 0, n_slots + reach)
+        parts = [padded.take(start + place, axis=1) * share for place, share in enumerate(self.share)]
         return sum(parts[2:-1], parts[1]), parts[0] + parts[-1]
 
 
 @dataclass(frozen=True, slots=True)
 class ExpectedLight:
-    """What slots give by a response."""
+    """Predicted light of slots through a response."""
 
-    #: (C, R) of all of it, and of what the metrics of a row are not about.
+    #: (C, R) total, and part from slots outside the metric of a row.
     light: Float32Array
     beside: Float32Array
-    #: The columns that are alike, and what their rows see.
+    #: Columns with equal delay, and the weights of their rows.
     views: list[tuple[slice, SlotView]]
 
 
 def expected_light(
     lit: Float32Array, positions: FloatArray, exposure_slots: float, isi_memory: int, response: Response
 ) -> ExpectedLight:
-    """Light that slots give to rows.
+    """Predict the light of rows from slots.
 
     Args:
-        lit: (C, N) probability that each slot is lit; half lit beyond.
+        lit: (C, N) probability that each slot is lit; 0.5 beyond.
         positions: (C, R) or (1, R) exposure's centre in slots.
         exposure_slots: exposure in slots.
-        isi_memory: slots of memory that metrics have.
-        response: what becomes of the exposed slots.
+        isi_memory: ISI memory of the metrics.
+        response: response of camera and compression.
     """
     n_columns = len(lit) if len(positions) == 1 else 1
-    groups = [slice(first, first + n_columns) for first in range(0, len(lit), n_columns)]
+    groups = [slice(start, start + n_columns) for start in range(0, len(lit), n_columns)]
     views = [
         (group, SlotView.of(centre, exposure_slots, isi_memory, response))
         for group, centre in zip(groups, positions, strict=True)

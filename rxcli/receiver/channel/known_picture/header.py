@@ -1,4 +1,4 @@
-"""First decisions, and what the headers show."""
+"""Initial slot decisions, and the contrast of headers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def first_decision(observed: ColumnLight, positions: FloatArray, clock: Clock) -
 
 
 def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) -> float:
-    """Contrast of the headers where the clock has them, 1 being full and 0 none; 1 where no header shows.
+    """Contrast of the headers at the positions of the clock, 1 full, 0 none; 1 if no header is visible.
 
     Args:
         observed: the columns' light.
@@ -50,22 +50,22 @@ def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) 
 
 
 def header_dark(positions: FloatArray, clock: Clock) -> BoolArray:
-    """(C, R) or (1, R) rows that see nothing but the three dark slots in the middle of a header."""
+    """(C, R) or (1, R) rows whose exposure lies in the three dark slots in the middle of a header."""
     return sees_dark_header((positions + clock.first_slot) % clock.packet_slots, clock.exposure_slots)
 
 
 def dark_light(
     lights: list[Float32Array], dark: list[BoolArray], inside: list[BoolArray], usual: float
 ) -> Float32Array:
-    """(C, S) light of the strips where nothing is lit.
+    """(C, S) light of the strips in dark slots.
 
-    What a black picture or a starved encoder leaves of a strip does not change with the slots: it is no picture.
+    It includes the offset left by a black picture or a low-bitrate encoder, which does not depend on the slots.
 
     Args:
         lights: (C, S, R) each.
         dark: (C, R) or (1, R) each, from `header_dark`.
         inside: (C, S, R) each, as for `KnownPicture`.
-        usual: what is taken where too few rows tell.
+        usual: value for strips with too few dark rows.
     """
     observed = [
         np.where(np.broadcast_to(rows[:, None], light.shape) & on, light, np.float32(np.nan))[..., rows.any(axis=0)]

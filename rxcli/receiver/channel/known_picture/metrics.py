@@ -1,4 +1,4 @@
-"""The light's likelihood under every pattern of slots."""
+"""Log-likelihood of the light for every slot pattern."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 
 def slot_likelihoods(observed: ColumnLight, expected: ExpectedLight, clock: Clock, isi_memory: int) -> SlotLikelihoods:
-    """Log-likelihood of every slot pattern at every slot, as `channel.slot_likelihoods` has it of an unknown picture.
+    """Log-likelihood of every slot pattern at every slot, the counterpart of `channel.slot_likelihoods`.
 
     Args:
         observed: the columns' light.
-        expected: light that the present idea of the slots gives.
+        expected: light predicted from the current estimate of the slots.
         clock: the clock.
-        isi_memory: slots of memory.
+        isi_memory: ISI memory.
     """
     value = (observed.value - expected.beside) * observed.precision
     parts = [
@@ -37,7 +37,7 @@ def slot_likelihoods(observed: ColumnLight, expected: ExpectedLight, clock: Cloc
 def _row_metrics(
     weighted: Float32Array, precision: Float32Array, view: SlotView, n_slots: int, isi_memory: int
 ) -> FloatArray:
-    """Metrics of columns that are alike; `weighted` is their light times its precision, (C, R)."""
+    """Metrics of columns with equal delay; `weighted` (C, R) is their light times its precision."""
     borders = np.searchsorted(view.metric, np.arange(n_slots + isi_memory + 1))
     sums, basis = _slot_sums(weighted, precision, view.share[1:-1], borders), _pattern_basis(isi_memory)
     metrics = sums.reshape(len(basis), -1).T @ basis
@@ -45,7 +45,7 @@ def _row_metrics(
 
 
 def _slot_sums(weighted: Float32Array, precision: Float32Array, share: Float32Array, borders: IntArray) -> Float32Array:
-    """What the rows of every metric add up to: J sums of light, then of the precision of every pair of shares.
+    """Sums over the rows of every metric: J sums of light, then sums of precision for every pair of shares.
 
     Args:
         weighted: (C, R) light times precision.
@@ -56,11 +56,11 @@ def _slot_sums(weighted: Float32Array, precision: Float32Array, share: Float32Ar
     Returns:
         (J + J (J + 1) / 2, C, n).
     """
-    n_shares, (first, second) = len(share), _pairs(len(share))
-    terms = np.concatenate([share, share[first] * share[second]])
+    n_shares, (left, right) = len(share), _pairs(len(share))
+    terms = np.concatenate([share, share[left] * share[right]])
     counts = np.diff(borders)
     sums = np.zeros((len(terms), weighted.shape[0], counts.size), np.float32)
-    # The first rows of all metrics, then the second ones, and so on: long vectors, where metrics have few rows each.
+    # All metrics' first rows, then all second rows, and so on: long vectors although metrics have few rows.
     for place in range(int(counts.max(initial=0))):
         rows = np.minimum(borders[:-1] + place, weighted.shape[1] - 1)
         here = terms.take(rows, axis=1) * (place < counts)
@@ -71,15 +71,15 @@ def _slot_sums(weighted: Float32Array, precision: Float32Array, share: Float32Ar
 
 @cache
 def _pairs(n: int) -> tuple[IntArray, IntArray]:
-    """Every two of `n`, and each with itself."""
-    first, second = np.triu_indices(n)
-    return first, second
+    """All pairs of `n` indices, including equal ones."""
+    left, right = np.triu_indices(n)
+    return left, right
 
 
 @cache
 def _pattern_basis(isi_memory: int) -> Float32Array:
-    """(terms, patterns) how `_slot_sums` make up the log-likelihood of every pattern."""
+    """(terms, patterns) coefficients of `_slot_sums` in the log-likelihood of every pattern."""
     patterns = slot_patterns(isi_memory).astype(np.float32)
-    first, second = _pairs(isi_memory + 1)
-    power = patterns[:, first] * patterns[:, second] * np.where(first == second, np.float32(0.5), np.float32(1))
+    left, right = _pairs(isi_memory + 1)
+    power = patterns[:, left] * patterns[:, right] * np.where(left == right, np.float32(0.5), np.float32(1))
     return np.ascontiguousarray(np.concatenate([patterns, -power], axis=1).T)

@@ -1,4 +1,4 @@
-"""The picture without stripes, learned frame by frame, and the columns' light through it."""
+"""Picture without stripes, estimated over frames, and the light of the columns behind it."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from rxcli.types import BoolArray, Float32Array
 
 @dataclass(frozen=True, slots=True)
 class ColumnLight:
-    """Light of C columns on R rows, between 0, dark, and 1, lit."""
+    """Light of C columns on R rows, 0 dark to 1 lit."""
 
     #: (C, R) float32.
     value: Float32Array
-    #: (C, R) float32: inverse of the variance; 0 where nothing is seen.
+    #: (C, R) float32: inverse variance; 0 where nothing is visible.
     precision: Float32Array
-    #: (C, R) float32: the value drawn to 0.5 where little is seen.
+    #: (C, R) float32: the value shrunk towards 0.5 by the prior.
     shrunk: Float32Array
 
 
 @dataclass(frozen=True, slots=True)
 class _System:
-    """The normal equations of all rows, factored; see `_factor`. Arrays (C, R)."""
+    """Factored normal equations of all rows, see `_factor`; arrays (C, R)."""
 
-    #: (C, S, R): what a strip's light is multiplied with.
+    #: (C, S, R): gain of a strip's light.
     gain: Float32Array
     diagonal: Float32Array
     next: Float32Array
@@ -40,9 +40,9 @@ class _System:
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where the picture lies in a frame that shows it elsewhere than the first one did."""
+    """Position of the picture in a frame relative to the first frame."""
 
-    #: (C, R) row of the picture that each row of the frame shows.
+    #: (C, R) picture row of each row of the frame.
     picture_row: Float32Array
     #: (C, S, R) bool: the strip is on the screen there.
     inside: BoolArray
@@ -50,29 +50,28 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What a frame taught of the picture."""
+    """Observation of the picture by one frame."""
 
     #: (C, S, R) light of the strips.
     light: Float32Array
-    #: (C, R) exposure-averaged slots, 0..1, and how far each is trusted.
+    #: (C, R) exposure-averaged slots, 0..1, and their reliability.
     slots: Float32Array
     trust: Float32Array
-    #: Where the frame shows the picture, and (C, P) its row that shows each row of the picture; None where it is
-    #: where the first one did.
+    #: Position of the picture, and (C, P) frame row of each picture row; None if unchanged since the first frame.
     placement: Placement | None = None
     frame_row: Float32Array | None = None
-    #: (R,) the rows that are meant; None for all.
+    #: (R,) rows to use; None for all.
     rows: BoolArray | None = None
 
 
 class KnownPicture:
-    """The picture without stripes, learned frame by frame, on the rows of the screen as the first frame showed it.
+    """Picture without stripes, estimated over frames, on the screen rows of the first frame.
 
     Args:
-        inside: (C, S, R) the strip is on the screen there.
-        crosstalk: of the strips.
-        black_level: light of a dark slot, one for all or (C, S).
-        noise: of a strip's light.
+        inside: (C, S, R) whether the strip is on the screen.
+        crosstalk: crosstalk of the strips.
+        black_level: light of a dark slot, common or (C, S).
+        noise: noise of a strip's light.
     """
 
     def __init__(
@@ -90,17 +89,17 @@ class KnownPicture:
         self._observed: Float32Array = np.zeros(inside.shape, np.float32)
         self._system: _System | None = None
         self._of_one: Float32Array | None = None
-        #: The picture and its relative variance as they were made of what is known; None where that changed since.
+        #: Cached picture and relative variance; None after a change.
         self._made: tuple[Float32Array, Float32Array] | None = None
-        #: Where it was asked for last, and the picture there.
+        #: Last requested placement, and the picture there.
         self._placed: tuple[Placement, KnownPicture] | None = None
-        #: (C,) variance of the columns' light over what was foreseen.
+        #: (C,) variance of the columns' light over what was predicted.
         self._excess = np.ones(inside.shape[0], np.float32)
 
     def placed(self, placement: Placement | None) -> KnownPicture:
-        """The picture on the rows of a frame; itself where the frame shows it where the first one did.
+        """The picture on the rows of a frame; itself if `placement` is None.
 
-        What is found of the columns' noise belongs to both.
+        Both share the estimated noise of the columns.
         """
         if placement is None:
             return self
@@ -109,15 +108,15 @@ class KnownPicture:
         return self._placed[1]
 
     def _moved(self, placement: Placement) -> KnownPicture:
-        other = copy(self)
+        moved = copy(self)
         picture, error = (_resampled(values, placement.picture_row, beyond=False) for values in self.picture())
-        other._made = picture, error
-        other._inside = placement.inside.astype(np.float32)
-        other._system = other._of_one = other._placed = None
-        return other
+        moved._made = picture, error
+        moved._inside = placement.inside.astype(np.float32)
+        moved._system = moved._of_one = moved._placed = None
+        return moved
 
     def learn(self, look: Look, *, forget: bool = True) -> None:
-        """Take a frame whose slots are known into the picture; with `forget` those before count a little less."""
+        """Update the picture by a frame with known slots; with `forget`, earlier frames lose some weight."""
         lit, observed = self._update_of(look)
         keep = np.float32(SETTINGS.memory_share if forget else 1.0)
         self._light = self._light * keep + lit
@@ -125,28 +124,28 @@ class KnownPicture:
         self._system = self._made = self._placed = None
 
     def without(self, looks: Sequence[Look]) -> KnownPicture:
-        """What is known but for some looks, that were learned with nothing forgotten since.
+        """The picture without some observations, which were added with nothing forgotten since.
 
-        A picture learned from a frame's own light bears out whatever was decided there, wrong or right.
+        A picture that contains a frame's own light would confirm its decisions, wrong or right.
         """
-        other = copy(self)
+        rest = copy(self)
         for look in looks:
             lit, observed = self._update_of(look)
-            other._light, other._observed = other._light - lit, np.maximum(other._observed - observed, 0)
-        other._system = other._made = other._placed = None
-        other._excess = self._excess.copy()
-        return other
+            rest._light, rest._observed = rest._light - lit, np.maximum(rest._observed - observed, 0)
+        rest._system = rest._made = rest._placed = None
+        rest._excess = self._excess.copy()
+        return rest
 
     def _update_of(self, look: Look) -> tuple[Float32Array, Float32Array]:
-        """Light and light expected of a picture of 1, each weighted with the latter, on the rows of the picture."""
+        """Light and predicted light of a picture of 1, each weighted by the latter, on the rows of the picture."""
         placement = look.placement
         expected = self._crosstalk @ _with_neighbours(look.slots)
         doubt = self._crosstalk @ (1 - _with_neighbours(look.trust, 1.0))
         inside = self._inside if placement is None else placement.inside
-        # Light over what little was expected is no picture: more of it than that may be another slot's.
+        # If little light was predicted, the observed light may come from other slots.
         power = expected * expected
-        told = power / (power + np.float32(SETTINGS.untold_error) + np.float32(SETTINGS.unsure_error) * doubt)
-        weighted = expected * (told * told) * np.maximum(1 - np.float32(SETTINGS.doubt_weight) * doubt, 0) * inside
+        known = power / (power + np.float32(SETTINGS.prediction_error) + np.float32(SETTINGS.uncertain_error) * doubt)
+        weighted = expected * (known * known) * np.maximum(1 - np.float32(SETTINGS.doubt_weight) * doubt, 0) * inside
         if look.rows is not None:
             weighted *= look.rows
         lit, observed = weighted * (look.light - self._black_level), weighted * expected
@@ -156,7 +155,7 @@ class KnownPicture:
         return _resampled(lit, row, beyond=True), _resampled(observed, row, beyond=True)
 
     def solve(self, light: Float32Array) -> ColumnLight:
-        """The columns' own light in a frame.
+        """Solve for the columns' own light in a frame.
 
         Args:
             light: (C, S, R).
@@ -164,19 +163,19 @@ class KnownPicture:
         return self._solved(light, self._settled())
 
     def _settled(self) -> _System:
-        """The equations of the picture as it is, made when first needed."""
+        """The cached equations of the current picture."""
         if self._system is None:
             self._system = self._factor()
         return self._system
 
     def solve_again(self, light: Float32Array, expected: Float32Array, rows_per_slot: float) -> ColumnLight:
-        """The columns' own light once more, strips trusted as far as they show what is expected of other slots nearby.
+        """Solve again with strips weighted by their errors in neighbouring slots.
 
-        Were a slot's own error counted, whatever was decided of it would bear itself out.
+        A slot's own error is left out, because it would confirm the decision of that slot.
 
         Args:
             light: (C, S, R).
-            expected: (C, R) light that the slots decided so far give.
+            expected: (C, R) light predicted from the decided slots.
             rows_per_slot: rows per slot.
         """
         predicted = self.picture()[0] * (self._crosstalk @ _with_neighbours(expected))
@@ -188,7 +187,7 @@ class KnownPicture:
         return self._solved(light, self._factor(around))
 
     def _share_of_one(self, rows_per_slot: float) -> Float32Array:
-        """(C, S, R) inverse of how many rows `_around` adds up."""
+        """(C, S, R) inverse of the number of rows that `_around` adds up."""
         if self._of_one is None:
             self._of_one = np.float32(1) / (_around(self._inside, rows_per_slot) + np.float32(1e-3))
         return self._of_one
@@ -207,31 +206,31 @@ class KnownPicture:
     def judge(
         self, observed: ColumnLight, expected: Float32Array, most: float, share: float, rows_per_slot: float
     ) -> ColumnLight | None:
-        """Compare columns with what was decided; they are trusted accordingly, now and, in part, from now on.
+        """Compare the light of columns with their decisions and update the noise estimate.
 
         Args:
-            observed: as `solve` gave it.
-            expected: (C, R) what the decided slots give.
-            most: squared error over the variance foreseen, median over the columns, of a frame that fits.
-            share: weight of this frame against those before, 0..1.
+            observed: the columns' light from `solve`.
+            expected: (C, R) light predicted from the decided slots.
+            most: largest median over the columns of the squared error relative to the predicted variance.
+            share: weight of this frame relative to earlier ones, 0..1.
             rows_per_slot: rows per slot.
 
         Returns:
-            The light with its precision put right; None, and nothing is learned of it, where the frame does not fit.
+            The light with corrected precision; None, without an update, if the frame does not fit.
         """
         error = np.square(observed.value - expected) * observed.precision
-        # And one row that errs as foreseen, for columns of which nothing is seen.
-        n_seen = np.count_nonzero(observed.precision, axis=1).astype(np.float32)
-        ratio = (error.sum(axis=1) + 1) / (n_seen + 1)
+        # One additional row with the predicted error, for columns without visible rows.
+        n_observed = np.count_nonzero(observed.precision, axis=1).astype(np.float32)
+        ratio = (error.sum(axis=1) + 1) / (n_observed + 1)
         if np.median(ratio) > most:
             return None
         self._excess *= 1 + np.float32(share) * (ratio - 1)
         precision = observed.precision / ratio[:, None]
-        precision /= _alike(observed.value - expected, precision, rows_per_slot)[:, None]
+        precision /= _error_correlation(observed.value - expected, precision, rows_per_slot)[:, None]
         return ColumnLight(observed.value, precision, observed.shrunk)
 
     def _tempered(self, precision: Float32Array) -> Float32Array:
-        """Precisions by what was found of the columns' noise; 0 where next to nothing is seen."""
+        """Reduce precisions by the estimated noise of the columns; 0 where almost nothing is visible."""
         tempered = precision / (self._excess[:, None] + np.float32(SETTINGS.common_error**2) * precision)
         tempered[precision <= 1e-3] = 0
         return np.asarray(tempered, np.float32)
@@ -248,11 +247,11 @@ class KnownPicture:
         around = (box_sums(self._light, SETTINGS.around_rows) + wide * self._wide()[:, None]) / near
         total = self._observed + smooth
         picture = np.maximum(self._light + smooth * around, 0) / total
-        # Light that neighbours spill is no look at a picture: it may be any number of times what was made of it.
+        # Crosstalk alone is no observation of the picture, whose error may then be arbitrarily large.
         unknown = wide / near
         error = np.float32(SETTINGS.around_error**2) + np.float32(SETTINGS.wide_error**2) * unknown * unknown
         error *= smooth * smooth
-        error += np.float32(SETTINGS.seen_error) * self._observed
+        error += np.float32(SETTINGS.row_error) * self._observed
         error /= total * total
         error += np.float32(SETTINGS.min_error**2)
         return picture, error
@@ -266,9 +265,9 @@ class KnownPicture:
         return np.asarray(wide, np.float32)
 
     def _factor(self, measured: Float32Array | None = None) -> _System:
-        """Normal equations A m = b of every row, A symmetric with two bands: A = L D L', and the diagonal of A^-1."""
+        """Factor the normal equations A m = b of every row, A symmetric with two bands: A = L D L', and diag(A^-1)."""
         picture, error = self.picture()
-        # Half of what is seen is lit.
+        # On average half of the slots are lit.
         variance = self._noise.through_picture(picture, picture * picture * error, np.full(1, 0.5, np.float32))
         if measured is not None:
             variance += measured
@@ -285,24 +284,24 @@ class KnownPicture:
         return _System(gain, *_factored(middle, beside, beyond))
 
 
-def _alike(error: Float32Array, precision: Float32Array, rows_per_slot: float) -> Float32Array:
-    """(C,) squared error of the sums over a slot's rows, over what is foreseen of rows that err each for itself.
+def _error_correlation(error: Float32Array, precision: Float32Array, rows_per_slot: float) -> Float32Array:
+    """(C,) squared error of the sums over a slot's rows, relative to rows with uncorrelated errors.
 
-    Sensor noise does; what an encoder leaves out of a picture lies on all rows of a slot alike. Columns of few slots
-    that tell are taken to be as the others.
+    Sensor noise is uncorrelated; the error of an encoder is common to all rows of a slot. Columns with few usable slots
+    are shrunk towards the mean over all columns.
     """
     n = max(round(rows_per_slot), 1)
     shape = len(error), error.shape[1] // n, n
     weight = precision[:, : shape[1] * n].reshape(shape)
     total = np.einsum("csr,csr->cs", weight, error[:, : shape[1] * n].reshape(shape))
-    foreseen = np.einsum("csr->cs", weight)
-    told = foreseen > SETTINGS.told_precision
-    # Means, not medians: with medians a clip of 4 surely wrong packets of 91 has 19 of 102.
-    squared = np.sum(np.square(total) / np.maximum(foreseen, SETTINGS.told_precision), axis=1, where=told)
-    count = told.sum(axis=1)
+    predicted = np.einsum("csr->cs", weight)
+    used = predicted > SETTINGS.min_slot_precision
+    # Means, because medians underestimate the correlation and give wrong packets with high confidence.
+    squared = np.sum(np.square(total) / np.maximum(predicted, SETTINGS.min_slot_precision), axis=1, where=used)
+    count = used.sum(axis=1)
     of_all = squared.sum() / max(int(count.sum()), 1)
-    alike = (squared + SETTINGS.like_others_slots * of_all) / (count + SETTINGS.like_others_slots)
-    return np.asarray(np.maximum(alike, SETTINGS.min_correlated_error), np.float32)
+    ratio = (squared + SETTINGS.mean_error_slots * of_all) / (count + SETTINGS.mean_error_slots)
+    return np.asarray(np.maximum(ratio, SETTINGS.min_correlated_error), np.float32)
 
 
 def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
@@ -312,13 +311,13 @@ def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
 
 
 def _around(values: Float32Array, rows_per_slot: float) -> Float32Array:
-    """Sum over the slots around, a row's own left out; last axis."""
+    """Sum over the neighbouring slots without a row's own, along the last axis."""
     near, far = (int(slots * rows_per_slot) for slots in (SETTINGS.own_slots, SETTINGS.error_slots))
     return box_sums(values, far) - box_sums(values, near)
 
 
 def _resampled(values: Float32Array, rows: Float32Array, *, beyond: bool) -> Float32Array:
-    """(C, S, M) values (C, S, N) at the rows (C, M), linearly between; `beyond` the ends there are none."""
+    """(C, S, M) values (C, S, N) interpolated linearly at the rows (C, M); 0 outside if `beyond`."""
     import cv2
 
     n_columns, n_strips, n_rows = values.shape
@@ -337,23 +336,23 @@ def _factored(
     A^-1 by the recursion of Takahashi, Fagan and Chin (1973): from the last column up.
     """
     n, _ = middle.shape
-    diagonal, first, second = middle.copy(), np.zeros_like(middle), np.zeros_like(middle)
-    # Of A^-1 the diagonal, and less the band beside it; two more rows, which stay 0, for the ends.
+    diagonal, band_1, band_2 = middle.copy(), np.zeros_like(middle), np.zeros_like(middle)
+    # Diagonal of A^-1 and the negative of its first band, with two more rows of zeros for the ends.
     inverse, near = np.zeros((2, n + 2, middle.shape[1]), np.float32)
     eliminated = beside.copy()
     for i in range(n):
         if i >= 1:
-            diagonal[i] -= first[i - 1] * eliminated[i - 1]
-            eliminated[i] -= second[i - 1] * eliminated[i - 1]
+            diagonal[i] -= band_1[i - 1] * eliminated[i - 1]
+            eliminated[i] -= band_2[i - 1] * eliminated[i - 1]
         if i >= 2:
-            diagonal[i] -= second[i - 2] * beyond[i - 2]
+            diagonal[i] -= band_2[i - 2] * beyond[i - 2]
         inverse[i] = 1 / diagonal[i]
-        first[i], second[i] = eliminated[i] * inverse[i], beyond[i] * inverse[i]
+        band_1[i], band_2[i] = eliminated[i] * inverse[i], beyond[i] * inverse[i]
     for i in range(n - 1, -1, -1):
-        far = first[i] * near[i + 1] - second[i] * inverse[i + 2]
-        near[i] = first[i] * inverse[i + 1] - second[i] * near[i + 1]
-        inverse[i] += first[i] * near[i] - second[i] * far
-    return diagonal, first, second, np.asarray(1 / inverse[:n], np.float32)
+        far = band_1[i] * near[i + 1] - band_2[i] * inverse[i + 2]
+        near[i] = band_1[i] * inverse[i + 1] - band_2[i] * near[i + 1]
+        inverse[i] += band_1[i] * near[i] - band_2[i] * far
+    return diagonal, band_1, band_2, np.asarray(1 / inverse[:n], np.float32)
 
 
 def _solve(system: _System, right: Float32Array) -> Float32Array:

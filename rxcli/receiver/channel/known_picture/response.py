@@ -1,4 +1,4 @@
-"""What a camera and its compression make of exposed slots, fitted frame by frame."""
+"""Response of camera and compression to exposed slots, fitted in every frame."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rxcli.receiver.channel.known_picture.settings import SETTINGS
 from rxcli.receiver.light import SlotLight
 from rxcli.types import Float32Array, FloatArray, IntArray
 
-#: Rows of columns, about, from which a response is measured, more would tell no more; and the golden ratio, whose
-#: multiples fall evenly between whole numbers.
+#: Approximate number of values from which a response is fitted; and the golden ratio, whose multiples are spread evenly
+#: modulo 1.
 _SAMPLES_OF_RESPONSE, _GOLDEN = 5000, 0.6180339887
 
 
@@ -24,13 +24,13 @@ class Exposures:
     #: (n,) index of the rows.
     rows: IntArray
     here: Float32Array
-    #: The sum of those a little before and after, and their slope.
+    #: Sum of the light half a slot before and after, and slope.
     beside: Float32Array
     slope: Float32Array
 
 
 def exposures(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Exposures:
-    """Of as many rows as tell all there is to know of the response.
+    """Compute exposed slots on a sufficient number of rows for fitting the response.
 
     Args:
         lit: (C, N) probability that each slot is lit.
@@ -40,31 +40,31 @@ def exposures(lit: Float32Array, positions: FloatArray, exposure_slots: float) -
     n_rows = positions.shape[1]
     every = max(n_rows * lit.shape[0] / _SAMPLES_OF_RESPONSE, 1.0)
     step = np.arange(int(n_rows / every))
-    # Evenly spread, but not evenly spaced: the rows must not fall on the same part of every slot.
+    # Not evenly spaced, so that the rows do not sample the same phase of every slot.
     rows = ((step + (step * _GOLDEN if every > 1 else 0) % 1) * every).astype(np.intp)
     some, side = positions[:, rows], SETTINGS.side_slots
-    seen = SlotLight(lit).mean_over(np.concatenate([some - side, some, some + side], axis=1), exposure_slots)
-    before, here, after = np.split(seen, 3, axis=1)
+    exposed = SlotLight(lit).mean_over(np.concatenate([some - side, some, some + side], axis=1), exposure_slots)
+    before, here, after = np.split(exposed, 3, axis=1)
     return Exposures(rows, here, before + after, (after - before) * np.float32(0.5 / side))
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A frame's response, fitted."""
+    """Fitted response of a frame."""
 
     response: Response
-    #: How many slots the clock is late, and how much later at the last row than halfway, as rows are that a camera has
-    #: stretched after reading them.
+    #: Lateness of the clock, slots, and its drift from the middle to the last row, which occurs if the camera stretched
+    #: the picture after readout.
     late: float
     drift: float
 
 
 def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
-    """The response of a frame by least squares over all columns.
+    """Fit the response of a frame by least squares over all columns.
 
     Args:
         observed: the columns' light.
-        slots: what they should have seen.
+        slots: exposed slots of the rows.
     """
     value, precision = (values.take(slots.rows, axis=1).ravel() for values in (observed.value, observed.precision))
     down = np.linspace(-1, 1, slots.rows.size, dtype=np.float32)
@@ -73,7 +73,7 @@ def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
     weighted = parts * precision
     weight = float(precision.sum()) + 1e-9
     normal, right = weighted @ parts.T / weight, weighted @ value / weight
-    # Drawn, a little, to no blur.
+    # Regularised towards no blur.
     usual = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
     fitted = usual + np.linalg.solve(normal + SETTINGS.response_ridge * np.eye(len(usual)), right - normal @ usual)
     least, most = np.array([*SETTINGS.response_bounds, (-SETTINGS.max_shift_slots, SETTINGS.max_shift_slots)]).T

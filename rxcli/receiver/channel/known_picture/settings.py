@@ -1,4 +1,4 @@
-"""Numbers of policy of a picture that is known from earlier frames."""
+"""Settings of the picture known from earlier frames."""
 
 from __future__ import annotations
 
@@ -7,60 +7,60 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class KnownPictureSettings:
-    """Each with its unit and the reason for it."""
+    """Thresholds, each with its unit and its reason."""
 
-    #: Share of its weight that a frame keeps with every frame after it.
+    #: Forgetting factor: share of its weight that a frame keeps with each later frame.
     memory_share: float = 0.95
-    #: Weight of the picture around a row against one frame's look at the row itself at full light.
+    #: Weight of the picture of the neighbouring rows relative to one observation of a row at full light.
     smooth_weight: float = 0.05
-    #: Share of a strip's light in doubt, inverse, from which it says nothing of the picture.
+    #: Inverse of the uncertain share of a strip's light at which it is not used for the picture.
     doubt_weight: float = 1.4
-    #: Squared error of the light expected of a strip, in parts of full light, and more of it per doubt.
-    untold_error: float = 0.01
-    unsure_error: float = 0.125
-    #: Rows around, in each direction, from which the picture of a row that was never lit is taken.
+    #: Squared error of the predicted light of a strip, relative to full light, and its increase with uncertain slots.
+    prediction_error: float = 0.01
+    uncertain_error: float = 0.125
+    #: Rows on each side from which the picture of a row that was never lit is interpolated.
     around_rows: int = 4
-    #: Relative error of a picture taken from the rows around, and of one that was looked at well.
+    #: Relative error of an interpolated picture, and of a well observed one.
     around_error: float = 0.6
     min_error: float = 0.02
-    #: Rows in each direction, all strips of a column together, from which the picture is taken where those around were
-    #: not lit either; its weight against theirs, and its relative error, which neighbouring rows have in common.
+    #: Rows on each side, over all strips of a column, that provide the picture if the neighbouring rows were not lit
+    #: either; relative weight, and relative error, which is common to neighbouring rows.
     wide_rows: int = 60
     wide_weight: float = 0.1
     wide_error: float = 2.0
-    #: Squared error of what a row is taken to see, in parts of full light, times the rows of a slot, which have it in
-    #: common: a slot decided wrongly, or spilled light that is not as the model has it.
-    seen_error: float = 0.03
-    #: A slot's light is at 0.5 with this precision before anything is seen.
+    #: Squared error of the light of a row, relative to full light, times the rows of a slot, which share it: wrong
+    #: decisions, and crosstalk that deviates from the model.
+    row_error: float = 0.03
+    #: Precision of the prior of a slot's light, whose mean is 0.5.
     prior_precision: float = 4.0
-    #: Error of a column's light, in parts of full light, that no pooling removes.
+    #: Error of a column's light, relative to full light, that is common to all strips.
     common_error: float = 0.04
-    #: Slots around, in each direction, over which a strip's error is averaged, and those of them left out as its own.
+    #: Slots on each side over which a strip's error is averaged, and the inner ones that are left out.
     error_slots: float = 20.0
     own_slots: float = 1.3
-    #: Precision of a slot's light from which its error tells how alike rows err; slots of all columns that count beside
-    #: a column's own; and the least squared error against rows that err each for itself.
-    told_precision: float = 0.5
-    like_others_slots: float = 20.0
+    #: Correlation of errors within a slot: minimum precision of a slot's light, weight of the mean over all columns in
+    #: slots, and lower limit of the ratio to uncorrelated errors.
+    min_slot_precision: float = 0.5
+    mean_error_slots: float = 20.0
     min_correlated_error: float = 0.9
 
-    #: What is possible of a response in the middle, at a side, and of its offset; and how much less is likelier.
+    #: Limits of the centre, the side and the offset of a response; and the ridge of their fit.
     response_bounds: tuple[tuple[float, float], ...] = ((0.3, 1.3), (-0.1, 0.35), (-0.2, 0.2))
     response_ridge: float = 1e-4
-    #: Largest correction of the clock at a time, slots.
+    #: Largest single correction of the clock, slots.
     max_shift_slots: float = 0.4
 
-    #: Rows of a strip, over all frames, from which its light where nothing is lit is known.
+    #: Minimum number of dark rows of a strip, over all frames, for its dark light.
     min_dark_rows: int = 12
-    #: Rows of a single column's header that must show, that it be judged.
+    #: Minimum number of header rows, times the precision of the prior, for a header contrast.
     min_header_rows: int = 40
 
-    #: Slots to each side that a blur reaches.
+    #: Distance of the blur taps, slots.
     side_slots: float = 0.5
-    #: A slot that is lit, or dark, but for this probability is sure.
+    #: Error probability below which a slot counts as certain.
     sure_probability: float = 1e-4
 
-    #: Every so manieth row tells enough of a column's signal-to-noise ratio.
+    #: Row step for the signal-to-noise ratio of a column.
     snr_every_row: int = 5
 
 
