@@ -162,7 +162,7 @@ def apply_autoencoder(
     """Make the last pass over doubtful columns: corrections by the auto-encoder, and comparison of whole words.
 
     Returns:
-        The reception, the columns whose corrections were improved, and the report; None if nothing was done.
+        The reception, the columns whose corrections were kept, and the report; None if nothing was done.
     """
     if options.cae == "never":
         return reception, frozenset(), None
@@ -175,7 +175,7 @@ def apply_autoencoder(
     if columns.size == 0 or reception.cleaned is None:
         return reception, frozenset(), None
     shown = columns if always else _worth_showing(reception, columns)
-    report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "improved": 0}
+    report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
     try:
         denoiser = options.denoiser or _denoiser()
         after = _corrected(reception, columns, shown, denoiser)

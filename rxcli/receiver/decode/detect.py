@@ -504,8 +504,8 @@ def detect_with_candidates(
     Args:
         metrics: as for `detect`.
         candidates: as for `detect`.
-        certain_log_prob: log probability from which a word counts as certain_log_prob.
-        n_words: candidate words of each symbol, K; at n_words 8, the size of the smallest codebook.
+        certain_log_prob: log probability from which a word counts as certain.
+        n_words: candidate words of each symbol, K; at most 8, the size of the smallest codebook.
 
     Raises:
         ValueError: shapes do not fit.
