@@ -254,17 +254,17 @@ def standard_decoder(
 
 
 def _receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
-    """Receive frames; the receiver is loaded while the first one is read."""
+    """Receive frames; the receiver is imported while the first frame is read."""
     loading = Thread(target=import_module, args=("rxcli.receiver.pipeline",), daemon=True)
     loading.start()
     frames = iter(frames)
     try:
-        first = list(islice(frames, 1))
+        head = list(islice(frames, 1))
     finally:
         loading.join()
     from rxcli.receiver.pipeline import receive
 
-    yield from receive(chain(first, frames), options)
+    yield from receive(chain(head, frames), options)
 
 
 def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded]:
