@@ -74,6 +74,14 @@ def test_the_walk_sees_blocks_and_commands() -> None:
     assert "decode" in {words[0] for words in COMMANDS}
 
 
+def test_ci_finds_the_command_that_runs_the_tests() -> None:
+    """In one line of the docs, which `.ci/run` runs as it stands there."""
+    lines = (ROOT / "docs" / "README.md").read_text(encoding="utf-8").splitlines()
+    [line] = [line for line in lines if "'.[test]'" in line]
+    assert line.startswith("python3 -m venv .venv && ")
+    assert line.endswith("-m pytest")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.name)
 def test_python_blocks_run(page: Path, desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
