@@ -18,6 +18,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from fcntl import ioctl
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -227,7 +228,7 @@ class Camera:
 
     def _configure(self) -> None:
         self._card = _check_capture(self._descriptor, self._path)
-        wanted = _choose(_modes(self._descriptor), self._settings, self._path)
+        wanted = _choose(list(_modes(self._descriptor)), self._settings, self._path)
         self._layout = _set_format(self._descriptor, wanted, self._path)
         fps = _set_rate(self._descriptor, self._settings.fps or wanted.fps)
         self.mode = Mode(wanted.pixel_format, self._layout.width, self._layout.height, fps)
@@ -413,42 +414,18 @@ def _is_known(descriptor: int, request: int, argument: ctypes.Structure, *refusa
     return True
 
 
-def _modes(descriptor: int) -> list[Mode]:
-    return [
-        Mode(name, width, height, _top_rate(descriptor, code, width, height))
-        for code, name in _formats(descriptor)
-        for width, height in _sizes(descriptor, code)
-    ]
-
-
-def _formats(descriptor: int) -> Iterator[tuple[int, str]]:
-    for description in _enumerate(
-        descriptor, abi.ENUM_FMT, lambda i: abi.FormatDescription(i, abi.BUF_TYPE_VIDEO_CAPTURE)
-    ):
-        name = abi.fourcc_name(description.pixelformat)
-        if name in PIXEL_FORMATS:
-            yield description.pixelformat, name
-
-
-def _sizes(descriptor: int, code: int) -> Iterator[tuple[int, int]]:
-    """Discrete sizes, or the largest of a range."""
-    for found in _enumerate(descriptor, abi.ENUM_FRAMESIZES, lambda i: abi.FrameSize(i, code)):
-        if found.type == abi.FRAME_SIZE_DISCRETE:
-            yield found.size[0], found.size[1]
-        else:
-            yield found.size[1], found.size[4]
-            return
-
-
-def _top_rate(descriptor: int, code: int, width: int, height: int) -> float:
-    shortest = 0.0
-    for found in _enumerate(descriptor, abi.ENUM_FRAMEINTERVALS, lambda i: abi.FrameInterval(i, code, width, height)):
-        numerator, denominator = found.interval[0], found.interval[1]  # of a range: its minimum
-        if numerator and denominator:
-            shortest = max(shortest, denominator / numerator)
-        if found.type != abi.FRAME_INTERVAL_DISCRETE:
-            break
-    return shortest
+def _modes(descriptor: int) -> Iterator[Mode]:
+    """Modes of known pixel formats; of a range of sizes or rates the largest."""
+    for form in _enumerate(descriptor, abi.ENUM_FMT, lambda i: abi.FormatDescription(i, abi.BUF_TYPE_VIDEO_CAPTURE)):
+        code, name = form.pixelformat, abi.fourcc_name(form.pixelformat)
+        sizes = partial(abi.FrameSize, pixel_format=code)
+        for size in _enumerate(descriptor, abi.ENUM_FRAMESIZES, sizes) if name in PIXEL_FORMATS else ():
+            places = (0, 1) if size.type == abi.FRAME_SIZE_DISCRETE else (1, 4)
+            width, height = (size.size[place] for place in places)
+            intervals = partial(abi.FrameInterval, pixel_format=code, width=width, height=height)
+            found = [item.interval for item in _enumerate(descriptor, abi.ENUM_FRAMEINTERVALS, intervals)]
+            rates = [interval[1] / interval[0] for interval in found if interval[0]]
+            yield Mode(name, width, height, max(rates, default=0.0))
 
 
 def _enumerate(descriptor: int, request: int, structure: Callable[[int], Any]) -> Iterator[Any]:

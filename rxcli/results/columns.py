@@ -7,6 +7,21 @@ from typing import Any
 
 from rxcli.types import FrameResult
 
+#: Columns of the packets' table on the terminal: key of `packet_rows`, title, width; one of negative width is flush
+#: left. Time and burst belong to clips, errors to packets that are compared with the truth.
+PACKET_TABLE = (
+    ("time_s", "time s", 9),
+    ("burst", "burst", 5),
+    ("column", "col", 5),
+    ("status", "status", -9),
+    ("w", "w", 1),
+    ("snr_db", "snr dB", 6),
+    ("confidence", "confidence", 10),
+    ("copies", "copies", 6),
+    ("errors", "errors", 6),
+    ("payload", "payload", 0),
+)
+
 
 def packet_rows(result: FrameResult) -> list[dict[str, Any]]:
     """Every packet of a frame as plain data, by column and in time order.

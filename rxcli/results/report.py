@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
 from rxcli.errors import capitalised
+from rxcli.results.columns import PACKET_TABLE, packet_rows
 from rxcli.results.record import plain
-from rxcli.types import ColumnResult, FrameResult, Message, ObjectProgress, PacketResult, ReceivedObject
+from rxcli.types import ColumnResult, FrameResult, Message, ObjectProgress, ReceivedObject
 
+#: How numbers of a packet's row are written.
+_NUMBERS = {"time_s": ".3f", "burst": "d", "column": "d", "w": "d", "snr_db": ".1f", "copies": ".2f", "errors": "d"}
 #: Hex digits of a payload that a table of 80 characters shows.
 _SHOWN_DIGITS = 20
 _STATUS = {
@@ -210,8 +214,14 @@ def _goes_on(result: FrameResult) -> bool:
 
 def table_header(clip: bool, scored: bool) -> str:
     """Header of `table_rows`."""
-    start = "   time s  burst" if clip else ""
-    return f"{start}    col  status     w  snr dB  confidence  copies{'  errors' * scored}  payload"
+    return _table_line({key: title for key, title, _ in PACKET_TABLE}, clip, scored)
+
+
+def _table_line(cells: Mapping[str, str], clip: bool, scored: bool) -> str:
+    """The cells of the packets' table that are shown, side by side."""
+    hidden = (() if clip else ("time_s", "burst")) + (() if scored else ("errors",))
+    shown = [f"{cells[key]:{'><'[width < 0]}{abs(width)}}" for key, _, width in PACKET_TABLE if key not in hidden]
+    return ("" if clip else "  ") + "  ".join(shown)
 
 
 def table_rows(result: FrameResult, clip: bool, scored: bool) -> list[str]:
@@ -226,8 +236,8 @@ def table_rows(result: FrameResult, clip: bool, scored: bool) -> list[str]:
     for _, group in groupby(result.columns, key=_row_key):
         columns = list(group)
         if columns[0].packets:
-            start = f"{result.time_s:9.3f}  " if clip else ""
-            rows += [_packet_row(columns[0], packet, start, clip, scored) for packet in columns[0].packets]
+            packets = packet_rows(replace(result, columns=(columns[0],)))
+            rows += [_table_line(_packet_cells(packet), clip, scored) for packet in packets]
         elif not clip:
             rows.append(_empty_row(columns))
     return rows
@@ -244,14 +254,15 @@ def _empty_row(columns: list[ColumnResult]) -> str:
     return f"  {span:>5}  {columns[0].status:<9}  {columns[0].message or ''}".rstrip()
 
 
-def _packet_row(column: ColumnResult, packet: PacketResult, start: str, clip: bool, scored: bool) -> str:
-    status = ("ok" if packet.is_believable else "weak") + "*" * column.denoised
-    burst = f"{_cell(packet.burst, 'd'):>5}" if clip else ""
-    errors = f"  {_cell(packet.bit_errors, 'd'):>6}" if scored else ""
-    return (
-        f"{start}{burst}  {column.column:>5}  {status:<9}  {_cell(column.w, 'd'):>1}  {_cell(column.snr_db, '.1f'):>6}"
-        f"  {_confidence(packet.confidence):>10}  {_cell(packet.copies, '.2f'):>6}{errors}  {shorten(packet.payload)}"
-    )
+def _packet_cells(packet: Mapping[str, Any]) -> dict[str, str]:
+    """The row of a packet as text."""
+    numbers = {key: _cell(packet[key], form) for key, form in _NUMBERS.items()}
+    status = packet["status"] + "*" * packet["denoised"]
+    return numbers | {
+        "status": status,
+        "confidence": _confidence(packet["confidence"]),
+        "payload": shorten(packet["payload"]),
+    }
 
 
 def _cell(value: float | None, form: str) -> str:
