@@ -15,11 +15,25 @@ from rxcli.types import FloatArray, Frame, FrameResult
 #: Rates are those of the last so many seconds.
 WINDOW_S = 1.0
 _LOCKED = ("ok", "partial")
-#: Share of light below which a picture is dark, and of pixels at white above which it is overexposed.
-_DARK, _BRIGHT = 0.02, 0.1
+#: Mean below which a picture is dark, and share of pixels at white above which it is overexposed. Without a lock: mean
+#: above which the exposure may be so long that no stripes show.
+_DARK, _BRIGHT, _WASHED_OUT = 0.06, 0.1, 0.4
 #: Share of the picture's height that a screen may move in a frame, which clips bear (`benchmark motion`: 8 pixels of
 #: 1080), and share of the columns below which motion matters at all.
 _STILL, _FEW = 0.01, 0.5
+_CLOSER = "Move closer, until the screen fills the picture."
+#: For those who aim: part of a message that was written for photos -> reason and next step.
+_AIMING = {
+    "in portrait": (
+        "The screen lies on its side in the picture.",
+        "Turn the camera, until its long side lies along the screen's.",
+    ),
+    "only a part of": ("Only a part of the picture shows stripes.", _CLOSER),
+    "no columns of": (
+        "No screen that sends is in view.",
+        "Move closer, until the screen fills the picture, and hold the camera level with it.",
+    ),
+}
 _WORDS = {"no_screen": "no screen", "no_signal": "no signal", "unreadable": "no picture"}
 
 
@@ -109,7 +123,7 @@ class Aim:
         while len(self._recent) > 2 and self._recent[0].time_s < now_s - WINDOW_S:
             self._recent.popleft()
         locked = result.status in _LOCKED
-        reason, advice = ("", "") if locked else split_message(result, light)
+        reason, advice = ("", "") if locked else aiming_hint(result, light)
         n_received = sum(column.status in ("ok", "weak") for column in result.columns) if locked else 0
         moved = self._moved(result.corners, height)
         if moved > _STILL and n_received <= _FEW * len(result.columns):
@@ -148,15 +162,26 @@ class Aim:
         }
 
 
-def split_message(result: FrameResult, light: Light | None = None) -> tuple[str, str]:
-    """Why nothing was received, and the next step, as two sentences; the second says what the picture's light asks for.
+def aiming_hint(result: FrameResult, light: Light | None = None) -> tuple[str, str]:
+    """Why there is no lock, and the one thing to do next, for a person who holds the camera.
+
+    Light comes first: in a picture that is too dark or washed out, nothing else can be told.
+    """
+    if light is not None and result.status != "unreadable":
+        if light.mean < _DARK:
+            return "The picture is too dark.", "Expose longer, raise the gain, or show a brighter picture."
+        if light.clipped > _BRIGHT or light.mean > _WASHED_OUT:
+            return "The picture is so bright that stripes fade.", "Expose shorter."
+    found = (hint for part, hint in _AIMING.items() if part in (result.message or ""))
+    reason, advice = next(found, None) or split_message(result)
+    return reason, _CLOSER if "closer so" in advice or advice == "Move closer." else advice
+
+
+def split_message(result: FrameResult) -> tuple[str, str]:
+    """Why nothing was received, and the next step, as two sentences.
 
     Messages are `what; next step`, see `rxcli.errors`; what the headline says already is left out.
     """
     text = printable((result.message or "no packet was found").removeprefix(result.source + ": "))
     reason, _, advice = text.removeprefix("no screen found: ").partition("; ")
-    if light is not None and result.status != "unreadable" and light.word != "good" and "expos" not in advice:
-        more = "expose longer or open the lens" if light.word == "too dark" else "expose shorter"
-        reason = f"{reason} (the picture is {light.word})"
-        advice = f"{more}; {advice}" if advice else more
     return sentence(reason), sentence(advice)

@@ -33,8 +33,8 @@ _RESTART_S = 2.0
 _HISTORY = 50
 
 
-class LiveCamera:
-    """Follows a camera and tells `publish` what comes, from a thread of its own.
+class LiveCamera(threading.Thread):
+    """Follows a camera and tells `publish` what comes.
 
     Args:
         device: the camera.
@@ -50,25 +50,19 @@ class LiveCamera:
         options: ReceiverOptions,
         publish: Callable[[dict[str, Any]], None],
     ) -> None:
-        self._arguments = (device, settings, options)
-        self._publish = publish
+        super().__init__(name=f"follow {device}", daemon=True)
+        self._arguments, self._publish = (device, settings, options), publish
         self._process: BaseProcess | None = None
-        self._running = False
-        self._thread = threading.Thread(target=self._follow, name=f"follow {device}", daemon=True)
-
-    def start(self) -> None:
-        """Begin."""
         self._running = True
-        self._thread.start()
 
     def close(self) -> None:
         """End."""
         self._running = False
         if self._process is not None:
             self._process.kill()
-        self._thread.join(timeout=5)
+        self.join(timeout=5)
 
-    def _follow(self) -> None:
+    def run(self) -> None:
         """Pass on what the process sends; start it again where it dies."""
         while self._running:
             self._process, ours = start_process(_work, *self._arguments)

@@ -28,6 +28,7 @@ from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from rxcli.errors import UsageError
+from rxcli.outputs import claim_folder
 from rxcli.resources import data_dir
 from rxcli.web.decoding import DecodingProcess, Limits, refusal
 
@@ -178,7 +179,7 @@ class Server:
     async def _start(self) -> None:
         site = self._site
         if site.keep is not None:
-            _make(site.keep)
+            claim_folder("--keep", site.keep)
         app = web.Application(middlewares=[self._guard], client_max_size=1 << 16)
         app.router.add_get(f"{site.prefix}/", self._index)
         app.router.add_get(f"{site.prefix}/asset/{{name}}", self._asset)
@@ -499,13 +500,6 @@ def _answer(answer: dict[str, Any], status: int, close: bool = False) -> web.Res
     if close:  # what is left of the body is not waited for
         response.force_close()
     return response
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"--keep {folder}: {error.strerror}", "name another folder") from None
 
 
 def _suffix(path: Path) -> str:
