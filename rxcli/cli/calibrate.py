@@ -25,6 +25,7 @@ from rxcli.ingest import KNOWN_SUFFIXES, open_source
 from rxcli.outputs import CAMERA, PICTURE, Output
 from rxcli.profiles import NAME, CameraProfile, LensModel, ReadoutMode, ScreenProfile, load_profile
 from rxcli.resources import user_dir
+from rxcli.runs.batch import collect_sources
 from rxcli.types import Frame, Metadata
 
 _FILE = click.Path(dir_okay=False, path_type=Path)
@@ -110,13 +111,11 @@ def _integers(option: str, text: str, separator: str, example: str) -> tuple[int
 
 def _files(paths: tuple[Path, ...]) -> list[Path]:
     """The files named, and those of known suffix in the folders named."""
-    files: list[Path] = []
-    for path in paths:
-        inside = sorted(p for p in path.rglob("*") if p.is_file() and p.suffix.lower() in KNOWN_SUFFIXES)
-        files += inside if path.is_dir() else [path]
-    if not files:
-        raise InputError(f"{', '.join(map(str, paths))}: no pictures or clips", "name files or another folder")
-    return files
+    sources = collect_sources(map(str, paths), KNOWN_SUFFIXES)
+    for source in sources:
+        if source.problem:
+            raise InputError(source.problem)
+    return [Path(source.path) for source in sources]
 
 
 def _lens_record(model: LensModel) -> dict[str, Any]:

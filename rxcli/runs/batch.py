@@ -19,7 +19,12 @@ from threading import Lock, Semaphore, Thread
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
+from rxcli.ingest import open_source
+from rxcli.link.collector import Collector
+from rxcli.options import ReceiverOptions
 from rxcli.outputs import OUTPUT_MARKER
+from rxcli.profiles import ScreenProfile
+from rxcli.results.dump import plain_name
 from rxcli.runs.processes import ONE_THREAD, environment, start_process
 from rxcli.types import FILE_MEMORY_MB, Frame, FrameResult
 
@@ -27,8 +32,6 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from multiprocessing.process import BaseProcess
 
-    from rxcli.profiles import ScreenProfile
-    from rxcli.receiver.pipeline import ReceiverOptions
 
 log = logging.getLogger(__name__)
 
@@ -78,8 +81,6 @@ def collect_sources(paths: Iterable[str], suffixes: frozenset[str]) -> list[Sour
 
 def _with_subfolders(sources: list[Source]) -> list[Source]:
     """The sources with a place of its own for the taps of each, whatever others are called."""
-    from rxcli.results.dump import plain_name
-
     folders = [os.path.dirname(os.path.abspath(source.name)) for source in sources]
     try:
         common = os.path.commonpath(folders) if folders else ""
@@ -173,8 +174,6 @@ class Decoder:
         if not self.link_screens:
             yield from results
             return
-        from rxcli.link.collector import Collector
-
         collector = Collector(self.link_screens, self.file_memory_mb)
         for number, (result, last) in enumerate(with_last(results)):
             taken = collector.add(result)
@@ -247,8 +246,6 @@ def standard_decoder(
     after: Callable[[FrameResult, str], None] | None = None,
 ) -> Decoder:
     """The decoder that reads files and receives them."""
-    from rxcli.ingest import open_source
-
     screens = options.screens if options.soft_bits else ()
     return Decoder(options, open_source, _receive, tap, after, screens, options.file_memory_mb)
 

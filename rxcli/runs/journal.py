@@ -44,11 +44,15 @@ class Head:
         """Differences from the first line of an earlier run."""
         if not isinstance(record, dict) or not isinstance(record.get("options"), dict):
             return ["it does not state the options of its run"]
-        before: dict[str, Any] = record["options"]
-        pairs: dict[str, tuple[Any, Any]] = {"version": (record.get("version"), self.version)}
-        for name in sorted({*before, *self.options}):
-            pairs["--" + name.replace("_", "-")] = before.get(name), self.options.get(name)
-        return [f"{name} was {_shown(old)}, is {_shown(new)}" for name, (old, new) in pairs.items() if old != new]
+        before, after = {"version": record.get("version")}, {"version": self.version}
+        for options, named in ((record["options"], before), (self.options, after)):
+            named |= {"--" + name.replace("_", "-"): value for name, value in options.items()}
+        return _differences(before, after)
+
+
+def _differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+    changed = [name for name in {**before, **after} if before.get(name) != after.get(name)]
+    return [f"{name} was {_shown(before.get(name))}, is {_shown(after.get(name))}" for name in changed]
 
 
 def _shown(value: object) -> str:
@@ -246,11 +250,8 @@ def _changes(source: str, facts: object, paths: Mapping[str, str]) -> list[str]:
     """How the file of a source differs from what it was."""
     if source not in paths:
         return []
-    before, current = facts if isinstance(facts, dict) else {}, file_facts(paths[source]) or {}
-    changed = next((name for name in ("bytes", "modified_s") if before.get(name) != current.get(name)), None)
-    if changed is None:
-        return []
-    return [f"{source} has changed ({changed} was {before.get(changed)!r}, is {current.get(changed)})"]
+    changed = _differences(facts if isinstance(facts, dict) else {}, file_facts(paths[source]) or {})
+    return [f"{source} has changed ({', '.join(changed)})"] if changed else []
 
 
 def _result(record: dict[str, Any], place: str) -> FrameResult:

@@ -4,11 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
-import signal
-import subprocess
-import sys
-import time
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +12,7 @@ import pytest
 from fake_receiver import fake_decoder
 
 from rxcli.errors import InputError, UsageError
-from rxcli.results.record import from_record, to_json_line
+from rxcli.results.record import to_json_line
 from rxcli.runs.batch import Source, collect_sources, decode_here, decode_in_processes, unreadable
 from rxcli.runs.journal import Head, Journal, Lines
 from rxcli.types import FrameResult
@@ -201,52 +196,3 @@ def test_a_journal_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="No space left"):
         full.append("a line")
     full.close()
-
-
-RUN = """
-import sys
-from pathlib import Path
-from fake_receiver import fake_decoder
-from rxcli.runs.batch import collect_sources, decode_here
-from rxcli.runs.batch import with_last
-from rxcli.runs.journal import Head, Journal, Lines
-folder, out = sys.argv[1], Path(sys.argv[2])
-journal = Journal(out, resume=True)
-done = {name for name, _ in journal.recover()}
-lines = Lines(Head("1", {}), {}, begun=bool(done))
-sources = collect_sources([folder], frozenset({".jpg", ".mp4"}))
-for source, results in decode_here([s for s in sources if s.name not in done], fake_decoder()):
-    lines.begin(source.name)
-    for result, last in with_last(results):
-        journal.append(lines.line(result, last))
-"""
-
-
-def start_run(folder: Path, out: Path) -> subprocess.Popen[bytes]:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    return subprocess.Popen([sys.executable, "-c", RUN, str(folder), str(out)], env=environment)
-
-
-def test_a_run_killed_again_and_again_ends_with_the_same_lines(tmp_path: Path) -> None:
-    folder, out = tmp_path / "in", tmp_path / "out.jsonl"
-    folder.mkdir()
-    sources = [write_order(folder, f"{i:02}.jpg", sleep_s=0.03) for i in range(20)]
-    sources.append(write_order(folder, "clip.mp4", frames=8, sleep_s=0.03))
-    undisturbed = lines(decode_here(sources, fake_decoder()))
-    generator = random.Random(5)
-    n_killed = 0
-    while n_killed < 5:
-        run = start_run(folder, out)
-        before = out.stat().st_size if out.exists() else -1
-        while (out.stat().st_size if out.exists() else -1) <= before and run.poll() is None:
-            time.sleep(0.005)
-        time.sleep(generator.uniform(0, 0.08))
-        run.send_signal(signal.SIGKILL)
-        n_killed += run.wait() == -signal.SIGKILL
-        if run.returncode == 0:
-            break
-        text = out.read_text()
-        assert all(from_record(json.loads(line)) for line in text.splitlines())
-    assert n_killed >= 3
-    assert start_run(folder, out).wait() == 0
-    assert [to_json_line(from_record(json.loads(line))) for line in out.read_text().splitlines()] == undisturbed
