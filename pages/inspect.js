@@ -70,7 +70,7 @@
     const node = section("The picture", outlined ? caption : "", figure, ...(outlined ? [legend(data.columns)] : []));
     for (const map of data.maps) {
       const inside = make("figure"), list = make("ul", null, "legend");
-      draw(inside, map, map.told);
+      draw(inside, map, map.text);
       for (const [number, grid] of (map.grids || []).entries()) {
         list.append(make("li", `Columns ${grid.pitch_px.toFixed(0)} pixels wide`, `grid${number}`));
       }

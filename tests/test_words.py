@@ -79,7 +79,7 @@ SOURCES = (
     *("link", "types.py", "protocol.py", "profiles.py", "options.py", "errors.py", "resources.py", "numerics.py"),
     *("outputs.py", "__init__.py", "receiver/reception.py", "calibrate", "ingest", "runs"),
     *("receiver/channel", "receiver/settings.py", "receiver/still.py", "receiver/pipeline.py", "receiver/__init__.py"),
-    *("receiver/unknown_camera.py", "receiver/cameras.py"),
+    *("receiver/unknown_camera.py", "receiver/cameras.py", "results", "cli"),
 )
 #: Files of these that still hold such words.
 EXCEPTIONS = ("receiver/channel/known_picture/picture.py",)

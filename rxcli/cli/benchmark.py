@@ -166,11 +166,11 @@ def compare(checkout: Path, name: str, out: Path, **given: Any) -> int:
 
     if name not in scenarios() or scenarios()[name].draw == "transfer":
         raise click.BadParameter(f"{name!r} is no scenario with pictures")
-    scenario, other = _chosen(name, given["captures"], given["only"]), work.check_checkout(checkout)
+    scenario, reference = _chosen(name, given["captures"], given["only"]), work.check_checkout(checkout)
     claim_own_folder("--out", out, ("*.journal.jsonl", "compare.json"))
     tasks = scenario.tasks(given["seed"], given["count"] or scenario.count, out / "media")
     with tqdm(total=2 * given["repeats"], desc="compare", leave=False, disable=given["quiet"] or None) as bar:
-        records = work.compare(tasks, other, out / "compare", given["repeats"], bar.update)
+        records = work.compare(tasks, reference, out / "compare", given["repeats"], bar.update)
     rows, differing = measures.rows(records, work.WAYS, work.COLUMNS), work.differing(records)
     click.echo(tables.titled([("this checkout against the other", rows), ("results that differ", differing)]))
     _say_written(tables.write_outputs(out, "compare", rows, differing))

@@ -58,7 +58,7 @@ class _Results:
     def __init__(self, given: dict[str, Any]) -> None:
         save, name, self._json_path, self._force = (given.pop(key) for key in ("save", "name", "json_path", "force"))
         if name is not None and save is not None:
-            raise UsageError("--save and --name both say where the profile goes", "give one of them")
+            raise UsageError("--save and --name both name the profile to write", "give one of them")
         if name is not None and not NAME.fullmatch(name):
             raise UsageError(f"--name {name!r} cannot name a profile", _NAME_HINT)
         self._target: Path | None = save if name is None else user_dir() / "cameras" / f"{name}.toml"
@@ -237,7 +237,9 @@ def shutter(
     Let the lamp fill much of the frame, out of focus, with an exposure well below half a period.
     """
     if bool(frequencies) == bool(screen):
-        raise UsageError("either --frequency or --screen is needed", "say what the lamp blinks at, as --frequency 1000")
+        raise UsageError(
+            "either --frequency or --screen is needed", "give the frequency of the lamp, as --frequency 1000"
+        )
     for value, option, limit in (*((f, "--frequency", 1e7) for f in frequencies), (exposure_s, "--exposure", 1)):
         if value is not None and not 0 < value < limit:
             raise UsageError(f"{option} must be above 0 and below {limit:g} (got {value:g})", "use hertz and seconds")
@@ -375,7 +377,7 @@ def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | Non
     record, lines = _converted_report(found.lens, found.worst_px, camera, found.lens_name, at, "the fisheye model")
     record |= {"readout_told_s": found.readout_s, "reversed": found.reversed, "notes": notes}
     record["readout_measured_s"] = measured.readout_s if measured else None
-    lines += [("readout", note) for note in notes]
+    lines += [("readout", warning) for warning in notes]
     wanted.write(record, lines, Metadata(make=found.make or None, model=found.model or None), extended)
 
 

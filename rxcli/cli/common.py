@@ -30,10 +30,10 @@ def options(*rows: tuple[Any, ...]) -> Callable[[_F], _F]:
 
     def decorate(command: _F) -> _F:
         for flags, kind, default, text, *more in reversed(rows):
-            first, *others = flags.split()
-            flag, _, metavar = first.partition("=")
+            long_flag, *short_flags = flags.split()
+            flag, _, metavar = long_flag.partition("=")
             arguments = {"metavar": metavar or None, **_option(kind, default), **(more[0] if more else {})}
-            command = click.option(flag, *others, help=text, **arguments)(command)
+            command = click.option(flag, *short_flags, help=text, **arguments)(command)
         return command
 
     return decorate
@@ -84,8 +84,8 @@ def receiver_options(given: dict[str, Any], **more: Any) -> ReceiverOptions:
     """
     from rxcli.options import receiver_options as options_of
 
-    told = {name: given[name] for name in _RECEIVER if given[name] not in (None, ())}
-    return options_of(**told, **more)
+    given_options = {name: given[name] for name in _RECEIVER if given[name] not in (None, ())}
+    return options_of(**given_options, **more)
 
 
 def claim_outputs(
@@ -112,7 +112,7 @@ def claim_outputs(
 
 
 def json_output(path: str | None, *keys: str) -> Output | None:
-    """The file of a command's --json, None where there is none; earlier ones are told by the `keys` they hold."""
+    """The file of a command's --json, or None; earlier outputs are recognised by their `keys`."""
     from rxcli.outputs import Output, json_with
 
     return None if path in (None, "-") else Output("--json", Path(str(path)), json_with(*keys))

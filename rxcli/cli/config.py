@@ -1,4 +1,4 @@
-"""The user's `config.toml`: defaults of a few options. What the command line or the environment says comes first."""
+"""The user's `config.toml`: defaults of a few options. The command line and the environment override them."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def _check(paths: tuple[str, ...], options: dict[str, Any]) -> None:
     no_address = "--cluster needs the address of a Dask scheduler (got none)"
     for is_wrong, reason, step in (
         (resume and no_file, "--resume needs the file that --json wrote", "give --json FILE"),
-        (resume and STDIN in paths, "--resume cannot tell whether stdin is what it was", "name the file"),
+        (resume and STDIN in paths, "--resume cannot check whether stdin is unchanged", "name the file"),
         (no_truth, "--max-ber needs the truth", "give --truth FILE, or --truth auto"),
         (cluster is not None and not cluster.strip(), no_address, "name it: tcp://host:8786"),
         (cluster and options["workers"] > 1, "--workers and --cluster exclude each other", "give one of them"),
@@ -144,8 +144,8 @@ def _claim(options: dict[str, Any], sources: list[Source]) -> Taken:
         if options[name] is not None:
             outputs.claim_folder(_flag(name), options[name])
     for name in ("dump_dir", "save_undistorted"):
-        both = options[name] and options["out"]
-        if both and options["out"].resolve().is_relative_to(options[name].resolve()):
+        conflict = options[name] and options["out"]
+        if conflict and options["out"].resolve().is_relative_to(options[name].resolve()):
             reason = f"--out {options['out']}: {_flag(name)} writes there"
             raise UsageError(reason, "name a folder for received files alone")
     return taken
@@ -165,8 +165,8 @@ def _outputs(options: dict[str, Any]) -> Iterator[Output]:
         "payloads": outputs.PAYLOADS,
     }.items():
         if options[name] not in (None, "-"):
-            kept = name == "json_path" and not resume
-            yield Output(_flag(name), Path(options[name]), ours, way_on=way_on if kept else None)
+            is_kept = name == "json_path" and not resume
+            yield Output(_flag(name), Path(options[name]), ours, way_on=way_on if is_kept else None)
 
 
 @contextmanager
@@ -235,7 +235,7 @@ class _Run:
                 self._decode([source for source in self._sources if source.name not in done])
             except BaseException:
                 with suppress(OSError):
-                    self._conclude()  # what it cannot write is told; why the run ended says more
+                    self._conclude()  # the reason why the run ended is more important than this
                 raise
         for name in self._baseline.missing() if self._baseline else ():
             self._summaries.append(SourceSummary(name, regressions=["in the baseline, and not in this run"]))

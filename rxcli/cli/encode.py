@@ -134,37 +134,37 @@ class _Plan:
 
     def _chunks(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """First burst and labels (bursts, symbols, columns) of some bursts at a time."""
-        for first in range(0, self.n_bursts, _CHUNK):
-            bursts = np.arange(first, min(first + _CHUNK, self.n_bursts))
-            yield first, self.sending.labels(bursts, self.screen.columns, self.screen.payload_symbols)
+        for start in range(0, self.n_bursts, _CHUNK):
+            bursts = np.arange(start, min(start + _CHUNK, self.n_bursts))
+            yield start, self.sending.labels(bursts, self.screen.columns, self.screen.payload_symbols)
 
     def write_labels(self) -> None:
         """Write labels as an array."""
         shape = (self.n_bursts, self.screen.payload_symbols, self.screen.columns)
         target = np.lib.format.open_memmap(self.out, "w+", np.uint8, shape)
-        for first, labels in self._chunks():
-            target[first : first + len(labels)] = labels
+        for start, labels in self._chunks():
+            target[start : start + len(labels)] = labels
         target.flush()
 
     def write_csv(self) -> None:
         """Write labels as text, one row a symbol."""
         with self.out.open("w", encoding="utf-8") as file:
             file.write("burst,symbol," + ",".join(f"column_{c}" for c in range(self.screen.columns)) + "\n")
-            for first, labels in self._chunks():
-                for burst, symbols in enumerate(labels, first):
+            for start, labels in self._chunks():
+                for burst, symbols in enumerate(labels, start):
                     for symbol, row in enumerate(symbols):
                         file.write(f"{burst},{symbol},{','.join(map(str, row))}\n")
 
     def write_slots(self) -> None:
-        """Write slots as an array of bits, and beside it a text that says their order."""
+        """Write slots as an array of bits, and beside it a text file that states their order."""
         screen, out = self.screen, self.out
         burst_slots, width = screen.packet_slots * screen.repeats, -(-screen.columns // 8)
         target = np.lib.format.open_memmap(out, "w+", np.uint8, (self.n_bursts * burst_slots, width))
-        for first, labels in self._chunks():
-            weights = self.weights if len(self.weights) == 1 else self.weights[first : first + len(labels)]
+        for start, labels in self._chunks():
+            weights = self.weights if len(self.weights) == 1 else self.weights[start : start + len(labels)]
             packets = np.packbits(packet_slots_of(labels, weights).transpose(0, 2, 1), axis=2)
             repeated = np.tile(packets, (1, screen.repeats, 1)).reshape(-1, width)
-            target[first * burst_slots : first * burst_slots + len(repeated)] = repeated
+            target[start * burst_slots : start * burst_slots + len(repeated)] = repeated
         target.flush()
         _readme_of(out).write_text(
             f"{out.name}: uint8 ({len(target)}, {width}); one row a slot at {screen.slot_rate_hz:g} Hz, first sent "

@@ -1,4 +1,4 @@
-"""Groups of commands as people meet them: help where nothing is said, a suggestion where a name is mistyped."""
+"""Groups of commands: help without arguments, suggestions for mistyped names."""
 
 from __future__ import annotations
 

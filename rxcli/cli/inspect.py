@@ -1,4 +1,4 @@
-"""`vlc-rx inspect`: a page that tells the whole story of one photo, or of a clip and one of its frames."""
+"""`vlc-rx inspect`: a page that shows every stage of the reception of a photo, or of a clip and one of its frames."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def write_page(
     """Receive the photo or clip at `path` and write the page that shows how; results of all its frames.
 
     Args:
-        path: a photo, or a clip, of which the first frames are received.
+        path: a photo, or a clip, whose first frames are received.
         page: what to write; its folder is made, and is the command's own.
         options: of the receiver.
         frame: number of the frame to show; None: the one with the most packets.
@@ -125,21 +125,21 @@ def _received(
     found = truth_for(path, truth)
     scorer = Scorer(load_truth(found)) if found else None
     n_frames = max(_MAX_FRAMES, (number or 0) + 1)
-    first: list[Frame] = []
+    head: list[Frame] = []
     decoder = replace(standard_decoder(options), open_source=lambda name: islice(open_source(name), n_frames))
-    frames = _noting(decoder.open_source(path), first)
+    frames = _noting(decoder.open_source(path), head)
     received = list(decoder.linked(decoder.receive(frames, options)))
     results = [scorer.add(result) if scorer else result for result in received]
     best = max(results, key=lambda result: len(result.packets), default=None)
     if best is None or (number is not None and number >= len(results)):
         raise InputError(f"{path}: has no frame {number or 0}", "choose a lower --frame")
     shown = best.frame if number is None else number
-    return results, first[0] if shown == 0 else next(islice(open_source(path), shown, None))
+    return results, head[0] if shown == 0 else next(islice(open_source(path), shown, None))
 
 
-def _noting(frames: Iterable[Frame], first: list[Frame]) -> Iterator[Frame]:
+def _noting(frames: Iterable[Frame], head: list[Frame]) -> Iterator[Frame]:
     """The frames; the first one is kept, so that a photo is read once."""
     for frame in frames:
-        if not first:
-            first.append(frame)
+        if not head:
+            head.append(frame)
         yield frame

@@ -51,7 +51,7 @@ class Exposure(click.ParamType[float]):
 
 
 class ProfileName(click.ParamType[str]):
-    """Name of a profile, or a TOML file; `folder` holds those that are known."""
+    """Name of a profile, or a TOML file; `folder` holds the known ones."""
 
     name = "profile"
 

@@ -166,7 +166,7 @@ def _open(path: str) -> TextIO:
 
 @dataclass
 class Status:
-    """What is said on stderr of lock, light and rates; a context manager that ends it properly.
+    """Status on stderr: lock, light and rates; a context manager that ends it properly.
 
     On a terminal a block of lines stays in place and payloads scroll above it; elsewhere a line comes now and then.
     """
@@ -206,19 +206,19 @@ class Status:
         """Take a frame's result into account, and show the state if it is time."""
         from rxcli.results.aim import Aim
 
-        now = time.monotonic()
+        now_s = time.monotonic()
         self._aim = self._aim or Aim()
-        before, self.state = self.state, self._aim.update(result, now, self._height, self._light)
+        before, self.state = self.state, self._aim.update(result, now_s, self._height, self._light)
         self._files = list(files)
         self.n_complete += len(result.messages) + len(result.objects)
         self.n_packets += len(result.packets)
-        self.show_if_due(now, changed=before is None or before.word != self.state.word)
+        self.show_if_due(now_s, changed=before is None or before.word != self.state.word)
 
-    def show_if_due(self, now: float | None = None, changed: bool = False) -> None:
+    def show_if_due(self, now_s: float | None = None, changed: bool = False) -> None:
         """Show the state if it is time, also where no whole frame comes."""
-        now = time.monotonic() if now is None else now
-        if changed or now - self._shown_s >= (_TERMINAL_S if self._on_terminal() else _LOG_S):
-            self._shown_s = now
+        now_s = time.monotonic() if now_s is None else now_s
+        if changed or now_s - self._shown_s >= (_TERMINAL_S if self._on_terminal() else _LOG_S):
+            self._shown_s = now_s
             self._show()
 
     @staticmethod
@@ -263,10 +263,10 @@ def format_status(state: AimState | None, counts: CameraCounts) -> list[str]:
     ]
     if state.ber_hat is not None:
         rates.append(f"BER about {state.ber_hat:.1e}")
-    seen = [] if state.light is None else [f"light {state.light.word}"]
+    facts = [] if state.light is None else [f"light {state.light.word}"]
     if state.height_share is not None:
-        seen.append(f"screen fills {100 * state.height_share:.0f} % of the height")
-    return [" | ".join(rates), " | ".join(seen + lost), " ".join(filter(None, (state.reason, state.advice)))]
+        facts.append(f"screen fills {100 * state.height_share:.0f} % of the height")
+    return [" | ".join(rates), " | ".join(facts + lost), " ".join(filter(None, (state.reason, state.advice)))]
 
 
 def fit_lines(lines: Sequence[str], width: int) -> list[str]:

@@ -164,7 +164,7 @@ def _terminate(_number: int, _frame: object) -> None:
 
 
 def _reserve_standard_streams() -> None:
-    """No file may get the number of a standard stream that is closed: libraries write to it. Ours then say so."""
+    """Replace closed standard streams, so that no file gets their numbers: libraries write to them."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -175,7 +175,7 @@ def _reserve_standard_streams() -> None:
 
 
 class _ClosedStream(io.TextIOBase):
-    """stdout where there is none: silent until somebody has something to say."""
+    """Replacement of a closed stdout, which fails on the first write."""
 
     def write(self, _text: str) -> int:
         raise OutputError("stdout is closed", "redirect it to a file, or use --quiet")
@@ -255,7 +255,7 @@ def _say(message: str) -> None:
 
 
 def _say_usage(error: click.ClickException) -> int:
-    """Click's message in one line, with the command whose help tells more."""
+    """Click's message in one line, with the command to ask for help."""
     context = getattr(error, "ctx", None)
     path = context.command_path if context is not None else "vlc-rx"
     message = error.format_message().rstrip(".").replace("\n", " ")
@@ -272,7 +272,7 @@ def _leave_stdout() -> None:
 def _say_system(error: OSError) -> int:
     """The system refuses something: no space, no right, too many files."""
     reason = error.strerror or str(error)
-    if error.filename is None:  # files of ours say their names
+    if error.filename is None:  # own errors name their files
         _say(f"stdout: cannot be written ({reason}); redirect it to where there is room")
         _leave_stdout()
     else:
@@ -284,7 +284,7 @@ def _say_internal(error: Exception) -> int:
     log = logging.getLogger("rxcli")
     if log.isEnabledFor(logging.DEBUG):
         log.debug("internal error", exc_info=error)
-    _say(f"internal error ({type(error).__name__}: {error}); run again with --verbose and report what it says")
+    _say(f"internal error ({type(error).__name__}: {error}); run again with --verbose and report its output")
     return ExitCode.NOT_RECEIVED
 
 

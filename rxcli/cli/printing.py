@@ -104,7 +104,7 @@ class Progress:
 
     Args:
         n_total: sources of the run.
-        n_done: those that an earlier run has done.
+        n_done: sources completed by an earlier run.
         quiet: show nothing.
     """
 

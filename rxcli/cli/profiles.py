@@ -40,7 +40,7 @@ def list_profiles(json_path: str | None, force: bool) -> None:
     screens, cameras = known_profiles(ScreenProfile), known_profiles(CameraProfile)
     if json_path is not None:
         known: dict[str, Any] = {"screens": screens, "cameras": cameras}
-        write_json({kind: [_listed(*one) for one in profiles] for kind, profiles in known.items()}, json_path)
+        write_json({kind: [_listed(*entry) for entry in profiles] for kind, profiles in known.items()}, json_path)
     if json_path == "-":
         return
     for screen, origin, _ in screens:
@@ -99,7 +99,7 @@ def validate(names: tuple[str, ...]) -> int:
 @_JSON
 @force_argument
 def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | None, force: bool) -> int:
-    """Say which camera profile each file would get, and why."""
+    """Show which camera profile each file would get, and why."""
     claim_outputs([json_output(json_path, "source", "camera", "reason")], paths, cameras, force)
 
     known = [load_profile(name, CameraProfile) for name in cameras]
@@ -136,12 +136,12 @@ def _first_frame(path: Path) -> Frame:
 
 def _choice(frame: Frame, path: Path, cameras: list[CameraProfile]) -> dict[str, Any]:
     """The profile that the file gets and the reason, with what decided it."""
-    told = frame.metadata
-    found = match_camera(cameras, told.make, told.model, frame.width, frame.height)
+    metadata = frame.metadata
+    found = match_camera(cameras, metadata.make, metadata.model, frame.width, frame.height)
     mode = found.mode_for(frame.width, frame.height) if found else None
     return {
         "source": str(path),
-        **{name: getattr(told, name) for name in ("make", "model", "lens")},
+        **{name: getattr(metadata, name) for name in ("make", "model", "lens")},
         **{name: getattr(frame, name) for name in ("width", "height")},
         "camera": found.name if found else None,
         "mode": mode.name if mode else None,
@@ -151,14 +151,14 @@ def _choice(frame: Frame, path: Path, cameras: list[CameraProfile]) -> dict[str,
 
 
 def _reason(frame: Frame, cameras: list[CameraProfile], found: str | None) -> str:
-    told = frame.metadata
+    metadata = frame.metadata
     size = f"{frame.width}x{frame.height}"
-    if told.model is None:
-        return "the file tells no camera model; name a profile with --camera, or all is estimated"
-    camera = " ".join(part for part in (told.make, told.model) if part)
+    if metadata.model is None:
+        return "the file states no camera model; name a profile with --camera, or all is estimated"
+    camera = " ".join(part for part in (metadata.make, metadata.model) if part)
     if found is not None:
         return f"{camera}, size {size}"
-    same = [c for c in cameras if c.matches(told.make, told.model)]
+    same = [c for c in cameras if c.matches(metadata.make, metadata.model)]
     if not same:
         return f"no profile of {camera}; all is estimated, or use `vlc-rx calibrate shutter`"
     sizes = ", ".join(f"{mode.width}x{mode.height}" for c in same for mode in c.modes) or "none"

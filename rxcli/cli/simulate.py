@@ -87,19 +87,19 @@ def simulate(out: Path, **options: Any) -> None:
     file_format = options["file_format"] or _format_of(out)
     _claim(out, options)
     scene = _scene(options, file_format)
-    take = prepare(scene, options["seed"])
-    _warn_of_cut_packets(take)
+    capture = prepare(scene, options["seed"])
+    _warn_of_cut_packets(capture)
     try:
-        truth = _write(take, out, file_format, options["bit_rate"])
-        _write_extras(take, options)
+        truth = _write(capture, out, file_format, options["bit_rate"])
+        _write_extras(capture, options)
     except OSError as error:
         where = error.filename or out
         raise UsageError(f"{where}: cannot be written ({error.strerror or error})", "choose another place") from None
-    click.echo(f"{out} and {truth.name}: {_summary(take)}", err=True)
+    click.echo(f"{out} and {truth.name}: {_summary(capture)}", err=True)
 
 
 def _claim(out: Path, options: dict[str, Any]) -> None:
-    """Refuse to write over what is no earlier capture of ours, which its truth beside it tells."""
+    """Refuse to replace a file that is no earlier capture, recognised by the truth beside it."""
     from rxcli import outputs
     from rxcli.lab.simulate.transmitter import WAVEFORM_FILES
     from rxcli.lab.simulate.truth import truth_path
@@ -113,8 +113,8 @@ def _claim(out: Path, options: dict[str, Any]) -> None:
     if options["waveforms"] is not None:
         outputs.claim_folder("--waveforms", options["waveforms"])
         for name in WAVEFORM_FILES:
-            look = outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS
-            found.append(outputs.Output("--waveforms", options["waveforms"] / name, look))
+            pattern = outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS
+            found.append(outputs.Output("--waveforms", options["waveforms"] / name, pattern))
     inputs = [options["picture"], options["payload"], *([options["file_path"]] if options["file_path"] else [])]
     claim_outputs(found, inputs, (options["screen"],), options["force"])
 
@@ -231,15 +231,15 @@ def _labels(options: dict[str, Any]) -> Sending | None:
     return sending_of(options["file_path"], options["text"], options["uri"])
 
 
-def _warn_of_cut_packets(take: Take) -> None:
-    """Say so where no frame can show a packet as a whole."""
-    sensor, corners = take.scene.sensor, take.exposure(0).view.corners
+def _warn_of_cut_packets(capture: Take) -> None:
+    """Warn if no frame can show a complete packet."""
+    sensor, corners = capture.scene.sensor, capture.exposure(0).view.corners
     top, bottom = max(float(corners[:, 1].min()), 0.0), min(float(corners[:, 1].max()), sensor.height - 1.0)
-    shown_s, packet_s = max(bottom - top, 0.0) * sensor.line_delay_s, take.scene.screen.packet_s
+    shown_s, packet_s = max(bottom - top, 0.0) * sensor.line_delay_s, capture.scene.screen.packet_s
     if shown_s < packet_s:
         click.echo(
             f"vlc-rx: no packet fits a frame: the screen is read in {1e3 * shown_s:.1f} ms, a packet of "
-            f"{take.scene.screen.name} lasts {1e3 * packet_s:.1f} ms; only clips put packets together",
+            f"{capture.scene.screen.name} lasts {1e3 * packet_s:.1f} ms; only clips put packets together",
             err=True,
         )
 
@@ -260,7 +260,7 @@ def _payload(text: str) -> bytes | None:
     return data
 
 
-def _write(take: Take, out: Path, file_format: str, bit_rate: int | None) -> Path:
+def _write(capture: Take, out: Path, file_format: str, bit_rate: int | None) -> Path:
     """Write the capture and its truth; returns the truth's path."""
     from tqdm import tqdm
 
@@ -270,28 +270,28 @@ def _write(take: Take, out: Path, file_format: str, bit_rate: int | None) -> Pat
 
     progress = partial(tqdm, desc=out.name, unit="frame", leave=False, disable=None)
     with replacing(out) as hidden:
-        write_capture(take, hidden, file_format, bit_rate, progress)
-    return write_truth(take.truth(out.name), out)
+        write_capture(capture, hidden, file_format, bit_rate, progress)
+    return write_truth(capture.truth(out.name), out)
 
 
-def _write_extras(take: Take, options: dict[str, Any]) -> None:
+def _write_extras(capture: Take, options: dict[str, Any]) -> None:
     """Camera profile and waveforms, where they are asked for."""
     from rxcli.lab.simulate.transmitter import export_waveforms
     from rxcli.lab.simulate.truth import build_camera_profile
     from rxcli.outputs import write_whole
     from rxcli.profiles import dump_profile
 
-    last = take.exposure(take.scene.n_frames - 1)
+    last = capture.exposure(capture.scene.n_frames - 1)
     if options["camera_profile"] is not None:
-        write_whole(options["camera_profile"], dump_profile(build_camera_profile(take.scene, last)))
+        write_whole(options["camera_profile"], dump_profile(build_camera_profile(capture.scene, last)))
     if options["waveforms"] is not None:
-        n_bursts = 1 + int(last.row_start_slots[-1] // take.link.burst_slots)
-        export_waveforms(take.drive, take.link, n_bursts, options["waveforms"])
+        n_bursts = 1 + int(last.row_start_slots[-1] // capture.link.burst_slots)
+        export_waveforms(capture.drive, capture.link, n_bursts, options["waveforms"])
 
 
-def _summary(take: Take) -> str:
-    scene, first = take.scene, take.exposure(0)
+def _summary(capture: Take) -> str:
+    scene, exposure = capture.scene, capture.exposure(0)
     return (
         f"{scene.sensor.width} x {scene.sensor.height}, {scene.rows_per_slot:.2f} rows per slot, "
-        f"exposure {first.exposure_slots:.2f} slots, {scene.n_frames} frame{'s' * (scene.n_frames > 1)}"
+        f"exposure {exposure.exposure_slots:.2f} slots, {scene.n_frames} frame{'s' * (scene.n_frames > 1)}"
     )

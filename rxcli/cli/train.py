@@ -64,7 +64,7 @@ def train(out: Path, **options: Any) -> None:
     name, version = options["name"], options["model_version"]
     card = export.export_model(fitted.network, out, name, version, described, losses, calibration)
     click.echo(
-        f"{out / card.file}: {described['parameters']} parameters, cross-entropy {losses['training_nats']:.4f} nats a "
+        f"{out / card.file}: {described['parameters']} parameters, cross-entropy {losses['training_nats']:.4f} per "
         f"word in training, {losses['validation_nats']:.4f} on held-out scenes",
         err=True,
     )

@@ -12,7 +12,7 @@ from rxcli.errors import sentence
 from rxcli.results.report import printable
 from rxcli.types import FloatArray, Frame, FrameResult
 
-#: Rates are those of the last so many seconds.
+#: Rates are averages over this time, seconds.
 WINDOW_S = 1.0
 _LOCKED = ("ok", "partial")
 #: Mean below which a picture is dark, and share of pixels at white above which it is overexposed. Without a lock: mean
@@ -165,7 +165,7 @@ class Aim:
 def aiming_hint(result: FrameResult, light: Light | None = None) -> tuple[str, str]:
     """Why there is no lock, and the one thing to do next, for a person who holds the camera.
 
-    Light comes first: in a picture that is too dark or washed out, nothing else can be told.
+    Light comes first: in a picture that is too dark or overexposed, nothing else can be judged.
     """
     if light is not None and result.status != "unreadable":
         if light.mean < _DARK:
@@ -180,7 +180,7 @@ def aiming_hint(result: FrameResult, light: Light | None = None) -> tuple[str, s
 def split_message(result: FrameResult) -> tuple[str, str]:
     """Why nothing was received, and the next step, as two sentences.
 
-    Messages are `what; next step`, see `rxcli.errors`; what the headline says already is left out.
+    Messages are `what; next step`, see `rxcli.errors`; parts of the headline are left out.
     """
     text = printable((result.message or "no packet was found").removeprefix(result.source + ": "))
     reason, _, advice = text.removeprefix("no screen found: ").partition("; ")

@@ -28,18 +28,18 @@ class Run:
 
 @dataclass(slots=True)
 class Baseline:
-    """What an earlier run gave, source by source; and what the run now gives."""
+    """Results of an earlier run and of the current one, source by source."""
 
     earlier: dict[str, Run]
-    #: Packets of less do not count, then or now.
+    #: Minimum confidence of counted packets in both runs.
     min_confidence: float
-    #: A source may take so many times as long as then.
+    #: Largest ratio of the time of a source to that of the baseline.
     slower: float
-    now: dict[str, Run] = field(default_factory=dict)
+    current: dict[str, Run] = field(default_factory=dict)
 
     def add(self, result: FrameResult) -> None:
-        """Count a frame of the run now."""
-        self._count(result, self.now)
+        """Count a frame of the current run."""
+        self._count(result, self.current)
 
     def _count(self, result: FrameResult, runs: dict[str, Run]) -> None:
         run = runs.setdefault(_key(result.source), Run())
@@ -54,22 +54,22 @@ class Baseline:
 
     def missing(self) -> list[str]:
         """Sources of the earlier run that this one had nothing of."""
-        return sorted(self.earlier.keys() - self.now.keys())
+        return sorted(self.earlier.keys() - self.current.keys())
 
     def regressions(self, source: str) -> list[str]:
         """In what a source is worse than in the earlier run; empty where it is not, or was not in that run."""
-        before, now = self.earlier.get(_key(source)), self.now.get(_key(source), Run())
+        before, current = self.earlier.get(_key(source)), self.current.get(_key(source), Run())
         if before is None:
             return []
         found = []
-        lost = before.packets - now.packets
+        lost = before.packets - current.packets
         if lost:
             columns = sorted({column for column, _ in lost})
             named = ", ".join(map(str, columns[:8])) + (", ..." if len(columns) > 8 else "")
             found.append(f"{plural(len(lost), 'packet')} of the baseline lost (column {named})")
-        if now.time_ms > self.slower * before.time_ms + _NOISE_MS:
+        if current.time_ms > self.slower * before.time_ms + _NOISE_MS:
             found.append(
-                f"{now.time_ms:.0f} ms, {now.time_ms / max(before.time_ms, 1e-3):.2f} times the baseline's "
+                f"{current.time_ms:.0f} ms, {current.time_ms / max(before.time_ms, 1e-3):.2f} times the baseline's "
                 f"{before.time_ms:.0f} ms ({self.slower:g} times is allowed)"
             )
         return found

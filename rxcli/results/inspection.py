@@ -1,4 +1,4 @@
-"""What a decoded frame shows when it is looked at again with the answer known: light against slots, stage by stage."""
+"""Analysis of a decoded frame with the decided slots: light against slots, stage by stage."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Trace:
     #: (n,) sensor rows, and light there, 1 is white.
     rows: FloatArray
     light: FloatArray
-    #: (n,) light that the decided slots should give; NaN where none are decided.
+    #: (n,) light predicted from the decided slots; NaN without decided slots.
     model: FloatArray
     #: (n,) share of the exposure in lit slots, 0..1, and light over the picture's own; NaN likewise.
     share: FloatArray
@@ -109,10 +109,10 @@ def _trace(
         spans += [(start + rows_per_slot * float(a), start + rows_per_slot * float(b)) for a, b in edges - 0.0]
         total = np.concatenate([[0.0], np.cumsum(slots)])
         grid = np.arange(slots.size + 1, dtype=np.float64)
-        first = (rows - start) / rows_per_slot
+        start_slots = (rows - start) / rows_per_slot
         length = max(exposure_rows, 1.0) / rows_per_slot
-        inside = (first >= 0) & (first + length <= slots.size)
-        lit = np.interp(first + length, grid, total) - np.interp(first, grid, total)
+        inside = (start_slots >= 0) & (start_slots + length <= slots.size)
+        lit = np.interp(start_slots + length, grid, total) - np.interp(start_slots, grid, total)
         share[inside] = lit[inside] / length
     spans = [(a - exposure_rows / 2, b - exposure_rows / 2) for a, b in spans]
     trace = Trace(column, rows, light, unknown, share, unknown, tuple(borders), tuple(spans))
@@ -125,12 +125,12 @@ def _with_model(trace: Trace, rows_per_slot: float) -> Trace:
     share, light = np.where(known, trace.share, 0), np.where(known, trace.light, 0)
     size = max(int(_PICTURE_SLOTS * rows_per_slot), 3)
     n, s, ss, y, ys = (_box(v, size) for v in (known.astype(float), share, share**2, light, light * share))
-    spread = n * ss - s**2
-    gain = np.where(spread > 1e-9, (n * ys - s * y) / np.maximum(spread, 1e-9), np.nan)
-    floor = (y - gain * s) / np.maximum(n, 1)
+    determinant = n * ss - s**2
+    gain = np.where(determinant > 1e-9, (n * ys - s * y) / np.maximum(determinant, 1e-9), np.nan)
+    offset = (y - gain * s) / np.maximum(n, 1)
     good = known & (gain > 0)
-    model = np.where(good, floor + gain * share, np.nan)
-    relative = np.where(good, (trace.light - floor) / np.where(good, gain, 1), np.nan)
+    model = np.where(good, offset + gain * share, np.nan)
+    relative = np.where(good, (trace.light - offset) / np.where(good, gain, 1), np.nan)
     share = np.where(good, trace.share, np.nan)
     residuals = _residuals(trace.rows, relative, share, rows_per_slot)
     return replace(trace, model=model, share=share, relative=relative, residuals=residuals)
@@ -147,8 +147,8 @@ def _residuals(rows: FloatArray, relative: FloatArray, share: FloatArray, rows_p
     """(m, 2) row and how much later than the clock the light is there, slots: one Gauss-Newton step per window."""
     size = int(_RESIDUAL_SLOTS * rows_per_slot)
     found = []
-    for first in range(0, rows.size - size + 1, max(size, 1)):
-        part = slice(first, first + size)
+    for top in range(0, rows.size - size + 1, max(size, 1)):
+        part = slice(top, top + size)
         slope = np.gradient(share[part])
         good = np.isfinite(slope) & np.isfinite(relative[part])
         power = float(np.sum(slope[good] ** 2))
@@ -185,7 +185,7 @@ def _crosstalk(traces: list[Trace]) -> FloatArray:
         if not np.isfinite(trace.relative).any():
             continue
         beside = [traces[at] if 0 <= at < len(traces) else None for at in (number - 1, number + 1)]
-        parts = [_on(trace.rows, other) if other else np.full(trace.rows.size, np.nan) for other in beside]
+        parts = [_on(trace.rows, neighbour) if neighbour else np.full(trace.rows.size, np.nan) for neighbour in beside]
         used = [part for part in parts if np.isfinite(part).any()]
         design = np.column_stack([trace.share, *used, np.ones(trace.rows.size)])
         good = np.isfinite(design).all(axis=1) & np.isfinite(trace.relative)
@@ -227,7 +227,7 @@ def column_light(profiles: RowProfiles, column: int) -> tuple[FloatArray, FloatA
 def decided_slots(
     column: ColumnResult, screen: ScreenProfile, rows_per_slot: float, rows: FloatArray
 ) -> Iterator[tuple[float, NDArray[np.uint8]]]:
-    """What each packet of a column says the slots were, over the copies that are visible on its sensor rows (n,).
+    """Decided slots of each packet of a column, over the copies that are visible on its sensor rows (n,).
 
     Yields:
         Sensor row where the first slot starts, and the slots, 0 or 1.
@@ -239,7 +239,7 @@ def decided_slots(
         slots = _packet_slots_of(packet, column.w, screen)
         if slots is None:
             continue
-        # Behind the copies that were counted, another burst may begin of which too little is seen.
+        # After the counted copies another burst may begin that is hardly visible.
         hidden = max(float(rows.min()) - packet.first_row, 0.0) / rows_per_slot
         longest = min(hidden + packet.copies * slots.size, screen.repeats * slots.size)
         n_slots = math.ceil(min((end - packet.first_row) / rows_per_slot, longest))

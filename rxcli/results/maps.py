@@ -1,4 +1,4 @@
-"""The map of a picture that tells why a screen was found where it was, or was not: coherence and the column grid."""
+"""Map of a picture that explains the found or missing screen: coherence and the column grid."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def column_map(frame: Frame) -> dict[str, Any] | None:
         return None
     plane = read_plane(frame)
     found = find_outlines(plane, layouts_of(ReceiverOptions()))
-    grids = [one.grid for one in found[:1]]
+    grids = [candidate.grid for candidate in found[:1]]
     scale = _WIDTH / frame.width
     return {
         "title": "Where the columns may be",
-        "told": "A grid of columns was found."
+        "text": "A grid of columns was found."
         if grids
-        else "No grid of columns stands out: strips of pixels change alike nowhere.",
-        "caption": "Bright: neighbouring strips of pixels change alike from row to row, as they do in front of a "
+        else "No grid of columns stands out: no strips of pixels change together.",
+        "caption": "Bright: neighbouring strips of pixels change together from row to row, as they do in front of a "
         "backlight however dark the picture is. Lines: borders of columns, across which they do not.",
         **_drawn(frame, read_strips(plane).lit),
         "grids": [
@@ -68,7 +68,7 @@ def _borders(grid: Grid, width: int, height: int) -> list[FloatArray]:
     lines = []
     for border in range(int(np.ceil(u.min())), int(np.floor(u.max())) + 1):
         at = np.array([np.interp(border, row, x, np.nan, np.nan) for row in u])
-        seen = np.isfinite(at)
-        if seen.sum() > 1:
-            lines.append(np.stack([at[seen], y[seen]], axis=-1))
+        finite = np.isfinite(at)
+        if finite.sum() > 1:
+            lines.append(np.stack([at[finite], y[finite]], axis=-1))
     return lines

@@ -39,7 +39,7 @@ def encoded_jpeg(pixels: NDArray[np.uint8], quality: int) -> str:
 
 
 def preview(frame: Frame, width_px: int = 1000) -> Preview:
-    """A copy of `frame` at most about `width_px` wide: every so many pixels, so that stripes stay stripes."""
+    """A copy of `frame` at most about `width_px` wide: by decimation, so that stripes remain."""
     step = max(1, math.ceil(max(frame.width, frame.height) / width_px))
     return Preview(grey_levels(frame, step), step)
 

@@ -22,7 +22,7 @@ from rxcli.results.record import plain
 from rxcli.results.report import headline, mirror_note, printable
 from rxcli.types import FloatArray, Frame, FrameResult
 
-#: Told by the first lines of a page that this program wrote.
+#: First lines of a page that this program wrote.
 MARK = "<!-- written by vlc-rx inspect -->"
 #: Points of a column's light, with few and with many columns; widths of the picture, and heights of traces, in steps.
 _POINTS, _FEW_POINTS, _MANY_COLUMNS, _STEPS, _WIDTH_PX = 1200, 500, 24, 1000, 1200
@@ -52,15 +52,15 @@ def inspection_page(
         "headline": headline(result),
         "source": printable(result.source),
         "steps": _steps(result),
-        "notes": [note for note in (mirror_note(result), reason) if note],
+        "notes": [sentence for sentence in (mirror_note(result), reason) if sentence],
         "advice": advice,
         "texts": text_rows(result),
         "facts": _facts(frame, result),
         "picture": picture_of(result, frame, preview(frame, _WIDTH_PX), screen, camera),
         "maps": [shown for shown in (column_map(frame),) if shown],
         "timeline": [
-            [one.frame, one.time_s, headline(one), len(one.packets), one.status in ("ok", "partial")]
-            for one in timeline
+            [entry.frame, entry.time_s, headline(entry), len(entry.packets), entry.status in ("ok", "partial")]
+            for entry in timeline
         ],
         "packets": packet_rows(result),
         "columns": column_rows(result),
@@ -69,7 +69,9 @@ def inspection_page(
         and {"corrected": [c.column for c in result.columns if c.denoised], **result.denoiser},
         "times": {name: value for name, value in result.timing_ms.items() if math.isfinite(value)},
         "skipped": result.skipped,
-        "search": [[one.hypothesis, one.log_prior, one.evidence, one.score, one.fate] for one in result.search],
+        "search": [
+            [entry.hypothesis, entry.log_prior, entry.evidence, entry.score, entry.fate] for entry in result.search
+        ],
     }
     return fill(data, f"{printable(Path(result.source).name)}: {headline(result).lower()}")
 

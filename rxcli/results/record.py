@@ -50,7 +50,7 @@ def to_json_line(result: FrameResult) -> str:
 
 
 def _details(result: FrameResult) -> dict[str, Any]:
-    """The parts of a record that stand only where there is something to say."""
+    """Optional parts of a record, present only if they are not empty."""
     details = {
         "estimated": result.estimated,
         "skipped": result.skipped,

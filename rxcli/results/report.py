@@ -37,7 +37,7 @@ def format_link(result: FrameResult) -> list[str]:
     """What came through the link layer with a frame, one line each, for people."""
     lines = format_received(result)
     lines += [format_progress(progress) for progress in result.progress]
-    return lines + [f"note: {printable(note)}" for note in result.link_notes]
+    return lines + [f"note: {printable(hint)}" for hint in result.link_notes]
 
 
 def format_received(result: FrameResult) -> list[str]:
@@ -100,7 +100,7 @@ def _escape(character: str) -> str:
 
 
 def printable_name(name: str) -> str:
-    """The name of a file as `printable`, with backslashes doubled, so that it can be told what the name was."""
+    """The name of a file as `printable`, with backslashes doubled, so that the original name can be recovered."""
     return printable(name.replace("\\", "\\\\"))
 
 
@@ -109,11 +109,11 @@ _FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 
 def format_frame(result: FrameResult) -> str:
-    """A heading and one row per packet; columns without packets are put together where they tell the same."""
+    """A heading and one row per packet; columns without packets are grouped if their rows are equal."""
     lines = [format_heading(result)]
-    note = mirror_note(result, "--mirrored")
-    if note:
-        lines.append(f"  {note}")
+    hint = mirror_note(result, "--mirrored")
+    if hint:
+        lines.append(f"  {hint}")
     if result.message:
         lines.append(f"  {printable(result.message.removeprefix(result.source + ': '))}")
     clip = _is_clip(result)
@@ -157,7 +157,7 @@ def headline(result: FrameResult) -> str:
 
 
 def count_packets(n_received: int, n_unsure: int) -> str:
-    """The packets of a photo, a clip or a run: those that can be believed, and the rest apart.
+    """The packets of a photo, a clip or a run: received ones, and unsure ones separately.
 
     Args:
         n_received: packets that are believable, see `rxcli.types.BELIEVABLE`.
@@ -190,7 +190,7 @@ def plural(number: int, noun: str) -> str:
 
 
 def wrapped(text: str, width: int) -> str:
-    """`text` with lines longer than `width` broken between words; those that follow are indented by as much and four.
+    """`text` with lines longer than `width` broken between words; continuation lines are indented by four more.
 
     Rows of tables and file names are never longer by more than one word, which is left whole.
     """
@@ -249,8 +249,8 @@ def _row_key(column: ColumnResult) -> tuple[str, str | None] | int:
 
 
 def _empty_row(columns: list[ColumnResult]) -> str:
-    first, last = columns[0].column, columns[-1].column
-    span = str(first) if first == last else f"{first}-{last}"
+    lowest, highest = columns[0].column, columns[-1].column
+    span = str(lowest) if lowest == highest else f"{lowest}-{highest}"
     return f"  {span:>5}  {columns[0].status:<9}  {columns[0].message or ''}".rstrip()
 
 

@@ -29,7 +29,7 @@ from rxcli.types import BELIEVABLE, FrameResult
 #: Packets that one sentence names.
 _MAX_NAMED = 6
 
-#: What a row tells of the score.
+#: Fields of the score in a row.
 _SCORED = ("expected", "error_free", "lost", "false", "extra", "wrong_w", "ber")
 
 
@@ -61,7 +61,7 @@ class SourceSummary:
     n_received: int = 0
     received_bits: int = 0
     n_columns: int = 0
-    #: Bursts of a clip of which a packet was reported, and times of its first and its last frame.
+    #: Bursts of a clip with a reported packet, and times of its first and its last frame.
     bursts: set[int] = field(default_factory=set)
     first_s: float = math.inf
     last_s: float = -math.inf
@@ -74,12 +74,11 @@ class SourceSummary:
     #: Packets that were put together from several frames.
     n_combined: int = 0
     statuses: Counter[str] = field(default_factory=Counter)
-    #: Reasons of failure of frames and columns, with how often each came up; `_kinds` has those that differ in numbers
-    #: alone under the first of them.
+    #: Counts of failure reasons of frames and columns; `_kinds` merges reasons that differ only in numbers.
     reasons: Counter[str] = field(default_factory=Counter)
     _kinds: dict[str, str] = field(default_factory=dict)
     time_ms: float = 0.0
-    #: Messages and files that came whole, files that did not, and those that could not be written.
+    #: Complete messages and files, incomplete files, and files that could not be written.
     n_messages: int = 0
     n_objects: int = 0
     incomplete: list[str] = field(default_factory=list)
@@ -137,7 +136,7 @@ class SourceSummary:
 
     @property
     def frames_failed(self) -> int:
-        """Frames of which nothing was received."""
+        """Frames without packets."""
         return self.n_frames - self.statuses["ok"] - self.statuses["partial"]
 
     @property
@@ -157,8 +156,8 @@ class SourceSummary:
         if not self.reasons:
             return ""
         common, _ = self.reasons.most_common(1)[0]
-        others = len(self.reasons) - 1
-        return f"{common} (and {others} other reason{'s' * (others > 1)})" if others else common
+        n_others = len(self.reasons) - 1
+        return f"{common} (and {n_others} other reason{'s' * (n_others > 1)})" if n_others else common
 
     def failures(self, limits: Limits) -> list[tuple[ExitCode, str]]:
         """Why this source does not pass: exit codes with reasons; empty where it does."""
@@ -234,7 +233,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def total(summaries: Sequence[SourceSummary]) -> SourceSummary:
-    """All sources as one, named "total"; scored over those of which the truth is known."""
+    """All sources as one, named "total"; scored over sources with known truth."""
     whole = SourceSummary("total")
     for summary in summaries:
         for name in (

@@ -1,4 +1,4 @@
-"""What was really sent, as `NAME.truth.json` tells it, and how well a reception agrees with it.
+"""The data that were sent, from `NAME.truth.json`, and the score of a reception against them.
 
 A packet is *expected*, once per source and column, when some frame shows its burst for at least 1.02 packet lengths. It
 is *lost* when nothing was reported for it or more than a quarter of its bits are wrong. A reported packet is *false*
@@ -66,7 +66,7 @@ class Truth(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def expected_bursts(self) -> frozenset[int]:
-        """Bursts of which some frame shows enough."""
+        """Bursts that some frame shows sufficiently."""
         enough = EXPECTED_LENGTHS * packet_slots(self.payload_symbols)
         return frozenset(b.burst for f in self.frames for b in f.bursts if b.visible_slots >= enough)
 
@@ -179,8 +179,8 @@ class Score:
         """Bit error rate in which half the bits of a lost packet count as wrong; None where nothing was expected."""
         return (self.bit_errors + self.lost_bits / 2) / self.bits if self.bits else None
 
-    def __add__(self, other: Score) -> Score:
-        return Score(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(Score)))
+    def __add__(self, score: Score) -> Score:
+        return Score(*(getattr(self, f.name) + getattr(score, f.name) for f in fields(Score)))
 
 
 @dataclass(frozen=True, slots=True, order=True)

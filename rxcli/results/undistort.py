@@ -41,7 +41,7 @@ def grey_levels(frame: Frame, step: int = 1) -> NDArray[np.uint8]:
 
     Args:
         frame: a picture as stored.
-        step: only every so many rows and columns, as if taken from the whole.
+        step: decimation of rows and columns, applied to the whole picture.
     """
     mosaic = frame.mosaic
     black, white = (frame.black, frame.white) if mosaic is None else (0.0, 1.0)
@@ -72,12 +72,12 @@ def _mosaic_grey(pixels: NDArray[np.uint8] | NDArray[np.uint16], mosaic: Mosaic)
 class UndistortedWriter:
     """Writes every frame it is given into a folder, undistorted, as PNG; picklable.
 
-    A frame whose lens no profile tells waits for its result, which may hold an estimated lens.
+    A frame without a lens profile waits for its result, which may hold an estimated lens.
     """
 
     folder: Path
     cameras: tuple[CameraProfile, ...]
-    #: Take the first camera whatever the file says of itself.
+    #: Use the first camera for every file.
     force_camera: bool = False
     #: Frames that wait, by source and index.
     _waiting: dict[tuple[str, int], Frame] = field(default_factory=dict, compare=False)

@@ -33,7 +33,7 @@ def test_where_no_grid_stands_out_the_map_says_so() -> None:
     shown = column_map(Frame(drawn(0.0), "drawn"))
     assert shown is not None
     assert shown["grids"] == []
-    assert "No grid of columns stands out" in shown["told"]
+    assert "No grid of columns stands out" in shown["text"]
 
 
 @pytest.mark.parametrize("shape", [(64, 400), (400, 64)])
