@@ -284,14 +284,13 @@ def test_clusters_widen_the_interval() -> None:
 
 def test_tables_align_and_survive_csv(tmp_path: Path) -> None:
     rows = [{"name": "a", "rate": 0.00012345, "range": (0.0, 0.5)}, {"name": "bcd", "rate": None, "range": (0.25, 1.0)}]
-    lines = tables.format_table(rows).splitlines()
-    assert lines[2].split() == ["a", "0.000123", "0..0.5"]
-    assert lines[3].split() == ["bcd", "-", "0.25..1"]
+    lines = tables.as_text(rows).splitlines()
+    assert [line.split() for line in lines[1:]] == [["a", "0.000123", "0..0.5"], ["bcd", "-", "0.25..1"]]
     table = tables.to_csv(rows).splitlines()
     assert table == ["name,rate,range_low,range_high", "a,0.00012345,0.0,0.5", "bcd,,0.25,1.0"]
     _, as_json = tables.write_outputs(tmp_path, "x", rows, {"more": 1})
     assert json.loads(as_json.read_text())["details"] == {"more": 1}
-    assert tables.format_table([]) == "(nothing to show)"
+    assert tables.as_text([]) == "(nothing to show)"
 
 
 def test_error_rates_are_plotted(tmp_path: Path) -> None:

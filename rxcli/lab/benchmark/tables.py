@@ -12,24 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from rxcli.outputs import write_whole
+from rxcli.results.report import format_table
 
 log = logging.getLogger(__name__)
 
 Row = dict[str, Any]
 
 
-def format_table(rows: Sequence[Row]) -> str:
-    """Rows of equal keys as an aligned table; numbers to the right."""
+def as_text(rows: Sequence[Row]) -> str:
+    """Rows of equal keys as an aligned table."""
     if not rows:
         return "(nothing to show)"
-    names = list(rows[0])
-    cells = [names, *([format_value(row.get(name)) for name in names] for row in rows)]
-    widths = [max(len(line[i]) for line in cells) for i in range(len(names))]
-    numeric = [all(isinstance(row.get(name), (int, float, type(None))) for row in rows) for name in names]
-    pads = [str.rjust if right else str.ljust for right in numeric]
-    lines = ["  ".join(pad(cell, w) for pad, cell, w in zip(pads, line, widths, strict=True)) for line in cells]
-    lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join(line.rstrip() for line in lines)
+    return format_table(rows[0], ([format_value(row.get(name)) for name in rows[0]] for row in rows))
 
 
 def format_value(value: Any) -> str:
@@ -73,7 +67,7 @@ def write_outputs(folder: Path, name: str, rows: Sequence[Row], details: Any) ->
 
 def titled(sections: Iterable[tuple[str, Sequence[Row]]]) -> str:
     """Several tables under their titles."""
-    return "\n\n".join(f"{title}\n{format_table(rows)}" for title, rows in sections)
+    return "\n\n".join(f"{title}\n{as_text(rows)}" for title, rows in sections)
 
 
 def plot(rows: Sequence[Row], path: Path, measure: str, interval: str, across: str = "scenes") -> None:
