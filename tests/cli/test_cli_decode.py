@@ -6,11 +6,7 @@ import csv
 import io
 import json
 import os
-import random
-import signal
-import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,7 +22,6 @@ from rxcli.results.undistort import UndistortedWriter
 from rxcli.types import Frame, FrameResult
 
 Decode = Callable[..., tuple[int, str, str]]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 
 @pytest.fixture
@@ -358,49 +353,6 @@ def test_a_frame_without_a_profile_waits_for_the_lens_that_is_estimated(
     straight = border(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
     assert np.ptp(border(bent)) >= 6
     assert np.ptp(straight) <= 1
-
-
-def test_worker_processes_change_nothing_but_the_time(tmp_path: Path, decode: Decode) -> None:
-    folder = tmp_path / "in"
-    folder.mkdir()
-    for seed in range(5):
-        write_frame(folder / f"{seed}.png", seed)
-    (folder / "3.png").write_bytes(b"no picture")
-    alone, several = (decode(folder, "--json", "-", "--truth", "auto", "--workers", n) for n in (1, 2))
-    assert alone[0] == several[0] == 3
-    assert without_times(alone[1]) == without_times(several[1])
-
-
-def test_a_large_folder_killed_again_and_again(tmp_path: Path, decode: Decode) -> None:
-    """Forty files, every tenth of them bad; the run is killed at random moments and resumed."""
-    folder, out = tmp_path / "in", tmp_path / "out.jsonl"
-    folder.mkdir()
-    for number in range(40):
-        if number % 10 == 5:
-            (folder / f"{number:02}.jpg").write_bytes(b"\xff\xd8\xff\xe0 cut")
-        elif number < 4:
-            write_frame(folder / f"{number:02}.png", number)
-        else:  # decoding is not what is tested here
-            (folder / f"{number:02}.png").write_bytes((folder / f"{number % 4:02}.png").read_bytes())
-    code, undisturbed, _ = decode(folder, "--json", "-")
-    assert code == 3
-    assert sum(record["status"] == "ok" for record in without_times(undisturbed)) == 36
-    names = write_profiles(tmp_path / "profiles")
-    command = [sys.executable, "-m", "rxcli.cli.main", "decode", str(folder), "--json", str(out), "--resume", *names]
-    generator = random.Random(3)
-    for _ in range(3):
-        before = out.stat().st_size if out.exists() else 0
-        killed = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.DEVNULL)
-        while (out.stat().st_size if out.exists() else 0) <= before:
-            assert killed.poll() is None, "it ended before it could be killed"
-            time.sleep(0.002)
-        time.sleep(generator.uniform(0, 0.1))
-        killed.send_signal(signal.SIGKILL)
-        assert killed.wait() == -signal.SIGKILL
-        assert len(without_times(out.read_text())) < 40
-    code, _, _ = decode(folder, "--json", out, "--resume")
-    assert code == 3
-    assert without_times(out.read_text()) == without_times(undisturbed)
 
 
 def test_reference_photo(shared_captures: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -20,7 +19,6 @@ from rxcli.cli.terminal import coloured
 from rxcli.errors import InputError
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-COMMAND = [sys.executable, "-m", "rxcli.cli.main"]
 
 
 def test_help_lists_the_commands_there_are_and_no_others(capsys: pytest.CaptureFixture[str]) -> None:
@@ -206,32 +204,3 @@ def test_verbose_shows_the_traceback_of_an_internal_error(
     with_command(monkeypatch, ZeroDivisionError("oh"))
     assert run(["--verbose", "fails"]) == 1
     assert "Traceback" in capsys.readouterr().err
-
-
-def test_a_closed_pipe_ends_the_run_without_a_word(tmp_path: Path) -> None:
-    for number in range(400):
-        (tmp_path / f"{number}.jpg").touch()
-    command = [*COMMAND, "decode", str(tmp_path), "--json", "-"]
-    with subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as started:
-        assert started.stdout is not None
-        assert started.stderr is not None
-        assert started.stdout.readline().startswith(b'{"source"')
-        started.stdout.close()
-        said = started.stderr.read()
-    assert started.returncode == 130
-    assert b"Traceback" not in said
-    assert b"Exception" not in said
-
-
-def test_an_interrupt_is_exit_code_130(tmp_path: Path) -> None:
-    for number in range(1000):  # more lines than a pipe holds: the run cannot end before the interrupt comes
-        (tmp_path / f"{number}.jpg").touch()
-    command = [*COMMAND, "decode", str(tmp_path), "--json", "-"]
-    started = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    assert started.stdout is not None
-    assert started.stdout.readline().startswith(b'{"source"')
-    started.send_signal(signal.SIGINT)
-    _, said = started.communicate()
-    assert started.returncode == 130
-    assert said.endswith(b"vlc-rx: interrupted\n")
-    assert b"Traceback" not in said
