@@ -2,7 +2,7 @@
 
 The finder estimates waveforms from the same strips that it places. Decided slots are known waveforms. A regression of
 each strip on the slots of its columns gives the strip's distance from its place in the grid; all strips together move
-the grid. The corners follow the columns; top and bottom stay as near as can be to where they were.
+the grid. The corners follow the columns; top and bottom turn with them.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ _MIN_WAVE = 1e-3
 def corners_by_slots(
     strips: Strips,
     corners: FloatArray,
+    aspect: float,
     sigma: float,
     clock: Clock,
     lit: Float32Array,
@@ -39,6 +40,7 @@ def corners_by_slots(
     Args:
         strips: of the picture.
         corners: (4, 2) pixels in the viewer's order, right to some tenths of a column.
+        aspect: width over height of the screen.
         sigma: light spread of the screen, column pitches.
         clock: of the slots.
         lit: (C, N) probability that each slot of the clock's grid is lit.
@@ -61,7 +63,7 @@ def corners_by_slots(
         normal = (slopes * weight.ravel()) @ slopes.T + np.diag(prior)
         gradient = slopes @ (weight * off).ravel() - prior * (numbers - start.numbers)
         numbers = numbers + np.linalg.solve(normal, gradient)
-    return _corners(replace(start, numbers=numbers), corners, n_columns)
+    return _corners(replace(start, numbers=numbers), corners, n_columns, aspect)
 
 
 def _start(strips: Strips, corners: FloatArray, n_columns: int, lens: Lens | None) -> Grid:
@@ -104,9 +106,8 @@ def _waves(
     return np.asarray(np.where(np.abs(changes) < _MIN_WAVE, 0, changes), np.float32)
 
 
-def _corners(grid: Grid, before: FloatArray, n_columns: int) -> FloatArray:
-    """Corners on the outer borders of a grid, with top and bottom nearest to where they were."""
-    x, y = grid.flat(before)
-    below = 1 + grid.numbers[3] * x + grid.numbers[4] * y
-    v0, c, d = np.linalg.lstsq(np.stack([np.ones(4), x, y], axis=1), np.array([0, 0, 1, 1]) * below)[0].tolist()
-    return Plane(grid, n_columns, v0, c, d).corners((0.0, 1.0))
+def _corners(grid: Grid, before: FloatArray, n_columns: int, aspect: float) -> FloatArray:
+    """Corners on the outer borders of a grid; top and bottom at right angles to its columns, as high as they were."""
+    plane = Plane.through(grid, n_columns, aspect, float(before[:, 1].mean()))
+    along = plane.along_flat(*grid.flat(before))
+    return plane.corners((float(along[:2].mean()), float(along[2:].mean())))

@@ -84,9 +84,9 @@ class FinderSettings:
     focal_widths: float = 0.8
     #: Gauss-Newton steps by decided slots, and standard deviations of the finder's columns before: shift and widths in
     #: screen widths, and perspective.
-    pose_steps: int = 2
-    pose_sd: float = 0.0025
-    pose_tilt_sd: float = 0.01
+    pose_steps: int = 3
+    pose_sd: float = 0.005
+    pose_tilt_sd: float = 0.02
     #: Log-odds against the likeliest first column down to which another is possible.
     min_log_odds: float = -7.0
     #: Log-odds of the next likely one below which the first column is plain, so that the screen's ends help the grid.

@@ -76,6 +76,7 @@ def _corners_by_slots(outline: Outline, best: Scored) -> FloatArray:
     return corners_by_slots(
         outline.strips,
         outline.corners,
+        screen.aspect,
         screen.light_spread,
         reception.clock,
         reception.clock.on_grid(reception.posteriors.lit),

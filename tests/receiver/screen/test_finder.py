@@ -207,7 +207,7 @@ def test_decided_slots_move_the_columns_to_their_place(is_turned: bool) -> None:
     lit = sent[:, 3:23].T
     if is_turned:  # Corners and columns are a viewer's, who sees the stored picture upside down.
         before, lit = before[[2, 3, 0, 1]], lit[::-1]
-    corners = corners_by_slots(strips, before, 0.47, clock, np.ascontiguousarray(lit), None)
+    corners = corners_by_slots(strips, before, 16 / 9, 0.47, clock, np.ascontiguousarray(lit), None)
     corners = corners[[2, 3, 0, 1]] if is_turned else corners
     off = (corners - CORNERS) @ along / (along @ along)
     assert np.abs(off).max() < 0.1
