@@ -11,11 +11,11 @@ import signal
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import chain, islice
 from queue import SimpleQueue
-from threading import Lock, Semaphore, Thread
+from threading import Lock, Semaphore, Thread, local
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
@@ -303,19 +303,24 @@ def _until_end(results: _Results) -> Iterator[FrameResult]:
         yield result
 
 
+class _WorkerDiedError(Exception):
+    """A worker process ended with a source in hand; its argument says how."""
+
+
 class _Pool:
     """Threads that each have a worker process, give it one source after the other, and queue its results."""
 
     def __init__(self, decoder: Decoder, n_workers: int) -> None:
-        self._decoder = decoder
-        self._n_workers = n_workers
+        self._decoder, self._n_workers = decoder, n_workers
         self._tasks: SimpleQueue[tuple[Source, _Results] | None] = SimpleQueue()
-        self._may_decode = Semaphore(n_workers)
-        self._lock = Lock()
-        self._workers = [_Worker(decoder) for _ in range(n_workers)]
-        self._closed = False
-        for worker in self._workers:
-            Thread(target=self._serve, args=(worker,), daemon=True).start()
+        #: One for each worker; a thread that takes them all decodes alone.
+        self._permits, self._taking_all = Semaphore(n_workers), Lock()
+        self._starting, self._closed = Lock(), False
+        self._processes: list[BaseProcess] = []
+        #: Process and connection of each thread.
+        self._own = local()
+        for _ in range(n_workers):
+            Thread(target=self._serve, daemon=True).start()
 
     def submit(self, source: Source) -> _Results:
         """Have a source decoded; returns the queue of its results, with a None behind the last."""
@@ -324,28 +329,31 @@ class _Pool:
         return results
 
     def close(self) -> None:
-        """End the workers, whatever they do."""
-        self._closed = True
-        for worker in self._workers:
+        """End the workers, which have nothing of their own and ignore gentler signals; none is started any more."""
+        with self._starting:
+            self._closed = True
+        for process in self._processes:
+            process.kill()
+            process.join()
+        for _ in range(self._n_workers):
             self._tasks.put(None)
-            worker.close()
 
-    def _serve(self, worker: _Worker) -> None:
+    def _serve(self) -> None:
         for source, results in iter(self._tasks.get, None):
             try:
-                for result in () if self._closed else self._decode(worker, source):
+                for result in self._decode(source):
                     results.put(result)
             except Exception as error:
                 results.put(error)
             results.put(None)
 
-    def _decode(self, worker: _Worker, source: Source) -> Iterator[FrameResult]:
+    def _decode(self, source: Source) -> Iterator[FrameResult]:
         """Results of a source, if need be in a second attempt, which repeats none of the first."""
         count = 0
-        for attempt in (self._may_decode, self._alone()):
+        for attempt in (self._permits, self._alone()):
             try:
                 with attempt:
-                    for result in islice(worker.results(source), count, None):
+                    for result in islice(self._results(source), count, None):
                         yield result
                         count += 1
                 return
@@ -353,7 +361,7 @@ class _Pool:
                 ending = death.args[0]
             if self._closed:
                 return
-            if attempt is self._may_decode:
+            if attempt is self._permits:
                 log.warning("%s: the process that decoded it %s; it is tried again", source.name, ending)
         message = f"{source.name}: two processes that decoded it died, the last one {ending}; try it by itself"
         yield replace(unreadable(source, count, message), retry=True)
@@ -361,37 +369,22 @@ class _Pool:
     @contextmanager
     def _alone(self) -> Iterator[None]:
         """While no other worker decodes."""
-        with self._lock:
+        with self._taking_all:
             for _ in range(self._n_workers):
-                self._may_decode.acquire()
+                self._permits.acquire()
         try:
             yield
         finally:
-            self._may_decode.release(self._n_workers)
+            self._permits.release(self._n_workers)
 
-
-class _WorkerDiedError(Exception):
-    """A worker died while decoding a source; the argument describes how."""
-
-
-@dataclass(slots=True)
-class _Worker:
-    """A process that decodes one source after the other; started when it is needed, and again after its death."""
-
-    decoder: Decoder
-    process: BaseProcess | None = None
-    connection: Connection | None = None
-    closed: bool = False
-    lock: Lock = field(default_factory=Lock)
-
-    def results(self, source: Source) -> Iterator[FrameResult]:
-        """The results of a source as they come.
+    def _results(self, source: Source) -> Iterator[FrameResult]:
+        """The results of a source from this thread's worker, as they come.
 
         Raises:
             _WorkerDiedError: the process died first.
             ReceiverError: of the worker.
         """
-        process, connection = self._started()
+        process, connection = self._worker()
         try:
             connection.send(source)
             while (message := connection.recv()) is not None:
@@ -401,25 +394,20 @@ class _Worker:
         except (EOFError, OSError):
             process.join()
             connection.close()
-            self.process = None
+            del self._own.worker
             raise _WorkerDiedError(_ending(process.exitcode)) from None
 
-    def _started(self) -> tuple[BaseProcess, Connection]:
-        with self.lock:
-            if self.closed:
+    def _worker(self) -> tuple[BaseProcess, Connection]:
+        """This thread's process, started where there is none, and the connection to it."""
+        with self._starting:
+            if self._closed:
                 raise _WorkerDiedError("was ended")
-            if self.process is None or self.connection is None:
+            if not hasattr(self._own, "worker"):
                 _hold_signals(signal.SIG_BLOCK)  # in this thread, and in the process until it ignores them
-                self.process, self.connection = start_process(_work, self.decoder, log_level())
-            return self.process, self.connection
-
-    def close(self) -> None:
-        """End the process, which has nothing of its own and ignores gentler signals; none is started any more."""
-        with self.lock:
-            self.closed = True
-            if self.process is not None:
-                self.process.kill()
-                self.process.join()
+                self._own.worker = start_process(_work, self._decoder, log_level())
+                self._processes.append(self._own.worker[0])
+        worker: tuple[BaseProcess, Connection] = self._own.worker
+        return worker
 
 
 def _ending(exitcode: int | None) -> str:
