@@ -144,16 +144,17 @@ def format_heading(result: FrameResult) -> str:
 def _counts(result: FrameResult) -> str:
     if _goes_on(result):
         return "its packets end in later frames"
+    return f"{_packets_in_words(result)} ({plural(len(result.columns), 'column')})"
+
+
+def _packets_in_words(result: FrameResult) -> str:
     n_received = sum(packet.is_believable for packet in result.packets)
-    return f"{count_packets(n_received, len(result.packets) - n_received)} ({plural(len(result.columns), 'column')})"
+    return count_packets(n_received, len(result.packets) - n_received)
 
 
 def headline(result: FrameResult) -> str:
     """What became of a frame, in a few words."""
-    if not result.packets:
-        return _STATUS[result.status]
-    n_received = sum(packet.is_believable for packet in result.packets)
-    return capitalised(count_packets(n_received, len(result.packets) - n_received))
+    return capitalised(_packets_in_words(result)) if result.packets else _STATUS[result.status]
 
 
 def count_packets(n_received: int, n_unsure: int) -> str:
