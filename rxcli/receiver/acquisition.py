@@ -12,7 +12,10 @@ from rxcli.receiver import camera as blind
 from rxcli.receiver import plane, sync
 from rxcli.receiver.context import FrameContext
 from rxcli.receiver.screen import geometry
-from rxcli.types import Clock, FloatArray, IntArray, RowProfiles
+from rxcli.types import Clock, FloatArray, IntArray, Outlines, RowProfiles
+
+#: Outlines of one frame that are kept.
+_MAX_OUTLINES = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,13 +96,25 @@ def n_strips_of(corners: FloatArray, n_columns: int) -> int:
     return plane.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
 
 
+def outlines_of(context: FrameContext, n_columns: int) -> Outlines:
+    """Outlines of the strips of a screen's columns, computed once for each place and lens."""
+    frame, corners, lens = context.frame, context.corners, context.camera.lens
+    known = context.timer.outlines
+    bent = lens and (lens.camera_matrix.tobytes(), lens.dist_coeffs.tobytes(), lens.corrected)
+    key = (frame.width, frame.height, corners.tobytes(), n_columns, bent)
+    if key not in known:
+        if len(known) >= _MAX_OUTLINES:
+            known.clear()
+        n_strips = n_strips_of(corners, n_columns)
+        known[key] = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
+    return known[key]
+
+
 def sample_columns(context: FrameContext, n_columns: int) -> ColumnSampler:
     """Sample the row profiles of a screen of `n_columns` columns in order of time."""
-    frame, camera, corners = context.frame, context.camera, context.corners
-    n_strips = n_strips_of(corners, n_columns)
+    frame, camera = context.frame, context.camera
     with context.timer("sampling"):
-        outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, camera.lens)
-        profiles = context.timer.planes.sample(frame, outlines, camera.tone)
+        profiles = context.timer.planes.sample(frame, outlines_of(context, n_columns), camera.tone)
         return ColumnSampler.of(blind.in_time_order(profiles, frame.height) if camera.reversed else profiles)
 
 

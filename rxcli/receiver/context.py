@@ -12,7 +12,7 @@ from rxcli.profiles import ScreenProfile
 from rxcli.receiver.camera import CameraHypothesis
 from rxcli.receiver.plane import PlaneStore
 from rxcli.receiver.screen.strips import Strips
-from rxcli.types import FloatArray, Frame, Lens
+from rxcli.types import FloatArray, Frame, Lens, Outlines
 
 DEFAULT_TONE = "srgb"
 #: Certainty from which the number of a column is likely.
@@ -83,6 +83,8 @@ class Timer:
     def __init__(self) -> None:
         self.timing_ms: dict[str, float] = {}
         self.planes = PlaneStore()
+        #: Outlines of columns by place and lens, see `acquisition.outlines_of`.
+        self.outlines: dict[tuple[Any, ...], Outlines] = {}
         self._start = time.perf_counter()
 
     @contextmanager

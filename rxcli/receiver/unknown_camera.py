@@ -8,10 +8,9 @@ from dataclasses import replace
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import camera as blind
-from rxcli.receiver.acquisition import Acquisition, sample_columns
+from rxcli.receiver.acquisition import Acquisition, outlines_of, sample_columns
 from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure, FrameContext, Timer
 from rxcli.receiver.reception import Reception
-from rxcli.receiver.screen import geometry
 from rxcli.types import FloatArray, Frame, RowProfiles
 
 
@@ -78,8 +77,7 @@ def settle(context: FrameContext, acquisition: Acquisition, reception: Reception
 
 def _strips(context: FrameContext, profiles: RowProfiles) -> blind.Strips:
     """Convert row profiles to strips in order of time."""
-    frame, (n_columns, n_strips, _) = context.frame, profiles.light.shape
-    outlines = geometry.column_outlines(context.corners, n_columns, n_strips, frame.width, frame.height)
+    frame, outlines = context.frame, outlines_of(context, len(profiles.light))
     x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
     return blind.strips_of(profiles, x[:, ::-1] if context.camera.reversed else x, frame.width, frame.height)
 

@@ -145,7 +145,7 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
     if not combs:
         return None
     best = with_light(some, grid_of_comb(combs[0], strips), sigma)
-    if combs[0].score < SETTINGS.plain_comb or best.contrast < SETTINGS.plain_contrast * best.explained:
+    if best.contrast < SETTINGS.plain_contrast * best.explained:
         others = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
         best = max([best, *others], key=lambda one: one.explained + SETTINGS.contrast_weight * one.contrast)
     return _settled(strips, moved_by_waveforms(some, best, sigma, SETTINGS.first_steps), sigma)
@@ -194,7 +194,7 @@ def _settled(strips: Strips, grid: Grid, sigma: float) -> Grid | None:
 
 def _stands_out(strips: Strips, grid: Grid) -> bool:
     by_chance = SETTINGS.min_contrast * grid.explained / np.sqrt(strips.n_rows * SETTINGS.n_windows)
-    return bool(grid.contrast > max(by_chance, SETTINGS.min_contrast_per_strip * strips.lit.size))
+    return bool(grid.contrast > by_chance)
 
 
 def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> list[OutlineCandidate]:

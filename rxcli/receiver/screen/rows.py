@@ -18,10 +18,6 @@ from rxcli.types import Float32Array, FloatArray
 
 #: Places along the screen at which light is asked for, and how far beyond its ends, screen heights.
 _BINS, _BEYOND = 640, 0.6
-#: Share of the strips, the least alike, that are taken to be without light.
-_DARK_SHARE = 0.1
-#: Places with less than this share of the strips that others have count in proportion.
-_FEW_STRIPS = 0.5
 #: Light counts from this share of what the lit rows have.
 _LIT_SHARE = 0.18
 #: Missing height, a share, below which the light is taken for the whole screen.
@@ -107,9 +103,8 @@ def find_rows(
     by_block = np.maximum(light.mean(axis=(1, 2)), 0.0)
     row = float((by_block * strips.raw_y.mean(axis=1)).sum() / max(float(by_block.sum()), TINY)) * strips.width
     row += (strips.height - 1) / 2
-    parts = _PartLight.of(strips, light, grid, n_columns)
     plane = Plane.through(grid, n_columns, aspect, row)
-    top, bottom = lit_range(*parts.along(plane))
+    top, bottom = lit_range(*_light_along(strips, light, plane))
     missing = 1 - (bottom - top)
     if missing < _WHOLE:
         # A little more than the screen costs less than rows that are left out.
@@ -131,48 +126,21 @@ def lit_range(v: FloatArray, light: FloatArray, longest: float = 1.0) -> tuple[f
     return float(v[0] + (start - 0.5) * step), float(v[0] + (end - 0.5) * step)
 
 
-@dataclass(frozen=True, slots=True)
-class _PartLight:
-    """How alike the strips of a screen are to what their neighbours predict, beyond what strips without light are.
+def _light_along(strips: Strips, light: Float32Array, plane: Plane) -> tuple[FloatArray, FloatArray]:
+    """How much light the columns have along the screen: (n,) v, and the light there.
 
     The strips of a column lie at the same place along the screen, and are taken together.
     """
-
-    #: (P, R), and how many strips each is the sum of.
-    light: Float32Array
-    n_together: int
-    #: (P,) places of the parts, and half the height of their rows, picture widths.
-    x: FloatArray
-    y: FloatArray
-    half_height: float
-
-    @classmethod
-    def of(cls, strips: Strips, light: Float32Array, grid: Grid, n_columns: int) -> _PartLight:
-        """The light of the strips that lie on the columns of a grid."""
-        u = columns_at(grid.numbers, strips.x, strips.y)
-        mean = light.mean(axis=2).reshape(strips.n_parts, -1, light.shape[1]).mean(axis=1).ravel()
-        dark = np.sort(mean)[: max(round(_DARK_SHARE * mean.size), 1)].mean()
-        n_blocks, n_strips, n_rows = light.shape
-        n = max(int(n_strips / max(float(np.ptp(u, axis=1).mean()), 1.0)), 1)
-        whole = n_strips // n * n
-        total = light[:, :whole].reshape(n_blocks, -1, n, n_rows).sum(axis=2)
-        u, x, y = (values[:, :whole].reshape(n_blocks, -1, n).mean(axis=2) for values in (u, strips.x, strips.y))
-        inside = (u > 0) & (u < n_columns)
-        above = (total - np.float32(n * max(float(dark), 0.0)))[inside]
-        return cls(np.asarray(above, np.float32), n, x[inside], y[inside], strips.half_height)
-
-    def along(self, plane: Plane) -> tuple[FloatArray, FloatArray]:
-        """How much light the columns have along the screen: (n,) v, and the light there."""
-        # A strip's rows of one window lie evenly along the screen.
-        ends = np.stack([plane.along(self.x, self.y + side * self.half_height) for side in (-1, 1)], axis=-1)
-        n_rows = self.light.shape[1]
-        share = (np.arange(n_rows) + 0.5) / n_rows
-        v = ends[..., :1] + np.diff(ends) * share
-        edges = np.linspace(-_BEYOND, 1 + _BEYOND, _BINS + 1)
-        place = np.floor((v.ravel() - edges[0]) / (edges[1] - edges[0])).astype(np.int64)
-        good = (place >= 0) & (place < _BINS)
-        total = np.bincount(place[good], self.light.ravel()[good], _BINS)
-        count = self.n_together * np.bincount(place[good], minlength=_BINS)
-        # At the ends of the picture a few strips alone say little.
-        enough = _FEW_STRIPS * float(np.median(count[count > 0])) if count.any() else 1.0
-        return (edges[1:] + edges[:-1]) / 2, np.asarray(total / np.maximum(count, enough))
+    u = columns_at(plane.grid.numbers, strips.x, strips.y)
+    n_blocks, n_strips, n_rows = light.shape
+    n = max(int(n_strips / max(float(np.ptp(u, axis=1).mean()), 1.0)), 1)
+    whole = n_strips // n * n
+    together = light[:, :whole].reshape(n_blocks, -1, n, n_rows).mean(axis=2)
+    u, x, y = (values[:, :whole].reshape(n_blocks, -1, n).mean(axis=2) for values in (u, strips.x, strips.y))
+    inside = (u > 0) & (u < plane.n_columns)
+    # A strip's rows of one window lie evenly along the screen.
+    ends = [plane.along(x[inside], y[inside] + side * strips.half_height) for side in (-1, 1)]
+    v = ends[0][:, None] + (ends[1] - ends[0])[:, None] * (np.arange(n_rows) + 0.5) / n_rows
+    total, edges = np.histogram(v, _BINS, (-_BEYOND, 1 + _BEYOND), weights=together[inside])
+    count = np.histogram(v, edges)[0]
+    return (edges[1:] + edges[:-1]) / 2, np.asarray(total / np.maximum(count, 1))

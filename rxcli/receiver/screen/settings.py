@@ -31,9 +31,7 @@ class FinderSettings:
     #: Columns are narrow where coherence this many picture widths apart falls below a share of that nearer by.
     near_widths: float = 0.004
     far_widths: float = 0.02
-    narrow_ratio: float = 0.5
-    #: Mean coherence of neighbours below which nothing in the picture flickers.
-    min_lit: float = 0.02
+    narrow_ratio: float = 0.6
 
     #: Columns from which on a screen's are narrow.
     narrow_columns: int = 50
@@ -52,10 +50,9 @@ class FinderSettings:
     pair_distance: float = 0.72
     #: Combs that are tried as grids.
     n_combs: int = 4
-    #: Heights of combs, standard deviations by chance: below the first there is none, from the second on it is right
-    #: if its contrast is this share of what it explains.
+    #: Height of a comb, standard deviations by chance, below which there is none; and contrast of the highest, as a
+    #: share of what it explains, from which on no other is tried.
     min_comb: float = 6.0
-    plain_comb: float = 12.0
     plain_contrast: float = 0.15
 
     #: Weight against waveforms of columns that hardly show, strips.
@@ -71,13 +68,12 @@ class FinderSettings:
     contrast_weight: float = 3.0
     #: Steps on every second window, steps of narrow columns at each reach, and last steps on all windows.
     first_steps: int = 3
-    narrow_steps: int = 5
+    narrow_steps: int = 4
     last_steps: int = 2
     #: How much further a grid of narrow columns is followed at a time.
     reach_gain: float = 1.6
-    #: Least contrast: as a share of what is explained times the root of the number of rows, and log-likelihood a strip.
+    #: Least contrast, as a share of what is explained times the root of the number of rows.
     min_contrast: float = 0.95
-    min_contrast_per_strip: float = 0.05
     #: Least contrast of narrow columns in the best part of a picture, a share of what is explained.
     min_part_contrast: float = 0.05
     #: Focal length of a camera that no profile describes, picture widths.

@@ -139,8 +139,6 @@ def flat_places(points: FloatArray, width: int, height: int, lens: Lens | None) 
 
 def shows_narrow_columns(strips: Strips) -> bool:
     """Whether light is coherent nearby and no more a little further on, as that of wide columns is."""
-    if float(strips.lit.mean()) < SETTINGS.min_lit:
-        return False
     near, far = (_lit_coherence(strips, widths) for widths in (SETTINGS.near_widths, SETTINGS.far_widths))
     return far < SETTINGS.narrow_ratio * near
 

@@ -16,8 +16,6 @@ from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
-#: Largest step of a grid's numbers.
-_LARGEST_STEP = np.array([0.1, 0.3, 0.3, 0.04, 0.04, 0.02])
 #: Columns of a block that are told apart, at most: a plane seen nearly edge-on counts any number.
 _MAX_COLUMNS = 64
 _TINY = np.float32(1e-6)
@@ -150,8 +148,7 @@ def moved_by_waveforms(
         if not weight.any():
             break  # A black picture: nothing says where the borders are.
         slopes = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
-        step = grid_step(numbers, SETTINGS.step_gain * off.ravel(), weight.ravel(), slopes)
-        numbers = numbers + np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+        numbers = numbers + grid_step(numbers, SETTINGS.step_gain * off.ravel(), weight.ravel(), slopes)
     return replace(grid, numbers=numbers)
 
 
