@@ -121,7 +121,9 @@ def lit_range(v: FloatArray, light: FloatArray, longest: float = 1.0) -> tuple[f
     end = int((gain - np.minimum.accumulate(gain)).argmax())
     start = int(gain[: end + 1].argmin())
     if end - start > n:
-        start = int((gain[n:] - gain[:-n]).argmax())
+        # The band pass smears light beyond both ends: the middle of the places that have nearly all of it.
+        held = gain[n:] - gain[:-n]
+        start = round(float(np.flatnonzero(held > SETTINGS.nearly_all * held.max()).mean()))
         end = start + n
     return float(v[0] + (start - 0.5) * step), float(v[0] + (end - 0.5) * step)
 

@@ -83,6 +83,8 @@ class FinderSettings:
     pose_steps: int = 3
     pose_sd: float = 0.005
     pose_tilt_sd: float = 0.02
+    #: Share of the light that is nearly all of it.
+    nearly_all: float = 0.98
     #: Log-odds against the likeliest first column down to which another is possible.
     min_log_odds: float = -7.0
     #: Log-odds of the next likely one below which the first column is plain, so that the screen's ends help the grid.
