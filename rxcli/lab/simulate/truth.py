@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 
 from rxcli.outputs import write_whole
@@ -97,17 +98,10 @@ def build_camera_profile(scene: Scene, exposure: Exposure) -> CameraProfile:
 
 
 def _camera_truth(scene: Scene, exposure: Exposure) -> dict[str, Any]:
-    return {
-        "name": scene.camera_name,
-        "line_delay_s": scene.sensor.line_delay_s,
-        "exposure_s": scene.exposure_s,
-        "width": scene.sensor.width,
-        "height": scene.sensor.height,
-        "frame_rate_hz": scene.frame_rate_hz,
-        "camera_matrix": exposure.view.camera_matrix.tolist(),
-        "dist_coeffs": exposure.view.coefficients.tolist(),
-        "distortion_already_corrected": scene.isp.correct_distortion and not scene.is_mosaic,
-    }
+    """What the camera profile says of readout and lens."""
+    profile = build_camera_profile(scene, exposure)
+    facts = msgspec.to_builtins(profile.modes[0]) | msgspec.to_builtins(profile.lens)
+    return {**facts, "name": profile.name}
 
 
 def _frame_truth(number: int, exposure: Exposure) -> dict[str, Any]:
