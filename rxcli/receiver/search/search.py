@@ -201,6 +201,8 @@ class _Walk:
             except StopIteration as end:
                 self._cameras, self.failure = None, end.value
                 break
+            if not proposed:
+                continue
             likeliest = min(proposed, key=lambda one: (-one.log_prior, one.identity))
             self.nearest = self.nearest or likeliest
             self._next_prior = likeliest.log_prior - SETTINGS.next_camera
