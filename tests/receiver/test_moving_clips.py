@@ -349,3 +349,17 @@ def test_a_clip_in_portrait_says_why_nothing_comes(shaky: Clip) -> None:
     turned = tuple(replace(f, metadata=replace(f.metadata, orientation=6)) for f in shaky[0][:3])
     results, _ = received(shaky, turned)
     assert all(result.status == "no_signal" and "portrait" in (result.message or "") for result in results)
+
+
+@pytest.fixture(scope="module")
+def quick_clip() -> Clip:
+    return filmed_by(at_rate(240, "paper-17k3", 20))
+
+
+@pytest.mark.parametrize("cut", [0, 1, 5])
+def test_a_quick_clip_of_an_unknown_camera_is_received_wherever_it_begins(quick_clip: Clip, cut: int) -> None:
+    """No frame shows a whole packet; the surest of the first frames' cameras reads all of them."""
+    frames, truth, _ = quick_clip
+    results, score = received((frames, truth, ReceiverOptions()), frames[cut : cut + 15])
+    assert score.error_free + score.extra_error_free >= 20
+    assert surely_wrong(results) == 0

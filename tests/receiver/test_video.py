@@ -547,3 +547,22 @@ def test_dark_columns_are_left_out_and_counted() -> None:
     packets = [p for r in marked[0] for c in r.columns for p in c.packets]
     assert all(p.bit_errors == 0 for p in packets if p.confidence >= 0.9)
     assert all(not c.packets for r in marked[0][6:] for c in r.columns[12:])
+
+
+def _right_packets(results: list[FrameResult], truth: Truth) -> dict[tuple[int, str], set[int]]:
+    """Column and payload of every right packet, and the frames that showed it."""
+    marked, _ = scored(results, truth)
+    packets = [(column.column, p) for r in marked for column in r.columns for p in column.packets]
+    return {(column, p.payload): set(p.frames or ()) for column, p in packets if p.bit_errors == 0}
+
+
+@pytest.mark.parametrize("left_out", [{0}, {0, 1, 2}, {8, 9}, {3}, {6}])
+def test_frames_that_are_missing_take_no_other_packets_along(
+    clip: Clip, results: list[FrameResult], left_out: set[int]
+) -> None:
+    """A clip cut anywhere, or with dropped frames, keeps the packets that the other frames showed."""
+    kept = tuple(frame for frame in clip.frames if frame.index not in left_out)
+    right = _right_packets(list(receive(kept, clip.options)), clip.truth)
+    shown = {packet for packet, frames in _right_packets(results, clip.truth).items() if not frames & left_out}
+    assert len(shown) >= 60
+    assert len(shown - right.keys()) <= 0.01 * len(shown)

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import numpy as np
+
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.acquisition import Acquisition
@@ -51,6 +53,21 @@ class Located:
         if corners is self.context.corners:
             return self
         return Located(replace(self.outline, corners=corners), replace(self.context, corners=corners))
+
+    @property
+    def camera_error(self) -> float:
+        """Relative standard deviation of the line delay; infinite where an estimated camera shows no packets."""
+        camera = self.context.camera
+        if camera.hypothesis is None:
+            return 0.0
+        return camera.estimated["line_delay_s"][1] / camera.line_delay_s if isinstance(self.found, Found) else np.inf
+
+    def with_surer_camera(self, other: Located | Failure) -> Located:
+        """The same with the camera of another frame, where that one is surer."""
+        if isinstance(other, Failure) or other.camera_error >= self.camera_error:
+            return self
+        context = replace(other.context, frame=self.context.frame, corners=self.context.corners)
+        return replace(self, context=context, found=other.found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +116,7 @@ class ClipCamera:
         context, period_s, little = located.context, _shortest_period_s(frames), shows_little(located.context)
         if context.camera.hypothesis is None or period_s is None:
             return self, located
-        too_long = context.camera.line_delay_s * context.frame.height / (period_s * SETTINGS.readout_slack)
+        too_long = _readout_periods(context, period_s)
         if too_long <= 1 and not little:
             return self, located
         min_rate_hz = too_long * max(screen.slot_rate_hz for screen in context.screens)
@@ -118,7 +135,9 @@ class ClipCamera:
         first = located.context
         readings = [first]
         if first.camera.hypothesis is not None:
+            period_s = _shortest_period_s(frames) or np.inf
             readings += _readings_of(first, self.options.screens)
+            readings = [reading for reading in readings if _readout_periods(reading, period_s) <= 1]
         starts = [(agree(frames, reading), reading) for reading in readings]
         agreed = [(start.lead, start, reading) for start, reading in starts if start is not None]
         if not agreed:
@@ -183,6 +202,11 @@ def _readings_of(context: FrameContext, screens: Sequence[ScreenProfile]) -> Ite
                 camera, line_delay_s=delay_s, exposure_s=exposure_s, reversed=reverse, estimated=estimated
             )
             yield replace(context, camera=reading, screens=alike)
+
+
+def _readout_periods(context: FrameContext, period_s: float) -> float:
+    """Time of the readout, in parts of the longest that fits a frame period."""
+    return context.camera.line_delay_s * context.frame.height / (period_s * SETTINGS.readout_slack)
 
 
 def _shortest_period_s(frames: Sequence[Frame]) -> float | None:

@@ -25,6 +25,7 @@ from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.reception import Reception, shows_steady_light
+from rxcli.receiver.search import Found
 from rxcli.receiver.search.nulls import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode, doubtful_columns, initial_pass
 from rxcli.receiver.sync import tracking
@@ -133,15 +134,31 @@ def _acquire(state: Acquiring, frame: Frame) -> tuple[State, list[FrameResult]]:
         outline = FirstOutline(frame, located.outline.corners, known.camera.options, located.context)
         first = FirstFrames(located, outline, (frame,))
     else:
-        first.outline.take(frame)
-        first = replace(first, frames=(*first.frames, frame))
-    enough = len(first.frames) == SETTINGS.frames_together or not shows_little(first.located.context)
-    return _receive_first(known, first) if first.outline.settled and enough else (Acquiring(known, first), [])
+        first = _with_frame(known, first, frame)
+    little, unsettled = shows_little(first.located.context), first.located.camera_error == np.inf
+    if unsettled:
+        min_frames = SETTINGS.frames_held_long if little else SETTINGS.frames_together
+    else:
+        min_frames = SETTINGS.frames_together if little else 1
+    enough = first.outline.settled and len(first.frames) >= min_frames
+    return _receive_first(known, first) if enough else (Acquiring(known, first), [])
+
+
+def _with_frame(known: Known, first: FirstFrames, frame: Frame) -> FirstFrames:
+    """The first frames and one more; where each shows little or nothing, the surest of their cameras counts."""
+    first.outline.take(frame)
+    located = first.located
+    if located.camera_error == np.inf or (located.camera_error > 0 and shows_little(located.context)):
+        located = located.with_surer_camera(known.camera.locate(frame, Timer()))
+    return FirstFrames(located, first.outline, (*first.frames, frame))
 
 
 def _receive_first(known: Known, first: FirstFrames) -> tuple[State, list[FrameResult]]:
     """Receive the first frames: they have agreed on an outline and, where each shows little, on a clock."""
-    camera, located = known.camera.read_in_time(first.located.moved_to(first.outline.corners), first.frames)
+    located = first.located.moved_to(first.outline.corners)
+    if isinstance(located.found, Found) and located.found.best.context.frame is not first.frames[0]:
+        located = replace(located, found=None)
+    camera, located = known.camera.read_in_time(located, first.frames)
     if len(first.frames) > 1 and shows_little(located.context):
         located, known.ledger.start = camera.with_common_clock(located, first.frames)
     after, results = _receive(Lost(replace(known, camera=camera)), first.frames[0], located)
