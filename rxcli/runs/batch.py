@@ -50,6 +50,8 @@ _ENDS_RUN = (UsageError, ProfileError, OutputError)
 _FIRST_DECIDES = (signal.SIGINT, signal.SIGTERM)
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
 _AHEAD = 32
+#: What receiving a photo loads.
+_LOADED = ("rxcli.receiver.pipeline", "cv2", "numpy.ma")
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +254,7 @@ def standard_decoder(
 
 def _receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
     """Receive frames; the receiver is imported while the first frame is read."""
-    loading = Thread(target=import_module, args=("rxcli.receiver.pipeline",), daemon=True)
+    loading = Thread(target=lambda: [import_module(name) for name in _LOADED], daemon=True)
     loading.start()
     frames = iter(frames)
     try:
