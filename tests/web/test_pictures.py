@@ -9,6 +9,7 @@ import asyncio
 import io
 import os
 import shutil
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +39,9 @@ MAX_HEIGHT = 1800
 def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A photo with a text; beside it one that was turned."""
     folder = tmp_path_factory.mktemp("photos")
-    assert run(["demo", "--out", str(folder / "demo"), "--no-open"]) == 0
-    shutil.copy(folder / "demo" / "photo.jpg", folder / "IMG_1.jpg")
+    with chdir(folder):
+        assert run(["demo", "--no-open"]) == 0
+    shutil.copy(folder / "vlc-rx-demo" / "photo.jpg", folder / "IMG_1.jpg")
     with Image.open(folder / "IMG_1.jpg") as upright:
         upright.rotate(90, expand=True).save(folder / "IMG_2.jpg", quality=92)
     return folder / "IMG_1.jpg"
@@ -115,7 +117,7 @@ def test_the_pages_are_pictured(
                 await shots.told(server, "locked", locked)
                 if size == "narrow":
                     await shots.told(server, "waiting", waiting)
-                await browser.open((photo.parent / "demo" / "index.html").as_uri())  # before the server goes
+                await browser.open((photo.parent / "vlc-rx-demo" / "index.html").as_uri())  # before the server goes
             widest = "Math.max(...[...document.querySelectorAll('svg')].map((one) => one.scrollWidth))"
             assert await browser.run(f"{widest} < innerWidth")  # all columns of every chart are in view
             await shots.keep("inspect")
