@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import replace
+from typing import Protocol, Self, TypeVar
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import camera as blind
 from rxcli.receiver.acquisition import Acquisition, outlines_of, sample_columns
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure, FrameContext, Timer
 from rxcli.receiver.reception import Reception
 from rxcli.types import FloatArray, Frame, RowProfiles
@@ -73,6 +75,53 @@ def settle(context: FrameContext, acquisition: Acquisition, reception: Reception
             tone=None if frame.mosaic is not None or frame.linear else camera.tone,
         )
     return _camera(found, screen.slot_rate_hz, frame, camera.tone), moved_slots
+
+
+class InitialPass(Protocol):
+    """What was received with a camera, and how much it looks like packets."""
+
+    @property
+    def context(self) -> FrameContext: ...
+    @property
+    def acquisition(self) -> Acquisition: ...
+    @property
+    def reception(self) -> Reception: ...
+    @property
+    def evidence(self) -> float: ...
+    def with_camera(self, camera: Camera) -> Self:
+        """The same, its camera told otherwise."""
+
+
+_Pass = TypeVar("_Pass", bound=InitialPass)
+
+
+def fitted(best: _Pass, received: Callable[[Camera], _Pass | None]) -> _Pass:
+    """An initial pass with an estimated camera, after the camera was fitted until that moves the clock no more.
+
+    Args:
+        best: the initial pass.
+        received: another one with another camera, None where no clock is found.
+    """
+    if best.context.camera.hypothesis is None:
+        return best
+    for _ in range(SETTINGS.max_fits):
+        camera, moved_slots = settle(best.context, best.acquisition, best.reception)
+        if moved_slots < SETTINGS.matters_slots:
+            best = best.with_camera(camera)
+            break
+        again = received(camera)
+        # A fit under which packets show less was of wrong slots.
+        if again is None or again.evidence < SETTINGS.kept_evidence * best.evidence:
+            break
+        best = again
+    camera, frame = best.context.camera, best.context.frame
+    if camera.hypothesis is None or not blind.is_linear(camera.hypothesis.tone) or frame.mosaic or frame.linear:
+        return best
+    # Values seem to be light: they are taken for it where packets show as well then.
+    again = received(replace(camera, tone="linear"))
+    if again is not None and again.evidence >= best.evidence:
+        return again
+    return best.with_camera(camera.without_tone_estimate())
 
 
 def _strips(context: FrameContext, profiles: RowProfiles) -> blind.Strips:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler
@@ -63,6 +64,10 @@ class Scored:
     evidence: float
     #: Tempered evidence plus log prior: the larger wins.
     score: float
+
+    def with_camera(self, camera: Camera) -> Self:
+        """The same, its camera told otherwise."""
+        return replace(self, context=replace(self.context, camera=camera))
 
 
 @dataclass(frozen=True, slots=True)

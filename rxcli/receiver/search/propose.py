@@ -85,7 +85,7 @@ class Proposer:
         if camera.hypothesis is not None:
             screens = tuple(one for one in screens if one.packet_slots == camera.hypothesis.packet_slots)
         for outline in families:
-            for alike in _by_clock(_fitting(outline, camera, screens), camera):
+            for alike in _by_clock(outline, camera, screens).values():
                 screen = _nearest(alike, _USUAL_COLUMNS)
                 likely = self._hypothesis(outline, camera, screen, log_prior + SETTINGS.temper * outline.log_odds)
                 out += [likely, *(_of_other_rows(likely) if outline is families[0] else ())]
@@ -94,9 +94,12 @@ class Proposer:
     def _screens(self) -> tuple[ScreenProfile, ...]:
         return self.known.screens if self.known else self.options.screens
 
-    def _hypothesis(self, outline: Outline, camera: Camera, screen: ScreenProfile, log_prior: float) -> Hypothesis:
+    def _hypothesis(
+        self, outline: Outline, camera: Camera, screen: ScreenProfile, log_prior: float, rows: int = 0
+    ) -> Hypothesis:
         variants = variants_of(screen, self.options.screens)
-        return Hypothesis(outline, 0, relabelled_camera(camera, screen, self.frame), variants[0], variants, log_prior)
+        camera = relabelled_camera(camera, screen, self.frame)
+        return Hypothesis(outline, rows, camera, variants[0], variants, log_prior)
 
     def context(self, hypothesis: Hypothesis) -> FrameContext:
         """The frame as a hypothesis has it, with the screens that its camera may show."""
@@ -131,45 +134,37 @@ class Proposer:
     def siblings(self, scored: Scored) -> Iterator[Hypothesis]:
         """Hypotheses that differ from a scored one in one thing, with the log prior that this thing changes."""
         hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, sampler=None, bursts=None)
-        outline, screen, camera = hypothesis.outline, hypothesis.screen, hypothesis.camera
+        outline, camera, log_prior = hypothesis.outline, hypothesis.camera, hypothesis.log_prior
+        clock, n_columns = _clock_of(hypothesis.screen, camera), hypothesis.screen.columns
         yield from _of_other_rows(hypothesis)
         for other in self.families():
-            if other.family != outline.family:
-                fitting = _of_clock(_fitting(other, camera, self.options.screens), screen, camera)
-                if fitting:
-                    log_prior = hypothesis.log_prior + SETTINGS.temper * (other.log_odds - outline.log_odds)
-                    yield self._hypothesis(other, camera, _nearest(fitting, screen.columns), log_prior)
-        screens = _fitting(outline, camera, self.options.screens)
-        yield from self._of_other_columns(scored, _of_clock(screens, screen, camera))
+            alike = _by_clock(other, camera, self.options.screens).get(clock)
+            if alike and other.family != outline.family:
+                change = SETTINGS.temper * (other.log_odds - outline.log_odds)
+                yield self._hypothesis(other, camera, _nearest(alike, n_columns), log_prior + change)
+        by_clock = _by_clock(outline, camera, self.options.screens)
+        yield from self._of_other_columns(scored, by_clock.pop(clock, []))
         if _is_clear(scored.reception):
             return
-        if camera.hypothesis is not None:
-            lengths = _by_clock([one for one in screens if one.packet_slots != screen.packet_slots], camera)
-            for alike in lengths:
-                nearest = _nearest(alike, screen.columns)
-                sibling = replace(
-                    self._hypothesis(outline, camera, nearest, hypothesis.log_prior), rows=hypothesis.rows
-                )
-                if too_small(self.context(sibling), nearest) is None:
-                    yield sibling
+        for alike in by_clock.values() if camera.hypothesis is not None else ():
+            sibling = self._hypothesis(outline, camera, _nearest(alike, n_columns), log_prior, hypothesis.rows)
+            if too_small(self.context(sibling), sibling.screen) is None:
+                yield sibling
         yield from self._of_other_bursts(scored)
 
     def _of_other_columns(self, scored: Scored, screens: list[ScreenProfile]) -> Iterator[Hypothesis]:
         """Screens of the same clock with other columns, by how similar strips at a distance are."""
-        by_columns = {screen.columns: screen for screen in reversed(screens)}
-        if len(by_columns) < 2:
+        hypothesis, camera = scored.hypothesis, scored.context.camera
+        by_columns = {screen.columns: screen for screen in (*reversed(screens), hypothesis.screen)}
+        own = by_columns.pop(hypothesis.screen.columns)
+        if not by_columns:
             return
-        hypothesis = scored.hypothesis
-        misfit = blind.columns_misfit(
-            scored.acquisition.sampler.binned, scored.reception.clock, [by_columns[n] for n in by_columns]
-        )
-        own = misfit[hypothesis.screen.columns]
+        sampler, clock = scored.acquisition.sampler, scored.reception.clock
+        misfit = blind.columns_misfit(sampler.binned, clock, [own, *by_columns.values()])
         for n_columns, screen in by_columns.items():
-            if n_columns != hypothesis.screen.columns:
-                change = SETTINGS.columns_weight * float(np.log(own / misfit[n_columns]))
-                log_prior = hypothesis.log_prior + change
-                sibling = self._hypothesis(hypothesis.outline, scored.context.camera, screen, log_prior)
-                yield replace(sibling, rows=hypothesis.rows)
+            change = SETTINGS.columns_weight * float(np.log(misfit[own.columns] / misfit[n_columns]))
+            log_prior = hypothesis.log_prior + change
+            yield self._hypothesis(hypothesis.outline, camera, screen, log_prior, hypothesis.rows)
 
     def _of_other_bursts(self, scored: Scored) -> Iterator[Hypothesis]:
         """Other bursts of the same copies, where packets leave doubt."""
@@ -209,35 +204,22 @@ def _nearest(screens: Iterable[ScreenProfile], n_columns: int) -> ScreenProfile:
     return min(screens, key=lambda one: (abs(np.log(one.columns / n_columns)), one.columns))
 
 
-def _of_clock(screens: Iterable[ScreenProfile], screen: ScreenProfile, camera: Camera) -> list[ScreenProfile]:
-    """Screens that share the clock of one."""
-    return [one for one in screens if _clock_of(one, camera) == _clock_of(screen, camera)]
-
-
 def _clock_of(screen: ScreenProfile, camera: Camera) -> tuple[float, int]:
     """What a picture tells screens apart by: the slot rate too, where the camera is known."""
     return (0.0 if camera.hypothesis is not None else screen.slot_rate_hz), screen.packet_slots
 
 
-def _fitting(outline: Outline, camera: Camera, screens: Iterable[ScreenProfile]) -> list[ScreenProfile]:
-    """Screens with the columns of an outline; of those that an estimated camera cannot tell apart the quickest."""
-    fitting = [one for one in screens if outline.n_columns in (None, one.columns)]
-    if camera.hypothesis is None:
-        return fitting
-    quickest: dict[tuple[int, int], ScreenProfile] = {}
-    for one in fitting:
-        shape = one.packet_slots, one.columns
-        if shape not in quickest or one.slot_rate_hz > quickest[shape].slot_rate_hz:
-            quickest[shape] = one
-    return list(quickest.values())
-
-
-def _by_clock(screens: Iterable[ScreenProfile], camera: Camera) -> list[list[ScreenProfile]]:
-    """Screens grouped by their clock."""
+def _by_clock(
+    outline: Outline, camera: Camera, screens: Iterable[ScreenProfile]
+) -> dict[tuple[float, int], list[ScreenProfile]]:
+    """Screens with the columns of an outline by their clock; where that tells no slot rate, the quickest of them."""
     groups: dict[tuple[float, int], list[ScreenProfile]] = {}
-    for screen in screens:
-        groups.setdefault(_clock_of(screen, camera), []).append(screen)
-    return [groups[clock] for clock in sorted(groups)]
+    for screen in sorted(screens, key=lambda one: -one.slot_rate_hz):
+        alike = groups.setdefault(_clock_of(screen, camera), [])
+        is_quickest = all(one.columns != screen.columns for one in alike)
+        if outline.n_columns in (None, screen.columns) and (is_quickest or camera.hypothesis is None):
+            alike.append(screen)
+    return {clock: groups[clock] for clock in sorted(groups) if groups[clock]}
 
 
 def _clock(hypothesis: Hypothesis, sampler: ColumnSampler) -> Clock | None:

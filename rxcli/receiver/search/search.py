@@ -10,7 +10,6 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.camera import is_linear
 from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
 from rxcli.receiver.corners import proposed_outlines
 from rxcli.receiver.screen.pose import corners_by_slots
@@ -22,7 +21,7 @@ from rxcli.receiver.search.outlines import numbered
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
-from rxcli.receiver.unknown_camera import settle
+from rxcli.receiver.unknown_camera import fitted
 from rxcli.types import FloatArray, Frame
 
 _Cameras = Generator[list[Hypothesis], None, Failure | None]
@@ -120,42 +119,19 @@ class _Walk:
             if self._is_hopeless():
                 break
         best = self._best()
-        was_settled = best is not None and SETTINGS.bail < best.evidence < SETTINGS.plain
-        return best if best is None or was_settled else self._settled(best)
+        was_fitted = best is not None and SETTINGS.bail < best.evidence < SETTINGS.plain
+        return best if best is None or was_fitted else self._fitted(best)
 
-    def _settled(self, best: Scored) -> Scored:
-        """The same with an estimated camera fitted to its slots until that moves the clock no more."""
-        if best.context.camera.hypothesis is None:
-            return best
-        for _ in range(SETTINGS.max_fits):
-            camera, moved_slots = settle(best.context, best.acquisition, best.reception)
-            if moved_slots < SETTINGS.matters_slots:
-                best = replace(best, context=replace(best.context, camera=camera))
-                break
-            again = self._again(best, camera)
-            # A fit under which packets show less was of wrong slots.
-            if again is None or again.evidence < SETTINGS.kept_evidence * best.evidence:
-                break
-            best = again
-        return self._as_light(best)
+    def _fitted(self, best: Scored) -> Scored:
+        """The same with its camera, where that is an estimate, fitted to its slots."""
 
-    def _as_light(self, best: Scored) -> Scored:
-        """With values taken for light where they seem to be, and packets show as well then."""
-        camera = best.context.camera
-        frame = best.context.frame
-        if camera.hypothesis is None or not is_linear(camera.hypothesis.tone) or frame.mosaic or frame.linear:
-            return best
-        again = self._again(best, replace(camera, tone="linear"))
-        if again is not None and again.evidence >= best.evidence:
-            return again
-        return replace(best, context=replace(best.context, camera=camera.without_tone_estimate()))
+        def received(camera: Camera) -> Scored | None:
+            hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
+            if hypothesis is None:
+                return None
+            return replace(self._measured(hypothesis, _acquired(hypothesis)), hypothesis=best.hypothesis)
 
-    def _again(self, best: Scored, camera: Camera) -> Scored | None:
-        """An initial pass with another camera; None where no clock is found."""
-        hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
-        if hypothesis is None:
-            return None
-        return replace(self._measured(hypothesis, _acquired(hypothesis)), hypothesis=best.hypothesis)
+        return fitted(best, received)
 
     def best_without_packets(self) -> Scored | None:
         """Of a frame without packets, the likeliest outline's hypothesis, where the camera is known."""
@@ -179,22 +155,20 @@ class _Walk:
         passes = [one.evidence for one in self._tried if one.fate != "no clock"]
         return len(passes) >= SETTINGS.hopeless_budget and max(passes) < SETTINGS.bail
 
-    @staticmethod
-    def _may_be_another_camera(best: Scored | None) -> bool:
-        """Whether the best camera is an estimate that shows no packets yet: other cameras come before its siblings."""
-        return best is not None and best.context.camera.hypothesis is not None and best.evidence < SETTINGS.few_packets
-
     def _push(self, queue: list[_Entry], key: float, hypothesis: Hypothesis) -> None:
         heapq.heappush(queue, (-key, hypothesis.identity, len(self._asked) + len(queue), hypothesis))
 
     def _next(self) -> tuple[list[_Entry], _Entry] | None:
         """The queue and the entry that is asked next; None where nothing could come near the best."""
         best = self._best()
-        near = best is not None and self._siblings and -self._siblings[0][0] >= best.score - SETTINGS.reach
-        if near and not (self._may_be_another_camera(best) and (self._fresh or self._cameras is not None)):
-            return self._siblings, heapq.heappop(self._siblings)
-        if best is not None and best.evidence > SETTINGS.plain:
-            return None
+        if best is not None:
+            # An estimate that shows no packets may be the wrong camera: others come before its siblings.
+            is_doubtful = best.context.camera.hypothesis is not None and best.evidence < SETTINGS.few_packets
+            is_near = self._siblings and -self._siblings[0][0] >= best.score - SETTINGS.reach
+            if is_near and not (is_doubtful and (self._fresh or self._cameras is not None)):
+                return self._siblings, heapq.heappop(self._siblings)
+            if best.evidence > SETTINGS.plain:
+                return None
         while self._cameras is not None and (not self._fresh or self._next_prior > -self._fresh[0][0]):
             try:
                 proposed = next(self._cameras)
@@ -221,7 +195,7 @@ class _Walk:
         scored = self._measured(hypothesis, acquisition)
         if SETTINGS.bail < scored.evidence < SETTINGS.plain:
             # Packets may show plainly once an estimated camera is fitted: then no other is asked.
-            scored = self._settled(scored)
+            scored = self._fitted(scored)
         bursts = replace(hypothesis, bursts=tuple(scored.reception.clock.burst.tolist()))
         self._asked.add((bursts.identity, False))
         self._scored.append(scored)

@@ -22,11 +22,6 @@ class SearchSettings:
     bail: float = 20.0
     #: Below this evidence an estimated camera is none: on a wrong one nothing shows more.
     few_packets: float = 40.0
-    #: Fits of an estimated camera at most; slots by which a fit moves the clock, anywhere, from which on the frame is
-    #: received with it again; and the share of the evidence that must stay.
-    max_fits: int = 2
-    matters_slots: float = 0.05
-    kept_evidence: float = 0.9
     #: Initial passes of a frame at most, and those that may pass without any evidence.
     budget: int = 24
     hopeless_budget: int = 8
