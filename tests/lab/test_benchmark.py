@@ -19,7 +19,7 @@ from rxcli.cli.benchmark import benchmark
 from rxcli.errors import InputError, ReceiverError, UsageError
 from rxcli.lab.benchmark import cases, compare, measures, quick, tables
 from rxcli.lab.benchmark.cases import Case, received
-from rxcli.lab.benchmark.draw import Place, binned, draw_nodata
+from rxcli.lab.benchmark.draw import Place, binned, draw_nodata, draw_small
 from rxcli.lab.benchmark.measures import Group, cluster_interval, logistic_regression, wilson
 from rxcli.lab.benchmark.media import bare_decode, write_known
 from rxcli.lab.benchmark.runner import Run, Task, do, load_journal, scenarios
@@ -55,9 +55,11 @@ def test_bound_and_paper_read_an_easy_frame(easy: Trial) -> None:
 
 def test_the_bound_is_no_magic(easy: Trial) -> None:
     dark = replace(easy.capture.scene, light_e_per_s=easy.capture.scene.light_e_per_s * 1e-4)
-    score = Group([{"ways": {"bound": received(case_of(simulate_trial(dark, 3, oracle=True)), "bound")}}], "bound", "")
+    case = case_of(simulate_trial(dark, 3, oracle=True))
+    score = Group([{"ways": {"bound": received(case, "bound")}}], "bound", "")
     assert score.score.ber is not None
     assert score.score.ber > 0.25
+    assert received(case, "paper")["score"]["error_free"] == 0
 
 
 def test_changes_that_nobody_sees_are_as_small_as_said(easy: Trial) -> None:
@@ -149,6 +151,11 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
     path.write_text("no journal\n")
     with pytest.raises(InputError, match="line 1 is no journal entry"):
         load_journal(path)
+
+
+def test_a_small_scene_is_received_without_problems(tmp_path: Path) -> None:
+    (case,) = draw_small(Place(0, 3, {}, tmp_path))
+    assert received(case, "receiver")["problems"] == []
 
 
 @pytest.mark.slow
