@@ -49,7 +49,7 @@ class FinderSettings:
     #: Distance of the pairs of strips that show the comb of borders best.
     pair_distance: float = 0.72
     #: Combs that are tried as grids.
-    n_combs: int = 4
+    n_combs: int = 8
     #: Height of a comb, standard deviations by chance, below which there is none; and contrast of the highest, as a
     #: share of what it explains, from which on no other is tried.
     min_comb: float = 6.0
