@@ -83,6 +83,9 @@ SOURCES = (
 )
 #: Files of these that still hold such words.
 EXCEPTIONS = ("receiver/channel/known_picture/picture.py",)
+#: Places whose prose is read, but not yet their names; one file holds a word in the text of a test picture.
+PROSE_ONLY = ("lab", "receiver/camera", "receiver/sampling")
+TEXT_IN_A_PICTURE = "lab/simulate/pictures.py"
 PAGES = (
     *("README.md", "sample_frames/README.md", "docs/README.md", "docs/architecture.md", "docs/auto_encoder.md"),
     *("docs/calibration.md", "docs/ci.md", "docs/folders.md", "docs/glossary.md", "docs/link.md", "docs/python.md"),
@@ -154,6 +157,15 @@ def test_faults_are_found() -> None:
 )
 def test_names_and_prose_of_code(path: Path) -> None:
     assert not list(faults_of(path))
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted({*files(*PROSE_ONLY)} - {*files(TEXT_IN_A_PICTURE)}),
+    ids=lambda path: str(path.relative_to(ROOT / "rxcli")),
+)
+def test_prose_of_code(path: Path) -> None:
+    assert not [fault for fault in faults_of(path) if ": name " not in fault]
 
 
 def text_of(page: Path) -> str:

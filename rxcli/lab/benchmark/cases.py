@@ -36,7 +36,7 @@ Way = Callable[["Case"], Iterable[FrameResult]]
 KERNEL = "Prescott"
 #: Share of the pixels that a rounding error of one grey level hits in the way "grey levels".
 _GREY_SHARE = 0.01
-#: A screen's columns are shifted where at least so many right packets stand under numbers shifted alike.
+#: Right packets with a common shift of their column numbers from which the numbering counts as shifted.
 _MIN_SHIFTED = 2
 
 
@@ -53,7 +53,7 @@ class Case:
     about: Record
     #: What was sent, where that is known.
     truth: Truth | None = None
-    #: False for pictures of which nothing may be reported.
+    #: False for pictures from which nothing may be reported.
     has_data: bool = True
     #: (4, 2) true corners of the screen on the stored picture.
     corners: FloatArray | None = None
@@ -180,7 +180,7 @@ def _packets(result: FrameResult, case: Case) -> Iterator[Record]:
 
 
 def _found(result: FrameResult, case: Case) -> Record:
-    """What the first frame tells of the screen and the camera."""
+    """Screen and camera as estimated from the first frame."""
     found, truth = result.corners, case.corners
     return {
         "status": result.status,
@@ -210,7 +210,7 @@ def column_shift(result: FrameResult, truth: Truth) -> int:
 
 
 def with_grey_levels(frame: Frame) -> Frame:
-    """The frame with one grey level more or less on 1 % of its pixels; the same frame changes alike every time."""
+    """The frame with one grey level more or less on 1 % of its pixels; deterministic for a frame."""
     rng = np.random.default_rng(frame.index)
     pixels = frame.pixels.astype(np.int32)
     pixels += rng.choice([-1, 0, 1], pixels.shape, p=[_GREY_SHARE / 2, 1 - _GREY_SHARE, _GREY_SHARE / 2])
@@ -228,7 +228,7 @@ def without_first_row(frame: Frame) -> Frame:
 
 
 def cropped_options(options: ReceiverOptions) -> ReceiverOptions:
-    """What is known of a picture, said of it without its first row: corners, and sizes of a camera that is named."""
+    """Adapt corners and camera of a picture to the removal of its first row."""
     cameras = tuple(map(_cropped_camera, options.cameras)) if options.force_camera else options.cameras
     corners = None if options.corners is None else options.corners - np.array([0.0, 1.0])
     return replace(options, cameras=cameras, corners=corners)

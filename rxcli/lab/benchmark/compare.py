@@ -36,10 +36,10 @@ import contextlib, io, json, sys, time
 from rxcli.cli.main import run
 jobs, done = json.load(sys.stdin), []
 for arguments in jobs[:1] + jobs:  # the first one once more: what is loaded once is nobody's time
-    said, start = io.StringIO(), time.process_time()
-    with contextlib.redirect_stdout(said):
+    printed, start = io.StringIO(), time.process_time()
+    with contextlib.redirect_stdout(printed):
         code = run(arguments)
-    done.append([said.getvalue(), time.process_time() - start, int(code)])
+    done.append([printed.getvalue(), time.process_time() - start, int(code)])
 json.dump(done[1:], sys.stdout)
 """
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")

@@ -149,7 +149,7 @@ _NARROW_SHARE, _SCREEN_PACKETS = 0.12, 1.25
 
 
 def draw_screen(at: Place) -> Iterator[Case]:
-    """A dark or ordinary picture on a screen anywhere in the frame; cameras are those that a user has.
+    """A dark or ordinary picture on a screen anywhere in the frame; cameras are typical of users.
 
     Point: `warped_px`, by how much software has moved the rows of developed pictures, at most.
     """
@@ -487,7 +487,7 @@ def binned(scene: Scene, share: float) -> Scene:
 
 
 def draw_capture(at: Place) -> Iterator[Case]:
-    """A photograph or clip, nothing told, with the truth that lies beside it; point: `path`."""
+    """A photograph or clip without given options, with the truth beside it; point: `path`."""
     path = Path(at.point["path"])
     truth = find_truth(path)
     case = Case(source=path, options=ReceiverOptions(), about={"file": path.name})

@@ -25,7 +25,7 @@ from rxcli.types import Float32Array, FloatArray, FrameSoftBits
 _MESSAGE_BYTES = 199
 #: A detector trusts no bit further than this.
 _MAX_LLR = 9.0
-#: Clips begin within so many seconds of an object's start, and last at most so many times what is needed.
+#: Latest start of clips after an object's start, seconds; and their maximum length relative to the required one.
 _START_WITHIN_S, _MAX_TIMES = 900.0, 6.0
 
 

@@ -19,11 +19,11 @@ from rxcli.types import FloatArray
 Row = dict[str, Any]
 #: From this confidence on a packet is sure.
 SURE = 0.99
-#: Rows per slot are to be as near as `ROWS_BOUND`, and further off than `ROWS_WILD` is a wild guess; both relative.
+#: Relative errors of rows per slot: `ROWS_BOUND` is the goal, larger ones than `ROWS_WILD` are outliers.
 ROWS_BOUND, ROWS_WILD = 5e-4, 1e-2
 #: Corners are to be as near as this, screen widths.
 CORNER_BOUND = 0.003
-#: A screen can be found where the true corners give so many packets.
+#: Minimum number of packets with the true corners for a screen that should be found.
 SHOWN = 5
 #: Two-sided 95 % quantile of the normal distribution.
 Z95 = 1.959963984540054
@@ -198,7 +198,7 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "no_screen": lambda g: sum(status == "no_screen" for status in g.values("status")),
     "not_found": lambda g: sum(r["status"] == "no_screen" for r in g.shown()),
     "of_shown": lambda g: len(g.shown()),
-    # Columns that are said to be counted from elsewhere are not numbered wrong.
+    # Columns that are reported as counted from the left are not numbered wrong.
     "numbered_wrong": lambda g: sum(bool(r.get("shift") and r["numbered"]) for r in g.receptions),
     "exact": lambda g: sum(g.values("exact")),
     "s_median": _transfers("seconds", median),
@@ -219,7 +219,7 @@ def rows(
     Args:
         records: of cases.
         ways: in which each was received.
-        columns: names of measures; those that no row has are left out.
+        columns: names of measures; empty ones are left out.
         beside: the way whose right packets are the measure of the others.
     """
     names = [name for name in dict.fromkeys(group for record in records for group in record["groups"]) if name]
@@ -253,8 +253,10 @@ def _rounded(value: Any) -> Any:
 
 
 def passes(records: Sequence[Record], ways: Sequence[str]) -> bool:
-    """Whether no reception has a problem, and in the first way nothing came of pictures without data and sure packets
-    are as right as they say, as far as the run can tell: the interval of the share of wrong ones reaches down to 1 %.
+    """Whether no reception has a problem, no picture without data gave packets, and sure packets are right.
+
+    The last two refer to the first way. The confidence of sure packets is refuted if the interval of their error rate
+    lies above 1 %.
     """
     group = Group(records, ways[0], ways[0])
     without_data = any(record["ways"][ways[0]]["packets"] for record in records if not record["has_data"])
@@ -340,7 +342,8 @@ def cluster_interval(errors: Sequence[float], sizes: Sequence[float], units: flo
     Args:
         errors: events of each cluster.
         sizes: trials of each cluster.
-        units: trials to count where the clusters do not differ, and so tell nothing of how their events hang together.
+        units: trials to count where the clusters do not differ and give
+            no estimate of the correlation of their events.
     """
     k, n = np.asarray(errors, np.float64), np.asarray(sizes, np.float64)
     k, n = k[n > 0], n[n > 0]
@@ -356,7 +359,7 @@ def cluster_interval(errors: Sequence[float], sizes: Sequence[float], units: flo
 
 
 def _packet_clusters(scores: Sequence[Score]) -> tuple[list[float], list[float]]:
-    """Wrong bits and bits of every packet, as far as scores tell: those that are neither lost nor right are alike."""
+    """Wrong bits and bits of every packet, from scores; packets neither lost nor right share the other errors."""
     errors: list[float] = []
     sizes: list[float] = []
     for score in (score for score in scores if score.expected):

@@ -29,7 +29,7 @@ class Medium:
     light: float = 1.0
     #: Width and height against the preset's.
     scale: float = 1.0
-    #: Whether the receiver is told camera and screen.
+    #: Whether camera and screen are given.
     named: bool = True
     #: Clips: frames to simulate, times that they are written, and bursts from one frame to the next, together a whole
     #: number, so that the clip may be repeated.

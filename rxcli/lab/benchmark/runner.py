@@ -44,12 +44,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     columns: tuple[str, ...] = ()
     #: Measures in the table beside the common ones.
     more: tuple[str, ...] = ()
-    #: Label -> what the drawing is told there; and what it is told everywhere.
+    #: Label -> arguments of the drawing at that point; and common arguments.
     points: dict[str, dict[str, Any]] = msgspec.field(default_factory=lambda: {"": {}})
     base: dict[str, Any] = {}
     #: Whether to print the bins of the confidence.
     bins: bool = False
-    #: Whether every case has a process of its own, whose memory then tells something.
+    #: Whether every case has a process of its own, so that its memory is meaningful.
     alone: bool = False
 
     @property
@@ -125,7 +125,7 @@ def code_fingerprint() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """How tasks are done: those that the journal lacks, in processes of one thread each."""
+    """Run the tasks that are missing in the journal, in processes of one thread each."""
 
     #: JSON lines, a finished task each.
     journal: Path

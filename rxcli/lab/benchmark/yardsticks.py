@@ -27,8 +27,7 @@ from rxcli.types import ColumnResult, FloatArray, FrameResult, Lens, PacketResul
 _HEADER_AGREEMENT = 0.9
 #: Two headers belong to one packet where their distance is this close to a packet's length.
 _LENGTH_TOLERANCE = 0.02
-#: The threshold is the mean over this many slots, of which any two symbols are lit in their constant share. On easy
-#: scenes three symbols gave the fewest errors of one to four.
+#: The threshold is the mean over this many slots.
 _THRESHOLD_SLOTS = 3 * SLOTS_PER_SYMBOL
 #: Share of a slot, in its middle, whose rows vote for its state.
 _SLOT_MIDDLE = 0.5

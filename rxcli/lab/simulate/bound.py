@@ -3,7 +3,7 @@
 The genie knows outline, clock, picture, room light and the other slots of the same column and of all others. What is
 left of a row for column `c` is the share `m` of its exposure that the column was lit, seen by every pixel with known
 gain `a` and noise variance `v`: the log-likelihood is `Q m - P m^2 / 2`, with `P = sum a^2 / v` and
-`Q = sum a (e - b) / v` over the row's pixels. So two numbers per row and column hold all that the sensor says.
+`Q = sum a (e - b) / v` over the row's pixels. So two numbers per row and column hold all information of the sensor.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class Capture:
     time_s: float
     #: (height, width) uint16 mosaic, or (height, width, 3) where the sensor has no filter array.
     raw: NDArray[np.uint16]
-    #: What the genie-aided bound needs; None where it was not asked for.
+    #: Data for the genie-aided bound; None unless requested.
     oracle: Oracle | None = None
 
     @cached_property
@@ -134,7 +134,7 @@ _STABILISED_ZOOM = 1.06
 def stabilised(picture: NDArray[Any], exposure: Exposure) -> NDArray[Any]:
     """A developed picture turned back by what the camera had moved in the middle of it, enlarged and cropped.
 
-    Its rows are no instants any more: a phone that does so by default has to be told to leave it.
+    Its rows are no instants any more: switch this off on a phone that does so by default.
     """
     import cv2
 

@@ -29,7 +29,7 @@ _TONES = {
     "bt709": (0.45, 1.099, 0.018, 4.5),
     "gamma": (1 / 2.2, 1.0, 0.0, 0.0),
 }
-#: Rows of a band of work and of its overlap: multiples of the mosaics' unit cells, so that all bands start alike.
+#: Rows of a band of work and of its overlap: multiples of the mosaics' unit cells, for a common phase.
 _BAND_ROWS, _HALO_ROWS = 384, 12
 
 

@@ -2,7 +2,7 @@
 
 A hand turns a camera rather than it moves it: slow sway, and tremor of 5 to 12 Hz. Turns about the vertical and about
 the horizontal shift the picture, a turn about the line of sight rolls it, and a step towards the screen enlarges it.
-The speed is told as people see it: how far the picture's centre goes from frame to frame, in pixels, on average.
+The speed is given as it appears: how far the picture's centre goes from frame to frame, in pixels, on average.
 """
 
 from __future__ import annotations

@@ -196,7 +196,7 @@ _KINDS: dict[str, tuple[Callable[[Generator], FloatArray], Callable[[Generator],
     "screen": (_any, _steady, False),
     "noise": (_noise, _steady, True),
 }
-#: Kinds that show stripes, how often each is drawn, and those that show none.
+#: Kinds with stripes and their frequencies; kinds without stripes.
 STRIPED_KINDS = ("pwm", "pwm textured", "pwm dark", "lamp", "codes", "blinds", "keyboard", "moire")
 _SHARES = (0.22, 0.18, 0.14, 0.14, 0.14, 0.06, 0.06, 0.06)
 EVEN_KINDS = ("photo", "screen", "noise")

@@ -160,7 +160,7 @@ def _night(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64
     return np.stack([base + moon + windows, base + moon + 0.8 * windows, 1.6 * base + moon + 0.3 * windows], axis=-1)
 
 
-# Pictures most of which are black, drawn at random: films with bars, windows on dark desktops, night, stars. They hide
+# Random pictures that are mostly black: films with bars, windows on dark desktops, night, stars. They hide
 # a screen's sides from a camera: no light, no edge.
 
 _BRIGHT = ("astronaut", "chelsea", "coffee", "motorcycle", "rocket", "sky", "gradient", "page", "flower", "hubble")

@@ -168,7 +168,7 @@ class Link:
     message: bytes | None = None
     #: What to send instead of it; None for `message`.
     labels: LabelSource | None = None
-    #: Light 0..1 of all columns alike in slots of these numbers, instead of packets; None for packets.
+    #: Common light 0..1 of all columns by slot number, instead of packets; None for packets.
     waveform: Waveform | None = None
 
     @property

@@ -1,7 +1,7 @@
 """Data sets: made once, kept in a folder, picked up where an interrupted run left them.
 
-A sample is what the receiver shows the network of the doubtful columns of a frame, with what the light model alone says
-of every word that could have been sent, and the word that was.
+A sample is the input of the network for the doubtful columns of a frame, with the log-likelihood of every possible word
+by the light model, and the word that was sent.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from rxcli.receiver.still import decode, doubtful_columns
 from rxcli.types import Clock, FloatArray
 
 _SCREENS = ("paper-34k6", "paper-17k3")
-#: Columns of a frame that are learned from; more of one picture tell little more.
+#: Maximum number of training columns per frame, since columns of one picture are similar.
 _MAX_COLUMNS = 8
-#: Words are taken to be at most this much less likely than the best, nats.
+#: Lower limit of the log-likelihood of a word relative to the best.
 _MIN_SCORE = -60.0
 #: Streams of random numbers.
 _FRAMES, _VALIDATION = 77, 900_000

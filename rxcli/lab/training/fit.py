@@ -22,7 +22,7 @@ MAX_WORDS, UNKNOWN = 128, -1
 #: Steps from one point of the plot of the loss to the next.
 _PLOTTED_EVERY = 200
 _WEIGHT_DECAY, _LARGEST_GRADIENT = 5e-2, 1.0
-#: The weights that are kept are a mean over about so many steps.
+#: Steps over which the stored weights are averaged.
 _AVERAGED_STEPS = 200
 #: Samples of a batch, columns of each, and how often strips are left out of a sample, down to how many.
 _BATCH_SAMPLES, _BATCH_COLUMNS, _THINNED, _MIN_STRIPS = 2, 4, 0.5, 3
@@ -73,7 +73,7 @@ class StripNetwork(nn.Module):  # type: ignore[misc]
         x = self.strip(x)
         gate = torch.sigmoid(self.gate(x)).reshape(batch, n_strips, -1, n_slots)
         x = x.reshape(batch, n_strips, -1, n_slots)
-        # Strips add up like independent observations; the mean of the open ones tells what they agree on.
+        # Strips add up like independent observations; the mean over open gates is their consensus.
         total = (gate * x).sum(dim=1)
         mean = total / (gate.sum(dim=1) + 0.1)
         y = torch.relu(self.column_in(torch.cat([total * 0.2, mean, columns], dim=1)))
@@ -127,7 +127,7 @@ def _codebook(w: int) -> Tensor:
 
 
 def loss_of(network: StripNetwork, sample: Sample, columns: NDArray[np.int64]) -> Tensor:
-    """Mean cross-entropy of the words of some columns, nats, when corrections are added to what the light model says.
+    """Mean cross-entropy (natural logarithm) of the words of some columns after the corrections.
 
     The copies of a burst are added before its words are compared, as the receiver does.
     """
@@ -179,7 +179,7 @@ class Fitted:
     """A network, its weights averaged over the last steps, and how its loss went."""
 
     network: StripNetwork
-    #: Step, and cross-entropy of a word in training and on held-out samples (nan of none), nats.
+    #: Step, and cross-entropy of a word in training and on held-out samples (nan of none), natural logarithm.
     history: list[tuple[int, float, float]]
 
 
@@ -247,6 +247,6 @@ def _plot_loss(history: Sequence[tuple[int, float, float]], path: Path) -> None:
     axes = figure.subplots()
     for label, values in zip(("training", "validation"), losses, strict=True):
         axes.plot(steps, values, label=label)
-    axes.set(xlabel="step", ylabel="cross-entropy of a word, nats", yscale="log")
+    axes.set(xlabel="step", ylabel="cross-entropy of a word", yscale="log")
     axes.legend()
     figure.savefig(path, dpi=110)

@@ -29,7 +29,7 @@ def why_not(strips: Strips) -> str:
     width = stripe_rows(strips)
     if width < SETTINGS.half_width_slots[0] * SETTINGS.min_rows_per_slot:
         return (
-            f"the stripes are about {width:.1f} rows wide, too few to tell slots apart (at least "
+            f"the stripes are about {width:.1f} rows wide, too few to separate slots (at least "
             f"{SETTINGS.min_rows_per_slot} rows a slot); use the picture in its full size, or a slower slot rate"
         )
     return (
@@ -47,7 +47,7 @@ def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
     def summed(values: Float32Array) -> FloatArray:
         return np.asarray(np.add.reduceat(values, blocks, axis=1), np.float64)
 
-    # Strips without light have no say.
+    # Strips without light are not used.
     level = level * weight
     product = summed(level[:-1] * level[1:]).sum(axis=0)
     power = np.sqrt(summed(level[:-1] ** 2).sum(axis=0) * summed(level[1:] ** 2).sum(axis=0))

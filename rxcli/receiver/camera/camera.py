@@ -76,8 +76,8 @@ def camera_profile(
     Args:
         estimated: see `summary`; `FrameResult.estimated`.
         name: of the profile.
-        make: of the camera, None where the file does not tell it.
-        model: of the camera, None where the file does not tell it.
+        make: of the camera, or None.
+        model: of the camera, or None.
         width: of the picture.
         height: of the picture.
 

@@ -33,7 +33,7 @@ def columns_misfit(profiles: RowProfiles, clock: Clock, screens: Sequence[Screen
     measured = np.array([_mean_likeness(slots, observed, distance) for distance in range(1, reach)])
     misfit = {}
     for screen in screens:
-        # Codewords are not quite random, so that strips far apart are a little alike too: a constant.
+        # Codewords are not quite random, so that distant strips are slightly correlated too, by a constant.
         basis = np.stack([_expected_likeness(n_strips, reach, screen), np.ones(reach - 1)], axis=1)
         fit, *_ = np.linalg.lstsq(basis, measured, rcond=None)
         left = measured - basis @ fit if fit[0] > 0 else measured

@@ -34,7 +34,7 @@ def curvature_terms(x: FloatArray, rows: FloatArray, width: int, height: int) ->
 
 
 def estimate_curvature(strips: Strips, level: Float32Array) -> tuple[FloatArray, float]:
-    """The bend whose sensor rows make neighbouring strips most alike.
+    """The bend whose sensor rows make neighbouring strips most similar.
 
     Args:
         strips: of the picture.

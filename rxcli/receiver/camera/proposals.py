@@ -3,7 +3,7 @@
 Neighbouring strips show the same slots, so the lag between them is the slope of the stripes: the bend. Edges fall
 between slots, so their power has a spectral line at the rate of the slots; columns repeat themselves a packet later.
 The periods that stand out so are scored by the header's correlation there. Read backwards the header is its own
-complement, so the sign tells the direction of readout.
+complement, so the sign gives the direction of readout.
 """
 
 from __future__ import annotations

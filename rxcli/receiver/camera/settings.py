@@ -33,10 +33,10 @@ class CameraSettings:
     #: difference, slots.
     mixed_rows: float = 2.0
     min_exposure_slots: float = 0.4
-    #: Rows of the shortest slot that can be told from its neighbours.
+    #: Rows of the shortest slot that is separable from its neighbours.
     min_rows_per_slot: float = 1.15
 
-    #: Lags between strips that are looked at, rows (at least so many joined ones); and windows of rows.
+    #: Lags between strips that are looked at, rows (and their minimum after joining); and windows of rows.
     bend_lag_rows: int = 8
     min_bend_lags: int = 4
     bend_windows: int = 20
@@ -74,12 +74,12 @@ class CameraSettings:
     converged_slots: float = 0.03
     #: Exposures around the one known that are compared, as factors.
     exposure_factors: tuple[float, ...] = (0.75, 1.0, 1.33)
-    #: Samples of a slot and strips of a column err alike: so many of them say what one would.
+    #: Number of samples equivalent to an independent one, since errors within a slot and column are correlated.
     samples_per_independent: float = 10.0
     #: A fit that explains less of the light's local variance, or moves any row by more slots, is none.
     min_explained: float = 0.1
     max_moved_slots: float = 20.0
-    #: How much larger errors are than the spread of the columns' pulls says: neighbours share their light.
+    #: Ratio of errors to the scatter of the columns' contributions, since neighbours share their light.
     sd_scale: float = 1.6
     #: Chi-square of the four coefficients from which stripes are bent beyond doubt.
     bent_chi_square: float = 40.0

@@ -55,7 +55,7 @@ def map_strips(outlines: Outlines, frame: Frame, light_of: Callable[[FloatArray]
 
     Args:
         outlines: of the strips.
-        frame: says how values are stored: which are black and white, and whether they are linear.
+        frame: its levels: which are black and white, and whether they are linear.
         light_of: linear light of coded values, both 0..1.
     """
     strip_px = float(np.median(np.abs(np.diff(outlines.edges_x[:, outlines.rows.size // 2]))))
@@ -66,7 +66,7 @@ def map_strips(outlines: Outlines, frame: Frame, light_of: Callable[[FloatArray]
 
 
 def moved_map(strips: StripMap, outlines: Outlines) -> StripMap:
-    """The same strips on a screen that is elsewhere now, where `outlines` say."""
+    """The same strips on a screen that is elsewhere now, by `outlines`."""
     places = _places_of(outlines, strips.cell_px, strips.n_cells)
     return replace(strips, first_row=int(outlines.rows[0]), places=places, inside=outlines.inside)
 
