@@ -113,7 +113,7 @@ def _stem(path: str) -> str:
 def _received(
     path: str, number: int | None, options: ReceiverOptions, truth: str | None
 ) -> tuple[list[FrameResult], Frame]:
-    """Results of a source's frames, and the one frame that is shown.
+    """Receive the frames of a source; also return the frame to show.
 
     Raises:
         InputError: the source cannot be read, or has no such frame.

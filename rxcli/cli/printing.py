@@ -89,7 +89,7 @@ class JsonLines(Writer):
 
 
 def print_line(line: str) -> None:
-    """A line of data, at once."""
+    """Print a line of data and flush it."""
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
 

@@ -209,7 +209,7 @@ def _is_clip(result: FrameResult) -> bool:
 
 
 def _goes_on(result: FrameResult) -> bool:
-    """Whether a frame of a clip was received, and all its bursts go on in the next."""
+    """Whether a frame of a clip was received and all its bursts continue in the next frame."""
     return result.status == "ok" and bool(result.columns) and not result.packets
 
 

@@ -306,7 +306,7 @@ def _until_end(results: _Results) -> Iterator[FrameResult]:
 
 
 class _WorkerDiedError(Exception):
-    """A worker process ended with a source in hand; its argument says how."""
+    """A worker process ended with a source in hand; the argument describes how."""
 
 
 class _Pool:

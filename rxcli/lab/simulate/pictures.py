@@ -29,7 +29,7 @@ GENERATED = ("white", "grey", "sky", "gradient", "bars", "noise", "checker", "te
 
 
 def draw_name(rng: np.random.Generator) -> str:
-    """The name of a picture that shows something."""
+    """Draw the name of a picture that is not black."""
     return str(rng.choice([name for name in picture_names() if name != "black"]))
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def visible_bursts(exposure: Exposure) -> list[dict[str, Any]]:
-    """Bursts on the rows between the screen's highest and lowest corner, with the slots seen of each."""
+    """Bursts on the rows between the screen's highest and lowest corner, with the visible slots of each."""
     heights, sensor = exposure.corners[:, 1], exposure.scene.sensor
     top, bottom = max(int(np.floor(heights.min())), 0), min(int(np.ceil(heights.max())), sensor.height - 1)
     if top >= bottom:
@@ -35,7 +35,7 @@ def visible_bursts(exposure: Exposure) -> list[dict[str, Any]]:
 
 
 def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[str, Any]:
-    """The truth of a capture.
+    """Build the truth of a capture.
 
     Args:
         scene: what was simulated.
