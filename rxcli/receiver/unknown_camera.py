@@ -78,7 +78,7 @@ def settle(context: FrameContext, acquisition: Acquisition, reception: Reception
 
 
 class InitialPass(Protocol):
-    """What was received with a camera, and how much it looks like packets."""
+    """Initial pass with a camera, and the evidence of its packets."""
 
     @property
     def context(self) -> FrameContext: ...
@@ -89,18 +89,18 @@ class InitialPass(Protocol):
     @property
     def evidence(self) -> float: ...
     def with_camera(self, camera: Camera) -> Self:
-        """The same, its camera told otherwise."""
+        """Replace the camera."""
 
 
 _Pass = TypeVar("_Pass", bound=InitialPass)
 
 
 def fitted(best: _Pass, received: Callable[[Camera], _Pass | None]) -> _Pass:
-    """An initial pass with an estimated camera, after the camera was fitted until that moves the clock no more.
+    """Fit the estimated camera of an initial pass until the clock no longer moves.
 
     Args:
         best: the initial pass.
-        received: another one with another camera, None where no clock is found.
+        received: makes an initial pass with a given camera; None if no clock is found.
     """
     if best.context.camera.hypothesis is None:
         return best
@@ -109,18 +109,18 @@ def fitted(best: _Pass, received: Callable[[Camera], _Pass | None]) -> _Pass:
         if moved_slots < SETTINGS.matters_slots:
             best = best.with_camera(camera)
             break
-        again = received(camera)
-        # A fit under which packets show less was of wrong slots.
-        if again is None or again.evidence < SETTINGS.kept_evidence * best.evidence:
+        candidate = received(camera)
+        # If the evidence drops, the fit used wrong slots.
+        if candidate is None or candidate.evidence < SETTINGS.kept_evidence * best.evidence:
             break
-        best = again
+        best = candidate
     camera, frame = best.context.camera, best.context.frame
     if camera.hypothesis is None or not blind.is_linear(camera.hypothesis.tone) or frame.mosaic or frame.linear:
         return best
-    # Values seem to be light: they are taken for it where packets show as well then.
-    again = received(replace(camera, tone="linear"))
-    if again is not None and again.evidence >= best.evidence:
-        return again
+    # The values seem linear; this is accepted if the evidence does not drop.
+    candidate = received(replace(camera, tone="linear"))
+    if candidate is not None and candidate.evidence >= best.evidence:
+        return candidate
     return best.with_camera(camera.without_tone_estimate())
 
 

@@ -98,7 +98,7 @@ def build_camera_profile(scene: Scene, exposure: Exposure) -> CameraProfile:
 
 
 def _camera_truth(scene: Scene, exposure: Exposure) -> dict[str, Any]:
-    """What the camera profile says of readout and lens."""
+    """Readout and lens from the camera profile."""
     profile = build_camera_profile(scene, exposure)
     facts = msgspec.to_builtins(profile.modes[0]) | msgspec.to_builtins(profile.lens)
     return {**facts, "name": profile.name}
