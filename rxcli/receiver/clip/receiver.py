@@ -250,8 +250,8 @@ def _tracked_view(state: Tracking | Lost, frame: Frame, timer: Timer) -> View | 
     """The view of a frame by what is known; None where that does not fit."""
     if not isinstance(state, Tracking) or not state.known.camera.fits(frame):
         return None
-    time = state.known.ledger.time
-    return None if time is None else state.scene.view(frame, time, timer)
+    time, thorough = state.known.ledger.time, not state.known.ledger.holds_more
+    return None if time is None else state.scene.view(frame, time, thorough, timer)
 
 
 # -- a frame like a photograph -----------------------------------------------------------------------------------------
