@@ -81,8 +81,6 @@ SOURCES = (
     *("receiver/channel", "receiver/settings.py", "receiver/still.py", "receiver/pipeline.py", "receiver/__init__.py"),
     *("receiver/unknown_camera.py", "receiver/cameras.py", "results", "cli"),
 )
-#: Files of these that still hold such words.
-EXCEPTIONS = ("receiver/channel/known_picture/picture.py",)
 #: Places whose prose is read, but not yet their names; one file holds a word in the text of a test picture.
 PROSE_ONLY = ("lab", "receiver/camera", "receiver/sampling")
 TEXT_IN_A_PICTURE = "lab/simulate/pictures.py"
@@ -152,9 +150,7 @@ def test_faults_are_found() -> None:
     assert all(PHRASE.search(words) for _, words in found)
 
 
-@pytest.mark.parametrize(
-    "path", sorted({*files(*SOURCES)} - {*files(*EXCEPTIONS)}), ids=lambda path: str(path.relative_to(ROOT / "rxcli"))
-)
+@pytest.mark.parametrize("path", files(*SOURCES), ids=lambda path: str(path.relative_to(ROOT / "rxcli")))
 def test_names_and_prose_of_code(path: Path) -> None:
     assert not list(faults_of(path))
 

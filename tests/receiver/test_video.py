@@ -17,7 +17,7 @@ from rxcli.lab.simulate.capture import Take, prepare
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
-from rxcli.receiver.channel.known_picture import ColumnLight, KnownPicture, Look
+from rxcli.receiver.channel.known_picture import ColumnLight, KnownPicture, Observation
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.decode.detect import detect
 from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
@@ -386,7 +386,7 @@ def test_known_picture_gives_back_the_columns_light() -> None:
 
     for _ in range(25):
         light, slots = frame()
-        known.learn(Look(light, slots, np.ones_like(slots)))
+        known.learn(Observation(light, slots, np.ones_like(slots)))
     light, slots = frame()
     reception = known.solve(light)
     assert np.abs(reception.value - slots).max() < 0.1
@@ -406,7 +406,7 @@ def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, r
 
     for _ in range(20):
         light, slots = frame()
-        known.learn(Look(light, slots, np.ones_like(slots)))
+        known.learn(Observation(light, slots, np.ones_like(slots)))
     return known, frame
 
 
@@ -434,7 +434,7 @@ def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
     known, frame = known_picture(np.random.default_rng(10))
     other = copy.deepcopy(known)
     light, slots = frame()
-    look = Look(light, slots, np.full_like(slots, 0.7))
+    look = Observation(light, slots, np.full_like(slots, 0.7))
     known.learn(look, forget=False)
     with_it, _ = known.picture()
     without, _ = known.without([look]).picture()
@@ -475,7 +475,7 @@ def test_rows_that_were_never_lit_are_not_known() -> None:
     # The model has it that the neighbour spills a twentieth; three times as much comes.
     light = np.where(np.arange(3)[:, None] == 1, 0.15, 0.9)[:, None] * np.ones((3, 1, 60)) * lit[:1]
     for _ in range(4):
-        known.learn(Look(light.astype(np.float32), lit, np.ones((3, 60), np.float32)))
+        known.learn(Observation(light.astype(np.float32), lit, np.ones((3, 60), np.float32)))
     both = lit.copy()
     both[1] = 1.0
     now = (np.array([0.95, 0.95, 0.05])[:, None, None] * np.ones((3, 1, 60))).astype(np.float32)

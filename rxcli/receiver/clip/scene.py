@@ -381,7 +381,7 @@ class TrackedScreen:
             self._n_updates += 1
         self.last = view
 
-    def learn(self, view: View, lit: Float32Array, *, forget: bool = True) -> known_picture.Look | None:
+    def learn(self, view: View, lit: Float32Array, *, forget: bool = True) -> known_picture.Observation | None:
         """Take a frame into the picture; returns what it showed.
 
         See `known_picture.KnownPicture.learn` for `forget`.
@@ -393,7 +393,7 @@ class TrackedScreen:
         positions = known_picture.row_positions(view.pose.rows, clock)
         slots = SlotLight(lit).mean_over(positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
-        look = known_picture.Look(view.light, slots, trust, view.pose.placement, self._frame_rows(view.pose))
+        look = known_picture.Observation(view.light, slots, trust, view.pose.placement, self._frame_rows(view.pose))
         self._picture.learn(look, forget=forget)
         return look
 
@@ -444,7 +444,7 @@ class TrackedScreen:
                 inside.append(view.pose.map.inside)
         return known_picture.dark_light(lights, dark, inside, self._begun_with[1])
 
-    def _measure_again(self, view: View, own: Sequence[known_picture.Look], known: Float32Array) -> None:
+    def _measure_again(self, view: View, own: Sequence[known_picture.Observation], known: Float32Array) -> None:
         """Measure a frame by the picture, less what the frame's `own` bursts have shown of it."""
         assert view.light is not None
         assert view.pose is not None
@@ -462,8 +462,8 @@ class TrackedScreen:
 
 
 def _of_bursts(
-    look: known_picture.Look | None, view: View, numbers: IntArray, bursts: IntArray
-) -> known_picture.Look | None:
+    look: known_picture.Observation | None, view: View, numbers: IntArray, bursts: IntArray
+) -> known_picture.Observation | None:
     """What a frame that shows the bursts `numbers` taught where it shows some of the `bursts`; None where none."""
     if look is None or view.pose is None or not np.isin(numbers, bursts).any():
         return None

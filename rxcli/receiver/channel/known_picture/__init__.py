@@ -12,14 +12,14 @@ compression, `header` measures the contrast of headers, and `metrics` computes s
 from rxcli.receiver.channel.known_picture.exposure import expected_light, row_positions, trusted
 from rxcli.receiver.channel.known_picture.header import dark_light, first_decision, header_contrast, header_dark
 from rxcli.receiver.channel.known_picture.metrics import slot_likelihoods
-from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Look, Placement
+from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Observation, Placement
 from rxcli.receiver.channel.known_picture.response import Fit, exposures, fit_response
 
 __all__ = [
     "ColumnLight",
     "Fit",
     "KnownPicture",
-    "Look",
+    "Observation",
     "Placement",
     "dark_light",
     "expected_light",

@@ -49,7 +49,7 @@ class Placement:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class Observation:
     """Observation of the picture by one frame."""
 
     #: (C, S, R) light of the strips.
@@ -115,41 +115,41 @@ class KnownPicture:
         moved._system = moved._of_one = moved._placed = None
         return moved
 
-    def learn(self, look: Look, *, forget: bool = True) -> None:
+    def learn(self, observation: Observation, *, forget: bool = True) -> None:
         """Update the picture by a frame with known slots; with `forget`, earlier frames lose some weight."""
-        lit, observed = self._update_of(look)
+        lit, observed = self._update_of(observation)
         keep = np.float32(SETTINGS.memory_share if forget else 1.0)
         self._light = self._light * keep + lit
         self._observed = self._observed * keep + observed
         self._system = self._made = self._placed = None
 
-    def without(self, looks: Sequence[Look]) -> KnownPicture:
+    def without(self, observations: Sequence[Observation]) -> KnownPicture:
         """The picture without some observations, which were added with nothing forgotten since.
 
         A picture that contains a frame's own light would confirm its decisions, wrong or right.
         """
         rest = copy(self)
-        for look in looks:
-            lit, observed = self._update_of(look)
+        for observation in observations:
+            lit, observed = self._update_of(observation)
             rest._light, rest._observed = rest._light - lit, np.maximum(rest._observed - observed, 0)
         rest._system = rest._made = rest._placed = None
         rest._excess = self._excess.copy()
         return rest
 
-    def _update_of(self, look: Look) -> tuple[Float32Array, Float32Array]:
+    def _update_of(self, observation: Observation) -> tuple[Float32Array, Float32Array]:
         """Light and predicted light of a picture of 1, each weighted by the latter, on the rows of the picture."""
-        placement = look.placement
-        expected = self._crosstalk @ _with_neighbours(look.slots)
-        doubt = self._crosstalk @ (1 - _with_neighbours(look.trust, 1.0))
+        placement = observation.placement
+        expected = self._crosstalk @ _with_neighbours(observation.slots)
+        doubt = self._crosstalk @ (1 - _with_neighbours(observation.trust, 1.0))
         inside = self._inside if placement is None else placement.inside
         # If little light was predicted, the observed light may come from other slots.
         power = expected * expected
         known = power / (power + np.float32(SETTINGS.prediction_error) + np.float32(SETTINGS.uncertain_error) * doubt)
         weighted = expected * (known * known) * np.maximum(1 - np.float32(SETTINGS.doubt_weight) * doubt, 0) * inside
-        if look.rows is not None:
-            weighted *= look.rows
-        lit, observed = weighted * (look.light - self._black_level), weighted * expected
-        row = look.frame_row
+        if observation.rows is not None:
+            weighted *= observation.rows
+        lit, observed = weighted * (observation.light - self._black_level), weighted * expected
+        row = observation.frame_row
         if row is None:
             return lit, observed
         return _resampled(lit, row, beyond=True), _resampled(observed, row, beyond=True)
