@@ -293,8 +293,9 @@ class Ledger:
         ]
         may_wait = self._n_held < SETTINGS.frames_held_long and not at_last and not self._options.prompt
         if len(held) > 1 and not (may_wait and self._doubt(held) > SETTINGS.too_much_doubt):
-            self._measure_again(held)
-            self._detect_again()
+            for _ in range(SETTINGS.looks_again if len(held) <= SETTINGS.frames_held else 1):
+                self._measure_again(held)
+                self._detect_again()
         self._hold(SETTINGS.frames_held_long if may_wait and self._doubt(held) > SETTINGS.much_doubt else 0)
 
     def _doubt(self, held: list[Waiting]) -> float:

@@ -75,6 +75,8 @@ class ClipSettings:
     frames_held: int = 6
     frames_held_long: int = 24
     much_doubt: float = 0.03
+    #: Passes over so few frames: what one of them was decided to be tells in the next of the others.
+    looks_again: int = 2
     #: Share in doubt, before the frames held are measured again, that this would not mend: it is left out.
     too_much_doubt: float = 0.25
     #: Share of columns that a quick look at a first frame may leave in doubt.
