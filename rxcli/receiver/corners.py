@@ -1,4 +1,4 @@
-"""Where the screen's corners are in a frame, and what to say where they are not found. Part of the wiring."""
+"""Find the screen's corners in a frame, or explain why there are none. Part of the wiring."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from rxcli.receiver.settings import SETTINGS
 from rxcli.types import FloatArray, Frame
 
 _TOO_SLOW = (
-    "the screen may be another one than those known (vlc-rx profiles lists them); else use a faster slot rate or "
-    "shorter packets"
+    "the screen may have no profile here (vlc-rx profiles lists them); else use a faster slot rate or shorter packets"
 )
 #: Orientations in which the readout runs along the columns' width.
 _PORTRAIT = (5, 6, 7, 8)
@@ -30,7 +29,7 @@ _SHOW_COLUMNS = (
 
 
 def proposed_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[Outline] | Failure:
-    """Outlines that the screen of a frame may have, at least one; or why there are none."""
+    """Candidate outlines of the screen in a frame, at least one; or why there are none."""
     refused = unreadable_orientation(frame)
     if refused is not None:
         return refused
@@ -51,50 +50,52 @@ def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> l
     layouts = layouts_of(options)
     with timer("geometry"):
         found = find_outlines(timer.planes.plane(frame), layouts, known_lens(frame, options))
-    alone = sum(not one.is_narrow for one in layouts) == 1
+    single_wide = sum(not layout.is_narrow for layout in layouts) == 1
     outlines = [
         Outline(
-            one.corners[0],
-            inferred=one.unlit_sides,
-            log_odds=one.log_odds,
-            family=one.layout.n_columns,
-            fills=one.fills,
-            other_rows=one.corners[1:],
-            strips=one.strips,
-            lens=one.grid.estimated_lens,
-            n_columns=None if alone and not one.layout.is_narrow else one.layout.n_columns,
+            screen.corners[0],
+            inferred=screen.unlit_sides,
+            log_odds=screen.log_odds,
+            family=screen.layout.n_columns,
+            fills=screen.fills,
+            other_rows=screen.corners[1:],
+            strips=screen.strips,
+            lens=screen.grid.estimated_lens,
+            n_columns=None if single_wide and not screen.layout.is_narrow else screen.layout.n_columns,
         )
-        for one in found
+        for screen in found
     ]
-    return [_as_viewed(one, frame.metadata.orientation) for one in outlines]
+    return [_as_viewed(outline, frame.metadata.orientation) for outline in outlines]
 
 
 def layouts_of(options: ReceiverOptions) -> list[ColumnLayout]:
-    """The columns that screens may have, few first."""
-    layouts = {one.columns: ColumnLayout(one.columns, one.light_spread, one.aspect) for one in options.screens}
+    """Column layouts of the screen profiles, in ascending order of columns."""
+    layouts = {
+        screen.columns: ColumnLayout(screen.columns, screen.light_spread, screen.aspect) for screen in options.screens
+    }
     return [layouts[n] for n in sorted(layouts)]
 
 
 def _as_viewed(outline: Outline, orientation: int) -> Outline:
     """An outline with its corners in the viewer's order."""
-    corners, *others = (geometry.viewer_order(one, orientation) for one in (outline.corners, *outline.other_rows))
-    return replace(outline, corners=corners, other_rows=tuple(others))
+    corners, *other_rows = (geometry.viewer_order(rows, orientation) for rows in (outline.corners, *outline.other_rows))
+    return replace(outline, corners=corners, other_rows=tuple(other_rows))
 
 
 def unreadable_orientation(frame: Frame) -> Failure | None:
-    """Why a picture whose readout runs along the columns' width cannot be received; None for others."""
+    """Failure of a picture whose readout runs along the columns' width, or None."""
     orientation = frame.metadata.orientation
     if orientation not in _PORTRAIT:
         return None
     return Failure(
         "no_signal",
         f"the picture was taken in portrait (EXIF orientation {orientation}): the sensor reads along the width of "
-        "the columns, so that they cannot be told apart; hold the camera in landscape",
+        "the columns, which then cannot be separated; hold the camera in landscape",
     )
 
 
 def outside_the_picture(corners: FloatArray, frame: Frame) -> Failure | None:
-    """Why an outline that was given shows next to nothing of the screen; None where it may do."""
+    """Failure of a given outline that shows too little of the screen, or None."""
     import cv2
 
     size = f"{frame.width} x {frame.height} pixels"
@@ -119,19 +120,19 @@ def outside_the_picture(corners: FloatArray, frame: Frame) -> Failure | None:
 
 
 def may_fill(frame: Frame) -> bool:
-    """Whether a part of a screen that fills the picture could be received at all."""
+    """Whether the picture is large enough to receive a screen that fills it."""
     return min(frame.width, frame.height) >= SETTINGS.min_rows
 
 
 def whole_picture(frame: Frame) -> FloatArray:
-    """(4, 2) the picture's own corners, the viewer's top left first: it may show nothing but a part of the screen."""
+    """Corners (4, 2) of the picture itself, the viewer's top left first, for a screen that fills the picture."""
     right, bottom = frame.width - 1.0, frame.height - 1.0
     corners = np.array([[0.0, 0.0], [right, 0.0], [right, bottom], [0.0, bottom]])
     return geometry.viewer_order(corners, frame.metadata.orientation)
 
 
 def turned_pixels(frame: Frame, options: ReceiverOptions, timer: Timer) -> str | None:
-    """What to say of a picture whose pixels lie on their side; None where they do not. Of a clip the first is asked."""
+    """Message about a picture that was rotated by 90 degrees, or None. Of a clip only the first frame is examined."""
     wide = [layout for layout in layouts_of(options) if not layout.is_narrow]
     if frame.index or not find_outlines(turned(timer.planes.plane(frame)), wide):
         return None
@@ -153,7 +154,7 @@ def reason_for_none(frame: Frame) -> str:
 
 
 def too_small(context: FrameContext, screen: ScreenProfile) -> str | None:
-    """Why no packet of `screen` fits the rows that show it, None where one does."""
+    """Message if no packet of `screen` fits the rows that show it, or None."""
     frame, camera = context.frame, context.camera
     fill = float(np.ptp(np.clip(context.corners[:, 1], 0, frame.height - 1))) / frame.height
     needed = screen.packet_s / (camera.line_delay_s * frame.height)

@@ -1,4 +1,4 @@
-"""Pixels to row profiles: every pixel of a frame is read once, into a plane that everything else is taken from."""
+"""Pixels to row profiles: each pixel of a frame is read once, into a plane from which profiles are sampled."""
 
 from rxcli.receiver.plane.read import read_plane, turned
 from rxcli.receiver.plane.rows import sample_rows, strips_per_column, tone_to_light

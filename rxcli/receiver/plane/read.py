@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rxcli.receiver.plane.settings import SETTINGS
 from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
 
-#: Rows read at a time: what fits the cache.
+#: Rows read at a time, chosen to fit the processor's cache.
 _BAND_ROWS = 64
 
 
@@ -39,7 +39,7 @@ def read_plane(frame: Frame) -> LightPlane:
 
 
 def turned(plane: LightPlane) -> LightPlane:
-    """The plane of the same picture turned by a quarter, in square pixels of a cell's width."""
+    """The plane of the picture rotated by 90 degrees, in square pixels of a cell's width."""
     cells = np.diff(plane.sums, axis=0)
     size = plane.cell_px
     n = cells.shape[1] // size
@@ -49,7 +49,7 @@ def turned(plane: LightPlane) -> LightPlane:
 
 
 def _cell_px(width: int, period: int) -> int:
-    """Width of a cell: a period times a power of two, as many as leave enough cells."""
+    """Width of a cell: the largest period times a power of two that leaves at least `min_cells` cells."""
     cell_px = period
     while width // (2 * cell_px) >= SETTINGS.min_cells:
         cell_px *= 2
@@ -58,14 +58,14 @@ def _cell_px(width: int, period: int) -> int:
 
 def _run(sums: Float32Array) -> Float32Array:
     """Running sums over the first axis, in place."""
-    # Four times as quick as numpy.cumsum, which goes down one column at a time.
+    # Much faster than numpy.cumsum, which goes down one column at a time.
     for left, here in pairwise(sums):
         np.add(left, here, out=here)
     return sums
 
 
 def _cells(band: NDArray[Any], cell_px: int) -> NDArray[Any]:
-    """(rows, n) sums of `cell_px` neighbouring whole numbers, a power of two: pairs of neighbours as one number."""
+    """Sums (rows, n) of `cell_px` neighbouring integers; `cell_px` is a power of two, and two lanes share a word."""
     while cell_px > 1:
         half = 8 * band.dtype.itemsize
         pairs = band.view(f"u{2 * band.dtype.itemsize}")

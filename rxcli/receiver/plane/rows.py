@@ -1,8 +1,8 @@
 """Plane and outlines to row profiles: the mean linear light of every strip on every row, with its noise.
 
-Coded values are averaged and the mean is made linear. Under a power law that changes how bright a textured strip is,
-but not how its light changes from row to row; room light and the straight part of the tone curve make it a little
-worse, by less than packets show.
+Encoded values are averaged and the mean is linearised. Under a power law this changes the brightness of a textured
+strip, but not how its light changes from row to row. Room light and the linear part of the tone curve add an error too
+small to cost packets.
 """
 
 from __future__ import annotations
@@ -61,20 +61,20 @@ def sample_rows(plane: LightPlane, outlines: Outlines, tone: str) -> RowProfiles
     cells = max(int(np.median(count) / (SETTINGS.parts_per_strip * plane.cell_px)), 1)
     rows = slice(int(outlines.rows[0]), int(outlines.rows[-1]) + 1)
     sums = plane.sums[int(edges.min()) : int(edges.max()) + 2 : cells, rows]
-    floor, slope = _noise_model(plane, sums, cells * plane.cell_px, tone)
+    noise_floor, noise_slope = _noise_model(plane, sums, cells * plane.cell_px, tone)
     return RowProfiles(
         light=light,
         inside=inside,
         rows=outlines.rows,
         sensor_row=outlines.sensor_row,
         count=count.reshape(inside.shape[:2]),
-        noise_floor=floor,
-        noise_slope=slope,
+        noise_floor=noise_floor,
+        noise_slope=noise_slope,
     )
 
 
 def _sums_at(sums: Float32Array, edges: Float32Array, first_row: int) -> Float32Array:
-    """Running sums (N + 1, R) at edges (n, rows) in cells from a first row on, linear between the borders of cells."""
+    """Interpolate running sums (N + 1, R) linearly at edges (n, rows), in cells; `first_row` is the first of R used."""
     height, flat = sums.shape[1], sums.ravel()
     place = np.minimum(edges, np.float32(len(sums) - 2)).astype(np.intp)
     part = np.subtract(edges, place, dtype=np.float32)
@@ -106,8 +106,8 @@ def _tone_table(tone: str) -> Float32Array:
 def _noise_model(plane: LightPlane, sums: Float32Array, part_px: int, tone: str) -> tuple[float, float]:
     """Variance of a pixel as floor + slope * light, from differences of adjacent parts of strips, `part_px` wide.
 
-    Medians over bins of equal light ignore the picture's edges; a straight line through the bins with floor and slope
-    not below zero.
+    Medians over bins of equal light ignore the picture's edges. The model is a straight line through the bins, with
+    floor and slope at least zero.
     """
     every = max(sums.shape[1] // SETTINGS.noise_rows, 1)
     parts = _light_of(plane, np.diff(sums[:, every // 2 :: every], axis=0) / np.float32(part_px), tone)
@@ -116,7 +116,7 @@ def _noise_model(plane: LightPlane, sums: Float32Array, part_px: int, tone: str)
     difference = np.abs(np.diff(parts, axis=0)).ravel()
     light = ((parts[1:] + parts[:-1]) / 2).ravel()
     n_bins = min(SETTINGS.noise_bins, max(1, light.size // 50))
-    # Bins of equal numbers; the few brightest that are left over do not matter.
+    # Bins of equal counts; the few brightest samples left over do not matter.
     bins = np.argsort(light)[: light.size // n_bins * n_bins].reshape(n_bins, -1)
     x = np.median(light[bins], axis=1)
     # For a normal difference of two parts of variance s2: median |d| = 0.6745 sqrt(2 s2).
@@ -127,8 +127,8 @@ def _noise_model(plane: LightPlane, sums: Float32Array, part_px: int, tone: str)
 def _floor_and_slope(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[float, float]:
     """Line through bins of light and variance: slope by a median over pairs, weighted by their distance."""
     run, rise = x[:, None] - x, y[:, None] - y
-    apart = run > 1e-4
-    slopes, weights = rise[apart] / run[apart], run[apart]
+    is_distinct = run > 1e-4
+    slopes, weights = rise[is_distinct] / run[is_distinct], run[is_distinct]
     order = np.argsort(slopes)
     reached = np.cumsum(weights[order])
     slope = float(slopes[order[np.searchsorted(reached, reached[-1] / 2)]]) if order.size else 0.0

@@ -1,4 +1,4 @@
-"""Numbers of policy of reading light from pixels."""
+"""Settings for reading light from pixels."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from dataclasses import dataclass
 class PlaneSettings:
     """Each with its unit and the reason for it."""
 
-    #: Cells that a row should have at least: some for every strip of a hundred columns.
+    #: Minimum number of cells of a row: several for every strip of a hundred columns.
     min_cells: int = 1500
-    #: Pixels that a strip should have before a column gets another one, and strips of a column at most.
+    #: Width of a strip in pixels from which a column is divided further, and maximum number of strips of a column.
     strip_px: int = 12
     max_strips: int = 8
-    #: The noise model compares neighbouring parts of a strip, of so many: denoised pixels are alike. Rows that it is
-    #: fitted to, and bins of equal light that their parts are sorted into.
+    #: The noise model compares neighbouring parts of a strip, because denoising correlates neighbouring pixels: parts
+    #: per strip, rows it is fitted to, and bins of equal light.
     parts_per_strip: int = 4
     noise_rows: int = 20
     noise_bins: int = 24
-    #: One row in this many says how many pixels a strip has.
+    #: Row spacing at which the pixels of a strip are counted.
     count_row_step: int = 16
-    #: Smallest distance of two edges, cells, that have light between them.
+    #: Minimum distance of two edges, in cells, at which light is measured between them.
     min_enclosed: float = 0.02
 
 

@@ -12,8 +12,8 @@ from rxcli.receiver.plane.read import read_plane
 from rxcli.receiver.plane.rows import sample_rows
 from rxcli.types import Float32Array, Frame, LightPlane, Outlines, RowProfiles
 
-#: Row profiles that are kept: those of few and of many columns, and of outlines in doubt.
-_MAX_KEPT = 4
+#: Cached row profiles: of layouts with few and with many columns, and of uncertain outlines.
+_MAX_CACHED = 4
 
 
 class PlaneStore:
@@ -31,12 +31,12 @@ class PlaneStore:
         return self._plane
 
     def sample(self, frame: Frame, outlines: Outlines, tone: str) -> RowProfiles:
-        """As `sample_rows`; sensor rows are those of `outlines`, which a lens may bend where edges stay."""
+        """Cached `sample_rows`; sensor rows are those of `outlines`, as a lens model may change them alone."""
         plane = self.plane(frame)
         for known_tone, edges, profiles in self._sampled:
             same = known_tone == tone and profiles.light.shape == outlines.inside.shape
             if same and np.array_equal(edges, outlines.edges_x) and np.array_equal(profiles.rows, outlines.rows):
                 return replace(profiles, sensor_row=outlines.sensor_row)
         profiles = sample_rows(plane, outlines, tone)
-        self._sampled = [*self._sampled[-_MAX_KEPT + 1 :], (tone, outlines.edges_x, profiles)]
+        self._sampled = [*self._sampled[-_MAX_CACHED + 1 :], (tone, outlines.edges_x, profiles)]
         return profiles
