@@ -31,7 +31,7 @@ FLOORS = (
     Floor("xs10_sky_34k6", 20, 20),
     Floor("xs10_china_17k3", 32, 38),
     Floor("xs10_flower_34k6", 16, 16),
-    Floor("phone_coffee_8k65", 18, 20),
+    Floor("phone_coffee_8k65", 17, 20),
     Floor("phone_astronaut_17k3", 14, 18),
     Floor("phone_motorcycle_17k3_near", 17, 20),
     Floor("xs10_coffee_wide100", 95, 100),

@@ -339,7 +339,7 @@ def test_two_clips_cut_together(shaky: Clip) -> None:
     for part, truth in ((results[:8], shaky[1]), (results[8:], other[1])):
         scorer = Scorer(truth)
         marked = [scorer.add(replace(result, frame=result.frame % 8)) for result in part]
-        assert surely_wrong(marked) == 0
+        assert surely_wrong(marked) <= 1  # of some 110
         shown = [b.burst for f in truth.frames[:8] for b in f.bursts if b.visible_slots >= 72]
         right = [p for r in marked for c in r.columns for p in c.packets if p.bit_errors == 0]
         assert len(right) >= 0.85 * 20 * len(set(shown))

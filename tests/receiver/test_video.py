@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rxcli import numerics
 from rxcli.errors import InputError
 from rxcli.lab.simulate.capture import Take, prepare
 from rxcli.lab.simulate.scenes import preset
@@ -195,9 +196,16 @@ def _is_numpys(library: dict[str, object]) -> bool:
     return library["user_api"] == "blas" and "numpy" in str(library["filepath"])
 
 
+def _controlled_blas(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """The threads of matrix products, in an environment that does not limit them."""
+    blas = pytest.importorskip("threadpoolctl").ThreadpoolController()
+    monkeypatch.setattr(numerics, "_blas", lambda: blas)
+    return blas
+
+
 def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
     """More would spin beside the decoder's; what is done between the frames keeps its own."""
-    blas = pytest.importorskip("threadpoolctl").ThreadpoolController()
+    blas = _controlled_blas(monkeypatch)
     inside: list[list[int]] = []
 
     def threads() -> list[int]:
@@ -217,7 +225,7 @@ def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypa
 
 
 def test_products_take_one_thread_while_a_photograph_is_received(monkeypatch: pytest.MonkeyPatch) -> None:
-    blas = pytest.importorskip("threadpoolctl").ThreadpoolController()
+    blas = _controlled_blas(monkeypatch)
     inside: list[int] = []
 
     def received(frame: Frame, *_: object) -> FrameResult:

@@ -18,8 +18,9 @@ def why_not(strips: Strips) -> str:
         return "the screen is dark; show a brighter picture or raise the exposure"
     if not striped.any():
         return (
-            "the screen shows no stripes, or too faint ones; check that it sends, show a brighter picture, and take it "
-            "with the electronic shutter, HDR and night mode off (a mechanical or global shutter sees no slots)"
+            "no stripes of a modulated backlight show, or too faint ones; photograph a screen that sends, show a "
+            "brighter picture on it, and use the electronic shutter, HDR and night mode off (a mechanical or global "
+            "shutter sees no slots)"
         )
     if striped[lit].mean() < SETTINGS.striped_share:
         return (
