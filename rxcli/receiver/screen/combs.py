@@ -1,9 +1,9 @@
-"""The comb of column borders: strips that are some way apart are least alike where a border lies between them.
+"""The comb of column borders: the correlation of two nearby strips is lowest if a border lies between them.
 
-With the columns' light spread a Gaussian of `sigma` column pitches, two strips at the places `u` and `u + d` (in
-columns) are as alike as the vectors `exp(-(u - k)^2 / 2 sigma^2)` over the columns k. Along the screen this goes up and
-down once a column, most at a distance of about 0.7. A Fourier sum over all pairs of about that distance finds the
-period: it needs no edge of the screen and no decoding.
+Let the light spread of a column be a Gaussian of `sigma` column pitches. Strips at `u` and `u + d` (in columns) then
+correlate as the vectors `exp(-(u - k)^2 / 2 sigma^2)` over the columns k. Along the screen this correlation oscillates
+with a period of one column, most strongly for `d` of about 0.7. A Fourier sum over all pairs at about that distance
+finds the period. It needs no edge of the screen and no decoding.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import Float32Array, FloatArray
 
-#: Combs that differ by less than this in pitch, and by this at the picture's ends, lead to the same grid; columns.
+#: Combs whose pitch and whose position at the picture's ends differ by less lead to the same grid; columns.
 _SAME_PITCH, _SAME_SHAPE = 0.7, 0.8
-#: Gauss-Newton steps that turn a comb into a grid; weight of a place, columns to the power of minus two.
+#: Gauss-Newton steps from a comb to a grid; precision of a position, columns to the power of minus two.
 _STEPS, _PRECISION = 4, 100.0
 
 
@@ -33,7 +33,7 @@ class Comb:
     X and Y are offsets from the part's middle over its width.
     """
 
-    #: Height over the standard deviation that it would have by chance, were all pairs independent.
+    #: Height over its standard deviation by chance, if all pairs were independent.
     score: float
     pitch: float
     turn: float
@@ -43,24 +43,24 @@ class Comb:
     #: Number of the part, from the left.
     part: int
 
-    def is_like(self, other: Comb) -> bool:
-        """Whether two combs differ so little that one fit finds both."""
-        shape = abs(self.turn - other.turn) + (abs(self.across - other.across) + abs(self.along - other.along)) / 4
-        same = self.part == other.part and abs(self.pitch - other.pitch) < _SAME_PITCH
+    def is_like(self, comb: Comb) -> bool:
+        """Whether two combs are so similar that a fit from either gives the same grid."""
+        shape = abs(self.turn - comb.turn) + (abs(self.across - comb.across) + abs(self.along - comb.along)) / 4
+        same = self.part == comb.part and abs(self.pitch - comb.pitch) < _SAME_PITCH
         return same and shape * self.pitch < _SAME_SHAPE
 
 
 @lru_cache(maxsize=64)
 def likeness(sigma: float, distance: float) -> tuple[float, float]:
-    """Mean and first harmonic, over the phase, of how alike two places `distance` columns apart are."""
+    """Mean and first harmonic, over the phase, of the correlation of two positions `distance` columns apart."""
     middle, centres = np.arange(64) / 64, np.arange(-6, 8) + 0.5
-    one, other = (np.exp(-((middle[:, None] + s * distance / 2 - centres) ** 2) / (2 * sigma**2)) for s in (-1, 1))
-    cosine = (one * other).sum(-1) / np.sqrt((one**2).sum(-1) * (other**2).sum(-1))
+    left, right = (np.exp(-((middle[:, None] + s * distance / 2 - centres) ** 2) / (2 * sigma**2)) for s in (-1, 1))
+    cosine = (left * right).sum(-1) / np.sqrt((left**2).sum(-1) * (right**2).sum(-1))
     return float(cosine.mean()), float(2 * (cosine * np.cos(2 * np.pi * middle)).mean())
 
 
 def find_combs(strips: Strips, sigma: float) -> list[Comb]:
-    """The combs that show best, best first: some of a picture that is one part, else the best of each part.
+    """The strongest combs, strongest first: several if the picture is one part, else the strongest of each part.
 
     Args:
         strips: of the picture.
@@ -70,9 +70,9 @@ def find_combs(strips: Strips, sigma: float) -> list[Comb]:
     found: list[Comb] = []
     for part in range(n_parts):
         own = strips.blocks(slice(part * n_windows, (part + 1) * n_windows))
-        combs = sorted(_combs_of_part(own, sigma, part), key=lambda one: -one.score)
+        combs = sorted(_combs_of_part(own, sigma, part), key=lambda comb: -comb.score)
         found += _distinct(combs, SETTINGS.n_combs if n_parts == 1 else 1)
-    return sorted(found, key=lambda one: -one.score)
+    return sorted(found, key=lambda comb: -comb.score)
 
 
 def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
@@ -91,12 +91,12 @@ def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
     return Grid(numbers, strips.width, strips.height, strips.lens)
 
 
-def _distinct(combs: list[Comb], most: int) -> list[Comb]:
+def _distinct(combs: list[Comb], max_combs: int) -> list[Comb]:
     chosen: list[Comb] = []
     for comb in combs:
-        if len(chosen) == most:
+        if len(chosen) == max_combs:
             break
-        if not any(comb.is_like(other) for other in chosen):
+        if not any(comb.is_like(earlier) for earlier in chosen):
             chosen.append(comb)
     return chosen
 
@@ -104,25 +104,25 @@ def _distinct(combs: list[Comb], most: int) -> list[Comb]:
 def _combs_of_part(strips: Strips, sigma: float, part: int) -> list[Comb]:
     """The best comb of each pitch."""
     step = strips.step * strips.n_parts
-    most = min(SETTINGS.max_pitch, 1 / (SETTINGS.min_column_strips * step))
-    pitches = np.arange(SETTINGS.min_pitch, most, SETTINGS.pitch_step)
-    apart = np.maximum(np.round(SETTINGS.pair_distance / (pitches * step)), 1).astype(np.int64)
+    max_pitch = min(SETTINGS.max_pitch, 1 / (SETTINGS.min_column_strips * step))
+    pitches = np.arange(SETTINGS.min_pitch, max_pitch, SETTINGS.pitch_step)
+    distances = np.maximum(np.round(SETTINGS.pair_distance / (pitches * step)), 1).astype(np.int64)
     y = strips.raw_y.mean(axis=1) * strips.n_parts
     found: list[Comb] = []
-    for distance in np.unique(apart).tolist():
-        both = strips.lit[:, :-distance] * strips.lit[:, distance:]
-        tried = pitches[apart == distance]
+    for distance in np.unique(distances).tolist():
+        lit_pairs = strips.lit[:, :-distance] * strips.lit[:, distance:]
+        tried = pitches[distances == distance]
         mean, harmonic = likeness(sigma, round(float(tried.mean()) * distance * step, 2))
-        rest = np.sqrt(both) * strips.coherence(distance) - np.float32(mean) * both
-        chance = np.sqrt(float(both.sum()) / (2 * strips.n_rows)) + TINY
-        # Combs are weighed by their own height, so that pitches of unlike distances can be compared.
+        rest = np.sqrt(lit_pairs) * strips.coherence(distance) - np.float32(mean) * lit_pairs
+        chance = np.sqrt(float(lit_pairs.sum()) / (2 * strips.n_rows)) + TINY
+        # Combs are scaled to their standard deviation by chance, so that different distances can be compared.
         rest *= np.float32(np.sign(harmonic) / chance)
         found += _best_combs(rest, step, y, tried, part, strips.n_parts)
     return found
 
 
 def _range(largest: float, at_corner: float) -> FloatArray:
-    """Values from minus to plus `largest`, 0 among them, that differ by the corner's step where each counts so much."""
+    """Values from `-largest` to `largest`, including 0, in steps that move a corner by the corner's step at most."""
     n = int(np.ceil(largest * at_corner / SETTINGS.corner_step))
     return np.linspace(-largest, largest, 2 * n + 1)
 
@@ -130,7 +130,7 @@ def _range(largest: float, at_corner: float) -> FloatArray:
 def _best_combs(
     rest: Float32Array, step: float, y: FloatArray, pitches: FloatArray, part: int, n_parts: int
 ) -> list[Comb]:
-    """The best comb of each pitch by values (W, n) of pairs of strips: along the strips, then over the windows."""
+    """The best comb of each pitch, from values (W, n) of pairs of strips: sum along the strips, then over windows."""
     largest, half_x, half_y = float(pitches[-1]), 0.5, float(np.abs(y).max())
     if SETTINGS.max_turn * largest * (y[1] - y[0]) < SETTINGS.corner_step and len(y) % 2 == 0:
         rest, y = rest[::2] + rest[1::2], (y[::2] + y[1::2]) / 2
@@ -138,16 +138,16 @@ def _best_combs(
     across = _range(SETTINGS.max_across / n_parts, largest * half_x**2)
     along = _range(SETTINGS.max_along / n_parts, largest * half_x * half_y)
     spacing, reach = SETTINGS.pitch_step / 2, float(along.max()) * half_y * largest
-    first = int(np.floor((float(pitches[0]) - reach) / spacing))
-    n_frequencies = int(np.ceil((largest + reach) / spacing)) - first + 1
+    start = int(np.floor((float(pitches[0]) - reach) / spacing))
+    n_frequencies = int(np.ceil((largest + reach) / spacing)) - start + 1
     own = pitches[:, None, None] * (1 + along[:, None] * y)
-    nearest = np.round(own / spacing).astype(np.int64) - first
-    wave = _waves(rest.shape[1], step, first, n_frequencies)
+    nearest = np.round(own / spacing).astype(np.int64) - start
+    wave = _waves(rest.shape[1], step, start, n_frequencies)
     x = (np.arange(rest.shape[1]) - (rest.shape[1] - 1) / 2) * step
     over_windows = _turned(pitches[:, None, None] * np.multiply.outer(y, turns))
     sums = np.empty((pitches.size, across.size, along.size, turns.size), np.complex64)
-    for number, bend in enumerate((float(pitches.mean()) * across).tolist()):
-        along_strips = (rest * _turned(bend * x * x)) @ wave
+    for number, quadratic in enumerate((float(pitches.mean()) * across).tolist()):
+        along_strips = (rest * _turned(quadratic * x * x)) @ wave
         sums[:, number] = np.matmul(along_strips[np.arange(y.size), nearest], over_windows)
     heights, out = np.abs(sums), []
     for number, pitch in enumerate(pitches.tolist()):
@@ -159,10 +159,10 @@ def _best_combs(
 
 
 @lru_cache(maxsize=32)
-def _waves(n: int, step: float, first: int, n_frequencies: int) -> NDArray[np.complex64]:
-    """(n, F) waves along pairs of strips `step` apart, at whole multiples of the spacing of frequencies."""
+def _waves(n: int, step: float, start: int, n_frequencies: int) -> NDArray[np.complex64]:
+    """(n, F) complex waves at pairs of strips with spacing `step`, from the frequency with index `start` on."""
     x = (np.arange(n) - (n - 1) / 2) * step
-    return _turned(np.outer(x, (first + np.arange(n_frequencies)) * (SETTINGS.pitch_step / 2)))
+    return _turned(np.outer(x, (start + np.arange(n_frequencies)) * (SETTINGS.pitch_step / 2)))
 
 
 def _turned(turns: FloatArray) -> NDArray[np.complex64]:

@@ -1,9 +1,9 @@
-"""The finder: outlines that the screen in a picture may have, from the coherence of strips alone.
+"""The finder: propose outlines of the screen in a picture, from the coherence of strips alone.
 
-No side of the screen has to show. Strips (`strips`) give combs of borders (`combs`); the comb whose waveforms explain
-the light best becomes a grid of columns (`grid`, `waveforms`); light outside and columns out of view say which column
-is the first (`numbering`), and light along the columns where the rows begin and end (`rows`). The finder proposes
-outlines with log-odds and decides nothing.
+No side of the screen has to be visible. Strips (`strips`) give combs of borders (`combs`). The comb whose waveforms
+explain the light best becomes a grid of columns (`grid`, `waveforms`). Light outside the screen and columns out of view
+identify the first column (`numbering`); light along the columns gives the first and last rows (`rows`). The finder
+proposes outlines with log-odds and leaves the decision to the search.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 BRIGHTEN = "expose longer, raise ISO, or show a brighter picture on the screen"
 #: Parts of a picture that are searched for narrow columns.
 _PARTS = 5
-#: Columns without light beside a side from which on it does not show.
+#: Number of unlit columns at a side from which the side counts as not visible.
 _UNLIT_COLUMNS = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class ColumnLayout:
-    """What is known of a screen's columns."""
+    """Columns of a screen: number, light spread and aspect."""
 
     n_columns: int = 20
     #: Light spread, column pitches.
@@ -44,23 +44,23 @@ class ColumnLayout:
 
     @property
     def is_narrow(self) -> bool:
-        """Whether columns are so many that each fifth of a picture is searched for them."""
+        """Whether the columns are narrow, so that each fifth of a picture is searched for them."""
         return self.n_columns >= SETTINGS.narrow_columns
 
 
 @dataclass(frozen=True, slots=True)
 class OutlineCandidate:
-    """A place that the screen may have."""
+    """A candidate position of the screen."""
 
-    #: (4, 2) pixels of the stored picture, clockwise from the screen's top left there: one for every extent of its rows
-    #: that may be, likeliest first.
+    #: (4, 2) pixels of the stored picture, clockwise from the screen's top left there: one for each candidate extent of
+    #: its rows, likeliest first.
     corners: tuple[FloatArray, ...]
     #: Strips of the picture on which it was found.
     strips: Strips
-    #: Its columns count from the screen's first.
+    #: Columns are numbered from the screen's first.
     grid: Grid
     layout: ColumnLayout
-    #: Log-odds of its first column and number of columns against the likeliest.
+    #: Log-odds of its first column and number of columns relative to the likeliest.
     log_odds: float
     #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
     fills: bool
@@ -71,19 +71,19 @@ class OutlineCandidate:
 def find_outlines(
     plane: LightPlane, layouts: Sequence[ColumnLayout], lens: Lens | None = None
 ) -> list[OutlineCandidate]:
-    """Outlines that the screen in a picture may have, likeliest first; none where no columns show.
+    """Candidate outlines of the screen in a picture, likeliest first; none if no columns are found.
 
     Args:
         plane: of the picture.
         layouts: that the screen may have.
-        lens: of the picture, where it is known.
+        lens: of the picture, if known.
     """
     if min(plane.width, plane.height) < SETTINGS.min_size_px:
         return []
     strips = read_strips(plane, lens)
     if strips.lit.shape[1] < SETTINGS.min_strips:
         return []
-    narrow, wide = ([one for one in layouts if one.is_narrow is many] for many in (True, False))
+    narrow, wide = ([layout for layout in layouts if layout.is_narrow is many] for many in (True, False))
     if narrow and shows_narrow_columns(strips):
         fine = read_strips(plane, lens, n_parts=_PARTS)
         grid = narrow_grid(fine, narrow[0].sigma)
@@ -94,11 +94,11 @@ def find_outlines(
 
 
 def why_useless(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white: float) -> tuple[str, str] | None:
-    """Why a picture cannot show a screen at all, and what to do; None where it can."""
+    """Why a picture cannot show a screen at all and the next step, or None."""
     height, width = pixels.shape
     if min(height, width) < SETTINGS.min_size_px:
-        least = SETTINGS.min_size_px
-        size = f"the picture has {width} x {height} pixels, a screen needs at least {least} each way"
+        min_px = SETTINGS.min_size_px
+        size = f"the picture has {width} x {height} pixels, a screen needs at least {min_px} each way"
         return size, "use the picture in its full size, not a thumbnail or a messenger's copy"
     sample = thinned(pixels, black, white)
     if np.mean(sample >= 0.004) < 0.005:
@@ -109,13 +109,13 @@ def why_useless(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, wh
 
 
 def thinned(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white: float) -> Float32Array:
-    """Some thousand pixels all over a picture; 0 is black, 1 is white."""
+    """Subsample a picture to a few thousand pixels; 0 is black, 1 is white."""
     steps = (slice(None, None, max(1, size // 64)) for size in pixels.shape)
     return np.asarray((pixels[*steps] - np.float32(black)) / (white - black), np.float32)
 
 
 def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout) -> FloatArray | None:
-    """The outline of a screen near to where it was one frame earlier; None where it does not show there any more.
+    """Outline of a screen close to that of the frame before, or None if it is not found there.
 
     Args:
         plane: of the picture.
@@ -139,20 +139,20 @@ def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout)
 
 
 def wide_grid(strips: Strips, sigma: float) -> Grid | None:
-    """The grid of wide columns that explains the strips' light best; None where none stands out."""
+    """The grid of wide columns that explains the strips' light best, or None."""
     some = strips.blocks(slice(None, None, 2))
     combs = _possible_combs(strips, sigma)
     if not combs:
         return None
     best = with_light(some, grid_of_comb(combs[0], strips), sigma)
     if best.contrast < SETTINGS.plain_contrast * best.explained:
-        others = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
-        best = max([best, *others], key=lambda one: one.explained + SETTINGS.contrast_weight * one.contrast)
+        rest = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
+        best = max([best, *rest], key=lambda grid: grid.explained + SETTINGS.contrast_weight * grid.contrast)
     return _settled(strips, moved_by_waveforms(some, best, sigma, SETTINGS.first_steps), sigma)
 
 
 def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
-    """The grid of narrow columns; None where none stands out.
+    """The grid of narrow columns, or None.
 
     Each part of the picture gives a grid. The one with the clearest borders is followed over the whole width.
     """
@@ -170,7 +170,7 @@ def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
 
 
 def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
-    """A grid of the part of a picture around `middle`, followed over the whole width."""
+    """Extend a grid from the part of a picture around `middle` to the whole width."""
     reach = 0.5 / _PARTS
     while reach < 0.5 + abs(middle):
         reach *= SETTINGS.reach_gain
@@ -181,13 +181,13 @@ def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
 
 
 def _possible_combs(strips: Strips, sigma: float) -> list[Comb]:
-    """The combs that are worth a grid; none where the best may be chance."""
+    """The combs to fit grids to; none if the best may be chance."""
     combs = find_combs(strips, sigma)
     return combs if combs and combs[0].score > SETTINGS.min_comb else []
 
 
 def _settled(strips: Strips, grid: Grid, sigma: float) -> Grid | None:
-    """A grid after its last steps; None where it explains nearly as much with its borders elsewhere."""
+    """A grid after its last steps, or None if borders half a column further on explain nearly as much."""
     grid = with_light(strips, moved_by_waveforms(strips, grid, sigma, SETTINGS.last_steps), sigma)
     return grid if _stands_out(strips, grid) else None
 
@@ -198,7 +198,7 @@ def _stands_out(strips: Strips, grid: Grid) -> bool:
 
 
 def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> list[OutlineCandidate]:
-    """The outlines of a grid: every first column that may be; those of one layout have the same rows."""
+    """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
     light = predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), layouts[0].sigma)
     profile = light_profile(strips, light, grid)
     starts = [first_columns(profile, layout.n_columns) for layout in layouts]
@@ -208,20 +208,20 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> li
     found: list[OutlineCandidate] = []
     for layout, start in zip(layouts, starts, strict=True):
         likely = np.flatnonzero(start.log_odds > start.log_odds.max() + SETTINGS.min_log_odds)
-        best = int(start.first[start.log_odds.argmax()])
+        best = int(start.columns[start.log_odds.argmax()])
         own = grid.shifted(best)
         if is_plain:
-            # Light beyond the first and last column is none of theirs.
+            # Light beyond the first and last column does not come from the screen.
             n_steps = SETTINGS.last_steps
             own = moved_by_waveforms(strips, own, layout.sigma, n_steps, n_columns=layout.n_columns)
         plane, ends = find_rows(strips, light, own, layout.n_columns, layout.aspect)
-        for number, log_odds in zip(start.first[likely].tolist(), start.log_odds[likely].tolist(), strict=True):
-            corners = tuple(plane.corners(one, number - best) for one in ends)
+        for number, log_odds in zip(start.columns[likely].tolist(), start.log_odds[likely].tolist(), strict=True):
+            corners = tuple(plane.corners(extent, number - best) for extent in ends)
             lit = (profile.ends[0] - number, number + layout.n_columns - profile.ends[1])
             unlit = _unlit_sides(corners[0], lit, len(ends) > 1, (strips.width, strips.height))
             counted, odds_lost = own.shifted(number - best), log_odds - likeliest
             found.append(OutlineCandidate(corners, strips, counted, layout, odds_lost, start.fills, unlit))
-    return sorted(found, key=lambda one: -one.log_odds)
+    return sorted(found, key=lambda candidate: -candidate.log_odds)
 
 
 def _unlit_sides(

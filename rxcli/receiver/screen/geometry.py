@@ -17,19 +17,19 @@ from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray, Lens, Out
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
-#: Rows of a picture for the viewer start at this stored corner: EXIF orientation -> order of the stored corners
-#: (top-left, top-right, bottom-right, bottom-left of the stored picture) as the viewer meets them.
+#: EXIF orientation -> order in which the viewer sees the corners of the stored picture (top-left, top-right,
+#: bottom-right, bottom-left).
 _VIEWER_CORNERS = {1: (0, 1, 2, 3), 2: (1, 0, 3, 2), 3: (2, 3, 0, 1), 4: (3, 2, 1, 0)}
-#: Share of the screen's height beyond its corners that outlines reach, so that no edge row is lost.
+#: Overlap of outlines beyond the screen's corners, as a share of its height, so that no edge row is lost.
 _OVERHANG = 0.02
 #: Sides of a picture, in the order of its corners: side i goes from corner i to corner i + 1.
 SIDE_NAMES = ("top", "right", "bottom", "left")
 _OUTLINE_POINTS, _MIDDLE_POINTS = 65, 33
-#: No lens moves a point of the picture by more than this many focal lengths.
+#: Maximum displacement of a point by a lens, in focal lengths.
 _LARGEST_MOVE = 10.0
-#: The inverse of the lens is found when a step moves no point by this many pixels.
+#: The inverse of the lens has converged when a step moves every point by less than this many pixels.
 _MIN_STEP = 1e-8
-#: Edges are straight to a thousandth of a pixel over this many rows.
+#: Rows over which edges are interpolated linearly: straight to a thousandth of a pixel.
 _KNOT_ROWS = 32
 
 
@@ -99,7 +99,7 @@ def undistort(points: FloatArray, lens: Lens, iterations: int = 20) -> FloatArra
 def homography(corners: FloatArray) -> FloatArray:
     """(3, 3) map of screen points (u to the right, v down, both 0..1) to pixels, from the (4, 2) corners."""
     (x0, y0), (x1, y1), (x2, y2), (x3, y3) = np.asarray(corners, np.float64).tolist()
-    # What the corners lack of a parallelogram makes the perspective (Heckbert 1989).
+    # The deviation of the corners from a parallelogram gives the perspective (Heckbert 1989).
     bent_x, bent_y = x0 - x1 + x2 - x3, y0 - y1 + y2 - y3
     right_x, right_y, left_x, left_y = x1 - x2, y1 - y2, x3 - x2, y3 - y2
     determinant = right_x * left_y - left_x * right_y
@@ -171,9 +171,9 @@ def quick_outlines(
 def _outlined(
     points: FloatArray, v: FloatArray, n_strips: int, finer: int, ends: tuple[int, int], width: int, lens: Lens | None
 ) -> Outlines:
-    """Outlines of strips whose edges, or every so manieth, go through points (n, v, 2); `ends` are their rows."""
-    first, last = ends
-    rows = np.arange(first, last + 1)
+    """Outlines of strips, where every `finer`-th edge passes through points (n, v, 2); `ends` are their rows."""
+    top, bottom = ends
+    rows = np.arange(top, bottom + 1)
     knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
     knot_x, knot_v = (_finer(values, finer) for values in _edges_at(points, v, knots))
     edges_x = _between_knots(knot_x.astype(np.float32), knots, rows)
@@ -197,9 +197,9 @@ def column_middles(corners: FloatArray, n_columns: int, lens: Lens | None) -> Fl
 
 
 def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:
-    first = int(np.clip(np.floor(corners[:, 1].min()), 0, height - 1))
-    last = int(np.clip(np.ceil(corners[:, 1].max()), first, height - 1))
-    return first, last
+    top = int(np.clip(np.floor(corners[:, 1].min()), 0, height - 1))
+    bottom = int(np.clip(np.ceil(corners[:, 1].max()), top, height - 1))
+    return top, bottom
 
 
 def _edges_at(points: FloatArray, v: FloatArray, knots: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -212,7 +212,7 @@ def _edges_at(points: FloatArray, v: FloatArray, knots: IntArray) -> tuple[Float
 
 
 def _finer(values: FloatArray, parts: int) -> FloatArray:
-    """Values (n, K) with so many even steps from one line to the next, (parts * (n - 1) + 1, K)."""
+    """Divide the distance between adjacent lines of values (n, K) into equal parts: (parts * (n - 1) + 1, K)."""
     if parts == 1:
         return values
     share = np.arange(parts)[:, None] / parts
@@ -221,16 +221,16 @@ def _finer(values: FloatArray, parts: int) -> FloatArray:
 
 
 def _interpolated(places: FloatArray | IntArray, known: FloatArray, *values: FloatArray) -> list[FloatArray]:
-    """`values` (n, P) each, at ascending `known` (n, P), linearly between at the `places` (n, K); the ends' beyond.
+    """Interpolate `values` (n, P each) from ascending `known` (n, P) linearly to the `places` (n, K).
 
-    As `np.interp` has it, for all lines at once.
+    `np.interp` for all lines at once; places beyond the ends take the values of the ends.
     """
     n_known = known.shape[1]
-    # One line after the other, far enough apart to be searched together.
-    apart = np.arange(len(known))[:, None]
+    # Lines are offset by more than their range, so that one search serves all.
+    line = np.arange(len(known))[:, None]
     distance = max(known.max(), places.max()) - min(known.min(), places.min()) + 1
-    found = np.searchsorted((known + apart * distance).ravel(), (places + apart * distance).ravel(), side="right")
-    right = np.clip(found.reshape(places.shape) - apart * n_known, 1, n_known - 1)
+    found = np.searchsorted((known + line * distance).ravel(), (places + line * distance).ravel(), side="right")
+    right = np.clip(found.reshape(places.shape) - line * n_known, 1, n_known - 1)
     left = right - 1
 
     def taken(of: FloatArray, index: IntArray) -> FloatArray:
@@ -243,16 +243,18 @@ def _interpolated(places: FloatArray | IntArray, known: FloatArray, *values: Flo
 
 
 def rows_elsewhere(rows: FloatArray, here: FloatArray, there: FloatArray) -> Float32Array:
-    """(C, R) row of what successive `rows` (R,) show, where points of columns at the rows `here` (C, n) are at `there`
-    (C, n); beyond the points as between the outermost."""
+    """Map successive `rows` (R,) of each column to (C, R) rows, by points `here` (C, n) that map to `there` (C, n).
+
+    Rows beyond the points are extrapolated with the mean slope.
+    """
     if here[0, -1] < here[0, 0]:
         here, there = here[:, ::-1], there[:, ::-1]
     knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
     (inner,) = _interpolated(np.broadcast_to(knots, (len(here), knots.size)), here, there)
-    first, last = here[:, :1], here[:, -1:]
-    slope = (there[:, -1:] - there[:, :1]) / (last - first)
-    found = inner + slope * (np.minimum(knots - first, 0) + np.maximum(knots - last, 0))
-    # Rows of the picture need less than single precision.
+    start, end = here[:, :1], here[:, -1:]
+    slope = (there[:, -1:] - there[:, :1]) / (end - start)
+    found = inner + slope * (np.minimum(knots - start, 0) + np.maximum(knots - end, 0))
+    # Single precision suffices for rows of a picture.
     return _between_knots(found.astype(np.float32), knots.astype(np.int64), rows.astype(np.int64))
 
 

@@ -1,8 +1,8 @@
-"""The column grid of a screen: which column each place of a picture belongs to.
+"""The column grid of a screen: the column as a function of the position in a picture.
 
-A flat screen before a camera has its columns at `u = u0 + (a X + b Y) / (1 + g X + h Y)`, X and Y offsets from the
-picture's middle over its width after the lens has been taken off: a lens that is known, or one radial coefficient that
-is estimated with the grid.
+A flat screen has its columns at `u = u0 + (a X + b Y) / (1 + g X + h Y)`. X and Y are offsets from the picture's middle
+in picture widths, with lens distortion removed: that of a known lens, or of one radial coefficient estimated with the
+grid.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ _INVERSE_STEPS = 12
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Columns as a function of the place in a picture."""
+    """Columns as a function of the position in a picture."""
 
     #: (6,) u0, a, b, g, h, and the radial coefficient, see the module's text.
     numbers: FloatArray
     width: int
     height: int
-    #: Lens that is left in the picture; None: none, or one that is not known.
+    #: Known lens of the picture; None: no lens, or an unknown one.
     lens: Lens | None
-    #: Log-likelihood of the strips' light that the columns' waveforms explain, and by how much it exceeds that with
-    #: borders half a column further on; 0 where it was not asked.
+    #: Log-likelihood of the strips' light that the columns' waveforms explain, and its excess over that with borders half
+    #: a column further on; 0 if not computed.
     explained: float = 0.0
     contrast: float = 0.0
 
@@ -41,7 +41,7 @@ class Grid:
 
     @property
     def estimated_lens(self) -> Lens | None:
-        """The lens that the radial coefficient stands for; None where the lens is known."""
+        """Lens with the estimated radial coefficient, or None if the lens is known."""
         if self.lens is not None:
             return None
         radial = self.numbers[5]
@@ -54,21 +54,21 @@ class Grid:
         return columns_at(self.numbers, *flat_places(points, self.width, self.height, self.lens))
 
     def flat(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Offsets of (..., 2) pixels from the picture's middle in picture widths, all lenses taken off."""
+        """Offsets of (..., 2) pixels from the picture's middle in picture widths, with lens distortion removed."""
         x, y = flat_places(points, self.width, self.height, self.lens)
         scale = 1 + self.numbers[5] * (x * x + y * y)
         return x * scale, y * scale
 
     def pixels_of(self, flat: FloatArray) -> FloatArray:
-        """(n, 2) pixels of (n, 2) such offsets."""
-        seen = flat
+        """(n, 2) pixels of (n, 2) offsets, the inverse of `flat`."""
+        distorted = flat
         for _ in range(_INVERSE_STEPS):
-            seen = flat / (1 + self.numbers[5] * (seen**2).sum(axis=-1, keepdims=True))
-        pixels = seen * self.width + np.array([(self.width - 1) / 2, (self.height - 1) / 2])
+            distorted = flat / (1 + self.numbers[5] * (distorted**2).sum(axis=-1, keepdims=True))
+        pixels = distorted * self.width + np.array([(self.width - 1) / 2, (self.height - 1) / 2])
         return pixels if self.lens is None or self.lens.corrected else geometry.distort(pixels, self.lens)
 
     def shifted(self, columns: float) -> Grid:
-        """The grid with its columns counted from another one."""
+        """The grid with its columns renumbered from column `columns` on."""
         return replace(self, numbers=self.numbers - np.array([columns, 0, 0, 0, 0, 0]))
 
 
@@ -79,12 +79,12 @@ def grid_between(corners: FloatArray, n_columns: int, size: tuple[int, int], len
         corners: (4, 2) pixels, clockwise from the top left.
         n_columns: columns of the screen.
         size: width and height of the picture, pixels.
-        lens: of the picture, where it is known.
+        lens: of the picture, if known.
     """
     width, height = size
     bent = lens is not None and not lens.corrected
-    seen = np.linalg.inv(geometry.homography(geometry.undistort(corners, lens) if bent and lens else corners))
-    matrix = seen @ np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1]])
+    to_screen = np.linalg.inv(geometry.homography(geometry.undistort(corners, lens) if bent and lens else corners))
+    matrix = to_screen @ np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1]])
     across, below = n_columns * matrix[0] / matrix[2, 2], matrix[2] / matrix[2, 2]
     u0, g, h = across[2], below[0], below[1]
     return Grid(np.array([u0, across[0] - u0 * g, across[1] - u0 * h, g, h, 0.0]), width, height, lens)
@@ -110,7 +110,7 @@ def grid_slopes(numbers: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray
 
 
 def grid_step(numbers: FloatArray, off: FloatArray, weight: FloatArray, slopes: FloatArray) -> FloatArray:
-    """(6,) Gauss-Newton step of a grid's numbers that moves its columns by `off`, with the priors.
+    """(6,) Gauss-Newton step of a grid's parameters that moves its columns by `off`, with the priors.
 
     Args:
         numbers: (6,) of the grid.

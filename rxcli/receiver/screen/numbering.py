@@ -1,7 +1,7 @@
-"""Which column of a grid is the screen's first: no light may lie outside, little of the screen outside the picture.
+"""Number the columns of a grid: no light may lie outside the screen, and little of the screen outside the picture.
 
-Numberings that differ by a shift have all columns in common but the outermost, so these decide. Light is looked for in
-eighths of a column: the edge of a screen lies on a border of its columns, the edge of a picture on it by chance only.
+Numberings that differ by a shift share all columns but the outermost, so these decide. Light is measured in eighths of
+a column: the edge of a screen lies on a column border, whereas that of a picture shown on it does so by chance only.
 """
 
 from __future__ import annotations
@@ -15,39 +15,40 @@ from rxcli.receiver.screen.grid import Grid, columns_at
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
-#: Parts of a column that are asked for light; and those at which its level is asked.
+#: Parts of a column in which light is measured, and those in which its level is measured.
 _PARTS, _LEVEL_PARTS = 8, 16
-#: Significance of light off the screen and on it, as scales of exponential distributions; the log-odds that a part
-#: without light is off the screen; and how much each counts, neighbouring parts being dark together.
+#: Scales of the exponential distributions of the light's significance, off the screen and on it; log-odds that a part
+#: without light is off the screen; weight of a part, as neighbouring parts are not independent.
 _OFF_SCALE, _LIT_SCALE, _DARK_PART, _PART_COUNTS = 1.2, 6.0, 0.25, 0.5
-#: Log-odds that parts of a column must have so that light ends no earlier.
+#: Minimum mean log-odds of parts of a column that belong to the light.
 _ENDS = 0.05
-#: Log-odds of each column outside the picture; and at least, where light reaches to that end of the picture.
+#: Log-odds of each column outside the picture, and their minimum at an end of the picture that light reaches.
 _OUTSIDE, _LARGER = -4.0, -3.0
-#: The light's middle is the screen's, but for this, screen widths.
+#: Standard deviation of the light's middle about the screen's middle, screen widths.
 _LIGHT_SD = 0.175
-#: So much of the picture, columns, must lie beyond light that ends in it.
+#: Columns of the picture that must lie beyond light which ends in the picture.
 _IN_VIEW = 0.4
-#: Light on one side of a border, log-odds, from which it begins there, the share of it that may lie beyond, and what it
-#: adds.
+#: Light begins at a border if the log-odds inside exceed this and those beyond stay below this share of them; log-odds
+#: that this adds.
 _BEGINS_ODDS, _BEYOND, _ON_BORDER = 2.0, 0.3, 3.0
-#: A film has dark bars beside it. It begins where its level is this share of the way from dark to bright (percentiles
-#: over the columns), is dark to this share so far beyond, takes these shares of the screen's width, and lies in its
-#: middle to this, columns; what that adds in log-odds with 20 columns: with more it is less likely by chance.
+#: A film has dark bars beside it. It begins where its level exceeds this share between dark and bright (percentiles
+#: over the columns). The level left over at this distance beside it, the range of its width as shares of the screen's,
+#: and its maximum offset from the screen's middle, columns. Log-odds that a film adds with the usual number of columns;
+#: with more columns it is less likely by chance.
 _DARK, _BRIGHT, _BEGINS = 5, 75, 0.25
 _LEFT_OVER, _BESIDE, _FILM_WIDTHS, _IN_MIDDLE, _FILM, _USUAL_COLUMNS = 0.12, 0.45, (0.53, 0.95), 0.2, 3.5, 20
 
 
 @dataclass(frozen=True, slots=True)
 class LightProfile:
-    """Where across the columns of a grid there is light."""
+    """Light across the columns of a grid."""
 
-    #: (P,) middles of the parts of columns, and whether the picture shows them.
+    #: (P,) middles of the parts of columns, and whether they are in the picture.
     place: FloatArray
     in_picture: BoolArray
-    #: (P,) log-odds that a part is on the screen over being off it.
+    #: (P,) log-odds that a part is on the screen.
     log_odds: FloatArray
-    #: Columns at which a film with dark bars beside it begins and ends; None: there is none.
+    #: Columns at which a film with dark bars beside it begins and ends, or None.
     film: tuple[float, float] | None
 
     @property
@@ -61,17 +62,17 @@ class LightProfile:
 
 
 def light_profile(strips: Strips, light: Float32Array, grid: Grid) -> LightProfile:
-    """The light across the columns of a grid.
+    """Measure the light across the columns of a grid.
 
     Args:
         strips: of the picture.
-        light: (B, S, R) what the strips have in common with their neighbours' waveforms, see `predicted_light`.
+        light: (B, S, R) products of the strips with the waveforms predicted from their neighbours, `predicted_light`.
         grid: of the picture.
     """
     u = columns_at(grid.numbers, strips.x, strips.y)
-    first = int(np.floor(u.min())) - 1
-    n = (int(np.ceil(u.max())) + 1 - first) * _PARTS
-    part = ((u - first) * _PARTS).astype(np.int64).ravel()
+    origin = int(np.floor(u.min())) - 1
+    n = (int(np.ceil(u.max())) + 1 - origin) * _PARTS
+    part = ((u - origin) * _PARTS).astype(np.int64).ravel()
     count = np.bincount(part, minlength=n)
     total = np.bincount(part, light.sum(axis=2).ravel(), n)
     power = np.bincount(part, np.einsum("bsr,bsr->bs", light, light).ravel(), n)
@@ -80,7 +81,7 @@ def light_profile(strips: Strips, light: Float32Array, grid: Grid) -> LightProfi
     off = np.exp(-significance / _OFF_SCALE) / _OFF_SCALE + TINY
     lit = np.exp(-significance / _LIT_SCALE) / _LIT_SCALE
     odds = _PART_COUNTS * np.log(np.exp(-_DARK_PART) + (1 - np.exp(-_DARK_PART)) * lit / off)
-    place = first + (np.arange(n) + 0.5) / _PARTS
+    place = origin + (np.arange(n) + 0.5) / _PARTS
     by_block = np.maximum(light.mean(axis=(1, 2)), 0.0)
     film = _film(np.where(by_block[:, None] > 0, strips.level, 0), u)
     return LightProfile(place, count > 0, np.where(count > 0, odds, 0.0), film)
@@ -89,8 +90,8 @@ def light_profile(strips: Strips, light: Float32Array, grid: Grid) -> LightProfi
 def _film(level: Float32Array, u: FloatArray) -> tuple[float, float] | None:
     """Columns at which a picture with dark bars on both sides begins and ends, by the level (B, S) of strips."""
     shown = level > 0
-    first = float(np.floor(u.min()))
-    part = ((u[shown] - first) * _LEVEL_PARTS).astype(np.int64)
+    origin = float(np.floor(u.min()))
+    part = ((u[shown] - origin) * _LEVEL_PARTS).astype(np.int64)
     if part.size == 0:
         return None
     count = np.bincount(part)
@@ -107,34 +108,34 @@ def _film(level: Float32Array, u: FloatArray) -> tuple[float, float] | None:
             return None
         if profile[outside] - dark > _LEFT_OVER * (profile[inside] - dark):
             return None
-    return first + ends[0] / _LEVEL_PARTS, first + (ends[1] + 1) / _LEVEL_PARTS
+    return origin + ends[0] / _LEVEL_PARTS, origin + (ends[1] + 1) / _LEVEL_PARTS
 
 
 @dataclass(frozen=True, slots=True)
 class FirstColumns:
-    """How likely each column of a grid is the screen's first."""
+    """Log-odds of each column of a grid to be the screen's first."""
 
     #: (F,) columns of the grid, and their log-odds, comparable between numbers of columns.
-    first: IntArray
+    columns: IntArray
     log_odds: FloatArray
     #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
     fills: bool
 
 
 def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
-    """How likely each column of a grid is the first of a screen with `n_columns`.
+    """Log-odds of each column of a grid to be the first of a screen with `n_columns`.
 
-    Light outside the screen, columns outside the picture and a film in the screen's middle decide. Where columns are
-    dark at both ends and none of these shows, several stay as likely.
+    Light outside the screen, columns outside the picture and a film in the screen's middle decide. If columns are dark
+    at both ends and no such evidence exists, several candidates remain equally likely.
     """
     shown = light.place[light.in_picture]
     left, right = float(shown.min()), float(shown.max())
-    first = np.arange(int(left) - n_columns + 3, int(right) - 2)
+    candidates = np.arange(int(left) - n_columns + 3, int(right) - 2)
     begin, end_of_light = light.ends
     reaches = (begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW)
     film = _FILM + float(np.log(n_columns / _USUAL_COLUMNS)) if _is_film(light, n_columns) else 0.0
     scores = []
-    for start in first.tolist():
+    for start in candidates.tolist():
         end = start + n_columns
         hidden = max(left - start, 0.0), max(end - right, 0.0)
         off = (begin + end_of_light) / 2 - start - n_columns / 2
@@ -143,7 +144,7 @@ def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
             score += film * (abs(sum(light.film) / 2 - start - n_columns / 2) < _IN_MIDDLE)
         score += _ON_BORDER * (_begins(light, start, 1) + _begins(light, end, -1))
         scores.append(score)
-    return FirstColumns(first, np.array(scores), all(reaches))
+    return FirstColumns(candidates, np.array(scores), all(reaches))
 
 
 def _is_film(light: LightProfile, n_columns: int) -> bool:
@@ -152,11 +153,11 @@ def _is_film(light: LightProfile, n_columns: int) -> bool:
 
 
 def _hidden(columns: tuple[float, float], reaches: tuple[bool, bool]) -> float:
-    """Log-odds of columns left and right of the picture, by whether light reaches to its ends."""
+    """Log-odds of columns left and right of the picture, given whether light reaches each end of the picture."""
     if all(reaches):
         return max(_OUTSIDE * sum(columns), _LARGER)
     odds = [_OUTSIDE * count for count in columns]
-    return sum(max(one, _LARGER) if to_the_end else one for one, to_the_end in zip(odds, reaches, strict=True))
+    return sum(max(side, _LARGER) if to_the_end else side for side, to_the_end in zip(odds, reaches, strict=True))
 
 
 def _begins(light: LightProfile, border: int, side: int) -> bool:
@@ -168,7 +169,7 @@ def _begins(light: LightProfile, border: int, side: int) -> bool:
 
 
 def _light_within(light: LightProfile, start: int, end: int) -> float:
-    """Log-odds that the screen lies between two borders; what lies next to them is the screen's if it has light."""
+    """Log-odds that the screen lies between two borders; parts next to a border count only if they have light."""
     near = np.minimum(np.abs(light.place - start), np.abs(light.place - end)) < 1 / _PARTS
     inside = (light.place > start) & (light.place < end) & ~near
     return float(light.log_odds[inside].sum() + np.maximum(light.log_odds[near], 0.0).sum())

@@ -20,7 +20,7 @@ from rxcli.receiver.screen.strips import Strips
 from rxcli.receiver.screen.waveforms import Mixes, offsets_of_known
 from rxcli.types import Clock, Float32Array, FloatArray, Lens
 
-#: Changes of light below which waves are dark: products of smaller numbers would take many times the time.
+#: Changes of light below which waves are set to zero: products of smaller numbers would be denormal and slow.
 _MIN_WAVE = 1e-3
 
 
@@ -35,7 +35,7 @@ def corners_by_slots(
     *,
     is_reversed: bool = False,
 ) -> FloatArray:
-    """Move corners to where the decided slots have the columns; returns (4, 2) pixels.
+    """Move corners to the column positions that decided slots give; returns (4, 2) pixels.
 
     Args:
         strips: of the picture.
@@ -52,12 +52,12 @@ def corners_by_slots(
     column = columns_at(start.numbers, strips.x, strips.y)
     waves = _waves(strips, column, clock, lit, lens, is_reversed)
     numbers, sd = start.numbers, SETTINGS.pose_sd * n_columns
-    # The lens is as the columns were read through it.
+    # The lens stays fixed: the strips were read through it.
     prior = np.array([sd, sd, sd, SETTINGS.pose_tilt_sd, SETTINGS.pose_tilt_sd, 1e-6]) ** -2.0
     slopes = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
     for _ in range(SETTINGS.pose_steps):
         mixes = Mixes.of(columns_at(numbers, strips.x, strips.y), sigma, n_columns)
-        columns = np.clip(mixes.first.astype(np.int64) + np.arange(mixes.share.shape[2]), 0, n_columns - 1)
+        columns = np.clip(mixes.first_column.astype(np.int64) + np.arange(mixes.share.shape[2]), 0, n_columns - 1)
         windows = np.tile(np.arange(strips.n_windows), strips.n_parts)
         off, weight = offsets_of_known(strips, mixes, waves[windows[:, None], columns])
         normal = (slopes * weight.ravel()) @ slopes.T + np.diag(prior)

@@ -1,7 +1,7 @@
-"""On which rows a screen's columns have light, and where its corners lie then.
+"""Find the rows on which a screen's columns have light, and with them its corners.
 
-Across the columns a grid says all. Along them the screen's lines stand at right angles to the columns at its middle,
-its height follows from its aspect, and its place from where light begins and ends.
+A grid determines positions across the columns. Along them, the screen's lines are at right angles to the columns at its
+middle, its height follows from its aspect, and its position from the first and last light.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import Float32Array, FloatArray
 
-#: Places along the screen at which light is asked for, and how far beyond its ends, screen heights.
+#: Bins along the screen in which light is measured, and their range beyond its ends, screen heights.
 _BINS, _BEYOND = 640, 0.6
-#: Light counts from this share of what the lit rows have.
+#: Share of the light of lit rows from which a row counts as lit.
 _LIT_SHARE = 0.18
-#: Missing height, a share, below which the light is taken for the whole screen.
+#: Share of missing height below which the light is taken for the whole screen.
 _WHOLE = 0.07
 
 
@@ -36,10 +36,10 @@ class Plane:
 
     @classmethod
     def through(cls, grid: Grid, n_columns: int, aspect: float, row: float) -> Plane:
-        """The plane whose middle lies on a row of the picture; the grid counts from the screen's first column.
+        """The plane with its middle on a row of the picture; the grid is numbered from the screen's first column.
 
-        Where a flat screen fades into the distance tells its normal, the columns tell its direction across; the one
-        along them stands at right angles to both.
+        The vanishing line of a flat screen gives its normal, and the columns its direction across. The direction along
+        the columns is at right angles to both.
         """
         u0, a, b, g, h, _ = grid.numbers
         focal = SETTINGS.focal_widths if grid.lens is None else grid.lens.camera_matrix[0, 0] / grid.width
@@ -53,12 +53,12 @@ class Plane:
         return cls(grid, n_columns, float(v0 + shift), float(c + shift * g), float(d + shift * h))
 
     def along(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """(...) v of places of `Strips`."""
+        """(...) v of positions of `Strips`."""
         scale = 1 + self.grid.numbers[5] * (x * x + y * y)
         return self.along_flat(x * scale, y * scale)
 
     def along_flat(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """(...) v of offsets from the picture's middle with all lenses taken off."""
+        """(...) v of offsets from the picture's middle, with lens distortion removed."""
         _, _, _, g, h, _ = self.grid.numbers
         return np.asarray((self.v0 + self.c * x + self.d * y) / (1 + g * x + h * y))
 
@@ -72,9 +72,9 @@ class Plane:
         right = np.stack([u, v - self.v0], axis=-1)
         return self.grid.pixels_of(np.linalg.solve(matrix, right[..., None])[..., 0])
 
-    def corners(self, ends: tuple[float, float], first: int = 0) -> FloatArray:
-        """(4, 2) corners, pixels, clockwise from the top left, of the screen between two v from a first column on."""
-        left, right = float(first), float(first + self.n_columns)
+    def corners(self, ends: tuple[float, float], first_column: int = 0) -> FloatArray:
+        """(4, 2) corners, pixels, clockwise from the top left, of the screen between two v from `first_column` on."""
+        left, right = float(first_column), float(first_column + self.n_columns)
         return self.pixels(np.array([[left, ends[0]], [right, ends[0]], [right, ends[1]], [left, ends[1]]]))
 
 
@@ -91,12 +91,12 @@ def _middle_of(grid: Grid, n_columns: int, row: float) -> FloatArray:
 def find_rows(
     strips: Strips, light: Float32Array, grid: Grid, n_columns: int, aspect: float
 ) -> tuple[Plane, list[tuple[float, float]]]:
-    """The screen's plane, and v at which the screen may begin and end, likeliest first.
+    """The screen's plane, and candidate pairs of v at which the screen begins and ends, likeliest first.
 
     Args:
         strips: of the picture.
-        light: (B, S, R) what the strips have in common with their neighbours' waveforms, see `predicted_light`.
-        grid: counted from the screen's first column.
+        light: (B, S, R) products of the strips with the waveforms predicted from their neighbours, `predicted_light`.
+        grid: numbered from the screen's first column.
         n_columns: columns of the screen.
         aspect: width over height of the screen.
     """
@@ -107,13 +107,13 @@ def find_rows(
     top, bottom = lit_range(*_light_along(strips, light, plane))
     missing = 1 - (bottom - top)
     if missing < _WHOLE:
-        # A little more than the screen costs less than rows that are left out.
+        # A slightly too large outline costs less than omitted rows.
         return plane, [(bottom - 1, top + 1)]
     return plane, [(top - missing / 2, bottom + missing / 2), (top, bottom), (top, top + 1), (bottom - 1, bottom)]
 
 
 def lit_range(v: FloatArray, light: FloatArray, longest: float = 1.0) -> tuple[float, float]:
-    """From where to where there is light, no more than `longest`."""
+    """Beginning and end of the light, at most `longest` apart."""
     step = float(v[1] - v[0])
     full = max(float(np.percentile(light[light != 0], 75)), TINY) if light.any() else TINY
     gain = np.concatenate([[0.0], np.cumsum(np.minimum(light, full) - _LIT_SHARE * full)])
@@ -121,7 +121,7 @@ def lit_range(v: FloatArray, light: FloatArray, longest: float = 1.0) -> tuple[f
     end = int((gain - np.minimum.accumulate(gain)).argmax())
     start = int(gain[: end + 1].argmin())
     if end - start > n:
-        # The band pass smears light beyond both ends: the middle of the places that have nearly all of it.
+        # The band pass smears light beyond both ends: use the middle of the positions that hold nearly all of it.
         held = gain[n:] - gain[:-n]
         start = round(float(np.flatnonzero(held > SETTINGS.nearly_all * held.max()).mean()))
         end = start + n
@@ -129,9 +129,9 @@ def lit_range(v: FloatArray, light: FloatArray, longest: float = 1.0) -> tuple[f
 
 
 def _light_along(strips: Strips, light: Float32Array, plane: Plane) -> tuple[FloatArray, FloatArray]:
-    """How much light the columns have along the screen: (n,) v, and the light there.
+    """Light of the columns along the screen: (n,) v, and (n,) the light there.
 
-    The strips of a column lie at the same place along the screen, and are taken together.
+    The strips of a column lie at the same position along the screen and are averaged.
     """
     u = columns_at(plane.grid.numbers, strips.x, strips.y)
     n_blocks, n_strips, n_rows = light.shape

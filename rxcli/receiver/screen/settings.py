@@ -1,4 +1,4 @@
-"""The numbers of the search for the screen."""
+"""Settings of the screen finder."""
 
 from __future__ import annotations
 
@@ -7,36 +7,36 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class FinderSettings:
-    """What the search for the screen is set to; lengths in column pitches unless a name says otherwise."""
+    """Settings of the screen finder; lengths in column pitches unless the name has a unit."""
 
-    #: Smallest picture that is searched, pixels each way.
+    #: Minimum width and height of a picture, pixels.
     min_size_px: int = 96
-    #: Strips across the picture, the fewest that tell a grid from noise, windows of rows, and strips across each fifth
-    #: of a picture with narrow columns.
+    #: Strips across the picture, minimum number of strips, windows of rows, and strips across each fifth of a picture
+    #: with narrow columns.
     n_strips: int = 200
     min_strips: int = 120
     n_windows: int = 16
     n_fifth_strips: int = 150
-    #: Rows that are averaged, as a share of the lag at which strips are half as alike as one row apart, least and most;
-    #: one of so many strips is asked.
+    #: Rows that are averaged, as a share of the lag at which the correlation of neighbouring strips falls to half its
+    #: value at lag one; their minimum and maximum; spacing of the strips used.
     short_share: float = 0.8
     min_short_rows: int = 2
     max_short_rows: int = 6
     sampled_strips: int = 8
-    #: Share of the strips, the least coherent, that show the sensor's row noise; share that shows the stripes best.
+    #: Share of the strips, the least coherent, that row noise is estimated from; share with the clearest stripes.
     dark_share: float = 0.3
     bright_share: float = 0.2
-    #: Kept rows over which light may be correlated, as those of a slot are.
+    #: Maximum lag, in averaged rows, at which the light of a strip is correlated, as within a slot.
     max_lag: int = 40
-    #: Columns are narrow where coherence this many picture widths apart falls below a share of that nearer by.
+    #: Columns are narrow if the coherence at the far distance, picture widths, is below this share of that at the near.
     near_widths: float = 0.004
     far_widths: float = 0.02
     narrow_ratio: float = 0.6
 
-    #: Columns from which on a screen's are narrow.
+    #: Number of columns from which a screen's columns count as narrow.
     narrow_columns: int = 50
-    #: Columns across the picture, or across a fifth of it, and their step; largest turn and changes of pitch across and
-    #: along the columns, as shares of the pitch; step of all three at a corner of the picture.
+    #: Columns across the picture, or across a fifth of it, and their step; maximum turn and maximum changes of pitch
+    #: across and along the columns, as shares of the pitch; step of all three at a corner of the picture.
     min_pitch: float = 9.0
     max_pitch: float = 46.0
     pitch_step: float = 0.4
@@ -44,50 +44,50 @@ class FinderSettings:
     max_across: float = 0.2
     max_along: float = 0.3
     corner_step: float = 0.4
-    #: Strips that a column has at least.
+    #: Minimum number of strips per column.
     min_column_strips: float = 4.0
     #: Distance of the pairs of strips that show the comb of borders best.
     pair_distance: float = 0.72
     #: Combs that are tried as grids.
     n_combs: int = 8
-    #: Height of a comb, standard deviations by chance, below which there is none; and contrast of the highest, as a
-    #: share of what it explains, from which on no other is tried.
+    #: Minimum height of a comb, standard deviations by chance; contrast of the highest comb, as a share of the light it
+    #: explains, from which no further combs are tried.
     min_comb: float = 6.0
     plain_contrast: float = 0.15
 
-    #: Weight against waveforms of columns that hardly show, strips.
+    #: Ridge regularisation of the waveforms of faint columns, in strips.
     ridge: float = 0.5
-    #: Steps of the fit come out too short by this, because waveforms follow the grid that they were estimated with.
+    #: Gain of a fit's steps: they are too short because the waveforms were estimated with the same grid.
     step_gain: float = 2.5
-    #: Standard deviations beyond which a strip's offset counts less.
+    #: Standard deviations beyond which the weight of a strip's offset decreases.
     huber_sd: float = 1.0
-    #: Standard deviations of perspective and of radial distortion before anything is seen.
+    #: Prior standard deviations of perspective and of radial distortion.
     perspective_sd: float = 0.15
     radial_sd: float = 0.004
-    #: Weight of the evidence that borders add, against that of the light that waveforms explain.
+    #: Weight of the log-likelihood that borders add, relative to that of the light that waveforms explain.
     contrast_weight: float = 3.0
     #: Steps on every second window, steps of narrow columns at each reach, and last steps on all windows.
     first_steps: int = 3
     narrow_steps: int = 4
     last_steps: int = 2
-    #: How much further a grid of narrow columns is followed at a time.
+    #: Factor by which the followed width of a grid of narrow columns grows at a time.
     reach_gain: float = 1.6
-    #: Least contrast, as a share of what is explained times the root of the number of rows.
+    #: Minimum contrast, as a share of the explained light times the root of the number of rows.
     min_contrast: float = 0.95
-    #: Least contrast of narrow columns in the best part of a picture, a share of what is explained.
+    #: Minimum contrast of narrow columns in the best part of a picture, as a share of the explained light.
     min_part_contrast: float = 0.05
     #: Focal length of a camera that no profile describes, picture widths.
     focal_widths: float = 0.8
-    #: Gauss-Newton steps by decided slots, and standard deviations of the finder's columns before: shift and widths in
+    #: Gauss-Newton steps with decided slots, and prior standard deviations of the finder's columns: shift and widths in
     #: screen widths, and perspective.
     pose_steps: int = 3
     pose_sd: float = 0.005
     pose_tilt_sd: float = 0.02
-    #: Share of the light that is nearly all of it.
+    #: Share of the maximum that counts as all of the light.
     nearly_all: float = 0.98
-    #: Log-odds against the likeliest first column down to which another is possible.
+    #: Log-odds relative to the likeliest first column down to which another one is possible.
     min_log_odds: float = -7.0
-    #: Log-odds of the next likely one below which the first column is plain, so that the screen's ends help the grid.
+    #: Log-odds of the second likeliest below which the first column is certain and the screen's ends help the grid.
     plain_log_odds: float = -3.0
 
 

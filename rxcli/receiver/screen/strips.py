@@ -1,9 +1,9 @@
-"""Changes of light along upright strips of a picture, and how coherent neighbouring strips are.
+"""Changes of light along upright strips of a picture, and the coherence of neighbouring strips.
 
-Two strips of one column see the same slots, whatever picture lies before them and however dark it is. Strips some
-pixels wide are band-passed along the rows and scaled to unit variance in windows of rows, called blocks here. What the
-least coherent strips have in common is row noise of the sensor and is projected off. Where columns are narrow, each
-fifth of the picture's width has finer strips and blocks of its own; everything after this module is the same for both.
+Two strips of one column receive the same slots, whatever the picture on the screen and its brightness. Strips several
+pixels wide are band-passed along the rows and scaled to unit variance in windows of rows, called blocks here. The
+common part of the least coherent strips is row noise of the sensor and is projected off. With narrow columns, each
+fifth of the picture's width has finer strips and its own blocks; everything after this module is the same for both.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _Real = TypeVar("_Real", np.float32, np.float64)
 class Strips:
     """B blocks of S strips of a picture, B = windows of rows x parts of the width, the windows of one part together."""
 
-    #: (B, S, R) float32: band-passed light of mean square one along the rows, row noise taken off.
+    #: (B, S, R) float32: band-passed light of mean square one along the rows, row noise removed.
     changes: Float32Array
     #: (B, S) float32: coherence of each strip's neighbours, 0..1, the share of its variance that is the columns'.
     lit: Float32Array
-    #: (B, S) float32: mean light, values of a pixel as they are coded.
+    #: (B, S) float32: mean light, as encoded pixel values.
     level: Float32Array
-    #: (B, S): middles of the strips, offsets from the picture's middle over its width: in the stored picture, and with
-    #: a known lens taken off.
+    #: (B, S): middles of the strips, offsets from the picture's middle in picture widths: in the stored picture, and
+    #: with the distortion of a known lens removed.
     raw_x: FloatArray
     raw_y: FloatArray
     x: FloatArray
@@ -48,7 +48,7 @@ class Strips:
     n_rows: float
     #: Parts of the picture's width: 1, or more where columns are narrow.
     n_parts: int
-    #: Size of the picture, pixels, and the lens that was taken off.
+    #: Size of the picture, pixels, and the lens whose distortion was removed.
     width: int
     height: int
     lens: Lens | None
@@ -78,8 +78,8 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
     """Strips of a picture, from its plane.
 
     Args:
-        plane: of the picture; a tone curve does no harm.
-        lens: of the picture, where it is known.
+        plane: of the picture; a tone curve need not be undone.
+        lens: of the picture, if known.
         n_parts: parts of the width with strips of their own.
     """
     width, height, n_windows = plane.width, plane.height, SETTINGS.n_windows
@@ -119,39 +119,39 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
 
 
 def _light_of_strips(plane: LightPlane, n_parts: int) -> tuple[Float32Array, FloatArray]:
-    """(S, R) mean values of strips of equal width, as many in every part, and (S,) the middles of the strips."""
+    """(S, R) mean values of strips of equal width, equally many per part, and (S,) the middles of the strips."""
     wanted = SETTINGS.n_strips if n_parts == 1 else n_parts * SETTINGS.n_fifth_strips
     n_cells = len(plane.sums) - 1
     cells = max(1, round(n_cells / wanted))
     n = n_cells // cells // n_parts * n_parts
-    first = (n_cells - n * cells) // 2
-    light = np.diff(plane.sums[first : first + n * cells + 1 : cells], axis=0)
+    start = (n_cells - n * cells) // 2
+    light = np.diff(plane.sums[start : start + n * cells + 1 : cells], axis=0)
     light /= np.float32(cells * plane.cell_px)
-    return light, np.asarray((first + (np.arange(n) + 0.5) * cells) * plane.cell_px - 0.5)
+    return light, np.asarray((start + (np.arange(n) + 0.5) * cells) * plane.cell_px - 0.5)
 
 
 def flat_places(points: FloatArray, width: int, height: int, lens: Lens | None) -> tuple[FloatArray, FloatArray]:
-    """Pixels (..., 2) as offsets from the picture's middle over its width, a lens that bends the picture taken off."""
+    """Convert pixels (..., 2) to offsets from the picture's middle in picture widths, with lens distortion removed."""
     if lens is not None and not lens.corrected:
         points = geometry.undistort(points, lens)
     return (points[..., 0] - (width - 1) / 2) / width, (points[..., 1] - (height - 1) / 2) / width
 
 
 def shows_narrow_columns(strips: Strips) -> bool:
-    """Whether light is coherent nearby and no more a little further on, as that of wide columns is."""
+    """Whether strips are coherent at a short distance only; with wide columns they stay coherent further on."""
     near, far = (_lit_coherence(strips, widths) for widths in (SETTINGS.near_widths, SETTINGS.far_widths))
     return far < SETTINGS.narrow_ratio * near
 
 
 def _lit_coherence(strips: Strips, widths: float) -> float:
-    """Mean coherence of lit strips some picture widths apart, over what it would be in one column."""
+    """Mean coherence of lit strips `widths` picture widths apart, relative to that within one column."""
     distance = max(round(widths / strips.step), 1)
     share = np.sqrt(strips.lit[:, :-distance] * strips.lit[:, distance:])
     return float((strips.coherence(distance) * share).sum() / (np.square(share).sum() + TINY))
 
 
 def _band_passed(light: Float32Array, short: int) -> Float32Array:
-    """(S, R / short) light averaged over a few rows less its mean over many."""
+    """(S, R / short) light averaged over a few rows, minus its mean over many."""
     import cv2
 
     whole = light.shape[1] // short * short
@@ -159,18 +159,18 @@ def _band_passed(light: Float32Array, short: int) -> Float32Array:
 
 
 def _short_rows(light: Float32Array) -> int:
-    """Rows that may be averaged without losing the slots, by how far along the rows neighbouring strips are alike."""
+    """Rows that may be averaged without losing the slots, from the correlation of neighbouring strips over lags."""
     import cv2
 
-    most, every = SETTINGS.max_short_rows, SETTINGS.sampled_strips
-    one, other = (light[first::every][: len(light) // every] for first in (0, 1))
-    one, other = (part - cv2.blur(part, (8 * most + 1, 1)) for part in (one, other))
-    n_lags = 2 * most
-    alike = [float(np.einsum("sr,sr->", one[:, :-lag], other[:, lag:])) for lag in range(1, n_lags)]
-    # White row noise has no part in lags from 1 on.
-    below = [lag for lag, value in enumerate(alike, 1) if value < alike[0] / 2]
+    max_rows, every = SETTINGS.max_short_rows, SETTINGS.sampled_strips
+    left, right = (light[start::every][: len(light) // every] for start in (0, 1))
+    left, right = (part - cv2.blur(part, (8 * max_rows + 1, 1)) for part in (left, right))
+    n_lags = 2 * max_rows
+    correlation = [float(np.einsum("sr,sr->", left[:, :-lag], right[:, lag:])) for lag in range(1, n_lags)]
+    # White row noise does not contribute at lags from 1 on.
+    below = [lag for lag, value in enumerate(correlation, 1) if value < correlation[0] / 2]
     half_lag = below[0] if below else n_lags
-    return int(np.clip(round(SETTINGS.short_share * half_lag), SETTINGS.min_short_rows, most))
+    return int(np.clip(round(SETTINGS.short_share * half_lag), SETTINGS.min_short_rows, max_rows))
 
 
 def _windows(band: Float32Array) -> Float32Array:
@@ -182,7 +182,7 @@ def _windows(band: Float32Array) -> Float32Array:
 
 
 def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """The changes less what the least coherent strips have in common; (W, S) coherence of neighbours; (W, R) noise."""
+    """Remove the common part of the least coherent strips: changes, (W, S) coherence of neighbours, (W, R) noise."""
     n_dark = max(int(SETTINGS.dark_share * changes.shape[1]), 1)
     dark = np.argsort(_smooth(_neighbours(changes), 5, 1), axis=1)[:, :n_dark]
     noise = np.take_along_axis(changes, dark[..., None], axis=1).mean(axis=1)
@@ -205,11 +205,11 @@ def _smooth(values: Float32Array, strips: int, windows: int) -> Float32Array:
 
 
 def _independent_rows(quiet: Float32Array, lit: Float32Array) -> float:
-    """Rows of a window that count as independent, by the autocorrelation of the strips that show the stripes best."""
+    """Effective number of independent rows of a window, from the autocorrelation of the most coherent strips."""
     bright = np.argsort(-lit.mean(axis=0))[: max(int(SETTINGS.bright_share * lit.shape[1]), 1)]
     some = quiet[::4, bright]
     rows = some.shape[2]
     lags = range(min(SETTINGS.max_lag, (rows + 1) // 2))
     products = np.array([float(np.einsum("wsr,wsr->", some[..., lag:], some[..., : rows - lag])) for lag in lags])
-    alike = products * rows / (rows - np.arange(len(lags))) / (products[0] + TINY)
-    return float(rows / (1 + 2 * float(np.square(alike[1:]).sum())))
+    correlation = products * rows / (rows - np.arange(len(lags))) / (products[0] + TINY)
+    return float(rows / (1 + 2 * float(np.square(correlation[1:]).sum())))

@@ -1,8 +1,8 @@
-"""A grid by what its columns send: each strip's light is a mix of the waveforms of the columns beside it.
+"""Refine a grid by its columns' waveforms: each strip's light is a mix of the waveforms of the columns nearby.
 
-The waveforms are estimated from one half of the strips and predict the other half, and the other way round. How a mix
-changes with the place is known, so that all strips together correct the grid; and how much of the strips' light the
-right grid explains, and how much less with its borders half a column further on, tells it from others.
+The waveforms are estimated from one half of the strips and predict the other half, and vice versa. The mix depends on
+the strip's position in a known way, so all strips together correct the grid. Two measures identify the right grid: the
+light of the strips that it explains, and the loss if its borders lie half a column further on.
 """
 
 from __future__ import annotations
@@ -16,52 +16,52 @@ from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
-#: Columns of a block that are told apart, at most: a plane seen nearly edge-on counts any number.
+#: Maximum number of columns of a block: on a plane viewed nearly edge-on the grid counts any number.
 _MAX_COLUMNS = 64
 _TINY = np.float32(1e-6)
-#: Logarithm of the least share of a column: products of smaller numbers would take many times the time.
+#: Logarithm of the minimum share of a column: products of smaller numbers would be denormal and slow.
 _MIN_SHARE = np.float32(-30)
 
 
 @dataclass(frozen=True, slots=True)
 class Mixes:
-    """What every strip has of the columns beside it under a grid; K columns of a block, counted from its first."""
+    """Shares of nearby columns in each strip's light under a grid; K columns of a block, counted from its first."""
 
-    #: (B, S, K) shares of the columns in the strips' light, of unit length, and how far off each column's middle lies.
+    #: (B, S, K) shares of the columns in the strips' light, of unit length, and offset from each column's middle.
     share: Float32Array
     distance: Float32Array
     #: (B, 1) column of the grid from which a block's are counted.
-    first: FloatArray
+    first_column: FloatArray
     sigma: float
 
     @classmethod
     def of(cls, u: FloatArray, sigma: float, n_columns: int | None = None) -> Mixes:
-        """The mixes of strips at columns (B, S); with `n_columns`, of a screen that has so many from column 0 on."""
-        first = np.floor(u.min(axis=1, keepdims=True))
-        u = u - first
+        """Mixes of strips at columns (B, S); with `n_columns`, columns outside 0 to `n_columns` contribute nothing."""
+        first_column = np.floor(u.min(axis=1, keepdims=True))
+        u = u - first_column
         n = int(min(np.ceil(u.max()), _MAX_COLUMNS))
         distance = np.minimum(u, n).astype(np.float32)[..., None] - (np.arange(n, dtype=np.float32) + np.float32(0.5))
         share = np.square(distance)
         share *= np.float32(-0.5 / sigma**2)
         np.exp(np.maximum(share, _MIN_SHARE, out=share), out=share)
         if n_columns is not None:
-            number = first + np.arange(n)
+            number = first_column + np.arange(n)
             share *= ((number >= 0) & (number < n_columns))[:, None]
-            share *= ((u > -first) & (u < n_columns - first))[..., None]
+            share *= ((u > -first_column) & (u < n_columns - first_column))[..., None]
         share /= np.sqrt(_dot(share, share) + _TINY**2)[..., None]
-        return cls(share, distance, first, sigma)
+        return cls(share, distance, first_column, sigma)
 
     def slopes(self) -> Float32Array:
-        """(B, S, K) derivatives of the shares by the strips' places, columns."""
+        """(B, S, K) derivatives of the shares by the strips' positions, columns."""
         slope = self.share * self.distance
         slope *= np.float32(-1 / self.sigma**2)
         slope -= self.share * _dot(slope, self.share)[..., None]
         return slope
 
 
-def _dot(one: Float32Array, other: Float32Array) -> Float32Array:
+def _dot(left: Float32Array, right: Float32Array) -> Float32Array:
     """(B, S) sums of products over the last axis."""
-    return np.asarray(np.einsum("bsk,bsk->bs", one, other), np.float32)
+    return np.asarray(np.einsum("bsk,bsk->bs", left, right), np.float32)
 
 
 def _waveforms(strips: Strips, mixes: Mixes, known: int) -> Float32Array:
@@ -75,9 +75,9 @@ def _waveforms(strips: Strips, mixes: Mixes, known: int) -> Float32Array:
 
 @dataclass(frozen=True, slots=True)
 class _Predicted:
-    """The waveforms of one half of the strips against the strips of the other half, as products of columns.
+    """Inner products of the waveforms of one half of the strips with the strips of the other half.
 
-    A strip that is some share of every column is the same share of its products; and there are fewer columns than rows.
+    A mix of columns has the same mix of their products, and there are fewer columns than rows.
     """
 
     #: (B, K, K) of waveforms with one another, (B, S / 2, K) of strips with waveforms, (B, S / 2) of strips alone.
@@ -93,7 +93,7 @@ class _Predicted:
 
 
 def predicted_light(strips: Strips, u: FloatArray, sigma: float) -> Float32Array:
-    """(B, S, R) products of every strip's changes with what the other strips' waveforms predict at columns (B, S)."""
+    """(B, S, R) products of each strip's changes with their prediction by the other half, at columns (B, S)."""
     out, mixes = np.empty_like(strips.changes), Mixes.of(u, sigma)
     for known, asked in ((0, 1), (1, 0)):
         waves = _waveforms(strips, mixes, known)
@@ -102,7 +102,7 @@ def predicted_light(strips: Strips, u: FloatArray, sigma: float) -> Float32Array
 
 
 def explained_light(strips: Strips, u: FloatArray, sigma: float) -> float:
-    """Log-likelihood that strips at columns (B, S) gain by what the other strips' waveforms predict of them."""
+    """Log-likelihood gain of strips at columns (B, S) from their prediction by the other half of the strips."""
     total, mixes = 0.0, Mixes.of(u, sigma)
     for known, asked in ((0, 1), (1, 0)):
         predicted, own = (
@@ -116,7 +116,7 @@ def explained_light(strips: Strips, u: FloatArray, sigma: float) -> float:
 
 
 def with_light(strips: Strips, grid: Grid, sigma: float) -> Grid:
-    """A grid with how much of the strips' light it explains, and how much more than half a column further on."""
+    """Add to a grid the strips' light that it explains, and the excess over the same half a column further on."""
     u = columns_at(grid.numbers, strips.x, strips.y)
     here, between = explained_light(strips, u, sigma), explained_light(strips, u + 0.5, sigma)
     return replace(grid, explained=here, contrast=here - between)
@@ -130,15 +130,15 @@ def moved_by_waveforms(
     within: BoolArray | None = None,
     n_columns: int | None = None,
 ) -> Grid:
-    """The grid moved to where its columns' waveforms say that the strips lie.
+    """Move a grid to the strip positions that its columns' waveforms indicate.
 
     Args:
         strips: of the picture.
         grid: right to some tenths of a column.
         sigma: light spread of the screen, column pitches.
-        n_steps: steps that it takes.
-        within: (B, S) strips that count; all by default.
-        n_columns: of the screen, where the grid counts from its first: light beyond them is none of its columns'.
+        n_steps: number of Gauss-Newton steps.
+        within: (B, S) strips to use; all by default.
+        n_columns: of the screen, if the grid is numbered from its first column: light beyond is not from a column.
     """
     numbers = grid.numbers
     for _ in range(n_steps):
@@ -146,14 +146,14 @@ def moved_by_waveforms(
         if within is not None:
             weight = weight * within
         if not weight.any():
-            break  # A black picture: nothing says where the borders are.
+            break  # A black picture has no borders.
         slopes = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
         numbers = numbers + grid_step(numbers, SETTINGS.step_gain * off.ravel(), weight.ravel(), slopes)
     return replace(grid, numbers=numbers)
 
 
 def _offsets(strips: Strips, mixes: Mixes) -> tuple[FloatArray, FloatArray]:
-    """(B, S) how far each strip lies from where a grid has it, columns, and the precision of that."""
+    """(B, S) offset of each strip from its position in a grid, columns, and the precision of the offset."""
     off, precision = np.zeros(strips.x.shape), np.zeros(strips.x.shape)
     slope, n = mixes.slopes(), strips.changes.shape[2]
     for known, asked in ((0, 1), (1, 0)):
@@ -164,7 +164,7 @@ def _offsets(strips: Strips, mixes: Mixes) -> tuple[FloatArray, FloatArray]:
 
 
 def offsets_of_known(strips: Strips, mixes: Mixes, waves: Float32Array) -> tuple[FloatArray, FloatArray]:
-    """(B, S) how far each strip lies from where a grid has it by known waveforms (B, K, R), and the precision."""
+    """(B, S) offset of each strip from its position in a grid, by known waveforms (B, K, R), and its precision."""
     n = strips.changes.shape[2]
     predicted = _Predicted.of(waves, strips.changes)
     off, precision = _offsets_of(predicted, mixes.share, mixes.slopes(), n)
@@ -172,7 +172,7 @@ def offsets_of_known(strips: Strips, mixes: Mixes, waves: Float32Array) -> tuple
 
 
 def _robust(off: FloatArray | Float32Array, precision: FloatArray) -> FloatArray:
-    """The precision of offsets, less of those that are large for it."""
+    """Precision of offsets, reduced for outliers (Huber weights)."""
     limit = SETTINGS.huber_sd / np.sqrt(np.maximum(precision, 1e-9))
     return np.asarray(precision / np.maximum(np.abs(off) / limit, 1.0))
 
@@ -180,7 +180,7 @@ def _robust(off: FloatArray | Float32Array, precision: FloatArray) -> FloatArray
 def _offsets_of(
     predicted: _Predicted, share: Float32Array, slope: Float32Array, n_rows: int
 ) -> tuple[Float32Array, Float32Array]:
-    """Regression of strips on their light and its slope along the screen: how far off they lie, and its precision."""
+    """Regress strips on their light and its slope along the screen: offset and its precision."""
     model = np.matmul(share, predicted.waves)
     power = _dot(model, share) + _TINY
     gain = _dot(predicted.strips, share) / power

@@ -259,7 +259,7 @@ def test_a_film_has_sharp_ends_and_fading_light_has_none() -> None:
     np.testing.assert_allclose(film, (2.6, 17.4), atol=0.3)
     assert profile_of("fading").film is None
     start = first_columns(profile_of("film"), 20)
-    assert start.first[start.log_odds.argmax()] == 0
+    assert start.columns[start.log_odds.argmax()] == 0
 
 
 def test_light_ends_where_bars_begin_and_takes_no_more_than_a_screen() -> None:
