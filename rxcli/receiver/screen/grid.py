@@ -29,8 +29,8 @@ class Grid:
     height: int
     #: Known lens of the picture; None: no lens, or an unknown one.
     lens: Lens | None
-    #: Log-likelihood of the strips' light that the columns' waveforms explain, and its excess over that with borders half
-    #: a column further on; 0 if not computed.
+    #: Log-likelihood of the strips' light that the columns' waveforms explain, and its excess over that with borders
+    #: half a column further on; 0 if not computed.
     explained: float = 0.0
     contrast: float = 0.0
 

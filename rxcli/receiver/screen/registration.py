@@ -1,17 +1,17 @@
-"""Where the screen is in every frame of a clip, by the picture on it: what a hand that holds the camera asks for.
+"""Register the screen in every frame of a clip by the picture on it, for a camera held by hand.
 
-The outline alone does not tell: on a dark picture a side is found to several pixels, and what is learned of a picture
-must lie where it was to a fraction of one. The picture's own texture tells to a tenth of a pixel, and stripes hardly
-disturb it: the backlight is smooth across a row, so light over its mean over a few neighbouring pixels is texture.
-What stripes leave of themselves is told from texture by its incoherence: columns send different things, so where
-stripes are all there is, parts of the screen disagree about where it went. The scatter of these parts says how well
-the place is known (a sandwich estimate of the covariance); what it leaves open the outline has to say.
+The outline alone is not precise enough: on a dark picture a side is found to several pixels, whereas a picture learned
+over frames must be aligned to a fraction of a pixel. The picture's own texture gives a tenth of a pixel. Stripes hardly
+disturb it: the backlight is smooth across a row, so light divided by its mean over a few neighbouring pixels is
+texture. Residual stripes differ from texture in their incoherence. Columns send different data, so parts of a screen
+without texture disagree about its motion. The scatter of these parts gives the precision of the position (a sandwich
+estimate of the covariance); directions that it leaves undetermined follow the outline.
 
-The texture lives in the screen's coordinates (u, v). A frame is read at the place where the screen should be, and the
-four corners are moved until it agrees: weighted least squares on the corners' eight coordinates, coarse, then fine
-(Lucas and Kanade 1981; gradients of both textures as Benhimane and Malis 2004 have them). Four free corners follow
-more than a flat screen before a lens: while a camera moves, rows are read one after the other, so that a steady motion
-shears and stretches the screen. That, too, is a motion of corners, and a row remains one instant.
+The texture is stored in the screen's coordinates (u, v). A frame is read at the expected position of the screen, and
+the four corners are moved until the textures agree: weighted least squares on the corners' eight coordinates, coarse,
+then fine (Lucas and Kanade 1981; gradients of both textures as in Benhimane and Malis 2004). Four free corners follow
+more than a flat screen in front of a lens: rows are read one after the other, so that a steady motion of the camera
+shears and stretches the screen. That is a motion of corners, too, and a row remains one instant.
 """
 
 from __future__ import annotations
@@ -28,58 +28,58 @@ from rxcli.numerics import TINY
 from rxcli.receiver.screen import geometry
 from rxcli.types import Float32Array, FloatArray, Frame, Lens
 
-#: Exponent of the tone curve that is taken off where texture is placed; any of the usual ones will do.
+#: Exponent of the tone curve that is undone before texture is computed; any of the usual values is accurate enough.
 _TONE = 2.2
-#: Width of a screen over its height.
+#: Ratio of a screen's width to its height.
 _ASPECT = 16 / 9
-#: Cells across and down the screen that its texture is known by, about.
+#: Approximate number of cells of the texture, across and down the screen.
 _CELLS_ACROSS, _CELLS_DOWN = 360, 110
-#: Share of the screen's size beyond its sides that belongs to the texture: its sides tell where it is.
+#: Share of the screen's size beyond its sides that belongs to the texture: the sides help to locate it.
 _MARGIN = 0.01
 #: Cells across over whose mean light is texture.
 _NEIGHBOURS = 7
-#: Error of a cell, parts of white before the tone curve is undone, and what stripes leave of themselves in the texture.
+#: Noise of a cell, as a share of white before the tone curve is undone, and residual of the stripes in the texture.
 _CELL_NOISE, _STRIPE_NOISE = 0.004, 0.08
-#: What stripes make of texture on its way down the screen, squared, in parts of it: rows are lit more or less.
+#: Squared relative change of the texture from row to row by stripes, as rows are lit unevenly.
 _UNEVEN_ROWS = 0.1
-#: How much more than its expected noise a change of the texture must be; cells around over which that is judged.
+#: Factor by which a gradient of the texture must exceed its expected noise; cells around over which both are averaged.
 _ABOVE_NOISE, _LOCAL_CELLS = 1.3, 15
-#: Value below which the tone curve is taken to be as steep as there.
+#: Value below which the slope of the tone curve is kept constant.
 _DARKEST = 0.03
-#: Percentage of the cells that are darker than what a dark column is taken to show.
+#: Percentile of the cells' light that is taken as the light of a dark column.
 _DARK_PERCENT = 8.0
 #: Cells of a coarse cell across and down, smoothing of the coarse texture in such cells, and iterations.
 _COARSE_CELLS, _COARSE_BLUR, _COARSE_ITERATIONS = (4, 2), 0.8, 4
-#: Iterations of the fine fit, and squared standard deviations of a step after which a fit ends; and the same of a
-#: screen whose texture is known from few frames: what is learned in a wrong place stays.
+#: Iterations of the fine fit, and squared standard deviations of a step after which a fit ends. The same for a texture
+#: known from few frames, where an error of position would remain in the texture.
 _FINE_ITERATIONS, _CONVERGED = 3, 0.5
 _FIRST_ITERATIONS, _FIRST_CONVERGED = 7, 0.001
-#: Every so manieth row of cells is enough of a texture that is known well.
+#: Spacing of the rows of cells that a well-known texture is fitted on.
 _SOME_ROWS = 2
-#: Every so manieth row of cells tells whether a screen stands still; how far, in screen sizes, it and its corners may
-#: seem to have moved; and the share of the textures' correlation that must be left.
+#: Test for a screen at rest: spacing of the rows of cells used, maximum measured motion of the screen and its corners
+#: in screen sizes, and minimum share of the textures' earlier correlation.
 _FEW_ROWS, _STILL_SHIFT, _STILL_CORNERS, _STILL_CORRELATION = 4, 0.0003, 0.0008, 0.97
-#: Cells across that a screen was at most from where it was expected, for the next to be looked for on fine cells alone.
+#: Maximum error of the last prediction, in cells, for the next fit to use fine cells alone.
 _FORESEEN_CELLS = 2.0
-#: Beyond how many standard deviations a cell is an outlier: a hand, a reflection.
+#: Standard deviations beyond which a cell is an outlier: a hand, a reflection.
 _OUTLIER = 2.5
-#: How far a frame may be from where it is expected, screen sizes: shift, affine modes, perspective modes.
-#: A screen's size is its width, or what its height makes it on pixels that are no squares.
+#: Standard deviations of a prediction in screen sizes: shift, affine modes, perspective modes.
+#: A screen's size is its width, or the width that its height implies on pixels that are not square.
 _SHIFT_SD, _AFFINE_SD, _PERSPECTIVE_SD = 0.008, 0.0027, 0.0004
-#: Information below which there is no texture, 1 over pixels squared. Neighbouring cells err alike: that of so many
-#: counts once.
-_MIN_INFORMATION, _ALIKE_CELLS = 1e-9, 4.0
-#: Parts of the screen, across and down, of which each may err in its own way; and how well an outline that is found in
-#: a frame is known, screen sizes.
+#: Information below which there is no texture, 1 over pixels squared. Number of neighbouring cells whose errors are
+#: fully correlated.
+_MIN_INFORMATION, _CORRELATED_CELLS = 1e-9, 4.0
+#: Parts of the screen, across and down, with independent errors; standard deviation of an outline found in a frame,
+#: screen sizes.
 _PARTS, _OUTLINE_SD = (20, 6), 0.002
-#: Standard deviation of the corners in screen sizes, and correlation of the textures, that make it certain where a
-#: screen is.
+#: Maximum standard deviation of the corners in screen sizes, and minimum correlation of the textures, of a certain
+#: position.
 _MAX_SD, _MIN_CORRELATION = 0.0012, 0.35
 #: Share of the last frame's motion that the next is expected to repeat.
 _PERSISTENCE = 0.7
-#: Frames from which the texture is learned one by one, and how often from then on.
+#: Number of first frames that each update the texture, and the interval of updates afterwards.
 _FIRST_FRAMES, _LEARN_EVERY = 10, 4
-#: Weight of the frames before, at most, in frames, in what is known of the texture.
+#: Maximum weight of the earlier frames in the texture, in frames.
 _MAX_WEIGHT = 40.0
 #: Corners clockwise from the top-left: their u and v.
 _AT_U, _AT_V = np.array([0, 1, 1, 0]), np.array([0, 0, 1, 1])
@@ -89,13 +89,13 @@ _KNOTS_U, _KNOTS_V = 17, 9
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Where the screen is in a frame."""
+    """Position of the screen in a frame."""
 
     #: (4, 2) pixels of the stored picture, the viewer's top-left first.
     corners: FloatArray
     #: (8, 8) covariance of the corners, x and y of each in turn, pixels squared.
     covariance: FloatArray
-    #: Correlation of the frame's texture with the one known, -1..1.
+    #: Correlation of the frame's texture with the known one, -1..1.
     correlation: float
 
     @property
@@ -105,23 +105,23 @@ class Registration:
 
     @property
     def tells(self) -> bool:
-        """Whether there is texture enough to tell where the screen is, if it is what it was."""
+        """Whether the texture suffices to locate the screen, provided that the picture has not changed."""
         return self.sd_px < _MAX_SD * _size(self.corners)
 
     @property
     def certain(self) -> bool:
-        """Whether the screen is there."""
+        """Whether the screen is certainly at this position."""
         return self.tells and self.fits
 
     @property
     def fits(self) -> bool:
-        """Whether the picture there is the one known, be there ever so little texture."""
+        """Whether the picture at this position is the known one, even if there is little texture."""
         return self.correlation > _MIN_CORRELATION
 
 
 @dataclass(frozen=True, slots=True)
 class _Texture:
-    """Light over the mean of its neighbours along the row, less 1, and its weight 0..1; of cells of a picture."""
+    """Light of cells over the mean of their neighbours along the row, minus 1, with its weight 0..1."""
 
     value: Float32Array
     weight: Float32Array
@@ -131,18 +131,18 @@ class _Texture:
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """What is known of the texture at the places v x u, (V, U) each."""
+    """The known texture at the positions v x u, (V, U) each."""
 
     value: Float32Array
-    #: (2, V, U) its change along u and along v as far as it is more than noise, and (3, V, U) the products of these.
+    #: (2, V, U) gradients along u and v, shrunk by their expected noise, and (3, V, U) their products.
     along: Float32Array
     products: Float32Array
-    #: How well it is known, 0..1.
+    #: Reliability of the texture, 0..1.
     trust: Float32Array
     places: _Places
 
     def every(self, step: int, places: _Places) -> _Known:
-        """Of every so manieth row alone, whose `places` these are."""
+        """The texture on every `step`-th row alone; `places` are the positions of these rows."""
         all_rows = (self.value, self.along, self.products, self.trust)
         value, along, products, trust = (np.ascontiguousarray(part[..., ::step, :]) for part in all_rows)
         return _Known(value, along, products, trust, places)
@@ -150,7 +150,7 @@ class _Known:
 
 @dataclass(frozen=True, slots=True)
 class _AllKnown:
-    """What is known of the texture: of all cells, on some rows, and on a few."""
+    """The known texture: on all rows of cells, on some, and on a few."""
 
     fine: _Known
     some: _Known
@@ -159,19 +159,19 @@ class _AllKnown:
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Places v x u on the screen, and what is worked out of them once."""
+    """Positions v x u on the screen, and matrices that depend on them alone."""
 
     u: FloatArray
     v: FloatArray
-    #: (knots, 3) points through which the screen is projected, and what makes (V, U) of values there: (V, knots down)
+    #: (knots, 3) points through which the screen is projected, and interpolation from these to (V, U): (V, knots down)
     #: and (knots across, U).
     knots: FloatArray
     down: Float32Array
     across: Float32Array
-    #: (3, V) and (U, 3) products of two corners' shares, of a motion of which places take part in theirs.
+    #: (3, V) and (U, 3) products of two corners' weights, where a weight is the share of a corner's motion.
     pairs_v: Float32Array
     pairs_u: Float32Array
-    #: (2 * parts down, V) and (U, 2 * parts across) shares of the corners in each part of the screen.
+    #: (2 * parts down, V) and (U, 2 * parts across) weights of the corners in each part of the screen.
     parts_v: Float32Array
     parts_u: Float32Array
 
@@ -196,11 +196,11 @@ class _Places:
 
 
 class ScreenTexture:
-    """The texture of a screen, and where the screen was in the last frames.
+    """The texture of a screen, and its position in the last frames.
 
     Args:
-        frame: a frame in which the screen is known.
-        corners: (4, 2) where it is there, the viewer's top-left first.
+        frame: a frame with a known position of the screen.
+        corners: (4, 2) of the screen in that frame, the viewer's top-left first.
         lens: of the camera, None for one without.
     """
 
@@ -215,7 +215,7 @@ class ScreenTexture:
         self._v = np.linspace(-_MARGIN, 1 + _MARGIN, n_v)
         self._plane = self._undistorted(corners)
         self._before = self._plane
-        #: Frames so far, and what they taught of the texture; None where it has to be worked out anew.
+        #: Frames so far, and the texture known from them; None if it has to be recomputed.
         self._n_frames = 0
         self._known_so_far: _AllKnown | None = None
         self._coarse_so_far: _Known | None = None
@@ -223,9 +223,9 @@ class ScreenTexture:
         self._coarse_places = _Places.of(_middles(self._u, across), _middles(self._v, down))
         self._places = _Places.of(self._u, self._v)
         self._some_places, self._few_places = (_Places.of(self._u, self._v[::n]) for n in (_SOME_ROWS, _FEW_ROWS))
-        #: Correlation of the textures when the screen was found last, all of them looked at.
+        #: Correlation of the textures when the screen was last fitted.
         self._correlation = 1.0
-        #: How far the screen was from where it was expected, at most of its corners.
+        #: Error of the last prediction: the maximum over the corners.
         self._surprise_px = float("inf")
         self._read_last: tuple[Frame, _Texture] | None = None
         self._value: Float32Array = np.zeros((n_v, n_u), np.float32)
@@ -233,7 +233,7 @@ class ScreenTexture:
         self.learn(frame, Registration(corners, np.zeros((8, 8)), 1.0))
 
     def find(self, frame: Frame) -> Registration:
-        """Where the screen is in the next frame."""
+        """Register the screen in the next frame."""
         texture = self._texture_of(frame)
         if self._known_so_far is None:
             self._known_so_far = self._known()
@@ -247,19 +247,19 @@ class ScreenTexture:
         return found
 
     def _near(self, texture: _Texture, some: _Known, expected: FloatArray) -> Registration | None:
-        """Where the screen is, if the last frame was about where it was expected and the textures agree as they did."""
+        """Fit on fine cells alone: if the last prediction was good, and the textures still correlate; else None."""
         if self._surprise_px > _FORESEEN_CELLS * self._cell_x or self._n_frames <= _FIRST_FRAMES:
             return None
         before = self._correlation
         found = self._found(texture, some, (expected, expected), _FINE_ITERATIONS)
-        alike = found.correlation > max(_STILL_CORRELATION * before, _MIN_CORRELATION)
-        if alike and found.tells:
+        is_correlated = found.correlation > max(_STILL_CORRELATION * before, _MIN_CORRELATION)
+        if is_correlated and found.tells:
             return found
         self._correlation = before
         return None
 
     def _anywhere(self, texture: _Texture, known: _AllKnown, expected: FloatArray) -> Registration:
-        """Where the screen is, on coarse cells first."""
+        """Fit on coarse cells, then on fine ones."""
         if self._coarse_so_far is None:
             self._coarse_so_far = self._known_coarsely()
         plane, _, _ = self._fit(_coarser(texture), self._coarse_so_far, (expected, expected), _COARSE_ITERATIONS)
@@ -277,9 +277,9 @@ class ScreenTexture:
         return Registration(self._lens_of(plane), covariance, self._correlation)
 
     def _still(self, texture: _Texture, few: _Known) -> Registration | None:
-        """Where the screen was, if it stood still before and a look at a few rows finds that it did not move.
+        """The last position, if the screen was at rest and a fit on a few rows finds no motion; else None.
 
-        A step of a fit tells of small motions only; after a large one the textures do not agree as they did.
+        One step of a fit measures small motions only. After a large motion the correlation of the textures drops.
         """
         if not np.array_equal(self._plane, self._before):
             return None
@@ -288,24 +288,24 @@ class ScreenTexture:
         found = Registration(self._lens_of(self._plane), covariance, correlation)
         shift, each, size = np.abs(moved.mean(axis=0)).max(), np.sqrt(np.square(moved).mean()), _size(plane)
         near = shift < _STILL_SHIFT * size and each < _STILL_CORNERS * size
-        alike = correlation > max(_STILL_CORRELATION * self._correlation, _MIN_CORRELATION)
-        return found if near and alike and found.tells else None
+        is_correlated = correlation > max(_STILL_CORRELATION * self._correlation, _MIN_CORRELATION)
+        return found if near and is_correlated and found.tells else None
 
     def with_outline(self, found: Registration, outline: FloatArray, sd: float = _OUTLINE_SD) -> Registration:
-        """What the texture says of a place, and what an outline (4, 2) says, together; `sd` in screen sizes."""
-        seen, at = self._undistorted(outline), self._undistorted(found.corners)
+        """Combine a registration with an outline (4, 2) of standard deviation `sd`, screen sizes."""
+        measured, at = self._undistorted(outline), self._undistorted(found.corners)
         information = np.linalg.inv(found.covariance)
         known = 1 / (sd * _size(outline)) ** 2
         covariance = np.asarray(np.linalg.inv(information + known * np.eye(8)), np.float64)
-        plane = covariance @ (information @ at.ravel() + known * seen.ravel())
+        plane = covariance @ (information @ at.ravel() + known * measured.ravel())
         return Registration(self._lens_of(plane.reshape(4, 2)), covariance, found.correlation)
 
     def seek(self, corners: FloatArray) -> None:
-        """The screen was found at the corners (4, 2) in another way: the next frame is expected there."""
+        """Expect the next frame at corners (4, 2) that were found in another way."""
         self._before = self._plane = self._undistorted(corners)
 
     def learn(self, frame: Frame, found: Registration) -> None:
-        """Take the texture of a frame in which the screen was found."""
+        """Update the texture with a frame in which the screen was found."""
         self._before, self._plane = self._plane, self._undistorted(found.corners)
         self._n_frames += 1
         if self._n_frames > _FIRST_FRAMES and self._n_frames % _LEARN_EVERY:
@@ -325,12 +325,12 @@ class ScreenTexture:
     def _known_coarsely(self) -> _Known:
         """The texture so far, of coarse cells."""
         across, down = _COARSE_CELLS
-        # Blurred means of so many cells have so much less noise.
+        # Number of cells that a blurred mean averages: noise is smaller by this factor.
         fewer = across * down * (1 + 4 * np.pi * _COARSE_BLUR**2) / 2
         return _known(_coarser(_Texture(self._value, self._weight, 1, 1)), fewer, self._coarse_places)
 
     def _texture_of(self, frame: Frame) -> _Texture:
-        """The texture of a frame; of the one that was asked for last, without reading it again."""
+        """The texture of a frame; that of the last one is cached."""
         if self._read_last is None or self._read_last[0] is not frame:
             self._read_last = frame, _texture_of(frame, self._cell_x, self._cell_y)
         return self._read_last[1]
@@ -364,7 +364,7 @@ class ScreenTexture:
             normal = _normal_matrix(known, weight, per_pixel)
             error *= weight
             scores = _scores_of_parts(known, error, per_pixel)
-            # The prior counts against as much information as the parts' scatter leaves.
+            # The normal matrix is scaled to the information that the scatter of the parts leaves.
             scale = max(float(np.square(scores).sum() / max(np.trace(normal), TINY)), TINY)
             total = normal / scale + prior
             slope = scores.sum(axis=0) / scale + prior @ (expected - plane).ravel()
@@ -378,7 +378,7 @@ class ScreenTexture:
         return plane, _sandwich(normal, scores, variance, prior), correlation
 
     def _read(self, texture: _Texture, plane: FloatArray, places: _Places) -> tuple[Float32Array, Float32Array]:
-        """Value and weight of a frame's texture at screen places, were the screen at `plane`."""
+        """Value and weight of a frame's texture at screen positions, assuming the screen at `plane`."""
         import cv2
 
         x, y = self._project(plane, places, (texture.cell_x, texture.cell_y))
@@ -389,7 +389,7 @@ class ScreenTexture:
         return value, weight
 
     def _project(self, plane: FloatArray, places: _Places, cell: tuple[int, int]) -> tuple[Float32Array, Float32Array]:
-        """Cells (V, U) of screen places: exactly at some knots, and bilinearly between."""
+        """Cells (V, U) of screen positions: exact at knots, bilinear in between."""
         projected = places.knots @ geometry.homography(plane).T
         pixels = self._lens_of(projected[:, :2] / projected[:, 2:])
         cells = ((pixels + 0.5) / cell - 0.5).T.reshape(2, places.down.shape[1], -1).astype(np.float32)
@@ -419,7 +419,7 @@ def _texture_of(frame: Frame, cell_x: int, cell_y: int) -> _Texture:
     else:
         light, noise = (table.take(sums) for table in _light_and_noise_of_sums(*levels))
     mean = cv2.boxFilter(light, -1, (_NEIGHBOURS, 1), borderType=cv2.BORDER_REPLICATE)
-    # A strip of the screen that is dark shows the room's light; its texture is nobody's.
+    # A dark strip of the screen shows room light; its texture is not that of the picture.
     lit = np.maximum(mean - _darkest(mean), np.float32(1e-4))
     noise /= lit
     noise *= noise
@@ -434,14 +434,14 @@ def _texture_of(frame: Frame, cell_x: int, cell_y: int) -> _Texture:
 def _light_and_noise_of_sums(
     cell_y: int, black: float, white: float, linear: bool
 ) -> tuple[Float32Array, Float32Array]:
-    """Light and noise of every sum that so many pixels of eight bits can have."""
+    """Light and noise of every possible sum of `cell_y` 8-bit pixels."""
     return _light_and_noise(np.arange(255 * cell_y + 1, dtype=np.float32), cell_y, black, white, linear)
 
 
 def _light_and_noise(
     sums: Float32Array, cell_y: int, black: float, white: float, linear: bool
 ) -> tuple[Float32Array, Float32Array]:
-    """Light of sums of so many pixels, and what a cell of that light errs by, in parts of what stripes leave."""
+    """Light of sums of `cell_y` pixels, and the noise of a cell of that light relative to the residual of stripes."""
     coded = np.clip((sums / np.float32(cell_y) - np.float32(black)) / np.float32(white - black), 0, 1)
     tone = np.float32(1.0 if linear else _TONE)
     steep = np.maximum(coded, np.float32(_DARKEST)) ** (tone - np.float32(1))
@@ -449,7 +449,7 @@ def _light_and_noise(
 
 
 def _darkest(mean: Float32Array) -> np.float32:
-    """Light that few of the cells in the middle of a picture, where the screen is, fall short of."""
+    """Low percentile of the light of cells in the middle of a picture, where the screen is."""
     n_rows = len(mean)
     some = mean[n_rows // 4 : n_rows - n_rows // 4 : 2, ::2].ravel()
     place = int(some.size * _DARK_PERCENT / 100)
@@ -457,14 +457,14 @@ def _darkest(mean: Float32Array) -> np.float32:
 
 
 def _coarser(texture: _Texture) -> _Texture:
-    """Weighted means over coarse cells; what is left over at the right and at the bottom is left out."""
+    """Weighted means over coarse cells; incomplete cells at the right and at the bottom are dropped."""
     import cv2
 
     across, down = _COARSE_CELLS
     n_y, n_x = texture.value.shape[0] // down, texture.value.shape[1] // across
     part = np.s_[: n_y * down, : n_x * across]
-    both = (texture.weight[part], (texture.value * texture.weight)[part])
-    coarse = [cv2.resize(values, (n_x, n_y), interpolation=cv2.INTER_AREA) for values in both]
+    fine = (texture.weight[part], (texture.value * texture.weight)[part])
+    coarse = [cv2.resize(values, (n_x, n_y), interpolation=cv2.INTER_AREA) for values in fine]
     weight, value = (cv2.GaussianBlur(values, (0, 0), _COARSE_BLUR) for values in coarse)
     return _Texture(
         np.asarray(value / np.maximum(weight, np.float32(TINY))),
@@ -475,35 +475,35 @@ def _coarser(texture: _Texture) -> _Texture:
 
 
 def _middles(places: FloatArray, cells: int) -> FloatArray:
-    """Middles of so many neighbouring places each."""
+    """Means of each `cells` neighbouring positions."""
     return np.asarray(places[: places.size // cells * cells].reshape(-1, cells).mean(axis=1))
 
 
 def _between(places: FloatArray, knots: FloatArray) -> Float32Array:
-    """(n, knots) weights of linear interpolation at ascending places."""
+    """(n, knots) weights of linear interpolation at ascending positions."""
     step = (places - knots[0]) * ((knots.size - 1) / (knots[-1] - knots[0]))
     return np.asarray(np.maximum(1 - np.abs(step[:, None] - np.arange(knots.size)), 0), np.float32)
 
 
 def _corner_weights(places: FloatArray) -> Float32Array:
-    """(2, n) how much of the motion of the corners at 0 and at 1 a place takes part in."""
+    """(2, n) shares of the motion of the corners at 0 and at 1 that positions follow."""
     return np.stack([1 - places, places]).astype(np.float32)
 
 
 def _pairs(shares: Float32Array) -> Float32Array:
-    """(3, n) products of two corners' shares (2, n): those of two along u times those along v are those of two."""
+    """(3, n) products of pairs of the corners' weights (2, n), along u or along v."""
     return np.stack([shares[0] * shares[0], shares[0] * shares[1], shares[1] * shares[1]])
 
 
 def _in_parts(shares: Float32Array, parts: int) -> Float32Array:
-    """(2 * parts, n) the corners' shares (2, n), in so many parts one after the other and none elsewhere."""
+    """(2 * parts, n) the corners' weights (2, n), split into `parts` consecutive parts and zero elsewhere."""
     n = shares.shape[1]
     part = np.searchsorted(np.arange(1, parts) * n // parts, np.arange(n), side="right")
     return np.asarray((shares[:, None] * (part == np.arange(parts)[:, None])).reshape(-1, n), np.float32)
 
 
 def _known(texture: _Texture, fewer: float, places: _Places) -> _Known:
-    """The texture at some places, its changes drawn to none where noise could make them; that is `fewer` times less."""
+    """The texture at `places`, its gradients shrunk by their expected noise, which is `fewer` times smaller."""
     import cv2
 
     def around(values: Float32Array) -> Float32Array:
@@ -521,14 +521,14 @@ def _known(texture: _Texture, fewer: float, places: _Places) -> _Known:
     n = total / np.maximum(around((weight > 0).astype(np.float32)), np.float32(TINY))
     for change, more, step in ((along_u, np.float32(0), u[1] - u[0]), (along_v, uneven / total, v[1] - v[0])):
         power = around(change * change * weight) / total
-        least = np.float32(_ABOVE_NOISE) * (noise + more) / np.maximum(n, np.float32(TINY))
-        change *= np.maximum(1 - least / np.maximum(power, np.float32(TINY)), 0) / np.float32(step)
+        min_power = np.float32(_ABOVE_NOISE) * (noise + more) / np.maximum(n, np.float32(TINY))
+        change *= np.maximum(1 - min_power / np.maximum(power, np.float32(TINY)), 0) / np.float32(step)
     products = along[[0, 0, 1]] * along[[0, 1, 1]]
     return _Known(value, along, products, weight / (weight + np.float32(1.0)), places)
 
 
 def _per_pixel(plane: FloatArray) -> FloatArray:
-    """(2, 2) changes to the right and down, per pixel, by those along u and v, were the screen a parallelogram."""
+    """(2, 2) gradients per pixel from those along u and v, with the screen approximated by a parallelogram."""
     side_u, side_v = (plane[1] - plane[0] + plane[2] - plane[3]) / 2, (plane[3] - plane[0] + plane[2] - plane[1]) / 2
     return np.asarray(np.linalg.inv(np.stack([side_u, side_v], axis=1)), np.float64)
 
@@ -541,13 +541,13 @@ def _normal_matrix(known: _Known, weight: Float32Array, per_pixel: FloatArray) -
         for product in known.products
     )
     normal = np.array([[uu, uv], [uv, vv]], np.float64)
-    # From changes along u and v, of two corners each, to those per pixel.
+    # From gradients along u and v, of two corners each, to gradients per pixel.
     normal = np.tensordot(per_pixel, np.tensordot(per_pixel, normal, (0, 1)), (0, 1))
     return np.asarray(normal.transpose(2, 0, 3, 1).reshape(8, 8))
 
 
 def _scores_of_parts(known: _Known, weighted: Float32Array, per_pixel: FloatArray) -> FloatArray:
-    """(parts, 8) what every part of the screen says of the motion of the corners: its share of the normal equations.
+    """(parts, 8) right-hand sides of the normal equations for the motion of the corners, by part of the screen.
 
     `weighted` is the error of the texture times its weight.
     """
@@ -560,29 +560,28 @@ def _scores_of_parts(known: _Known, weighted: Float32Array, per_pixel: FloatArra
 
 
 def _sandwich(normal: FloatArray, scores: FloatArray, variance: float, prior: FloatArray) -> FloatArray:
-    """(8, 8) covariance of a fit: by the scatter of its parts, not below that of even noise of a `variance`, and no
-    larger than the prior allows."""
+    """(8, 8) sandwich covariance of a fit, from the scatter of its parts, white noise and the prior."""
     bread = np.linalg.inv(normal + (1e-6 * np.trace(normal) + _MIN_INFORMATION) * np.eye(8))
-    spread = scores - scores.mean(axis=0)
-    noise = _ALIKE_CELLS * variance * (normal + _MIN_INFORMATION * np.eye(8))
-    covariance = bread @ (spread.T @ spread + noise) @ bread + 1e-4 * np.eye(8)
+    scatter = scores - scores.mean(axis=0)
+    noise = _CORRELATED_CELLS * variance * (normal + _MIN_INFORMATION * np.eye(8))
+    covariance = bread @ (scatter.T @ scatter + noise) @ bread + 1e-4 * np.eye(8)
     return np.asarray(np.linalg.inv(np.linalg.inv(covariance) + prior))
 
 
 def _size(corners: FloatArray) -> float:
-    """Size of a screen (4, 2), pixels: its width, or what a screen as high is wide where that is more."""
+    """Size of a screen (4, 2), pixels: the larger of its width and the width that its height implies."""
     return float(max(np.ptp(corners[:, 0]), np.ptp(corners[:, 1]) * _ASPECT))
 
 
 def _information(size: float) -> FloatArray:
-    """(8, 8) information on how far the corners may be from where they are expected."""
+    """(8, 8) prior information on the difference of the corners from their prediction."""
     return _information_of_one() / (size * size)
 
 
 @cache
 def _information_of_one() -> FloatArray:
     """As `_information`, of a screen of size 1."""
-    # Modes of four corners along one axis: all alike, right against left, bottom against top, and crosswise.
+    # Modes of four corners along one axis: common, right against left, bottom against top, and crosswise.
     modes = np.array([[1, 1, 1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1], [1, -1, 1, -1]]) / 4
     sds: Sequence[float] = (_SHIFT_SD, _AFFINE_SD, _AFFINE_SD, _PERSPECTIVE_SD)
     along = (modes.T / np.square(np.array(sds))) @ modes
