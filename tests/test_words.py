@@ -80,7 +80,7 @@ SOURCES = (
     *("outputs.py", "__init__.py", "receiver/reception.py", "calibrate", "ingest", "runs"),
     *("receiver/channel", "receiver/settings.py", "receiver/still.py", "receiver/pipeline.py", "receiver/__init__.py"),
     *("receiver/unknown_camera.py", "receiver/cameras.py", "results", "cli"),
-    *("receiver/corners.py", "receiver/plane", "receiver/screen"),
+    *("receiver/corners.py", "receiver/plane", "receiver/screen", "web"),
 )
 #: Places whose prose is read, but not yet their names; one file holds a word in the text of a test picture.
 PROSE_ONLY = ("lab", "receiver/camera", "receiver/sampling")
@@ -89,7 +89,7 @@ PAGES = (
     *("README.md", "sample_frames/README.md", "docs/README.md", "docs/architecture.md", "docs/auto_encoder.md"),
     *("docs/calibration.md", "docs/ci.md", "docs/folders.md", "docs/glossary.md", "docs/link.md", "docs/python.md"),
     *("docs/simulator.md", "docs/usage.md", "docs/benchmark.md", "docs/blind.md", "docs/screen.md", "docs/search.md"),
-    *("docs/video.md", "models/confidence/README.md", "models/strips/README.md"),
+    *("docs/serve.md", "docs/video.md", "models/confidence/README.md", "models/strips/README.md"),
 )
 #: Limits of a page's words and of the documentation's, code aside, and of the README's lines.
 MAX_PAGE_WORDS, MAX_WORDS, MAX_README_LINES = 1500, 20_000, 120

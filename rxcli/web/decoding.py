@@ -1,4 +1,4 @@
-"""Pictures are decoded in a process of its own, with limits: it may die, hang or swell, and another takes its place."""
+"""Decode pictures in a separate process with limits: it may die, hang or run out of memory, and is then replaced."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: Larger pictures are refused before they are decoded: no phone makes them, and they cost memory.
+#: Larger pictures are refused before they are decoded: no phone takes them, and they cost memory.
 MAX_PIXELS = 64_000_000
-#: Clips are read until they have cost so much time of the processor; then what was received till then is shown.
+#: Maximum processor time of a clip; then the results so far are shown.
 _CLIP_S = 12.0
 _MAX_PACKETS = 2000
-#: What was received of a clip so far is told after so many seconds at the earliest.
+#: Minimum interval between partial results of a clip.
 _PARTIAL_S = 0.4
 _POLL_S = 0.05
-#: Pages whose photos add up at a time, the latest ones, and the memory of the files under way of each.
+#: Number of latest pages whose photos are combined, and the memory for incomplete files of each.
 _SESSIONS, _SESSION_MB = 8, 32
-#: Width of the picture on the page, and small copies of frames that are kept for results that come some frames later.
-_WIDTH_PX, _KEPT = 1000, 40
-#: Address space of the process: far more than it uses, far less than would hurt the machine.
+#: Width of the picture on the page, and number of small copies of frames stored for results that arrive frames later.
+_WIDTH_PX, _MAX_PREVIEWS = 1000, 40
+#: Address space of the process: far more than it uses, far less than would harm the machine.
 _ADDRESS_SPACE = 6 << 30
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What one picture may cost."""
+    """Limits for decoding one picture."""
 
     time_s: float = 45.0
-    #: Resident memory of the process, bytes.
-    memory: int = 1 << 30
+    #: Resident memory of the process.
+    resident_bytes: int = 1 << 30
 
 
 class DecodingProcess:
@@ -55,8 +55,8 @@ class DecodingProcess:
 
     Args:
         options: of the receiver.
-        limits: when it is ended and replaced.
-        folder: of uploads, which it removes where the server was killed; None: there is none.
+        limits: beyond which it is ended and replaced.
+        folder: of uploads, which the process removes if the server is killed, or None.
     """
 
     def __init__(self, options: ReceiverOptions, limits: Limits | None = None, folder: Path | None = None) -> None:
@@ -81,19 +81,19 @@ class DecodingProcess:
 
     @property
     def pid(self) -> int | None:
-        """Number of the process, None where there is none."""
+        """Process id, or None if no process runs."""
         return self._process.pid if self._process is not None else None
 
     def decode(
-        self, path: Path, name: str, tell: Callable[[dict[str, Any]], None] | None = None, session: str = ""
+        self, path: Path, name: str, publish: Callable[[dict[str, Any]], None] | None = None, session: str = ""
     ) -> dict[str, Any]:
-        """What became of the file at `path`, as plain data for the page; a failure is an answer like any other.
+        """Decode the file at `path` to plain data for the page; a failure is an answer like any other.
 
         Args:
             path: the file.
-            name: what messages call it.
-            tell: given, from time to time, the answer so far of a clip that is still being read.
-            session: photos of one session add up; empty: this one stands alone.
+            name: of the file in messages.
+            publish: called from time to time with the answer so far of a clip that is still being read.
+            session: photos of one session are combined; empty: not combined.
         """
         if self._process is None or not self._process.is_alive():
             self.close()
@@ -101,7 +101,7 @@ class DecodingProcess:
         assert self._connection is not None
         try:
             self._connection.send((str(path), name, session))
-            return self._answer(tell)
+            return self._answer(publish)
         except _EndedError as ended:
             reason, step = ended.args
         except (EOFError, OSError):
@@ -110,28 +110,28 @@ class DecodingProcess:
         self.close()
         return refusal(reason, step)
 
-    def _answer(self, tell: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
+    def _answer(self, publish: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
         assert self._connection is not None
         end_s = time.monotonic() + self._limits.time_s
         while True:
             while not self._connection.poll(_POLL_S):
                 if time.monotonic() > end_s:
                     raise _EndedError(f"it took more than {self._limits.time_s:.0f} s", "try a smaller picture")
-                if resident_bytes(self.pid) > self._limits.memory:
+                if resident_bytes(self.pid) > self._limits.resident_bytes:
                     raise _EndedError("it takes too much memory", "try a smaller picture")
             answer: dict[str, Any] = self._connection.recv()
             if not answer.get("partial"):
                 return answer
-            if tell is not None:
-                tell(answer)
+            if publish is not None:
+                publish(answer)
 
 
 class _EndedError(Exception):
-    """A limit was passed: reason and next step."""
+    """A limit was exceeded: reason and next step."""
 
 
 def refusal(reason: str, step: str) -> dict[str, Any]:
-    """The answer for a file that is not received."""
+    """The answer for a file that cannot be received."""
     return {
         "status": "unreadable",
         "headline": "The file could not be read",
@@ -141,7 +141,7 @@ def refusal(reason: str, step: str) -> dict[str, Any]:
 
 
 def _work(connection: Connection, options: ReceiverOptions, folder: Path | None) -> None:
-    """The process's life: take a file, send the answer, until the other end is closed."""
+    """Main loop of the process: receive a file, send its answer, until the other end is closed."""
     import shutil
     import signal
 
@@ -163,7 +163,7 @@ def _work(connection: Connection, options: ReceiverOptions, folder: Path | None)
 def _photos_of(
     session: str, sessions: OrderedDict[str, PhotoCollector], options: ReceiverOptions
 ) -> PhotoCollector | None:
-    """What the photos of a session have given so far; None where none are added up."""
+    """Combined photos of a session so far, or None without a session."""
     from rxcli.link.collector import PhotoCollector
 
     if not session:
@@ -177,7 +177,7 @@ def _photos_of(
 
 
 def _confine() -> None:
-    """No file is written, no core dumped; libraries' own messages about broken pictures go nowhere."""
+    """Forbid files and core dumps, limit the address space, and discard libraries' messages about broken pictures."""
     import resource
 
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
@@ -189,7 +189,7 @@ def _confine() -> None:
 
 
 def _warm_up(options: ReceiverOptions) -> None:
-    """Import and load what the first picture would otherwise wait for, by decoding a sample."""
+    """Decode a sample, so that the first picture does not wait for imports and models."""
     from rxcli.ingest import video  # noqa: F401
     from rxcli.receiver import clip  # noqa: F401
     from rxcli.resources import data_dir
@@ -200,7 +200,7 @@ def _warm_up(options: ReceiverOptions) -> None:
     if sample.is_file():
         try:
             answer_for(sample, "sample", options)
-        except Exception as error:  # whatever it is, pictures that come will tell
+        except Exception as error:  # whatever it is, the first picture reports it
             log.debug("the sample was not decoded: %s", error)
 
 
@@ -208,7 +208,7 @@ def answer_for(
     path: Path,
     name: str,
     options: ReceiverOptions,
-    tell: Callable[[dict[str, Any]], None] | None = None,
+    publish: Callable[[dict[str, Any]], None] | None = None,
     photos: PhotoCollector | None = None,
 ) -> dict[str, Any]:
     """The answer for one file; see `DecodingProcess.decode`. A photo is added to `photos`."""
@@ -219,14 +219,14 @@ def answer_for(
         _check_pixels(path)
     except InputError as error:
         return refusal(error.message, error.hint)
-    gathered, told_s = _Gathered(options, time.process_time() + _CLIP_S), started_s
+    gathered, published_s = _Gathered(options, time.process_time() + _CLIP_S), started_s
     decoder = standard_decoder(options, gathered.tap)
     try:
         for result in decoder.results(Source(name, str(path))):
             gathered.add(_without(photos.add(result) if photos else result, path))
-            if tell is not None and gathered.has_news and time.monotonic() - told_s > _PARTIAL_S:
-                tell(gathered.answer() | {"name": name, "partial": True})
-                told_s = time.monotonic()
+            if publish is not None and gathered.has_news and time.monotonic() - published_s > _PARTIAL_S:
+                publish(gathered.answer() | {"name": name, "partial": True})
+                published_s = time.monotonic()
         answer = gathered.answer()
     except MemoryError:
         return refusal("it takes too much memory", "try a smaller picture")
@@ -235,19 +235,19 @@ def answer_for(
 
 
 def _files(progress: Iterable[ObjectProgress]) -> list[dict[str, Any]]:
-    """Files under way, of a clip or of photos together."""
-    return [{"share": one.share, "bytes": one.container_bytes} for one in progress]
+    """Incomplete files, of a clip or of combined photos."""
+    return [{"share": file.share, "bytes": file.container_bytes} for file in progress]
 
 
 def _without(result: FrameResult, path: Path) -> FrameResult:
-    """The result, with a message that fits the page, and does not tell where the upload lies."""
+    """Adapt the message of a result to the page, without the path of the upload."""
     return (
         replace(result, message=without_commands(result.message.replace(f"{path}: ", ""))) if result.message else result
     )
 
 
 def _check_pixels(path: Path) -> None:
-    """Refuse a picture by the size that its header claims, before memory is taken for it."""
+    """Refuse a picture by the size in its header, before memory is allocated for it."""
     import warnings
 
     from PIL import Image
@@ -257,7 +257,7 @@ def _check_pixels(path: Path) -> None:
             warnings.simplefilter("ignore")
             with Image.open(path) as picture:
                 width, height = picture.size
-    except Exception:  # no picture that Pillow knows: the readers say what is wrong with it
+    except Exception:  # no picture that Pillow knows: the readers report what is wrong with it
         return
     if width * height > MAX_PIXELS:
         raise InputError(
@@ -267,34 +267,34 @@ def _check_pixels(path: Path) -> None:
 
 
 class Previews:
-    """Sees every frame before it is received, and keeps small copies of the last ones.
+    """Small copies of the last frames, taken before the frames are received.
 
     Args:
-        width_px: of a copy, at most about.
+        width_px: approximate maximum width of a copy.
         quality: of its JPEG.
     """
 
     def __init__(self, width_px: int, quality: int = 80) -> None:
         self._width_px, self._quality = width_px, quality
-        self._kept: dict[int, Preview] = {}
-        #: The newest.
+        self._previews: dict[int, Preview] = {}
+        #: The newest frame.
         self.frame: Frame | None = None
 
     def tap(self, frame: Frame, _name: str) -> None:
-        """Look at the next frame."""
+        """Store a copy of the next frame."""
         from rxcli.results.overlay import preview
 
         self.frame = frame
-        self._kept[frame.index] = preview(frame, self._width_px)
-        while len(self._kept) > _KEPT:
-            del self._kept[min(self._kept)]
+        self._previews[frame.index] = preview(frame, self._width_px)
+        while len(self._previews) > _MAX_PREVIEWS:
+            del self._previews[min(self._previews)]
 
     def picture(self, result: FrameResult, options: ReceiverOptions) -> dict[str, Any] | None:
-        """The picture of a result as JPEG with outlines in its pixels; None where it is not kept any more."""
+        """Picture of a result as JPEG with outlines in its pixels, or None if its frame is no longer stored."""
         from rxcli.results.cameras import camera_of, screen_of
         from rxcli.results.overlay import picture_of
 
-        small = self._kept.get(result.frame)
+        small = self._previews.get(result.frame)
         if small is None or self.frame is None:
             return None
         camera = camera_of(self.frame, result, options.cameras)
@@ -302,7 +302,7 @@ class Previews:
 
 
 class _Gathered(Previews):
-    """All results of a source as one answer, shown with the frame that gave most; ends a clip in good time."""
+    """All results of a source as one answer, with the picture of the best frame; stops a clip that takes too long."""
 
     def __init__(self, options: ReceiverOptions, end_s: float) -> None:
         super().__init__(_WIDTH_PX)
@@ -313,18 +313,18 @@ class _Gathered(Previews):
         self._files: list[dict[str, Any]] = []
         self._n_frames = self._n_received = self._n_unsure = 0
         self._cut_short = False
-        #: Whether packets or texts came in a frame that is not the first since the last answer.
+        #: Whether packets or texts were received since the last answer, other than in the first frame.
         self.has_news = False
 
     def tap(self, frame: Frame, name: str) -> None:
-        """Look at the next frame; where a clip has cost too much time it ends here."""
+        """Store a copy of the next frame, or stop a clip that has taken too long."""
         if time.process_time() > self._end_s and frame.index:
             self._cut_short = True
             raise InputError("only the beginning of the clip was read", "send a shorter one for the rest")
         super().tap(frame, name)
 
     def add(self, result: FrameResult) -> None:
-        """Take the next result."""
+        """Add the next result."""
         from rxcli.results.columns import packet_rows, text_rows
 
         if self._cut_short and result.status == "unreadable":
@@ -342,7 +342,7 @@ class _Gathered(Previews):
             self._best = len(found), result, self.picture(result, self._options)
 
     def answer(self) -> dict[str, Any]:
-        """What is known so far."""
+        """The answer so far."""
         from rxcli.results.aim import split_message
         from rxcli.results.columns import column_rows
         from rxcli.results.record import to_record

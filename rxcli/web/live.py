@@ -1,4 +1,4 @@
-"""A live camera in a process of its own: its picture, its state, its payloads, as the page shows them."""
+"""Follow a live camera in a separate process: its picture, state and payloads, for the page."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: Events a second at most, and the width of their pictures: what a phone on a poor network can follow.
+#: Maximum rate of events, and the width of their pictures, for a phone on a poor network.
 _EVENTS_PER_S = 8.0
 _WIDTH_PX = 720
 _RESTART_S = 2.0
-#: Texts and packets that a page which is opened later still gets.
+#: Number of earlier texts and packets that a page receives when it is opened.
 _HISTORY = 50
 
 
 class LiveCamera(threading.Thread):
-    """Follows a camera and tells `publish` what comes.
+    """Follow a camera and publish its events.
 
     Args:
         device: the camera.
-        settings: what is asked of it.
+        settings: of the camera.
         options: of the receiver.
-        publish: given each event, plain data.
+        publish: called with each event as plain data.
     """
 
     def __init__(
@@ -56,14 +56,14 @@ class LiveCamera(threading.Thread):
         self._running = True
 
     def close(self) -> None:
-        """End."""
+        """Stop."""
         self._running = False
         if self._process is not None:
             self._process.kill()
         self.join(timeout=5)
 
     def run(self) -> None:
-        """Pass on what the process sends; start it again where it dies."""
+        """Publish the events of the process, and restart the process if it dies."""
         while self._running:
             self._process, ours = start_process(_work, *self._arguments)
             try:
@@ -79,7 +79,7 @@ class LiveCamera(threading.Thread):
 
 
 def _work(connection: Connection, device: Path, settings: CameraSettings, options: ReceiverOptions) -> None:
-    """The process's life."""
+    """Main loop of the process."""
     import signal
 
     from rxcli.errors import ReceiverError, sentence
@@ -100,10 +100,10 @@ def _work(connection: Connection, device: Path, settings: CameraSettings, option
 
 
 def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any]]:
-    """What the page is told, at most some times a second: picture, outline, state, and packets and texts since then.
+    """Events for the page at a limited rate: picture, outline, state, and the packets and texts since the last event.
 
     Args:
-        frames: of one camera, without end; where it has `counts`, dropped and damaged ones are told too.
+        frames: endless, of one camera; if it has `counts`, dropped and damaged frames are reported, too.
         options: of the receiver.
     """
     from rxcli.results.aim import Aim, light_of
@@ -118,7 +118,7 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
     texts: list[dict[str, Any]] = []
 
     def event(result: FrameResult, state: AimState) -> dict[str, Any]:
-        """A result, and the packets and texts since the event before."""
+        """A result, with the packets and texts since the last event."""
         made = {
             "state": asdict(state),
             "light": state.light.word if state.light else None,

@@ -1,7 +1,7 @@
-"""The page's HTTP server: a few fixed addresses, everything bounded, nothing from outside in a path.
+"""The page's HTTP server: a few fixed addresses, limits on everything, and no path that depends on a request.
 
-What the page may cost: `Bounds`. Where it can be reached from other machines, a token stands in its address; requests
-that come from the pages of others are refused.
+`Bounds` limits the cost of visitors. If other machines can reach the page, its address contains a token. Requests from
+pages of other origins are refused.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",  # the address may hold the token
     "Cache-Control": "no-store",
 }
-#: A line of JSON for every answer: what is known so far, and at last the whole.
+#: A line of JSON for each answer: partial answers, then the complete one.
 _LINES = "application/x-ndjson"
-#: Header that photos which are to add up have in common.
+#: Header that is equal for all photos to be combined, and its maximum length.
 _SESSION, _SESSION_CHARACTERS = "X-Session", 64
 _LOCAL = ("127.0.0.1", "localhost", "::1", "[::1]")
 _CHUNK = 1 << 16
@@ -64,40 +64,40 @@ _SWEEP_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What visitors may cost."""
+    """Limits on the cost of visitors."""
 
     upload_bytes: int = 96 << 20
-    #: An upload must be whole after so long, and may be behind its least rate by so much.
+    #: Maximum duration of an upload, and the time by which it may lag behind its minimum rate.
     upload_s: float = 60.0
     grace_s: float = 5.0
-    #: Least rate of an upload, bytes a second.
+    #: Minimum rate of an upload, bytes a second.
     upload_rate: int = 32 << 10
-    #: Pictures that may be on their way at once, and whole ones that may wait to be read.
+    #: Maximum number of simultaneous uploads, and of complete pictures that wait to be decoded.
     uploads: int = 4
     waiting: int = 8
-    #: A part of an answer must be taken after so long.
+    #: Time within which a client must accept a part of an answer.
     answer_s: float = 30.0
-    #: Pages that may watch the live camera.
+    #: Maximum number of pages that watch the live camera.
     watchers: int = 8
-    #: Open connections; of more, those that have asked for nothing are closed, oldest first.
+    #: Maximum number of open connections; beyond it, idle ones are closed, oldest first.
     connections: int = 64
-    #: A connection that has asked for nothing is closed after so long.
+    #: Time after which an idle connection is closed.
     idle_s: float = 15.0
     decoding: Limits = field(default_factory=Limits)
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """What is served, and where."""
+    """What is served, and at which address."""
 
     options: ReceiverOptions
     host: str = "127.0.0.1"
     port: int = 8017
-    #: Part of the address where the server can be reached from elsewhere; None: none is asked for.
+    #: Secret part of the address if other machines can reach the server, or None.
     token: str | None = None
     device: Path | None = None
     camera: CameraSettings | None = None
-    #: Where uploads are kept; None: nowhere.
+    #: Folder in which uploads are stored permanently, or None.
     keep: Path | None = None
     bounds: Bounds = field(default_factory=Bounds)
 
@@ -113,7 +113,7 @@ class Site:
 
 
 def own_address() -> str:
-    """This machine's address in its network, as far as the system knows one; nothing is sent."""
+    """This machine's address in its network, from the system's routes; nothing is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # never reached: an address for documentation (RFC 5737)
@@ -124,14 +124,14 @@ def own_address() -> str:
 
 @dataclass(eq=False, slots=True)
 class _Upload:
-    """A picture on its way."""
+    """A picture being uploaded."""
 
     begun_s: float
     limit: asyncio.Timeout
     n_bytes: int = 0
 
     def is_slow(self, now_s: float, rate: int) -> bool:
-        """Whether it is slower than uploads must be, in its second second or later."""
+        """Whether it is below the minimum rate after its first second."""
         return now_s - self.begun_s > 1.0 and self.n_bytes < rate * (now_s - self.begun_s)
 
 
@@ -148,13 +148,13 @@ class Server:
         self._decoder = DecodingProcess(site.options, site.bounds.decoding, self._folder)
         self._thread = ThreadPoolExecutor(1, "decode")
         self._arriving: list[_Upload] = []
-        #: Who is told their place, in the order in which pictures are read.
+        #: Callbacks of waiting pictures, in the order of decoding; each receives its place in the queue.
         self._queue: list[Callable[[dict[str, Any]], None]] = []
-        #: The oldest first.
+        #: Oldest first.
         self._watchers: dict[asyncio.Queue[str], web.Request] = {}
         self._history: deque[str] = deque(maxlen=20)
         self._idle_since: dict[int, float] = {}
-        #: Of pictures: photos that add up need names of their own.
+        #: Numbers of pictures: combined photos need distinct names.
         self._numbers = itertools.count(1)
         self._live: Any = None
         #: The port, once the server runs.
@@ -206,7 +206,7 @@ class Server:
 
             def publish(event: dict[str, Any]) -> None:
                 with contextlib.suppress(RuntimeError):  # the loop has ended
-                    loop.call_soon_threadsafe(self._tell, event)
+                    loop.call_soon_threadsafe(self._broadcast, event)
 
             self._live = LiveCamera(site.device, camera, site.options, publish)
             self._live.start()
@@ -225,11 +225,11 @@ class Server:
             self._decoder.close()  # what the thread may have started meanwhile
             shutil.rmtree(self._folder, ignore_errors=True)
 
-    # -- who may ask --------------------------------------------------------------------------------------------------
+    # -- access control -----------------------------------------------------------------------------------------------
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
-        """Refuse what comes from the pages of others, or to another name; add the headers that bind the browser."""
+        """Refuse requests from other origins or to other host names, and add the security headers."""
         if not self._is_ours(request):
             raise web.HTTPForbidden(text="not from this page", headers=_HEADERS)
         try:
@@ -247,7 +247,7 @@ class Server:
 
     @contextlib.contextmanager
     def _taken_in_time(self, request: web.Request) -> Iterator[None]:
-        """Close the connection of who does not take what is written; nothing more is written to who has gone."""
+        """Abort the connection of a client that does not accept data in time or has disconnected."""
         try:
             yield
         except (ConnectionError, TimeoutError):
@@ -265,7 +265,7 @@ class Server:
         return origin is None or origin in (f"http://{host}", f"https://{host}")
 
     async def _sweep(self) -> None:
-        """Close connections that ask for nothing: long ones, and the oldest where there are too many."""
+        """Close idle connections: after a time, and the oldest ones if there are too many."""
         bounds = self._site.bounds
         while True:
             await asyncio.sleep(_SWEEP_S)
@@ -289,8 +289,8 @@ class Server:
         text = (_PAGE / "index.html").read_text(encoding="utf-8")
         live = "yes" if self._site.device is not None else "no"
         largest = str(self._site.bounds.upload_bytes)
-        kept = "not kept" if self._site.keep is None else "kept"
-        text = text.replace("{{kept}}", kept).replace("{{live}}", live).replace("{{largest}}", largest)
+        retention = "not kept" if self._site.keep is None else "kept"
+        text = text.replace("{{kept}}", retention).replace("{{live}}", live).replace("{{largest}}", largest)
         return web.Response(text=text, content_type="text/html")
 
     async def _asset(self, request: web.Request) -> web.Response:
@@ -321,12 +321,14 @@ class Server:
             return _answer(slow, 408, close=True)
         except OSError as error:
             log.warning("an upload could not be stored: %s", error)
-            return _answer(refusal("there is no room for the picture", "tell who runs this page"), 507, close=True)
+            return _answer(
+                refusal("there is no room for the picture", "inform the operator of this page"), 507, close=True
+            )
         finally:
             path.unlink(missing_ok=True)
 
     def _make_room(self) -> None:
-        """End the slowest upload where there is no room for another and it is slower than uploads must be."""
+        """If all upload places are taken, end the slowest upload below the minimum rate."""
         bounds, now_s = self._site.bounds, asyncio.get_running_loop().time()
         slow = [upload for upload in self._arriving if upload.is_slow(now_s, bounds.upload_rate)]
         if slow and len(self._arriving) >= bounds.uploads:
@@ -335,46 +337,48 @@ class Server:
             self._arriving.remove(slowest)
 
     async def _decoded(
-        self, request: web.Request, path: Path, tell: Callable[[dict[str, Any]], None]
+        self, request: web.Request, path: Path, publish: Callable[[dict[str, Any]], None]
     ) -> dict[str, Any]:
-        """The answer for an upload, in its turn; `tell` is given its place before, and what is known meanwhile."""
+        """Answer of an upload in its turn; `publish` receives its place in the queue and partial answers."""
         loop = asyncio.get_running_loop()
-        self._queue.append(tell)
-        self._tell_places()
+        self._queue.append(publish)
+        self._publish_places()
         try:
-            answer = await loop.run_in_executor(self._thread, self._decode_for, request, path, tell)
+            answer = await loop.run_in_executor(self._thread, self._decode_for, request, path, publish)
         finally:
-            self._queue.remove(tell)
-            self._tell_places()
+            self._queue.remove(publish)
+            self._publish_places()
         self._keep(path, answer)
         return answer
 
-    def _decode_for(self, request: web.Request, path: Path, tell: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    def _decode_for(
+        self, request: web.Request, path: Path, publish: Callable[[dict[str, Any]], None]
+    ) -> dict[str, Any]:
         if request.transport is None or request.transport.is_closing():
             return refusal("nobody waits for the answer", "send it again")
         session = request.headers.get(_SESSION, "")[:_SESSION_CHARACTERS]
-        return self._decoder.decode(path, f"picture {next(self._numbers)}", tell, session)
+        return self._decoder.decode(path, f"picture {next(self._numbers)}", publish, session)
 
-    def _tell_places(self) -> None:
-        """Tell all but the first how many are before them."""
-        for place, tell in enumerate(self._queue):
+    def _publish_places(self) -> None:
+        """Send their place in the queue to all waiting pictures but the first."""
+        for place, publish in enumerate(self._queue):
             if place:
-                tell({"status": "waiting", "place": place, "partial": True})
+                publish({"status": "waiting", "place": place, "partial": True})
 
     async def _answer_by_and_by(self, request: web.Request, path: Path) -> web.StreamResponse:
-        """A line of JSON for what is known of a clip so far, from time to time, and one for the whole answer."""
+        """Stream partial answers of a clip and the complete answer, one line of JSON each."""
         response = web.StreamResponse(headers={**_HEADERS, "Content-Type": _LINES})
         await response.prepare(request)
         loop = asyncio.get_running_loop()
         lines: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
 
-        def tell(answer: dict[str, Any]) -> None:
+        def publish(answer: dict[str, Any]) -> None:
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(lines.put_nowait, answer)
 
-        decoding = asyncio.create_task(self._decoded(request, path, tell))
+        decoding = asyncio.create_task(self._decoded(request, path, publish))
         decoding.add_done_callback(lambda _: lines.put_nowait({}))
-        with self._taken_in_time(request):  # the upload stays until it is decoded, whoever still listens
+        with self._taken_in_time(request):  # the upload stays until it is decoded, even if nobody listens any more
             while answer := await lines.get():
                 await self._write_line(response, answer)
         whole = await decoding
@@ -389,10 +393,10 @@ class Server:
             await response.write(json.dumps(answer).encode() + b"\n")
 
     async def _save(self, request: web.Request, path: Path) -> int | None:
-        """Write the body to `path`; its size, None where it is too large.
+        """Write the body to `path`; returns its size, or None if it is too large.
 
         Raises:
-            TimeoutError: it comes too slowly.
+            TimeoutError: the upload is too slow.
         """
         bounds = self._site.bounds
         begun_s = asyncio.get_running_loop().time()
@@ -420,7 +424,7 @@ class Server:
         )
 
     def _keep(self, path: Path, answer: dict[str, Any]) -> None:
-        """Keep the upload and what became of it, where that was asked for."""
+        """Store the upload and its result, if requested."""
         folder = self._site.keep
         if folder is None:
             return
@@ -433,7 +437,7 @@ class Server:
             log.warning("an upload could not be kept: %s", error)
 
     async def _events(self, request: web.Request) -> web.StreamResponse:
-        """What the live camera shows, as server-sent events."""
+        """Events of the live camera, as server-sent events."""
         if self._site.device is None:
             raise web.HTTPNotFound(headers=_HEADERS)
         if len(self._watchers) >= self._site.bounds.watchers:
@@ -456,8 +460,8 @@ class Server:
             self._watchers.pop(queue, None)
         return response
 
-    def _tell(self, event: dict[str, Any]) -> None:
-        """Give an event to all who watch; one that lags misses pictures, not texts."""
+    def _broadcast(self, event: dict[str, Any]) -> None:
+        """Send an event to all watching pages; a slow page misses pictures, but no texts."""
         text = json.dumps(event)
         if event.get("texts"):
             self._history.append(json.dumps({"texts": event["texts"]}))
@@ -469,7 +473,7 @@ class Server:
 
 
 async def _next(queue: asyncio.Queue[str]) -> str:
-    """The next event, or an empty one that keeps the connection."""
+    """The next event, or an empty one that keeps the connection open."""
     try:
         async with asyncio.timeout(10):
             return await queue.get()
@@ -478,7 +482,7 @@ async def _next(queue: asyncio.Queue[str]) -> str:
 
 
 def _is_taking(asked: Any) -> bool:
-    """Whether the connection, or that of a request, still holds a part of an answer that was written to it."""
+    """Whether a connection or request has unsent data."""
     return asked.transport is not None and asked.transport.get_write_buffer_size() > 0
 
 
@@ -488,7 +492,7 @@ def _abort(request: web.Request) -> None:
 
 
 def _requests_log() -> logging.Logger:
-    """Where aiohttp says what is wrong with requests: those that are no HTTP are nobody's concern."""
+    """Log of aiohttp's errors, without those of requests that are not HTTP."""
     requests = logging.getLogger(f"{__name__}.requests")
     if not requests.filters:
         requests.addFilter(lambda record: not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError)))
@@ -497,13 +501,13 @@ def _requests_log() -> logging.Logger:
 
 def _answer(answer: dict[str, Any], status: int, close: bool = False) -> web.Response:
     response = web.json_response(answer, status=status)
-    if close:  # what is left of the body is not waited for
+    if close:  # the rest of the body is not awaited
         response.force_close()
     return response
 
 
 def _suffix(path: Path) -> str:
-    """A suffix for a kept upload, by what is in it, never by what it was called."""
+    """Suffix of a stored upload, from its content and never from its name."""
     from rxcli.ingest.sniff import HEAD_BYTES, read_bytes, sniff
 
     kinds = {"jpeg": ".jpg", "png": ".png", "tiff": ".tif", "heif": ".heic", "raw": ".raw", "video": ".mp4"}

@@ -74,7 +74,7 @@ class Shots:
         """The page of a live camera after an event."""
         await self.browser.open(server.address)
         while await self.browser.run("document.querySelector('#live-picture img') === null"):
-            server._tell(event)  # as often as a camera would: the page may not listen yet
+            server._broadcast(event)  # as often as a camera would: the page may not listen yet
         await self.browser.until("document.querySelector('#live-picture img').complete")
         word = await self.browser.run("document.getElementById('lock').textContent")
         assert word == event["state"]["word"]

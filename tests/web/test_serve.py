@@ -431,7 +431,7 @@ def test_the_decoding_process_may_die_hang_and_swell(tmp_path: Path, options: Re
         decoder.close()
     for limits, told in (
         (Limits(time_s=0.0), "It took more than 0 s."),
-        (Limits(memory=0), "It takes too much memory."),
+        (Limits(resident_bytes=0), "It takes too much memory."),
     ):
         decoder = DecodingProcess(options, limits)
         try:
