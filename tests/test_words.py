@@ -80,7 +80,7 @@ SOURCES = (
     *("outputs.py", "__init__.py", "receiver/reception.py", "calibrate", "ingest", "runs"),
     *("receiver/channel", "receiver/settings.py", "receiver/still.py", "receiver/pipeline.py", "receiver/__init__.py"),
     *("receiver/unknown_camera.py", "receiver/cameras.py", "results", "cli"),
-    *("receiver/corners.py", "receiver/plane", "receiver/screen", "web"),
+    *("receiver/corners.py", "receiver/plane", "receiver/screen", "receiver/search", "web"),
 )
 #: Places whose prose is read, but not yet their names; one file holds a word in the text of a test picture.
 PROSE_ONLY = ("lab", "receiver/camera", "receiver/sampling")

@@ -1,8 +1,8 @@
-"""One search decides what a picture shows: outline, rows, camera, screen, clock and bursts.
+"""Search for the outline, rows, camera, screen, clock and bursts of a picture.
 
-`propose` yields hypotheses with log priors and never decides. `evidence` measures an initial pass. `search` has the
-best hypotheses measured, best prior first, until one is plain or the budget is spent. `nulls` ask the winner whether
-light without data explains it as well, and `explain` says why nothing was found.
+`propose` yields hypotheses with log priors and never decides. `evidence` measures an initial pass. `search` makes
+initial passes of the best hypotheses, best prior first, until one is certain or the budget is spent. `nulls` test
+whether light without data explains the winner as well, and `explain` gives the reason for a failure.
 """
 
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried

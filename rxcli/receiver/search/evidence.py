@@ -1,4 +1,4 @@
-"""One measure for every hypothesis: how much its initial pass looks like packets."""
+"""Evidence of a hypothesis: the log-likelihood ratio of packets in its initial pass."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _COLUMNS = 20
 def log_evidence(reception: Reception) -> float:
     """Log-likelihood ratio of packets over slots of any kind, for a screen of twenty columns.
 
-    A column that fits poorly, or is dark, says nothing. Where light is weak, headers come through before symbols do.
+    A dark or poorly fitting column contributes nothing. In weak light, headers are detected before symbols are.
     """
     llr = reception.column_llr
     headers = max(float(reception.posteriors.header_llr.sum()), 0.0)
@@ -31,7 +31,7 @@ def score(reception: Reception, acquisition: Acquisition, evidence: float, log_p
 
     Args:
         reception: initial pass, of all columns or of some.
-        acquisition: what it was of.
+        acquisition: that the pass used.
         evidence: see `log_evidence`.
         log_prior: of the hypothesis.
     """
@@ -41,14 +41,14 @@ def score(reception: Reception, acquisition: Acquisition, evidence: float, log_p
     if complete:
         clock = reception.clock
         possible = sync.possible_bursts(clock, detect.slot_llr(reception.metrics), acquisition.repeats)
-        own = [likeness for other, likeness in possible if np.array_equal(other.burst, clock.burst)]
+        own = [likeness for candidate, likeness in possible if np.array_equal(candidate.burst, clock.burst)]
         similarity = (own[0] if own else possible[-1][1]) - possible[0][1]
     gain = SETTINGS.complete_packet * complete + SETTINGS.copies_weight * similarity
     return SETTINGS.temper * (packets * evidence + gain) + log_prior
 
 
 def distinct_share(reception: Reception) -> float:
-    """Share of the columns' slots that say more than their neighbour's: too narrow columns show one packet often."""
+    """Share of the columns' slots that is independent of the neighbour's: too narrow columns repeat one packet."""
     slots = reception.posteriors.lit[..., PREAMBLE_SLOTS:].transpose(1, 0, 2).reshape(reception.snr.shape[0], -1)
     if len(slots) < 2:
         return 1.0

@@ -1,4 +1,4 @@
-"""Why nothing was received, from what the search saw."""
+"""Reason why nothing was received, from the results of the search."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ NO_HEADERS = (
 
 
 def why_no_packets(proposer: Proposer, nearest: Hypothesis | None, failure: Failure | None) -> Failure:
-    """Why a screen gave no packets.
+    """Reason why a screen gave no packets.
 
     Args:
         proposer: of the frame.
-        nearest: the likeliest hypothesis; None where no camera was proposed.
-        failure: why there were no cameras.
+        nearest: the likeliest hypothesis, or None if no camera was proposed.
+        failure: reason why there were no cameras.
     """
     if nearest is None:
         return replace(failure or Failure("no_signal", NO_HEADERS), outline=proposer.families()[0])

@@ -1,4 +1,4 @@
-"""What a picture may show, and how a hypothesis fared."""
+"""Hypotheses about a picture, and their results."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from rxcli.types import Clock, FloatArray, SearchStep
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """What a picture may show. The clock is found, and the columns are read, only when the hypothesis is asked for."""
+    """A hypothesis about a picture. Its clock is found, and its columns are read, only before its initial pass."""
 
     outline: Outline
-    #: Which of the outline's rows, 0 the likeliest.
+    #: Index among the outline's candidate rows, 0 the likeliest.
     rows: int
     camera: Camera
     screen: ScreenProfile
-    #: The screen and others that differ only in how often they send a packet, the one that sends it most first.
+    #: The screen and others that differ only in the number of copies per burst, largest number first.
     variants: tuple[ScreenProfile, ...]
     log_prior: float
     clock: Clock | None = None
-    #: Burst of every copy; None: as the similarity of copies indicates.
+    #: Burst of every copy; None: from the similarity of copies.
     bursts: tuple[int, ...] | None = None
     sampler: ColumnSampler | None = field(default=None, repr=False, compare=False)
 
     @property
     def corners(self) -> FloatArray:
-        """(4, 2) stored pixels, as a viewer sees the screen from the top left on."""
+        """(4, 2) stored pixels, the viewer's top left first."""
         return (self.outline.corners, *self.outline.other_rows)[self.rows]
 
     @property
     def identity(self) -> tuple[object, ...]:
-        """Equal for hypotheses that an initial pass cannot tell apart; also the order of ties."""
+        """Equal for hypotheses that an initial pass cannot distinguish; also the order of ties."""
         camera = self.camera
         return (
             self.outline.family,
@@ -66,13 +66,13 @@ class Scored:
     score: float
 
     def with_camera(self, camera: Camera) -> Self:
-        """The same, its camera told otherwise."""
+        """The same with another camera."""
         return replace(self, context=replace(self.context, camera=camera))
 
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """A hypothesis that was tried; for the fates see `SearchStep`."""
+    """A hypothesis that was tried; `SearchStep` lists the fates."""
 
     hypothesis: Hypothesis
     evidence: float
@@ -92,7 +92,7 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a search decided."""
+    """Result of a search."""
 
     best: Scored
     #: The outline with the probability that its columns are numbered as the screen's.

@@ -1,4 +1,4 @@
-"""Light without data: does a waveform without packets, or a single lamp, explain what was found as well?"""
+"""Tests for light without data: whether a periodic waveform or a single lamp explains the light as well."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _ONE_LAMP = f"all columns show the same light and no packets in it, as of a sing
 
 
 def light_without_data(context: FrameContext, acquisition: Acquisition) -> Failure | None:
-    """Why the light of a screen whose clock was found carries no data; None where it may carry some.
+    """Failure of a screen with a clock whose light carries no data, or None.
 
-    Independent columns are what the link is made of. Where all are alike they are received as one: a screen that sends
-    the same in all columns still shows headers, equal copies and words of the codebook there.
+    The link consists of independent columns. If all columns are equal they are received as one: a screen that sends the
+    same in all columns still has headers, equal copies and words of the codebook.
     """
     if all(too_small(context, screen) for screen in context.screens):
-        return None  # No packet fits; and light of few rows repeats itself under some period.
+        return None  # No packet fits, and light of few rows is periodic for some period.
     with context.timer("detect"):
         binned = acquisition.binned()
         samples = sync.sample_slots(binned.profiles, binned.clock, SETTINGS.light_samples)
@@ -46,7 +46,7 @@ def light_without_data(context: FrameContext, acquisition: Acquisition) -> Failu
 
 
 def is_switched(context: FrameContext, profiles: RowProfiles) -> bool:
-    """Whether one period explains the light of all columns on their rows, where no clock was found."""
+    """Whether one period explains the light of all columns; used if no clock was found."""
     if all(too_small(context, screen) for screen in context.screens):
         return False
     light, inside = profiles.light, profiles.inside.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Which column is the first: packets do not tell, so the prior of the outlines decides, and says how sure it is."""
+"""Number the columns of a screen: packets do not depend on the first column, so the outlines' prior decides."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from rxcli.receiver.search.settings import SETTINGS
 
 
 def likeliest_of_family(outlines: Sequence[Outline]) -> Outline:
-    """The outline of a family under which its packets are sought: the likeliest.
+    """The likeliest outline of a family, under which its packets are sought.
 
-    Where no number is likely, columns are counted from the left of what is seen.
+    If no numbering is likely, columns are counted from the left of the visible part.
     """
-    odds = np.array([one.log_odds for one in outlines])
-    best = max(outlines, key=lambda one: (one.log_odds, -_left(one)))
+    odds = np.array([outline.log_odds for outline in outlines])
+    best = max(outlines, key=lambda outline: (outline.log_odds, -_left(outline)))
     share = 1 / float(np.exp(odds - odds.max()).sum())
     if best.fills and share < SETTINGS.likely_certainty:
-        return max((one for one in outlines if one.log_odds > best.log_odds - SETTINGS.may_be_log_odds), key=_left)
+        possible = (outline for outline in outlines if outline.log_odds > best.log_odds - SETTINGS.may_be_log_odds)
+        return max(possible, key=_left)
     return best
 
 
@@ -33,12 +34,13 @@ def numbered(own: Outline, outlines: Sequence[Outline], score_of: Callable[[int]
     Args:
         own: the outline that was chosen.
         outlines: all that were proposed.
-        score_of: the best score under outlines of a family, None where none was near enough to be tried.
+        score_of: the best score under outlines of a family, or None if none was tried.
     """
-    alike = np.array([one.log_odds for one in outlines if one.family == own.family])
-    scores = np.array([score for family in {one.family for one in outlines} if (score := score_of(family)) is not None])
+    family_odds = np.array([outline.log_odds for outline in outlines if outline.family == own.family])
+    families = {outline.family for outline in outlines}
+    scores = np.array([score for family in families if (score := score_of(family)) is not None])
     mine = score_of(own.family)
-    certainty = 1 / float(np.exp(np.sort(alike) - own.log_odds).sum())
+    certainty = 1 / float(np.exp(np.sort(family_odds) - own.log_odds).sum())
     if mine is not None:
         certainty /= float(np.exp(np.sort(scores) - mine).sum())
     return replace(
@@ -47,6 +49,6 @@ def numbered(own: Outline, outlines: Sequence[Outline], score_of: Callable[[int]
 
 
 def _left(outline: Outline) -> float:
-    """How far right, for a viewer, an outline begins: of those that leave no light out the furthest begins in view."""
+    """Position of an outline's left side along its top, for a viewer: larger is further right."""
     along = outline.corners[1] - outline.corners[0]
     return float(outline.corners[0] @ along / np.linalg.norm(along))

@@ -1,4 +1,4 @@
-"""Hypotheses with log priors, likeliest first. Nothing is decided here."""
+"""Propose hypotheses with log priors, likeliest first. Nothing is decided here."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.unknown_camera import propose_cameras, relabelled_camera
 from rxcli.types import Clock, Frame
 
-#: Columns that a clock is sought on first, or the number next to it.
+#: Number of columns on which a clock is sought first, or the nearest available number.
 _USUAL_COLUMNS = 20
 
 
 @dataclass(frozen=True, slots=True)
 class Proposer:
-    """Proposes what one frame may show.
+    """Proposes hypotheses about one frame.
 
     Attributes:
         frame: the picture.
         options: screens and cameras.
         timer: of the frame.
         outlines: that the screen may have.
-        known: the camera and the screens where these are known from other frames.
+        known: the camera and the screens, if known from other frames.
     """
 
     frame: Frame
@@ -54,9 +54,9 @@ class Proposer:
         return sorted(chosen, key=lambda outline: (-outline.log_odds, outline.family))
 
     def cameras(self) -> Generator[list[Hypothesis], None, Failure | None]:
-        """Hypotheses camera by camera, the likeliest camera first; returns why there are none, or no more.
+        """Hypotheses camera by camera, the likeliest camera first; returns the reason why there are none, or no more.
 
-        Rows are the same instants wherever the columns are, so the first family that shows any camera speaks for all.
+        Rows are the same instants wherever the columns are, so the first family with any camera serves for all.
         """
         known = self.known.camera if self.known else known_camera(self.frame, self.options)
         if isinstance(known, Failure):
@@ -83,10 +83,10 @@ class Proposer:
         """Hypotheses of one camera: a screen for every outline and clock; the likeliest outline on other rows too."""
         screens, families, out = self._screens(), self.families(), []
         if camera.hypothesis is not None:
-            screens = tuple(one for one in screens if one.packet_slots == camera.hypothesis.packet_slots)
+            screens = tuple(screen for screen in screens if screen.packet_slots == camera.hypothesis.packet_slots)
         for outline in families:
-            for alike in _by_clock(outline, camera, screens).values():
-                screen = _nearest(alike, _USUAL_COLUMNS)
+            for same_clock in _by_clock(outline, camera, screens).values():
+                screen = _nearest(same_clock, _USUAL_COLUMNS)
                 likely = self._hypothesis(outline, camera, screen, log_prior + SETTINGS.temper * outline.log_odds)
                 out += [likely, *(_of_other_rows(likely) if outline is families[0] else ())]
         return out
@@ -102,22 +102,24 @@ class Proposer:
         return Hypothesis(outline, rows, camera, variants[0], variants, log_prior)
 
     def context(self, hypothesis: Hypothesis) -> FrameContext:
-        """The frame as a hypothesis has it, with the screens that its camera may show."""
+        """The frame under a hypothesis, with the screens that its camera allows."""
         camera, screens = hypothesis.camera, self._screens()
         if camera.lens is None:
             camera = replace(camera, lens=hypothesis.outline.lens)
         if camera.hypothesis is not None:
             own = hypothesis.screen
             screens = tuple(
-                one for one in screens if (one.slot_rate_hz, one.packet_slots) == (own.slot_rate_hz, own.packet_slots)
+                screen
+                for screen in screens
+                if (screen.slot_rate_hz, screen.packet_slots) == (own.slot_rate_hz, own.packet_slots)
             )
         return FrameContext(self.frame, hypothesis.corners, camera, screens, self.timer)
 
     def with_clock(self, hypothesis: Hypothesis) -> Hypothesis | None:
-        """The hypothesis with its columns read and its clock; None where no header shows."""
+        """The hypothesis with its columns and its clock, or None if no header is found."""
         n_columns = hypothesis.screen.columns
         usual = _nearest((hypothesis.screen, *self.options.screens), _USUAL_COLUMNS).columns
-        # A header shows on columns of any width: narrow ones are read where it does.
+        # A header is found on columns of any width, so narrow ones are read only after it was found on wide ones.
         for n in dict.fromkeys((usual, n_columns)):
             sampler = sample_columns(self.context(hypothesis), n)
             with self.timer("clock"):
@@ -127,33 +129,33 @@ class Proposer:
         assert clock is not None
         lead = np.log(clock.header_peak_ratio / SETTINGS.clear_lead)
         log_prior = hypothesis.log_prior + SETTINGS.lead_weight * min(float(lead), 0.0)
-        kept = hypothesis.bursts is not None and len(hypothesis.bursts) == clock.n_copies
-        bursts = hypothesis.bursts if kept else None
+        has_same_copies = hypothesis.bursts is not None and len(hypothesis.bursts) == clock.n_copies
+        bursts = hypothesis.bursts if has_same_copies else None
         return replace(hypothesis, clock=clock, sampler=sampler, bursts=bursts, log_prior=log_prior)
 
     def siblings(self, scored: Scored) -> Iterator[Hypothesis]:
-        """Hypotheses that differ from a scored one in one thing, with the log prior that this thing changes."""
+        """Hypotheses that differ from a scored one in one respect, with their changed log prior."""
         hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, sampler=None, bursts=None)
         outline, camera, log_prior = hypothesis.outline, hypothesis.camera, hypothesis.log_prior
         clock, n_columns = _clock_of(hypothesis.screen, camera), hypothesis.screen.columns
         yield from _of_other_rows(hypothesis)
-        for other in self.families():
-            alike = _by_clock(other, camera, self.options.screens).get(clock)
-            if alike and other.family != outline.family:
-                change = SETTINGS.temper * (other.log_odds - outline.log_odds)
-                yield self._hypothesis(other, camera, _nearest(alike, n_columns), log_prior + change)
+        for candidate in self.families():
+            same_clock = _by_clock(candidate, camera, self.options.screens).get(clock)
+            if same_clock and candidate.family != outline.family:
+                change = SETTINGS.temper * (candidate.log_odds - outline.log_odds)
+                yield self._hypothesis(candidate, camera, _nearest(same_clock, n_columns), log_prior + change)
         by_clock = _by_clock(outline, camera, self.options.screens)
         yield from self._of_other_columns(scored, by_clock.pop(clock, []))
         if _is_clear(scored.reception):
             return
-        for alike in by_clock.values() if camera.hypothesis is not None else ():
-            sibling = self._hypothesis(outline, camera, _nearest(alike, n_columns), log_prior, hypothesis.rows)
+        for same_clock in by_clock.values() if camera.hypothesis is not None else ():
+            sibling = self._hypothesis(outline, camera, _nearest(same_clock, n_columns), log_prior, hypothesis.rows)
             if too_small(self.context(sibling), sibling.screen) is None:
                 yield sibling
         yield from self._of_other_bursts(scored)
 
     def _of_other_columns(self, scored: Scored, screens: list[ScreenProfile]) -> Iterator[Hypothesis]:
-        """Screens of the same clock with other columns, by how similar strips at a distance are."""
+        """Screens of the same clock with other columns, by the similarity of strips at a distance."""
         hypothesis, camera = scored.hypothesis, scored.context.camera
         by_columns = {screen.columns: screen for screen in (*reversed(screens), hypothesis.screen)}
         own = by_columns.pop(hypothesis.screen.columns)
@@ -167,7 +169,7 @@ class Proposer:
             yield self._hypothesis(hypothesis.outline, camera, screen, log_prior, hypothesis.rows)
 
     def _of_other_bursts(self, scored: Scored) -> Iterator[Hypothesis]:
-        """Other bursts of the same copies, where packets leave doubt."""
+        """Other bursts of the same copies, if packets are uncertain."""
         reception, repeats = scored.reception, scored.acquisition.repeats
         complete = complete_packets(reception)
         possible = sync.possible_bursts(reception.clock, detect.slot_llr(reception.metrics), repeats)
@@ -201,24 +203,24 @@ def _is_clear(reception: Reception) -> bool:
 
 def _nearest(screens: Iterable[ScreenProfile], n_columns: int) -> ScreenProfile:
     """The screen whose number of columns is nearest."""
-    return min(screens, key=lambda one: (abs(np.log(one.columns / n_columns)), one.columns))
+    return min(screens, key=lambda screen: (abs(np.log(screen.columns / n_columns)), screen.columns))
 
 
 def _clock_of(screen: ScreenProfile, camera: Camera) -> tuple[float, int]:
-    """What a picture tells screens apart by: the slot rate too, where the camera is known."""
+    """Key by which a picture distinguishes screens: packet slots, and with a known camera the slot rate."""
     return (0.0 if camera.hypothesis is not None else screen.slot_rate_hz), screen.packet_slots
 
 
 def _by_clock(
     outline: Outline, camera: Camera, screens: Iterable[ScreenProfile]
 ) -> dict[tuple[float, int], list[ScreenProfile]]:
-    """Screens with the columns of an outline by their clock; where that tells no slot rate, the quickest of them."""
+    """Screens with the columns of an outline by their clock; if that has no slot rate, only the fastest of them."""
     groups: dict[tuple[float, int], list[ScreenProfile]] = {}
-    for screen in sorted(screens, key=lambda one: -one.slot_rate_hz):
-        alike = groups.setdefault(_clock_of(screen, camera), [])
-        is_quickest = all(one.columns != screen.columns for one in alike)
-        if outline.n_columns in (None, screen.columns) and (is_quickest or camera.hypothesis is None):
-            alike.append(screen)
+    for screen in sorted(screens, key=lambda profile: -profile.slot_rate_hz):
+        group = groups.setdefault(_clock_of(screen, camera), [])
+        is_fastest = all(faster.columns != screen.columns for faster in group)
+        if outline.n_columns in (None, screen.columns) and (is_fastest or camera.hypothesis is None):
+            group.append(screen)
     return {clock: groups[clock] for clock in sorted(groups) if groups[clock]}
 
 

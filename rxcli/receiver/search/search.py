@@ -1,4 +1,4 @@
-"""Best first: the likeliest hypothesis has an initial pass, and what it shows says which comes next."""
+"""Best-first search: make an initial pass of the likeliest hypothesis; its score determines the next one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rxcli.receiver.unknown_camera import fitted
 from rxcli.types import FloatArray, Frame
 
 _Cameras = Generator[list[Hypothesis], None, Failure | None]
-#: Less the key, so that a heap gives the likeliest first; ties by identity; a number where that is the same.
+#: Negative key, so that a heap returns the likeliest first; identity and a number order ties.
 _Entry = tuple[float, tuple[object, ...], int, Hypothesis]
 
 
@@ -41,10 +41,10 @@ def search(
 
     Args:
         frame: the picture.
-        options: screens, cameras, perhaps corners.
-        timer: time is counted there.
-        known: a frame of the same camera, where the camera and the screens are known.
-        budget: initial passes, at most.
+        options: screens, cameras, and corners if given.
+        timer: of the frame.
+        known: context of a frame of the same camera, if the camera and the screens are known.
+        budget: maximum number of initial passes.
     """
     outlines = proposed_outlines(frame, options, timer)
     if isinstance(outlines, Failure):
@@ -52,8 +52,8 @@ def search(
     proposer = Proposer(frame, options, timer, tuple(outlines), known)
     walk = _Walk(proposer, budget)
     best = walk.run()
-    least = SETTINGS.bail if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
-    if best is None or best.evidence < least:
+    min_evidence = SETTINGS.bail if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
+    if best is None or best.evidence < min_evidence:
         best = walk.best_without_packets()
     if best is None:
         return replace(why_no_packets(proposer, walk.nearest, walk.failure), tried=walk.record(None))
@@ -68,7 +68,7 @@ def search(
 
 
 def _corners_by_slots(outline: Outline, best: Scored) -> FloatArray:
-    """Corners of an outline where the decided slots have its columns, if there are packets."""
+    """Corners of an outline, refined with the decided slots if there are packets."""
     context, reception, screen = best.context, best.reception, best.acquisition.screen
     if outline.strips is None or best.evidence < SETTINGS.plain:
         return outline.corners
@@ -94,10 +94,10 @@ class _Walk:
         self._asked: set[tuple[object, ...]] = set()
         self._fresh: list[_Entry] = []
         self._siblings: list[_Entry] = []
-        #: None when there are no more; the log prior that the next may have.
+        #: None when there are no more; upper bound of the next one's log prior.
         self._cameras: _Cameras | None = proposer.cameras()
         self._next_prior = np.inf
-        #: Why there are no cameras; and the first hypothesis.
+        #: Reason why there are no cameras; and the first hypothesis.
         self.failure: Failure | None = None
         self.nearest: Hypothesis | None = None
 
@@ -123,7 +123,7 @@ class _Walk:
         return best if best is None or was_fitted else self._fitted(best)
 
     def _fitted(self, best: Scored) -> Scored:
-        """The same with its camera, where that is an estimate, fitted to its slots."""
+        """The same with its camera fitted to its slots, if the camera is an estimate."""
 
         def received(camera: Camera) -> Scored | None:
             hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
@@ -134,35 +134,35 @@ class _Walk:
         return fitted(best, received)
 
     def best_without_packets(self) -> Scored | None:
-        """Of a frame without packets, the likeliest outline's hypothesis, where the camera is known."""
-        shown = [one for one in self._scored if one.context.camera.hypothesis is None]
-        return max(shown, key=lambda one: (one.hypothesis.outline.log_odds, one.score), default=None)
+        """Hypothesis of the likeliest outline of a frame without packets, or None if the camera is not known."""
+        shown = [scored for scored in self._scored if scored.context.camera.hypothesis is None]
+        return max(shown, key=lambda scored: (scored.hypothesis.outline.log_odds, scored.score), default=None)
 
     def score_of(self, family: int) -> float | None:
-        """The best score under outlines of a family; None where none was tried."""
-        tried = (one for one in self._tried if one.fate != "no clock" and one.hypothesis.outline.family == family)
-        return max((one.score for one in tried), default=None)
+        """The best score under outlines of a family, or None if none was tried."""
+        tried = (step for step in self._tried if step.fate != "no clock" and step.hypothesis.outline.family == family)
+        return max((step.score for step in tried), default=None)
 
     def record(self, best: Scored | None, fate: str = "won") -> tuple[Tried, ...]:
         """Every hypothesis that was tried, in order, with the fate of the best one."""
         own = best and best.hypothesis.identity
-        return tuple(replace(one, fate=fate) if one.hypothesis.identity == own else one for one in self._tried)
+        return tuple(replace(step, fate=fate) if step.hypothesis.identity == own else step for step in self._tried)
 
     def _best(self) -> Scored | None:
-        return max(self._scored, key=lambda one: one.score, default=None)
+        return max(self._scored, key=lambda scored: scored.score, default=None)
 
     def _is_hopeless(self) -> bool:
-        passes = [one.evidence for one in self._tried if one.fate != "no clock"]
+        passes = [step.evidence for step in self._tried if step.fate != "no clock"]
         return len(passes) >= SETTINGS.hopeless_budget and max(passes) < SETTINGS.bail
 
     def _push(self, queue: list[_Entry], key: float, hypothesis: Hypothesis) -> None:
         heapq.heappush(queue, (-key, hypothesis.identity, len(self._asked) + len(queue), hypothesis))
 
     def _next(self) -> tuple[list[_Entry], _Entry] | None:
-        """The queue and the entry that is asked next; None where nothing could come near the best."""
+        """The next entry and its queue, or None if no entry could come near the best."""
         best = self._best()
         if best is not None:
-            # An estimate that shows no packets may be the wrong camera: others come before its siblings.
+            # An estimate without packets may be the wrong camera: other cameras come before its siblings.
             is_doubtful = best.context.camera.hypothesis is not None and best.evidence < SETTINGS.few_packets
             is_near = self._siblings and -self._siblings[0][0] >= best.score - SETTINGS.reach
             if is_near and not (is_doubtful and (self._fresh or self._cameras is not None)):
@@ -177,7 +177,7 @@ class _Walk:
                 break
             if not proposed:
                 continue
-            likeliest = min(proposed, key=lambda one: (-one.log_prior, one.identity))
+            likeliest = min(proposed, key=lambda hypothesis: (-hypothesis.log_prior, hypothesis.identity))
             self.nearest = self.nearest or likeliest
             self._next_prior = likeliest.log_prior - SETTINGS.next_camera
             for hypothesis in proposed:
@@ -185,7 +185,7 @@ class _Walk:
         return (self._fresh, heapq.heappop(self._fresh)) if self._fresh else None
 
     def _score(self, hypothesis: Hypothesis) -> None:
-        """An initial pass, of the middle columns first where there is a better hypothesis already."""
+        """Make an initial pass; if there is a better hypothesis already, of the middle columns first."""
         best, acquisition = self._best(), _acquired(hypothesis)
         if best is not None and hypothesis.screen.columns > SETTINGS.few_columns:
             half = self._measured(hypothesis, acquisition.middle())
@@ -194,7 +194,7 @@ class _Walk:
                 return
         scored = self._measured(hypothesis, acquisition)
         if SETTINGS.bail < scored.evidence < SETTINGS.plain:
-            # Packets may show plainly once an estimated camera is fitted: then no other is asked.
+            # Packets may become certain once an estimated camera is fitted: then no other camera is tried.
             scored = self._fitted(scored)
         bursts = replace(hypothesis, bursts=tuple(scored.reception.clock.burst.tolist()))
         self._asked.add((bursts.identity, False))
