@@ -13,7 +13,7 @@ class SearchSettings:
     temper: float = 0.08
     #: Weight of headers without symbols relative to packets.
     header_weight: float = 0.1
-    #: Evidence that a complete packet adds; weight of the copies' similarity, which the packets contain by half already.
+    #: Evidence that a complete packet adds; weight of the copies' similarity, half already in the packets.
     complete_packet: float = 60.0
     copies_weight: float = 0.5
     #: Above this evidence no further cameras are proposed: wrong clocks reach 391.
