@@ -1,8 +1,8 @@
 """The first frames of a clip: they agree on where the screen is and, where each shows little, on a clock.
 
 The strips of a whole clip lie where its first frame has the screen, and a single dark frame may be wrong by twenty
-pixels there. The texture of the picture says how the screen moved from the first frame to the next ones; what the
-search finds in these is carried back, and the median of a few counts. Where the second agrees, two are enough.
+pixels there. The texture of the picture gives the motion of the screen from the first frame to the next ones. The
+outlines found in these are carried back, and their median is used. If the second agrees, two are enough.
 
 A frame that shows less than two packets may show no whole header, or show payload that looks like one. Over several
 frames the headers come back at the same place in the packet's length, and nothing else does.
@@ -96,7 +96,7 @@ class Start:
     """What the first frames agree on."""
 
     screen: ScreenProfile
-    #: It and those that differ from it in how often a packet is sent.
+    #: The screen and others that differ only in the number of copies per burst.
     variants: tuple[ScreenProfile, ...]
     time: LinkTime
     #: How much likelier the headers' place is than the best elsewhere.
@@ -195,7 +195,7 @@ def _fold(
     for (slots, response), start in zip(responses, starts, strict=True):
         place = np.round((slots + start) * q).astype(np.int64) % n
         np.add.at(score, place, response)
-    # Stamps are rounded to milliseconds: neighbouring places say the same.
+    # Stamps are rounded to milliseconds: neighbouring places are equivalent.
     score = (score + np.roll(score, 1) + np.roll(score, -1)) / 3
     place, lead = sync.header_comb(score, q)
     return float(score.max()), lead, place / q

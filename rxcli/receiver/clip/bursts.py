@@ -1,4 +1,4 @@
-"""The bursts of a clip: what frames see of them is added up, and detected when somebody asks what it says."""
+"""The bursts of a clip: metrics of several frames are added, and detected when their result is needed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class BurstReader:
         self.open = Bursts()
 
     def add(self, view: View, numbers: IntArray) -> None:
-        """Add a frame to its bursts (B,); they are detected when somebody asks what they say."""
+        """Add a frame to its bursts (B,), which are detected when their result is needed."""
         metrics = channel.by_burst(view.bursts.metrics, view.bursts.clock)
         self.open.add(view.bursts, numbers, metrics)
 
@@ -117,7 +117,7 @@ class BurstReader:
         return clock.on_grid(lit)
 
     def doubts(self, waiting: Waiting) -> tuple[int, int]:
-        """Packets of a frame in columns that are well lit and of which all was seen: those in doubt, and all."""
+        """Numbers of doubtful packets and of all packets, among complete packets of a frame in well-lit columns."""
         assert waiting.view is not None
         assert waiting.numbers is not None
         self.detect_stale(waiting)

@@ -62,12 +62,12 @@ class Located:
             return 0.0
         return camera.estimated["line_delay_s"][1] / camera.line_delay_s if isinstance(self.found, Found) else np.inf
 
-    def with_surer_camera(self, other: Located | Failure) -> Located:
-        """The same with the camera of another frame, where that one is surer."""
-        if isinstance(other, Failure) or other.camera_error >= self.camera_error:
+    def with_surer_camera(self, located: Located | Failure) -> Located:
+        """The same with the camera of another frame, if that camera is more precise."""
+        if isinstance(located, Failure) or located.camera_error >= self.camera_error:
             return self
-        context = replace(other.context, frame=self.context.frame, corners=self.context.corners)
-        return replace(self, context=context, found=other.found)
+        context = replace(located.context, frame=self.context.frame, corners=self.context.corners)
+        return replace(self, context=context, found=located.found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +79,7 @@ class ClipCamera:
     context: FrameContext | None = None
     #: Properties of the frames that the camera is known for.
     frame_kind: tuple[object, ...] = ()
-    #: Whether the camera's profile was compared with the clip, and what there is to say of it.
+    #: Whether the camera's profile was compared with the clip, and a message about it.
     profile_tried: bool = False
     note: str | None = None
 
@@ -130,20 +130,20 @@ class ClipCamera:
     def with_common_clock(self, located: Located, frames: Sequence[Frame]) -> tuple[Located, Start | None]:
         """Find the clock that the first frames share, with the reading of the first frame's camera that leads.
 
-        Less than a packet tells rows per slot, but perhaps another screen, or the wrong direction of the readout.
+        Less than a packet gives rows per slot, but perhaps another screen, or the wrong direction of the readout.
         """
-        first = located.context
-        readings = [first]
-        if first.camera.hypothesis is not None:
+        original = located.context
+        readings = [original]
+        if original.camera.hypothesis is not None:
             period_s = _shortest_period_s(frames) or np.inf
-            readings += _readings_of(first, self.options.screens)
+            readings += _readings_of(original, self.options.screens)
             readings = [reading for reading in readings if _readout_periods(reading, period_s) <= 1]
         starts = [(agree(frames, reading), reading) for reading in readings]
         agreed = [(start.lead, start, reading) for start, reading in starts if start is not None]
         if not agreed:
             return located, None
         _, start, chosen = max(agreed, key=lambda candidate: candidate[0])
-        return (located if chosen is first else replace(located, context=chosen, found=None)), start
+        return (located if chosen is original else replace(located, context=chosen, found=None)), start
 
     # -- a frame received like a photograph ------------------------------------------------------------------------
 
@@ -195,13 +195,13 @@ def _readings_of(context: FrameContext, screens: Sequence[ScreenProfile]) -> Ite
     for slot_rate_hz in dict.fromkeys(screen.slot_rate_hz for screen in screens):
         scale = rate_hz / slot_rate_hz
         delay_s, exposure_s = scale * camera.line_delay_s, scale * camera.exposure_s
-        alike = tuple(screen for screen in screens if screen.slot_rate_hz == slot_rate_hz)
+        same_rate = tuple(screen for screen in screens if screen.slot_rate_hz == slot_rate_hz)
         for reverse in (False, True):
             estimated = {**camera.estimated, "line_delay_s": (delay_s, scale * camera.estimated["line_delay_s"][1])}
             reading = replace(
                 camera, line_delay_s=delay_s, exposure_s=exposure_s, reversed=reverse, estimated=estimated
             )
-            yield replace(context, camera=reading, screens=alike)
+            yield replace(context, camera=reading, screens=same_rate)
 
 
 def _readout_periods(context: FrameContext, period_s: float) -> float:
@@ -210,7 +210,7 @@ def _readout_periods(context: FrameContext, period_s: float) -> float:
 
 
 def _shortest_period_s(frames: Sequence[Frame]) -> float | None:
-    """The shortest time from one frame to the next, by their time stamps; None where these do not tell."""
+    """The shortest time from one frame to the next by their time stamps, or None."""
     passed = [
         after.time_s - before.time_s
         for before, after in pairwise(frames)
@@ -234,8 +234,10 @@ def _doubt_of(reception: Reception) -> float:
 
 
 def _shows_packets(reception: Reception, doubt: float) -> bool:
-    """Whether a camera explains a frame: less than a share of the columns is in `doubt` where packets are whole, and
-    the slots look like packets where none is."""
+    """Whether a camera explains a frame.
+
+    If packets are complete, the share of doubtful columns must be below `doubt`; else the slots must resemble packets.
+    """
     return _doubt_of(reception) < doubt if complete_packets(reception).any() else has_clear_packets(reception)
 
 

@@ -85,7 +85,7 @@ class Ledger:
         self._bursts = BurstReader(options.skip)
         self._link: _Link | None = None
         self._next_number = 0
-        #: How much longer time stamps are than the time was; None where that cannot be told, and frames stand alone.
+        #: Ratio of time stamps to the link's time; None if it cannot be estimated, and frames are received alone.
         self._stretch: float | None = 1.0
         #: Counts the starts of the link's time: burst numbers of different ones cannot be compared.
         self._epoch = 0
@@ -102,7 +102,7 @@ class Ledger:
         self._hold(SETTINGS.frames_held if "tracking" in self._options.skip else 0)
 
     def _hold(self, n_frames: int) -> None:
-        """Hold back so many frames; 0 from then on."""
+        """Hold back `n_frames` frames; 0: none."""
         self._n_held = n_frames
         self._bursts.dark_too = n_frames > 0
 
@@ -123,7 +123,7 @@ class Ledger:
 
     @property
     def message(self) -> str | None:
-        """What there is to say of the clip's time stamps."""
+        """Message about the clip's time stamps, or None."""
         if self._stretch is None:
             return _RETIMED
         return _SLOW_MOTION.format(self._stretch) if self._stretch != 1 else None
@@ -245,7 +245,7 @@ class Ledger:
         self._compare(view)
 
     def _compare(self, view: View) -> None:
-        """What the frame says of the phase of the bursts."""
+        """Update the phase of the bursts with a frame."""
         assert self._link is not None
         clock = view.bursts.clock
         llr = detect.slot_llr(view.bursts.metrics)
@@ -259,7 +259,7 @@ class Ledger:
                 self._detect(waiting)
 
     def _detect(self, waiting: Waiting) -> None:
-        """Add a frame to its bursts, and learn from it; they are detected when somebody asks what they say."""
+        """Add a frame to its bursts, which are detected when their result is needed, and learn from it."""
         numbers, view = self._add(waiting), waiting.view
         if "certain_columns" not in self._options.skip or self._options.stop_when_certain:
             self._bursts.detect_stale(waiting)
@@ -307,7 +307,7 @@ class Ledger:
         return self._scene is not None and self._scene.can_measure_again(view)
 
     def _measure_again(self, held: list[Waiting]) -> None:
-        """Learn the picture anew from all frames held, and measure those in doubt by what the others say of it."""
+        """Learn the picture anew from all held frames, and measure doubtful frames with the picture of the others."""
         assert self._scene is not None
         self._bursts.detect_stale(*held)
         known = [self._bursts.lit(waiting) for waiting in held]
@@ -353,20 +353,20 @@ class Ledger:
         n_ended = 0 if self._n_held else self._n_ended()
         if n_ended < (1 if at_last or self._options.prompt else SETTINGS.reports_together):
             return []
-        seen = [w for w in islice(self._waiting, n_ended) if w.view is not None]
-        self._bursts.detect_stale(*seen)
+        ended = [w for w in islice(self._waiting, n_ended) if w.view is not None]
+        self._bursts.detect_stale(*ended)
         done = []
         for _ in range(n_ended):
-            first = self._waiting.popleft()
-            done.append(self._report(first, self._waiting[0] if self._waiting else None))
+            oldest = self._waiting.popleft()
+            done.append(self._report(oldest, self._waiting[0] if self._waiting else None))
         return done
 
     def _n_ended(self) -> int:
         """How many of the frames that wait, from the oldest on, can be reported."""
-        for place, first in enumerate(self._waiting):
-            if first.view is not None:
+        for place, waiting in enumerate(self._waiting):
+            if waiting.view is not None:
                 following = self._waiting[place + 1] if place + 1 < len(self._waiting) else None
-                if following is None or first.numbers is None:
+                if following is None or waiting.numbers is None:
                     return place
                 if following.view is not None and following.numbers is None:
                     return place
@@ -467,7 +467,7 @@ def _confidence_features(burst: tracking.ClosedBurst, n_strips: int) -> FloatArr
 
 
 def _against(burst: tracking.ClosedBurst) -> Float32Array | None:
-    """(C,) log-likelihood against what was decided of the payload slot that says so most; None for photographs."""
+    """(C,) maximum log-likelihood ratio against the decision over the payload slots; None for photographs."""
     if not burst.tracked:
         return None
     llr = detect.slot_llr(burst.metrics[None])[0, :, PREAMBLE_SLOTS:]

@@ -31,7 +31,7 @@ class TrackedScreen:
         acquisition: of that frame.
         lens: of the camera.
         black_level: light of a dark slot there.
-        named: whether the user said where the screen is.
+        named: whether the user gave the corners.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class TrackedScreen:
         self._lens, self._named = lens, named
         self._first_middles = geometry.column_middles(pose.corners, pose.map.inside.shape[0], lens)
         self._texture = ScreenTexture(frame, pose.corners, lens)
-        #: Frames whose picture did not tell where the screen is, and outlines in a row that were where the first was.
+        #: Frames whose picture did not locate the screen, and consecutive outlines equal to the first of them.
         self._n_untold = self._n_still = 0
         #: Looks in a row that found it where it was, and frames since the last one.
         self._n_rested = self._n_unlooked = 0
@@ -131,7 +131,7 @@ class TrackedScreen:
         return True
 
     def _untold(self, found: Registration, outline: FloatArray | None) -> Registration:
-        """Where the screen is that has too little texture to tell: it rests, unless its outline says that it moves."""
+        """Position of a screen with too little texture: at rest, unless its outline indicates a motion."""
         at_rest = self._texture.with_outline(found, self._expected, SETTINGS.rest_sd)
         if self._rests or _is_possible(self._expected - found.corners, found.covariance):
             at_rest = replace(at_rest, corners=self._expected)
@@ -149,16 +149,16 @@ class TrackedScreen:
 
     @property
     def _rests(self) -> bool:
-        """Whether a screen whose picture does not tell where it is stays where it is."""
+        """Whether a screen that its picture does not locate is taken to rest."""
         return self._named or self._n_still >= SETTINGS.still_looks
 
     @property
     def _expected(self) -> FloatArray:
-        """(4, 2) where a screen is expected whose picture does not tell."""
+        """(4, 2) expected corners of a screen that its picture does not locate."""
         return self.corners if self._rests else self.corners + self._drift
 
     def _outline_near(self, frame: Frame, corners: FloatArray, surprised: bool) -> FloatArray | None:
-        """Corners (4, 2) of the screen by its outline, where the picture on it does not tell; None where it shows none.
+        """Corners (4, 2) by the outline, for a screen that its picture does not locate, or None.
 
         It is looked for in every other frame, and less often as long as it stays where it is and nothing is a surprise.
         """
@@ -305,9 +305,9 @@ class TrackedScreen:
     def _clock(
         self, frame: Frame, flat: known_picture.ColumnLight, old: Clock, time: tracking.LinkTime
     ) -> Clock | None:
-        """The clock of the frame: from its headers where they are about as foretold, else as foretold.
+        """The clock of the frame: from headers near their predicted place, else the predicted clock.
 
-        None where headers do not show: another scene, or something in front of the screen.
+        None if no headers are found: another scene, or something in front of the screen.
         """
         rows = self.rows
         n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
@@ -342,7 +342,7 @@ class TrackedScreen:
         if found is None:
             return predicted, contrast
         found = replace(found, delay_slots=old.delay_slots)
-        if predicted is not None and _apart(found, predicted) > time.sure_slots:
+        if predicted is not None and _clock_distance(found, predicted) > time.sure_slots:
             return predicted, contrast
         here = self._header(flat, found)
         return (found, here) if here > contrast + SETTINGS.better_header else (predicted, contrast)
@@ -350,7 +350,7 @@ class TrackedScreen:
     def _shifted(self, flat: known_picture.ColumnLight, clock: Clock, contrast: float) -> tuple[Clock, float]:
         """The clock, shifted to where its headers show plainly better, and their contrast.
 
-        Where a camera holds the picture still, rows are not those that were read at their time.
+        If a camera stabilises the picture, its rows do not correspond to their read-out times.
         """
         best, most = clock, contrast
         for step in (-SETTINGS.header_shift, SETTINGS.header_shift):
@@ -369,7 +369,7 @@ class TrackedScreen:
     # -- the picture ----------------------------------------------------------------------------------------------
 
     def take(self, view: View, lit: Callable[[], Float32Array]) -> None:
-        """The frame that was received last. The first ones, and some of those that follow, are learned from.
+        """Set the frame that was received last; learn from the first frames, and from some later ones.
 
         Args:
             view: the frame.
@@ -415,8 +415,9 @@ class TrackedScreen:
         numbers: Sequence[IntArray],
         doubtful: Sequence[bool],
     ) -> None:
-        """Learn the picture anew from frames, and measure those in doubt by what others say of it, where these are many
-        enough by what other bursts say of it.
+        """Learn the picture anew from frames, and measure doubtful ones with the picture of the others.
+
+        If there are enough frames, the picture for a frame leaves out all light of that frame's bursts.
 
         Args:
             views: the frames.
@@ -474,7 +475,7 @@ def _of_bursts(
 
 
 def _retimed(clock: Clock, rows: FloatArray, fit: known_picture.Fit) -> Clock:
-    """The clock put right by what a fit says of rows that were stretched after they were read."""
+    """Correct the clock by a fit, for rows that were stretched after they were read."""
     middle, half = (rows[0] + rows[-1]) / 2, (rows[-1] - rows[0]) / 2
     rows_per_slot = 1 / (1 / clock.rows_per_slot + fit.drift / half)
     at_middle = (middle - clock.row0) / clock.rows_per_slot + fit.late
@@ -482,7 +483,7 @@ def _retimed(clock: Clock, rows: FloatArray, fit: known_picture.Fit) -> Clock:
 
 
 def _less_ends(inside: BoolArray, rows: float) -> BoolArray:
-    """(C, S, R) strips on the screen, without so many rows at its ends."""
+    """(C, S, R) strips on the screen, without `rows` rows at its ends."""
     n = int(np.ceil(min(rows, SETTINGS.max_end_rows)))
     left = np.zeros_like(inside)
     left[..., n:-n] = inside[..., 2 * n :] & inside[..., : -2 * n]
@@ -492,7 +493,7 @@ def _less_ends(inside: BoolArray, rows: float) -> BoolArray:
 def _map(
     frame: Frame, corners: FloatArray, camera: Camera, acquisition: Acquisition, n_strips: int | None = None
 ) -> tracked.StripMap:
-    """Where the strips lie; as many as before where `n_strips` says so, for a picture known by strips cannot follow."""
+    """Map of the strips; `n_strips` keeps an earlier number of strips, which a known picture depends on."""
     n_columns = acquisition.screen.columns
     if n_strips is None:
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
@@ -505,17 +506,17 @@ def _shown(inside: NDArray[np.bool_], positions: FloatArray, clock: Clock) -> In
     """(n_copies, C, packet) 1 where the middle of a slot is on the screen."""
     on_screen = np.asarray(inside.any(axis=1))
     columns = np.arange(on_screen.shape[0]) % positions.shape[0]
-    first = positions[columns, on_screen.argmax(axis=1)][:, None]
-    last = positions[columns, on_screen.shape[1] - 1 - on_screen[:, ::-1].argmax(axis=1)][:, None]
+    start = positions[columns, on_screen.argmax(axis=1)][:, None]
+    end = positions[columns, on_screen.shape[1] - 1 - on_screen[:, ::-1].argmax(axis=1)][:, None]
     middles = np.arange(clock.n_slots) + 0.5
-    shown = (middles >= first) & (middles <= last) & np.asarray(on_screen.any(axis=1))[:, None]
+    shown = (middles >= start) & (middles <= end) & np.asarray(on_screen.any(axis=1))[:, None]
     return np.asarray(clock.to_copies(shown.astype(np.float32)), np.int64).transpose(1, 0, 2)
 
 
-def _apart(first: Clock, second: Clock) -> float:
-    """Slots between two clocks, whole packets aside."""
-    length = first.packet_slots
-    difference = first.first_slot - second.first_slot - (first.row0 - second.row0) / first.rows_per_slot
+def _clock_distance(left: Clock, right: Clock) -> float:
+    """Slots between two clocks, modulo the packet."""
+    length = left.packet_slots
+    difference = left.first_slot - right.first_slot - (left.row0 - right.row0) / left.rows_per_slot
     return float(abs((difference + length / 2) % length - length / 2))
 
 

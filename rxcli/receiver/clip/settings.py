@@ -1,4 +1,4 @@
-"""Numbers of policy of clips: what is carried over from frame to frame, and when it is checked."""
+"""Settings of clips: what is carried over from frame to frame, and when it is checked."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class ClipSettings:
     """Each with its unit and the reason for it."""
 
-    #: Strips of a column, at most: more tell no more of a picture that is known, and take time.
+    #: Maximum number of strips of a column: more do not improve a known picture, and take time.
     max_strips: int = 4
     #: Frames from which a frame is measured without what others that show its bursts have taught of the picture there;
     #: of fewer, too little would be left.
@@ -17,8 +17,8 @@ class ClipSettings:
     #: Movement that is none: pixels, or standard deviations of what was found.
     still_px: float = 0.3
     still_sds: float = 2.5
-    #: Where texture tells little: how well rest is known in screen sizes, and standard deviations of what may be rest;
-    #: and how well the place of one that does not rest is known.
+    #: With little texture: standard deviation of a screen at rest in screen sizes, standard deviations within which a
+    #: motion may be rest, and standard deviation of the position of a moving screen.
     rest_sd: float = 0.0005
     rest_sds: float = 4.0
     moving_sd: float = 0.003
@@ -28,7 +28,7 @@ class ClipSettings:
     #: deviation of the corners. A row beyond the end is dark, whatever the known picture expects there.
     min_end_rows: float = 1.0
     max_end_rows: float = 14.0
-    #: How often a still outline is looked for where the picture does not tell, and looks that make it still.
+    #: Interval of outline searches if the picture does not locate a screen at rest, and searches that establish rest.
     look_every: int = 8
     still_looks: int = 3
     #: In screen widths: how far an outline may be from where the screen was to be there still, and how far it may move
@@ -42,7 +42,7 @@ class ClipSettings:
     #: Frames from which the picture is learned one by one, and how often from then on.
     first_updates: int = 12
     update_every: int = 6
-    #: Frames of which the picture is known so little that strips are compared with what is expected of them.
+    #: Number of first frames with a poorly known picture, so that strips are compared with their expected light.
     few_updates: int = 4
     #: Columns decided worse than this many times the foreseen variance do not fit what is known; and of a screen
     #: that is taken to rest: while it does 0.8 to 1.3 times, 2 pixels away 2 times and more.
@@ -52,20 +52,20 @@ class ClipSettings:
     #: compression has taken much of it.
     min_header: float = 0.3
     faded: float = 0.85
-    #: Slots of lateness that are put right, of the clock and of its drift from halfway down to the last row: rows that
-    #: are instants drift by 0.02 at most, those that a camera has stretched to hold a picture still by 0.1 to 0.4. How
-    #: often such rows are timed anew.
+    #: Minimum lateness that is corrected, in slots, of the clock and of its drift from the middle to the last row: rows
+    #: that are instants drift by 0.02 at most, rows stretched by stabilisation by 0.1 to 0.4. Maximum number of
+    #: corrections.
     late_slots: float = 0.03
     retimings: int = 4
     #: Share of a frame's noise, and of its rows per slot, in what is expected of the next.
     frame_share: float = 0.2
-    #: Contrast of its headers at which the foretold clock is not doubted.
+    #: Contrast of its headers at which the predicted clock is accepted.
     good_header: float = 0.6
-    #: Contrast of its headers from which a foretold clock needs no shift; and step and number of shifts tried, slots.
+    #: Contrast of its headers from which a predicted clock needs no shift; and step and number of shifts tried, slots.
     plain_header: float = 0.8
     header_shift: float = 0.3
     max_shifts: int = 5
-    #: How much better its headers must show for a clock to be taken instead of the foretold one.
+    #: Gain in header contrast at which another clock replaces the predicted one.
     better_header: float = 0.1
     #: Variance of a strip's light, at least: that of a starved clip's dark parts is none.
     min_variance: float = 1e-7
@@ -75,18 +75,18 @@ class ClipSettings:
     frames_held: int = 6
     frames_held_long: int = 24
     much_doubt: float = 0.03
-    #: Passes over so few frames: what one of them was decided to be tells in the next of the others.
+    #: Number of passes over the held frames: decisions on one frame improve the picture for the others.
     looks_again: int = 2
     #: Share in doubt, before the frames held are measured again, that this would not mend: it is left out.
     too_much_doubt: float = 0.25
-    #: Share of columns that a quick look at a first frame may leave in doubt.
+    #: Maximum share of doubtful columns after the initial pass of a first frame.
     quick_doubt: float = 0.5
     #: Share of columns in doubt from which a first frame is not explained by the camera that is named, and below which
     #: it is by another.
     unlike_doubt: float = 0.85
     like_doubt: float = 0.65
-    #: Pixels of which one is compared with the frame before; least change from row to row, grey levels of 255, and
-    #: share of it that a frame shown twice differs from itself.
+    #: Spacing of the pixels compared with the frame before; minimum change from row to row, grey levels of 255, and
+    #: share of it by which a repeated frame may differ.
     same_step: int = 15
     same_contrast: float = 3.0
     same_share: float = 0.25
@@ -108,7 +108,7 @@ class ClipSettings:
     doubtful_log_prob: float = -0.05
     #: Squared contrast over variance of a slot, at which all copies of a packet together do not give one.
     dark_snr: float = 0.5
-    #: Dark columns are tried all the same in every so manieth frame.
+    #: Dark columns are tried all the same in one frame in this many.
     try_dark_every: int = 30
 
     #: Corners of two searches that differ by less than this, in screen widths, agree; searches where they do not.
