@@ -80,10 +80,10 @@ SOURCES = (
     *("outputs.py", "__init__.py", "receiver/reception.py", "calibrate", "ingest", "runs"),
     *("receiver/channel", "receiver/settings.py", "receiver/still.py", "receiver/pipeline.py", "receiver/__init__.py"),
     *("receiver/unknown_camera.py", "receiver/cameras.py", "results", "cli"),
-    *("receiver/corners.py", "receiver/plane", "receiver/screen", "receiver/search", "web"),
+    *("receiver/corners.py", "receiver/plane", "receiver/screen", "receiver/search", "receiver/clip", "web"),
 )
 #: Places whose prose is read, but not yet their names; one file holds a word in the text of a test picture.
-PROSE_ONLY = ("lab", "receiver/camera", "receiver/sampling", "receiver/clip")
+PROSE_ONLY = ("lab", "receiver/camera", "receiver/sampling")
 TEXT_IN_A_PICTURE = "lab/simulate/pictures.py"
 PAGES = (
     *("README.md", "sample_frames/README.md", "docs/README.md", "docs/architecture.md", "docs/auto_encoder.md"),

@@ -71,7 +71,7 @@ class FirstOutline:
         """(4, 2) in the first frame, by all frames so far."""
         return self._first + np.median(self._differences, axis=0)
 
-    def take(self, frame: Frame) -> None:
+    def add(self, frame: Frame) -> None:
         """Search the next frame, too."""
         if self.settled or self._texture is None:
             return

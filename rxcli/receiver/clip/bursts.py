@@ -97,9 +97,9 @@ class BurstReader:
             np.concatenate([w[c] for w, (_, c) in zip(weights, places, strict=True)]),
         )
         certain = posteriors.log_prob[0].min(axis=1) >= SETTINGS.certain_log_prob
-        for one in np.unique(number):
-            mine = np.flatnonzero(number == one)
-            self.open.store(int(one), column[mine], posteriors.of_columns(mine), certain[mine])
+        for value in np.unique(number):
+            mine = np.flatnonzero(number == value)
+            self.open.store(int(value), column[mine], posteriors.of_columns(mine), certain[mine])
         # Weights of columns that were certain are the only ones tried next, until they are not certain any more.
         self._weights[column] = False
         self._weights[column[certain], posteriors.w[certain] - 1] = True

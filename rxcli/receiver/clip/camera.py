@@ -35,7 +35,7 @@ class Settled:
     context: FrameContext
     acquisition: Acquisition
     #: Its initial pass, where there was one; what was decoded to refine its camera, where that was estimated.
-    first: Reception | None = None
+    initial: Reception | None = None
     reception: Reception | None = None
 
 
@@ -81,7 +81,7 @@ class ClipCamera:
     frame_kind: tuple[object, ...] = ()
     #: Whether the camera's profile was compared with the clip, and a message about it.
     profile_tried: bool = False
-    note: str | None = None
+    message: str | None = None
 
     def fits(self, frame: Frame) -> bool:
         """Whether a frame is of the kind that the camera is known for."""
@@ -137,9 +137,9 @@ class ClipCamera:
         if original.camera.hypothesis is not None:
             period_s = _shortest_period_s(frames) or np.inf
             readings += _readings_of(original, self.options.screens)
-            readings = [reading for reading in readings if _readout_periods(reading, period_s) <= 1]
-        starts = [(agree(frames, reading), reading) for reading in readings]
-        agreed = [(start.lead, start, reading) for start, reading in starts if start is not None]
+            readings = [estimate for estimate in readings if _readout_periods(estimate, period_s) <= 1]
+        starts = [(agree(frames, estimate), estimate) for estimate in readings]
+        agreed = [(start.lead, start, estimate) for start, estimate in starts if start is not None]
         if not agreed:
             return located, None
         _, start, chosen = max(agreed, key=lambda candidate: candidate[0])
@@ -186,7 +186,7 @@ class ClipCamera:
         ):
             return tried, None
         stretch = context.camera.line_delay_s / found.context.camera.line_delay_s
-        return replace(unnamed, context=found.context, note=_UNLIKE.format(stretch)), found
+        return replace(unnamed, context=found.context, message=_UNLIKE.format(stretch)), found
 
 
 def _readings_of(context: FrameContext, screens: Sequence[ScreenProfile]) -> Iterator[FrameContext]:
@@ -198,10 +198,8 @@ def _readings_of(context: FrameContext, screens: Sequence[ScreenProfile]) -> Ite
         same_rate = tuple(screen for screen in screens if screen.slot_rate_hz == slot_rate_hz)
         for reverse in (False, True):
             estimated = {**camera.estimated, "line_delay_s": (delay_s, scale * camera.estimated["line_delay_s"][1])}
-            reading = replace(
-                camera, line_delay_s=delay_s, exposure_s=exposure_s, reversed=reverse, estimated=estimated
-            )
-            yield replace(context, camera=reading, screens=same_rate)
+            scaled = replace(camera, line_delay_s=delay_s, exposure_s=exposure_s, reversed=reverse, estimated=estimated)
+            yield replace(context, camera=scaled, screens=same_rate)
 
 
 def _readout_periods(context: FrameContext, period_s: float) -> float:

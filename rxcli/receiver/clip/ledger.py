@@ -215,15 +215,15 @@ class Ledger:
         link, waiting = self._link, [w for w in self._waiting if w.view is not None]
         assert link is not None
         link.stamps_judged = True
-        first = waiting[0].view
-        assert first is not None
-        shown = np.ptp(np.flatnonzero(first.acquisition.profiles.inside.any(axis=(0, 1))))
-        rate_hz = first.acquisition.screen.slot_rate_hz
-        self._stretch = link.time.time_stamp_stretch(float(shown) / first.bursts.clock.rows_per_slot / rate_hz)
+        first_view = waiting[0].view
+        assert first_view is not None
+        shown = np.ptp(np.flatnonzero(first_view.acquisition.profiles.inside.any(axis=(0, 1))))
+        rate_hz = first_view.acquisition.screen.slot_rate_hz
+        self._stretch = link.time.time_stamp_stretch(float(shown) / first_view.bursts.clock.rows_per_slot / rate_hz)
         if self._stretch == link.time.stretch:
             return
         link.time = tracking.LinkTime(link.time.packet_slots, rate_hz, self._stretch or 1.0)
-        link.phase = tracking.BurstPhase(first.acquisition.repeats)
+        link.phase = tracking.BurstPhase(first_view.acquisition.repeats)
         link.stamps_judged = True
         self._bursts.begin()
         for each in waiting:
@@ -265,7 +265,7 @@ class Ledger:
             self._bursts.detect_stale(waiting)
         tracked = view is not None and view.flat is not None and self._bursts.open.is_open(int(numbers[-1]))
         if self._scene is not None and view is not None and tracked:
-            self._scene.take(view, lambda: self._bursts.lit(waiting))
+            self._scene.update(view, lambda: self._bursts.lit(waiting))
 
     def _add(self, waiting: Waiting) -> IntArray:
         """Add a frame to its bursts; returns their numbers."""
@@ -408,13 +408,13 @@ def _shape(view: View) -> tuple[int, int]:
     return view.acquisition.screen.columns, view.bursts.clock.packet_slots
 
 
-def _bursts_of(closed: Sequence[tracking.ClosedBurst], first: int, view: View) -> list[confidence.BurstInClip]:
-    """Bursts that end in the frame of a view, for `assemble`; `first` is the number of the frame's first burst."""
+def _bursts_of(closed: Sequence[tracking.ClosedBurst], first_number: int, view: View) -> list[confidence.BurstInClip]:
+    """Bursts that end in the frame of a view, for `assemble`; `first_number` is that of the frame's first burst."""
     n_strips = view.acquisition.sampler.binned.light.shape[1]
     return [
         confidence.BurstInClip(
             number=burst.number,
-            index=int(burst.number - first),
+            index=int(burst.number - first_number),
             posteriors=burst.posteriors,
             n_observed=burst.n_observed,
             frames=burst.frames,

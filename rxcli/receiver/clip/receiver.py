@@ -77,7 +77,7 @@ class Acquiring:
     """No frame has been received: the first ones wait until they agree."""
 
     known: Known
-    first: FirstFrames | None = None
+    started: FirstFrames | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,9 +114,9 @@ def step(state: State, frame: Frame) -> tuple[State, list[FrameResult]]:
 
 def finish(state: State) -> list[FrameResult]:
     """The results still held back."""
-    if not isinstance(state, Acquiring) or state.first is None:
+    if not isinstance(state, Acquiring) or state.started is None:
         return state.known.ledger.finish()
-    after, results = _receive_first(state.known, state.first)
+    after, results = _receive_first(state.known, state.started)
     return results + after.known.ledger.finish()
 
 
@@ -125,44 +125,44 @@ def finish(state: State) -> list[FrameResult]:
 
 def _acquire(state: Acquiring, frame: Frame) -> tuple[State, list[FrameResult]]:
     """Take one of the first frames; they are received once they agree on an outline and, perhaps, on a clock."""
-    known, first = state.known, state.first
-    if first is None:
+    known, started = state.known, state.started
+    if started is None:
         located = known.camera.locate(frame, Timer())
         if isinstance(located, Failure):
             after, results = _receive(Lost(known), frame, located)
             return Acquiring(after.known), results
         outline = FirstOutline(frame, located.outline.corners, known.camera.options, located.context)
-        first = FirstFrames(located, outline, (frame,))
+        started = FirstFrames(located, outline, (frame,))
     else:
-        first = _with_frame(known, first, frame)
-    little, unsettled = shows_little(first.located.context), first.located.camera_error == np.inf
+        started = _with_frame(known, started, frame)
+    little, unsettled = shows_little(started.located.context), started.located.camera_error == np.inf
     if unsettled:
         min_frames = SETTINGS.frames_held_long if little else SETTINGS.frames_together
     else:
         min_frames = SETTINGS.frames_together if little else 1
-    enough = first.outline.settled and len(first.frames) >= min_frames
-    return _receive_first(known, first) if enough else (Acquiring(known, first), [])
+    enough = started.outline.settled and len(started.frames) >= min_frames
+    return _receive_first(known, started) if enough else (Acquiring(known, started), [])
 
 
-def _with_frame(known: Known, first: FirstFrames, frame: Frame) -> FirstFrames:
+def _with_frame(known: Known, started: FirstFrames, frame: Frame) -> FirstFrames:
     """The first frames and one more; where each shows little or nothing, the surest of their cameras counts."""
-    first.outline.take(frame)
-    located = first.located
+    started.outline.add(frame)
+    located = started.located
     if located.camera_error == np.inf or (located.camera_error > 0 and shows_little(located.context)):
         located = located.with_surer_camera(known.camera.locate(frame, Timer()))
-    return FirstFrames(located, first.outline, (*first.frames, frame))
+    return FirstFrames(located, started.outline, (*started.frames, frame))
 
 
-def _receive_first(known: Known, first: FirstFrames) -> tuple[State, list[FrameResult]]:
+def _receive_first(known: Known, started: FirstFrames) -> tuple[State, list[FrameResult]]:
     """Receive the first frames: they have agreed on an outline and, where each shows little, on a clock."""
-    located = first.located.moved_to(first.outline.corners)
-    if isinstance(located.found, Found) and located.found.best.context.frame is not first.frames[0]:
+    located = started.located.moved_to(started.outline.corners)
+    if isinstance(located.found, Found) and located.found.best.context.frame is not started.frames[0]:
         located = replace(located, found=None)
-    camera, located = known.camera.read_in_time(located, first.frames)
-    if len(first.frames) > 1 and shows_little(located.context):
-        located, known.ledger.start = camera.with_common_clock(located, first.frames)
-    after, results = _receive(Lost(replace(known, camera=camera)), first.frames[0], located)
-    for frame in first.frames[1:]:
+    camera, located = known.camera.read_in_time(located, started.frames)
+    if len(started.frames) > 1 and shows_little(located.context):
+        located, known.ledger.start = camera.with_common_clock(located, started.frames)
+    after, results = _receive(Lost(replace(known, camera=camera)), started.frames[0], located)
+    for frame in started.frames[1:]:
         after, more = _receive(after, frame)
         results += more
     return after, results
@@ -194,8 +194,8 @@ def _receive(
         state, view, report = _receive_anew(state, frame, located, timer)
         waiting.result = replace(waiting.result, denoiser=report)
     camera = state.known.camera
-    if camera.note and not waiting.result.message:
-        waiting.result = replace(waiting.result, message=camera.note)
+    if camera.message and not waiting.result.message:
+        waiting.result = replace(waiting.result, message=camera.message)
     if isinstance(view, Failure):
         waiting.result = replace(waiting.result, status=view.status, message=view.message, timing_ms=timer.total())
         return state, ledger.add(waiting, scene_ends=True)
@@ -314,7 +314,7 @@ def _receive_anew(
             camera.options.corners is not None,
         )
         view.light, view.pose = scene.strips(frame), scene.pose
-    scene.take(view, lambda: reception.clock.on_grid(reception.posteriors.lit))
+    scene.update(view, lambda: reception.clock.on_grid(reception.posteriors.lit))
     if before is not None and n_unknown <= SETTINGS.max_unknown_frames and _goes_on(before, scene, view, ledger.time):
         # A hand before the screen, or a frame too quick to be followed, is no reason to learn the picture anew.
         before.seek(scene.corners)
@@ -343,12 +343,12 @@ def _decoded(settled: Settled, known: Known, timer: Timer) -> tuple[Reception, f
     options, acquisition, reception = known.camera.options, settled.acquisition, settled.reception
     if reception is None:
         with timer("detect"):
-            first = settled.first or initial_pass(acquisition)
-            few_doubtful = doubtful_columns(first).size <= SETTINGS.quick_doubt * first.snr.shape[0]
+            initial = settled.initial or initial_pass(acquisition)
+            few_doubtful = doubtful_columns(initial).size <= SETTINGS.quick_doubt * initial.snr.shape[0]
             measured_again = known.ledger.holds_first and _can_track(settled, options)
             if measured_again and options.cae != "always" and few_doubtful:
-                return first, frozenset(), None
-            reception = decode(acquisition, options.skip, first)
+                return initial, frozenset(), None
+            reception = decode(acquisition, options.skip, initial)
     with timer("denoise"):
         return apply_autoencoder(acquisition, reception, options)
 

@@ -368,7 +368,7 @@ class TrackedScreen:
 
     # -- the picture ----------------------------------------------------------------------------------------------
 
-    def take(self, view: View, lit: Callable[[], Float32Array]) -> None:
+    def update(self, view: View, lit: Callable[[], Float32Array]) -> None:
         """Set the frame that was received last; learn from the first frames, and from some later ones.
 
         Args:
@@ -393,9 +393,11 @@ class TrackedScreen:
         positions = known_picture.row_positions(view.pose.rows, clock)
         slots = SlotLight(lit).mean_over(positions, clock.exposure_slots)
         trust = known_picture.trusted(lit, positions, clock.exposure_slots)
-        look = known_picture.Observation(view.light, slots, trust, view.pose.placement, self._frame_rows(view.pose))
-        self._picture.learn(look, forget=forget)
-        return look
+        observation = known_picture.Observation(
+            view.light, slots, trust, view.pose.placement, self._frame_rows(view.pose)
+        )
+        self._picture.learn(observation, forget=forget)
+        return observation
 
     def _frame_rows(self, pose: Pose) -> Float32Array | None:
         """(C, P) row of a frame that shows each row of the picture; None where that is where the first one did."""
@@ -427,12 +429,14 @@ class TrackedScreen:
         """
         self._n_updates = 0
         self._picture = self._new_picture(self._dark_light(views))
-        looks = [self.learn(view, lit, forget=False) for view, lit in zip(views, known, strict=True)]
-        for view, look, lit, shown, needed in zip(views, looks, known, numbers, doubtful, strict=True):
+        observations = [self.learn(view, lit, forget=False) for view, lit in zip(views, known, strict=True)]
+        for view, observation, lit, shown, needed in zip(views, observations, known, numbers, doubtful, strict=True):
             if needed:
-                others = zip(looks, views, numbers, strict=True) if len(views) >= SETTINGS.enough_views else ()
-                own = (_of_bursts(*each, shown) for each in others if each[1] is not view)
-                self._measure_again(view, [each for each in (look, *own) if each is not None], lit)
+                remaining = (
+                    zip(observations, views, numbers, strict=True) if len(views) >= SETTINGS.enough_views else ()
+                )
+                own = (_of_bursts(*each, shown) for each in remaining if each[1] is not view)
+                self._measure_again(view, [each for each in (observation, *own) if each is not None], lit)
 
     def _dark_light(self, views: Sequence[View]) -> Float32Array:
         """(C, S) light of the strips where nothing is lit."""
@@ -463,15 +467,15 @@ class TrackedScreen:
 
 
 def _of_bursts(
-    look: known_picture.Observation | None, view: View, numbers: IntArray, bursts: IntArray
+    observation: known_picture.Observation | None, view: View, numbers: IntArray, bursts: IntArray
 ) -> known_picture.Observation | None:
     """What a frame that shows the bursts `numbers` taught where it shows some of the `bursts`; None where none."""
-    if look is None or view.pose is None or not np.isin(numbers, bursts).any():
+    if observation is None or view.pose is None or not np.isin(numbers, bursts).any():
         return None
     clock = view.bursts.clock
     slots = np.clip((view.pose.rows - clock.row0) / clock.rows_per_slot, 0, clock.n_slots - 1)
     copies = (slots.astype(np.int64) + clock.first_slot) // clock.packet_slots
-    return replace(look, rows=np.isin(numbers[clock.burst[copies]], bursts))
+    return replace(observation, rows=np.isin(numbers[clock.burst[copies]], bursts))
 
 
 def _retimed(clock: Clock, rows: FloatArray, fit: known_picture.Fit) -> Clock:
