@@ -63,9 +63,13 @@ class Acquisition:
 
     def middle(self) -> Acquisition:
         """The acquisition of the middle half of the columns, strips binned in pairs."""
-        n_columns, profiles, rows = self.screen.columns, self.sampler.binned, self.sampler.binned.sensor_row
-        part = slice(n_columns // 4, n_columns - n_columns // 4)
-        middle = replace(
+        n_columns = self.screen.columns
+        return self.of_columns(slice(n_columns // 4, n_columns - n_columns // 4))
+
+    def of_columns(self, part: slice) -> Acquisition:
+        """The acquisition of some columns, strips binned in pairs."""
+        profiles, rows = self.sampler.binned, self.sampler.binned.sensor_row
+        chosen = replace(
             profiles,
             light=profiles.light[part],
             inside=profiles.inside[part],
@@ -73,7 +77,7 @@ class Acquisition:
             sensor_row=None if rows is None else rows[part],
         )
         clock = replace(self.clock, delay_slots=self.clock.delay_slots[part])
-        return replace(self, sampler=ColumnSampler(middle, middle), clock=clock)
+        return replace(self, sampler=ColumnSampler(chosen, chosen), clock=clock)
 
     def as_one_column(self) -> Acquisition:
         """The acquisition with every column as a strip of a single one."""

@@ -17,6 +17,7 @@ from rxcli.receiver.search import evidence
 from rxcli.receiver.search.explain import why_no_packets
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
 from rxcli.receiver.search.nulls import light_without_data
+from rxcli.receiver.search.numbers import less_likely_outlines
 from rxcli.receiver.search.outlines import numbered
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
@@ -57,6 +58,8 @@ def search(
         best = walk.best_without_packets()
     if best is None:
         return replace(why_no_packets(proposer, walk.nearest, walk.failure), tried=walk.record(None))
+    if best.evidence >= SETTINGS.few_packets:
+        outlines = list(less_likely_outlines(best, outlines, proposer))
     chosen = replace(
         numbered(best.hypothesis.outline, outlines, walk.score_of), corners=best.hypothesis.corners, other_rows=()
     )

@@ -26,6 +26,7 @@ from rxcli.receiver.pipeline import receive_frame
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.evidence import distinct_share
+from rxcli.receiver.search.numbers import less_likely_outlines
 from rxcli.receiver.search.propose import Proposer
 from rxcli.types import Frame, FrameResult
 
@@ -136,6 +137,20 @@ def test_columns_that_repeat_their_neighbour_say_nothing_more(repeats: int, shar
     lit = np.random.default_rng(repeats).random((2, 100 // repeats, 260)).repeat(repeats, axis=1) > 0.5
     reception: Any = SimpleNamespace(posteriors=SimpleNamespace(lit=lit.astype(np.float32)), snr=np.zeros((100, 1)))
     assert distinct_share(reception) == pytest.approx(share, abs=0.02)
+
+
+def test_columns_with_packets_are_not_left_out_of_the_screen() -> None:
+    trial = trial_of("paper-17k3")
+    options, timer = ReceiverOptions(corners=trial.corners, cameras=(trial.camera,), force_camera=True), Timer()
+    found = search(trial.frame, options, timer)
+    assert isinstance(found, Found)
+    own = found.best.hypothesis.outline
+    side = (own.corners[1] - own.corners[0]) / found.best.hypothesis.screen.columns
+    rivals = [replace(own, corners=own.corners + shift * side, log_odds=-0.5) for shift in (-2, 1)]
+    proposer = Proposer(trial.frame, options, timer, (own, *rivals), None)
+    kept, *less_likely = less_likely_outlines(found.best, (own, *rivals), proposer)
+    assert kept is own
+    assert max(one.log_odds for one in less_likely) < -3.0
 
 
 def test_every_hypothesis_is_recorded_with_its_fate(tmp_path: Path) -> None:
