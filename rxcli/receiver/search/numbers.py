@@ -1,7 +1,7 @@
 """How sure the number of the first column is, by the packets of the outermost columns.
 
-Outlines of one family share all columns but the outermost. A column of the screen has packets of its own; one beyond
-its side has none, or those that its neighbour sheds there.
+Outlines of one family share all columns but the outermost. A column of the screen has its own packets; one beyond its
+side has none, or its neighbour's.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _BESIDE = 2
 
 
 def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Proposer) -> Iterator[Outline]:
-    """Yield the outlines; those that lack columns with packets of the best one's get lower log-odds.
+    """Yield the outlines, with lower log-odds where they leave out columns with packets.
 
     Args:
         best: the hypothesis that was chosen.
@@ -35,22 +35,22 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
     """
     own, n_columns = best.hypothesis.outline, best.hypothesis.screen.columns
     acquisition = replace(best.acquisition, clock=best.reception.clock)
-    for other in outlines:
-        shift = _columns_between(own, other, n_columns)
-        is_rival = other.family == own.family and other.log_odds > own.log_odds - SETTINGS.rival_log_odds
+    for rival in outlines:
+        shift = _columns_between(own, rival, n_columns)
+        is_rival = rival.family == own.family and rival.log_odds > own.log_odds - SETTINGS.rival_log_odds
         if not is_rival or not 0 < abs(shift) <= SETTINGS.max_shift:
-            yield other
+            yield rival
             continue
-        moved = replace(best.hypothesis, outline=other, rows=0, camera=best.context.camera)
+        moved = replace(best.hypothesis, outline=rival, rows=0, camera=best.context.camera)
         sampler = sample_columns(proposer.context(moved), n_columns)
         gain = _outer_evidence(replace(acquisition, sampler=sampler), -shift) - _outer_evidence(acquisition, shift)
-        yield replace(other, log_odds=other.log_odds + SETTINGS.outer_weight * min(gain, 0.0))
+        yield replace(rival, log_odds=rival.log_odds + SETTINGS.outer_weight * min(gain, 0.0))
 
 
-def _columns_between(own: Outline, other: Outline, n_columns: int) -> int:
+def _columns_between(own: Outline, rival: Outline, n_columns: int) -> int:
     """Columns by which an outline begins further to the viewer's right than one's own."""
     side = own.corners[1] - own.corners[0]
-    return round(float((other.corners[0] - own.corners[0]) @ side / (side @ side)) * n_columns)
+    return round(float((rival.corners[0] - own.corners[0]) @ side / (side @ side)) * n_columns)
 
 
 def _outer_evidence(acquisition: Acquisition, n: int) -> float:
