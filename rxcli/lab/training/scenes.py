@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.benchmark.draw import phone_of
+from rxcli.lab.benchmark.draw import phone_of, screen_of
 from rxcli.lab.simulate.pictures import draw_dark_picture, load_picture
-from rxcli.lab.simulate.scenes import Scene, preset
+from rxcli.lab.simulate.scenes import Scene, preset, random_scene
 
 #: scikit-image's pictures that training may use; the others are for validation.
 TRAINING_PHOTOS = ("camera", "coins", "hubble", "moon", "page", "retina")
@@ -19,7 +19,9 @@ _DRAWN_DARK = ("terminal", "night", "stars")
 #: Shares of parts of photographs and of scattered shapes among the pictures; the others are dark ones.
 _PHOTOS, _SHAPES = 0.5, 0.35
 #: Width of simulated sensors: narrow ones are quick, and lateral pixels are averaged in strips anyway.
-_WIDTHS = (800, 1400)
+_WIDTHS = (800, 2000)
+#: Shares of random phones and of screens anywhere in a picture among the scenes; the others are random scenes.
+_PHONES, _SCREENS = 0.4, 0.25
 
 Picture = NDArray[np.uint8]
 
@@ -77,11 +79,14 @@ def _shapes(rng: np.random.Generator, width: int, height: int) -> NDArray[np.flo
 
 
 def training_scene(rng: np.random.Generator) -> Scene:
-    """A scene to learn from: a random phone in scarce light, because on easy scenes there is nothing to learn."""
-    phone, _ = phone_of(int(rng.integers(2**31)), int(rng.integers(2**31)))
+    """A scene to learn from: one of the benchmark's in scarce light, because on easy scenes there is nothing to learn.
+
+    Pictures and noise are drawn anew, so that no picture and no camera of the benchmark is learned.
+    """
+    base = _base_scene(rng)
     white_e = 10 ** rng.uniform(0.5, 2.0)
     sensor = replace(
-        phone.sensor,
+        base.sensor,
         cfa="rgb" if rng.random() < 0.5 else "bayer",
         response=(float(rng.uniform(0.45, 0.7)), 1.0, float(rng.uniform(0.5, 0.75))),
         read_noise_e=float(rng.uniform(1.2, 4.0)),
@@ -89,15 +94,24 @@ def training_scene(rng: np.random.Generator) -> Scene:
         full_scale_e=white_e * float(rng.uniform(2.0, 5.0)),
     )
     scene = replace(
-        phone,
-        picture=random_picture(rng, phone.screen.width_px, phone.screen.height_px),
+        base,
+        picture=random_picture(rng, base.screen.width_px, base.screen.height_px),
         sensor=sensor,
-        room=replace(phone.room, light_e_per_s=white_e / phone.exposure_s * 10 ** rng.uniform(-3, -0.7)),
-        isp=replace(phone.isp, quality=int(rng.choice([75, 85, 90, 95]))),
-        light_e_per_s=white_e / phone.exposure_s,
+        room=replace(base.room, light_e_per_s=white_e / base.exposure_s * 10 ** rng.uniform(-3, -0.7)),
+        isp=replace(base.isp, quality=int(rng.choice([75, 85, 90, 95]))),
+        light_e_per_s=white_e / base.exposure_s,
         camera_name="training",
     )
     return scene.scaled(min(rng.uniform(*_WIDTHS) / sensor.width, 1.0), 1.0)
+
+
+def _base_scene(rng: np.random.Generator) -> Scene:
+    kind, seed = rng.random(), int(rng.integers(2**31))
+    if kind < _PHONES:
+        return phone_of(seed, 0)[0]
+    if kind < _PHONES + _SCREENS:
+        return screen_of(seed, 0)[0]
+    return replace(random_scene(rng), orientation=1)
 
 
 @dataclass(frozen=True)
