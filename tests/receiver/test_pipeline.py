@@ -313,7 +313,7 @@ def test_a_screen_too_small_says_how_much_it_needs() -> None:
     quick = msgspec.structs.replace(camera, modes=(msgspec.structs.replace(mode, line_delay_s=line_delay / 4),))
     result = received(frame_of(taken, pixels), replace(options, cameras=(quick,)))
     assert result.message is not None
-    assert result.message.index("the screen may be another one") < result.message.index("a faster slot rate")
+    assert result.message.index("the screen may have no profile here") < result.message.index("a faster slot rate")
 
 
 def without_signal(kind: str, taken: Capture) -> NDArray[np.uint8]:

@@ -82,7 +82,7 @@ def _waves(
     places = np.stack([strips.raw_x, strips.raw_y], axis=-1) * strips.width
     places += (np.array([strips.width, strips.height]) - 1) / 2
     sensor_row = (places if lens is None or not lens.corrected else geometry.distort(places, lens))[..., 1]
-    rows = (np.arange(n_windows * n_rows) * strips.row_step).reshape(n_windows, n_rows)
+    rows = (np.arange(n_windows * n_rows) * strips.short_rows).reshape(n_windows, n_rows)
     windows = np.tile(np.arange(n_windows), strips.n_parts)[:, None]
     inside = (column > 0) & (column < n_columns)
     cell = (np.clip(column, 0, n_columns - 1).astype(np.int64) * n_windows + windows)[inside]

@@ -42,9 +42,8 @@ class Strips:
     half_height: float
     #: (W, R) row noise that was projected off the strips of each window of rows.
     row_noise: Float32Array
-    #: Rows that the band pass averages, and picture rows from one row of `changes` to the next.
+    #: Rows that the band pass averages: picture rows from one row of `changes` to the next.
     short_rows: int
-    row_step: int
     #: Independent rows of a block: an incoherent pair of strips has a variance of one over these.
     n_rows: float
     #: Parts of the picture's width: 1, or more where columns are narrow.
@@ -86,13 +85,12 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
     width, height, n_windows = plane.width, plane.height, SETTINGS.n_windows
     light, x = _light_of_strips(plane, n_parts)
     short = _short_rows(light)
-    step = (short + 1) // 2
-    band = _band_passed(light, short, step)
+    band = _band_passed(light, short)
     rows = band.shape[1] // n_windows
-    middles = (np.arange(n_windows) * rows + (rows - 1) / 2) * step
+    middles = (np.arange(n_windows) * rows + (rows - 1) / 2) * short
     points = np.stack(np.meshgrid(x, middles), axis=-1)
     quiet, lit, noise = _without_row_noise(_windows(band))
-    level = light[:, : rows * step * n_windows].reshape(x.size, n_windows, rows * step).mean(axis=2).T
+    level = light[:, : rows * short * n_windows].reshape(x.size, n_windows, rows * short).mean(axis=2).T
 
     def parted(values: NDArray[_Real]) -> NDArray[_Real]:
         """(W, S, ...) as (parts x W, S / parts, ...)."""
@@ -109,10 +107,9 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
         raw_y,
         x_flat,
         y_flat,
-        half_height=rows * step / 2 / width,
+        half_height=rows * short / 2 / width,
         row_noise=noise,
         short_rows=short,
-        row_step=step,
         n_rows=_independent_rows(quiet, lit),
         n_parts=n_parts,
         width=width,
@@ -153,12 +150,12 @@ def _lit_coherence(strips: Strips, widths: float) -> float:
     return float((strips.coherence(distance) * share).sum() / (np.square(share).sum() + TINY))
 
 
-def _band_passed(light: Float32Array, short: int, step: int) -> Float32Array:
-    """(S, R / step) light averaged over a few rows, minus its mean over many, at every `step`-th row."""
+def _band_passed(light: Float32Array, short: int) -> Float32Array:
+    """(S, R / short) light averaged over a few rows, minus its mean over many."""
     import cv2
 
-    whole = light.shape[1] // step * step
-    return np.asarray((cv2.blur(light, (short, 1)) - cv2.blur(light, (8 * short, 1)))[:, :whole:step], np.float32)
+    whole = light.shape[1] // short * short
+    return np.asarray((cv2.blur(light, (short, 1)) - cv2.blur(light, (8 * short, 1)))[:, :whole:short], np.float32)
 
 
 def _short_rows(light: Float32Array) -> int:
