@@ -20,7 +20,7 @@ from rxcli.receiver.screen.strips import Strips
 from rxcli.receiver.screen.waveforms import Mixes, offsets_of_known
 from rxcli.types import Clock, Float32Array, FloatArray, Lens
 
-#: Changes of light below which waves are set to zero: products of smaller numbers would be denormal and slow.
+#: Changes of light below which waves are set to zero: products of smaller numbers take many times the time.
 _MIN_WAVE = 1e-3
 
 

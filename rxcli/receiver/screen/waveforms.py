@@ -19,7 +19,7 @@ from rxcli.types import BoolArray, Float32Array, FloatArray
 #: Maximum number of columns of a block: on a plane viewed nearly edge-on the grid counts any number.
 _MAX_COLUMNS = 64
 _TINY = np.float32(1e-6)
-#: Logarithm of the minimum share of a column: products of smaller numbers would be denormal and slow.
+#: Logarithm of the minimum share of a column: products of smaller numbers take many times the time.
 _MIN_SHARE = np.float32(-30)
 
 
