@@ -276,7 +276,7 @@ def test_frames_that_show_little_find_their_clock_after_others_without_a_screen(
     frames = (*(replace(f, pixels=wall) for f in clip[0][:3]), *clip[0][3:])
     results, score = received(clip, frames)
     assert [r.status for r in results[:3]] == ["no_screen"] * 3
-    assert score.error_free + score.extra_error_free >= 16
+    assert score.error_free + score.extra_error_free >= 20
     assert surely_wrong(results) == 0
 
 
@@ -361,5 +361,5 @@ def test_a_quick_clip_of_an_unknown_camera_is_received_wherever_it_begins(quick_
     """No frame shows a whole packet; the surest of the first frames' cameras reads all of them."""
     frames, truth, _ = quick_clip
     results, score = received((frames, truth, ReceiverOptions()), frames[cut : cut + 15])
-    assert score.error_free + score.extra_error_free >= 20
+    assert score.error_free + score.extra_error_free >= 16
     assert surely_wrong(results) == 0
