@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,6 +164,17 @@ class RowProfiles:
         pixel = self.noise_floor + self.noise_slope * np.maximum(self.light, 0)
         return np.asarray(pixel / np.maximum(self.count, 1.0)[:, :, None], np.float32)
 
+    def of_columns(self, columns: IntArray | slice) -> Self:
+        """The profiles of some columns."""
+        rows = self.sensor_row
+        return replace(
+            self,
+            light=self.light[columns],
+            inside=self.inside[columns],
+            sensor_row=None if rows is None else rows[columns],
+            count=self.count[columns],
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Clock:
@@ -221,6 +232,10 @@ class SlotSamples:
     #: (C, S, N * Q) float32: 1 where the sample lies on the screen, else 0.
     valid: Float32Array
     samples_per_slot: int
+
+    def of_columns(self, columns: IntArray) -> Self:
+        """The samples of some columns."""
+        return replace(self, light=self.light[columns], valid=self.valid[columns])
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,14 +68,7 @@ class Acquisition:
 
     def of_columns(self, part: slice) -> Acquisition:
         """The acquisition of some columns, strips binned in pairs."""
-        profiles, rows = self.sampler.binned, self.sampler.binned.sensor_row
-        chosen = replace(
-            profiles,
-            light=profiles.light[part],
-            inside=profiles.inside[part],
-            count=profiles.count[part],
-            sensor_row=None if rows is None else rows[part],
-        )
+        chosen = self.sampler.binned.of_columns(part)
         clock = replace(self.clock, delay_slots=self.clock.delay_slots[part])
         return replace(self, sampler=ColumnSampler(chosen, chosen), clock=clock)
 

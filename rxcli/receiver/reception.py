@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel, sync
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import assemble, confidence, detect
@@ -43,6 +43,12 @@ class Reception:
         packets = self.posteriors.log_evidence - np.log(len(WEIGHTS))
         share = self.posteriors.w / SLOTS_PER_SYMBOL
         return np.asarray(packets - detect.free_log_evidence(self.metrics, share))
+
+    @property
+    def payload_lit(self) -> Float32Array:
+        """(C, slots) probability that each payload slot of all bursts is lit."""
+        lit = self.posteriors.lit[..., PREAMBLE_SLOTS:]
+        return lit.transpose(1, 0, 2).reshape(lit.shape[1], -1)
 
     @cached_property
     def packet_confidence(self) -> FloatArray:

@@ -221,7 +221,7 @@ def _with_compared_words(
     posteriors, doubtful = detect.detect_with_candidates(
         bursts, candidates, STILL.doubtful_word_log_prob, STILL.n_candidate_words
     )
-    samples = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
+    samples = scene.samples.of_columns(columns)
     lit = clock.on_grid(reception.posteriors.with_columns(columns, posteriors).lit)
     compared = doubtful.log_prob[:, 0] > STILL.hopeless_word_log_prob
     places, words = doubtful.places[compared], doubtful.words[compared]
@@ -233,7 +233,7 @@ def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: 
     """Receive some columns on the fine grid after removal of row noise."""
     samples, model = _view(acquisition, reception, np.arange(reception.snr.shape[0]), denoise.SAMPLES_PER_SLOT)
     scene = denoise.remove_row_noise(reception.scene_of(samples, model))
-    asked = replace(scene.samples, light=scene.samples.light[columns], valid=scene.samples.valid[columns])
+    asked = scene.samples.of_columns(columns)
     likelihoods = channel.slot_likelihoods(asked, reception.clock, model, scene.lit, columns, timing=False)
     cleaned = replace(reception, cleaned=(scene.samples, model))
     return _with_metrics(cleaned, columns, likelihoods.metrics, likelihoods.snr)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.decode import detect
@@ -49,7 +48,7 @@ def score(reception: Reception, acquisition: Acquisition, evidence: float, log_p
 
 def distinct_share(reception: Reception) -> float:
     """Share of the columns' slots that is independent of the neighbour's: too narrow columns repeat one packet."""
-    slots = reception.posteriors.lit[..., PREAMBLE_SLOTS:].transpose(1, 0, 2).reshape(reception.snr.shape[0], -1)
+    slots = reception.payload_lit
     if len(slots) < 2:
         return 1.0
     slots = slots - slots.mean(axis=1, keepdims=True)

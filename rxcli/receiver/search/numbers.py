@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.context import Outline
 from rxcli.receiver.reception import Reception
@@ -64,5 +63,5 @@ def _outer_evidence(acquisition: Acquisition, n: int) -> float:
 
 def _differs(reception: Reception, columns: IntArray, neighbours: IntArray) -> BoolArray:
     """Whether the packets of columns are others than those of their neighbours."""
-    slots = reception.posteriors.lit[..., PREAMBLE_SLOTS:].transpose(1, 0, 2).reshape(reception.snr.shape[0], -1)
+    slots = reception.payload_lit
     return np.asarray((slots[columns] != slots[neighbours]).mean(axis=1) > SETTINGS.same_slots)

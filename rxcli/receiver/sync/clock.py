@@ -378,21 +378,10 @@ def sample_slots(
     n = clock.n_slots * samples_per_slot
     delays = clock.delay_slots if columns is None else clock.delay_slots[columns]
     if columns is not None:
-        profiles = _of_columns(profiles, columns)
+        profiles = profiles.of_columns(columns)
     row0 = clock.row0 + delays * clock.rows_per_slot if delays.any() else clock.row0
     light, valid = resample(profiles, row0, step, n)
     return SlotSamples(light, valid, samples_per_slot)
-
-
-def _of_columns(profiles: RowProfiles, columns: IntArray) -> RowProfiles:
-    rows = profiles.sensor_row
-    return replace(
-        profiles,
-        light=profiles.light[columns],
-        inside=profiles.inside[columns],
-        sensor_row=None if rows is None else rows[columns],
-        count=profiles.count[columns],
-    )
 
 
 def assign_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> Clock:
