@@ -35,8 +35,8 @@ CALIBRATION_SAMPLES = 12
 def train(out: Path, **options: Any) -> None:
     """Fit the auto-encoder on simulated scenes and write a model folder to OUT.
 
-    Needs the extra `train` (PyTorch on the CPU is enough). The data sets are kept and used again. OUT gets
-    model.onnx, model.toml and loss.png.
+    Needs the extra `train` (PyTorch on the CPU is enough). OUT gets model.onnx, model.toml and loss.png. The data sets
+    and a checkpoint of the fit are kept; the same command resumes an interrupted run.
     """
     for package in ("torch", "onnx", "matplotlib"):
         if find_spec(package) is None:

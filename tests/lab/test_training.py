@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ SEED = 9
 
 
 @pytest.fixture(scope="module")
-def samples(tmp_path_factory: pytest.TempPathFactory) -> list[fit.Sample]:
+def samples(tmp_path_factory: pytest.TempPathFactory) -> list[dataset.Sample]:
     """Of a frame whose columns are doubtful."""
     return dataset.frame_samples(1, SEED, tmp_path_factory.mktemp("data"), progress=False)
 
@@ -48,11 +49,11 @@ def test_random_pictures_are_seeded_and_have_contrast(seed: int) -> None:
     assert one.std() > 1
 
 
-def test_samples_tell_what_was_sent(samples: list[fit.Sample]) -> None:
+def test_samples_tell_what_was_sent(samples: list[dataset.Sample]) -> None:
     """The light model alone finds most words, and nearly all where it is sure."""
     assert len(samples) == 1
     sample = samples[0]
-    known = sample.words != fit.UNKNOWN
+    known = sample.words != dataset.UNKNOWN
     assert known.mean() > 0.3
     best = sample.scores.argmax(axis=-1)
     assert (best == sample.words)[known].mean() > 0.4
@@ -83,17 +84,17 @@ def test_words_are_scored_as_the_detector_would() -> None:
         np.testing.assert_allclose(scores[symbol, : len(wanted)], wanted, atol=0.05)
 
 
-def test_a_network_that_corrects_nothing_leaves_the_light_models_loss(samples: list[fit.Sample]) -> None:
+def test_a_network_that_corrects_nothing_leaves_the_light_models_loss(samples: list[dataset.Sample]) -> None:
     sample = samples[0]
     columns = np.arange(sample.w.size)
-    known = sample.words != fit.UNKNOWN
+    known = sample.words != dataset.UNKNOWN
     scores = sample.scores[known].astype(np.float64)
     right = np.take_along_axis(scores, sample.words[known][:, None], axis=1)[:, 0]
     wanted = (np.log(np.exp(scores).sum(axis=1)) - right).mean()
     assert fit.loss_of(StripNetwork(SMALL), sample, columns).item() == pytest.approx(wanted, rel=1e-4)
 
 
-def test_corrections_of_all_copies_count(samples: list[fit.Sample]) -> None:
+def test_corrections_of_all_copies_count(samples: list[dataset.Sample]) -> None:
     """A network that knew the slots would leave no loss."""
     sample = samples[0]
 
@@ -107,8 +108,8 @@ def test_corrections_of_all_copies_count(samples: list[fit.Sample]) -> None:
     for row, w in enumerate(sample.w):
         for slot, place in enumerate(grid):
             burst, at = sample.burst[place // length], place % length - 20
-            word = sample.words[burst, row, at // 10] if at >= 0 else fit.UNKNOWN
-            if word != fit.UNKNOWN:
+            word = sample.words[burst, row, at // 10] if at >= 0 else dataset.UNKNOWN
+            if word != dataset.UNKNOWN:
                 corrections[row, slot] = 100 * (2.0 * codebook(int(w))[word, at % 10] - 1)
     assert fit.loss_of(Knowing(), sample, np.arange(sample.w.size)).item() < 1e-3
 
@@ -125,7 +126,7 @@ def test_data_sets_are_kept_and_made_again_where_damaged(tmp_path: Path) -> None
     assert path.stat().st_mtime_ns == stamp
 
 
-def test_fitting_learns(samples: list[fit.Sample], tmp_path: Path) -> None:
+def test_fitting_learns(samples: list[dataset.Sample], tmp_path: Path) -> None:
     before = fit.mean_loss(StripNetwork(SMALL), samples)
     recipe = fit.Recipe(SMALL, steps=60, learning_rate=1e-2)
     history = fit.fit(samples, samples, recipe, tmp_path, progress=False).history
@@ -138,10 +139,42 @@ def test_nothing_is_learned_from_nothing(tmp_path: Path) -> None:
         fit.fit([], [], fit.Recipe(SMALL, steps=1), tmp_path, progress=False)
 
 
-def test_equal_recipes_give_equal_weights(samples: list[fit.Sample], tmp_path: Path) -> None:
-    one, two = (fit.fit(samples, [], fit.Recipe(SMALL, steps=4), tmp_path, progress=False) for _ in range(2))
+def test_equal_recipes_give_equal_weights(samples: list[dataset.Sample], tmp_path: Path) -> None:
+    folders = (tmp_path / "one", tmp_path / "two")
+    one, two = (fit.fit(samples, [], fit.Recipe(SMALL, steps=4), folder, progress=False) for folder in folders)
     for name, weights in one.network.state_dict().items():
         np.testing.assert_array_equal(two.network.state_dict()[name].numpy(), weights.numpy(), err_msg=name)
+
+
+def test_an_interrupted_fit_is_resumed(
+    samples: list[dataset.Sample], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fit, "_CHECKPOINT_EVERY", 2)
+    recipe, n_steps, loss = fit.Recipe(SMALL, steps=5), 0, fit._drawn_loss
+
+    def interrupted_loss(*batch: Any) -> torch.Tensor:
+        nonlocal n_steps
+        n_steps += 1
+        if n_steps == 4:
+            raise KeyboardInterrupt
+        return loss(*batch)
+
+    whole = fit.fit(samples, samples, recipe, tmp_path / "whole", progress=False)
+    monkeypatch.setattr(fit, "_drawn_loss", interrupted_loss)
+    with pytest.raises(KeyboardInterrupt):
+        fit.fit(samples, samples, recipe, tmp_path / "resumed", progress=False)
+    resumed = fit.fit(samples, samples, recipe, tmp_path / "resumed", progress=False)
+    assert n_steps == 4 + 3
+    assert resumed.history == whole.history
+    for name, weights in whole.network.state_dict().items():
+        np.testing.assert_array_equal(resumed.network.state_dict()[name].numpy(), weights.numpy(), err_msg=name)
+
+
+def test_the_checkpoint_of_another_fit_is_left_alone(samples: list[dataset.Sample], tmp_path: Path) -> None:
+    fit.fit(samples, [], fit.Recipe(SMALL, steps=2), tmp_path, progress=False)
+    history = fit.fit(samples, [], fit.Recipe(SMALL, steps=3), tmp_path, progress=False).history
+    alone = fit.fit(samples, [], fit.Recipe(SMALL, steps=3), tmp_path / "alone", progress=False).history
+    assert history[-1][:2] == alone[-1][:2]
 
 
 @pytest.mark.parametrize("shape", [Shape(), SMALL])

@@ -7,6 +7,7 @@ by the light model, and the word that was sent.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -17,7 +18,6 @@ from tqdm import tqdm
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.camera import Exposure
 from rxcli.lab.simulate.scenes import Scene as SimulatedScene
-from rxcli.lab.training.fit import MAX_WORDS, UNKNOWN, Sample
 from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_scene
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 from rxcli.receiver.channel import by_burst
@@ -27,6 +27,8 @@ from rxcli.receiver.search import search
 from rxcli.receiver.still import decode, doubtful_columns
 from rxcli.types import Clock, FloatArray
 
+#: Words of the largest codebook, and what stands for a word that is not known.
+MAX_WORDS, UNKNOWN = 128, -1
 _SCREENS = ("paper-34k6", "paper-17k3")
 #: Maximum number of training columns per frame, since columns of one picture are similar.
 _MAX_COLUMNS = 8
@@ -34,6 +36,29 @@ _MAX_COLUMNS = 8
 _MIN_SCORE = -60.0
 #: Streams of random numbers.
 _FRAMES, _VALIDATION = 77, 900_000
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Doubtful columns of a frame as the network sees them, and what was sent; B columns, N slots, M symbols."""
+
+    #: (B, S, F, N) float16.
+    strips: NDArray[np.float16]
+    #: (B, G, N) float16.
+    columns: NDArray[np.float16]
+    #: (B, N) 1 where a slot of the payload can be seen.
+    reception: NDArray[np.float16]
+    #: (): place of the first slot in its packet, and slots of a packet.
+    first_slot: NDArray[np.int64]
+    packet_slots: NDArray[np.int64]
+    #: (copies,) burst of each copy.
+    burst: NDArray[np.int64]
+    #: (B,) weight that was sent.
+    w: NDArray[np.int64]
+    #: (bursts, B, M, 128) log-likelihood of every word by the light model alone.
+    scores: NDArray[np.float16]
+    #: (bursts, B, M) index of the word that was sent, or `UNKNOWN`.
+    words: NDArray[np.int64]
 
 
 def frame_samples(n_frames: int, seed: int, folder: Path, *, progress: bool = True) -> list[Sample]:

@@ -16,7 +16,8 @@ import tomli_w
 import torch
 
 from rxcli.errors import ReceiverError
-from rxcli.lab.training.fit import Sample, StripNetwork
+from rxcli.lab.training.dataset import Sample
+from rxcli.lab.training.fit import StripNetwork
 from rxcli.receiver.channel.denoise import (
     COLUMN_FEATURES,
     N_COLUMN_FEATURES,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,13 +15,12 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from rxcli.errors import InputError
+from rxcli.lab.training.dataset import MAX_WORDS, UNKNOWN, Sample
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 from rxcli.receiver.channel.denoise import N_COLUMN_FEATURES, N_STRIP_FEATURES
 
-#: Words of the largest codebook, and what stands for a word that is not known.
-MAX_WORDS, UNKNOWN = 128, -1
-#: Steps from one point of the plot of the loss to the next.
-_PLOTTED_EVERY = 200
+#: Steps from one checkpoint, and point of the plot of the loss, to the next.
+_CHECKPOINT_EVERY = 500
 _WEIGHT_DECAY, _LARGEST_GRADIENT = 5e-2, 1.0
 #: Steps over which the stored weights are averaged.
 _AVERAGED_STEPS = 200
@@ -83,29 +83,6 @@ class StripNetwork(nn.Module):  # type: ignore[misc]
 def n_parameters(network: nn.Module) -> int:
     """Weights of a network."""
     return sum(p.numel() for p in network.parameters())
-
-
-@dataclass(frozen=True)
-class Sample:
-    """Doubtful columns of a frame as the network sees them, and what was sent; B columns, N slots, M symbols."""
-
-    #: (B, S, F, N) float16.
-    strips: NDArray[np.float16]
-    #: (B, G, N) float16.
-    columns: NDArray[np.float16]
-    #: (B, N) 1 where a slot of the payload can be seen.
-    reception: NDArray[np.float16]
-    #: (): place of the first slot in its packet, and slots of a packet.
-    first_slot: NDArray[np.int64]
-    packet_slots: NDArray[np.int64]
-    #: (copies,) burst of each copy.
-    burst: NDArray[np.int64]
-    #: (B,) weight that was sent.
-    w: NDArray[np.int64]
-    #: (bursts, B, M, 128) log-likelihood of every word by the light model alone.
-    scores: NDArray[np.float16]
-    #: (bursts, B, M) index of the word that was sent, or `UNKNOWN`.
-    words: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -186,13 +163,13 @@ class Fitted:
 def fit(
     samples: Sequence[Sample], validation: Sequence[Sample], recipe: Recipe, folder: Path, *, progress: bool = True
 ) -> Fitted:
-    """Fit a network; equal recipes and samples give equal weights.
+    """Fit a network; equal recipes and samples give equal weights, whether the fit was interrupted or not.
 
     Args:
-        samples: what to learn from.
-        validation: samples that are not learned from.
+        samples: training samples.
+        validation: samples for the validation loss alone.
         recipe: sizes and steps.
-        folder: gets the plot of the loss.
+        folder: gets the plot of the loss, and the checkpoint from which an interrupted fit is resumed.
         progress: show a bar on stderr.
 
     Raises:
@@ -208,9 +185,11 @@ def fit(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, recipe.learning_rate, total_steps=recipe.steps + 1, pct_start=0.1
     )
-    rng, history, running = np.random.default_rng(recipe.seed), [], float("nan")
-    for step in tqdm(range(1, recipe.steps + 1), disable=not progress, unit="step"):
-        loss = _drawn_loss(network, samples, rng)
+    checkpoint = _Checkpoint(folder, recipe, len(samples), (network, averaged, optimiser, schedule))
+    history = checkpoint.restore()
+    start, running = history[-1][:2] if history else (0, float("nan"))
+    for step in tqdm(range(start + 1, recipe.steps + 1), disable=not progress, unit="step"):
+        loss = _drawn_loss(network, samples, np.random.default_rng([recipe.seed, step]))
         optimiser.zero_grad()
         torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(network.parameters(), _LARGEST_GRADIENT)
@@ -218,11 +197,43 @@ def fit(
         schedule.step()
         averaged.update_parameters(network)
         running = loss.item() if np.isnan(running) else 0.98 * running + 0.02 * loss.item()
-        if step % _PLOTTED_EVERY == 0 or step == recipe.steps:
+        if step % _CHECKPOINT_EVERY == 0 or step == recipe.steps:
             history.append((step, running, mean_loss(averaged.module, validation)))
-    folder.mkdir(parents=True, exist_ok=True)
+            checkpoint.save(history)
     _plot_loss(history, folder / "loss.png")
     return Fitted(averaged.module.eval(), history)
+
+
+@dataclass(frozen=True)
+class _Checkpoint:
+    """State of a fit in a folder."""
+
+    folder: Path
+    recipe: Recipe
+    n_samples: int
+    #: Network, optimiser and all else that has a state.
+    parts: tuple[Any, ...]
+
+    @property
+    def _fit(self) -> str:
+        return f"{self.recipe} {self.n_samples} samples"
+
+    def save(self, history: list[tuple[int, float, float]]) -> None:
+        """Write the state of all parts, and the losses so far."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        part = self.folder / "checkpoint.part"
+        torch.save({"fit": self._fit, "history": history, "parts": [each.state_dict() for each in self.parts]}, part)
+        part.replace(self.folder / "checkpoint.pt")
+
+    def restore(self) -> list[tuple[int, float, float]]:
+        """Restore the parts; return the losses so far, none if the folder has no checkpoint of this fit."""
+        path = self.folder / "checkpoint.pt"
+        stored = torch.load(path, weights_only=True) if path.exists() else {}
+        if stored.get("fit") != self._fit:
+            return []
+        for part, state in zip(self.parts, stored["parts"], strict=True):
+            part.load_state_dict(state)
+        return list(stored["history"])
 
 
 def _moving_average(averaged: Tensor, current: Tensor, n_averaged: Tensor) -> Tensor:
