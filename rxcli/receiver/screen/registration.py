@@ -64,6 +64,8 @@ _PERSISTENCE = 0.7
 _FIRST_FRAMES, _LEARN_EVERY = 10, 4
 #: Maximum weight of the earlier frames in the texture, in frames.
 _MAX_WEIGHT = 40.0
+#: From x and y of each corner in turn to all x, then all y.
+_BY_AXIS = np.array([0, 2, 4, 6, 1, 3, 5, 7])
 #: Points down and across through which the screen is projected.
 _KNOTS = (9, 17)
 
@@ -137,7 +139,7 @@ class ScreenTexture:
     def find(self, frame: Frame) -> Registration:
         """Register the screen in the next frame."""
         if self._known is None:
-            self._known = _known_of(_coarser(self._mean), np.prod(_COARSE)), _known_of(self._mean, 1)
+            self._known = _known_of(_coarser(self._mean), _COARSE[0] * _COARSE[1]), _known_of(self._mean, 1)
         texture = self._texture_of(frame)
         plane = expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
         for cells, known, size in zip((_coarser(texture), texture), self._known, (_COARSE, (1, 1)), strict=True):
@@ -197,8 +199,7 @@ class ScreenTexture:
             weight /= 1 + error**2 / np.float32(_OUTLIER**2 * variance)
             # From the corners' motion along u and v to pixels, with the screen approximated by a parallelogram.
             side_u, side_v = plane[1] - plane[0] + plane[2] - plane[3], plane[3] - plane[0] + plane[2] - plane[1]
-            to_pixels = np.kron(np.eye(4), np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2)).reshape(4, 2, 8)
-            to_pixels = to_pixels.swapaxes(0, 1).reshape(8, 8)
+            to_pixels = np.kron(np.eye(4), np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2))[_BY_AXIS]
             slopes = known.slopes.reshape(8, -1)
             normal = to_pixels.T @ ((slopes * weight.ravel()) @ slopes.T) @ to_pixels
             scores = _sums_of_parts(known.slopes * (weight * error)) @ to_pixels
@@ -281,8 +282,8 @@ def _known_of(texture: Float32Array, n_cells: int) -> _Known:
     v, u = (_fractions(n)[:, None] for n in value.shape)
     corner_v, corner_u = np.array([0, 0, 1, 1]), np.array([0, 1, 1, 0])
     shares = np.where(corner_v, v, 1 - v).T[:, :, None] * np.where(corner_u, u, 1 - u).T[:, None]
-    slopes = (along[:, None] * shares.astype(np.float32)).reshape(8, *value.shape)
-    return _Known(value, weight / (weight + np.float32(1)), slopes)
+    slopes = np.asarray(along[:, None] * shares, np.float32).reshape(8, *value.shape)
+    return _Known(value, np.asarray(weight / (weight + 1), np.float32), slopes)
 
 
 def _fractions(n: int) -> FloatArray:
