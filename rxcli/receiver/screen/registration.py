@@ -298,7 +298,7 @@ def _positions(n_v: int, n_u: int) -> tuple[FloatArray, Float32Array, Float32Arr
     grid_v, grid_u = np.meshgrid(knots_v, knots_u, indexing="ij")
     knots = np.stack([grid_u, grid_v, np.ones_like(grid_u)], axis=-1).reshape(-1, 3)
     down, across = (
-        np.stack([np.interp(_fractions(n), at, one) for one in np.eye(at.size)], axis=1).astype(np.float32)
+        np.stack([np.interp(_fractions(n), at, unit) for unit in np.eye(at.size)], axis=1).astype(np.float32)
         for n, at in ((n_v, knots_v), (n_u, knots_u))
     )
     return knots, down, np.ascontiguousarray(across.T)
