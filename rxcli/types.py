@@ -455,6 +455,8 @@ class FrameResult:
     #: Blind estimates of the camera: name -> (value, standard deviation).
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
     columns: tuple[ColumnResult, ...] = ()
+    #: Results of further screens in a photograph that packets were received from.
+    other_screens: tuple[FrameResult, ...] = ()
     #: Wall time by stage, milliseconds.
     timing_ms: dict[str, float] = field(default_factory=dict)
     #: Skipped steps: name -> count.
@@ -486,6 +488,7 @@ class FrameResult:
             self,
             corners=None if self.corners is None else self.corners[[1, 0, 3, 2]],
             columns=tuple(replace(c, column=len(self.columns) - 1 - c.column) for c in reversed(self.columns)),
+            other_screens=tuple(other.with_columns_mirrored() for other in self.other_screens),
             soft_bits=None if soft is None else replace(soft, llr=soft.llr[:, :, ::-1]),
             mirrored=not self.mirrored,
         )

@@ -12,7 +12,15 @@ from rxcli.receiver.cameras import known_lens
 from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.plane import turned
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.find import BRIGHTEN, ColumnLayout, find_outlines, thinned, why_useless
+from rxcli.receiver.screen.find import (
+    BRIGHTEN,
+    ColumnLayout,
+    OutlineCandidate,
+    find_outlines,
+    find_screens,
+    thinned,
+    why_useless,
+)
 from rxcli.receiver.settings import SETTINGS
 from rxcli.types import FloatArray, Frame
 
@@ -28,44 +36,46 @@ _SHOW_COLUMNS = (
 )
 
 
-def proposed_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[Outline] | Failure:
-    """Candidate outlines of the screen in a frame, at least one; or why there are none."""
+def proposed_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[list[Outline]] | Failure:
+    """Candidate outlines, at least one, of every screen in a frame; or why there are none."""
     refused = unreadable_orientation(frame)
     if refused is not None:
         return refused
     if options.corners is not None:
         with timer("geometry"):
-            return outside_the_picture(options.corners, frame) or [Outline(options.corners)]
-    found = possible_outlines(frame, options, timer)
+            return outside_the_picture(options.corners, frame) or [[Outline(options.corners)]]
+    found = possible_screens(frame, options, timer)
     if found:
         return found
     reason = turned_pixels(frame, options, timer) or reason_for_none(frame)  # Pixels may lie on their side.
     if "no_screen" in options.skip or not may_fill(frame):
         return Failure("no_screen", f"no screen found: {reason}")
-    return [Outline(whole_picture(frame), inferred=geometry.SIDE_NAMES, column_offset=None)]
+    return [[Outline(whole_picture(frame), inferred=geometry.SIDE_NAMES, column_offset=None)]]
 
 
-def possible_outlines(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[Outline]:
-    """Outlines that the finder proposes."""
+def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[list[Outline]]:
+    """Outlines that the finder proposes of every screen."""
     layouts = layouts_of(options)
     with timer("geometry"):
-        found = find_outlines(timer.planes.plane(frame), layouts, known_lens(frame, options))
+        screens = find_screens(timer.planes.plane(frame), layouts, known_lens(frame, options))
     single_wide = sum(not layout.is_narrow for layout in layouts) == 1
-    outlines = [
-        Outline(
-            screen.corners[0],
-            inferred=screen.unlit_sides,
-            log_odds=screen.log_odds,
-            family=screen.layout.n_columns,
-            fills=screen.fills,
-            other_rows=screen.corners[1:],
-            strips=screen.strips,
-            lens=screen.grid.estimated_lens,
-            n_columns=None if single_wide and not screen.layout.is_narrow else screen.layout.n_columns,
+
+    def outline(candidate: OutlineCandidate) -> Outline:
+        is_usual = single_wide and not candidate.layout.is_narrow
+        found = Outline(
+            candidate.corners[0],
+            inferred=candidate.unlit_sides,
+            log_odds=candidate.log_odds,
+            family=candidate.layout.n_columns,
+            fills=candidate.fills,
+            other_rows=candidate.corners[1:],
+            strips=candidate.strips,
+            lens=candidate.grid.estimated_lens,
+            n_columns=None if is_usual else candidate.layout.n_columns,
         )
-        for screen in found
-    ]
-    return [_as_viewed(outline, frame.metadata.orientation) for outline in outlines]
+        return _as_viewed(found, frame.metadata.orientation)
+
+    return [[outline(candidate) for candidate in screen] for screen in screens]
 
 
 def layouts_of(options: ReceiverOptions) -> list[ColumnLayout]:

@@ -17,8 +17,8 @@ from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.context import Failure, Timer
-from rxcli.receiver.corners import too_small
+from rxcli.receiver.context import Failure, Outline, Timer
+from rxcli.receiver.corners import proposed_screens, too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.reception import Reception, headerless, slot_margin, soft_bits
 from rxcli.receiver.search import search
@@ -91,9 +91,19 @@ def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str 
 
 
 def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
+    """Receive every screen in a frame; the one with the most packets comes first."""
+    screens = proposed_screens(frame, options, timer)
+    if isinstance(screens, Failure):
+        return failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), screens)
+    received = [_receive_screen(frame, outlines, options, timer) for outlines in screens]
+    first, *others = sorted(received, key=lambda result: -sum(packet.is_believable for packet in result.packets))
+    return replace(first, other_screens=tuple(other for other in others if other.packets))
+
+
+def _receive_screen(frame: Frame, outlines: list[Outline], options: ReceiverOptions, timer: Timer) -> FrameResult:
     result = FrameResult(frame.source, frame.index, frame.time_s, "ok")
     # Search: where the columns are, what a row is in time, which screen and clock.
-    found = search(frame, options, timer)
+    found = search(frame, options, timer, outlines=outlines)
     if isinstance(found, Failure):
         return failed(result, found)
     outline, context, acquisition = found.outline, found.best.context, found.best.acquisition

@@ -52,6 +52,7 @@ def to_json_line(result: FrameResult) -> str:
 def _details(result: FrameResult) -> dict[str, Any]:
     """Optional parts of a record, present only if they are not empty."""
     details = {
+        "other_screens": [to_record(other) for other in result.other_screens],
         "estimated": result.estimated,
         "skipped": result.skipped,
         "denoiser": result.denoiser,
@@ -138,6 +139,7 @@ def from_record(record: dict[str, Any]) -> FrameResult:
             FrameResult,
             corners=None if corners is None else np.array(corners, dtype=np.float64).reshape(4, 2),
             columns=tuple(_read(c, ColumnResult, packets=tuple(map(_packet, c["packets"]))) for c in record["columns"]),
+            other_screens=tuple(map(from_record, record.get("other_screens", ()))),
             messages=tuple(messages),
             objects=tuple(_read(file, ReceivedObject, data=b"") for file in files),
             progress=tuple(_read(file, ObjectProgress) for file in under_way),

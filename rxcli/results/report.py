@@ -121,6 +121,9 @@ def format_frame(result: FrameResult) -> str:
     rows = table_rows(result, clip, scored)
     if rows:
         lines += [table_header(clip, scored), *rows]
+    for other in result.other_screens:
+        lines += [f"  another screen: {_place(other)} | screen {other.screen_profile} | {_counts(other)}"]
+        lines += [table_header(clip, scored), *table_rows(other, clip, scored)]
     return "\n".join(lines)
 
 
@@ -172,7 +175,7 @@ def result_in_words(result: FrameResult) -> str:
     """What was done for a frame, in one line: screen, camera, time by stage, what was left out."""
     parts = [f"{printable_name(result.source)} frame {result.frame}: {result.status}"]
     if result.corners is not None:
-        parts.append("screen at " + " ".join(f"{x:.0f},{y:.0f}" for x, y in result.corners))
+        parts.append(f"screen at {_place(result)}")
     if result.line_delay_s:
         known = result.camera_profile or "estimated"
         parts.append(f"camera {known}: {result.line_delay_s * 1e6:.4g} us a row")
@@ -183,6 +186,11 @@ def result_in_words(result: FrameResult) -> str:
     if result.denoiser:
         parts.append(f"auto-encoder: {plain(result.denoiser)}")
     return "; ".join(parts)
+
+
+def _place(result: FrameResult) -> str:
+    """Corners of the screen, pixels."""
+    return "" if result.corners is None else " ".join(f"{x:.0f},{y:.0f}" for x, y in result.corners)
 
 
 def plural(number: int, noun: str) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import Comb, find_combs, grid_of_comb
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
-from rxcli.receiver.screen.numbering import first_columns, light_profile
+from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips, read_strips, shows_narrow_columns
@@ -73,6 +73,16 @@ def find_outlines(
 ) -> list[OutlineCandidate]:
     """Candidate outlines of the screen in a picture, likeliest first; none if no columns are found.
 
+    Args: see `find_screens`.
+    """
+    return next(iter(find_screens(plane, layouts, lens)), [])
+
+
+def find_screens(
+    plane: LightPlane, layouts: Sequence[ColumnLayout], lens: Lens | None = None
+) -> list[list[OutlineCandidate]]:
+    """Candidate outlines of each screen in a picture, likeliest first; the clearest screen comes first.
+
     Args:
         plane: of the picture.
         layouts: that the screen may have.
@@ -84,13 +94,28 @@ def find_outlines(
     if strips.lit.shape[1] < SETTINGS.min_strips:
         return []
     narrow, wide = ([layout for layout in layouts if layout.is_narrow is many] for many in (True, False))
+    screens = _screens_apart(strips, wide) if wide else []
+    if screens:
+        return screens
     if narrow and shows_narrow_columns(strips):
         fine = read_strips(plane, lens, n_parts=_PARTS)
         grid = narrow_grid(fine, narrow[0].sigma)
         if grid is not None:
-            return _numbered(fine, grid, narrow)
+            return [_numbered(fine, grid, narrow)]
     grid = wide_grid(strips, wide[0].sigma) if wide else None
-    return [] if grid is None else _numbered(strips, grid, wide)
+    return [] if grid is None else [_numbered(strips, grid, wide)]
+
+
+def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list[OutlineCandidate]]:
+    """Candidate outlines of two screens side by side, or none: together they light more columns than one has."""
+    sides = strips.sides_of_gap()
+    grids = [wide_grid(side, layouts[0].sigma) for side in sides]
+    found = [(side, grid) for side, grid in zip(sides, grids, strict=True) if grid is not None]
+    n_lit = sum(np.ptp(_light_across(side, grid, layouts[0].sigma)[1].ends) for side, grid in found)
+    if len(found) < 2 or n_lit < max(layout.n_columns for layout in layouts) + 1:
+        return []
+    clearest_first = sorted(found, key=lambda side_and_grid: -side_and_grid[1].explained)
+    return [_numbered(side, grid, layouts) for side, grid in clearest_first]
 
 
 def why_useless(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white: float) -> tuple[str, str] | None:
@@ -199,8 +224,7 @@ def _stands_out(strips: Strips, grid: Grid) -> bool:
 
 def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> list[OutlineCandidate]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
-    light = predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), layouts[0].sigma)
-    profile = light_profile(strips, light, grid)
+    light, profile = _light_across(strips, grid, layouts[0].sigma)
     starts = [first_columns(profile, layout.n_columns) for layout in layouts]
     odds = np.concatenate([start.log_odds for start in starts])
     likeliest = float(odds.max())
@@ -222,6 +246,12 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> li
             counted, odds_lost = own.shifted(number - best), log_odds - likeliest
             found.append(OutlineCandidate(corners, strips, counted, layout, odds_lost, start.fills, unlit))
     return sorted(found, key=lambda candidate: -candidate.log_odds)
+
+
+def _light_across(strips: Strips, grid: Grid, sigma: float) -> tuple[Float32Array, LightProfile]:
+    """Light of the strips that a grid predicts, and its profile across the columns."""
+    light = predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), sigma)
+    return light, light_profile(strips, light, grid)
 
 
 def _unlit_sides(

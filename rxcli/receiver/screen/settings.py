@@ -32,6 +32,12 @@ class FinderSettings:
     near_widths: float = 0.004
     far_widths: float = 0.02
     narrow_ratio: float = 0.6
+    #: Two screens lie apart if strips between them have less than this share of the light, over this many picture
+    #: widths; share of the light that each has, and mean coherence of all strips, at least.
+    gap_light: float = 0.25
+    min_gap_widths: float = 0.015
+    min_apart: float = 0.2
+    min_apart_light: float = 0.1
 
     #: Number of columns from which a screen's columns count as narrow.
     narrow_columns: int = 50

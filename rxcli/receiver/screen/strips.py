@@ -20,6 +20,8 @@ from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
 _Real = TypeVar("_Real", np.float32, np.float64)
+#: Arrays by block and strip.
+_OF_STRIPS = ("changes", "lit", "level", "raw_x", "raw_y", "x", "y")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,8 +72,25 @@ class Strips:
 
     def blocks(self, chosen: slice | NDArray[np.int64]) -> Strips:
         """Some of the blocks."""
-        arrays = {name: getattr(self, name)[chosen] for name in ("changes", "lit", "level", "raw_x", "raw_y", "x", "y")}
+        arrays = {name: getattr(self, name)[chosen] for name in _OF_STRIPS}
         return replace(self, **arrays)
+
+    def between(self, start: int, end: int) -> Strips:
+        """The strips from `start` on, up to but without `end`, of every block."""
+        arrays = {name: getattr(self, name)[:, start:end] for name in _OF_STRIPS}
+        return replace(self, **arrays)
+
+    def sides_of_gap(self) -> list[Strips]:
+        """The strips on either side of the widest gap without coherent light, the gap in both; none without a gap."""
+        lit = self.lit.mean(axis=0)
+        share = np.cumsum(lit) / (lit.sum() + np.float32(TINY))
+        is_dark = lit < SETTINGS.gap_light * np.quantile(lit, 0.9)
+        is_dark[(share < SETTINGS.min_apart) | (share > 1 - SETTINGS.min_apart)] = False
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], is_dark, [False]]).astype(np.int8))).reshape(-1, 2)
+        start, end = max(edges.tolist(), key=lambda gap: gap[1] - gap[0], default=(0, 0))
+        if (end - start) * self.step < SETTINGS.min_gap_widths or lit.mean() < SETTINGS.min_apart_light:
+            return []
+        return [self.between(0, end), self.between(start, lit.size)]
 
 
 def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1) -> Strips:

@@ -11,7 +11,7 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
-from rxcli.receiver.corners import proposed_outlines
+from rxcli.receiver.corners import proposed_screens
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.explain import why_no_packets
@@ -36,6 +36,7 @@ def search(
     timer: Timer,
     known: FrameContext | None = None,
     *,
+    outlines: list[Outline] | None = None,
     budget: int = SETTINGS.budget,
 ) -> Found | Failure:
     """Find outline, rows, camera, screen, clock and bursts of a frame.
@@ -45,11 +46,14 @@ def search(
         options: screens, cameras, and corners if given.
         timer: of the frame.
         known: context of a frame of the same camera, if the camera and the screens are known.
+        outlines: of the screen to receive; those of the clearest one in the picture if left out.
         budget: maximum number of initial passes.
     """
-    outlines = proposed_outlines(frame, options, timer)
-    if isinstance(outlines, Failure):
-        return outlines
+    if outlines is None:
+        screens = proposed_screens(frame, options, timer)
+        if isinstance(screens, Failure):
+            return screens
+        outlines = screens[0]
     proposer = Proposer(frame, options, timer, tuple(outlines), known)
     walk = _Walk(proposer, budget)
     best = walk.run()

@@ -75,7 +75,7 @@ def test_the_order_of_proposals_screens_and_cameras_does_not_matter(
         return [some[k] for k in rng.permutation(len(some))]
 
     def received(order: Callable[[Iterable[Any]], list[Any]]) -> tuple[FrameResult, list[tuple[int, str, float]]]:
-        monkeypatch.setattr(outlines, "possible_outlines", lambda *_: order(possible))
+        monkeypatch.setattr(outlines, "possible_screens", lambda *_: [order(possible)])
         monkeypatch.setattr(Proposer, "_of_camera", lambda *given: order(of_camera(*given)))
         monkeypatch.setattr(Proposer, "siblings", lambda *given: order(siblings(*given)))
         monkeypatch.setattr(blind, "propose", lambda *given, **named: map(order, propose(*given, **named)))
