@@ -95,9 +95,9 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
     screens = proposed_screens(frame, options, timer)
     if isinstance(screens, Failure):
         return failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), screens)
-    received = [_receive_screen(frame, outlines, options, timer) for outlines in screens]
-    first, *others = sorted(received, key=lambda result: -sum(packet.is_believable for packet in result.packets))
-    return replace(first, other_screens=tuple(other for other in others if other.packets))
+    results = [_receive_screen(frame, outlines, options, timer) for outlines in screens]
+    results.sort(key=lambda result: -sum(packet.is_believable for packet in result.packets))
+    return replace(results[0], other_screens=tuple(result for result in results[1:] if result.packets))
 
 
 def _receive_screen(frame: Frame, outlines: list[Outline], options: ReceiverOptions, timer: Timer) -> FrameResult:
