@@ -488,7 +488,7 @@ class FrameResult:
             self,
             corners=None if self.corners is None else self.corners[[1, 0, 3, 2]],
             columns=tuple(replace(c, column=len(self.columns) - 1 - c.column) for c in reversed(self.columns)),
-            other_screens=tuple(other.with_columns_mirrored() for other in self.other_screens),
+            other_screens=tuple(screen.with_columns_mirrored() for screen in self.other_screens),
             soft_bits=None if soft is None else replace(soft, llr=soft.llr[:, :, ::-1]),
             mirrored=not self.mirrored,
         )

@@ -52,7 +52,7 @@ def to_json_line(result: FrameResult) -> str:
 def _details(result: FrameResult) -> dict[str, Any]:
     """Optional parts of a record, present only if they are not empty."""
     details = {
-        "other_screens": [to_record(other) for other in result.other_screens],
+        "other_screens": [to_record(screen) for screen in result.other_screens],
         "estimated": result.estimated,
         "skipped": result.skipped,
         "denoiser": result.denoiser,

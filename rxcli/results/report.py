@@ -121,9 +121,9 @@ def format_frame(result: FrameResult) -> str:
     rows = table_rows(result, clip, scored)
     if rows:
         lines += [table_header(clip, scored), *rows]
-    for other in result.other_screens:
-        lines += [f"  another screen: {_place(other)} | screen {other.screen_profile} | {_counts(other)}"]
-        lines += [table_header(clip, scored), *table_rows(other, clip, scored)]
+    for screen in result.other_screens:
+        lines += [f"  another screen: {_place(screen)} | screen {screen.screen_profile} | {_counts(screen)}"]
+        lines += [table_header(clip, scored), *table_rows(screen, clip, scored)]
     return "\n".join(lines)
 
 
