@@ -51,18 +51,12 @@ class StillSettings:
     fine_samples: int = 4
     #: Rows mixed by the development of a picture, as the width of a box; this widens the exposure.
     mixed_rows: float = 1.0
-    #: Confidence below which a column with a symbol below `beyond_doubt_log_prob` gets further passes; and log
-    #: probability below which the words of a symbol are compared as a whole.
+    #: Confidence below which a column with a symbol below `beyond_doubt_log_prob` gets further passes.
     doubtful: float = 0.985
-    doubtful_word_log_prob: float = -1e-2
     #: Mean log probability of symbols below which a column is hopeless after the first fine pass; before that pass its
     #: weight may be wrong.
     beyond_repair_log_prob: float = -0.8
-    #: Candidate words of an uncertain symbol, and log probability of the best one below which they are not compared.
-    n_candidate_words: int = 4
-    hopeless_word_log_prob: float = -1.4
-    #: Limit of strip slots for the network, which takes most of the time. The least certain columns beyond it only have
-    #: their words compared.
+    #: Limit of strip slots for the network, which takes most of the time; the least certain columns are left out.
     max_network_slots: int = 58_000
 
 

@@ -15,7 +15,7 @@ from rxcli.receiver import channel, sync
 from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import detect
-from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, slot_llr
 from rxcli.receiver.reception import (
     Reception,
     best_log_prob,
@@ -159,74 +159,46 @@ def _view(
 def apply_autoencoder(
     acquisition: Acquisition, reception: Reception, options: ReceiverOptions
 ) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
-    """Make the last pass over doubtful columns: corrections by the auto-encoder, and comparison of whole words.
+    """Make the last pass over doubtful columns: corrections by the auto-encoder.
 
     Returns:
         The reception, the columns whose corrections were kept, and the report; None if nothing was done.
     """
     if options.cae == "never":
         return reception, frozenset(), None
-    always = options.cae == "always"
-    if always:
+    if options.cae == "always":
         columns = np.arange(reception.snr.shape[0])
         reception = _without_row_noise(acquisition, reception, columns)
     else:
-        columns = doubtful_columns(reception, STILL.beyond_repair_log_prob)
-    if columns.size == 0 or reception.cleaned is None:
+        columns = _worth_showing(reception, doubtful_columns(reception, STILL.beyond_repair_log_prob))
+    scene = reception.scene
+    if columns.size == 0 or scene is None:
         return reception, frozenset(), None
-    shown = columns if always else _worth_showing(reception, columns)
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
     try:
         denoiser = options.denoiser or _denoiser()
-        after = _corrected(reception, columns, shown, denoiser)
+        corrections = denoiser.slot_corrections(scene, columns)
     except ReceiverError as error:
         return reception, frozenset(), {**report, "columns": 0, "message": str(error)}
+    corrected = reception.metrics[columns] + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
+    after = _with_metrics(reception, columns, corrected)
     improved = columns[(word_log_prob(after) > word_log_prob(reception))[columns]]
     report.update(model=denoiser.name, kept=improved.size)
     metrics = reception.metrics.copy()
     metrics[improved] = after.metrics[improved]
     posteriors = reception.posteriors.with_columns(improved, after.posteriors.of_columns(improved))
-    return replace(reception, metrics=metrics, posteriors=posteriors), frozenset(improved.tolist()), report
-
-
-def _corrected(
-    reception: Reception, columns: NDArray[np.int64], shown: NDArray[np.int64], denoiser: denoise.Denoiser
-) -> Reception:
-    """Compare the words of some columns, with the auto-encoder's corrections of the columns `shown` to it."""
-    scene = reception.scene
-    assert scene is not None
-    corrections = np.zeros((reception.snr.shape[0], reception.clock.n_slots), np.float32)
-    corrections[shown] = denoiser.slot_corrections(scene, shown)
-    metrics = reception.metrics[columns] + channel.metrics_of(corrections[columns], reception.model.exposure.isi_memory)
-    after = _with_metrics(reception, columns, _with_compared_words(reception, scene, columns, metrics))
     # The network knows the positions of headers, so their presence is judged without it.
-    return replace(after, posteriors=replace(after.posteriors, header_llr=reception.posteriors.header_llr))
+    posteriors = replace(posteriors, header_llr=reception.posteriors.header_llr)
+    return replace(reception, metrics=metrics, posteriors=posteriors), frozenset(improved.tolist()), report
 
 
 def _worth_showing(reception: Reception, columns: NDArray[np.int64]) -> NDArray[np.int64]:
     """The surest of `columns`, as many as the time of the network allows."""
-    assert reception.cleaned is not None
+    if reception.cleaned is None:
+        return columns[:0]
     n_strips = reception.cleaned[0].light.shape[1]
     n_columns = max(STILL.max_network_slots // (n_strips * reception.clock.n_slots), 1)
     return np.sort(columns[np.argsort(-best_log_prob(reception)[columns], kind="stable")[:n_columns]])
-
-
-def _with_compared_words(
-    reception: Reception, scene: denoise.DenoiserInput, columns: NDArray[np.int64], metrics: FloatArray
-) -> FloatArray:
-    """Metrics of some columns after comparison of the likeliest words of every uncertain symbol."""
-    clock = reception.clock
-    bursts = channel.by_burst(metrics, clock)
-    candidates = detect.plausible_weights(bursts, SETTINGS.weight_margin)
-    posteriors, doubtful = detect.detect_with_candidates(
-        bursts, candidates, STILL.doubtful_word_log_prob, STILL.n_candidate_words
-    )
-    samples = scene.samples.of_columns(columns)
-    lit = clock.on_grid(reception.posteriors.with_columns(columns, posteriors).lit)
-    compared = doubtful.log_prob[:, 0] > STILL.hopeless_word_log_prob
-    places, words = doubtful.places[compared], doubtful.words[compared]
-    corrections = channel.word_corrections(samples, clock, scene.model, lit, columns, places, words)
-    return metrics + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
 
 
 def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
@@ -244,7 +216,7 @@ def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: 
 _PASSES = (
     (_coarse, -np.inf),
     (_fine, -np.inf),
-    (_fine, STILL.beyond_repair_log_prob),
+    (_without_row_noise, STILL.beyond_repair_log_prob),
     (_without_row_noise, STILL.beyond_repair_log_prob),
 )
 
@@ -258,7 +230,7 @@ def _in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> C
     """Assign copies to bursts as given, or from metrics (C, N + memory, patterns)."""
     if acquisition.burst is not None:
         return replace(clock, burst=acquisition.burst)
-    return sync.assign_bursts(clock, detect.slot_llr(metrics), acquisition.repeats)
+    return sync.assign_bursts(clock, slot_llr(metrics), acquisition.repeats)
 
 
 def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:

@@ -16,18 +16,13 @@ pattern is the sum of the log-likelihoods over strips and samples.
 The prediction of the picture needs the slots, so model and detection are iterated. The initial metrics compare every
 sample with its local extremes.
 
-The metrics treat each slot separately, given the current estimate of all other slots. The likeliest words of uncertain
-symbols are then compared as a whole (`word_corrections`): the picture is modelled as a random process in time, a Kalman
-filter runs through the symbol and its neighbouring slots, and the innovations give the likelihood of a word.
-
-`model` holds the parameters of a frame, `picture` predicts the picture, `likelihoods` computes metrics, `words`
-compares words, and `patterns` converts slots and metrics between the frame's grid and bursts.
+`model` holds the parameters of a frame, `picture` predicts the picture, `likelihoods` computes metrics, and `patterns`
+converts slots and metrics between the frame's grid and bursts.
 """
 
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
 from rxcli.receiver.channel.model import ObservationModel, estimate_black_level, estimate_sigma
 from rxcli.receiver.channel.patterns import by_burst, initial_metrics, metrics_of
-from rxcli.receiver.channel.words import word_corrections
 
 __all__ = [
     "ObservationModel",
@@ -38,5 +33,4 @@ __all__ = [
     "initial_metrics",
     "metrics_of",
     "slot_likelihoods",
-    "word_corrections",
 ]

@@ -28,10 +28,11 @@ from numpy.typing import NDArray
 
 from rxcli.errors import ProfileError
 from rxcli.numerics import box_sums
-from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, slot_patterns
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
+from rxcli.receiver.light import slot_llr
 from rxcli.resources import data_dir, onnx_runtime
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
@@ -47,8 +48,6 @@ COLUMN_FEATURES = ("known", "phase[10]", "believed", "lent", "weight", "score", 
 N_STRIP_FEATURES, N_COLUMN_FEATURES = 26, 16
 #: Limit of residuals in features, standard deviations; the network was trained with it.
 _RESIDUAL_SIGMAS = 4.0
-#: Lower limit of probabilities.
-_TINY = 1e-30
 _MAX_MODEL_BYTES = 2_000_000
 
 
@@ -191,7 +190,7 @@ def _column_features(scene: DenoiserInput, observed: _Residuals, columns: NDArra
     """(B, 16, N) features of columns, see `COLUMN_FEATURES`."""
     q, clock = scene.samples.samples_per_slot, scene.clock
     lit = np.clip(scene.lit[columns], 1e-5, 1 - 1e-5)
-    llr = _slot_llr(scene.metrics[columns], lit)
+    llr = slot_llr(scene.metrics[columns], lit)
     contrast = _contrast_feature(observed.contrast)
     place = clock.places % SLOTS_PER_SYMBOL
     by_slot = (
@@ -222,26 +221,6 @@ def _pooled(values: NDArray[np.floating[Any]], q: int) -> Float32Array:
     """(B, N) sum over strips and the samples of a slot, for the effective number of independent samples."""
     return np.asarray(
         values.sum(axis=1).reshape(values.shape[0], -1, q).sum(axis=2) * np.float32(SETTINGS.slot_information / q)
-    )
-
-
-def _slot_llr(metrics: FloatArray, lit: Float32Array) -> Float32Array:
-    """(B, N) log-likelihood ratio of every slot by the light model, given the current estimate of the slots around it.
-
-    Args:
-        metrics: (B, N + memory, patterns).
-        lit: (B, N) probability that each slot is lit, neither 0 nor 1.
-    """
-    isi_memory, n_slots = metrics.shape[1] - lit.shape[1], lit.shape[1]
-    patterns = slot_patterns(isi_memory).astype(np.float64)
-    padded = np.pad(lit.astype(np.float64), ((0, 0), (isi_memory, isi_memory)), constant_values=0.5)
-    odds = np.lib.stride_tricks.sliding_window_view(np.log(padded) - np.log1p(-padded), isi_memory + 1, axis=1)
-    joint = metrics + odds @ patterns.T
-    joint = np.exp(joint - joint.max(axis=2, keepdims=True))
-    # (B, N + memory, memory + 1): posterior minus prior log-odds of each slot of a pattern.
-    gained = np.log(joint @ patterns + _TINY) - np.log(joint @ (1 - patterns) + _TINY) - odds
-    return np.asarray(
-        sum(gained[:, age : age + n_slots, isi_memory - age] for age in range(isi_memory + 1)), np.float32
     )
 
 

@@ -30,11 +30,6 @@ class ChannelSettings:
 
     #: Slots on each side over which the local mean light is taken; the network was trained with this value.
     level_slots: int = 10
-    #: Picture processes of a word, smooth to rough: relative standard deviation about the mean light, and correlation
-    #: length in slots (Ornstein-Uhlenbeck).
-    picture_kinds: tuple[tuple[float, float], ...] = ((0.06, 0.7), (0.25, 2.0), (0.7, 3.0))
-    #: Slots on each side of a word that are included in its likelihood.
-    around_slots: int = 3
 
     #: Row noise is estimated from every n-th strip, since errors of the strips of a column are correlated.
     row_strips: int = 2

@@ -141,7 +141,7 @@ class BurstReader:
 
 
 def _settled_weights(before: NDArray[np.bool_], metrics: FloatArray, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(C, 9) the weight of each column, by all bursts (B, C, ...) of a frame; only of those wanted, (B, C)."""
+    """(C, 9) the weight of each column, from all bursts (B, C, ...) of a frame; only of those wanted, (B, C)."""
     bursts, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
     weights = before.copy()
     unknown = columns[~weights[columns].any(axis=1)]
@@ -149,6 +149,6 @@ def _settled_weights(before: NDArray[np.bool_], metrics: FloatArray, wanted: NDA
         weights[unknown] = detect.plausible_weights(metrics[bursts][:, unknown], receiver_settings.weight_margin)
     several = columns[weights[columns].sum(axis=1) > 1]
     if several.size:
-        confidence_features = detect.weight_log_evidence(metrics[bursts][:, several], weights[several])
-        weights[several] = np.arange(len(WEIGHTS)) == confidence_features.argmax(axis=1)[:, None]
+        found = detect.detect(metrics[bursts][:, several], weights[several])
+        weights[several] = np.array(WEIGHTS) == found.w[:, None]
     return weights

@@ -21,6 +21,7 @@ from rxcli.receiver.context import Timer
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
+from rxcli.receiver.light import slot_llr
 from rxcli.receiver.sync import tracking
 from rxcli.results.dump import dump_stages
 from rxcli.types import (
@@ -248,7 +249,7 @@ class Ledger:
         """Update the phase of the bursts with a frame."""
         assert self._link is not None
         clock = view.bursts.clock
-        llr = detect.slot_llr(view.bursts.metrics)
+        llr = slot_llr(view.bursts.metrics)
         copies = clock.to_copies(llr).transpose(1, 0, 2) * (view.bursts.shown > 0)
         self._link.phase.update(view.bursts.first_copy, np.asarray(copies, np.float64))
 
@@ -470,6 +471,6 @@ def _against(burst: tracking.ClosedBurst) -> Float32Array | None:
     """(C,) maximum log-likelihood ratio against the decision over the payload slots; None for photographs."""
     if not burst.tracked:
         return None
-    llr = detect.slot_llr(burst.metrics[None])[0, :, PREAMBLE_SLOTS:]
+    llr = slot_llr(burst.metrics[None])[0, :, PREAMBLE_SLOTS:]
     decided = np.sign(burst.posteriors.lit[0, :, PREAMBLE_SLOTS:] - 0.5)
     return np.asarray(np.maximum(-llr * decided, 0).max(axis=1), np.float32)

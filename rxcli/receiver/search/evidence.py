@@ -7,7 +7,7 @@ import numpy as np
 from rxcli.numerics import TINY
 from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.decode import detect
+from rxcli.receiver.light import slot_llr
 from rxcli.receiver.reception import Reception, complete_packets
 from rxcli.receiver.search.settings import SETTINGS
 
@@ -39,7 +39,7 @@ def score(reception: Reception, acquisition: Acquisition, evidence: float, log_p
     similarity = 0.0
     if complete:
         clock = reception.clock
-        possible = sync.possible_bursts(clock, detect.slot_llr(reception.metrics), acquisition.repeats)
+        possible = sync.possible_bursts(clock, slot_llr(reception.metrics), acquisition.repeats)
         own = [likeness for candidate, likeness in possible if np.array_equal(candidate.burst, clock.burst)]
         similarity = (own[0] if own else possible[-1][1]) - possible[0][1]
     gain = SETTINGS.complete_packet * complete + SETTINGS.copies_weight * similarity

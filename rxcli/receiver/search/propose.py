@@ -15,7 +15,7 @@ from rxcli.receiver.acquisition import ColumnSampler, noise_of, sample_columns, 
 from rxcli.receiver.cameras import known_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
 from rxcli.receiver.corners import too_small
-from rxcli.receiver.decode import detect
+from rxcli.receiver.light import slot_llr
 from rxcli.receiver.reception import Reception, complete_packets
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.outlines import likeliest_of_family
@@ -172,7 +172,7 @@ class Proposer:
         """Other bursts of the same copies, if packets are uncertain."""
         reception, repeats = scored.reception, scored.acquisition.repeats
         complete = complete_packets(reception)
-        possible = sync.possible_bursts(reception.clock, detect.slot_llr(reception.metrics), repeats)
+        possible = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), repeats)
         plain = len(possible) == 1 or possible[0][1] - possible[1][1] > SETTINGS.plain_bursts
         if complete.any() and plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
             return

@@ -13,7 +13,6 @@ from rxcli.protocol import slot_patterns
 from rxcli.receiver import channel, sync
 from rxcli.receiver.channel.patterns import by_pattern
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
-from rxcli.receiver.channel.words import _innovations
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
 from rxcli.types import Clock, SlotSamples
 
@@ -342,86 +341,3 @@ def test_metrics_of_copies_are_added(isi_memory: int) -> None:
     # The header after a copy tells of the copy's last slots: its first metrics are added at the end.
     np.testing.assert_allclose(found[0, :, 70], metrics[:, 37] + metrics[:, 107] + metrics[:, 177])
     assert (found[:, :, :isi_memory] == 0).all()
-
-
-@pytest.mark.parametrize(("deviation", "length"), [(0.1, 0.7), (0.5, 3.0)])
-def test_innovations_are_those_of_a_gaussian_process(deviation: float, length: float) -> None:
-    rng = np.random.default_rng(0)
-    n = 12
-    gain, noise = rng.uniform(0.1, 1, n), rng.uniform(0.01, 0.2, n)
-    apart = np.abs(np.arange(n)[:, None] - np.arange(n)) / 2
-    covariance = deviation**2 * np.exp(-apart / length) * gain[:, None] * gain + np.diag(noise)
-    residual = rng.multivariate_normal(np.zeros(n), covariance)
-    density = -(residual @ np.linalg.solve(covariance, residual) + np.linalg.slogdet(covariance)[1]) / 2
-    by_time = (values.astype(np.float32)[:, None, None] for values in (residual, gain, noise))
-    (found,) = _innovations(*by_time, ((deviation, length),))
-    assert found[0, 0] == pytest.approx(density, rel=1e-4, abs=1e-3)
-
-
-def words_in_doubt(
-    lit: FloatArray, now: Clock, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Every symbol that is seen whole, with its word and three that have a lit slot elsewhere; the word anywhere."""
-    places, words = [], []
-    for start in range(-now.first_slot % 10, now.n_slots - 9, 10):
-        copy, slot = divmod(start + now.first_slot, now.packet_slots)
-        if slot < 20:
-            continue
-        for column in range(len(lit)):
-            sent = (lit[column, start : start + 10] > 0.5).astype(np.uint8)
-            others = []
-            for _ in range(3):
-                other = sent.copy()
-                other[rng.choice(np.flatnonzero(sent))] = 0
-                other[rng.choice(np.flatnonzero(sent == 0))] = 1
-                others.append(other)
-            places.append((now.burst[copy], column, (slot - 20) // 10))
-            words.append(rng.permutation(np.stack([sent, *others])))
-    first = np.unique(np.array(places), axis=0, return_index=True)[1]
-    return np.array(places)[first], np.stack(words)[first]
-
-
-def right_words(shot_gain: Shot, seed: int) -> list[bool]:
-    """Of every symbol, whether the corrections like the word that was sent best."""
-    link, now, samples, model = scene(shot_gain, seed)
-    lit = true_slots(link, shot_gain, now.n_slots)
-    places, words = words_in_doubt(lit, now, np.random.default_rng(seed))
-    found = channel.word_corrections(samples, now, model, lit, np.arange(6), places, words)
-    right = []
-    for (burst, column, symbol), choice in zip(places, words, strict=True):
-        copies = np.flatnonzero(now.burst == burst) * now.packet_slots + 20 + 10 * symbol - now.first_slot
-        starts = [at for at in copies if 0 <= at <= now.n_slots - 10]
-        score = sum(choice @ found[column, at : at + 10] for at in starts)
-        right.append(bool((choice[score.argmax()] == lit[column, starts[0] : starts[0] + 10]).all()))
-    return right
-
-
-@pytest.mark.parametrize("exposure", [0.6, 1.08, 2.0])
-def test_the_light_tells_words_apart(exposure: float) -> None:
-    """In noise in which a word is often mistaken for one of three others by chance alone."""
-    calm = Shot(texture=0.3, sigma=0.05, start_slot=12.3, exposure_slots=exposure)
-    assert np.mean(right_words(calm, 8) + right_words(calm, 9)) > 0.95
-    # Nothing but noise: one of four is right by chance.
-    dark = replace(calm, level=1e-4)
-    assert np.mean(right_words(dark, 8) + right_words(dark, 9)) < 0.6
-
-
-def test_words_are_weighed_alike_at_any_brightness_and_cut_by_the_grid() -> None:
-    shot_gain = Shot(texture=0.3, sigma=0.02, ambient=0.02, start_slot=12.3)
-    link, now, samples, model = scene(shot_gain, seed=9)
-    lit = true_slots(link, shot_gain, now.n_slots)
-    every = np.argwhere(np.ones((int(now.burst.max()) + 1, 6, 5)))
-    words = np.tile(np.array([[1] * 5 + [0] * 5, [1] * 4 + [0] * 5 + [1]], np.uint8), (len(every), 1, 1))
-    one = channel.word_corrections(samples, now, model, lit, np.arange(6), every, words)
-    brighter = replace(samples, light=samples.light * np.float32(3))
-    scaled = brightened(model, 3)
-    other = channel.word_corrections(brighter, now, scaled, lit, np.arange(6), every, words)
-    assert one.shape == lit.shape
-    assert np.isfinite(one).all()
-    np.testing.assert_allclose(other, one, rtol=0.01, atol=0.05)
-    # Only the two slots in which the words differ are corrected, and nothing where one word is likely.
-    assert {int(slot) for slot in (np.flatnonzero(np.abs(one).max(axis=0)) + now.first_slot) % 10} == {4, 9}
-    alike = words[:, [0, 0]]
-    assert not channel.word_corrections(samples, now, model, lit, np.arange(6), every, alike).any()
-    nothing = channel.word_corrections(samples, now, model, lit, np.arange(6), every[:0], words[:0])
-    assert not nothing.any()

@@ -187,32 +187,6 @@ def test_one_column_alone_has_no_row_light_to_tell(scene: DenoiserInput) -> None
     np.testing.assert_array_equal(denoise.remove_row_noise(alone).samples.light, alone.samples.light)
 
 
-def test_slots_that_are_independent_keep_their_ratio() -> None:
-    llr = np.random.default_rng(1).normal(0, 3, (2, 50)).astype(np.float32)
-    for isi_memory in (1, 3):
-        found = denoise._slot_llr(metrics_of(llr, isi_memory), np.full(llr.shape, 0.5, np.float32))
-        np.testing.assert_allclose(found, llr, atol=1e-4)
-
-
-@pytest.mark.parametrize("isi_memory", [1, 3])
-def test_ratios_of_slots_by_brute_force(isi_memory: int) -> None:
-    """With all others known, a slot's ratio is a difference of sums of metrics."""
-    rng = np.random.default_rng(isi_memory)
-    n = 12
-    metrics, slots = rng.normal(0, 2, (1, n + isi_memory, 2 << isi_memory)), rng.integers(0, 2, n)
-
-    def total(states: np.ndarray) -> float:
-        padded = np.pad(states, isi_memory)
-        index = [int("".join(map(str, padded[i : i + isi_memory + 1])), 2) for i in range(n + isi_memory)]
-        return float(metrics[0, np.arange(n + isi_memory), index].sum())
-
-    lit = np.where(slots == 1, 1 - 1e-5, 1e-5)[None].astype(np.float32)
-    found = denoise._slot_llr(metrics, lit)[0]
-    for slot in range(isi_memory, n - isi_memory):
-        lit_there, dark_there = (np.where(np.arange(n) == slot, state, slots) for state in (1, 0))
-        assert found[slot] == pytest.approx(total(lit_there) - total(dark_there), abs=1e-2)
-
-
 def test_only_the_own_belief_and_the_neighbours_are_looked_at(scene: DenoiserInput) -> None:
     lit = scene.lit.copy()
     lit[0] = 1 - lit[0]

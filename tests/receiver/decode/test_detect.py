@@ -21,12 +21,11 @@ from rxcli.protocol import (
 from rxcli.receiver.channel import metrics_of
 from rxcli.receiver.decode.detect import (
     detect,
-    detect_with_candidates,
     initial_slot_probability,
     plausible_weights,
     slot_margin,
-    weight_log_evidence,
 )
+from rxcli.receiver.light import slot_llr
 
 FloatArray = NDArray[np.float64]
 #: One sample a slot, of that slot alone; memory 1.
@@ -104,14 +103,13 @@ def test_agrees_with_enumeration_of_all_sequences(w: int, n_symbols: int, isi_me
     rng = np.random.default_rng([w, n_symbols, isi_memory])
     metrics = rng.normal(0, 1.5, (1, 4, 20 + 10 * n_symbols + isi_memory, 2 << isi_memory))
     found = detect(metrics, only(w, 4))
-    confidence_features = weight_log_evidence(metrics, only(w, 4))
     every = sequences(w, n_symbols)
     k = bits_per_symbol(w)
     bits = indices_to_bits(every.ravel(), w).reshape(len(every), n_symbols, k)
     for column in range(4):
         paths = path_metrics(metrics[0, column], every, w)
         total = log_sum(paths)
-        assert confidence_features[column, w - 1] == pytest.approx(total - n_symbols * k * log(2), abs=2e-3)
+        assert found.log_evidence[column] == pytest.approx(total - n_symbols * k * log(2), abs=2e-3)
         share = np.exp(paths - total)
         for symbol in range(n_symbols):
             posterior = np.bincount(every[:, symbol], share, 1 << k)
@@ -303,25 +301,6 @@ def test_shapes_that_do_not_fit(shape: tuple[int, ...]) -> None:
 
 
 @pytest.mark.parametrize("isi_memory", [1, 3])
-def test_doubtful_words_are_those_of_the_posterior(isi_memory: int) -> None:
-    metrics = np.random.default_rng(isi_memory).normal(0, 1.5, (2, 3, 60 + isi_memory, 2 << isi_memory))
-    w = np.array([5, 1, 5])
-    candidates = np.zeros((3, 9), bool)
-    candidates[np.arange(3), w - 1] = True
-    found, doubtful = detect_with_candidates(metrics, candidates, -0.3, 4)
-    places, words, log_prob = doubtful.places, doubtful.words, doubtful.log_prob
-    np.testing.assert_array_equal(found.index, detect(metrics, candidates).index)
-    at = tuple(places.T)
-    assert {tuple(place) for place in places} == {tuple(place) for place in np.argwhere(found.log_prob < -0.3)}
-    assert 0 < len(places) < found.log_prob.size
-    np.testing.assert_allclose(log_prob[:, 0], found.log_prob[at], atol=1e-4)
-    best = [codebook(int(w[column]))[found.index[burst, column, symbol]] for burst, column, symbol in places]
-    np.testing.assert_array_equal(words[:, 0], best)
-    assert (np.diff(log_prob, axis=1) <= 0).all()
-    assert (words.sum(axis=2) == w[places[:, 1], None]).all()
-
-
-@pytest.mark.parametrize("isi_memory", [1, 3])
 def test_support_is_what_turning_a_single_slot_costs(isi_memory: int) -> None:
     rng = np.random.default_rng(5)
     decided = rng.random((2, 3, 12)) < 0.5
@@ -342,9 +321,27 @@ def test_support_is_what_turning_a_single_slot_costs(isi_memory: int) -> None:
         assert margin[1, 2, slot] == pytest.approx(total(decided[1, 2]) - total(turned), abs=1e-5)
 
 
-def test_no_word_is_doubtful_where_all_are_sure() -> None:
-    metrics = np.zeros((1, 2, 41, 4))
-    metrics[..., 1::2] = 30.0 * np.tile(codebook(5)[3], 5)[:41, None][:, :1]
-    metrics[..., ::2] = -metrics[..., 1::2]
-    _, doubtful = detect_with_candidates(metrics, only(5, 2), -10.0, 4)
-    assert [len(part) for part in (doubtful.places, doubtful.words, doubtful.log_prob)] == [0, 0, 0]
+def test_slots_that_are_independent_keep_their_ratio() -> None:
+    llr = np.random.default_rng(1).normal(0, 3, (2, 50)).astype(np.float32)
+    for isi_memory in (1, 3):
+        found = slot_llr(metrics_of(llr, isi_memory))
+        np.testing.assert_allclose(found, llr, atol=1e-4)
+
+
+@pytest.mark.parametrize("isi_memory", [1, 3])
+def test_ratios_of_slots_by_brute_force(isi_memory: int) -> None:
+    """With all others known, a slot's ratio is a difference of sums of metrics."""
+    rng = np.random.default_rng(isi_memory)
+    n = 12
+    metrics, slots = rng.normal(0, 2, (1, n + isi_memory, 2 << isi_memory)), rng.integers(0, 2, n)
+
+    def total(states: NDArray[np.int64]) -> float:
+        padded = np.pad(states, isi_memory)
+        index = [int("".join(map(str, padded[i : i + isi_memory + 1])), 2) for i in range(n + isi_memory)]
+        return float(metrics[0, np.arange(n + isi_memory), index].sum())
+
+    lit = np.where(slots == 1, 1 - 1e-5, 1e-5)[None].astype(np.float32)
+    found = slot_llr(metrics, lit)[0]
+    for slot in range(isi_memory, n - isi_memory):
+        lit_there, dark_there = (np.where(np.arange(n) == slot, state, slots) for state in (1, 0))
+        assert found[slot] == pytest.approx(total(lit_there) - total(dark_there), abs=1e-2)
