@@ -270,8 +270,8 @@ def _trellis(
     transitions = boundary @ (remainder @ branches.transition).reshape(boundary.shape)
     start = np.broadcast_to(branches.start, end.shape)
     # One chain for both directions: symbols are sequential, so everything else is batched.
-    both = np.concatenate([transitions, transitions[::-1].swapaxes(3, 4)], axis=1)
-    states, log_total = _chain(both, np.concatenate([start, end]))
+    directions = np.concatenate([transitions, transitions[::-1].swapaxes(3, 4)], axis=1)
+    states, log_total = _chain(directions, np.concatenate([start, end]))
     before, after = states[:, : len(end)], states[::-1, len(end) :]
     last = np.log(np.maximum((before[-1] * end).sum(axis=2), _MIN_LIKELIHOOD)) + log_total[: len(end)]
     return _Trellis(w, columns, log_scale + last.sum(axis=0), boundary, remainder, before, after)
