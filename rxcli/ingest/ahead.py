@@ -6,8 +6,8 @@ import os
 import sys
 from collections.abc import Generator
 from contextlib import closing, suppress
-from queue import SimpleQueue
-from threading import Event, Semaphore, Thread, get_native_id
+from queue import Empty, Queue
+from threading import Event, Thread, get_native_id
 
 from rxcli.types import Frame
 
@@ -23,22 +23,18 @@ def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, N
     Args:
         frames: generator, which is exhausted or closed in that thread.
     """
-    items: SimpleQueue[Frame | BaseException | None] = SimpleQueue()
-    room, closed = Semaphore(_MIN_FRAMES), Event()
+    items: Queue[Frame | BaseException | None] = Queue(_MIN_FRAMES)
+    closed = Event()
 
     def fill() -> None:
         _give_way()
         try:
             with closing(frames):
-                for number, frame in enumerate(frames):
-                    if number == 0:
-                        n_frames = min(_MAX_BYTES // frame.pixels.nbytes, _MAX_FRAMES)
-                        for _ in range(_MIN_FRAMES, n_frames):
-                            room.release()
-                    room.acquire()
+                for frame in frames:
+                    items.maxsize = min(max(_MAX_BYTES // frame.pixels.nbytes, _MIN_FRAMES), _MAX_FRAMES)
+                    items.put(frame)
                     if closed.is_set():
                         return
-                    items.put(frame)
             items.put(None)
         except BaseException as error:  # raised again where the frames are taken
             items.put(error)
@@ -47,13 +43,14 @@ def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, N
     thread.start()
     try:
         while isinstance(item := items.get(), Frame):
-            room.release()
             yield item
         if item is not None:
             raise item
     finally:
         closed.set()
-        room.release()
+        with suppress(Empty):  # room for a frame that waits, after which the thread ends
+            while True:
+                items.get_nowait()
         thread.join()
 
 

@@ -1,15 +1,15 @@
 """HEIC pictures through the optional extra `heic`.
 
-libheif rotates and mirrors pixels by the file's `irot` and `imir` properties and offers no alternative. The properties
-are read here (ISO/IEC 23008-12, section 6.5) to undo this, because rows must stay in readout order.
+libheif rotates and mirrors pixels by the file's `irot` and `imir` properties and offers no alternative. This is undone
+here, because rows must stay in readout order.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ def read_heif(data: bytes, path: Path) -> tuple[Luma, Metadata]:
         width, height = file.size
         check_size(path, width, height, 12, len(data))  # planes, interleaved RGB of up to 16 bits, luma
         pixels = np.asarray(file)
+        turned = _orientation(file[file.primary_index])
     except InputError:
         raise
     except Exception as error:  # libheif's errors come as some five unrelated types
@@ -47,68 +48,22 @@ def read_heif(data: bytes, path: Path) -> tuple[Luma, Metadata]:
     matrix = (file.info.get("nclx_profile") or {}).get("matrix_coefficients")
     luma = luma_of(pixels, BT709 if matrix == _MATRIX_BT709 else BT601)
     metadata = exif_metadata(file.info.get("exif") or b"")
-    turned = heif_orientation(data)
     return as_stored(luma, turned), replace(metadata, orientation=turned) if turned != 1 else metadata
 
 
-def heif_orientation(data: bytes) -> int:
-    """The orientation that `irot` and `imir` of the primary picture give it; 1 where they are absent or unreadable."""
-    try:
-        turns = list(_primary_turns(data))
-    except (IndexError, KeyError, ValueError):
-        return 1
+def _orientation(image: Any) -> int:
+    """The orientation that the turns and mirrors applied by libheif amount to.
+
+    Args:
+        image: pillow_heif's, which keeps them private: ("irot", degrees counter-clockwise) or ("imir", axis), in order.
+    """
 
     def view(picture: NDArray[np.int64]) -> NDArray[np.int64]:
-        for name, value in turns:
-            picture = np.rot90(picture, value & 3) if name == b"irot" else np.flip(picture, axis=value & 1)
+        for name, value, *_ in image._c_image.transformations:
+            if name == "irot":
+                picture = np.rot90(picture, value // 90)
+            elif name == "imir":
+                picture = np.flip(picture, axis=value)
         return picture
 
     return orientation_of(view)
-
-
-def _primary_turns(data: bytes) -> Iterator[tuple[bytes, int]]:
-    """Turns and mirrors of the primary picture, in the order of application: (name, angle or axis)."""
-    meta = dict(_boxes(data))[b"meta"]
-    boxes = dict(_boxes(meta[4:]))
-    properties = dict(_boxes(boxes[b"iprp"]))
-    container = list(_boxes(properties[b"ipco"]))
-    pitm = boxes[b"pitm"]
-    primary = int.from_bytes(pitm[4:6] if pitm[0] == 0 else pitm[4:8])
-    for index in _associations(properties[b"ipma"]).get(primary, ()):
-        name, content = container[index - 1]
-        if name in (b"irot", b"imir"):
-            yield name, content[0]
-
-
-def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Name and content of the boxes of ISO media (ISO/IEC 14496-12, section 4.2)."""
-    at = 0
-    while at + 8 <= len(data):
-        size, name, start = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8], at + 8
-        if size == 1:
-            size, start = int.from_bytes(data[start : start + 8]), start + 8
-        end = at + size if size else len(data)
-        if end < start:
-            raise ValueError("a box ends before it starts")
-        yield name, data[start:end]
-        at = end
-
-
-def _associations(ipma: bytes) -> dict[int, list[int]]:
-    """Item -> its properties, numbered from 1 (ISO/IEC 23008-12, section 9.3)."""
-    stream = io.BytesIO(ipma)
-
-    def unsigned(size: int) -> int:
-        data = stream.read(size)
-        if len(data) < size:
-            raise ValueError("the box is cut")
-        return int.from_bytes(data)
-
-    version, flags = unsigned(1), unsigned(3)
-    found: dict[int, list[int]] = {}
-    for _ in range(unsigned(4)):
-        item = unsigned(2 if version == 0 else 4)
-        width = 2 if flags & 1 else 1
-        mask = 0x7FFF if flags & 1 else 0x7F  # the top bit means "essential"
-        found[item] = [unsigned(width) & mask for _ in range(unsigned(1))]
-    return found

@@ -10,7 +10,7 @@ import logging
 import warnings
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
 from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import Kind, check_size, read_bytes, reason_of
 from rxcli.types import Frame, Metadata
+
+#: Pillow's are left out: sizes are checked here, and broken directories do no harm.
+_no_warnings = partial(warnings.catch_warnings, action="ignore")
 
 
 def read_image(path: Path, kind: Kind) -> Frame:
@@ -143,7 +146,7 @@ def _pillow_tiff(path: Path, page: Any) -> NDArray[Any]:
 
     tag = page.tags.get("Orientation")
     orientation = int(tag.value) if tag is not None and tag.value in range(1, 9) else 1
-    with _quiet(), quiet_libraries(), Image.open(path, formats=("TIFF",)) as image:
+    with _no_warnings(), quiet_libraries(), Image.open(path, formats=("TIFF",)) as image:
         return as_stored(_pillow_pixels(image), orientation)  # Pillow turns TIFFs for viewing
 
 
@@ -183,7 +186,7 @@ def _read_with_pillow(data: bytes, path: Path) -> NDArray[np.uint8]:
     from PIL import Image
 
     try:
-        with _quiet(), Image.open(io.BytesIO(data), formats=("BMP", "WEBP")) as image:
+        with _no_warnings(), Image.open(io.BytesIO(data), formats=("BMP", "WEBP")) as image:
             check_size(path, *image.size, 8, len(data))  # as it is stored, as RGB twice, luma
             return np.asarray(luma_of(_pillow_pixels(image)), np.uint8)
     except InputError:
@@ -197,11 +200,3 @@ def _pillow_pixels(image: Any) -> NDArray[Any]:
     plain = image.mode in ("L", "RGB", "I;16", "I;16B", "F")
     pixels = np.asarray(image if plain else image.convert("RGB"))
     return pixels.astype(pixels.dtype.newbyteorder("="))
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without Pillow's warnings: sizes are checked here, and broken directories do no harm."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield

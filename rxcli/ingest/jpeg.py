@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from rxcli.ingest.sniff import check_size, reason_of
 _FAULTS = (ValueError, KeyError, MemoryError, OverflowError)
 #: Frames whose coefficients are gathered from several scans; baseline ones may be, too, in separate scans.
 _PROGRESSIVE = (0xC2, 0xC6, 0xCA, 0xCE)
+#: Start of a scan.
+_SCAN = 0xDA
 #: Encoders use some ten; every scan goes over the whole picture.
 _MAX_SCANS = 100
 _PADDING = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
@@ -53,16 +56,28 @@ def _frame_of(data: Any) -> tuple[float, bool]:
     marker identifies the process, its sixth byte is the number of components; B.2.3: the first byte of a scan's header
     is the number of its components.
     """
-    at, data, held, n_components, is_progressive = 2, memoryview(data), 1.0, 0, False
-    while at + 10 <= len(data) and data[at] == 0xFF:
-        marker, length = data[at + 1], data[at + 2] << 8 | data[at + 3]
-        if marker == 0xDA:
-            return held, not is_progressive and data[at + 4] == n_components
+    held, n_components, is_progressive = 1.0, 0, False
+    for marker, start, _ in segments(data):
+        if marker == _SCAN:
+            return held, not is_progressive and data[start] == n_components
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            n_components, is_progressive = data[at + 9], marker in _PROGRESSIVE
+            n_components, is_progressive = data[start + 5], marker in _PROGRESSIVE
             held = 1.0 + (2 * n_components if is_progressive else 0)
-        at += 1 if marker == 0xFF else 2 + max(length, 2)
     return held, False
+
+
+def segments(data: Any) -> Iterator[tuple[int, int, int]]:
+    """Marker, and start and end of the content, of the segments up to the first scan (ITU-T T.81, B.1.1.4)."""
+    at = 2
+    while at + 10 <= len(data) and data[at] == 0xFF:
+        if data[at + 1] == 0xFF:  # padding
+            at += 1
+            continue
+        end = at + 2 + max(data[at + 2] << 8 | data[at + 3], 2)
+        yield data[at + 1], at + 4, end
+        if data[at + 1] == _SCAN:
+            return
+        at = end
 
 
 def _gray(data: Any, strict: bool = True) -> NDArray[np.uint8]:

@@ -10,18 +10,21 @@ import io
 import math
 import struct
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from rxcli.ingest.extent import claims_too_much
+from rxcli.ingest.jpeg import segments
 from rxcli.types import Metadata
 
 # EXIF 2.32, tables 3 to 8.
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
 _EXPOSURE, _SENSITIVITY, _RECOMMENDED_INDEX, _ISO_SPEED = 0x829A, 0x8827, 0x8832, 0x8833
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
+#: Marker of the segments of a JPEG file that hold EXIF.
+_APP1 = 0xE1
 #: Value of the 16-bit sensitivity tag if the ISO does not fit; longer tags then hold it.
 _ISO_OVERFLOW = 65535
 #: Enough of a file for its directories, where they must be copied.
@@ -44,7 +47,8 @@ Tags = Mapping[int, Any]
 
 def jpeg_metadata(data: bytes) -> Metadata:
     """Metadata of a JPEG file's bytes."""
-    return exif_metadata(next(_exif_segments(data), b""))
+    contents = (data[start:end] for marker, start, end in segments(data) if marker == _APP1)
+    return exif_metadata(next((content for content in contents if content.startswith(b"Exif\0\0")), b""))
 
 
 def exif_metadata(exif: bytes) -> Metadata:
@@ -126,17 +130,6 @@ def _canon_metadata(head: bytes) -> Metadata:
     return merge(exif_metadata(main), exif_metadata(exif))
 
 
-def _exif_segments(data: bytes) -> Iterator[bytes]:
-    """EXIF blocks in the header of a JPEG file."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != 0xDA:
-        (length,) = struct.unpack_from(">H", data, at + 2)
-        segment = data[at + 4 : at + 2 + length]
-        if data[at + 1] == 0xE1 and segment.startswith(b"Exif\0\0"):
-            yield segment
-        at += 2 + max(length, 2)
-
-
 def _load_directories(stream: BinaryIO) -> tuple[Tags, Tags]:
     """First and EXIF directory as plain dictionaries, empty where they are broken."""
     from PIL import Image
@@ -145,8 +138,7 @@ def _load_directories(stream: BinaryIO) -> tuple[Tags, Tags]:
     if claims_too_much(stream):
         return {}, {}
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             stream.seek(0)
             exif = Image.Exif()
             exif.load_from_fp(stream)

@@ -2,7 +2,8 @@
 
 The kernel interface is used directly. OpenCV hides why a camera cannot be opened, takes another pixel format unasked,
 and gives no times. FFmpeg's input (through PyAV) gives times, but sets neither exposure nor gain, lists modes to its
-log alone, and counts no frames that the driver dropped.
+log alone, takes YUYV where 10 or 12 bits are asked for, counts no frames that the driver dropped, and cannot be stopped
+while a camera is silent.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import os
 import select
 import time
 from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from fcntl import ioctl
 from functools import partial
@@ -112,10 +113,6 @@ class CameraCounts:
     start_s: float | None = None
 
 
-class _TimeUpError(Exception):
-    """The time of a live source is over."""
-
-
 class CameraLost(InputError):
     """A camera that is missing, busy, silent or unplugged: it may come back."""
 
@@ -145,56 +142,48 @@ class LiveSource:
         self.mode: Mode | None = None
         self._path = path
         self._on_lost = on_lost or (lambda reason: None)
-        self._duration_s, self._end_s = duration_s, math.inf
+        self._duration_s = math.inf if duration_s is None else duration_s
         self._on_idle = on_idle or (lambda: None)
 
-    def _idle(self) -> None:
-        self._on_idle()
-        if time.monotonic() >= self._end_s:
-            raise _TimeUpError
-
     def __iter__(self) -> Generator[Frame, None, None]:
-        if self._duration_s is not None:
-            self._end_s = time.monotonic() + self._duration_s
-        try:
-            yield from self._frames()
-        except _TimeUpError:
-            return
-
-    def _frames(self) -> Generator[Frame, None, None]:
-        waiting = False
-        while True:
+        end_s, is_waiting = time.monotonic() + self._duration_s, False
+        while time.monotonic() < end_s:
             try:
-                with closing(Camera(self._path, self.settings, self.counts, self._idle)) as camera:
-                    self.mode, waiting = camera.mode, False
+                with closing(Camera(self._path, self.settings, self.counts)) as camera:
+                    self.mode, is_waiting = camera.mode, False
                     for frame in camera:
-                        yield frame
-                        if time.monotonic() >= self._end_s:
+                        if frame is None:
+                            self._on_idle()
+                        else:
+                            yield frame
+                        if time.monotonic() >= end_s:
                             return
             except CameraLost as error:
                 if not self.settings.wait:
                     raise
-                if not waiting:
+                if not is_waiting:
                     self._on_lost(str(error))
-                waiting = True
-                time.sleep(min(_RETRY_S, max(self._end_s - time.monotonic(), 0.0)))
-                self._idle()
+                is_waiting = True
+                time.sleep(min(_RETRY_S, max(end_s - time.monotonic(), 0.0)))
+                self._on_idle()
 
 
 class Camera:
     """One connection to a camera, which is to be closed, and an iterator over its newest frames.
+
+    None stands between frames where no whole one came for a while.
 
     Raises:
         CameraLost: missing, busy, silent or unplugged.
         InputError: no camera, or not in the mode that is asked for.
     """
 
-    def __init__(self, path: Path, settings: CameraSettings, counts: CameraCounts, on_idle: Callable[[], None]) -> None:
-        self.counts, self._on_idle = counts, on_idle
-        self._path, self._settings = path, settings
+    def __init__(self, path: Path, settings: CameraSettings, counts: CameraCounts) -> None:
+        self.counts, self._path, self._settings = counts, path, settings
         self._maps: list[mmap.mmap] = []
-        #: Number of the last frame that the driver gave.
+        #: Number of the last frame that the driver gave, and when it came.
         self._sequence: int | None = None
+        self._came_s = time.monotonic()
         with _explained(path):
             self._descriptor = _open(path)
             try:
@@ -203,18 +192,23 @@ class Camera:
                 self.close()
                 raise
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[Frame | None]:
         with _explained(self._path):
             while True:
+                n_damaged = self.counts.damaged
                 buffer = self._newest()
-                luma = self._luma(buffer)
-                self._give_back(buffer)
-                if luma is None:
-                    self.counts.damaged += 1
-                    self._on_idle()
-                else:
-                    self.counts.delivered += 1
+                silent_s = time.monotonic() - self._came_s
+                luma = None if buffer is None else self._luma(buffer)
+                if buffer is not None:
+                    self._give_back(buffer)
+                    self.counts.damaged += luma is None
+                elif silent_s > self._settings.stall_s:
+                    reason = f"{self._path}: the camera sent nothing for {self._settings.stall_s:g} s"
+                    raise CameraLost(reason, "check its cable, or lower size and rate")
+                if luma is not None:
                     yield self._frame(luma, buffer.seconds + buffer.microseconds * 1e-6)
+                elif silent_s > _POLL_S or self.counts.damaged > n_damaged:
+                    yield None
 
     def close(self) -> None:
         """Hand the device back; may be called again."""
@@ -229,9 +223,9 @@ class Camera:
     def _configure(self) -> None:
         self._card = _check_capture(self._descriptor, self._path)
         wanted = _choose(list(_modes(self._descriptor)), self._settings, self._path)
-        self._layout = _set_format(self._descriptor, wanted, self._path)
+        self._form = _set_format(self._descriptor, wanted, self._path)
         fps = _set_rate(self._descriptor, self._settings.fps or wanted.fps)
-        self.mode = Mode(wanted.pixel_format, self._layout.width, self._layout.height, fps)
+        self.mode = Mode(wanted.pixel_format, self._form.width, self._form.height, fps)
         self.exposure_s = _set_exposure(self._descriptor, self._settings.exposure_s, self._path)
         _set_gain(self._descriptor, self._settings.gain, self._path)
         self._map_buffers()
@@ -250,35 +244,25 @@ class Camera:
     # -- taking frames ------------------------------------------------------------------------------------------------
 
     def _newest(self) -> Any:
-        """The newest whole capture, waited for; those before it go back to the driver unseen."""
-        last_frame_s, newest, n_captures = time.monotonic(), None, 0
-        while True:
-            buffer = self._dequeue(0.0 if newest else _POLL_S)
-            if buffer is None:
-                # Where every buffer was filled, the driver had none for what came after: the newest is old.
-                if newest and n_captures != len(self._maps):
-                    return newest
-                if newest:
-                    self._pass_over(newest)
-                    newest, n_captures = None, 0
-                elif (silent_s := time.monotonic() - last_frame_s) > self._settings.stall_s:
-                    reason = f"{self._path}: the camera sent nothing for {self._settings.stall_s:g} s"
-                    raise CameraLost(reason, "check its cable, or lower size and rate")
-                elif silent_s > _POLL_S:
-                    self._on_idle()
-                continue
-            last_frame_s = time.monotonic()
+        """The newest whole capture; those before it go back to the driver unseen. None where none came for a while."""
+        newest, n_captures = None, 0
+        while buffer := self._dequeue(0.0 if n_captures else _POLL_S):
+            n_captures += 1
             if self._sequence is not None:
                 self.counts.dropped += max(0, buffer.sequence - self._sequence - 1)
-            self._sequence = buffer.sequence
+            self._sequence, self._came_s = buffer.sequence, time.monotonic()
             if buffer.flags & abi.BUF_FLAG_ERROR:
                 self.counts.damaged += 1
                 self._give_back(buffer)
-                self._on_idle()
                 continue
             if newest:
                 self._pass_over(newest)
-            newest, n_captures = buffer, n_captures + 1
+            newest = buffer
+        # Where every buffer was filled, the driver had none for what came after: the newest is old.
+        if newest and n_captures == len(self._maps):
+            self._pass_over(newest)
+            return None
+        return newest
 
     def _dequeue(self, wait_s: float) -> Any:
         """A filled buffer, None where there is none yet."""
@@ -303,42 +287,31 @@ class Camera:
         """A copy (height, width) of the luma in a buffer; None where it is damaged."""
         data = self._maps[buffer.index]
         if self.mode.pixel_format == "MJPG":
-            return _decode_jpeg(data[: buffer.bytesused], self._path)
-        return self._layout.luma(data)
+            from rxcli.ingest.jpeg import decode_luma
+
+            with suppress(InputError):
+                return decode_luma(data[: buffer.bytesused], self._path)
+            return None
+        pixels, width, height = PIXEL_FORMATS[self.mode.pixel_format], self.mode.width, self.mode.height
+        dtype = np.dtype(pixels.dtype)
+        pitch = self._form.bytesperline or width * pixels.step * dtype.itemsize
+        samples: NDArray[Any] = np.frombuffer(data, dtype, count=pitch * height // dtype.itemsize)
+        stop = pixels.start + width * pixels.step
+        return samples.reshape(height, -1)[:, pixels.start : stop : pixels.step].copy()
+
+    def _levels(self) -> tuple[float, float]:
+        """Values of black and white."""
+        pixels, form = PIXEL_FORMATS[self.mode.pixel_format], self._form
+        full = form.quantization == abi.QUANTIZATION_FULL_RANGE or form.colorspace == abi.COLORSPACE_JPEG
+        return (16, 235) if pixels.ycbcr and not full else (0, pixels.white)
 
     def _frame(self, luma: Luma, time_s: float) -> Frame:
         if self.counts.start_s is None:
             self.counts.start_s = time_s
-        return Frame(
-            pixels=luma,
-            source=str(self._path),
-            index=self.counts.delivered - 1,
-            time_s=time_s - self.counts.start_s,
-            metadata=Metadata(model=self._card, exposure_s=self.exposure_s),
-            black=self._layout.black,
-            white=self._layout.white,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """Where luma lies in a buffer, and its levels."""
-
-    form: PixelFormat
-    width: int
-    height: int
-    #: Bytes from one row to the next.
-    pitch: int
-    black: float
-    white: float
-
-    def luma(self, data: Any) -> Luma:
-        """A copy (height, width) of the luma in a buffer."""
-        dtype = np.dtype(self.form.dtype)
-        samples: NDArray[Any] = np.frombuffer(data, dtype, count=self.pitch * self.height // dtype.itemsize)
-        rows = samples.reshape(self.height, -1)
-        stop = self.form.start + self.width * self.form.step
-        return rows[:, self.form.start : stop : self.form.step].copy()
+        self.counts.delivered += 1
+        metadata, (black, white) = Metadata(model=self._card, exposure_s=self.exposure_s), self._levels()
+        index, time_s = self.counts.delivered - 1, time_s - self.counts.start_s
+        return Frame(luma, str(self._path), index, time_s, metadata, black=black, white=white)
 
 
 def list_modes(path: Path) -> list[Mode]:
@@ -351,7 +324,7 @@ def list_modes(path: Path) -> list[Mode]:
         descriptor = _open(path)
         try:
             _check_capture(descriptor, path)
-            return sorted(_modes(descriptor), key=_merit(None), reverse=True)
+            return sorted(_modes(descriptor), key=_merit, reverse=True)
         finally:
             os.close(descriptor)
 
@@ -437,15 +410,10 @@ def _enumerate(descriptor: int, request: int, structure: Callable[[int], Any]) -
         yield item
 
 
-def _merit(fps: float | None) -> Callable[[Mode], tuple[bool, int, int]]:
+def _merit(mode: Mode, fps: float | None = None) -> tuple[bool, int, int]:
     """Order of modes: fast enough, then large, then by pixel format."""
-    order = list(PIXEL_FORMATS)
-
-    def merit(mode: Mode) -> tuple[bool, int, int]:
-        fast = mode.fps == 0 or mode.fps >= (fps or _USUAL_FPS) * 0.98
-        return fast, mode.width * mode.height, -order.index(mode.pixel_format)
-
-    return merit
+    is_fast = mode.fps == 0 or mode.fps >= (fps or _USUAL_FPS) * 0.98
+    return is_fast, mode.width * mode.height, -list(PIXEL_FORMATS).index(mode.pixel_format)
 
 
 def _choose(modes: list[Mode], settings: CameraSettings, path: Path) -> Mode:
@@ -458,14 +426,15 @@ def _choose(modes: list[Mode], settings: CameraSettings, path: Path) -> Mode:
     fitting = [mode for mode in fitting if settings.width in (None, mode.width)]
     fitting = [mode for mode in fitting if settings.height in (None, mode.height)]
     if fitting:
-        return max(fitting, key=_merit(settings.fps))
+        return max(fitting, key=partial(_merit, fps=settings.fps))
     if not modes:
         raise InputError(f"{path}: none of its pixel formats can be read", f"known are {', '.join(PIXEL_FORMATS)}")
     asked = f"{settings.pixel_format or 'any format'} {settings.width or 'any'} x {settings.height or 'any'}"
     raise InputError(f"{path}: does not offer {asked}", f"it offers {', '.join(str(mode) for mode in modes)}")
 
 
-def _set_format(descriptor: int, mode: Mode, path: Path) -> _Layout:
+def _set_format(descriptor: int, mode: Mode, path: Path) -> Any:
+    """Set the format of a mode; returns the one in effect, with the size and the bytes of a row."""
     code = abi.fourcc(mode.pixel_format)
     form = abi.Format(
         type=abi.BUF_TYPE_VIDEO_CAPTURE, width=mode.width, height=mode.height, pixelformat=code, field=abi.FIELD_NONE
@@ -474,12 +443,7 @@ def _set_format(descriptor: int, mode: Mode, path: Path) -> _Layout:
     if form.pixelformat != code:  # a driver may answer with the nearest that it has
         got = abi.fourcc_name(form.pixelformat)
         raise InputError(f"{path}: gives {got} instead of {mode.pixel_format}", "ask for another --format")
-    pixels = PIXEL_FORMATS[mode.pixel_format]
-    sample = np.dtype(pixels.dtype).itemsize
-    pitch = form.bytesperline or form.width * pixels.step * sample
-    full = form.quantization == abi.QUANTIZATION_FULL_RANGE or form.colorspace == abi.COLORSPACE_JPEG
-    black, white = (16, 235) if pixels.ycbcr and not full else (0, pixels.white)
-    return _Layout(pixels, form.width, form.height, pitch, black, white)
+    return form
 
 
 def _set_rate(descriptor: int, fps: float) -> float:
@@ -528,12 +492,3 @@ def _set(descriptor: int, control: int, value: int) -> int | None:
 
 def _buffer(index: int) -> ctypes.Structure:
     return abi.Buffer(index=index, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
-
-
-def _decode_jpeg(data: bytes, path: Path) -> NDArray[np.uint8] | None:
-    from rxcli.ingest.jpeg import decode_luma
-
-    try:
-        return decode_luma(data, path)
-    except InputError:
-        return None

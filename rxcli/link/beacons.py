@@ -17,9 +17,6 @@ from rxcli.types import FrameSoftBits, MessageKind
 #: to the beacon's bits.
 _TRY_FROM, _RETRY_GAIN, _TRY_UP_TO = 1.02, 0.08, 2.5
 _ITERATIONS, _PATIENCE = 25, ldpc.Patience(6, 0.95)
-#: Information per sent bit from which parity alone can rule out a codeword, and the share of unsatisfied checks that
-#: does: by chance half of them are, for a codeword of that information a quarter.
-_WELL_SEEN, _NO_CODEWORD = 0.9, 0.4
 #: Log-likelihood ratio below which bursts, or copies within one burst, do not carry the same message.
 _MIN_SIMILARITY = -8.0
 #: Step of columns and bits in the initial comparison.
@@ -203,19 +200,15 @@ def read_words(layout: BeaconLayout, buffers: Float32, accept: object = None) ->
     """Decode buffers (n, n_bits) of a layout; None if no sufficiently likely word is found."""
     found: list[bytes | None] = [None] * len(buffers)
     check = unprotect_beacon if accept is None else accept
-    well_seen = information(buffers).mean(axis=1) > _WELL_SEEN
-    unsatisfied = ldpc.sent_parity(layout.code, (buffers > 0).astype(np.uint8))
-    tried = np.flatnonzero(~well_seen | (unsatisfied < _NO_CODEWORD))
 
     def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
         good = np.zeros(places.size, bool)
-        for i, (place, coded) in enumerate(zip(tried[places], np.packbits(bits, axis=1), strict=True)):
+        for i, (place, coded) in enumerate(zip(places, np.packbits(bits, axis=1), strict=True)):
             if check(coded.tobytes()) is not None and is_likely(layout, bits[i], buffers[place]):  # type: ignore[operator]
                 found[place], good[i] = coded.tobytes(), True
         return good
 
-    if tried.size:
-        ldpc.decode(layout.code, ldpc.quantised(buffers[tried]), accepted, _ITERATIONS, _PATIENCE)
+    ldpc.decode(layout.code, ldpc.quantised(buffers), accepted, _ITERATIONS, _PATIENCE)
     return found
 
 

@@ -28,9 +28,6 @@ _MAX_MESSAGE = 1000
 #: Log-likelihood ratio of filler bits, which are known.
 _KNOWN = 8000
 
-#: Number of checks that suffice to distinguish a codeword from other bits.
-_MAX_CHECKS = 6
-
 Bits = NDArray[np.uint8]
 Edge = tuple[int, int]
 
@@ -151,55 +148,6 @@ def _solve_core(code: Code, coded: Bits) -> None:
                 (column, shift), *_ = missing
                 coded[:, column] = np.roll(_sum(coded, [e for e in row if e[0] in solved]), shift, axis=1)
                 solved.add(column)
-
-
-def sent_parity(code: Code, bits: Bits) -> NDArray[np.float64]:
-    """Share of the parity checks on sent bits alone that hard decisions violate: about half by chance.
-
-    Args:
-        code: the code.
-        bits: (batch, n) uint8 of 0/1, the first n bits of the buffer.
-
-    Returns:
-        (batch,) share; 0 if no check involves these bits alone.
-    """
-    batch, n_bits = bits.shape
-    sent = code.k - _PUNCTURED * code.z
-    n_parity = max(n_bits - sent, 0) // code.z
-    checks = _sent_checks(code, n_parity)
-    if not checks or not n_parity:
-        return np.zeros(batch)
-    coded = np.zeros((batch, code.information_columns + n_parity, code.z), np.uint8)
-    flat = coded.reshape(batch, -1)
-    flat[:, _PUNCTURED * code.z : code.k] = bits[:, :sent]
-    flat[:, code.information_columns * code.z :] = bits[:, sent : sent + n_parity * code.z]
-    return np.asarray(np.mean([_sum(coded, list(edges)).mean(axis=1) for edges in checks], axis=0))
-
-
-@cache
-def _sent_checks(code: Code, n_parity: int) -> tuple[tuple[Edge, ...], ...]:
-    """The lightest checks on sent bits of the first parity columns.
-
-    Unsent columns are eliminated from a row by adding the lightest row with only that unsent column.
-    """
-    known = code.information_columns + n_parity
-    rows = sorted((row for row in code.rows if max(column for column, _ in row) < known), key=len)
-    unsent = [[column for column, _ in row if column < _PUNCTURED] for row in rows]
-    pivots = {columns[0]: row for row, columns in reversed(list(zip(rows, unsent, strict=True))) if len(columns) == 1}
-    checks = []
-    for row, columns in zip(rows, unsent, strict=True):
-        if row not in pivots.values() and all(column in pivots for column in columns):
-            for column in columns:
-                row = _without(row, column, pivots[column], code.z)
-            checks.append(row)
-    return tuple(sorted(checks, key=len)[:_MAX_CHECKS])
-
-
-def _without(row: tuple[Edge, ...], column: int, pivot: tuple[Edge, ...], z: int) -> tuple[Edge, ...]:
-    """Sum of two rows of checks, the second shifted so that a common column cancels."""
-    turn = dict(row)[column] - dict(pivot)[column]
-    edges = [*row, *((c, (shift + turn) % z) for c, shift in pivot)]
-    return tuple(edge for edge in edges if edges.count(edge) == 1)
 
 
 #: Acceptance test of hard decisions: (batch indices (n,), information bits (n, k)) -> (n,) bool.

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
-import uuid
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from rxcli.errors import InputError
 from rxcli.link.formats import safe_name
-from rxcli.outputs import Taken
+from rxcli.outputs import Taken, write_whole
 from rxcli.types import FrameResult, ReceivedObject
 
 
@@ -20,8 +19,7 @@ def save_object(
 ) -> ReceivedObject:
     """Write a complete file and return it with its path.
 
-    The file is written under a temporary name and renamed, so that a partial file is never visible. An existing file of
-    the same name and content is left as it is.
+    A partial file is never visible. An existing file of the same name and content is left as it is.
 
     Args:
         received: the file.
@@ -30,33 +28,20 @@ def save_object(
         taken: files of this run; the new one is added.
 
     Raises:
-        InputError: a different file has its name, or the folder is not writable.
+        InputError: a different file has its name, or it cannot be written.
     """
     path = folder / safe_name(received.name)
     taken = Taken() if taken is None else taken
-    if _is_same(path, received):
-        taken.add(path, "a file received before")
-        return replace(received, path=str(path))
-    whose = taken.by(path)
-    if whose is not None:
-        raise InputError(
-            f"{path} is {whose}; {received.name} ({received.size} bytes) was not written",
-            "give another folder with --out",
-        )
-    hidden = folder / f".vlc-rx-{uuid.uuid4().hex}.part"
-    try:
-        try:
-            hidden.write_bytes(received.data)
-            _put(hidden, path, force)
-        finally:
-            hidden.unlink(missing_ok=True)
-    except FileExistsError:
-        raise InputError(
-            f"{path} exists with other content; {received.name} ({received.size} bytes) was not written",
-            "give --force to overwrite it, or another folder",
-        ) from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})", "name another folder") from None
+    if not _is_same(path, received):
+        whose, lost = taken.by(path), f"{received.name} ({received.size} bytes) was not written"
+        if whose is not None:
+            raise InputError(f"{path} is {whose}; {lost}", "give another folder with --out")
+        if os.path.lexists(path) and not force:
+            step = "give --force to overwrite it, or another folder"
+            raise InputError(f"{path} exists with other content; {lost}", step)
+        if path.is_symlink():  # the link itself is replaced, never its target
+            path.unlink(missing_ok=True)
+        write_whole(path, received.data)
     taken.add(path, "a file received before")
     return replace(received, path=str(path))
 
@@ -73,19 +58,6 @@ def save_objects(
             objects.append(received)
             on_error(str(error))
     return replace(result, objects=tuple(objects)) if objects else result
-
-
-def _put(written: Path, path: Path, force: bool) -> None:
-    if force:
-        os.replace(written, path)  # replaces a link itself, never its target
-        return
-    try:
-        os.link(written, path)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without links
-        with path.open("xb") as file:
-            file.write(written.read_bytes())
 
 
 def _is_same(path: Path, received: ReceivedObject) -> bool:

@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from rxcli.errors import InputError, UsageError
 from rxcli.ingest import open_source
-from rxcli.link.collector import Collector
 from rxcli.options import ReceiverOptions, receiver_options
 from rxcli.receiver.pipeline import receive as receive_frames
 from rxcli.receiver.pipeline import receive_frame
 from rxcli.results.dump import Taps, read_taps
-from rxcli.runs.batch import with_last
+from rxcli.runs.batch import standard_decoder
 from rxcli.types import Frame, FrameResult
 
 #: A picture: a file, an array of grey values, or a frame with what is known of it.
@@ -84,9 +83,7 @@ class Receiver:
 
     def _with_messages(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
         """Results with the texts and files that they complete; the last one with what is left of others."""
-        collector = Collector(self.options.screens, self.options.file_memory_mb)
-        for result, last in with_last(results):
-            yield collector.finish(collector.add(result)) if last else collector.add(result)
+        return standard_decoder(self.options).linked(results)
 
     def tap(self, picture: Picture) -> tuple[FrameResult, Taps | None]:
         """Receive one photograph and keep the arrays of every stage boundary; None where reception ended before.

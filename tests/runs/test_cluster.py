@@ -10,18 +10,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from fake_receiver import fake_decoder
 from small_frames import write_frame, write_profiles
 
 from rxcli.cli.main import run
-from rxcli.errors import OutputError, UsageError
+from rxcli.errors import UsageError
 from rxcli.results.record import to_json_line
-from rxcli.runs import cluster
 from rxcli.runs.batch import Source, decode_here
 from rxcli.runs.cluster import decode_on_cluster
 
@@ -131,20 +128,6 @@ def test_taps_land_where_the_user_is(
 
 
 KINDS = (("straight", ".00000.png"), ("taps", "-000000.npz"))
-
-
-def test_a_worker_names_no_file_elsewhere(tmp_path: Path) -> None:
-    decoder = replace(fake_decoder(), options=SimpleNamespace(dump_dir=tmp_path / "taps"))
-    with pytest.raises(OutputError, match="a worker names a file outside --dump-dir"):
-        cluster._write([("--dump-dir/../other.npz", b"")], decoder)
-    assert not list(tmp_path.iterdir())
-
-
-def test_taps_that_are_too_large_to_send(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "_MAX_TAPPED", 1 << 20)
-    (tmp_path / "a.npz").write_bytes(bytes(3 << 20))
-    with pytest.raises(OutputError, match=r"x\.mp4: its taps take 3 MB; a cluster sends at most 1 MB"):
-        cluster._collect(tmp_path, Source("x.mp4", "x.mp4"))
 
 
 def test_a_scheduler_that_is_not_there(tmp_path: Path) -> None:
