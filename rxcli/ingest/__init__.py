@@ -15,7 +15,6 @@ from rxcli.ingest.sniff import (
     Kind,
     check_file,
     check_no_list,
-    is_raw_tiff,
     read_bytes,
     sniff,
 )
@@ -48,7 +47,11 @@ def _kind(path: Path) -> Kind | None:
     head = read_bytes(path, HEAD_BYTES)
     check_no_list(path, head)
     kind = sniff(head, path.suffix.lower())
-    return "raw" if kind == "tiff" and is_raw_tiff(path) else kind
+    if kind == "tiff":
+        from rxcli.ingest.metadata import is_raw_tiff
+
+        return "raw" if is_raw_tiff(path) else "tiff"
+    return kind
 
 
 def _read(path: Path, kind: Kind) -> Iterator[Frame]:

@@ -17,8 +17,12 @@ from typing import Any, BinaryIO
 
 from rxcli.ingest.extent import claims_too_much
 from rxcli.ingest.jpeg import segments
+from rxcli.ingest.sniff import RAW_SUFFIXES
 from rxcli.types import Metadata
 
+# TIFF 6.0, and DNG 1.4; a colour filter array, and linear RAW.
+_SUBFILE_TYPE, _PHOTOMETRIC, _DNG_VERSION = 0x00FE, 0x0106, 0xC612
+_RAW_PHOTOMETRICS = (32803, 34892)
 # EXIF 2.32, tables 3 to 8.
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
 _EXPOSURE, _SENSITIVITY, _RECOMMENDED_INDEX, _ISO_SPEED = 0x829A, 0x8827, 0x8832, 0x8833
@@ -61,13 +65,16 @@ def tiff_metadata(stream: BinaryIO) -> Metadata:
     return _from_tags(*_load_directories(stream))
 
 
-def tiff_tags(path: Path) -> Tags:
-    """Tags of a TIFF file's first directory; none where it is broken."""
-    try:
-        with path.open("rb") as file:
-            return _load_directories(file)[0]
-    except OSError:
-        return {}
+def is_raw_tiff(path: Path) -> bool:
+    """Whether a TIFF file is a camera's RAW in TIFF clothes: a DNG, a mosaic, or a preview with its RAW further on."""
+    with path.open("rb") as file:
+        tags, _ = _load_directories(file)
+    has_raw_name = path.suffix.lower() in RAW_SUFFIXES
+    if not tags:
+        return has_raw_name
+    if _DNG_VERSION in tags or tags.get(_PHOTOMETRIC) in _RAW_PHOTOMETRICS:
+        return True
+    return _MAKE in tags and (tags.get(_SUBFILE_TYPE) == 1 or has_raw_name)
 
 
 def raw_metadata(path: Path) -> Metadata:

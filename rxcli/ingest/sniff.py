@@ -33,9 +33,6 @@ MAX_BYTES = 1_250_000_000
 
 #: Starts of playlists (HLS, FFmpeg's concat, DASH), whatever their names.
 _LIST_MAGIC = (b"#EXTM3U", b"ffconcat", b"<MPD")
-_SUBFILE_TYPE, _PHOTOMETRIC, _MAKE, _DNG_VERSION = 0x00FE, 0x0106, 0x010F, 0xC612
-#: Colour filter array, and linear RAW.
-_RAW_PHOTOMETRICS = (32803, 34892)
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"hevc", b"hevx", b"msf1")
 #: Signatures: offset, bytes and kind; the first match decides.
 _MAGIC: tuple[tuple[int, tuple[bytes, ...], Kind], ...] = (
@@ -116,19 +113,6 @@ def check_no_list(path: Path, head: bytes) -> None:
     """
     if head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(_LIST_MAGIC):
         raise InputError(f"{path}: is a list of other files, which are not opened", "name the clips themselves")
-
-
-def is_raw_tiff(path: Path) -> bool:
-    """Whether a TIFF file is a camera's RAW in TIFF clothes: a DNG, a mosaic, or a preview with its RAW further on."""
-    from rxcli.ingest.metadata import tiff_tags
-
-    tags = tiff_tags(path)
-    if not tags:
-        return path.suffix.lower() in RAW_SUFFIXES
-    if _DNG_VERSION in tags or tags.get(_PHOTOMETRIC) in _RAW_PHOTOMETRICS:
-        return True
-    preview = tags.get(_SUBFILE_TYPE) == 1
-    return _MAKE in tags and (preview or path.suffix.lower() in RAW_SUFFIXES)
 
 
 def check_size(source: object, width: int, height: int, bytes_a_pixel: float = 1, further_bytes: int = 0) -> None:
