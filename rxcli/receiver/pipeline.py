@@ -129,8 +129,8 @@ def _receive_screen(frame: Frame, outlines: list[Outline], options: ReceiverOpti
         no_header,
         options.min_confidence,
         denoised,
+        outline.certainty,
     )
-    columns = assemble.with_certainty(columns, outline.certainty, options.min_confidence)
     if camera.reversed:
         columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
     result = replace(

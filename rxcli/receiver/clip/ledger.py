@@ -26,7 +26,6 @@ from rxcli.receiver.sync import tracking
 from rxcli.results.dump import dump_stages
 from rxcli.types import (
     BoolArray,
-    ColumnResult,
     Float32Array,
     FloatArray,
     Frame,
@@ -383,10 +382,23 @@ class Ledger:
             going_on = np.intersect1d(waiting.numbers, following.numbers)
         closed = bursts.open.close(np.setdiff1d(waiting.numbers, going_on))
         ended = _bursts_of(closed, int(waiting.numbers[0]), view)
-        columns = _columns_of(view, ended, bursts.confidence(going_on), self._options.min_confidence)
-        columns = assemble.with_certainty(columns, self.certainty, self._options.min_confidence)
+        headerless = np.zeros(len(view.snr), bool)
         if self._link is not None:
-            columns = assemble.drop_headerless_packets(columns, self._link.headerless(closed, len(columns)))
+            headerless = self._link.headerless(closed, headerless.size)
+        sure = bursts.confidence(going_on)
+        columns = assemble.clip_results(
+            view.bursts.clock,
+            ended,
+            np.zeros(headerless.size, np.float32) if sure is None else sure,
+            view.snr,
+            headerless,
+            self._options.min_confidence,
+            self.certainty,
+        )
+        if view.denoised:
+            columns = tuple(replace(c, denoised=c.column in view.denoised) for c in columns)
+        if view.context.camera.reversed:
+            columns = tuple(assemble.in_stored_rows(column, view.height) for column in columns)
         if self._options.dump_dir is not None:
             found = _taps(waiting, view, ended)
             dump_stages(self._options.dump_dir, waiting.result.source, waiting.result.frame, found)
@@ -424,24 +436,6 @@ def _bursts_of(closed: Sequence[tracking.ClosedBurst], first_number: int, view: 
         )
         for burst in closed
     ]
-
-
-def _columns_of(
-    view: View, ended: Sequence[confidence.BurstInClip], later: Float32Array | None, min_confidence: float
-) -> tuple[ColumnResult, ...]:
-    """Results of a frame's columns.
-
-    Args:
-        view: the frame.
-        ended: bursts that end in it.
-        later: (C,) confidence of the best packet that the next frame will report; None where it reports none.
-        min_confidence: packets below it are left out.
-    """
-    sure = np.zeros(view.snr.shape[0], np.float32) if later is None else later
-    columns = assemble.clip_results(view.bursts.clock, ended, sure, view.snr, min_confidence)
-    if view.denoised:
-        columns = tuple(replace(c, denoised=c.column in view.denoised) for c in columns)
-    return tuple(assemble.in_stored_rows(c, view.height) for c in columns) if view.context.camera.reversed else columns
 
 
 def _taps(waiting: Waiting, view: View, ended: Sequence[confidence.BurstInClip]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.protocol import PREAMBLE_SLOTS, bits_per_symbol, indices_to_bits
 from rxcli.receiver.decode.confidence import BurstInClip, Quality, clip_quality, confidence_features, still_quality
 from rxcli.receiver.decode.settings import SETTINGS
@@ -25,10 +26,12 @@ from rxcli.types import (
     SlotSamples,
 )
 
-_HEADERLESS = "no packet header shows where this screen's packets have one; "
-_OVEREXPOSED = "the column is overexposed: expose shorter"
-_OTHER_SCREEN = "the screen may be another one (--screen auto tries all), or its place wrong (--corners)"
+_HEADERLESS = (
+    "no packet header shows where this screen's packets have one; the screen may be another one (--screen auto tries "
+    "all), its place wrong (--corners), or the column overexposed"
+)
 _ECHO = "it shows nothing but the light of the column beside it; show a brighter picture there"
+_GOES_ON = "its burst goes on in the next frame and is reported there"
 
 
 def column_results(
@@ -40,8 +43,9 @@ def column_results(
     headerless: BoolArray,
     min_confidence: float,
     denoised: frozenset[int] = frozenset(),
+    certainty: float = 1.0,
 ) -> tuple[ColumnResult, ...]:
-    """Results of every column.
+    """Results of every column of a photograph.
 
     Args:
         clock: the clock.
@@ -52,50 +56,170 @@ def column_results(
         headerless: (C,) columns without packets, see `find_headerless`.
         min_confidence: packets below it are left out.
         denoised: columns that were corrected by the auto-encoder.
+        certainty: probability that the columns' numbers are right.
     """
-    n_observed = slots_observed(samples, clock)
-    whole = complete(n_observed)
+    snr_db = snr_db_of_columns(snr)
     was_denoised = np.isin(np.arange(len(snr)), list(denoised))
     by_burst = slot_margin_by_burst(slot_margin, clock)
     quality = still_quality(posteriors, confidence_features(posteriors, by_burst, was_denoised, samples.light.shape[1]))
-    snr_db = snr_db_of_columns(snr)
-    echoing: BoolArray = np.any(echoes(posteriors, snr_db) & whole, axis=0)
-    reported = whole & quality.reported(min_confidence)
-    against = [
-        _headerless_reason(samples, column) if headerless[column] else _ECHO if echo else None
-        for column, echo in enumerate(echoing)
+    bursts = [
+        _burst(clock, index, posteriors, index, quality, n_observed, snr_db, certainty)
+        for index, n_observed in enumerate(slots_observed(samples, clock))
     ]
-    withheld = np.where(whole & quality.reported(0.0) & ~reported, quality.confidence, 0.0).max(axis=0)
-    shown = reported & [not why for why in against]
-    if not (quality.confidence[shown] >= SETTINGS.min_best_confidence).any():
-        reported = np.zeros_like(reported)  # Light without data: an isolated packet is chance.
-    packets = [_Packets.of(burst, clock, posteriors, counted, quality) for burst, counted in enumerate(n_observed)]
-    return tuple(
-        _column_result(
-            column,
-            clock,
-            posteriors,
-            db,
-            n_observed[:, column],
-            () if against[column] else _of_column(packets, reported, column),
-            against[column],
-            _withheld(withheld[column], min_confidence),
-            bool(was_denoised[column]),
+    sure = quality.confidence >= SETTINGS.min_best_confidence
+    if not any((burst.possible & ~headerless)[sure[index]].any() for index, burst in enumerate(bursts)):
+        # Light without data: an isolated packet is chance.
+        bursts = [replace(burst, possible=np.zeros_like(burst.possible)) for burst in bursts]
+    columns = _columns(clock, bursts, snr_db, headerless, np.zeros_like(headerless), min_confidence)
+    return tuple(replace(column, denoised=bool(was_denoised[column.column])) for column in columns)
+
+
+def clip_results(
+    clock: Clock,
+    bursts: Sequence[BurstInClip],
+    going_on: Float32Array,
+    snr: Float32Array,
+    headerless: BoolArray,
+    min_confidence: float,
+    certainty: float = 1.0,
+) -> tuple[ColumnResult, ...]:
+    """Results of every column in a frame of a clip.
+
+    Args:
+        clock: the clock.
+        bursts: bursts that end in this frame, in time order.
+        going_on: (C,) confidence of the best packet that the next frame will report.
+        snr: (C, N) squared contrast over variance of every slot of the grid.
+        headerless: (C,) columns without packets, see `find_headerless`.
+        min_confidence: packets below it are left out.
+        certainty: probability that the columns' numbers are right.
+    """
+    snr_db = snr_db_of_columns(snr)
+    ended = [
+        _burst(
+            *(clock, burst.index, burst.posteriors, 0, clip_quality(burst), burst.n_observed, snr_db, certainty),
+            number=burst.number,
+            frames=burst.frames,
         )
-        for column, db in enumerate(snr_db)
+        for burst in bursts
+    ]
+    return _columns(clock, ended, snr_db, headerless, going_on >= BELIEVABLE, min_confidence)
+
+
+@dataclass(frozen=True, slots=True)
+class _Burst:
+    """Packets of one burst in all C columns."""
+
+    packets: list[PacketResult]
+    #: (C,) weights, and (C, packet) how often each slot was observed.
+    w: IntArray
+    n_observed: IntArray
+    #: (C,) whether a column repeats its neighbour, and whether its packet may be reported.
+    echo: BoolArray
+    possible: BoolArray
+
+
+def _burst(
+    clock: Clock,
+    index: int,
+    posteriors: BurstPosteriors,
+    place: int,
+    quality: Quality,
+    n_observed: IntArray,
+    snr_db: Sequence[float | None],
+    certainty: float,
+    number: int | None = None,
+    frames: tuple[int, ...] | None = None,
+) -> _Burst:
+    """Packets of the burst `index` of a clock, which is at `place` in posteriors and quality."""
+    copies, rows = (
+        n_observed.sum(axis=1) / clock.packet_slots,
+        _header_rows(int((clock.burst == index).argmax()), clock),
     )
+    payloads = _payloads(posteriors.index[place], posteriors.w)
+    packets = [
+        PacketResult(
+            first_row=first_row,
+            copies=n_copies,
+            payload_bits=bits_per_symbol(w) * posteriors.index.shape[2],
+            payload=payload,
+            confidence=certainty * confidence,
+            ber_hat=ber_hat,
+            burst=number,
+            frames=frames,
+            confidence_features=tuple(features),
+        )
+        for first_row, n_copies, w, payload, confidence, ber_hat, features in zip(
+            rows.tolist(),
+            copies.tolist(),
+            posteriors.w.tolist(),
+            payloads,
+            quality.confidence[place].tolist(),
+            quality.ber_hat[place].tolist(),
+            quality.confidence_features[place].tolist(),
+            strict=True,
+        )
+    ]
+    echo = complete(n_observed) & echoes(posteriors, snr_db)[place]
+    possible = complete(n_observed) & ~echo & (quality.ber_hat[place] <= SETTINGS.max_ber_hat)
+    return _Burst(packets, posteriors.w, n_observed, echo, possible)
 
 
-def _of_column(packets: Sequence[_Packets], reported: BoolArray, column: int) -> tuple[PacketResult, ...]:
-    """Reported packets of a column; `reported` is (B, C)."""
-    return tuple(burst.result(column) for burst, shown in zip(packets, reported[:, column], strict=True) if shown)
+def _payloads(index: IntArray, weights: IntArray) -> list[str]:
+    """Payload of every column in hex, from codebook indices (C, N) and weights (C,)."""
+    payload = [""] * len(index)
+    for w in set(weights.tolist()):
+        columns = np.flatnonzero(weights == w)
+        bits = indices_to_bits(index[columns].ravel(), w).reshape(columns.size, -1)
+        for column, packed in zip(columns.tolist(), np.packbits(bits, axis=1), strict=True):
+            payload[column] = packed.tobytes().hex()
+    return payload
 
 
-def _headerless_reason(samples: SlotSamples, column: int) -> str:
-    """Message for a column with slots but without header, which depends on whether it is overexposed."""
-    light = samples.light[column][samples.valid[column] > 0]
-    overexposed = light.size > 0 and float(np.mean(light >= SETTINGS.white_level)) > SETTINGS.overexposed_share
-    return _HEADERLESS + (_OVEREXPOSED if overexposed else _OTHER_SCREEN)
+def _header_rows(copy: int, clock: Clock) -> FloatArray:
+    """(C,) sensor row whose exposure starts with the header of `copy`."""
+    slots = copy * clock.packet_slots - clock.first_slot + clock.delay_slots + clock.exposure_slots / 2
+    return np.asarray(clock.row0 + slots * clock.rows_per_slot)
+
+
+def _columns(
+    clock: Clock,
+    bursts: Sequence[_Burst],
+    snr_db: Sequence[float | None],
+    headerless: BoolArray,
+    goes_on: BoolArray,
+    min_confidence: float,
+) -> tuple[ColumnResult, ...]:
+    """Results of every column; those that go on have packets in the next frame."""
+    out = []
+    for column, db in enumerate(snr_db):
+        possible = [burst for burst in bursts if burst.possible[column] and not headerless[column]]
+        reported = [burst for burst in possible if burst.packets[column].confidence >= min_confidence]
+        packets = tuple(burst.packets[column] for burst in reported)
+        confidence = max((burst.packets[column].confidence for burst in possible), default=0.0)
+        status = _column_status(packets, db)
+        if not packets and goes_on[column] and not headerless[column]:
+            status = "ok"
+        message = _ECHO if any(burst.echo[column] for burst in bursts) else None
+        message = _HEADERLESS if headerless[column] else message or _withheld(confidence, min_confidence)
+        if status == "ok" or not bursts:
+            message = _GOES_ON
+        else:
+            n_observed = np.stack([burst.n_observed[column] for burst in bursts])
+            message = _incomplete_reason(n_observed) or message or _light_reason(status, db)
+        out.append(
+            ColumnResult(
+                column=column,
+                status=status,
+                # Without a packet the weight is not reliable.
+                w=next((int(b.w[column]) for b in reported if b.packets[column].confidence == confidence), None),
+                snr_db=db,
+                delay_slots=float(clock.delay_slots[column]),
+                packets=packets,
+                message=None if packets else message,
+            )
+        )
+    return tuple(out)
 
 
 def _withheld(confidence: float, min_confidence: float) -> str | None:
@@ -105,98 +229,33 @@ def _withheld(confidence: float, min_confidence: float) -> str | None:
     return f"its packet has a confidence of {confidence:.4f}, below the {min_confidence:g} asked for (--min-confidence)"
 
 
-def clip_results(
-    clock: Clock, bursts: Sequence[BurstInClip], going_on: Float32Array, snr: Float32Array, min_confidence: float
-) -> tuple[ColumnResult, ...]:
-    """Results of every column in a frame of a clip.
-
-    Args:
-        clock: the clock.
-        bursts: bursts that end in this frame, in time order.
-        going_on: (C,) confidence of the best packet that the next frame will report.
-        snr: (C, N) squared contrast over variance of every slot of the grid.
-        min_confidence: packets below it are left out.
-    """
-    snr_db = snr_db_of_columns(snr)
-    qualities = [clip_quality(burst) for burst in bursts]
-    whole = [complete(burst.n_observed[None])[0] for burst in bursts]
-    reported = [
-        (is_complete & ~echoes(burst.posteriors, snr_db)[0] & quality.reported(min_confidence)[0]).tolist()
-        for burst, is_complete, quality in zip(bursts, whole, qualities, strict=True)
-    ]
-    withheld = np.zeros(len(snr_db))
-    for is_complete, quality in zip(whole, qualities, strict=True):
-        surest = np.where(is_complete & (quality.ber_hat[0] <= SETTINGS.max_ber_hat), quality.confidence[0], 0.0)
-        withheld = np.maximum(withheld, surest)
-    own = [replace(clock, burst=np.where(clock.burst == burst.index, 0, 1)) for burst in bursts]
-    packets_by_burst = [
-        _Packets.of(0, clock, burst.posteriors, burst.n_observed, quality)
-        for burst, clock, quality in zip(bursts, own, qualities, strict=True)
-    ]
-    out = []
-    for column, db in enumerate(snr_db):
-        packets = tuple(
-            each.result(column, burst.number, burst.frames)
-            for burst, each, shown in zip(bursts, packets_by_burst, reported, strict=True)
-            if shown[column]
-        )
-        result = _clip_column(column, clock, bursts, float(going_on[column]), db, packets)
-        if not packets and result.status != "ok" and (message := _withheld(float(withheld[column]), min_confidence)):
-            result = replace(result, message=message)
-        out.append(result)
-    return tuple(out)
-
-
-def _clip_column(
-    column: int,
-    clock: Clock,
-    bursts: Sequence[BurstInClip],
-    going_on: float,
-    snr_db: float | None,
-    packets: tuple[PacketResult, ...],
-) -> ColumnResult:
-    status = _column_status(packets, snr_db)
-    if not packets and going_on >= BELIEVABLE:
-        status = "ok"
-    message = None
-    if not packets:
-        message = _clip_reason(status, snr_db, [burst.n_observed[column] for burst in bursts])
-    return ColumnResult(
-        column=column,
-        status=status,
-        w=_weight_of_best(column, packets, bursts),
-        snr_db=snr_db,
-        delay_slots=float(clock.delay_slots[column]),
-        packets=packets,
-        message=message,
+def _incomplete_reason(n_observed: IntArray) -> str | None:
+    """Message for a column without a complete packet, or None; `n_observed` is (B, packet)."""
+    missing = int((n_observed[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
+    if not missing:
+        return None
+    return (
+        f"no packet is in view as a whole: of {n_observed.shape[1]} slots {missing} are missing; move closer so that "
+        "the screen fills more of the height, or take another picture"
     )
+
+
+def _light_reason(status: ColumnStatus, snr_db: float | None) -> str:
+    if status == "dark" or snr_db is None:
+        return "too little light under this column; show a brighter picture or raise the exposure"
+    return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
+
+
+def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:
+    if packets:
+        return "ok" if any(packet.is_believable for packet in packets) else "weak"
+    return "dark" if snr_db is None or snr_db < SETTINGS.dark_snr_db else "no_packet"
 
 
 def snr_db_of_columns(snr: Float32Array) -> list[float | None]:
     """Median signal-to-noise ratio of each column's visible slots, dB; None where nothing is visible."""
-    if (snr > 0).all():
-        median = snr[:, 0] if snr.shape[1] == 1 else np.median(snr, axis=1)
-        return [float(db) for db in 10 * np.log10(np.maximum(median, 1e-6))]
-    return [_snr_db(column) for column in snr]
-
-
-def _weight_of_best(column: int, packets: Sequence[PacketResult], bursts: Sequence[BurstInClip]) -> int | None:
-    """Weight of a column's surest packet, or None: without a packet the weight is not reliable."""
-    if not packets:
-        return None
-    number = max(packets, key=lambda packet: packet.confidence).burst
-    return next(int(burst.posteriors.w[column]) for burst in bursts if burst.number == number)
-
-
-def _clip_reason(status: ColumnStatus, snr_db: float | None, n_observed: list[IntArray]) -> str:
-    if status == "ok" or not n_observed:
-        return "its burst goes on in the next frame and is reported there"
-    return _incomplete_reason(np.stack(n_observed)) or _light_reason(status, snr_db)
-
-
-def _snr_db(snr: Float32Array) -> float | None:
-    lit = snr[snr > 0]
-    return float(10 * np.log10(max(float(np.median(lit)), 1e-6))) if lit.size else None
+    median = [float(np.median(column[column > 0])) if (column > 0).any() else None for column in snr]
+    return [None if ratio is None else float(10 * np.log10(max(ratio, TINY))) for ratio in median]
 
 
 def all_dark(snr: Float32Array) -> bool:
@@ -233,39 +292,8 @@ def slots_observed(samples: SlotSamples, clock: Clock) -> IntArray:
 
 
 def complete(n_observed: IntArray) -> BoolArray:
-    """(B, C) whether every payload slot was observed, so that the packet can be reported.
-
-    Args:
-        n_observed: (B, C, packet) from `slots_observed`.
-    """
-    return np.asarray((n_observed[:, :, PREAMBLE_SLOTS:] > 0).all(axis=2))
-
-
-def _column_result(
-    column: int,
-    clock: Clock,
-    posteriors: BurstPosteriors,
-    snr_db: float | None,
-    n_observed: IntArray,
-    packets: tuple[PacketResult, ...],
-    against: str | None,
-    withheld: str | None,
-    denoised: bool,
-) -> ColumnResult:
-    sure_of_w = not against and posteriors.w_log_prob[column].max() > np.log(SETTINGS.min_weight_probability)
-    status = _column_status(packets, snr_db)
-    return ColumnResult(
-        column=column,
-        status=status,
-        w=int(posteriors.w[column]) if packets or sure_of_w else None,
-        snr_db=snr_db,
-        denoised=denoised,
-        delay_slots=float(clock.delay_slots[column]),
-        packets=packets,
-        message=None
-        if packets
-        else _incomplete_reason(n_observed) or against or withheld or _light_reason(status, snr_db),
-    )
+    """(..., C) whether every payload slot was observed, from the counts (..., C, packet) of `slots_observed`."""
+    return np.asarray((n_observed[..., PREAMBLE_SLOTS:] > 0).all(axis=-1))
 
 
 def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolArray:
@@ -299,94 +327,6 @@ def find_headerless(header_llr: FloatArray) -> BoolArray:
     return np.asarray(by_column < (SETTINGS.min_header_llr if together else np.inf), bool)
 
 
-def drop_headerless_packets(columns: tuple[ColumnResult, ...], headerless: BoolArray) -> tuple[ColumnResult, ...]:
-    """Drop the packets of the headerless columns (C,) of a clip."""
-    message = _HEADERLESS + _OTHER_SCREEN
-    return tuple(
-        replace(column, packets=(), w=None, status="no_packet", message=message) if out and column.packets else column
-        for column, out in zip(columns, headerless, strict=True)
-    )
-
-
-def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:
-    if packets:
-        return "ok" if any(packet.is_believable for packet in packets) else "weak"
-    return "dark" if snr_db is None or snr_db < SETTINGS.dark_snr_db else "no_packet"
-
-
-def _incomplete_reason(n_observed: IntArray) -> str | None:
-    """Message for a column without a complete packet, or None; `n_observed` is (B, packet)."""
-    missing = int((n_observed[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
-    if not missing:
-        return None
-    return (
-        f"no packet is in view as a whole: of {n_observed.shape[1]} slots {missing} are missing; move closer so that "
-        "the screen fills more of the height, or take another picture"
-    )
-
-
-def _light_reason(status: ColumnStatus, snr_db: float | None) -> str:
-    if status == "dark" or snr_db is None:
-        return "too little light under this column; show a brighter picture or raise the exposure"
-    return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
-
-
-@dataclass(frozen=True, slots=True)
-class _Packets:
-    """The packets of one burst in all columns, computed together because clips have many."""
-
-    payload: list[str]
-    n_bits: list[int]
-    copies: list[float]
-    first_row: list[float]
-    confidence: list[float]
-    ber_hat: list[float]
-    features: list[list[float]]
-
-    @classmethod
-    def of(
-        cls, burst: int, clock: Clock, posteriors: BurstPosteriors, n_observed: IntArray, quality: Quality
-    ) -> _Packets:
-        """Collect the packets of a burst; `n_observed` is (C, packet)."""
-        bits = [bits_per_symbol(w) for w in posteriors.w.tolist()]
-        copy = int((clock.burst == burst).argmax())
-        n_symbols = posteriors.index.shape[2]
-        return cls(
-            payload=_payloads(posteriors.index[burst], posteriors.w),
-            n_bits=[k * n_symbols for k in bits],
-            copies=(n_observed.sum(axis=1) / clock.packet_slots).tolist(),
-            first_row=_header_rows(copy, clock).tolist(),
-            confidence=quality.confidence[burst].tolist(),
-            ber_hat=quality.ber_hat[burst].tolist(),
-            features=quality.confidence_features[burst].tolist(),
-        )
-
-    def result(self, column: int, number: int | None = None, frames: tuple[int, ...] | None = None) -> PacketResult:
-        """Result of a column's packet; in clips with its burst number and the frames that show it."""
-        return PacketResult(
-            first_row=self.first_row[column],
-            copies=self.copies[column],
-            payload_bits=self.n_bits[column],
-            payload=self.payload[column],
-            confidence=self.confidence[column],
-            ber_hat=self.ber_hat[column],
-            burst=number,
-            frames=frames,
-            confidence_features=tuple(self.features[column]),
-        )
-
-
-def _payloads(index: IntArray, weights: IntArray) -> list[str]:
-    """Payload of every column in hex, from codebook indices (C, N) and weights (C,)."""
-    payload = [""] * len(index)
-    for w in set(weights.tolist()):
-        columns = np.flatnonzero(weights == w)
-        bits = indices_to_bits(index[columns].ravel(), w).reshape(columns.size, -1)
-        for column, packed in zip(columns.tolist(), np.packbits(bits, axis=1), strict=True):
-            payload[column] = packed.tobytes().hex()
-    return payload
-
-
 def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Array:
     """(B, C, N) margins (C, N) of each burst's payload slots, 0 elsewhere on the grid."""
     slot = np.arange(clock.first_slot, clock.first_slot + clock.n_slots)
@@ -394,36 +334,6 @@ def slot_margin_by_burst(slot_margin: Float32Array, clock: Clock) -> Float32Arra
     bursts = np.arange(int(clock.burst.max()) + 1)
     payload_of = payload & (clock.burst[slot // clock.packet_slots] == bursts[:, None])
     return np.asarray(payload_of[:, None] * slot_margin)
-
-
-def with_certainty(
-    columns: tuple[ColumnResult, ...], certainty: float, min_confidence: float
-) -> tuple[ColumnResult, ...]:
-    """Reduce the confidence of packets by the certainty of the column numbers.
-
-    Args:
-        columns: results as if their numbers were beyond doubt.
-        certainty: probability that they are right.
-        min_confidence: packets below it are left out.
-    """
-    if certainty >= 1:
-        return columns
-    return tuple(_doubted(column, certainty, min_confidence) for column in columns)
-
-
-def _doubted(column: ColumnResult, certainty: float, min_confidence: float) -> ColumnResult:
-    packets = tuple(replace(packet, confidence=certainty * packet.confidence) for packet in column.packets)
-    reported = tuple(packet for packet in packets if packet.confidence >= min_confidence)
-    status = column.status
-    if status in ("ok", "weak"):
-        status = _column_status(reported, column.snr_db)
-    return replace(column, packets=reported, status=status)
-
-
-def _header_rows(copy: int, clock: Clock) -> FloatArray:
-    """(C,) sensor row whose exposure starts with the header of `copy`."""
-    slots = copy * clock.packet_slots - clock.first_slot + clock.delay_slots + clock.exposure_slots / 2
-    return np.asarray(clock.row0 + slots * clock.rows_per_slot)
 
 
 def in_stored_rows(column: ColumnResult, height: int) -> ColumnResult:

@@ -13,7 +13,7 @@ class DecodeSettings:
     max_ber_hat: float = 0.1
     #: If no packet of a photograph reaches this confidence, none is reported.
     min_best_confidence: float = 0.1
-    #: Minimum probability at which a weight is reported and its soft bits are used.
+    #: Minimum probability of a weight at which its soft bits are used.
     min_weight_probability: float = 0.99
     #: A column below this signal-to-noise ratio, dB, is too dark to try.
     dark_snr_db: float = 0.0
@@ -23,9 +23,6 @@ class DecodeSettings:
     #: negative, of one header.
     min_total_header_llr: float = 6.0
     max_header_llr: float = 12.0
-    #: Light of white, and the share of a column's samples at white from which the column counts as overexposed.
-    white_level: float = 0.98
-    overexposed_share: float = 0.2
 
     #: Limit of a slot's log-likelihood ratio when weights are compared: one bad slot must not decide.
     max_slot_llr: float = 12.0

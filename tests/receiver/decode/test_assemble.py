@@ -274,13 +274,6 @@ def test_a_column_never_seen_is_dark() -> None:
     assert (first.status, first.snr_db, first.packets) == ("dark", None, ())
 
 
-@pytest.mark.parametrize(("w_probability", "known"), [(0.999, True), (0.6, False)])
-def test_an_unsure_weight_is_not_reported_alone(w_probability: float, known: bool) -> None:
-    unsure = posteriors_of([6, 5], indices([6, 5]), probability=0.5001, w_probability=w_probability)
-    (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), unsure, snr(120), samples_of(120), 0)
-    assert first.w == (6 if known else None)
-
-
 PACKET_RESULT = PacketResult(0.0, 1.0, 21, "000000", 0.99, 0.001)
 
 
