@@ -132,10 +132,8 @@ def _burst(
     frames: tuple[int, ...] | None = None,
 ) -> _Burst:
     """Packets of the burst `index` of a clock, which is at `place` in posteriors and quality."""
-    copies, rows = (
-        n_observed.sum(axis=1) / clock.packet_slots,
-        _header_rows(int((clock.burst == index).argmax()), clock),
-    )
+    copies = n_observed.sum(axis=1) / clock.packet_slots
+    rows = _header_rows(int((clock.burst == index).argmax()), clock)
     payloads = _payloads(posteriors.index[place], posteriors.w)
     packets = [
         PacketResult(
@@ -190,7 +188,7 @@ def _columns(
     goes_on: BoolArray,
     min_confidence: float,
 ) -> tuple[ColumnResult, ...]:
-    """Results of every column; those that go on have packets in the next frame."""
+    """Results of every column; a column that `goes_on` has packets in the next frame."""
     out = []
     for column, db in enumerate(snr_db):
         possible = [burst for burst in bursts if burst.possible[column] and not headerless[column]]
