@@ -1,7 +1,6 @@
 """How sure the number of the first column is, by the packets of the outermost columns.
 
-Outlines of one family share all columns but the outermost. A column of the screen has its own packets; one beyond its
-side has none, or its neighbour's.
+Outlines of one family share all columns but the outermost. A column of the screen has packets, one beyond it has none.
 """
 
 from __future__ import annotations
@@ -13,12 +12,10 @@ import numpy as np
 
 from rxcli.receiver.acquisition import Acquisition, sample_columns
 from rxcli.receiver.context import Outline
-from rxcli.receiver.reception import Reception
 from rxcli.receiver.search.hypothesis import Scored
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
-from rxcli.types import BoolArray, IntArray
 
 #: Columns that are read beside the outermost, because they shed light there.
 _BESIDE = 2
@@ -53,15 +50,8 @@ def _columns_between(own: Outline, rival: Outline, n_columns: int) -> int:
 
 
 def _outer_evidence(acquisition: Acquisition, n: int) -> float:
-    """Log-likelihood ratio of packets of their own in the first `n` columns, or in the last `-n`."""
+    """Log-likelihood ratio of packets in the first `n` columns, or in the last `-n`."""
     read = slice(0, n + _BESIDE) if n > 0 else slice(n - _BESIDE, None)
     reception = initial_pass(acquisition.of_columns(read))
     outer = np.arange(n) if n > 0 else _BESIDE + np.arange(-n)
-    own = _differs(reception, outer, outer + np.sign(n))
-    return float(np.maximum(reception.column_llr[outer], 0.0) @ own)
-
-
-def _differs(reception: Reception, columns: IntArray, neighbours: IntArray) -> BoolArray:
-    """Whether the packets of columns are others than those of their neighbours."""
-    slots = reception.payload_lit
-    return np.asarray((slots[columns] != slots[neighbours]).mean(axis=1) > SETTINGS.same_slots)
+    return float(np.maximum(reception.column_llr[outer], 0.0).sum())

@@ -49,12 +49,10 @@ class SearchSettings:
     sure_certainty: float = 0.9
     may_be_log_odds: float = 3.0
     #: Outlines of other first columns whose outermost columns are compared: log-odds below the chosen one's and shift
-    #: in columns, at most. Weight of the log-likelihood of packets there, as samples err together, and share of slots
-    #: in which packets that are the same may differ.
+    #: in columns, at most. Weight of the log-likelihood of packets there, as samples err together.
     rival_log_odds: float = 5.0
     max_shift: int = 3
     outer_weight: float = 0.2
-    same_slots: float = 0.1
 
 
 SETTINGS = SearchSettings()
