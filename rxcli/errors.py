@@ -94,6 +94,11 @@ class UsageError(ReceiverError):
     exit_code = ExitCode.USAGE
 
 
+def shortened(text: str, length: int = 80) -> str:
+    """`text` cut to a length, so that a message stays one line."""
+    return text if len(text) <= length else f"{text[: length - 3]}..."
+
+
 def capitalised(text: str) -> str:
     """`text` with a capital, for titles."""
     return text[:1].upper() + text[1:]

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar, overload
 import msgspec
 from msgspec import Meta
 
-from rxcli.errors import ProfileError
+from rxcli.errors import ProfileError, shortened
 from rxcli.protocol import packet_slots
 from rxcli.resources import data_dir, profile_dirs, read_limited
 
@@ -165,13 +165,23 @@ def parse_profile(text: str, kind: type[_Profile], source: str) -> _Profile:
     Raises:
         ProfileError: no TOML, an unknown key, or an impossible value.
     """
+    return check_profile(_parsed(text, source), kind, source)
+
+
+def _parsed(text: str, source: str) -> dict[str, Any]:
     try:
-        raw = tomllib.loads(text)
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers of thousands of digits, and brackets in brackets
         reason = f"{error!s:.200}" if str(error) else type(error).__name__
         hint = "correct the file, or name a shipped profile"
         raise ProfileError(f"{source}: not valid TOML ({reason})", hint) from None
-    return check_profile(raw, kind, source)
+
+
+def _kind_of(raw: dict[str, Any], source: str) -> type[Any]:
+    kind = raw.get("kind")
+    if kind not in ("screen", "camera"):
+        raise ProfileError(f"{source}: kind must be 'screen' or 'camera' (got {kind!r})", "correct the file")
+    return CameraProfile if kind == "camera" else ScreenProfile
 
 
 def check_profile(raw: dict[str, Any], kind: type[_Profile], source: str) -> _Profile:
@@ -223,12 +233,7 @@ def _explain(message: str, raw: dict[str, Any]) -> str:
             value = value[int(part)] if isinstance(value, (list, tuple)) else value[part]
         except (KeyError, IndexError, ValueError, TypeError):
             return f"{path}: {message[: found.start()]}"
-    return f"{path}: {message[: found.start()]} (got {_shown(value)})"
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f"{text[:77]}..."
+    return f"{path}: {message[: found.start()]} (got {shortened(repr(value))})"
 
 
 @overload
@@ -261,7 +266,8 @@ def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any
     except (OSError, UnicodeDecodeError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise ProfileError(f"{name}: cannot be read as a profile ({reason})", "name a TOML file") from None
-    return parse_profile(text, kind or _kind_of(text, name), name)
+    raw = _parsed(text, name)
+    return check_profile(raw, kind or _kind_of(raw, name), name)
 
 
 def _file_of(name: str, kind: type[Any]) -> Path:
@@ -270,17 +276,6 @@ def _file_of(name: str, kind: type[Any]) -> Path:
         return Path(name)
     by_name = (folder / _KINDS[kind] / f"{name}.toml" for _, folder in profile_dirs())
     return next((path for path in by_name if path.is_file()), Path(name))
-
-
-def _kind_of(text: str, name: str) -> type[Any]:
-    """The `kind` in a profile's text; any where it is no TOML, which the parser reports."""
-    try:
-        kind = tomllib.loads(text).get("kind")
-    except (ValueError, RecursionError):
-        return ScreenProfile
-    if kind not in ("screen", "camera"):
-        raise ProfileError(f"{name}: kind must be 'screen' or 'camera' (got {kind!r})", "correct the file")
-    return CameraProfile if kind == "camera" else ScreenProfile
 
 
 def _profile_files(kind: type[Any]) -> list[tuple[str, Path]]:

@@ -9,15 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rxcli.errors import InputError
-from rxcli.ingest.sniff import (
-    HEAD_BYTES,
-    KNOWN_SUFFIXES,
-    Kind,
-    check_file,
-    check_no_list,
-    read_bytes,
-    sniff,
-)
+from rxcli.ingest.sniff import HEAD_BYTES, KNOWN_SUFFIXES, Kind, check_file, check_no_list, read_bytes, sniff
 from rxcli.types import Frame
 
 __all__ = ["KNOWN_SUFFIXES", "open_source"]

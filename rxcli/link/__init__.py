@@ -21,15 +21,3 @@ transmitter, and `rxcli.link.encoder.packet_slots_of` converts them to slots. `s
 The log-likelihood ratio of a bit is ln p(1)/p(0) everywhere, 0 if nothing is known. Burst numbers count through a clip;
 `epoch` changes where the count may have jumped (a new photo, a lost clock). This package knows nothing of pixels.
 """
-
-from __future__ import annotations
-
-from rxcli.link.collector import Collector as Collector
-from rxcli.link.encoder import Sending as Sending
-from rxcli.link.encoder import file_object as file_object
-from rxcli.link.encoder import message as message
-from rxcli.link.receiver import LinkReceiver as LinkReceiver
-from rxcli.types import FrameSoftBits as FrameSoftBits
-from rxcli.types import Message as Message
-from rxcli.types import ObjectProgress as ObjectProgress
-from rxcli.types import ReceivedObject as ReceivedObject

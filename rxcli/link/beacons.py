@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,11 +17,9 @@ from rxcli.types import FrameSoftBits, MessageKind
 #: Information at which a beacon is first decoded, its increase before the next attempt, and the upper limit; relative
 #: to the beacon's bits.
 _TRY_FROM, _RETRY_GAIN, _TRY_UP_TO = 1.02, 0.08, 2.5
-_ITERATIONS, _PATIENCE = 25, ldpc.Patience(6, 0.95)
+_ITERATIONS = 25
 #: Log-likelihood ratio below which bursts, or copies within one burst, do not carry the same message.
 _MIN_SIMILARITY = -8.0
-#: Step of columns and bits in the initial comparison.
-_COARSE_STEP = 3
 #: Log-likelihood ratio above which bursts are copies of each other.
 _COPIES = 8.0
 #: Minimum log-likelihood of a decoded word per bit, relative to ln 2: the CRC of a wrong word may fit by chance.
@@ -126,8 +125,6 @@ class BeaconSearch:
 
     def _joined(self, period: int, soft: FrameSoftBits) -> _Round | None:
         """Add the bursts to their round or to a new one; None if they contradict each other."""
-        if len(soft.burst) > period and _contradicts(soft, period):
-            return None
         frame = _frame_sum(soft, period)
         if frame.similarity() < _MIN_SIMILARITY:
             return None
@@ -185,30 +182,25 @@ class BeaconSearch:
         return None if words[0] is None else unprotect_beacon(words[0])
 
 
-def _contradicts(soft: FrameSoftBits, period: int) -> bool:
-    """Whether bursts of a frame at the same position clearly differ, from a subset of their bits."""
-    some = FrameSoftBits(soft.burst, soft.llr[:, :, ::_COARSE_STEP, ::_COARSE_STEP])
-    return _frame_sum(some, period).similarity() < 2 * _MIN_SIMILARITY
-
-
 def gathered(layout: BeaconLayout, llr: Float32) -> Float32:
     """(n_bits,) sums of a round's log-likelihood ratios (P, N, C, 7) for each bit of the buffer."""
     return np.bincount(layout.places.ravel(), llr.ravel(), layout.n_bits).astype(np.float32)
 
 
-def read_words(layout: BeaconLayout, buffers: Float32, accept: object = None) -> list[bytes | None]:
+def read_words(
+    layout: BeaconLayout, buffers: Float32, check: Callable[[bytes], object] = unprotect_beacon
+) -> list[bytes | None]:
     """Decode buffers (n, n_bits) of a layout; None if no sufficiently likely word is found."""
     found: list[bytes | None] = [None] * len(buffers)
-    check = unprotect_beacon if accept is None else accept
 
     def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
         good = np.zeros(places.size, bool)
         for i, (place, coded) in enumerate(zip(places, np.packbits(bits, axis=1), strict=True)):
-            if check(coded.tobytes()) is not None and is_likely(layout, bits[i], buffers[place]):  # type: ignore[operator]
+            if check(coded.tobytes()) is not None and is_likely(layout, bits[i], buffers[place]):
                 found[place], good[i] = coded.tobytes(), True
         return good
 
-    ldpc.decode(layout.code, ldpc.quantised(buffers), accepted, _ITERATIONS, _PATIENCE)
+    ldpc.decode(layout.code, ldpc.quantised(buffers), accepted, _ITERATIONS, gives_up=True)
     return found
 
 

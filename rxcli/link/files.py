@@ -36,8 +36,6 @@ _LN2 = float(np.log(2.0))
 _TRY_ANNOUNCEMENT, _MIN_SIMILARITY = 1.02, -8.0
 #: Batch size for announcements whose copies do not decide.
 _ANNOUNCEMENTS_AT_ONCE = 32
-#: Batches that are decoded at first, and the spacing afterwards, since most clips send no file.
-_FREE_BATCHES, _THEN_EVERY = 8, 4
 #: Blocks per batch, the share of the remaining blocks that suffices, and frames after which fewer suffice.
 _BLOCKS_AT_ONCE, _SHARE_AT_ONCE, _PATIENT_FRAMES = 32, 0.5, 30
 _ITERATIONS = 25
@@ -304,7 +302,6 @@ class FileSearch:
         #: Recent bursts with the timeline by which they were added.
         self._recent: list[tuple[_Timeline, _Burst]] = []
         self._candidates: list[tuple[int, int, Float32]] = []
-        self._n_gathered = 0
         #: Bursts of the current frame.
         self._fresh: list[tuple[_Timeline, _Burst]] = []
         #: Sentences about refused files.
@@ -344,10 +341,7 @@ class FileSearch:
                 self._candidates.append((soft.epoch, int(number), buffer))
         # These have too few copies to decide. A batch costs little more than a single attempt.
         if len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
-            if self._n_gathered < _FREE_BATCHES or self._n_gathered % _THEN_EVERY == 0:
-                self._try_gathered()
-            self._n_gathered += 1
-            self._candidates.clear()
+            self._try_gathered()
 
     def _is_expected(self, epoch: int, number: int, buffer: Float32) -> bool:
         """Whether a burst is the announcement that its timeline predicts."""
@@ -446,10 +440,9 @@ class FileSearch:
 
     def _flush_entered(self) -> None:
         """Add all bursts of a frame together."""
-        fresh, lines = list(self._fresh), {id(line): line for line, _ in self._fresh}
-        self._fresh.clear()
-        for key, line in lines.items():
-            _enter_bursts(line, [burst for owner, burst in fresh if id(owner) == key], 1)
+        fresh, self._fresh = self._fresh, []
+        for line in dict.fromkeys(line for line, _ in fresh):
+            _enter_bursts(line, [burst for owner, burst in fresh if owner is line], 1)
             line.file.frames_waited += 1
         self._recent += fresh
         del self._recent[:-_MAX_RECENT]

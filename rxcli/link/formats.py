@@ -79,17 +79,8 @@ def parse_beacon(body: bytes) -> tuple[MessageKind, bytes] | None:
     if KINDS[kind] == "raw":
         return "raw", data
     text = data.rstrip(b"\0")
-    if not text or b"\0" in text or not _is_utf8(text):
-        return None
-    return KINDS[kind], text
-
-
-def _is_utf8(data: bytes) -> bool:
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError:
-        return False
-    return True
+    is_utf8 = text.decode("utf-8", "ignore").encode("utf-8") == text
+    return (KINDS[kind], text) if text and b"\0" not in text and is_utf8 else None
 
 
 def protect_beacon(body: bytes) -> bytes:

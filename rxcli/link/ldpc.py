@@ -159,14 +159,9 @@ def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
     return np.asarray(np.clip(np.rint(llr / LLR_STEP), -_MAX_INPUT, _MAX_INPUT), np.int8)
 
 
-@dataclass(frozen=True, slots=True)
-class Patience:
-    """When a block is given up as no codeword: its share of unsatisfied checks does not fall."""
-
-    #: Iterations after which the share is compared with that after the first one.
-    iterations: int
-    #: Ratio of the share after these iterations to that after the first one, above which a block is given up.
-    max_ratio: float
+#: Iterations after which a block is given up as no codeword, and the least ratio of its share of unsatisfied checks to
+#: that after the first iteration at which it is.
+_PATIENCE, _MAX_RATIO = 6, 0.95
 
 
 def decode(
@@ -174,7 +169,7 @@ def decode(
     buffer_llr: NDArray[np.int8],
     accept: Accept,
     max_iterations: int = 22,
-    patience: Patience | None = None,
+    gives_up: bool = False,
 ) -> NDArray[np.bool_]:
     """Decode a batch of blocks by layered normalised min-sum in 16-bit numbers, until `accept` accepts them.
 
@@ -185,7 +180,7 @@ def decode(
         buffer_llr: (batch, M) int8: ln p(1)/p(0) in steps of `LLR_STEP` of the first M bits of the buffer, 0 unknown.
         accept: called after every iteration with batch indices and information bits.
         max_iterations: maximum number of iterations.
-        patience: when to give up a block; None to use all iterations.
+        gives_up: whether a block that looks like no codeword is given up before all iterations.
 
     Returns:
         (batch,) which blocks were accepted.
@@ -198,7 +193,7 @@ def decode(
     first_share = np.ones(places.size)
     for iteration in range(1, max_iterations + 1):
         layers.update()
-        if iteration == 1 and patience is not None:
+        if iteration == 1 and gives_up:
             first_share = layers.unsatisfied()
         if iteration == 1 and max_iterations > 1:
             continue
@@ -206,8 +201,8 @@ def decode(
         good = accept(places[which], layers.information(which))
         accepted[places[which[good]]] = True
         still[which[good]] = False
-        if patience is not None and iteration == patience.iterations:
-            still &= layers.unsatisfied() < patience.max_ratio * first_share
+        if gives_up and iteration == _PATIENCE:
+            still &= layers.unsatisfied() < _MAX_RATIO * first_share
         if not still.any():
             break
         if still.mean() < _CROWDED:

@@ -53,10 +53,7 @@ class LinkReceiver:
 
     def finish(self) -> list[Event]:
         """Decode the rest at the end of the transmission."""
-        if self._last is None:
-            return []
-        last = self._last
-        return [self._object(last, *found) for found in self._files.finish()]
+        return [self._object(self._last, *found) for found in self._files.finish() if self._last is not None]
 
     def _new_messages(self, soft: FrameSoftBits, found: Sequence[tuple[MessageKind, bytes]]) -> list[Event]:
         known = {(message.kind, message.data) for message in self.messages}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -61,9 +60,8 @@ def save_objects(
 
 
 def _is_same(path: Path, received: ReceivedObject) -> bool:
-    if path.is_symlink() or not path.is_file() or path.stat().st_size != received.size:
-        return False
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest() == received.sha256
+        is_file = path.is_file() and not path.is_symlink()
+        return is_file and path.stat().st_size == received.size and path.read_bytes() == received.data
     except OSError:
         return False

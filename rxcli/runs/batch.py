@@ -10,6 +10,7 @@ import os
 import signal
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -314,20 +315,18 @@ class _Pool:
 
     def __init__(self, decoder: Decoder, n_workers: int) -> None:
         self._decoder, self._n_workers = decoder, n_workers
-        self._tasks: SimpleQueue[tuple[Source, _Results] | None] = SimpleQueue()
+        self._threads = ThreadPoolExecutor(n_workers)
         #: One for each worker; a thread that takes them all decodes alone.
         self._permits, self._taking_all = Semaphore(n_workers), Lock()
         self._starting, self._closed = Lock(), False
         self._processes: list[BaseProcess] = []
         #: Process and connection of each thread.
         self._own = local()
-        for _ in range(n_workers):
-            Thread(target=self._serve, daemon=True).start()
 
     def submit(self, source: Source) -> _Results:
         """Have a source decoded; returns the queue of its results, with a None behind the last."""
         results: _Results = SimpleQueue()
-        self._tasks.put((source, results))
+        self._threads.submit(self._serve, source, results)
         return results
 
     def close(self) -> None:
@@ -337,17 +336,15 @@ class _Pool:
         for process in self._processes:
             process.kill()
             process.join()
-        for _ in range(self._n_workers):
-            self._tasks.put(None)
+        self._threads.shutdown(wait=False, cancel_futures=True)
 
-    def _serve(self) -> None:
-        for source, results in iter(self._tasks.get, None):
-            try:
-                for result in self._decode(source):
-                    results.put(result)
-            except Exception as error:
-                results.put(error)
-            results.put(None)
+    def _serve(self, source: Source, results: _Results) -> None:
+        try:
+            for result in self._decode(source):
+                results.put(result)
+        except Exception as error:
+            results.put(error)
+        results.put(None)
 
     def _decode(self, source: Source) -> Iterator[FrameResult]:
         """Results of a source, if need be in a second attempt, which repeats none of the first."""

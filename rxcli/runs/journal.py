@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import InputError, UsageError, shortened
 from rxcli.outputs import replacing, unwritable
 from rxcli.results.record import from_record, to_record
 from rxcli.types import FrameResult
@@ -52,12 +52,11 @@ class Head:
 
 def _differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
     changed = [name for name in {**before, **after} if before.get(name) != after.get(name)]
-    return [f"{name} was {_shown(before.get(name))}, is {_shown(after.get(name))}" for name in changed]
+    return [f"{name} was {_shown(before, name)}, is {_shown(after, name)}" for name in changed]
 
 
-def _shown(value: object) -> str:
-    text = json.dumps(value, default=str)
-    return text if len(text) <= 80 else f"{text[:77]}..."
+def _shown(values: Mapping[str, Any], name: str) -> str:
+    return shortened(json.dumps(values.get(name), default=str))
 
 
 def file_facts(path: str) -> dict[str, Any] | None:

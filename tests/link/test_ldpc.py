@@ -108,7 +108,7 @@ def test_a_block_whose_checks_do_not_improve_is_given_up() -> None:
         iterations.append(places.size)
         return (found == bits[places]).all(axis=1)
 
-    assert decode(code, llr, accept, 25, ldpc.Patience(6, 0.95)).all()
+    assert decode(code, llr, accept, 25, gives_up=True).all()
     iterations.clear()
-    assert not decode(code, chance, accept, 25, ldpc.Patience(6, 0.95)).any()
+    assert not decode(code, chance, accept, 25, gives_up=True).any()
     assert sum(iterations) < 8 * 12
