@@ -15,6 +15,9 @@ from typing import Any
 import aiohttp
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+_FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run")
+_FLAGS += ("--disable-quic", "--disable-background-networking", "--disable-component-update", "--disable-sync")
+_FLAGS += ("--remote-debugging-port=0", "--mute-audio", "--hide-scrollbars")
 
 
 class Browser:
@@ -35,18 +38,15 @@ class Browser:
     async def __aenter__(self) -> Browser:
         self._home = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
         assert CHROMIUM is not None
-        flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"]
-        flags += ["--disable-quic", "--disable-background-networking", "--disable-component-update", "--disable-sync"]
-        flags += ["--remote-debugging-port=0", "--mute-audio", "--hide-scrollbars"]
-        flags += [f"--user-data-dir={self._home.name}"]
-        self._process = subprocess.Popen(
-            [CHROMIUM, *flags, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        port = await self._port()
+        command = [CHROMIUM, *_FLAGS, f"--user-data-dir={self._home.name}", "about:blank"]
+        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        file, end_s = Path(self._home.name) / "DevToolsActivePort", time.monotonic() + 60
+        while not (file.exists() and file.read_text().strip()):
+            assert time.monotonic() < end_s, "the browser did not start"
+            await asyncio.sleep(0.05)
         self._session = aiohttp.ClientSession()
-        async with self._session.get(f"http://127.0.0.1:{port}/json") as answer:
-            pages = await answer.json()
-        address = next(page["webSocketDebuggerUrl"] for page in pages if page["type"] == "page")
+        async with self._session.get(f"http://127.0.0.1:{file.read_text().split()[0]}/json") as answer:
+            [address] = [page["webSocketDebuggerUrl"] for page in await answer.json() if page["type"] == "page"]
         self._socket = await self._session.ws_connect(address, max_msg_size=0)
         self._reader = asyncio.create_task(self._read())
         for domain in ("Page", "Runtime", "DOM", "Log", "Network"):
@@ -54,8 +54,7 @@ class Browser:
         width, height = self._size
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
         await self.call("Emulation.setDeviceMetricsOverride", **metrics)
-        scheme = [{"name": "prefers-color-scheme", "value": "dark" if self._dark else "light"}]
-        await self.call("Emulation.setEmulatedMedia", features=scheme)
+        await self.prefer("dark" if self._dark else "light")
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -66,31 +65,18 @@ class Browser:
         self._process.wait()
         self._home.cleanup()
 
-    async def _port(self) -> str:
-        file = Path(self._home.name) / "DevToolsActivePort"
-        end_s = time.monotonic() + 60
-        while not (file.exists() and file.read_text().strip()):
-            assert time.monotonic() < end_s, "the browser did not start"
-            await asyncio.sleep(0.05)
-        return file.read_text().split()[0]
-
     async def _read(self) -> None:
         async for message in self._socket:
             data = json.loads(message.data)
+            method, told = data.get("method"), data.get("params", {})
             if "id" in data:
-                waiting = self._answers.pop(data["id"], None)
-                if waiting is not None and not waiting.done():
-                    waiting.set_result(data)
-                continue
-            self._note(data["method"], data["params"])
-
-    def _note(self, method: str, told: dict[str, Any]) -> None:
-        if method == "Runtime.exceptionThrown":
-            self.complaints.append(json.dumps(told["exceptionDetails"]))
-        elif method == "Runtime.consoleAPICalled" and told["type"] in ("error", "warning", "assert"):
-            self.complaints.append(json.dumps(told["args"]))
-        elif method == "Log.entryAdded" and told["entry"]["level"] in ("error", "warning"):
-            self.complaints.append(told["entry"]["text"] + " " + told["entry"].get("url", ""))
+                self._answers.pop(data["id"]).set_result(data)
+            elif (
+                method == "Runtime.exceptionThrown"
+                or (method == "Runtime.consoleAPICalled" and told["type"] in ("error", "warning", "assert"))
+                or (method == "Log.entryAdded" and told["entry"]["level"] in ("error", "warning"))
+            ):
+                self.complaints.append(json.dumps(told))
 
     async def call(self, method: str, **parameters: Any) -> Any:
         """One call of the protocol."""
@@ -112,13 +98,17 @@ class Browser:
         await self.call("Page.navigate", url=address)
         await self.until("document.readyState === 'complete' && location.href !== 'about:blank'")
 
-    async def until(self, expression: str, timeout_s: float = 60.0) -> float:
-        """Wait until an expression is true; seconds that it took."""
-        start_s = time.monotonic()
+    async def until(self, expression: str) -> None:
+        """Wait until an expression is true."""
+        end_s = time.monotonic() + 60
         while not await self.run(expression):
-            assert time.monotonic() - start_s < timeout_s, f"never came true: {expression}"
+            assert time.monotonic() < end_s, f"never came true: {expression}"
             await asyncio.sleep(0.03)
-        return time.monotonic() - start_s
+
+    async def prefer(self, scheme: str) -> None:
+        """Show pages as to a reader who prefers light or dark ones."""
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        await self.call("Emulation.setEmulatedMedia", features=features)
 
     async def choose(self, selector: str, *paths: Path) -> None:
         """Choose files, as a person does with the dialogue."""

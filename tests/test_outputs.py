@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import json
 import os
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,7 @@ from small_frames import write_frame, write_profiles
 from rxcli import outputs
 from rxcli.cli.main import run
 from rxcli.errors import OutputError, UsageError
-from rxcli.outputs import Output, claim, encode_png, replacing, write_whole
+from rxcli.outputs import Output, claim, replacing, write_whole
 
 
 @pytest.fixture
@@ -31,47 +34,37 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("option", ["--json", "--junit", "--save-camera"])
-@pytest.mark.parametrize("target", ["in/a.png", "in/link.png", "profiles/screen.toml", "profiles/camera.toml"])
-@pytest.mark.parametrize("force", [[], ["--force"]])
-def test_an_input_or_a_profile_is_never_written_over(
-    option: str,
-    target: str,
-    force: list[str],
-    tmp_path: Path,
-    names: list[str],
-    capsys: pytest.CaptureFixture[str],
+@pytest.mark.parametrize(
+    "target", ["in/a.png", "in/link.png", "in/a.truth.json", "profiles/screen.toml", "profiles/camera.toml"]
+)
+def test_what_is_read_is_never_written_over(
+    option: str, target: str, tmp_path: Path, names: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "in" / "link.png").symlink_to("a.png")
     before = contents(tmp_path)
-    assert run(["decode", str(tmp_path / "in" / "a.png"), option, str(tmp_path / target), *force, *names]) == 2
-    assert contents(tmp_path) == before
-    said = capsys.readouterr().err
-    assert said.startswith(f"vlc-rx: {option} {tmp_path / target}: the same file is ")
-    assert said.count("\n") == 1
-
-
-def test_a_truth_that_is_read_is_never_written_over(tmp_path: Path, names: list[str]) -> None:
-    path = tmp_path / "in" / "a.png"
-    before = contents(tmp_path)
-    truth = str(tmp_path / "in" / "a.truth.json")
-    for options in (["--truth", truth], ["--truth", "auto"]):
-        assert run(["decode", str(path), *options, "--json", truth, "--force", *names]) == 2
-    assert run(["decode", str(path), "--json", truth, *names]) == 2  # not read, and not ours either
-    assert contents(tmp_path) == before
+    command = ["decode", str(tmp_path / "in" / "a.png"), "--truth", "auto", option, str(tmp_path / target), *names]
+    for force in ([], ["--force"]):
+        assert run([*command, *force]) == 2
+        assert contents(tmp_path) == before
+        said = capsys.readouterr().err
+        assert said.startswith(f"vlc-rx: {option} {tmp_path / target}: the same file is ")
+        assert said.count("\n") == 1
 
 
 def test_one_file_twice_and_folders_are_refused(
     tmp_path: Path, names: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    picture, same = str(tmp_path / "in" / "a.png"), str(tmp_path / "out.csv")
+    (tmp_path / "loop").symlink_to("loop")
     os.symlink(tmp_path, tmp_path / "here")
     for options, reason in (
-        (["--summary", same, "--junit", same], "the same file is written by"),
-        (["--summary", same, "--json", str(tmp_path / "here" / "out.csv")], "the same file is written by"),
-        (["--json", str(tmp_path / "in")], "is a folder"),
-        (["--json", str(tmp_path / "none" / "out.jsonl")], "there is no such folder"),
+        (["--summary", "out.csv", "--junit", "out.csv"], "the same file is written by"),
+        (["--summary", "out.csv", "--json", "here/out.csv"], "the same file is written by"),
+        (["--json", "in"], "is a folder"),
+        (["--json", "none/out.jsonl"], "there is no such folder"),
+        *((["--json", name], "--json") for name in ("a\0b", "x" * 300, "loop")),  # names that no system takes
     ):
-        assert run(["decode", picture, *options, *names]) == 2
+        with chdir(tmp_path):
+            assert run(["decode", "in/a.png", *options, *names]) == 2
         assert reason in capsys.readouterr().err
     assert not (tmp_path / "out.csv").exists()
 
@@ -97,22 +90,31 @@ def test_a_file_of_somebody_else_needs_force_and_one_of_ours_does_not(
     assert not list(tmp_path.glob(".*"))
 
 
-def test_other_commands_do_not_destroy_either(tmp_path: Path, names: list[str]) -> None:
-    picture = tmp_path / "in" / "a.png"
+@pytest.mark.parametrize(
+    "command",
+    [
+        "simulate in/a.png",
+        "simulate b.png --camera-profile in/a.png",
+        "simulate b.png --picture in/a.png --camera-profile in/a.png --force",
+        "simulate /proc/o.png",
+        "encode --text a --screen data-17k3 --out /proc/o.npy",
+        "inspect in/a.png --out /proc/o",
+        "profiles which in/a.png --json in/a.png",
+        "profiles show profiles/screen.toml --json profiles/screen.toml",
+        "calibrate lens in/a.png --picture in/a.png",
+        "calibrate lens in/a.png --save in/a.png",
+        "calibrate shutter in/a.png --frequency 1000 --json in/a.png",
+        "calibrate shutter in/a.png --frequency 1000 --save /proc/o.toml",
+        "live /dev/video0 --json in/a.png",
+    ],
+)
+@pytest.mark.usefixtures("names")
+def test_other_commands_do_not_destroy_either(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = contents(tmp_path)
-    for command in (
-        ["simulate", str(picture)],
-        ["simulate", str(tmp_path / "b.png"), "--camera-profile", str(picture)],
-        ["simulate", str(tmp_path / "b.png"), "--picture", str(picture), "--camera-profile", str(picture), "--force"],
-        ["profiles", "which", str(picture), "--json", str(picture)],
-        ["profiles", "show", names[1], "--json", names[1]],
-        ["calibrate", "lens", str(picture), "--picture", str(picture)],
-        ["calibrate", "lens", str(picture), "--save", str(picture)],
-        ["calibrate", "shutter", str(picture), "--frequency", "1000", "--json", str(picture)],
-        ["live", "/dev/video0", "--json", str(picture)],
-    ):
-        assert run(command) == 2, command
-        assert contents(tmp_path) == before, command
+    with chdir(tmp_path):
+        assert run(command.split()) == 2
+    assert contents(tmp_path) == before
+    assert ("cannot be written (No such file or directory)" in capsys.readouterr().err) == ("/proc" in command)
 
 
 def test_a_capture_of_the_simulator_may_be_made_anew(tmp_path: Path) -> None:
@@ -128,19 +130,23 @@ def test_a_capture_of_the_simulator_may_be_made_anew(tmp_path: Path) -> None:
     assert run([*command, "--force"]) == 0
 
 
-def half_written(path: Path, error: Exception) -> None:
-    with replacing(path) as hidden:
-        hidden.write_text("half")
-        raise error
-
-
-def test_what_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [(ZeroDivisionError(), ZeroDivisionError), (OSError(errno.ENOSPC, "No space left"), OutputError)],
+)
+def test_what_fails_leaves_the_old_file_and_nothing_else(
+    error: Exception, raised: type[Exception], tmp_path: Path
+) -> None:
     path = tmp_path / "a.txt"
     write_whole(path, "old")
-    with pytest.raises(ZeroDivisionError):
-        half_written(path, ZeroDivisionError())
-    with pytest.raises(OutputError, match=r"a\.txt: cannot be written \(No space left"):
-        half_written(path, OSError(28, os.strerror(28)))
+
+    def fail() -> None:
+        with replacing(path) as hidden:
+            hidden.write_text("half")
+            raise error
+
+    with pytest.raises(raised):
+        fail()
     assert contents(tmp_path) == {"a.txt": b"old"}
     with pytest.raises(OutputError, match="cannot be written"):
         write_whole(tmp_path / "none" / "a.txt", "new")
@@ -157,30 +163,16 @@ def test_a_link_is_followed_and_a_device_is_no_file(tmp_path: Path) -> None:
     claim([Output("--json", null, outputs.JOURNAL), Output("--junit", null, outputs.JUNIT)])
     write_whole(null, "new")
     assert null.is_char_device()
-    with pytest.raises(OutputError, match="/dev/full: cannot be written"):
-        write_whole(Path("/dev/full"), "new")
+    for path, code in (("/dev/full", 3), ("/proc/none", 2)):  # a full disk, a wrong name
+        with pytest.raises(OutputError, match=f"{path}: cannot be written") as caught:
+            write_whole(Path(path), "new")
+        assert caught.value.exit_code == code
 
 
-def test_names_that_no_system_takes(tmp_path: Path) -> None:
-    for name in ("a\0b", "x" * 300, "loop"):
-        (tmp_path / "loop").unlink(missing_ok=True)
-        (tmp_path / "loop").symlink_to("loop")
-        with pytest.raises(UsageError):
-            claim([Output("--json", tmp_path / name, outputs.JOURNAL)])
-
-
-def test_our_png_is_known_again(tmp_path: Path) -> None:
-    import cv2
-
-    picture = np.arange(60, dtype=np.uint8).reshape(6, 10)
-    data = encode_png(picture)
-    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), picture)
-    assert outputs.PICTURE.search(data)
-    assert not outputs.PICTURE.search(cv2.imencode(".png", picture)[1].tobytes())
-
-
-def test_taps_of_files_with_one_name_stand_in_their_folders(tmp_path: Path, names: list[str]) -> None:
-    """`a/IMG.png` and `b/IMG.png` had one NPZ between them, and so had names that differ in odd characters only."""
+def test_taps_of_files_with_one_name_stand_in_their_folders(
+    tmp_path: Path, names: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As do names that differ in odd characters only; a file of somebody else is not replaced."""
     for number, place in enumerate(("a/IMG.png", "b/IMG.png", "b/c/x y.png", "b/c/x_y.png")):
         (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
         write_frame(tmp_path / place, number)
@@ -189,16 +181,23 @@ def test_taps_of_files_with_one_name_stand_in_their_folders(tmp_path: Path, name
         f"{camera.read_text()}\n[lens]\nwidth = 340\nheight = 620\ndist_coeffs = [-0.1, 0.0, 0.0, 0.0]\n"
         "camera_matrix = [[500.0, 0.0, 169.5], [0.0, 500.0, 309.5], [0.0, 0.0, 1.0]]\n"
     )
-    folders = [str(tmp_path / "a"), str(tmp_path / "b")]
     taps, pictures = tmp_path / "taps", tmp_path / "pictures"
-    assert run(["decode", *folders, "--dump-dir", str(taps), "--save-undistorted", str(pictures), *names]) in (0, 1)
+    command = ["decode", str(tmp_path / "a"), str(tmp_path / "b"), *names, "--dump-dir", str(taps)]
+    assert run([*command, "--save-undistorted", str(pictures)]) in (0, 1)
     assert set(contents(taps)) == {
         *("a/IMG.png-000000.npz", "b/IMG.png-000000.npz"),
         *("b/c/x_y.png-000000.npz", "b/c/2/x_y.png-000000.npz"),
     }
     assert {"a/IMG.png.00000.png", "b/IMG.png.00000.png"} <= set(contents(pictures))
+    assert outputs.PICTURE.search(contents(pictures)["a/IMG.png.00000.png"])
     lights = [np.load(path)["samples.light"].tobytes() for path in taps.rglob("*.npz")]
     assert len(set(lights)) == 4
+    assert run(command) in (0, 1)
+    (taps / "a" / "IMG.png-000000.npz").write_text("mine")
+    capsys.readouterr()
+    assert run(command) == 2
+    assert "no earlier output" in capsys.readouterr().err
+    assert (taps / "a" / "IMG.png-000000.npz").read_text() == "mine"
 
 
 @pytest.mark.parametrize(
@@ -217,101 +216,47 @@ def test_what_cannot_be_written_is_wrong_usage_before_any_work(
         assert captured.err.count("\n") == 1
 
 
-def test_other_commands_try_their_outputs_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = tmp_path / "a.png"
-    picture.write_bytes(b"")
-    for arguments in (
-        ["inspect", str(picture), "--out", "/proc/o"],
-        ["simulate", "/proc/o.png"],
-        ["encode", "--text", "a", "--screen", "data-17k3", "--out", "/proc/o.npy"],
-        ["calibrate", "shutter", str(picture), "--frequency", "1000", "--save", "/proc/o.toml"],
-    ):
-        assert run(arguments) == 2
-        assert "cannot be written (No such file or directory)" in capsys.readouterr().err
-
-
-def test_a_file_that_may_not_be_changed_is_no_output(tmp_path: Path) -> None:
-    path = tmp_path / "o"
-    path.write_bytes(b"")
-    path.chmod(0o400)
-    if os.access(path, os.W_OK):
-        pytest.skip("permissions do not bind this user")
-    with pytest.raises(UsageError, match="Permission denied"):
-        claim([Output("--json", path, outputs.ANYTHING)])
-
-
-def test_a_failing_disk_is_no_wrong_usage() -> None:
-    full = outputs.unwritable(Path("a"), OSError(errno.ENOSPC, "No space left on device"))
-    readonly = outputs.unwritable(Path("a"), OSError(errno.EROFS, "Read-only file system"))
-    assert (full.exit_code, readonly.exit_code) == (3, 2)
-
-
-def test_claiming_leaves_no_trace(tmp_path: Path) -> None:
-    claim([Output("--json", tmp_path / "o", outputs.ANYTHING), Output("--junit", tmp_path / "p", outputs.JUNIT)])
-    outputs.claim_folder("--out", tmp_path / "folder")
-    assert [path.name for path in tmp_path.rglob("*")] == ["folder"]
-
-
-def test_taps_do_not_replace_a_file_of_somebody_else(
-    tmp_path: Path, names: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    picture, taps = tmp_path / "in" / "a.png", tmp_path / "taps"
-    assert run(["decode", str(picture), "--dump-dir", str(taps), *names]) == 0
-    assert run(["decode", str(picture), "--dump-dir", str(taps), *names]) == 0
-    (taps / "a.png-000000.npz").write_text("mine")
-    assert run(["decode", str(picture), "--dump-dir", str(taps), *names]) == 2
-    assert "no earlier output" in capsys.readouterr().err
-    assert (taps / "a.png-000000.npz").read_text() == "mine"
-
-
 def test_cells_that_a_spreadsheet_would_compute_are_quoted(tmp_path: Path, names: list[str]) -> None:
-    folder = tmp_path / "odd"
-    folder.mkdir()
-    for name in ("=1+1.png", "+a.png", "@b.png", "-c.png", "d.png"):
-        (folder / name).write_bytes(b"")
-    before = Path.cwd()
-    os.chdir(folder)
-    try:
-        odd = ["=1+1.png", "+a.png", "@b.png", "-c.png", "d.png"]
-        run(["decode", "--summary", "s.csv", *names, "--quiet", "--", *odd])
-        write_frame(folder / "=1+1.png", 1)
-        run(["decode", "--payloads", "p.csv", *names, "--quiet", "--", "=1+1.png"])
-    finally:
-        os.chdir(before)
-    sources = [line.split(",")[0] for line in (folder / "s.csv").read_text().splitlines()[1:]]
-    assert sources == ["'=1+1.png", "'+a.png", "'@b.png", "'-c.png", "d.png"]
-    assert {line.split(",")[0] for line in (folder / "p.csv").read_text().splitlines()[1:]} == {"'=1+1.png"}
+    shown = {name: f"'{name}" for name in ("=1+1.png", "+a.png", "@b.png", "-c.png")}
+    shown |= {"d.png": "d.png", "line\nbreak.png": "line\\nbreak.png", "back\\n.png": "back\\\\n.png"}
+    shown |= {os.fsdecode(b"byte\xff.png"): "byte\\xff.png"}  # the names can be told from what is shown
+    write_frame(tmp_path / "=1+1.png", 1)
+    with chdir(tmp_path):
+        for name in shown:
+            Path(name).write_bytes(Path("=1+1.png").read_bytes())
+        assert run(["decode", "--summary", "s.csv", "--payloads", "p.csv", *names, "--quiet", "--", *shown]) == 0
+    for name in ("s.csv", "p.csv"):
+        rows = csv.DictReader(io.StringIO((tmp_path / name).read_text(encoding="utf-8")))
+        assert list(dict.fromkeys(row["source"] for row in rows)) == list(shown.values())
 
 
 @pytest.mark.parametrize(
     "command",
     [
-        ["benchmark", "confidence", "--count", "1"],
-        ["benchmark", "compare", "."],
-        ["benchmark", "--quick"],
-        ["inspect", "a.png"],
-        ["train"],
+        "benchmark confidence --count 1 --out photos",
+        "benchmark compare . --out photos",
+        "benchmark --quick --out photos",
+        "inspect a.png --out photos",
+        "train photos",
     ],
-    ids=lambda command: " ".join(command[:2]),
 )
 def test_folders_of_results_are_no_folders_of_photos(
-    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A folder that holds other files is neither written to nor marked as one that runs pass over."""
-    monkeypatch.chdir(tmp_path)
-    write_frame(tmp_path / "a.png", 1)
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    (photos / "a.jpg").write_bytes(b"photo")
-    (photos / "notes.csv").write_text("mine")
-    for name in ("torch", "onnx", "matplotlib") if command == ["train"] else ():
+    monkeypatch.setattr("rxcli.lab.benchmark.compare.check_checkout", lambda path: path)
+    photos = {"a.jpg": b"photo", "notes.csv": b"mine"}
+    (tmp_path / "photos").mkdir()
+    for name, data in photos.items():
+        (tmp_path / "photos" / name).write_bytes(data)
+    for name in ("torch", "onnx", "matplotlib") if command == "train photos" else ():
         pytest.importorskip(name)
-    if command[1:2] == ["compare"]:
-        monkeypatch.setattr("rxcli.lab.benchmark.compare.check_checkout", lambda path: path)
-    assert run([*command, *(["--out"] if command != ["train"] else []), "photos"]) == 2
+    with chdir(tmp_path):
+        write_frame(Path("a.png"), 1)
+        assert run(command.split()) == 2
     said = capsys.readouterr().err
     assert "photos: the folder holds files that this command did not write; name a new folder" in said
-    assert sorted(path.name for path in photos.iterdir()) == ["a.jpg", "notes.csv"]
+    assert contents(tmp_path / "photos") == photos
 
 
 def test_a_folder_of_results_is_new_empty_or_the_commands_own(tmp_path: Path) -> None:

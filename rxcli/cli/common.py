@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -32,7 +31,8 @@ def options(*rows: tuple[Any, ...]) -> Callable[[_F], _F]:
         for flags, kind, default, text, *more in reversed(rows):
             long_flag, *short_flags = flags.split()
             flag, _, metavar = long_flag.partition("=")
-            arguments = {"metavar": metavar or None, **_option(kind, default), **(more[0] if more else {})}
+            arguments = {"metavar": metavar or None, "callback": _finite, **_option(kind, default)}
+            arguments |= more[0] if more else {}
             command = click.option(flag, *short_flags, help=text, **arguments)(command)
         return command
 
@@ -46,6 +46,14 @@ def _option(kind: Any, default: Any) -> dict[str, Any]:
         return {"type": kind[0], "multiple": True}
     shown = {} if default is None else {"default": default, "show_default": True}
     return {"type": click.Choice(kind) if isinstance(kind, tuple) else kind, **shown}
+
+
+def _finite(context: click.Context, parameter: click.Parameter, value: Any) -> Any:
+    """Refuse nan and infinities: no comparison with nan fails, so that it passes every bound."""
+    for number in value if isinstance(value, tuple) else (value,):
+        if isinstance(number, float) and not math.isfinite(number):
+            raise click.BadParameter(f"{number} is no number", context, parameter)
+    return value
 
 
 _SCREEN_HELP = "Screen profile; may be given several times. [default: auto, the one whose clock fits best]"
@@ -124,19 +132,12 @@ def write_json(value: Any, path: str) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    text = json.dumps(_finite(value), indent=2)
-    if path == "-":
-        click.echo(text)
-        return
+    import msgspec
+
     from rxcli.outputs import write_whole
 
-    write_whole(Path(path), text + "\n")
-
-
-def _finite(value: Any) -> Any:
-    """JSON knows no NaN and no infinity."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    text = msgspec.json.format(msgspec.json.encode(value, enc_hook=float), indent=2).decode()  # null for nan
+    if path == "-":
+        click.echo(text)
+    else:
+        write_whole(Path(path), text + "\n")

@@ -47,7 +47,10 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
     """Encode the file PATH, a text or a URI as labels, or slots, for a transmitter."""
     screen = load_profile(options["screen"], ScreenProfile)
     _check(out, options)
-    _claim(path, out, options)
+    inputs = [path, Path(options["weights"]) if options["weights"].endswith(".json") else None]
+    readme = Output("--slots", _readme_of(out), ENCODED) if options["slots"] else None
+    written = [Output("--out", out, ENCODED), readme]
+    claim_outputs(written, filter(None, inputs), (options["screen"],), options["force"])
     sending = sending_of(path, options["text"], options["uri"], _RATES[options["mother"]], options["object_id"])
     n_bursts = _n_bursts(options, sending, screen)
     plan = _Plan(sending, screen, _weights(options["weights"], n_bursts, screen.columns), n_bursts, out)
@@ -62,22 +65,14 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
 
 
 def _check(out: Path, options: dict[str, Any]) -> None:
-    if options["bursts"] is not None and options["seconds"] is not None:
-        raise UsageError("--bursts and --seconds exclude each other", "give one of them")
-    if out.suffix not in (".npy", ".csv"):
-        raise UsageError(f"--out must end in .npy or .csv (got {str(out)!r})", "name such a file")
-    if options["slots"] and out.suffix != ".npy":
-        raise UsageError("--slots are written as .npy only", "name such a file, or leave --slots out")
-
-
-def _claim(path: Path | None, out: Path, options: dict[str, Any]) -> None:
-    """Refuse outputs that would destroy something."""
-    found = [Output("--out", out, ENCODED)]
-    if options["slots"]:
-        found.append(Output("--slots", _readme_of(out), ENCODED))
-    inputs = [path] if path is not None else []
-    inputs += [Path(options["weights"])] if options["weights"].endswith(".json") else []
-    claim_outputs(found, inputs, (options["screen"],), options["force"])
+    both = options["bursts"] is not None and options["seconds"] is not None
+    for is_wrong, reason, step in (
+        (both, "--bursts and --seconds exclude each other", "give one of them"),
+        (out.suffix not in (".npy", ".csv"), f"--out must end in .npy or .csv (got {str(out)!r})", "name such a file"),
+        (options["slots"] and out.suffix != ".npy", "--slots are written as .npy only", "name such a file"),
+    ):
+        if is_wrong:
+            raise UsageError(reason, step)
 
 
 def _readme_of(out: Path) -> Path:

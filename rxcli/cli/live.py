@@ -6,11 +6,12 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,7 +20,7 @@ from rxcli.cli.kinds import FOLDER, Exposure
 from rxcli.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
-    from rxcli.ingest.v4l2 import CameraCounts, LiveSource
+    from rxcli.ingest.v4l2 import CameraCounts, CameraSettings, LiveSource
     from rxcli.outputs import Taken
     from rxcli.results.aim import Aim, AimState, Light
     from rxcli.types import Frame, FrameResult, ObjectProgress
@@ -53,7 +54,10 @@ _BAR = 20
 def live(device: Path, **options: Any) -> int:
     """Receive from the V4L2 camera DEVICE, such as /dev/video0, until Ctrl-C."""
     if options["list_only"]:
-        return _show_modes(device)
+        from rxcli.ingest.v4l2 import list_modes
+
+        click.echo("\n".join(map(str, list_modes(device))))
+        return ExitCode.OK
     configured = replace(receiver_options(options, soft_bits=True), prompt=True)
     taken = _claim(device, options)
     from rxcli.ingest.v4l2 import LiveSource
@@ -72,7 +76,7 @@ def live(device: Path, **options: Any) -> int:
     with ExitStack() as stack:
         write = _writer(options["json_path"], stack)
         stack.enter_context(status)
-        frames = stack.enter_context(closing(_limited(source, options["n_frames"])))
+        frames = islice(stack.enter_context(closing(iter(source))), options["n_frames"])
         collector = Collector(configured.screens, configured.file_memory_mb)
         for received in receive(status.watched(frames), configured):
             result = collector.add(received)
@@ -98,7 +102,7 @@ def _claim(device: Path, options: dict[str, Any]) -> Taken:
     return claim_outputs([output], (device,), (*options["screens"], *options["cameras"]), options["force"])
 
 
-def _settings(options: dict[str, Any]) -> Any:
+def _settings(options: dict[str, Any]) -> CameraSettings:
     from rxcli.ingest.v4l2 import PIXEL_FORMATS, CameraSettings
 
     name = options["pixel_format"] and options["pixel_format"].upper()
@@ -108,60 +112,35 @@ def _settings(options: dict[str, Any]) -> Any:
     return CameraSettings(pixel_format=name, **same)
 
 
-def _show_modes(device: Path) -> int:
-    from rxcli.ingest.v4l2 import list_modes
-
-    for mode in list_modes(device):
-        click.echo(str(mode))
-    return ExitCode.OK
-
-
-def _limited(source: LiveSource, n_frames: int | None) -> Generator[Frame, None, None]:
-    """Frames of the camera up to a number."""
-    with closing(iter(source)) as frames:
-        for number, frame in enumerate(frames, 1):
-            yield frame
-            if number == n_frames:
-                return
-
-
 def _writer(json_path: str | None, stack: ExitStack) -> Callable[[FrameResult], None]:
     """What is done with a result: a JSON line for each frame, or a table for those with packets."""
+    from rxcli.cli.printing import print_line
     from rxcli.results.record import to_json_line
-    from rxcli.results.report import format_frame, format_link
-
-    def show(result: FrameResult) -> None:
-        for line in format_link(result):
-            click.echo(line)
-        if result.packets:
-            _print_above(format_frame(result))
+    from rxcli.runs.journal import Journal
 
     if json_path is None:
-        return show
-    file = sys.stdout if json_path == "-" else stack.enter_context(_open(json_path))
+        return _show
+    to_stdout = json_path == "-"
+    put = print_line if to_stdout else stack.enter_context(closing(Journal(Path(json_path)))).append
+    return lambda result: put(to_json_line(result))
 
-    def write(result: FrameResult) -> None:
-        file.write(to_json_line(result).rstrip("\n") + "\n")
-        file.flush()
 
-    return write
+def _show(result: FrameResult) -> None:
+    from rxcli.results.report import format_frame, format_link
+
+    lines = [*format_link(result), *([format_frame(result)] if result.packets else [])]
+    if lines:
+        _print_above("\n".join(lines))
 
 
 def _print_above(text: str) -> None:
     """Print to stdout, above the block of the status where one stays on the terminal."""
     from tqdm import tqdm
 
-    from rxcli.cli.terminal import for_terminal
+    from rxcli.cli.printing import print_text
 
     with tqdm.external_write_mode():
-        click.echo(for_terminal(text, sys.stdout))
-
-
-def _open(path: str) -> TextIO:
-    try:
-        return Path(path).open("w", encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"--json {path}: {error.strerror}", "name another file") from None
+        print_text(text)
 
 
 @dataclass

@@ -10,20 +10,18 @@ import gc
 import io
 import json
 import logging
-import math
 import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import click
 
 from rxcli import __version__
-from rxcli.cli.groups import PlainContext, SuggestingGroup
+from rxcli.cli.groups import SuggestingGroup
 from rxcli.errors import ExitCode, OutputError, ReceiverError, Terminated
 
 _COMMANDS = {
@@ -41,34 +39,28 @@ _COMMANDS = {
 }
 
 
-def _set_verbose(context: click.Context, _parameter: click.Parameter, verbose: bool) -> None:
-    if verbose:
-        logging.getLogger("rxcli").setLevel(logging.DEBUG)
+def _switch(flags: list[str], switch_on: Callable[[], None], text: str) -> click.Option:
+    """An option of every command that acts before the command runs."""
+
+    def act(_context: click.Context, _parameter: click.Parameter, given: bool) -> None:
+        if given:
+            switch_on()
+
+    return click.Option(flags, is_flag=True, is_eager=True, expose_value=False, callback=act, help=text)
 
 
-_VERBOSE = click.Option(
-    ["-v", "--verbose"],
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_set_verbose,
-    help="Log what is done to stderr; show the traceback of an internal error.",
-)
-
-
-def _set_log_json(_context: click.Context, _parameter: click.Parameter, as_json: bool) -> None:
-    if as_json:
-        _StderrHandler.as_json = True
-
-
-_LOG_JSON = click.Option(
-    ["--log-json"],
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_set_log_json,
-    help="Write logs and errors to stderr as JSON, one object a line.",
-)
+_SWITCHES = [
+    _switch(
+        ["-v", "--verbose"],
+        lambda: logging.getLogger("rxcli").setLevel(logging.DEBUG),
+        "Log what is done to stderr; show the traceback of an internal error.",
+    ),
+    _switch(
+        ["--log-json"],
+        lambda: setattr(_StderrHandler, "as_json", True),
+        "Write logs and errors to stderr as JSON, one object a line.",
+    ),
+]
 
 
 class _PipeClosedError(Exception):
@@ -79,22 +71,18 @@ class _LazyGroup(SuggestingGroup):
     """A group whose commands are modules of `rxcli.cli`, imported when they are run."""
 
     def list_commands(self, _context: click.Context) -> list[str]:
-        return [name for name in _COMMANDS if find_spec(f"rxcli.cli.{name}") is not None]
+        return list(_COMMANDS)
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
-        if name not in self.list_commands(context):
-            return None
-        command = getattr(import_module(f"rxcli.cli.{name}"), name)
-        assert isinstance(command, click.Command)
-        command.context_class = PlainContext
-        if _VERBOSE not in command.params:
-            command.params += [_VERBOSE, _LOG_JSON]
-            _take_finite_numbers_only(command)
-        return command
+        if name in _COMMANDS and name not in self.commands:
+            command = getattr(import_module(f"rxcli.cli.{name}"), name)
+            command.params += [switch for switch in _SWITCHES if switch not in command.params]
+            self.add_command(command, name)
+        return super().get_command(context, name)
 
     def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, _COMMANDS[name]) for name in self.list_commands(context)])
+            formatter.write_dl(list(_COMMANDS.items()))
 
     def invoke(self, context: click.Context) -> Any:
         try:
@@ -105,30 +93,10 @@ class _LazyGroup(SuggestingGroup):
         return result
 
 
-def _take_finite_numbers_only(command: click.Command) -> None:
-    """Refuse nan and infinities for every option: no comparison with nan fails, so that it passes every bound."""
-    for parameter in command.params:
-        if isinstance(parameter.type, click.types.FloatParamType):
-            parameter.callback = _finite_then(parameter.callback)
-    if isinstance(command, click.Group):
-        for below in command.commands.values():
-            _take_finite_numbers_only(below)
-
-
-def _finite_then(callback: Callable[..., Any] | None) -> Callable[..., Any]:
-    def check(context: click.Context, parameter: click.Parameter, value: Any) -> Any:
-        for number in value if isinstance(value, tuple) else (value,):
-            if number is not None and not math.isfinite(number):
-                raise click.BadParameter(f"{number} is no number", context, parameter)
-        return value if callback is None else callback(context, parameter, value)
-
-    return check
-
-
 @click.group(
     name="vlc-rx",
     cls=_LazyGroup,
-    params=[_VERBOSE, _LOG_JSON],
+    params=list(_SWITCHES),
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
 )
 @click.version_option(__version__, prog_name="vlc-rx", message="%(prog)s %(version)s")
@@ -143,9 +111,13 @@ def cli(context: click.Context) -> None:
     none, 2 bad usage or profile, 3 an input could not be read or an output could not be written, 130 interrupted, 143
     terminated.
     """
-    from rxcli.cli.config import option_defaults
+    from rxcli.resources import user_dir
 
-    context.default_map = option_defaults(list(_COMMANDS))
+    path = user_dir() / "config.toml"
+    if path.is_file():
+        from rxcli.cli.config import option_defaults
+
+        context.default_map = dict.fromkeys(_COMMANDS, option_defaults(path))
 
 
 def main() -> None:
@@ -190,28 +162,43 @@ def run(arguments: Sequence[str]) -> int:
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.ctx.get_help())
         return ExitCode.OK
-    except click.ClickException as error:
-        return _say_usage(error)
-    except (click.Abort, KeyboardInterrupt):
-        _say("interrupted")
-        return ExitCode.INTERRUPTED
-    except Terminated:
-        _say("terminated")
-        return ExitCode.TERMINATED
     except (_PipeClosedError, BrokenPipeError):
         _leave_stdout()
         return ExitCode.INTERRUPTED
-    except ReceiverError as error:
-        _say(str(error))
-        return error.exit_code
-    except OSError as error:
-        return _say_system(error)
-    except MemoryError:
-        _say("more memory is needed than there is; decode fewer or smaller files at a time")
-        return ExitCode.UNREADABLE
-    except Exception as error:
-        return _say_internal(error)
+    except (Exception, KeyboardInterrupt, Terminated) as error:
+        message, ending = _explained(error)
+        _say(message)
+        return ending
     return int(code or ExitCode.OK)
+
+
+def _explained(error: BaseException) -> tuple[str, ExitCode]:
+    """An error in one line with the next step, and its exit code."""
+    match error:
+        case click.ClickException():
+            context = getattr(error, "ctx", None)
+            path = context.command_path if context is not None else "vlc-rx"
+            message = error.format_message().rstrip(".").replace("\n", " ")
+            return f"{message}; see `{path} --help`", ExitCode.USAGE
+        case click.Abort() | KeyboardInterrupt():
+            return "interrupted", ExitCode.INTERRUPTED
+        case Terminated():
+            return "terminated", ExitCode.TERMINATED
+        case ReceiverError():
+            return str(error), error.exit_code
+        case OSError(filename=None):  # own errors name their files
+            _leave_stdout()
+            reason = f"stdout: cannot be written ({error.strerror or error})"
+            return f"{reason}; redirect it to where there is room", ExitCode.UNREADABLE
+        case OSError():
+            reason = f"{error.filename}: {error.strerror or error}"
+            return f"{reason}; make room or correct the permissions, and try again", ExitCode.UNREADABLE
+        case MemoryError():
+            step = "decode fewer or smaller files at a time"
+            return f"more memory is needed than there is; {step}", ExitCode.UNREADABLE
+    logging.getLogger("rxcli").debug("internal error", exc_info=error)
+    reason = f"internal error ({type(error).__name__}: {error})"
+    return f"{reason}; run again with --verbose and report its output", ExitCode.NOT_RECEIVED
 
 
 def _log_to_stderr() -> None:
@@ -254,38 +241,10 @@ def _say(message: str) -> None:
         click.echo(f"vlc-rx: {message}", err=True)
 
 
-def _say_usage(error: click.ClickException) -> int:
-    """Click's message in one line, with the command to ask for help."""
-    context = getattr(error, "ctx", None)
-    path = context.command_path if context is not None else "vlc-rx"
-    message = error.format_message().rstrip(".").replace("\n", " ")
-    _say(f"{message}; see `{path} --help`")
-    return ExitCode.USAGE
-
-
 def _leave_stdout() -> None:
     """What still waits to be written cannot be, and is not tried again at exit."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _say_system(error: OSError) -> int:
-    """The system refuses something: no space, no right, too many files."""
-    reason = error.strerror or str(error)
-    if error.filename is None:  # own errors name their files
-        _say(f"stdout: cannot be written ({reason}); redirect it to where there is room")
-        _leave_stdout()
-    else:
-        _say(f"{error.filename}: {reason}; make room or correct the permissions, and try again")
-    return ExitCode.UNREADABLE
-
-
-def _say_internal(error: Exception) -> int:
-    log = logging.getLogger("rxcli")
-    if log.isEnabledFor(logging.DEBUG):
-        log.debug("internal error", exc_info=error)
-    _say(f"internal error ({type(error).__name__}: {error}); run again with --verbose and report its output")
-    return ExitCode.NOT_RECEIVED
 
 
 if __name__ == "__main__":

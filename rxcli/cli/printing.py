@@ -1,17 +1,20 @@
-"""What `decode` shows while it runs: texts and tables on stdout, progress on stderr."""
+"""What commands show: texts and tables on stdout, lines of JSON and CSV, progress on stderr."""
 
 from __future__ import annotations
 
+import os
+import re
+import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, TextIO
 
 import click
 
-from rxcli.cli.terminal import for_terminal
-from rxcli.results.report import format_frame, format_link, plural, table_header, table_rows
+from rxcli.results import report
+from rxcli.results.columns import PAYLOAD_TABLE
 from rxcli.results.summary import SourceSummary, format_clip
 from rxcli.runs.journal import Lines
 from rxcli.types import FrameResult
@@ -20,6 +23,10 @@ from rxcli.types import FrameResult
 _EVERY_S = 10.0
 #: Seconds after which a terminal gets a bar.
 _DELAY_S = 0.5
+_COLOURS = {"ok": "green", "partial": "yellow", "weak": "yellow", "dark": "bright_black"}
+_COLOURS |= dict.fromkeys(("no_packet", "no_screen", "no_signal", "unreadable"), "red")
+#: A state stands in a heading between bars, or in a table behind the column's number.
+_STATE = re.compile(rf"(?<= \| )({'|'.join(_COLOURS)})(?= \||$)|(?<=\d  )({'|'.join(_COLOURS)})(?=\*? )", re.MULTILINE)
 
 
 class Writer:
@@ -56,16 +63,16 @@ class Table(Writer):
     def write(self, result: FrameResult, last: bool) -> None:
         """Print what came with the frame."""
         self._clip |= not last
-        for line in format_link(result):
+        for line in report.format_link(result):
             print_text(line)
         if not self._clip:
             self.has_table |= bool(result.packets)
-            print_text(format_frame(result) + "\n")
+            print_text(report.format_frame(result) + "\n")
         elif self._packets and result.packets:
             if not self._has_header:
-                print_text(table_header(clip=True, scored=self._scored))
+                print_text(report.table_header(clip=True, scored=self._scored))
             self.has_table = self._has_header = True
-            print_text("\n".join(table_rows(result, clip=True, scored=self._scored)))
+            print_text("\n".join(report.table_rows(result, clip=True, scored=self._scored)))
 
     def end(self, summary: SourceSummary) -> None:
         """Print the line of a clip."""
@@ -88,6 +95,22 @@ class JsonLines(Writer):
         self._put(self._lines.line(result, last))
 
 
+class PayloadTable(Writer):
+    """One row of CSV a packet, given to `put`."""
+
+    def __init__(self, put: Callable[[str], None]) -> None:
+        self._put = put
+        self._write([PAYLOAD_TABLE])
+
+    def write(self, result: FrameResult, last: bool) -> None:
+        """Write the packets of the frame."""
+        if result.packets:
+            self._write(report.payload_rows(result))
+
+    def _write(self, rows: Iterable[Iterable[Any]]) -> None:
+        self._put(report.csv_text(rows).removesuffix("\n"))
+
+
 def print_line(line: str) -> None:
     """Print a line of data and flush it."""
     sys.stdout.write(line + "\n")
@@ -95,8 +118,21 @@ def print_line(line: str) -> None:
 
 
 def print_text(text: str, err: bool = False) -> None:
-    """Text for people: on a terminal, lines end between words and states have colours."""
-    click.echo(for_terminal(text, sys.stderr if err else sys.stdout), err=err)
+    """Text for people: on a terminal, lines end between words, and states have colours unless NO_COLOR is set."""
+    stream = sys.stderr if err else sys.stdout
+    if is_terminal(stream):
+        text = coloured(report.wrapped(text, shutil.get_terminal_size().columns), bool(os.environ.get("NO_COLOR")))
+    click.echo(text, err=err)
+
+
+def is_terminal(stream: TextIO) -> bool:
+    """Whether people read a stream as it is written."""
+    return stream is not None and stream.isatty()
+
+
+def coloured(text: str, plain: bool = False) -> str:
+    """States of frames and columns in their colours."""
+    return text if plain else _STATE.sub(lambda found: click.style(found[0], fg=_COLOURS[found[0]]), text)
 
 
 class Progress:
@@ -112,7 +148,7 @@ class Progress:
         self._total, self._done, self._before = n_total, n_done, n_done
         self._counts = [0, 0, 0]  # frames, packets, files and texts
         self._start_s = self._said_s = time.monotonic()
-        self._prints = not quiet and not _is_terminal(sys.stderr)
+        self._prints = not quiet and not is_terminal(sys.stderr)
         self._hidden = quiet or self._prints
         #: Made when it has something to show: one photo is decoded before its package is loaded.
         self.bar: Any = None
@@ -153,7 +189,7 @@ class Progress:
 
     def _so_far(self) -> str:
         frames, packets, came = self._counts
-        return f"{plural(frames, 'frame')}, {plural(packets, 'packet')}, {came} texts and files"
+        return f"{report.plural(frames, 'frame')}, {report.plural(packets, 'packet')}, {came} texts and files"
 
     def line(self, passed_s: float) -> str:
         """How far it is after some seconds, and when it will end."""
@@ -163,7 +199,3 @@ class Progress:
             left_s = passed_s * (self._total - self._done) / done
             parts += [f"{done / passed_s:.2g} a second", f"{left_s:.0f} s left"]
         return "; ".join(parts)
-
-
-def _is_terminal(stream: TextIO) -> bool:
-    return stream is not None and stream.isatty()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import msgspec
 from rxcli.cli.common import claim_outputs, force_argument, json_output, options, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.cli.kinds import CAMERA, complete_files
-from rxcli.cli.terminal import for_terminal
+from rxcli.cli.printing import print_text
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 from rxcli.ingest import open_source
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, known_profiles, load_profile, match_camera
@@ -36,26 +35,24 @@ def profiles(context: click.Context) -> None:
 def list_profiles(json_path: str | None, force: bool) -> None:
     """List the profiles that go by their names: the user's own and the shipped ones."""
     claim_outputs([json_output(json_path, "screens", "cameras")], force=force)
-
     screens, cameras = known_profiles(ScreenProfile), known_profiles(CameraProfile)
     if json_path is not None:
         known: dict[str, Any] = {"screens": screens, "cameras": cameras}
         write_json({kind: [_listed(*entry) for entry in profiles] for kind, profiles in known.items()}, json_path)
     if json_path == "-":
         return
-    for screen, origin, _ in screens:
-        about = f"{screen.columns} columns, {screen.slot_rate_hz:g} Hz"
-        _say_profile("screen", screen.name, origin, about, screen.description)
-    for camera, origin, _ in cameras:
-        modes = ", ".join(f"{mode.name} {mode.width}x{mode.height}" for mode in camera.modes) or "no readout modes"
-        _say_profile("camera", camera.name, origin, modes + ("; lens" if camera.lens else ""), camera.description)
+    for profile, origin, _ in (*screens, *cameras):
+        described = f"; {profile.description}" if profile.description else ""
+        print_text(f"{profile.kind}  {profile.name:<16} {origin:<8} {_about(profile)}{described}")
     click.echo(f"\nuser profiles lie in {user_dir()} (cameras/, screens/); `profiles show NAME` prints one")
 
 
-def _say_profile(kind: str, name: str, origin: str, about: str, description: str) -> None:
-
-    line = f"{kind}  {name:<16} {origin:<8} {about}" + (f"; {description}" if description else "")
-    click.echo(for_terminal(line, sys.stdout))
+def _about(profile: ScreenProfile | CameraProfile) -> str:
+    """What a profile holds, in a few words."""
+    if isinstance(profile, ScreenProfile):
+        return f"{profile.columns} columns, {profile.slot_rate_hz:g} Hz"
+    modes = ", ".join(f"{mode.name} {mode.width}x{mode.height}" for mode in profile.modes) or "no readout modes"
+    return modes + ("; lens" if profile.lens else "")
 
 
 def _listed(profile: ScreenProfile | CameraProfile, origin: str, path: Path) -> Any:
@@ -69,7 +66,6 @@ def _listed(profile: ScreenProfile | CameraProfile, origin: str, path: Path) -> 
 def show(name: str, json_path: str | None, force: bool) -> None:
     """Show the profile NAME, one that is known or a TOML file."""
     claim_outputs([json_output(json_path, "format", "kind", "name")], profiles=(name,), force=force)
-
     profile = load_profile(name)
     if json_path is not None:
         write_json(msgspec.to_builtins(profile), json_path)
@@ -82,7 +78,8 @@ def show(name: str, json_path: str | None, force: bool) -> None:
 def validate(names: tuple[str, ...]) -> int:
     """Check profiles: those named, or all that are known. Exit code 2 where one is wrong."""
     codes = []
-    for name in names or _known_names():
+    known = (*known_profiles(ScreenProfile), *known_profiles(CameraProfile))
+    for name in names or [profile.name for profile, _, _ in known]:
         try:
             profile = load_profile(name)
         except ReceiverError as error:
@@ -101,7 +98,6 @@ def validate(names: tuple[str, ...]) -> int:
 def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | None, force: bool) -> int:
     """Show which camera profile each file would get, and why."""
     claim_outputs([json_output(json_path, "source", "camera", "reason")], paths, cameras, force)
-
     known = [load_profile(name, CameraProfile) for name in cameras]
     known = known or [profile for profile, _, _ in known_profiles(CameraProfile)]
     records, codes = [], [ExitCode.OK]
@@ -117,12 +113,6 @@ def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | No
         for record in records:
             click.echo(f"{record['source']}: {record['camera'] or 'no profile'} ({record['reason']})")
     return worst(codes)
-
-
-def _known_names() -> list[str]:
-
-    screens, cameras = known_profiles(ScreenProfile), known_profiles(CameraProfile)
-    return [*(screen.name for screen, _, _ in screens), *(camera.name for camera, _, _ in cameras)]
 
 
 def _first_frame(path: Path) -> Frame:
@@ -146,20 +136,19 @@ def _choice(frame: Frame, path: Path, cameras: list[CameraProfile]) -> dict[str,
         "camera": found.name if found else None,
         "mode": mode.name if mode else None,
         "line_delay_s": mode.line_delay_s if mode else None,
-        "reason": _reason(frame, cameras, found.name if found else None),
+        "reason": _reason(frame, cameras, found),
     }
 
 
-def _reason(frame: Frame, cameras: list[CameraProfile], found: str | None) -> str:
-    metadata = frame.metadata
-    size = f"{frame.width}x{frame.height}"
+def _reason(frame: Frame, cameras: list[CameraProfile], found: CameraProfile | None) -> str:
+    metadata, size = frame.metadata, f"{frame.width}x{frame.height}"
+    camera = " ".join(part for part in (metadata.make, metadata.model) if part)
+    same = [profile for profile in cameras if profile.matches(metadata.make, metadata.model)]
     if metadata.model is None:
         return "the file states no camera model; name a profile with --camera, or all is estimated"
-    camera = " ".join(part for part in (metadata.make, metadata.model) if part)
     if found is not None:
         return f"{camera}, size {size}"
-    same = [c for c in cameras if c.matches(metadata.make, metadata.model)]
     if not same:
         return f"no profile of {camera}; all is estimated, or use `vlc-rx calibrate shutter`"
-    sizes = ", ".join(f"{mode.width}x{mode.height}" for c in same for mode in c.modes) or "none"
+    sizes = ", ".join(f"{mode.width}x{mode.height}" for profile in same for mode in profile.modes) or "none"
     return f"{same[0].name} is this camera but has no readout mode of {size} (it has {sizes})"

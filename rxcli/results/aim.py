@@ -92,19 +92,12 @@ class AimState:
     advice: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class _Moment:
-    time_s: float
-    n_packets: int
-    bits: int
-    wrong_bits: float
-
-
 @dataclass(slots=True)
 class Aim:
     """Follows the results of a live camera."""
 
-    _recent: deque[_Moment] = field(default_factory=deque)
+    #: Time, packets, bits and wrong bits of recent results.
+    _recent: deque[tuple[float, int, int, float]] = field(default_factory=deque)
     #: Of the last result.
     _corners: FloatArray | None = None
 
@@ -119,8 +112,8 @@ class Aim:
         """
         bits = sum(packet.payload_bits for packet in result.packets)
         wrong = sum(packet.payload_bits * packet.ber_hat for packet in result.packets)
-        self._recent.append(_Moment(now_s, len(result.packets), bits, wrong))
-        while len(self._recent) > 2 and self._recent[0].time_s < now_s - WINDOW_S:
+        self._recent.append((now_s, len(result.packets), bits, wrong))
+        while len(self._recent) > 2 and self._recent[0][0] < now_s - WINDOW_S:
             self._recent.popleft()
         locked = result.status in _LOCKED
         reason, advice = ("", "") if locked else aiming_hint(result, light)
@@ -150,15 +143,13 @@ class Aim:
 
     def _rates(self) -> dict[str, Any]:
         """Of the last second; what the first frame brought only starts the span."""
-        recent = list(self._recent)
-        span_s = max(recent[-1].time_s - recent[0].time_s, 1e-3)
-        later = recent[1:]
-        bits = sum(moment.bits for moment in recent)
+        times_s, packets, bits, wrong_bits = zip(*self._recent, strict=True)
+        span_s = max(times_s[-1] - times_s[0], 1e-3)
         return {
-            "frames_per_s": len(later) / span_s,
-            "packets_per_s": sum(moment.n_packets for moment in later) / span_s,
-            "bits_per_s": sum(moment.bits for moment in later) / span_s,
-            "ber_hat": sum(moment.wrong_bits for moment in recent) / bits if bits else None,
+            "frames_per_s": (len(times_s) - 1) / span_s,
+            "packets_per_s": sum(packets[1:]) / span_s,
+            "bits_per_s": sum(bits[1:]) / span_s,
+            "ber_hat": sum(wrong_bits) / sum(bits) if any(bits) else None,
         }
 
 

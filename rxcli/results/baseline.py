@@ -42,14 +42,9 @@ class Baseline:
         self._count(result, self.current)
 
     def _count(self, result: FrameResult, runs: dict[str, Run]) -> None:
-        run = runs.setdefault(_key(result.source), Run())
-        run.packets |= {
-            (column.column, packet.payload)
-            for column in result.columns
-            for packet in column.packets
-            if packet.confidence >= self.min_confidence
-        }
-        total = result.timing_ms.get("total", 0.0)
+        run, total = runs.setdefault(os.path.normpath(result.source), Run()), result.timing_ms.get("total", 0.0)
+        sure = ((c.column, p) for c in result.columns for p in c.packets if p.confidence >= self.min_confidence)
+        run.packets |= {(column, packet.payload) for column, packet in sure}
         run.time_ms += total if math.isfinite(total) else 0.0
 
     def missing(self) -> list[str]:
@@ -58,12 +53,11 @@ class Baseline:
 
     def regressions(self, source: str) -> list[str]:
         """In what a source is worse than in the earlier run; empty where it is not, or was not in that run."""
-        before, current = self.earlier.get(_key(source)), self.current.get(_key(source), Run())
-        if before is None:
-            return []
+        name = os.path.normpath(source)
+        current = self.current.get(name, Run())
+        before = self.earlier.get(name, current)
         found = []
-        lost = before.packets - current.packets
-        if lost:
+        if lost := before.packets - current.packets:
             columns = sorted({column for column, _ in lost})
             named = ", ".join(map(str, columns[:8])) + (", ..." if len(columns) > 8 else "")
             found.append(f"{plural(len(lost), 'packet')} of the baseline lost (column {named})")
@@ -75,27 +69,23 @@ class Baseline:
         return found
 
 
-def load_baseline(path: Path, min_confidence: float, slower: float) -> Baseline:
-    """The run that `decode --json` wrote to `path`.
+def load_baseline(path: Path | None, min_confidence: float, slower: float) -> Baseline:
+    """The run that `decode --json` wrote to `path`; an empty one where no path is given.
 
     Raises:
         UsageError: it cannot be read, or is none.
     """
-    baseline = Baseline({}, min_confidence, slower)
+    baseline, place = Baseline({}, min_confidence, slower), f"--baseline {path}"
+    if path is None:
+        return baseline
     try:
         with path.open(encoding="utf-8") as file:
             for number, line in enumerate(file, start=1):
-                try:
-                    baseline._count(from_record(json.loads(line)), baseline.earlier)
-                except (ValueError, RecursionError, UsageError):
-                    what = f"--baseline {path} line {number}: no result of `vlc-rx decode --json`"
-                    raise UsageError(what, "name such a file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UsageError(f"--baseline {path}: cannot be read ({reason})", "name a file that --json wrote") from None
+                place = f"--baseline {path} line {number}"
+                baseline._count(from_record(json.loads(line)), baseline.earlier)
+    except OSError as error:
+        reason = f"--baseline {path}: cannot be read ({error.strerror})"
+        raise UsageError(reason, "name a file that --json wrote") from None
+    except (ValueError, RecursionError, UsageError):
+        raise UsageError(f"{place}: no result of `vlc-rx decode --json`", "name such a file") from None
     return baseline
-
-
-def _key(source: str) -> str:
-    """A source as both runs name it."""
-    return os.path.normpath(source)

@@ -7,20 +7,23 @@ from typing import Any
 
 from rxcli.types import FrameResult
 
-#: Columns of the packets' table on the terminal: key of `packet_rows`, title, width; one of negative width is flush
-#: left. Time and burst belong to clips, errors to packets that are compared with the truth.
+#: Columns of the packets' table on the terminal: key of `packet_rows`, title, width, format; one of negative width is
+#: flush left. Time and burst belong to clips, errors to packets that are compared with the truth.
 PACKET_TABLE = (
-    ("time_s", "time s", 9),
-    ("burst", "burst", 5),
-    ("column", "col", 5),
-    ("status", "status", -9),
-    ("w", "w", 1),
-    ("snr_db", "snr dB", 6),
-    ("confidence", "confidence", 10),
-    ("copies", "copies", 6),
-    ("errors", "errors", 6),
-    ("payload", "payload", 0),
+    ("time_s", "time s", 9, ".3f"),
+    ("burst", "burst", 5, "d"),
+    ("column", "col", 5, "d"),
+    ("status", "status", -9, ""),
+    ("w", "w", 1, "d"),
+    ("snr_db", "snr dB", 6, ".1f"),
+    ("confidence", "confidence", 10, ".4f"),
+    ("copies", "copies", 6, ".2f"),
+    ("errors", "errors", 6, "d"),
+    ("payload", "payload", 0, ""),
 )
+#: Columns of `--payloads`: title -> key of `packet_rows`.
+PAYLOAD_TABLE = {name: name for name in ("source", "frame", "column", "burst")}
+PAYLOAD_TABLE |= {"bits": "payload_bits", "hex": "payload", "confidence": "confidence"}
 
 
 def packet_rows(result: FrameResult) -> list[dict[str, Any]]:

@@ -78,28 +78,17 @@ def inspect_frame(
     profiles, columns = _in_time_order(frame, result, plane.sample_rows(plane.read_plane(frame), outlines, tone))
     rows_per_slot = 1 / (screen.slot_rate_hz * result.line_delay_s)
     exposure_rows = (result.exposure_s or 0.0) / result.line_delay_s
-    traces = []
-    for column in columns:
-        rows, light = column_light(profiles, column.column)
-        order = np.argsort(rows, kind="stable")
-        traces.append(_trace(column, rows[order], light[order], screen, rows_per_slot, exposure_rows))
-    return Inspection(
-        rows_per_slot=rows_per_slot,
-        traces=tuple(traces),
-        histogram=_histogram(traces),
-        eye=_eye(traces, rows_per_slot),
-        crosstalk=_crosstalk(traces),
-    )
+    traces = [_trace(profiles, column, screen, rows_per_slot, exposure_rows) for column in columns]
+    eye = _eye(traces, rows_per_slot)
+    return Inspection(rows_per_slot, tuple(traces), _histogram(traces), eye, _crosstalk(traces))
 
 
 def _trace(
-    column: ColumnResult,
-    rows: FloatArray,
-    light: FloatArray,
-    screen: ScreenProfile,
-    rows_per_slot: float,
-    exposure_rows: float,
+    profiles: RowProfiles, column: ColumnResult, screen: ScreenProfile, rows_per_slot: float, exposure_rows: float
 ) -> Trace:
+    rows, light = column_light(profiles, column.column)
+    order = np.argsort(rows, kind="stable")
+    rows, light = rows[order], light[order]
     unknown = np.full(rows.size, np.nan)
     share, borders, spans = unknown.copy(), [], []
     for start, slots in decided_slots(column, screen, rows_per_slot, rows):
@@ -182,19 +171,13 @@ def _crosstalk(traces: list[Trace]) -> FloatArray:
     """How much of a column's light follows the slots of its neighbours: least squares on the rows that all show."""
     shares = np.full((len(traces), 3), np.nan)
     for number, trace in enumerate(traces):
-        if not np.isfinite(trace.relative).any():
-            continue
-        beside = [traces[at] if 0 <= at < len(traces) else None for at in (number - 1, number + 1)]
-        parts = [_on(trace.rows, neighbour) if neighbour else np.full(trace.rows.size, np.nan) for neighbour in beside]
-        used = [part for part in parts if np.isfinite(part).any()]
-        design = np.column_stack([trace.share, *used, np.ones(trace.rows.size)])
+        sides = [side for side in (0, 2) if 0 <= number + side - 1 < len(traces)]
+        parts = {1: trace.share} | {side: _on(trace.rows, traces[number + side - 1]) for side in sides}
+        used = {side: part for side, part in parts.items() if np.isfinite(part).any()}
+        design = np.column_stack([*used.values(), np.ones(trace.rows.size)])
         good = np.isfinite(design).all(axis=1) & np.isfinite(trace.relative)
-        if good.sum() < 20 * design.shape[1]:
-            continue
-        weights = np.linalg.lstsq(design[good], trace.relative[good], rcond=None)[0]
-        shares[number, 1] = weights[0]
-        for side, weight in zip([s for s in (0, 2) if np.isfinite(parts[s // 2]).any()], weights[1:], strict=False):
-            shares[number, side] = weight
+        if 1 in used and good.sum() >= 20 * design.shape[1]:
+            shares[number, list(used)] = np.linalg.lstsq(design[good], trace.relative[good], rcond=None)[0][:-1]
     return shares
 
 

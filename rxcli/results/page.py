@@ -121,13 +121,10 @@ def _inspection(known: Inspection) -> dict[str, Any]:
     n_points = _FEW_POINTS if len(known.traces) > _MANY_COLUMNS else _POINTS
     residuals = [trace.residuals for trace in known.traces if trace.residuals is not None]
     return {
-        "rows_per_slot": known.rows_per_slot,
+        **{name: getattr(known, name) for name in ("rows_per_slot", "histogram", "eye", "crosstalk")},
         "traces": [_trace(trace, n_points) for trace in known.traces],
         "received": any(trace.borders for trace in known.traces),
-        "histogram": known.histogram,
-        "eye": known.eye,
         "residuals": np.concatenate(residuals) if residuals else [],
-        "crosstalk": known.crosstalk,
     }
 
 

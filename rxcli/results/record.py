@@ -71,24 +71,19 @@ def _blocks(record: dict[str, Any]) -> dict[str, Any]:
 
 def _numbering(result: FrameResult) -> dict[str, Any]:
     """What is not plain of the screen's place: sides that were inferred, and which column is which."""
-    out: dict[str, Any] = {}
-    if result.inferred_sides:
-        out["inferred_sides"] = list(result.inferred_sides)
-    if result.column_certainty < 1:
-        out["column_certainty"] = _rounded(result.column_certainty, 4)
-    if result.column_offset is None:
-        out["column_offset"] = None
-    if result.mirrored is not False:
-        out["mirrored"] = result.mirrored
-    return out
+    certainty = _rounded(result.column_certainty, 4)
+    return {
+        **({"inferred_sides": list(result.inferred_sides)} if result.inferred_sides else {}),
+        **({"column_certainty": certainty} if result.column_certainty < 1 else {}),
+        **({"column_offset": None} if result.column_offset is None else {}),
+        **({"mirrored": result.mirrored} if result.mirrored is not False else {}),
+    }
 
 
 def _written(value: Any, digits: Mapping[str, int | None]) -> dict[str, Any]:
     """Fields of a dataclass as they are written."""
-    return {
-        name: plain(item) if n in (None, _SIGNIFICANT) else _rounded(item, n)
-        for name, n, item in ((name, n, getattr(value, name, 1.0)) for name, n in digits.items())
-    }
+    values = ((name, n, getattr(value, name, 1.0)) for name, n in digits.items())
+    return {name: plain(item) if n in (None, _SIGNIFICANT) else _rounded(item, n) for name, n, item in values}
 
 
 def _present(value: Any, *names: str) -> dict[str, Any]:

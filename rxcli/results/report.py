@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import math
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
 from rxcli.errors import capitalised
-from rxcli.results.columns import PACKET_TABLE, packet_rows
+from rxcli.results.columns import PACKET_TABLE, PAYLOAD_TABLE, packet_rows
 from rxcli.results.record import plain
-from rxcli.types import ColumnResult, FrameResult, Message, ObjectProgress, ReceivedObject
+from rxcli.types import FrameResult, Message, ObjectProgress, ReceivedObject
 
-#: How numbers of a packet's row are written.
-_NUMBERS = {"time_s": ".3f", "burst": "d", "column": "d", "w": "d", "snr_db": ".1f", "copies": ".2f", "errors": "d"}
 #: Hex digits of a payload that a table of 80 characters shows.
 _SHOWN_DIGITS = 20
 _STATUS = {
@@ -35,9 +35,8 @@ LEGEND = (
 
 def format_link(result: FrameResult) -> list[str]:
     """What came through the link layer with a frame, one line each, for people."""
-    lines = format_received(result)
-    lines += [format_progress(progress) for progress in result.progress]
-    return lines + [f"note: {printable(hint)}" for hint in result.link_notes]
+    notes = [f"note: {printable(hint)}" for hint in result.link_notes]
+    return [*format_received(result), *map(format_progress, result.progress), *notes]
 
 
 def format_received(result: FrameResult) -> list[str]:
@@ -80,9 +79,21 @@ def mirror_note(result: FrameResult, option: str = "") -> str:
     return ""
 
 
-def csv_cell(value: Any) -> Any:
-    """`value` so that a spreadsheet takes it for text, not for a formula (OWASP, CSV injection)."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA_STARTS) else value
+def csv_text(rows: Iterable[Iterable[Any]]) -> str:
+    """Rows as CSV; a spreadsheet takes their texts for texts, not for formulas (OWASP, CSV injection)."""
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows(
+        [f"'{cell}" if isinstance(cell, str) and cell.startswith(_FORMULA_STARTS) else cell for cell in row]
+        for row in rows
+    )
+    return text.getvalue()
+
+
+def payload_rows(result: FrameResult) -> Iterator[list[Any]]:
+    """One row of `PAYLOAD_TABLE` a packet."""
+    for packet in packet_rows(result):
+        written = {"source": printable_name(result.source), "confidence": f"{packet['confidence']:.6f}"}
+        yield [(packet | written)[key] for key in PAYLOAD_TABLE.values()]
 
 
 def printable(text: str) -> str:
@@ -223,14 +234,24 @@ def _goes_on(result: FrameResult) -> bool:
 
 def table_header(clip: bool, scored: bool) -> str:
     """Header of `table_rows`."""
-    return _table_line({key: title for key, title, _ in PACKET_TABLE}, clip, scored)
+    return _table_line({key: title for key, title, _, _ in PACKET_TABLE}, clip, scored)
 
 
-def _table_line(cells: Mapping[str, str], clip: bool, scored: bool) -> str:
+def _table_line(cells: Mapping[str, Any], clip: bool, scored: bool) -> str:
     """The cells of the packets' table that are shown, side by side."""
     hidden = (() if clip else ("time_s", "burst")) + (() if scored else ("errors",))
-    shown = [f"{cells[key]:{'><'[width < 0]}{abs(width)}}" for key, _, width in PACKET_TABLE if key not in hidden]
+    shown = (
+        f"{_cell(cells[key], form):{'><'[width < 0]}{abs(width)}}"
+        for key, _, width, form in PACKET_TABLE
+        if key not in hidden
+    )
     return ("" if clip else "  ") + "  ".join(shown)
+
+
+def _cell(value: Any, form: str) -> str:
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "-"
+    return value if isinstance(value, str) else format(value, form)
 
 
 def table_rows(result: FrameResult, clip: bool, scored: bool) -> list[str]:
@@ -242,45 +263,27 @@ def table_rows(result: FrameResult, clip: bool, scored: bool) -> list[str]:
         scored: whether wrong bits are counted.
     """
     rows: list[str] = []
-    for _, group in groupby(result.columns, key=_row_key):
-        columns = list(group)
-        if columns[0].packets:
-            packets = packet_rows(replace(result, columns=(columns[0],)))
-            rows += [_table_line(_packet_cells(packet), clip, scored) for packet in packets]
+    # Columns with packets stand alone.
+    groups = groupby(result.columns, key=lambda c: c.column if c.packets else (c.status, c.message))
+    for first, *others in (list(group) for _, group in groups):
+        if first.packets:
+            packets = packet_rows(replace(result, columns=(first,)))
+            rows += [_table_line(_shown(packet), clip, scored) for packet in packets]
         elif not clip:
-            rows.append(_empty_row(columns))
+            span = f"{first.column}-{others[-1].column}" if others else str(first.column)
+            rows.append(f"  {span:>5}  {first.status:<9}  {first.message or ''}".rstrip())
     return rows
 
 
-def _row_key(column: ColumnResult) -> tuple[str, str | None] | int:
-    """Equal for columns without packets that share a row; the column's number where it has packets."""
-    return column.column if column.packets else (column.status, column.message)
-
-
-def _empty_row(columns: list[ColumnResult]) -> str:
-    lowest, highest = columns[0].column, columns[-1].column
-    span = str(lowest) if lowest == highest else f"{lowest}-{highest}"
-    return f"  {span:>5}  {columns[0].status:<9}  {columns[0].message or ''}".rstrip()
-
-
-def _packet_cells(packet: Mapping[str, Any]) -> dict[str, str]:
-    """The row of a packet as text."""
-    numbers = {key: _cell(packet[key], form) for key, form in _NUMBERS.items()}
-    status = packet["status"] + "*" * packet["denoised"]
-    return numbers | {
-        "status": status,
-        "confidence": _confidence(packet["confidence"]),
+def _shown(packet: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of a packet for people; confidence is rounded downwards, so that only certainty reads 1.0000."""
+    confidence = packet["confidence"]
+    return {
+        **packet,
+        "status": packet["status"] + "*" * packet["denoised"],
+        "confidence": math.floor(confidence * 1e4) / 1e4 if math.isfinite(confidence) else None,
         "payload": shorten(packet["payload"]),
     }
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "-" if value is None or not math.isfinite(value) else format(value, form)
-
-
-def _confidence(value: float) -> str:
-    """Rounded downwards, so that only certainty reads 1.0000."""
-    return _cell(math.floor(value * 1e4) / 1e4 if math.isfinite(value * 1e4) else None, ".4f")
 
 
 def shorten(payload: str) -> str:

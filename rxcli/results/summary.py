@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rxcli.errors import ExitCode, UsageError, worst
 from rxcli.outputs import replacing, write_whole
-from rxcli.results.report import (
-    count_packets,
-    csv_cell,
-    format_progress,
-    format_received,
-    format_table,
-    plural,
-    printable,
-    printable_name,
-)
+from rxcli.results import report
+from rxcli.results.report import count_packets, plural, printable, printable_name
 from rxcli.results.truth import EXPECTED_LENGTHS, Fault, Score
 from rxcli.types import BELIEVABLE, FrameResult
 
 #: Packets that one sentence names.
 _MAX_NAMED = 6
-
-#: Fields of the score in a row.
+#: Columns of a row that are counts of the frames, and fields of the score.
+_COUNTED = ("frames", "frames_failed", "packets", "received", "unsure", "combined")
 _SCORED = ("expected", "error_free", "lost", "false", "extra", "wrong_w", "ber")
+#: Columns that the terminal shows; those of the truth where any is known.
+_SHOWN, _SHOWN_SCORED = ("source", "frames", "received", "unsure", "confidence"), (*_SCORED[:4], "ber")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,16 +43,15 @@ class SourceSummary:
     """The figures of one source, gathered frame by frame."""
 
     source: str
-    n_frames: int = 0
-    n_packets: int = 0
-    confidence_sum: float = 0.0
     #: Packets below this confidence do not count for the limits.
     min_confidence: float = BELIEVABLE
-    #: Packets that count.
-    n_sure: int = 0
-    #: Packets that can be believed, and the bits of them; columns in view, over all frames of photos.
-    n_received: int = 0
-    received_bits: int = 0
+    #: Counts: frames, those without packets (`frames_failed`) and `unreadable` ones; packets, those that can be
+    #: believed (`received`, with their `bits`) or not (`unsure`), that count for the limits (`sure`), that were put
+    #: together from several frames (`combined`); complete messages and files.
+    n: Counter[str] = field(default_factory=Counter)
+    confidence_sum: float = 0.0
+    time_ms: float = 0.0
+    #: Most columns in view of a frame.
     n_columns: int = 0
     #: Bursts of a clip with a reported packet, and times of its first and its last frame.
     bursts: set[int] = field(default_factory=set)
@@ -68,21 +60,14 @@ class SourceSummary:
     #: What it was received with.
     screen: str | None = None
     camera: str | None = None
-    #: Texts and files, a line each.
+    #: Texts and files, a line each; incomplete files, and files that could not be written.
     came: list[str] = field(default_factory=list)
+    incomplete: list[str] = field(default_factory=list)
+    unwritten: list[str] = field(default_factory=list)
     lowest_confidence: float = math.inf
-    #: Packets that were put together from several frames.
-    n_combined: int = 0
-    statuses: Counter[str] = field(default_factory=Counter)
     #: Counts of failure reasons of frames and columns; `_kinds` merges reasons that differ only in numbers.
     reasons: Counter[str] = field(default_factory=Counter)
     _kinds: dict[str, str] = field(default_factory=dict)
-    time_ms: float = 0.0
-    #: Complete messages and files, incomplete files, and files that could not be written.
-    n_messages: int = 0
-    n_objects: int = 0
-    incomplete: list[str] = field(default_factory=list)
-    unwritten: list[str] = field(default_factory=list)
     #: None where no truth is known.
     score: Score | None = None
     #: Expected packets that did not come as they were sent.
@@ -95,60 +80,50 @@ class SourceSummary:
     def add(self, result: FrameResult) -> None:
         """Count one frame."""
         packets = result.packets
-        self.n_frames += 1
-        self.statuses[result.status] += 1
-        self.n_packets += len(packets)
-        self.confidence_sum += sum(packet.confidence for packet in packets)
-        self.n_sure += sum(packet.confidence >= self.min_confidence for packet in packets)
         believable = [packet for packet in packets if packet.is_believable]
-        self.n_received += len(believable)
-        self.received_bits += sum(packet.payload_bits for packet in believable)
+        self.n.update(
+            frames=1,
+            frames_failed=int(result.status not in ("ok", "partial")),
+            unreadable=int(result.status == "unreadable"),
+            packets=len(packets),
+            received=len(believable),
+            bits=sum(packet.payload_bits for packet in believable),
+            unsure=len(packets) - len(believable),
+            sure=sum(packet.confidence >= self.min_confidence for packet in packets),
+            combined=sum(packet.frames is not None and len(packet.frames) > 1 for packet in packets),
+            messages=len(result.messages),
+            files=len(result.objects),
+        )
+        self.confidence_sum += sum(packet.confidence for packet in packets)
+        self.lowest_confidence = min((packet.confidence for packet in packets), default=self.lowest_confidence)
+        total = result.timing_ms.get("total", math.nan)
+        self.time_ms += total if math.isfinite(total) else 0.0
         self.n_columns = max(self.n_columns, len(result.columns))
         self.bursts |= {packet.burst for packet in packets if packet.burst is not None}
         self.first_s, self.last_s = min(self.first_s, result.time_s), max(self.last_s, result.time_s)
         self.screen, self.camera = result.screen_profile or self.screen, result.camera_profile or self.camera
-        self.came += format_received(result)
-        self.lowest_confidence = min((packet.confidence for packet in packets), default=self.lowest_confidence)
-        self.n_combined += sum(packet.frames is not None and len(packet.frames) > 1 for packet in packets)
-        total = result.timing_ms.get("total", math.nan)
-        self.time_ms += total if math.isfinite(total) else 0.0
-        self.n_messages += len(result.messages)
-        self.n_objects += len(result.objects)
-        self.incomplete += [format_progress(progress) for progress in result.progress]
-        if result.message:
-            self._count_reason(result.message)
-        for column in result.columns:
-            if column.message and column.status != "ok":
-                self._count_reason(column.message)
-
-    def _count_reason(self, reason: str) -> None:
-        self.reasons[self._kinds.setdefault(re.sub(r"\d+(\.\d+)?", "#", reason), reason)] += 1
-
-    @property
-    def n_unsure(self) -> int:
-        """Packets that were reported and cannot be believed."""
-        return self.n_packets - self.n_received
+        self.came += report.format_received(result)
+        self.incomplete += map(report.format_progress, result.progress)
+        failed = [column.message for column in result.columns if column.status != "ok"]
+        for reason in filter(None, (result.message, *failed)):
+            self.reasons[self._kinds.setdefault(re.sub(r"\d+(\.\d+)?", "#", reason), reason)] += 1
 
     @property
     def is_clip(self) -> bool:
         """Whether there were several frames."""
-        return self.n_frames > 1
-
-    @property
-    def frames_failed(self) -> int:
-        """Frames without packets."""
-        return self.n_frames - self.statuses["ok"] - self.statuses["partial"]
+        return self.n["frames"] > 1
 
     @property
     def is_complete(self) -> bool:
         """Whether every column gave a packet that can be believed, in every burst of a clip."""
         expected = self.n_columns * max(len(self.bursts), 1)
-        return not (self.frames_failed or self.n_unsure) and self.n_received >= expected > 0
+        return not (self.n["frames_failed"] or self.n["unsure"]) and self.n["received"] >= expected > 0
 
     @property
     def confidence(self) -> float | None:
-        """Mean confidence of the packets, None where there are none."""
-        return self.confidence_sum / self.n_packets if self.n_packets else None
+        """Mean confidence of the packets, None where it is not known."""
+        mean = self.confidence_sum / self.n["packets"] if self.n["packets"] else math.nan
+        return round(mean, 6) if math.isfinite(mean) else None
 
     @property
     def reason(self) -> str:
@@ -157,92 +132,67 @@ class SourceSummary:
             return ""
         common, _ = self.reasons.most_common(1)[0]
         n_others = len(self.reasons) - 1
-        return f"{common} (and {n_others} other reason{'s' * (n_others > 1)})" if n_others else common
+        return f"{common} (and {plural(n_others, 'other reason')})" if n_others else common
 
     def failures(self, limits: Limits) -> list[tuple[ExitCode, str]]:
         """Why this source does not pass: exit codes with reasons; empty where it does."""
-        found: list[tuple[ExitCode, str]] = []
-        if not self.n_frames:
-            pass
-        elif self.statuses["unreadable"]:
-            found.append((ExitCode.UNREADABLE, self.reason))
-        elif not self.n_packets and not self.n_messages and not self.n_objects:
-            found.append((ExitCode.NOT_RECEIVED, f"no packet: {self.reason}" if self.reason else "no packet"))
-        elif self.n_sure < limits.min_packets:
-            found.append((ExitCode.NOT_RECEIVED, self._too_few(limits.min_packets)))
-        if limits.min_packet_confidence is not None and self.lowest_confidence < limits.min_packet_confidence:
-            reason = (
-                f"a packet has a confidence of {self.lowest_confidence:.4g}, below {limits.min_packet_confidence:g}"
-            )
-            found.append((ExitCode.NOT_RECEIVED, reason))
-        found += [(ExitCode.NOT_RECEIVED, problem) for problem in (*self.regressions, *self.unwritten)]
+        found = [(ExitCode.NOT_RECEIVED, reason) for reason in self._shortfalls(limits)]
+        if self.n["unreadable"]:
+            found.insert(0, (ExitCode.UNREADABLE, self.reason))
         if self.truth_problem:
             found.append((ExitCode.UNREADABLE, self.truth_problem))
-        if limits.max_ber is not None and self.n_frames:
-            found += self._ber_failures(limits.max_ber)
         return found
 
-    def _too_few(self, asked: int) -> str:
-        counted = count_packets(self.n_sure, self.n_packets - self.n_sure)
-        of_them = "" if self.min_confidence == BELIEVABLE else f" (confidence {self.min_confidence:g} or more)"
-        return f"{counted}; {asked} {'was' if asked == 1 else 'were'} asked for{of_them}"
-
-    def _ber_failures(self, max_ber: float) -> list[tuple[ExitCode, str]]:
-        if self.score is None:
-            return [(ExitCode.NOT_RECEIVED, "no truth to hold the bit error rate against")]
-        if self.score.ber is None:
-            reason = f"no bit error rate: the truth shows no burst for {EXPECTED_LENGTHS:g} packet lengths"
-            return [(ExitCode.NOT_RECEIVED, reason)]
-        if self.score.ber <= max_ber:
-            return []
-        named = ", ".join(map(str, self.faults[:_MAX_NAMED]))
-        more = f" and {len(self.faults) - _MAX_NAMED} more" if len(self.faults) > _MAX_NAMED else ""
-        reason = f"bit error rate {self.score.ber:.3g} is above {max_ber:.3g}: {named}{more}"
-        return [(ExitCode.NOT_RECEIVED, reason)]
+    def _shortfalls(self, limits: Limits) -> Iterator[str]:
+        """What was not received, or not well enough."""
+        n, lowest, least = self.n, self.lowest_confidence, limits.min_packet_confidence
+        if n["frames"] and not n["unreadable"]:
+            if not (n["packets"] or n["messages"] or n["files"]):
+                yield f"no packet: {self.reason}" if self.reason else "no packet"
+            elif n["sure"] < limits.min_packets:
+                counted, asked = count_packets(n["sure"], n["packets"] - n["sure"]), limits.min_packets
+                of_them = "" if self.min_confidence == BELIEVABLE else f" (confidence {self.min_confidence:g} or more)"
+                yield f"{counted}; {asked} {'was' if asked == 1 else 'were'} asked for{of_them}"
+        if least is not None and lowest < least:
+            yield f"a packet has a confidence of {lowest:.4g}, below {least:g}"
+        yield from (*self.regressions, *self.unwritten)
+        if limits.max_ber is not None and n["frames"]:
+            if self.score is None:
+                yield "no truth to hold the bit error rate against"
+            elif self.score.ber is None:
+                yield f"no bit error rate: the truth shows no burst for {EXPECTED_LENGTHS:g} packet lengths"
+            elif self.score.ber > limits.max_ber:
+                named = ", ".join(map(str, self.faults[:_MAX_NAMED]))
+                more = f" and {len(self.faults) - _MAX_NAMED} more" if len(self.faults) > _MAX_NAMED else ""
+                yield f"bit error rate {self.score.ber:.3g} is above {limits.max_ber:.3g}: {named}{more}"
 
     def row(self, limits: Limits) -> dict[str, Any]:
-        """The figures as plain data; None where unknown."""
+        """The figures as plain data: the columns that every writer shows or chooses from; None where unknown."""
         failures = self.failures(limits)
+        # That no packet is whole in some frames of a clip is no failure.
+        is_whole = self.incomplete or (self.is_clip and not self.n["frames_failed"])
+        reason = failures[0][1] if failures else "; ".join(self.incomplete) if is_whole else self.reason
         return {
             "source": printable_name(self.source),
             "exit_code": int(worst([code for code, _ in failures])),
-            "frames": self.n_frames,
-            "frames_failed": self.frames_failed,
-            "packets": self.n_packets,
-            "received": self.n_received,
-            "unsure": self.n_unsure,
-            "combined": self.n_combined,
-            "confidence": _finite(self.confidence),
-            **{name: getattr(self.score, name) if self.score else None for name in _SCORED},
-            "messages": self.n_messages,
-            "files": self.n_objects,
+            **{name: self.n[name] for name in _COUNTED},
+            "confidence": self.confidence,
+            **{name: getattr(self.score, name, None) for name in _SCORED},
+            "messages": self.n["messages"],
+            "files": self.n["files"],
             "time_ms": round(self.time_ms, 1),
-            "reason": (failures[0][1] if failures else self._shortfall).removeprefix(f"{self.source}: "),
+            "reason": reason.removeprefix(f"{self.source}: "),
         }
-
-    @property
-    def _shortfall(self) -> str:
-        """What is missing of a source that passes: that no packet is whole in some frames of a clip is none."""
-        if self.incomplete or (self.is_clip and not self.frames_failed):
-            return "; ".join(self.incomplete)
-        return self.reason
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else round(value, 6)
 
 
 def total(summaries: Sequence[SourceSummary]) -> SourceSummary:
     """All sources as one, named "total"; scored over sources with known truth."""
     whole = SourceSummary("total")
     for summary in summaries:
-        for name in (
-            *("n_frames", "n_packets", "n_sure", "n_received", "confidence_sum", "n_combined", "time_ms"),
-            *("n_messages", "n_objects"),
-        ):
-            setattr(whole, name, getattr(whole, name) + getattr(summary, name))
-        whole.statuses.update(summary.statuses)
+        whole.n.update(summary.n)
         whole.reasons.update(summary.reasons)
+        whole.confidence_sum += summary.confidence_sum
+        whole.time_ms += summary.time_ms
         if summary.score is not None:
             whole.score = (whole.score or Score()) + summary.score
     return whole
@@ -253,37 +203,42 @@ def exit_code(summaries: Sequence[SourceSummary], limits: Limits) -> ExitCode:
     return worst([code for summary in summaries for code, _ in summary.failures(limits)])
 
 
-def format_summary(summaries: Sequence[SourceSummary], limits: Limits) -> str:
-    """One row per source, a total where there are several, and columns for the truth where any is known."""
+def format_summary(summaries: Sequence[SourceSummary], limits: Limits, is_told: bool = False) -> str:
+    """One row per source, a total where there are several, and columns for the truth where any is known.
+
+    Args:
+        summaries: of the sources.
+        limits: that they must keep.
+        is_told: the table above states why a photo was not received; for a photo alone it is not repeated.
+    """
     rows = [summary.row(limits) for summary in summaries]
-    scored = any(summary.score is not None for summary in summaries)
-    names = ["source", "frames", "received", "unsure", "confidence"]
-    names += ["expected", "error_free", "lost", "false", "ber"] if scored else []
-    cells = [[_text(row[name]) for name in names] + [printable(str(row["reason"]))] for row in rows]
+    names = (*_SHOWN, *(_SHOWN_SCORED if any(summary.score is not None for summary in summaries) else ()))
     if len(summaries) > 1:
-        whole = total(summaries).row(Limits())
         failed = sum(row["exit_code"] != 0 for row in rows)
-        ending = f"{failed} of {len(rows)} failed" if failed else ""
-        if not failed and all(summary.is_complete for summary in summaries):
-            ending = "all received"
-        cells.append([_text(whole[name]) for name in names] + [ending])
-    return format_table([name.replace("_", "-") for name in names] + [""], cells)
+        is_whole = not failed and all(summary.is_complete for summary in summaries)
+        ending = f"{failed} of {len(rows)} failed" if failed else "all received" if is_whole else ""
+        rows.append(total(summaries).row(Limits()) | {"reason": ending})
+    elif is_told and not summaries[0].is_clip:
+        told = summaries[0].reason.removeprefix(f"{summaries[0].source}: ")
+        rows[0]["reason"] = rows[0]["reason"].removesuffix(told).removesuffix(": ")
+    cells = [[*(_text(row[name]) for name in names), printable(row["reason"])] for row in rows]
+    return report.format_table([*(name.replace("_", "-") for name in names), ""], cells)
 
 
 def format_clip(clip: SourceSummary) -> str:
     """A clip in one line: what was received of it, with how many packets a burst, how quickly and how surely."""
-    span_s = (clip.last_s - clip.first_s) * clip.n_frames / max(clip.n_frames - 1, 1)
-    parts = [printable_name(clip.source), f"clip of {plural(clip.n_frames, 'frame')}, {span_s:.2f} s"]
+    n, span_s = clip.n, (clip.last_s - clip.first_s) * clip.n["frames"] / max(clip.n["frames"] - 1, 1)
+    parts = [printable_name(clip.source), f"clip of {plural(n['frames'], 'frame')}, {span_s:.2f} s"]
     if clip.screen:
         parts += [f"screen {clip.screen}", f"camera {clip.camera or 'unknown'}"]
-    parts.append(f"{plural(len(clip.bursts), 'burst')}: {count_packets(clip.n_received, clip.n_unsure)}")
-    if clip.n_packets:
-        rate = f"{clip.received_bits / span_s / 1e3:.1f} kb/s" if span_s > 0 else "all in one instant"
-        parts += [rate, f"mean confidence {_text(_finite(clip.confidence))}"]
+    parts.append(f"{plural(len(clip.bursts), 'burst')}: {count_packets(n['received'], n['unsure'])}")
+    if n["packets"]:
+        rate = f"{n['bits'] / span_s / 1e3:.1f} kb/s" if span_s > 0 else "all in one instant"
+        parts += [rate, f"mean confidence {_text(clip.confidence)}"]
     parts.append(f"{clip.time_ms:.0f} ms")
     lines = [" | ".join(parts)]
-    if clip.frames_failed and clip.reasons:
-        lines.append(f"  {plural(clip.frames_failed, 'frame')} gave nothing: {printable(clip.reason)}")
+    if n["frames_failed"] and clip.reasons:
+        lines.append(f"  {plural(n['frames_failed'], 'frame')} gave nothing: {printable(clip.reason)}")
     return "\n".join(lines)
 
 
@@ -302,11 +257,17 @@ def write_summary(path: Path, summaries: Sequence[SourceSummary], limits: Limits
     """
     check_summary_path(path)
     rows = [summary.row(limits) for summary in summaries]
+    if path.suffix.casefold() == ".csv":
+        write_whole(path, report.csv_text([_COLUMNS, *(row.values() for row in rows)]))
+        return
+    import pyarrow
+    import pyarrow.parquet
+
+    kinds = {"source": pyarrow.string(), "reason": pyarrow.string()}
+    kinds |= dict.fromkeys(("confidence", "ber", "time_ms"), pyarrow.float64())
+    schema = pyarrow.schema([(name, kinds.get(name, pyarrow.int64())) for name in _COLUMNS])
     with replacing(path) as hidden:
-        if path.suffix.casefold() == ".csv":
-            _write_csv(hidden, rows)
-        else:
-            _write_parquet(hidden, rows)
+        pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), hidden)
 
 
 def check_summary_path(path: Path) -> None:
@@ -325,23 +286,6 @@ def check_summary_path(path: Path) -> None:
             raise UsageError(f"{path}: Parquet needs the package pyarrow", "pip install '.[parquet]', or name a .csv")
 
 
-def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, _COLUMNS)
-        writer.writeheader()
-        writer.writerows({name: csv_cell(value) for name, value in row.items()} for row in rows)
-
-
-def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
-    import pyarrow
-    import pyarrow.parquet
-
-    kinds = {"source": pyarrow.string(), "reason": pyarrow.string()}
-    kinds |= dict.fromkeys(("confidence", "ber", "time_ms"), pyarrow.float64())
-    schema = pyarrow.schema([(name, kinds.get(name, pyarrow.int64())) for name in _COLUMNS])
-    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), path)
-
-
 _COLUMNS = tuple(SourceSummary("").row(Limits()))
 
 
@@ -353,23 +297,22 @@ def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) 
     """
     from xml.etree import ElementTree
 
-    suite, kinds = ElementTree.Element("testsuite", name="vlc-rx decode"), Counter[str]()
+    root = ElementTree.Element("testsuites")
+    suite, kinds = ElementTree.SubElement(root, "testsuite", name="vlc-rx decode"), Counter[str]()
     for summary in summaries:
-        about = {"classname": "decode", "name": printable_name(summary.source), "time": f"{summary.time_ms / 1e3:.3f}"}
+        row, failures = summary.row(limits), summary.failures(limits)
+        about = {"classname": "decode", "name": row["source"], "time": f"{row['time_ms'] / 1e3:.3f}"}
         case = ElementTree.SubElement(suite, "testcase", about)
-        failures = summary.failures(limits)
         if failures:  # one a case, as the readers of these files expect it: the worst, with all reasons
-            code = worst([code for code, _ in failures])
+            code = ExitCode(row["exit_code"])
             kind = "error" if code is ExitCode.UNREADABLE else "failure"
             reasons = "; ".join(dict.fromkeys(reason for _, reason in failures))
             element = ElementTree.SubElement(case, kind, message=printable(reasons), type=code.name.lower())
             element.text = "\n".join(map(str, summary.faults)) or None
             kinds[kind] += 1
-        ElementTree.SubElement(case, "system-out").text = count_packets(summary.n_received, summary.n_unsure)
+        ElementTree.SubElement(case, "system-out").text = count_packets(row["received"], row["unsure"])
     counts = {"tests": len(summaries), "errors": kinds["error"], "failures": kinds["failure"]}
     suite.attrib |= {name: str(count) for name, count in counts.items()}
     suite.set("time", f"{sum(summary.time_ms for summary in summaries) / 1e3:.3f}")
-    root = ElementTree.Element("testsuites")
-    root.append(suite)
     ElementTree.indent(root)
     write_whole(path, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")

@@ -7,6 +7,7 @@ when it differs in more than a quarter of its bits from every burst of its frame
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from string import hexdigits
@@ -85,9 +86,7 @@ def find_truth(capture: str | Path) -> Path | None:
 
 def truth_for(capture: str | Path, asked: str | Path | None) -> Path | None:
     """The truth of `capture` where a file is asked for, or "auto" for the one beside it; None where there is none."""
-    if asked == "auto":
-        return find_truth(capture)
-    return None if asked is None else Path(asked)
+    return find_truth(capture) if asked == "auto" else None if asked is None else Path(asked)
 
 
 def load_truth(path: str | Path) -> Truth:
@@ -101,36 +100,26 @@ def load_truth(path: str | Path) -> Truth:
     except (OSError, ValueError, RecursionError) as error:  # msgspec's own errors are ValueErrors
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: cannot be read as truth ({reason})", "name a NAME.truth.json file") from None
-    problem = _contradiction(truth)
-    if problem:
+    for problem in _contradictions(truth):
         raise InputError(f"{path}: {problem}", "correct the truth file")
     return truth
 
 
-def _contradiction(truth: Truth) -> str | None:
-    """What is inconsistent in `truth`, None where nothing is."""
-    for name in ("w", "payload_bits"):
-        if len(getattr(truth, name)) != truth.columns:
-            return f"{name} must have one entry per column, {truth.columns} (got {len(getattr(truth, name))})"
-    if not set(truth.w) <= set(WEIGHTS):
-        return f"w must be in 1..9 (got {sorted(set(truth.w) - set(WEIGHTS))[0]})"
-    shown = {b.burst for f in truth.frames for b in f.bursts}
-    if shown - truth.payload.keys():
-        return (
-            f"payload must hold every burst that a frame shows (burst {min(shown - truth.payload.keys())} is missing)"
-        )
-    return next(filter(None, (_payload_problem(b, row, truth) for b, row in truth.payload.items())), None)
-
-
-def _payload_problem(burst: int, row: tuple[str, ...], truth: Truth) -> str | None:
-    if len(row) != truth.columns:
-        return f"payload of burst {burst} must have one entry per column, {truth.columns} (got {len(row)})"
-    for column, (text, n_bits) in enumerate(zip(row, truth.payload_bits, strict=True)):
-        if 4 * len(text) < n_bits or not set(text) <= set(hexdigits):
-            return (
-                f"payload of burst {burst}, column {column}, must be hex of at least {n_bits} bits (got {text!r:.60})"
-            )
-    return None
+def _contradictions(truth: Truth) -> Iterator[str]:
+    """What is inconsistent in `truth`."""
+    per_column = {"w": truth.w, "payload_bits": truth.payload_bits}
+    per_column |= {f"payload of burst {burst}": row for burst, row in truth.payload.items()}
+    for name, values in per_column.items():
+        if len(values) != truth.columns:
+            yield f"{name} must have one entry per column, {truth.columns} (got {len(values)})"
+    for w in sorted(set(truth.w) - set(WEIGHTS)):
+        yield f"w must be in 1..9 (got {w})"
+    for burst in sorted({b.burst for f in truth.frames for b in f.bursts} - truth.payload.keys()):
+        yield f"payload must hold every burst that a frame shows (burst {burst} is missing)"
+    for burst, row in truth.payload.items():
+        for column, (text, n) in enumerate(zip(row, truth.payload_bits, strict=True)):
+            if 4 * len(text) < n or not set(text) <= set(hexdigits):
+                yield f"payload of burst {burst}, column {column}, must be hex of at least {n} bits (got {text!r:.60})"
 
 
 def wrong_bits(received: str, n_received: int, sent: str, n_sent: int) -> int:
@@ -218,32 +207,27 @@ class Scorer:
         return replace(result, columns=columns)
 
     def _add_column(self, column: ColumnResult, bursts: tuple[int, ...]) -> ColumnResult:
-        known = column.column < self._truth.columns
-        if column.w is not None and not (known and column.w == self._truth.w[column.column]):
-            self._wrong_w += 1
-        candidates = bursts if known else ()
+        sent_w = dict(enumerate(self._truth.w)).get(column.column)
+        self._wrong_w += column.w not in (None, sent_w)
+        candidates = () if sent_w is None else bursts
         return replace(column, packets=tuple(self._add_packet(p, column.column, candidates) for p in column.packets))
 
     def _add_packet(self, packet: PacketResult, column: int, bursts: tuple[int, ...]) -> PacketResult:
         if not bursts:
             self._false += 1
             return replace(packet, bit_errors=None)
-        n_sent = self._truth.payload_bits[column]
-        errors = {
-            burst: wrong_bits(packet.payload, packet.payload_bits, self._truth.payload[burst][column], n_sent)
-            for burst in bursts
-        }
-        burst = min(errors, key=errors.__getitem__)
-        if errors[burst] > MAX_WRONG_SHARE * max(n_sent, packet.payload_bits):
+        sent, n_sent = self._truth.payload, self._truth.payload_bits[column]
+        found = ((wrong_bits(packet.payload, packet.payload_bits, sent[b][column], n_sent), b) for b in bursts)
+        errors, burst = min(found, key=lambda pair: pair[0])
+        if errors > MAX_WRONG_SHARE * max(n_sent, packet.payload_bits):
             self._false += 1
         else:
-            key = (burst, column)
-            self._fewest[key] = min(self._fewest.get(key, errors[burst]), errors[burst])
-        return replace(packet, bit_errors=errors[burst])
+            self._fewest[burst, column] = min(self._fewest.get((burst, column), errors), errors)
+        return replace(packet, bit_errors=errors)
 
     def faults(self) -> list[Fault]:
         """Expected packets of the frames so far that were lost or have wrong bits."""
-        expected = [(c, b) for c in range(self._truth.columns) for b in sorted(self._truth.expected_bursts)]
+        expected = ((c, b) for c in range(self._truth.columns) for b in sorted(self._truth.expected_bursts))
         found = (Fault(column, burst, self._fewest.get((burst, column))) for column, burst in expected)
         return [fault for fault in found if fault.wrong_bits != 0]
 

@@ -88,11 +88,10 @@ class UndistortedWriter:
         Raises:
             OutputError: the file cannot be written, or is there and none of ours.
         """
-        lens = self._lens(frame)
-        if lens is not None:
-            self._write(frame, lens, subfolder)
-            return
-        self._waiting[frame.source, frame.index] = frame
+        meta = frame.metadata
+        fits = match_camera(self.cameras, meta.make, meta.model, frame.width, frame.height)
+        if not self._write(frame, self.cameras[0] if self.force_camera else fits, subfolder):
+            self._waiting[frame.source, frame.index] = frame
         while len(self._waiting) > _MAX_WAITING:
             self._give_up(self._waiting.pop(next(iter(self._waiting))))
 
@@ -103,20 +102,19 @@ class UndistortedWriter:
             OutputError: the file cannot be written, or is there and none of ours.
         """
         frame = self._waiting.pop((result.source, result.frame), None)
-        if frame is None:
-            return
-        camera = camera_of(frame, result, self.cameras)
+        if frame is not None and not self._write(frame, camera_of(frame, result, self.cameras), subfolder):
+            self._give_up(frame)
+
+    def _write(self, frame: Frame, camera: CameraProfile | None, subfolder: str) -> bool:
+        """Write a frame if the lens of its camera is known; returns whether it is."""
         lens = lens_for(camera.lens, frame.width, frame.height) if camera and camera.lens else None
         if lens is None:
-            self._give_up(frame)
-        else:
-            self._write(frame, lens, subfolder)
-
-    def _write(self, frame: Frame, lens: Lens, subfolder: str) -> None:
+            return False
         path = self.folder / subfolder / f"{Path(frame.source).name}.{frame.index:05d}.png"
         make_parent(path)
         check_replaceable(path, PICTURE, "--save-undistorted")
         write_whole(path, encode_png(undistorted(frame, lens)))
+        return True
 
     @staticmethod
     def _give_up(frame: Frame) -> None:
@@ -125,12 +123,3 @@ class UndistortedWriter:
             "--camera)",
             frame.source,
         )
-
-    def _lens(self, frame: Frame) -> Lens | None:
-        meta = frame.metadata
-        camera = (
-            self.cameras[0]
-            if self.force_camera
-            else match_camera(self.cameras, meta.make, meta.model, frame.width, frame.height)
-        )
-        return lens_for(camera.lens, frame.width, frame.height) if camera and camera.lens else None

@@ -4,24 +4,34 @@ from __future__ import annotations
 
 import logging
 import os
+import resource
+import shutil
+import signal
 import time
+import warnings
 from collections import OrderedDict
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from PIL import Image
 
 from rxcli.errors import InputError, capitalised, sentence, without_commands
+from rxcli.link.collector import PhotoCollector
+from rxcli.options import ReceiverOptions
+from rxcli.resources import data_dir
+from rxcli.results import report
+from rxcli.results.aim import split_message
+from rxcli.results.cameras import camera_of, screen_of
+from rxcli.results.columns import column_rows, packet_rows, text_rows
+from rxcli.results.overlay import Preview, picture_of, preview
+from rxcli.results.record import to_record
+from rxcli.runs.batch import Source, standard_decoder, use_one_thread
 from rxcli.runs.processes import resident_bytes, start_process
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-    from multiprocessing.connection import Connection
-    from multiprocessing.process import BaseProcess
-
-    from rxcli.link.collector import PhotoCollector
-    from rxcli.options import ReceiverOptions
-    from rxcli.results.overlay import Preview
-    from rxcli.types import Frame, FrameResult, ObjectProgress
+from rxcli.types import Frame, FrameResult, ObjectProgress
 
 log = logging.getLogger(__name__)
 
@@ -142,9 +152,6 @@ def refusal(reason: str, step: str) -> dict[str, Any]:
 
 def _work(connection: Connection, options: ReceiverOptions, folder: Path | None) -> None:
     """Main loop of the process: receive a file, send its answer, until the other end is closed."""
-    import shutil
-    import signal
-
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # the server decides what they mean
         signal.signal(number, signal.SIG_IGN)
     _confine()
@@ -164,12 +171,9 @@ def _photos_of(
     session: str, sessions: OrderedDict[str, PhotoCollector], options: ReceiverOptions
 ) -> PhotoCollector | None:
     """Combined photos of a session so far, or None without a session."""
-    from rxcli.link.collector import PhotoCollector
-
     if not session:
         return None
-    if session not in sessions:
-        sessions[session] = PhotoCollector(options.screens, min(options.file_memory_mb, _SESSION_MB))
+    sessions.setdefault(session, PhotoCollector(options.screens, min(options.file_memory_mb, _SESSION_MB)))
     sessions.move_to_end(session)
     if len(sessions) > _SESSIONS:
         sessions.popitem(last=False)
@@ -178,8 +182,6 @@ def _photos_of(
 
 def _confine() -> None:
     """Forbid files and core dumps, limit the address space, and discard libraries' messages about broken pictures."""
-    import resource
-
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (_ADDRESS_SPACE, _ADDRESS_SPACE))
@@ -192,8 +194,6 @@ def _warm_up(options: ReceiverOptions) -> None:
     """Decode a sample, so that the first picture does not wait for imports and models."""
     from rxcli.ingest import video  # noqa: F401
     from rxcli.receiver import clip  # noqa: F401
-    from rxcli.resources import data_dir
-    from rxcli.runs.batch import use_one_thread
 
     use_one_thread()
     sample = data_dir("sample_frames") / "phone_chelsea_17k3.jpg"
@@ -212,8 +212,6 @@ def answer_for(
     photos: PhotoCollector | None = None,
 ) -> dict[str, Any]:
     """The answer for one file; see `DecodingProcess.decode`. A photo is added to `photos`."""
-    from rxcli.runs.batch import Source, standard_decoder
-
     started_s = time.monotonic()
     try:
         _check_pixels(path)
@@ -241,17 +239,12 @@ def _files(progress: Iterable[ObjectProgress]) -> list[dict[str, Any]]:
 
 def _without(result: FrameResult, path: Path) -> FrameResult:
     """Adapt the message of a result to the page, without the path of the upload."""
-    return (
-        replace(result, message=without_commands(result.message.replace(f"{path}: ", ""))) if result.message else result
-    )
+    message = result.message and without_commands(result.message.replace(f"{path}: ", ""))
+    return replace(result, message=message)
 
 
 def _check_pixels(path: Path) -> None:
     """Refuse a picture by the size in its header, before memory is allocated for it."""
-    import warnings
-
-    from PIL import Image
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -282,8 +275,6 @@ class Previews:
 
     def tap(self, frame: Frame, _name: str) -> None:
         """Store a copy of the next frame."""
-        from rxcli.results.overlay import preview
-
         self.frame = frame
         self._previews[frame.index] = preview(frame, self._width_px)
         while len(self._previews) > _MAX_PREVIEWS:
@@ -291,9 +282,6 @@ class Previews:
 
     def picture(self, result: FrameResult, options: ReceiverOptions) -> dict[str, Any] | None:
         """Picture of a result as JPEG with outlines in its pixels, or None if its frame is no longer stored."""
-        from rxcli.results.cameras import camera_of, screen_of
-        from rxcli.results.overlay import picture_of
-
         small = self._previews.get(result.frame)
         if small is None or self.frame is None:
             return None
@@ -325,8 +313,6 @@ class _Gathered(Previews):
 
     def add(self, result: FrameResult) -> None:
         """Add the next result."""
-        from rxcli.results.columns import packet_rows, text_rows
-
         if self._cut_short and result.status == "unreadable":
             return
         self._n_frames += 1
@@ -343,26 +329,21 @@ class _Gathered(Previews):
 
     def answer(self) -> dict[str, Any]:
         """The answer so far."""
-        from rxcli.results.aim import split_message
-        from rxcli.results.columns import column_rows
-        from rxcli.results.record import to_record
-        from rxcli.results.report import count_packets, headline, mirror_note
-
         self.has_news = False
         if self._best is None:
             return refusal("it holds no picture", "send another file")
         _, result, picture = self._best
-        packets = self._packets
+        packets, counted = self._packets, report.count_packets(self._n_received, self._n_unsure)
         reason, advice = ("", "") if packets else split_message(result)
         columns = [
             row | {"message": row["message"] and without_commands(row["message"])} for row in column_rows(result)
         ]
         return {
             "status": result.status if not packets or result.status != "unreadable" else "partial",
-            "headline": capitalised(count_packets(self._n_received, self._n_unsure)) if packets else headline(result),
+            "headline": capitalised(counted) if packets else report.headline(result),
             "reason": reason,
             "advice": advice,
-            "mirrored": mirror_note(result),
+            "mirrored": report.mirror_note(result),
             "texts": list(self._texts),
             "files": list(self._files),
             "packets": list(packets),

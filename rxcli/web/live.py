@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import logging
+import signal
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rxcli.errors import without_commands
+from rxcli.errors import ReceiverError, sentence, without_commands
+from rxcli.ingest.v4l2 import CameraSettings, LiveSource
+from rxcli.options import ReceiverOptions
+from rxcli.results.aim import Aim, AimState, light_of
+from rxcli.results.columns import packet_rows, text_rows
+from rxcli.runs.batch import Source, standard_decoder, use_one_thread
 from rxcli.runs.processes import start_process
-
-if TYPE_CHECKING:
-    from multiprocessing.connection import Connection
-    from multiprocessing.process import BaseProcess
-
-    from rxcli.ingest.v4l2 import CameraSettings
-    from rxcli.options import ReceiverOptions
-    from rxcli.results.aim import AimState
-    from rxcli.types import FrameResult
+from rxcli.types import FrameResult
+from rxcli.web.decoding import Previews
 
 log = logging.getLogger(__name__)
 
@@ -80,12 +81,6 @@ class LiveCamera(threading.Thread):
 
 def _work(connection: Connection, device: Path, settings: CameraSettings, options: ReceiverOptions) -> None:
     """Main loop of the process."""
-    import signal
-
-    from rxcli.errors import ReceiverError, sentence
-    from rxcli.ingest.v4l2 import LiveSource
-    from rxcli.runs.batch import use_one_thread
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     use_one_thread()
     source = LiveSource(device, settings, on_lost=lambda reason: connection.send({"problem": sentence(reason)}))
@@ -106,11 +101,6 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
         frames: endless, of one camera; if it has `counts`, dropped and damaged frames are reported, too.
         options: of the receiver.
     """
-    from rxcli.results.aim import Aim, light_of
-    from rxcli.results.columns import packet_rows, text_rows
-    from rxcli.runs.batch import Source, standard_decoder
-    from rxcli.web.decoding import Previews
-
     watched, aim = Previews(_WIDTH_PX, quality=70), Aim()
     prompt = replace(options, prompt=True)
     decoder = replace(standard_decoder(prompt, watched.tap), open_source=lambda path: frames)

@@ -19,9 +19,11 @@ def encode(*arguments: object) -> int:
 
 
 def test_labels_of_a_text(tmp_path: Path) -> None:
-    out = tmp_path / "t.npy"
+    out, long = tmp_path / "t.npy", tmp_path / "l.npy"
     assert encode("--text", "hello", "--screen", "data-17k3", "--out", out, "--bursts", 3) == ExitCode.OK
     assert np.array_equal(np.load(out), message("hello").labels(np.arange(3), 20, 11))
+    assert encode("--text", "x" * 200, "--out", long, "--bursts", 40) == ExitCode.OK  # goes as a file
+    assert np.array_equal(np.load(long), file_object("message.txt", b"x" * 200).labels(np.arange(40), 20, 24))
 
 
 def test_labels_of_a_file_for_people(tmp_path: Path) -> None:
@@ -32,13 +34,6 @@ def test_labels_of_a_file_for_people(tmp_path: Path) -> None:
     assert rows[0][:3] == ["burst", "symbol", "column_0"]
     labels = np.array(rows[1:], np.int64)[:, 2:].reshape(-1, 5, 20)
     assert np.array_equal(labels, file_object("a.bin", b"content").labels(np.arange(3), 20, 5))
-
-
-def test_a_long_text_goes_as_a_file(tmp_path: Path) -> None:
-    out = tmp_path / "t.npy"
-    assert encode("--text", "x" * 200, "--out", out, "--bursts", 40) == ExitCode.OK
-    expected = file_object("message.txt", b"x" * 200).labels(np.arange(40), 20, 24)
-    assert np.array_equal(np.load(out), expected)
 
 
 @pytest.mark.parametrize("screen", ["data-34k6", "paper-34k6"])
@@ -70,21 +65,21 @@ def test_slots_are_packed_in_the_order_that_the_line_beside_them_says(tmp_path: 
         (["--uri", "u" * 200], ExitCode.USAGE, "199 bytes"),
         (["missing.bin"], ExitCode.UNREADABLE, "missing.bin"),
         (["--text", "a", "--screen", "nothing"], ExitCode.USAGE, "data-34k6"),
+        (["--text", "a", "--force", "--out", "x.txt"], ExitCode.USAGE, "must end in .npy or .csv (got 'x.txt')"),
+        (["--text", "a", "--slots", "--out", "x.csv"], ExitCode.USAGE, "--slots are written as .npy only"),
+        (["--text", "a"], ExitCode.USAGE, "replace it with --force"),
     ],
 )
 def test_what_cannot_work_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], code: ExitCode, words: str
 ) -> None:
-    assert encode(*arguments, "--out", tmp_path / "x.npy") == code
-    assert words in capsys.readouterr().err
-    assert not (tmp_path / "x.npy").exists()
-
-
-def test_somebodys_file_is_not_overwritten(tmp_path: Path) -> None:
     out = tmp_path / "x.npy"
-    out.write_text("precious")
-    assert encode("--text", "a", "--out", out) == ExitCode.USAGE
-    assert out.read_text() == "precious"
+    if arguments == ["--text", "a"]:
+        out.write_text("precious")
+    before = out.read_bytes() if out.exists() else None
+    assert encode("--out", out, *arguments) == code
+    assert words in capsys.readouterr().err
+    assert (out.read_bytes() if out.exists() else None) == before
 
 
 @pytest.fixture(scope="module")
@@ -98,27 +93,19 @@ def photo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_text_is_printed_as_text_and_first(photo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["decode", str(photo), "--camera", str(photo.with_name("camera.toml"))]) == ExitCode.OK
+def test_a_text_comes_first_and_in_json_and_payloads_as_rows(
+    photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command, table = ["decode", str(photo), "--camera", str(photo.with_name("camera.toml"))], tmp_path / "p.csv"
+    assert run(command) == ExitCode.OK
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("text: hällo")
     assert lines[-1] == lines[0]
     assert "\x1b" not in lines[0]
-
-
-def test_a_text_in_json_and_payloads_as_rows(photo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    table = tmp_path / "p.csv"
-    arguments = ["--json", "-", "--quiet", "--payloads", str(table), "--camera", str(photo.with_name("camera.toml"))]
-    assert run(["decode", str(photo), *arguments]) == ExitCode.OK
+    assert run([*command, "--json", "-", "--quiet", "--payloads", str(table)]) == ExitCode.OK
     record = json.loads(capsys.readouterr().out)
     assert record["messages"] == [{"kind": "text", "text": "hällo\x1b", "hex": "hällo\x1b".encode().hex()}]
     assert "soft_bits" not in record
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert len(rows) == sum(len(column["packets"]) for column in record["columns"])
     assert rows[0]["hex"] == record["columns"][0]["packets"][0]["payload"]
-
-
-def test_it_is_said_that_no_packet_fits_a_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--preset", "video-1080p", "--screen", "paper-8k65", "--fill", "0.2", "--scale", "0.1"]
-    assert run(["simulate", str(tmp_path / "x.png"), *arguments]) == ExitCode.OK
-    assert "no packet fits a frame" in capsys.readouterr().err

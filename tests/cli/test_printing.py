@@ -81,7 +81,7 @@ def test_progress_tells_the_end(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 def test_a_terminal_gets_a_bar_when_there_is_time_to_read_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(printing, "_is_terminal", lambda stream: True)
+    monkeypatch.setattr(printing, "is_terminal", lambda stream: True)
     with Progress(3, 0, quiet=False) as progress:
         progress.add(frame(0, 1), last=True)
         assert capsys.readouterr().err == ""

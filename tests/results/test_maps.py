@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from rxcli.results.maps import column_map
@@ -22,21 +21,12 @@ def drawn(light: float) -> NDArray[np.uint8]:
     return np.clip(luma, 0, 255).astype(np.uint8)
 
 
-def test_borders_of_the_grid_are_drawn() -> None:
-    shown = column_map(Frame(drawn(40.0), "drawn"))
+def test_borders_of_the_grid_are_drawn_where_one_stands_out() -> None:
+    shown, nothing = (column_map(Frame(drawn(light), "drawn")) for light in (40.0, 0.0))
     assert shown is not None
+    assert nothing is not None
     assert len(shown["grids"][0]["lines"]) >= 15
     assert round(shown["grids"][0]["pitch_px"]) == 45
-
-
-def test_where_no_grid_stands_out_the_map_says_so() -> None:
-    shown = column_map(Frame(drawn(0.0), "drawn"))
-    assert shown is not None
-    assert shown["grids"] == []
-    assert "No grid of columns stands out" in shown["text"]
-
-
-@pytest.mark.parametrize("shape", [(64, 400), (400, 64)])
-def test_tiny_pictures_have_no_map(shape: tuple[int, int]) -> None:
-    frame = Frame(np.zeros(shape, np.uint8), "tiny")
-    assert column_map(frame) is None
+    assert nothing["grids"] == []
+    assert "No grid of columns stands out" in nothing["text"]
+    assert column_map(Frame(np.zeros((64, 400), np.uint8), "tiny")) is None

@@ -18,15 +18,8 @@ from hypothesis import strategies as st
 
 from rxcli.errors import ExitCode, InputError, UsageError
 from rxcli.results.record import from_record, to_json_line, to_record
-from rxcli.results.report import (
-    format_frame,
-    format_table,
-    headline,
-    printable,
-    printable_name,
-    shorten,
-)
-from rxcli.results.summary import Limits, SourceSummary, exit_code, format_summary, total, write_junit, write_summary
+from rxcli.results.report import format_frame, headline, printable, printable_name
+from rxcli.results.summary import Limits, SourceSummary, exit_code, format_summary, write_junit, write_summary
 from rxcli.results.truth import Score
 from rxcli.types import ColumnResult, FrameResult, PacketResult
 
@@ -72,14 +65,8 @@ def test_unknown_values_are_null_and_failures_carry_a_message() -> None:
     assert record["camera"] == {"profile": None, "line_delay_s": None, "exposure_s": None}
     assert record["message"] == LOST.message
     assert "message" not in to_record(OK)
-    assert "message" in to_record(OK)["columns"][1]
     assert to_record(OK)["columns"][1]["snr_db"] is None
-
-
-def test_clips_have_burst_and_frames() -> None:
-    packet = replace(PACKET, burst=7, frames=(3, 4))
-    [found] = to_record(replace(OK, columns=(replace(OK.columns[0], packets=(packet,)),)))["columns"][0]["packets"]
-    assert (found["burst"], found["frames"]) == (7, [3, 4])
+    assert to_record(OK)["columns"][1]["message"] == OK.columns[1].message
 
 
 wild = st.floats(allow_nan=True, allow_infinity=True) | st.none()
@@ -111,10 +98,12 @@ def test_no_value_makes_a_line_that_is_not_json(
 
 
 def test_a_line_reads_back_as_the_result() -> None:
-    back = from_record(json.loads(to_json_line(OK)))
-    assert back.columns == OK.columns
+    packet = replace(PACKET, burst=7, frames=(3, 4))  # of a clip
+    sent = replace(OK, columns=(replace(OK.columns[0], packets=(packet,)), *OK.columns[1:]))
+    back = from_record(json.loads(to_json_line(sent)))
+    assert back.columns == sent.columns
     assert back.corners == pytest.approx(np.round(OK.corners, 2))
-    assert replace(back, corners=None) == replace(OK, corners=None)
+    assert replace(back, corners=None) == replace(sent, corners=None)
 
 
 @pytest.mark.parametrize("record", [{}, [], None, {"source": 3}, to_record(OK) | {"columns": 3}])
@@ -147,33 +136,15 @@ def test_a_name_can_be_told_from_what_is_printed(raw: bytes) -> None:
 
 
 def test_the_table_shows_what_a_person_looks_for() -> None:
-    text = format_frame(OK)
-    heading, header, first, second, dark = text.splitlines()
+    columns = (replace(OK.columns[0], packets=(PACKET, replace(PACKET, confidence=0.99999, payload="ab" * 10))),)
+    heading, header, first, second, dark = format_frame(replace(OK, columns=columns + OK.columns[1:])).splitlines()
     assert heading == "a.jpg | ok | screen paper-34k6 | camera xs10 | 2 packets received (3 columns) | 150 ms"
     assert header.split() == ["col", "status", "w", "snr", "dB", "confidence", "copies", "payload"]
     assert first.split() == ["0", "ok", "5", "21.3", "0.9980", "2.76", "d076558cfe9de2d…5d9c"]
-    assert second == first
+    assert second.split()[4:] == ["0.9999", "2.76", "ab" * 10]  # never rounded up to certainty; a short one whole
     assert first.index("d076") == header.index("payload")
     assert dark.split(maxsplit=2) == ["1-2", "dark", "too little light; expose longer"]
-
-
-def test_the_table_never_rounds_confidence_up_to_certainty() -> None:
-    packet = replace(PACKET, confidence=0.99999)
-    assert " 0.9999 " in format_frame(replace(OK, columns=(replace(OK.columns[0], packets=(packet,)),)))
-
-
-def test_a_failure_is_told_once() -> None:
     assert format_frame(BAD) == "c.jpg | unreadable\n  the file is empty; copy it again"
-
-
-def test_short_payloads_are_shown_whole() -> None:
-    assert shorten("0123456789abcdef0123") == "0123456789abcdef0123"
-    assert len(shorten("0" * 42)) == 20
-
-
-def test_tables_line_up() -> None:
-    lines = format_table(["name", "n", ""], [["a", "10", "x"], ["long", "2", ""]]).splitlines()
-    assert lines == ["name   n", "a     10  x", "long   2"]
 
 
 def summary(*results: FrameResult, score: Score | None = None) -> SourceSummary:
@@ -186,50 +157,43 @@ def summary(*results: FrameResult, score: Score | None = None) -> SourceSummary:
 SCORE = Score(expected=4, bits=400, error_free=3, bit_errors=8)
 
 
-@pytest.mark.parametrize(
-    ("summaries", "limits", "code"),
-    [
-        ([summary(OK)], Limits(), ExitCode.OK),
-        ([summary(OK), summary(LOST)], Limits(), ExitCode.NOT_RECEIVED),
-        ([summary(OK), summary(BAD), summary(LOST)], Limits(), ExitCode.UNREADABLE),
-        ([summary(OK, BAD)], Limits(), ExitCode.UNREADABLE),
-        ([summary(OK)], Limits(min_packets=2), ExitCode.OK),
-        ([summary(OK)], Limits(min_packets=3), ExitCode.NOT_RECEIVED),
-        ([summary(OK, score=SCORE)], Limits(max_ber=0.02), ExitCode.OK),
-        ([summary(OK, score=SCORE)], Limits(max_ber=0.0199), ExitCode.NOT_RECEIVED),
-        ([summary(OK)], Limits(max_ber=1.0), ExitCode.NOT_RECEIVED),
+def test_exit_codes() -> None:
+    ok, lost, bad, scored = summary(OK), summary(LOST), summary(BAD), summary(OK, score=SCORE)
+    for summaries, limits, code in (
         ([], Limits(), ExitCode.OK),
-    ],
-)
-def test_exit_codes(summaries: list[SourceSummary], limits: Limits, code: ExitCode) -> None:
-    assert exit_code(summaries, limits) is code
-
-
-def test_the_total_adds_up() -> None:
-    whole = total([summary(OK, score=SCORE), summary(LOST), summary(OK, score=SCORE)])
-    assert (whole.n_frames, whole.n_packets, whole.confidence) == (3, 4, pytest.approx(0.998))
-    assert whole.score is not None
-    assert (whole.score.expected, whole.score.ber) == (8, pytest.approx(0.02))
+        ([ok], Limits(), ExitCode.OK),
+        ([ok, lost], Limits(), ExitCode.NOT_RECEIVED),
+        ([ok, bad, lost], Limits(), ExitCode.UNREADABLE),
+        ([summary(OK, BAD)], Limits(), ExitCode.UNREADABLE),
+        ([ok], Limits(min_packets=2), ExitCode.OK),
+        ([ok], Limits(min_packets=3), ExitCode.NOT_RECEIVED),
+        ([scored], Limits(max_ber=0.02), ExitCode.OK),
+        ([scored], Limits(max_ber=0.0199), ExitCode.NOT_RECEIVED),
+        ([ok], Limits(max_ber=1.0), ExitCode.NOT_RECEIVED),
+    ):
+        assert exit_code(summaries, limits) is code, limits
 
 
 def test_the_summary_names_reasons_and_scores() -> None:
-    header, first, second, last = format_summary([summary(OK, score=SCORE), summary(BAD)], Limits()).splitlines()
-    assert header.split() == [
-        "source",
-        "frames",
-        "received",
-        "unsure",
-        "confidence",
-        "expected",
-        "error-free",
-        "lost",
-        "false",
-        "ber",
-    ]
+    scored = summary(OK, score=SCORE)
+    header, first, second, last = format_summary([scored, summary(BAD)], Limits()).splitlines()
+    names = ["source", "frames", "received", "unsure", "confidence", "expected", "error-free", "lost", "false", "ber"]
+    assert header.split() == names
     assert first.split()[:10] == ["a.jpg", "1", "2", "0", "0.998", "4", "3", "0", "0", "0.02"]
     assert second.endswith("the file is empty; copy it again")
     assert last.endswith("1 of 2 failed")
+    last = format_summary([scored, summary(LOST), scored], Limits()).splitlines()[-1]
+    assert last.split()[:10] == ["total", "3", "4", "0", "0.998", "8", "6", "0", "0", "0.02"]
     assert "expected" not in format_summary([summary(OK)], Limits())
+
+
+def test_a_photo_alone_says_its_reason_once() -> None:
+    """In the table above the summary; what that does not show stays."""
+    assert format_summary([summary(BAD)], Limits(), is_told=True).endswith(" -")
+    assert format_summary([summary(LOST)], Limits(), is_told=True).endswith("no packet")
+    assert format_summary([summary(OK)], Limits(min_packets=3), is_told=True).endswith("3 were asked for")
+    for summaries in ([summary(LOST), summary(OK)], [summary(LOST, LOST)]):
+        assert "give --corners" in format_summary(summaries, Limits(), is_told=True)
 
 
 def unsure(n_unsure: int, n_columns: int = 3) -> FrameResult:
@@ -270,27 +234,28 @@ def test_all_received_is_said_only_where_it_is_so() -> None:
 def test_reasons_that_differ_in_numbers_are_one() -> None:
     many = [replace(LOST, frame=n, message=f"too dark at {n}.5 dB; expose longer") for n in range(9)]
     assert summary(*many).reason == "too dark at 0.5 dB; expose longer"
+    packet = replace(PACKET, confidence=math.nan)
+    found = summary(replace(OK, columns=(replace(OK.columns[0], packets=(packet,)),)))
+    assert found.row(Limits())["confidence"] is None
 
 
-def test_summary_files(tmp_path: Path) -> None:
-    summaries = [summary(OK, score=SCORE), summary(BAD)]
-    write_summary(tmp_path / "s.csv", summaries, Limits())
-    with (tmp_path / "s.csv").open(newline="") as file:
-        first, second = csv.DictReader(file)
-    assert (first["source"], first["packets"], first["ber"], first["exit_code"]) == ("a.jpg", "2", "0.02", "0")
-    assert (second["ber"], second["exit_code"]) == ("", "3")
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_summary_files(suffix: str, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed (extra parquet)")
+    path, summaries = tmp_path / f"s.{suffix}", [summary(OK, score=SCORE), summary(BAD)]
+    write_summary(path, summaries, Limits())
+    if suffix == "csv":
+        rows = csv.DictReader(path.read_text().splitlines())
+        first, second = ({name: cell or None for name, cell in row.items()} for row in rows)
+    else:
+        first, second = parquet.read_table(path).to_pylist()
+    for name, kind, expected in (("packets", int, 2), ("ber", float, 0.02), ("exit_code", int, 0), ("unsure", int, 0)):
+        assert kind(first[name]) == expected
+    assert (first["source"], second["ber"], int(second["exit_code"])) == ("a.jpg", None, 3)
     with pytest.raises(UsageError, match=r"must end in .csv or .parquet \(got"):
         write_summary(tmp_path / "s.xls", summaries, Limits())
     with pytest.raises(InputError, match="cannot be written"):
-        write_summary(tmp_path / "none" / "s.csv", summaries, Limits())
-
-
-def test_parquet_summaries(tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed (extra parquet)")
-    write_summary(tmp_path / "s.parquet", [summary(BAD), summary(OK, score=SCORE)], Limits())
-    first, second = parquet.read_table(tmp_path / "s.parquet").to_pylist()
-    assert (first["expected"], first["exit_code"]) == (None, 3)
-    assert (second["expected"], second["ber"]) == (4, 0.02)
+        write_summary(tmp_path / "none" / path.name, summaries, Limits())
 
 
 def test_junit(tmp_path: Path) -> None:
@@ -304,12 +269,6 @@ def test_junit(tmp_path: Path) -> None:
     assert "the file is empty" in str(error.find("error").get("message"))
     assert "no screen found" in str(failure.find("failure").get("message"))
     assert str(failure.get("name")).endswith("<&>.jpg")
-
-
-def test_confidence_without_a_number_is_unknown() -> None:
-    packet = replace(PACKET, confidence=math.nan)
-    found = summary(replace(OK, columns=(replace(OK.columns[0], packets=(packet,)),)))
-    assert found.row(Limits())["confidence"] is None
 
 
 def test_a_frame_whose_bursts_go_on_does_not_look_like_a_failure() -> None:

@@ -1,0 +1,326 @@
+"""What `vlc-rx decode` does: claim its outputs, decode every source, write what was asked for."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import Any
+
+import click
+import msgspec
+
+from rxcli import __version__, outputs
+from rxcli.cli.common import claim_outputs, receiver_options
+from rxcli.cli.printing import JsonLines, PayloadTable, Progress, Table, Writer, print_line, print_text
+from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
+from rxcli.ingest import KNOWN_SUFFIXES, open_source
+from rxcli.link.collector import PhotoCollector
+from rxcli.link.saving import save_objects
+from rxcli.profiles import dump_profile
+from rxcli.results import report, summary
+from rxcli.results.baseline import load_baseline
+from rxcli.results.truth import Scorer, load_truth, truth_for
+from rxcli.runs import batch
+from rxcli.runs.journal import Head, Journal, Lines
+from rxcli.types import BELIEVABLE, FrameResult
+
+log = logging.getLogger(__name__)
+#: Options that change nothing of a source's results: where they go, who decodes, what is asked of them.
+_NO_MATTER = frozenset(
+    {
+        *("json_path", "junit", "summary", "save_camera", "dump_dir", "save_undistorted", "quiet", "force", "resume"),
+        *("workers", "cluster", "max_ber", "min_packets", "min_packet_confidence"),
+        *("baseline", "slower", "out", "payloads", "packets"),
+    }
+)
+#: The source that is read from stdin.
+STDIN = "-"
+
+
+def run(paths: tuple[str, ...], given: dict[str, Any]) -> ExitCode:
+    """Decode the files and folders `paths` with the options that were `given`."""
+    sources = batch.collect_sources(paths, frozenset(KNOWN_SUFFIXES))
+    _check(paths, given, len(sources))
+    log.info("paths: %s", ", ".join(paths))
+    more = {name: given[name] for name in ("dump_dir", "stop_when_certain")}
+    configured = receiver_options(given, **more, soft_bits=True)
+    tap, after = None, None
+    if given["save_undistorted"]:
+        from rxcli.results.undistort import UndistortedWriter
+
+        folder = Path(given["save_undistorted"]).absolute()
+        tap = UndistortedWriter(folder, configured.cameras, configured.force_camera)
+        after = tap.finish
+    taken = _claim(given, sources)
+    with _stdin_as_file(sources) as sources:
+        return _Run(batch.standard_decoder(configured, tap, after), given, taken, sources).run()
+
+
+def _check(paths: tuple[str, ...], given: dict[str, Any], n_sources: int) -> None:
+    """Refuse what makes no sense before the long work starts."""
+    resume, cluster, truth = given["resume"], given["cluster"], given["truth"]
+    is_one_truth = truth not in (None, "auto") and n_sources != 1
+    no_file, no_truth = given["json_path"] in (None, "-"), given["max_ber"] is not None and not truth
+    no_address = "--cluster needs the address of a Dask scheduler (got none)"
+    one_truth = f"--truth {truth} is the truth of one file ({n_sources} were given)"
+    for is_wrong, reason, step in (
+        (resume and no_file, "--resume needs the file that --json wrote", "give --json FILE"),
+        (resume and STDIN in paths, "--resume cannot check whether stdin is unchanged", "name the file"),
+        (no_truth, "--max-ber needs the truth", "give --truth FILE, or --truth auto"),
+        (is_one_truth, one_truth, "give --truth auto, which takes the NAME.truth.json beside each file"),
+        (cluster is not None and not cluster.strip(), no_address, "name it: tcp://host:8786"),
+        (cluster and given["workers"] > 1, "--workers and --cluster exclude each other", "give one of them"),
+        (cluster and STDIN in paths, "stdin cannot be sent to a cluster", "name a file that its workers see"),
+    ):
+        if is_wrong:
+            raise UsageError(reason, step)
+    if given["summary"]:
+        summary.check_summary_path(given["summary"])
+
+
+def _flag(name: str) -> str:
+    return "--" + name.removesuffix("_path").replace("_", "-")
+
+
+def _claim(given: dict[str, Any], sources: list[batch.Source]) -> outputs.Taken:
+    """Refuse outputs that would destroy something, and make the folders of the taps; returns the files of the run."""
+    truths = [truth_for(source.name, given["truth"]) for source in sources]
+    inputs = [source.path for source in sources] + [str(path) for path in truths if path is not None]
+    taken = claim_outputs(_outputs(given), inputs, (*given["screens"], *given["cameras"]), given["force"])
+    out = given["out"]
+    for name in ("dump_dir", "save_undistorted", "out"):
+        if given[name] is not None:
+            outputs.claim_folder(_flag(name), given[name])
+            if out is not None and name != "out" and out.resolve().is_relative_to(given[name].resolve()):
+                reason = f"--out {out}: {_flag(name)} writes there"
+                raise UsageError(reason, "name a folder for received files alone")
+    return taken
+
+
+def _outputs(given: dict[str, Any]) -> Iterator[outputs.Output]:
+    """Every file that the run will write."""
+    is_table = given["summary"] is not None and given["summary"].suffix.casefold() == ".csv"
+    for name, ours in {
+        # Resuming looks closer, and knows half lines.
+        "json_path": outputs.ANYTHING if given["resume"] else outputs.JOURNAL,
+        "junit": outputs.JUNIT,
+        "summary": outputs.CSV_SUMMARY if is_table else outputs.PARQUET_SUMMARY,
+        "save_camera": outputs.ESTIMATED_CAMERA,
+        "payloads": outputs.PAYLOADS,
+    }.items():
+        if given[name] not in (None, "-"):
+            way_on = None
+            if name == "json_path" and not given["resume"]:
+                way_on = "go on with it by --resume, replace it with --force, or name another file"
+            yield outputs.Output(_flag(name), Path(given[name]), ours, way_on=way_on)
+
+
+@contextmanager
+def _stdin_as_file(sources: list[batch.Source]) -> Iterator[list[batch.Source]]:
+    """The sources, with what comes from stdin put into a file for as long as it is needed."""
+    if all(source.name != STDIN for source in sources):
+        yield sources
+        return
+    if sys.stdin is None:
+        raise InputError("stdin is closed", "name a file instead of -")
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(NamedTemporaryFile(prefix="vlc-rx-"))
+            shutil.copyfileobj(sys.stdin.buffer, file)
+            file.flush()
+        except OSError as error:
+            reason = f"stdin: cannot be kept in a temporary file ({error.strerror or error})"
+            raise InputError(reason, "make room, or set TMPDIR to another folder") from None
+        yield [replace(source, path=file.name) if source.name == STDIN else source for source in sources]
+
+
+class _Run:
+    """One run over many sources: where results go, and what is kept for the summary."""
+
+    def __init__(
+        self, decoder: batch.Decoder, given: dict[str, Any], taken: outputs.Taken, sources: list[batch.Source]
+    ) -> None:
+        self._decoder, self._given, self._taken, self._sources = decoder, given, taken, sources
+        asked = given["min_confidence"]
+        #: Packets of less confidence do not count for the limits.
+        self._min_confidence = BELIEVABLE if asked is None else asked
+        self._baseline = load_baseline(given["baseline"], self._min_confidence, given["slower"])
+        self._limits = summary.Limits(given["max_ber"], given["min_packets"], given["min_packet_confidence"])
+        self._summaries: list[summary.SourceSummary] = []
+        self._photos = PhotoCollector(decoder.link_screens, decoder.file_memory_mb)
+        #: The frame with the most packets of those whose camera was estimated.
+        self._estimated: FrameResult | None = None
+        #: Name of a source -> where it is opened.
+        self._paths = {source.name: source.path for source in sources}
+        self._output, self._payloads = Writer(), Writer()
+
+    def run(self) -> ExitCode:
+        """Decode what is not done yet, and write what is asked for; returns the exit code."""
+        path, resume, done = self._given["json_path"], self._given["resume"], set[str]()
+        with ExitStack() as stack:
+
+            def journal(path: str | Path, resume: bool = False) -> Journal:
+                return stack.enter_context(closing(Journal(Path(path), resume)))
+
+            lines = Lines(self._head(), {name: path for name, path in self._paths.items() if name != STDIN})
+            kept = None if path in (None, "-") else journal(path, resume)
+            if self._given["payloads"] is not None:
+                self._payloads = PayloadTable(journal(self._given["payloads"]).append)
+            if kept is not None and resume:
+                done = self._recover(kept, lines)
+            lines.begun = bool(done)
+            if path is not None:
+                self._output = JsonLines(lines, print_line if kept is None else kept.append)
+            elif not self._given["quiet"]:
+                self._output = Table(self._given["packets"])
+            try:
+                self._decode([source for source in self._sources if source.name not in done])
+            except BaseException:
+                with suppress(OSError):
+                    self._conclude()  # the reason why the run ended is more important than this
+                raise
+        for name in self._baseline.missing():
+            lost = summary.SourceSummary(name, regressions=["in the baseline, and not in this run"])
+            self._summaries.append(lost)
+        return worst([*self._conclude(), summary.exit_code(self._summaries, self._limits)])
+
+    def _head(self) -> Head:
+        """What the results depend on: the version, the options, what the profiles hold."""
+        given = {name: value for name, value in self._given.items() if name not in _NO_MATTER}
+        configured = self._decoder.options
+        profiles = msgspec.json.encode((configured.screens, configured.cameras))
+        mark = {"profiles": hashlib.sha256(profiles).hexdigest()[:16]}
+        return Head(__version__, json.loads(json.dumps(given, default=str)) | mark)
+
+    def _recover(self, journal: Journal, lines: Lines) -> set[str]:
+        """Take the results of an earlier run into the summary; returns the names of its complete sources."""
+        done = set()
+        for name, results in journal.recover(lines.head, lines.paths):
+            with self._summarised(name) as (counted, scorer):
+                for result in results:
+                    self._count(scorer.add(result) if scorer else result, counted)
+            done.add(name)
+        return done
+
+    def _decode(self, sources: list[batch.Source]) -> None:
+        n_done, quiet = len(self._sources) - len(sources), self._given["quiet"]
+        log.info("%s to decode, %d done before", report.plural(len(sources), "source"), n_done)
+        with Progress(len(self._sources), n_done, quiet) as progress:
+            for source, results in self._decoded(sources):
+                with self._summarised(source.name) as (counted, scorer):
+                    self._output.begin(source.name, scorer is not None)
+                    for received, last in batch.with_last(results):
+                        result = self._photos.add(scorer.add(received) if scorer else received)
+                        if out := self._given["out"]:
+                            force = self._given["force"]
+                            result = save_objects(result, out, force, counted.unwritten.append, self._taken)
+                        self._count(result, counted)
+                        self._keep_estimate(result)
+                        log.info("%s", report.result_in_words(result))
+                        with progress.hidden():
+                            self._output.write(result, last)
+                        progress.add(result, last)
+                    with progress.hidden():
+                        self._output.end(counted)
+
+    def _decoded(self, sources: list[batch.Source]) -> Iterator[batch.Decoded]:
+        if self._given["cluster"]:
+            from rxcli.runs.cluster import decode_on_cluster
+
+            return decode_on_cluster(sources, self._decoder, self._given["cluster"])
+        if self._given["workers"] > 1 and len(sources) > 1:
+            return batch.decode_in_processes(sources, self._decoder, self._given["workers"])
+        return batch.decode_here(sources, self._decoder)
+
+    @contextmanager
+    def _summarised(self, name: str) -> Iterator[tuple[summary.SourceSummary, Scorer | None]]:
+        """The figures of a source and the scorer of its packets, if its truth is known; kept however it ends."""
+        counted, scorer = summary.SourceSummary(name, min_confidence=self._min_confidence), None
+        path = truth_for(name, self._given["truth"])
+        try:
+            scorer = None if path is None else Scorer(load_truth(path))
+        except InputError as error:
+            if self._given["truth"] != "auto":
+                raise
+            counted.truth_problem = str(error)
+        try:
+            yield counted, scorer
+        finally:
+            if counted.n["frames"]:  # none: interrupted before the first
+                if scorer is not None:
+                    counted.score, counted.faults = scorer.score(), scorer.faults()
+                counted.regressions = self._baseline.regressions(name)
+                self._summaries.append(counted)
+
+    def _count(self, result: FrameResult, counted: summary.SourceSummary) -> None:
+        counted.add(result)
+        self._baseline.add(result)
+        self._payloads.write(result, last=False)
+
+    def _keep_estimate(self, result: FrameResult) -> None:
+        most = len(self._estimated.packets) if self._estimated else 0
+        # An estimate that received nothing may be wrong, and a profile is not doubted.
+        if "line_delay_s" in result.estimated and len(result.packets) > most:
+            self._estimated = result
+
+    def _save_camera(self, path: Path) -> None:
+        from rxcli.receiver.camera import camera_profile
+
+        if self._estimated is None:
+            click.echo(f"vlc-rx: {path} was not written: no packet was received with an estimated camera", err=True)
+            return
+        frame = next(iter(open_source(self._paths[self._estimated.source])))
+        about = frame.metadata
+        name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-") or "camera"
+        profile = camera_profile(self._estimated.estimated, name, about.make, about.model, frame.width, frame.height)
+        outputs.write_whole(path, dump_profile(profile))
+
+    def _conclude(self) -> list[ExitCode]:
+        """Write what is written at the end, each whether or not the others can be; returns why some could not.
+
+        Raises:
+            OSError: stdout cannot be written, or its reader has gone; all files are written.
+        """
+        places = {name: place for place, name in enumerate(self._paths)}
+        self._summaries.sort(key=lambda counted: places.get(counted.source, len(places)))
+        codes = []
+        steps: dict[str, Callable[[Path], None]] = {
+            "summary": lambda path: summary.write_summary(path, self._summaries, self._limits),
+            "save_camera": self._save_camera,
+            "junit": lambda path: summary.write_junit(path, self._summaries, self._limits),
+        }
+        for name, write in steps.items():
+            try:
+                if self._given[name]:
+                    write(self._given[name])
+            except ReceiverError as error:
+                click.echo(f"vlc-rx: {error}", err=True)
+                codes.append(error.exit_code)
+        self._print_summary()
+        return codes
+
+    def _print_summary(self) -> None:
+        to_stderr = self._given["json_path"] == "-"
+        if self._given["quiet"]:
+            for counted in self._summaries:
+                for _, reason in counted.failures(self._limits):
+                    name = "" if reason.startswith(f"{counted.source}: ") else f"{counted.source}: "
+                    click.echo(f"vlc-rx: {report.printable(name + reason)}", err=True)
+        elif self._summaries:
+            if self._output.has_table:
+                print_text(report.LEGEND + "\n")
+            is_told = isinstance(self._output, Table)
+            print_text(summary.format_summary(self._summaries, self._limits, is_told), err=to_stderr)
+            for counted in self._summaries:
+                of = f"{report.printable_name(counted.source)}: " if len(self._summaries) > 1 else ""
+                for line in counted.came:
+                    print_text(of + line, err=to_stderr)
