@@ -35,16 +35,21 @@ def profiles(context: click.Context) -> None:
 def list_profiles(json_path: str | None, force: bool) -> None:
     """List the profiles that go by their names: the user's own and the shipped ones."""
     claim_outputs([json_output(json_path, "screens", "cameras")], force=force)
-    screens, cameras = known_profiles(ScreenProfile), known_profiles(CameraProfile)
+    known = _known()
     if json_path is not None:
-        known: dict[str, Any] = {"screens": screens, "cameras": cameras}
-        write_json({kind: [_listed(*entry) for entry in profiles] for kind, profiles in known.items()}, json_path)
+        kinds = {f"{kind}s": [entry for entry in known if entry[0].kind == kind] for kind in ("screen", "camera")}
+        write_json({kind: [_listed(*entry) for entry in entries] for kind, entries in kinds.items()}, json_path)
     if json_path == "-":
         return
-    for profile, origin, _ in (*screens, *cameras):
+    for profile, origin, _ in known:
         described = f"; {profile.description}" if profile.description else ""
         print_text(f"{profile.kind}  {profile.name:<16} {origin:<8} {_about(profile)}{described}")
     click.echo(f"\nuser profiles lie in {user_dir()} (cameras/, screens/); `profiles show NAME` prints one")
+
+
+def _known() -> list[tuple[ScreenProfile | CameraProfile, str, Path]]:
+    """Screens, then cameras, each with its origin and its file."""
+    return [*known_profiles(ScreenProfile), *known_profiles(CameraProfile)]
 
 
 def _about(profile: ScreenProfile | CameraProfile) -> str:
@@ -78,8 +83,7 @@ def show(name: str, json_path: str | None, force: bool) -> None:
 def validate(names: tuple[str, ...]) -> int:
     """Check profiles: those named, or all that are known. Exit code 2 where one is wrong."""
     codes = []
-    known = (*known_profiles(ScreenProfile), *known_profiles(CameraProfile))
-    for name in names or [profile.name for profile, _, _ in known]:
+    for name in names or [profile.name for profile, _, _ in _known()]:
         try:
             profile = load_profile(name)
         except ReceiverError as error:

@@ -7,7 +7,7 @@ when it differs in more than a quarter of its bits from every burst of its frame
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sized
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from string import hexdigits
@@ -107,7 +107,7 @@ def load_truth(path: str | Path) -> Truth:
 
 def _contradictions(truth: Truth) -> Iterator[str]:
     """What is inconsistent in `truth`."""
-    per_column = {"w": truth.w, "payload_bits": truth.payload_bits}
+    per_column: dict[str, Sized] = {"w": truth.w, "payload_bits": truth.payload_bits}
     per_column |= {f"payload of burst {burst}": row for burst, row in truth.payload.items()}
     for name, values in per_column.items():
         if len(values) != truth.columns:
