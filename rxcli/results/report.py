@@ -281,7 +281,7 @@ def _shown(packet: Mapping[str, Any]) -> dict[str, Any]:
     return {
         **packet,
         "status": packet["status"] + "*" * packet["denoised"],
-        "confidence": math.floor(confidence * 1e4) / 1e4 if math.isfinite(confidence) else None,
+        "confidence": math.floor(confidence * 1e4) / 1e4 if math.isfinite(confidence * 1e4) else None,
         "payload": shorten(packet["payload"]),
     }
 
