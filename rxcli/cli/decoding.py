@@ -172,14 +172,14 @@ class _Run:
                 return stack.enter_context(closing(Journal(Path(path), resume)))
 
             lines = Lines(self._head(), {name: path for name, path in self._paths.items() if name != STDIN})
-            kept = None if path in (None, "-") else journal(path, resume)
+            output = None if path in (None, "-") else journal(path, resume)
             if self._given["payloads"] is not None:
                 self._payloads = PayloadTable(journal(self._given["payloads"]).append)
-            if kept is not None and resume:
-                done = self._recover(kept, lines)
+            if output is not None and resume:
+                done = self._recover(output, lines)
             lines.begun = bool(done)
             if path is not None:
-                self._output = JsonLines(lines, print_line if kept is None else kept.append)
+                self._output = JsonLines(lines, print_line if output is None else output.append)
             elif not self._given["quiet"]:
                 self._output = Table(self._given["packets"])
             try:
@@ -318,8 +318,8 @@ class _Run:
         elif self._summaries:
             if self._output.has_table:
                 print_text(report.LEGEND + "\n")
-            is_told = isinstance(self._output, Table)
-            print_text(summary.format_summary(self._summaries, self._limits, is_told), err=to_stderr)
+            is_shown = isinstance(self._output, Table)
+            print_text(summary.format_summary(self._summaries, self._limits, is_shown), err=to_stderr)
             for counted in self._summaries:
                 of = f"{report.printable_name(counted.source)}: " if len(self._summaries) > 1 else ""
                 for line in counted.came:

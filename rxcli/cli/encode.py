@@ -65,9 +65,9 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
 
 
 def _check(out: Path, options: dict[str, Any]) -> None:
-    both = options["bursts"] is not None and options["seconds"] is not None
+    is_ambiguous = options["bursts"] is not None and options["seconds"] is not None
     for is_wrong, reason, step in (
-        (both, "--bursts and --seconds exclude each other", "give one of them"),
+        (is_ambiguous, "--bursts and --seconds exclude each other", "give one of them"),
         (out.suffix not in (".npy", ".csv"), f"--out must end in .npy or .csv (got {str(out)!r})", "name such a file"),
         (options["slots"] and out.suffix != ".npy", "--slots are written as .npy only", "name such a file"),
     ):

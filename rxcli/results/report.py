@@ -265,13 +265,13 @@ def table_rows(result: FrameResult, clip: bool, scored: bool) -> list[str]:
     rows: list[str] = []
     # Columns with packets stand alone.
     groups = groupby(result.columns, key=lambda c: c.column if c.packets else (c.status, c.message))
-    for first, *others in (list(group) for _, group in groups):
-        if first.packets:
-            packets = packet_rows(replace(result, columns=(first,)))
+    for column, *equal in (list(group) for _, group in groups):
+        if column.packets:
+            packets = packet_rows(replace(result, columns=(column,)))
             rows += [_table_line(_shown(packet), clip, scored) for packet in packets]
         elif not clip:
-            span = f"{first.column}-{others[-1].column}" if others else str(first.column)
-            rows.append(f"  {span:>5}  {first.status:<9}  {first.message or ''}".rstrip())
+            span = f"{column.column}-{equal[-1].column}" if equal else str(column.column)
+            rows.append(f"  {span:>5}  {column.status:<9}  {column.message or ''}".rstrip())
     return rows
 
 

@@ -45,9 +45,9 @@ class SourceSummary:
     source: str
     #: Packets below this confidence do not count for the limits.
     min_confidence: float = BELIEVABLE
-    #: Counts: frames, those without packets (`frames_failed`) and `unreadable` ones; packets, those that can be
-    #: believed (`received`, with their `bits`) or not (`unsure`), that count for the limits (`sure`), that were put
-    #: together from several frames (`combined`); complete messages and files.
+    #: Counts by name. `frames`: all, `frames_failed`: without packets, `unreadable`. `packets`: all, `received`: the
+    #: believable ones and their `bits`, `unsure`: the others, `sure`: at least `min_confidence`, `combined`: put
+    #: together from several frames. `messages` and `files`: complete.
     n: Counter[str] = field(default_factory=Counter)
     confidence_sum: float = 0.0
     time_ms: float = 0.0
@@ -203,13 +203,13 @@ def exit_code(summaries: Sequence[SourceSummary], limits: Limits) -> ExitCode:
     return worst([code for summary in summaries for code, _ in summary.failures(limits)])
 
 
-def format_summary(summaries: Sequence[SourceSummary], limits: Limits, is_told: bool = False) -> str:
+def format_summary(summaries: Sequence[SourceSummary], limits: Limits, is_shown: bool = False) -> str:
     """One row per source, a total where there are several, and columns for the truth where any is known.
 
     Args:
         summaries: of the sources.
         limits: that they must keep.
-        is_told: the table above states why a photo was not received; for a photo alone it is not repeated.
+        is_shown: the table above states why a photo was not received; for a photo alone it is not repeated.
     """
     rows = [summary.row(limits) for summary in summaries]
     names = (*_SHOWN, *(_SHOWN_SCORED if any(summary.score is not None for summary in summaries) else ()))
@@ -218,9 +218,9 @@ def format_summary(summaries: Sequence[SourceSummary], limits: Limits, is_told: 
         is_whole = not failed and all(summary.is_complete for summary in summaries)
         ending = f"{failed} of {len(rows)} failed" if failed else "all received" if is_whole else ""
         rows.append(total(summaries).row(Limits()) | {"reason": ending})
-    elif is_told and not summaries[0].is_clip:
-        told = summaries[0].reason.removeprefix(f"{summaries[0].source}: ")
-        rows[0]["reason"] = rows[0]["reason"].removesuffix(told).removesuffix(": ")
+    elif is_shown and not summaries[0].is_clip:
+        shown = summaries[0].reason.removeprefix(f"{summaries[0].source}: ")
+        rows[0]["reason"] = rows[0]["reason"].removesuffix(shown).removesuffix(": ")
     cells = [[*(_text(row[name]) for name in names), printable(row["reason"])] for row in rows]
     return report.format_table([*(name.replace("_", "-") for name in names), ""], cells)
 

@@ -189,11 +189,11 @@ def test_the_summary_names_reasons_and_scores() -> None:
 
 def test_a_photo_alone_says_its_reason_once() -> None:
     """In the table above the summary; what that does not show stays."""
-    assert format_summary([summary(BAD)], Limits(), is_told=True).endswith(" -")
-    assert format_summary([summary(LOST)], Limits(), is_told=True).endswith("no packet")
-    assert format_summary([summary(OK)], Limits(min_packets=3), is_told=True).endswith("3 were asked for")
+    assert format_summary([summary(BAD)], Limits(), is_shown=True).endswith(" -")
+    assert format_summary([summary(LOST)], Limits(), is_shown=True).endswith("no packet")
+    assert format_summary([summary(OK)], Limits(min_packets=3), is_shown=True).endswith("3 were asked for")
     for summaries in ([summary(LOST), summary(OK)], [summary(LOST, LOST)]):
-        assert "give --corners" in format_summary(summaries, Limits(), is_told=True)
+        assert "give --corners" in format_summary(summaries, Limits(), is_shown=True)
 
 
 def unsure(n_unsure: int, n_columns: int = 3) -> FrameResult:
