@@ -33,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ingest_files import BAYER, write_dng
 from numpy.typing import NDArray
 from small_frames import write_frame, write_profiles
 
@@ -83,6 +84,9 @@ _GYROFLOW = {
         "distortion_coeffs": [0.3, 0.1, -0.2, 0.1],
     },
 }
+
+#: Stands for the mutated file in a command.
+_PATH = "PATH"
 
 Mutate = Callable[[bytes, random.Random], bytes]
 
@@ -198,15 +202,7 @@ def _write_stills(folder: Path, picture: NDArray[np.uint8]) -> None:
         import pillow_heif
 
         pillow_heif.from_pillow(image).save(str(folder / "a.heic"))
-    tags = [
-        (33421, "H", 2, (2, 2), True),
-        (33422, "B", 4, b"\0\1\1\2", True),
-        (50706, "B", 4, b"\1\4\0\0", True),
-        (50708, "s", 0, "Synthetic cam", True),
-        (50721, "2i", 9, (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1), True),
-    ]
-    mosaic = picture[..., 1].astype(np.uint16) * 16
-    tifffile.imwrite(folder / "a.dng", mosaic, photometric=32803, extratags=tags, metadata=None)
+    write_dng(folder / "a.dng", picture[..., 1].astype(np.uint16) * 16, BAYER)
 
 
 def _write_clips(folder: Path, picture: NDArray[np.uint8]) -> None:
@@ -287,7 +283,7 @@ class Cases:
         # Nobody's own profiles and settings.
         with environment({"VLC_RX_HOME": str(self._home)}):
             (self._home / "config.toml").unlink(missing_ok=True)
-            name, arguments = self._file(rng) if kind == "file" else (kind, getattr(self, f"_{kind}")(rng))
+            name, arguments = self._file(rng) if kind == "file" else (kind, self.arguments(kind, rng))
             return self._outcome(seed, name, arguments)
 
     def _outcome(self, seed: int, name: str, arguments: list[str]) -> dict[str, Any]:
@@ -326,27 +322,32 @@ class Cases:
         more = rng.choice(([], [], ["--no-skip", "no_screen"], ["--json", "-"], ["--screen", "paper-17k3"], taps))
         return name, ["decode", path, *self.pictures[kind].options, *more]
 
-    def _screen(self, rng: random.Random) -> list[str]:
-        path = self._write("changed.toml", _mutated_text(self._texts[rng.choice(("screen", "shipped"))], rng))
-        decode = ["decode", self._good(), *self._known, "--screen", path]
-        return rng.choice((["profiles", "validate", path], decode, decode))
-
-    def _camera(self, rng: random.Random) -> list[str]:
-        path = self._write("changed.toml", _mutated_text(self._texts["camera"], rng))
-        decode = ["decode", self._good(), *self._known[:2], *self._known[4:], "--camera", path]
-        return rng.choice((["profiles", "validate", path], decode, decode))
-
-    def _truth(self, rng: random.Random) -> list[str]:
-        path = self._write("truth.json", _mutated_text(self._texts["truth"], rng))
-        return ["decode", self._good(), *self._known, "--truth", path, "--max-ber", "0.1"]
-
-    def _config(self, rng: random.Random) -> list[str]:
-        (self._home / "config.toml").write_bytes(_mutated_text(self._texts["config"], rng))
-        return rng.choice((["profiles", "list"], ["decode", self._good(), *self._known]))
-
-    def _gyroflow(self, rng: random.Random) -> list[str]:
-        path = self._write("lens.json", _mutated_text(self._texts["gyroflow"], rng))
-        return ["calibrate", "gyroflow", path, "--json", "-"]
+    def arguments(self, kind: str, rng: random.Random) -> list[str]:
+        """The command of a case of a kind that is no picture."""
+        if kind == "option":
+            return self._option(rng)
+        good, known = self._good(), self._known
+        decode, both = ["decode", good, *known], ["decode", good, self._good(2), *known]
+        resume = [*both, "--resume", "--json", _PATH]
+        summary = ["--summary", str(self.folder / "summary.csv"), "--junit", str(self.folder / "junit.xml")]
+        validate, of_camera = (
+            ["profiles", "validate", _PATH],
+            ["decode", good, *known[:2], *known[4:], "--camera", _PATH],
+        )
+        commands = {
+            "screen": [validate, *[[*decode, "--screen", _PATH]] * 2],
+            "camera": [validate, of_camera, of_camera],
+            "truth": [[*decode, "--truth", _PATH, "--max-ber", "0.1"]],
+            "config": [["profiles", "list"], decode],
+            "gyroflow": [["calibrate", "gyroflow", _PATH, "--json", "-"]],
+            "journal": [resume, [*resume, *summary]],
+            "baseline": [[*both, "--baseline", _PATH]],
+        }[kind]
+        text = self._results() if kind in ("journal", "baseline") else self._texts[kind]
+        if kind == "screen" and rng.random() < 0.5:
+            text = self._texts["shipped"]
+        path = self._write({"config": "home/config.toml"}.get(kind, f"mutated.{kind}"), _mutated_text(text, rng))
+        return [path if part == _PATH else part for part in rng.choice(commands)]
 
     def _option(self, rng: random.Random) -> list[str]:
         arguments = ["decode", self._good(), *self._known, "--truth", "auto"]
@@ -357,23 +358,11 @@ class Cases:
             arguments += [option, *values]
         return arguments
 
-    def _journal(self, rng: random.Random) -> list[str]:
-        path = self._write("journal.jsonl", _mutated_text(self._results(), rng))
-        summary = ["--summary", str(self.folder / "summary.csv"), "--junit", str(self.folder / "junit.xml")]
-        return ["decode", *self._both(), "--json", path, "--resume", *rng.choice(([], summary))]
-
-    def _baseline(self, rng: random.Random) -> list[str]:
-        path = self._write("baseline.jsonl", _mutated_text(self._results(), rng))
-        return ["decode", *self._both(), "--baseline", path]
-
-    def _both(self) -> list[str]:
-        return [self._good(1), self._good(2), *self._known]
-
     def _results(self) -> bytes:
         """What a run over both pictures writes."""
         if self._whole is None:
             out = self.folder / "whole.jsonl"
-            _call(["decode", *self._both(), "--json", str(out), "--force"])
+            _call(["decode", self._good(), self._good(2), *self._known, "--json", str(out), "--force"])
             self._whole = out.read_bytes()
         return self._whole
 

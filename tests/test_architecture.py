@@ -63,17 +63,6 @@ def own(names: set[str]) -> set[str]:
     return {name for name in names if name.split(".")[0] == "rxcli"}
 
 
-def part_of(name: str) -> str:
-    """The part of the house that a module belongs to: its first name below rxcli."""
-    return name.split(".")[1] if "." in name else ""
-
-
-def stage_of(name: str) -> str | None:
-    """The stage that a module belongs to; None outside the receiver and for what wires it."""
-    parts = name.split(".")
-    return parts[2] if parts[1:2] == ["receiver"] and len(parts) > 2 and parts[2] in STAGES else None
-
-
 def below(*folders: str) -> list[str]:
     """Modules in some folders, named as they are imported."""
     return sorted(name for name in MODULES for folder in folders if f"{name}.".startswith(f"rxcli.{folder}."))
@@ -127,46 +116,46 @@ def test_no_module_imports_itself_through_others() -> None:
     assert not below, "in circles, or above them"
 
 
-@pytest.mark.parametrize("name", ["rxcli.protocol", "rxcli.types", "rxcli.errors", "rxcli.outputs", "rxcli.resources"])
-def test_the_base_stands_on_nothing(name: str) -> None:
-    assert own(imports(MODULES[name])) <= BASE - {name}
+@pytest.mark.parametrize(
+    ("places", "allowed"),
+    [
+        (("protocol", "types", "errors", "outputs", "resources"), BASE),
+        # A wrong equation shared with the receiver would cancel in every round trip.
+        (("lab.simulate",), BASE | {"rxcli.protocol", "rxcli.profiles", *below("lab.simulate")}),
+        # Reports know results only.
+        (
+            ("results.record", "results.report", "results.truth"),
+            DATA | {"rxcli.results.record", "rxcli.results.columns"},
+        ),
+    ],
+    ids=["base", "simulator", "reports"],
+)
+def test_what_some_stand_on(places: tuple[str, ...], allowed: set[str]) -> None:
+    for name in below(*places):
+        assert own(imports(MODULES[name])) <= allowed, name
+
+
+@pytest.mark.parametrize(
+    ("library", "users"),
+    [
+        ("torch", ("lab.training",)),
+        ("click", ("cli",)),
+        ("rxcli.cli", ("cli",)),
+        ("rxcli.receiver.pipeline", ("calibrate", "cli", "lab", "runs", "web")),
+    ],
+)
+def test_what_is_imported_by_some_alone(library: str, users: tuple[str, ...]) -> None:
+    """Only training needs torch, nothing below imports the command line, and only those above it call the pipeline."""
+    importers = {
+        name for name, tree in MODULES.items() if any(f"{f}.".startswith(f"{library}.") for f in imports(tree))
+    }
+    assert importers <= {"rxcli", *below(*users)}
 
 
 def test_protocol_is_pure() -> None:
     assert {found.split(".")[0] for found in imports(MODULES["rxcli.protocol"])} <= {
         *("__future__", "collections", "functools", "itertools", "math", "typing", "numpy", "rxcli")
     }
-
-
-def test_the_simulator_shares_only_protocol_and_profiles_with_the_receiver() -> None:
-    """A wrong equation shared by both would cancel in every round trip."""
-    allowed = BASE | {"rxcli.protocol", "rxcli.profiles"}
-    for name in below("lab.simulate"):
-        assert own(imports(MODULES[name])) - set(below("lab.simulate")) <= allowed, name
-
-
-def test_only_training_imports_torch() -> None:
-    for name, tree in MODULES.items():
-        if name not in below("lab.training"):
-            assert not {found for found in imports(tree) if found.split(".")[0] == "torch"}, name
-
-
-def test_nothing_below_imports_the_command_line() -> None:
-    for name, tree in MODULES.items():
-        if part_of(name) != "cli":
-            found = {part_of(other) for other in own(imports(tree))}
-            assert "cli" not in found, name
-            assert "click" not in imports(tree), name
-
-
-@pytest.mark.parametrize("part", ["record", "report", "truth"])
-def test_reports_know_results_only(part: str) -> None:
-    assert own(imports(MODULES[f"rxcli.results.{part}"])) <= DATA | {"rxcli.results.record", "rxcli.results.columns"}
-
-
-def test_only_those_above_it_call_the_pipeline() -> None:
-    callers = {part_of(name) for name, tree in MODULES.items() if "rxcli.receiver.pipeline" in imports(tree)}
-    assert callers <= {"", "calibrate", "cli", "lab", "runs", "web"}
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))

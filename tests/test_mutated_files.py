@@ -35,7 +35,7 @@ def test_unharmed_samples_are_received(cases: mutated_files.Cases, capsys: pytes
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mutated_files, "_mutated_text", lambda data, _rng: data)
         for kind in ("screen", "camera", "truth", "journal", "baseline", "config", "gyroflow"):
-            assert run(getattr(cases, f"_{kind}")(rng)) == 0, kind
+            assert run(cases.arguments(kind, rng)) == 0, kind
 
 
 def test_damaged_pngs_can_have_right_checksums(cases: mutated_files.Cases) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from pathlib import Path
 from typing import Any
@@ -109,26 +108,21 @@ def test_screens_for_texts_and_files_are_those_of_the_paper_sending_a_packet_onc
     ("path", "value", "words"),
     [
         ("modes.0.line_delay_s", 0.0, ["line_delay_s", "0.0"]),
-        ("modes.0.line_delay_s", 2.0, ["line_delay_s", "2.0"]),
         ("modes.0.width", -5, ["width", "-5"]),
         ("modes.0.exposure", 1e-4, ["exposure"]),
         ("lens.dist_coeffs", [0.1], ["dist_coeffs"]),
         ("lens.camera_matrix.0.0", -500.0, ["camera_matrix", "-500.0"]),
         ("lens.camera_matrix.0.2", float("nan"), ["finite"]),
-        ("lens.camera_matrix.0.2", float("inf"), ["finite"]),
         ("lens.camera_matrix.2.2", 2.0, ["camera_matrix", "2.0"]),
         ("lens.camera_matrix.0.1", 1e300, ["camera_matrix", "1e+300"]),
         ("lens.camera_matrix.0.0", 1e300, ["camera_matrix", "does not fit a picture of"]),
-        ("lens.camera_matrix.1.2", -1e9, ["camera_matrix", "does not fit a picture of"]),
         ("lens.camera_matrix.1.1", 1e-300, ["camera_matrix", "does not fit a picture of"]),
         ("lens.dist_coeffs", [0.0, 1e300, 0.0, 0.0, 0.0], ["no lens has distortion coefficients", "1e+300"]),
         ("tone", "film", ["tone", "film"]),
         ("slot_rate", 1.0, ["slot_rate"]),
-        ("slot_rate_hz", -1.0, ["slot_rate_hz", "-1.0"]),
         ("slot_rate_hz", "fast", ["slot_rate_hz", "'fast'"]),
         ("columns", 0, ["columns", ">= 1", "0"]),
         ("columns", 2.5, ["columns", "2.5"]),
-        ("columns", True, ["columns", "True"]),
         ("payload_symbols", None, ["payload_symbols"]),
         ("format", 2, ["format", "2"]),
         ("kind", "camera", ["kind", "camera"]),
@@ -161,78 +155,33 @@ def test_any_text_is_a_profile_or_a_profile_error(text: str) -> None:
         parse_profile(text, ScreenProfile, "fuzz.toml")
 
 
-json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
-    max_leaves=12,
+@pytest.mark.parametrize("profile", [*shipped_profiles(ScreenProfile), *shipped_profiles(CameraProfile)])
+@pytest.mark.parametrize("change", [{}, {"description": 'a "b"\n\\ \x01 \u202e'}], ids=["shipped", "described"])
+def test_a_written_profile_is_read_back_exactly(profile: Any, change: dict[str, str]) -> None:
+    profile = msgspec.structs.replace(profile, **change)
+    assert parse_profile(dump_profile(profile), type(profile), "written") == profile
+
+
+@pytest.mark.parametrize(
+    ("make", "model", "size", "fits"),
+    [
+        ("MAKER CORP.", "m 1", (640, 480), True),
+        (None, "M 1", (640, 480), True),
+        ("Other", "M 1", (640, 480), False),
+        ("Maker", "M 2", (640, 480), False),
+        ("Maker", None, (640, 480), False),
+        ("Maker", "M 1", (480, 640), False),
+    ],
 )
-
-
-@settings(max_examples=150, deadline=None)
-@given(st.sampled_from(["modes", "lens", "models", "name", "tone", "make", "modes.0.width"]), json_values)
-def test_any_value_under_a_key_loads_or_is_a_profile_error(path: str, value: Any) -> None:
-    raw = json.loads(json.dumps(CAMERA))
-    if path == "modes.0.width":
-        raw["modes"][0]["width"] = value
-    else:
-        raw[path] = value
-    with contextlib.suppress(ProfileError):
-        assert isinstance(check_profile(raw, CameraProfile, "fuzz"), CameraProfile)
-
-
-names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,12}", fullmatch=True)
-sizes = st.integers(1, 100_000)
-numbers = st.floats(-1e3, 1e3)
-modes = st.builds(
-    ReadoutMode,
-    name=names,
-    width=sizes,
-    height=sizes,
-    line_delay_s=st.floats(1e-9, 0.9),
-    exposure_s=st.none() | st.floats(1e-7, 0.9),
-    frame_rate_hz=st.none() | st.floats(0.1, 1e4),
-)
-lenses = st.builds(
-    lambda f, c, d, w, h: LensModel(
-        width=w,
-        height=h,
-        camera_matrix=((f * max(w, h), 0.0, c * w), (0.0, f * max(w, h), c * h), (0.0, 0.0, 1.0)),
-        dist_coeffs=tuple(d),
-    ),
-    st.floats(0.01, 100),
-    st.floats(-100, 100),
-    st.lists(numbers, min_size=4, max_size=14),
-    sizes,
-    sizes,
-)
-cameras = st.builds(
-    CameraProfile,
-    format=st.just(1),
-    kind=st.just("camera"),
-    name=names,
-    make=st.text(max_size=10),
-    models=st.lists(st.text(max_size=10), max_size=3).map(tuple),
-    modes=st.lists(modes, max_size=3).map(tuple),
-    lens=st.none() | lenses,
-    description=st.text(max_size=30),
-)
-
-
-@settings(max_examples=100, deadline=None)
-@given(cameras)
-def test_a_written_profile_is_read_back_exactly(profile: CameraProfile) -> None:
-    assert parse_profile(dump_profile(profile), CameraProfile, "written") == profile
-
-
-def test_profiles_match_by_make_model_and_size() -> None:
-    camera = check_profile(CAMERA | {"make": "Maker"}, CameraProfile, "c")
-    assert match_camera([camera], "MAKER CORP.", "m 1", 640, 480) is camera
-    assert match_camera([camera], None, "M 1", 640, 480) is camera
-    assert match_camera([camera], "Other", "M 1", 640, 480) is None
-    assert match_camera([camera], "Maker", "M 2", 640, 480) is None
-    assert match_camera([camera], "Maker", None, 640, 480) is None
-    assert match_camera([camera], "Maker", "M 1", 480, 640) is None
-    assert [mode and mode.name for mode in (camera.mode_for(640, 480), camera.mode_for(480, 640))] == ["still", None]
+def test_profiles_match_by_make_model_and_size(
+    make: str | None, model: str | None, size: tuple[int, int], fits: bool
+) -> None:
+    """A body takes the lens that another profile of its own gives."""
+    whole = check_profile(CAMERA | {"make": "Maker"}, CameraProfile, "c")
+    body, glass = msgspec.structs.replace(whole, lens=None), msgspec.structs.replace(whole, name="lens", modes=())
+    assert match_camera([whole], make, model, *size) is (whole if fits else None)
+    assert match_camera([glass, body], make, model, *size) == (whole if fits else None)
+    assert match_camera([glass], make, model, *size) is None
 
 
 def test_list_and_show(capsys: pytest.CaptureFixture[str]) -> None:
@@ -262,12 +211,9 @@ def test_validate_goes_on_after_a_bad_one(tmp_path: Path, capsys: pytest.Capture
     assert len(err.strip().splitlines()) == 2
 
 
-def picture(path: Path, size: tuple[int, int], make: str | None = None, model: str | None = None) -> str:
+def picture(path: Path, size: tuple[int, int], make: str = "", model: str = "") -> str:
     exif = Image.Exif()
-    if make:
-        exif[0x010F] = make
-    if model:
-        exif[0x0110] = model
+    exif.update({tag: text for tag, text in ((0x010F, make), (0x0110, model)) if text})
     Image.new("L", size, 90).save(path, exif=exif)
     return str(path)
 
@@ -275,12 +221,8 @@ def picture(path: Path, size: tuple[int, int], make: str | None = None, model: s
 def test_which_says_the_profile_and_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     profile = tmp_path / "c.toml"
     profile.write_text(tomli_w.dumps(CAMERA))
-    files = [
-        picture(tmp_path / "a.jpg", (640, 480), "X", "M 1"),
-        picture(tmp_path / "b.jpg", (320, 240), "X", "M 1"),
-        picture(tmp_path / "c.jpg", (640, 480), "X", "M 9"),
-        picture(tmp_path / "d.jpg", (640, 480)),
-    ]
+    about = (((640, 480), "X", "M 1"), ((320, 240), "X", "M 1"), ((640, 480), "X", "M 9"), ((640, 480),))
+    files = [picture(tmp_path / f"{name}.jpg", *of) for name, of in zip("abcd", about, strict=True)]
     assert run(["profiles", "which", *files, "--camera", str(profile), "--json", "-"]) == 0
     records = json.loads(capsys.readouterr().out)
     assert [r["camera"] for r in records] == ["c", None, None, None]
@@ -292,19 +234,6 @@ def test_which_says_the_profile_and_why(tmp_path: Path, capsys: pytest.CaptureFi
     out, err = capsys.readouterr()
     assert files[0] in out
     assert "absent.jpg" in err
-
-
-def test_a_body_takes_the_lens_that_a_profile_of_its_own_gives() -> None:
-    mode = {"name": "still", "width": 60, "height": 40, "line_delay_s": 1e-5}
-    matrix = [[50.0, 0.0, 30.0], [0.0, 50.0, 20.0], [0.0, 0.0, 1.0]]
-    lens = {"width": 60, "height": 40, "camera_matrix": matrix, "dist_coeffs": [0.1, 0.0, 0.0, 0.0]}
-    about = {"format": 1, "kind": "camera", "models": ["M"]}
-    body = check_profile({**about, "name": "body", "modes": [mode]}, CameraProfile, "body")
-    glass = check_profile({**about, "name": "lens", "lens": lens}, CameraProfile, "lens")
-    found = match_camera([glass, body], None, "m", 60, 40)
-    assert found is not None
-    assert (found.name, found.lens) == ("body", glass.lens)
-    assert match_camera([glass], None, "m", 60, 40) is None
 
 
 @pytest.mark.parametrize(

@@ -42,23 +42,14 @@ def test_import_loads_nothing_heavy() -> None:
     assert set(done.stdout.split()) <= {"rxcli", "__future__"}
 
 
-@pytest.mark.parametrize("name", rxcli.__all__)
-def test_every_name_is_there(name: str) -> None:
-    assert getattr(rxcli, name) is getattr(rxcli, name)
-    assert name in dir(rxcli)
-
-
-def test_other_names_are_not() -> None:
+def test_names_are_those_that_type_checkers_know() -> None:
+    text = Path(rxcli.__file__).read_text(encoding="utf-8")
+    known = {line.split()[-1] for line in text.splitlines() if line.startswith("    from rxcli.")}
+    assert known == set(rxcli.__all__) - {"__version__"} <= set(dir(rxcli))
+    assert all(getattr(rxcli, name) is not None for name in rxcli.__all__)
+    assert (Path(rxcli.__file__).parent / "py.typed").is_file()
     with pytest.raises(AttributeError, match="no attribute 'decoed'"):
         _ = rxcli.decoed  # type: ignore[attr-defined]
-
-
-def test_types_and_names_agree() -> None:
-    """What type checkers are told is what is loaded."""
-    text = Path(rxcli.__file__).read_text(encoding="utf-8")
-    told = {line.split()[-1] for line in text.splitlines() if line.startswith("    from rxcli.")}
-    assert told == set(rxcli.__all__) - {"__version__"}
-    assert (Path(rxcli.__file__).parent / "py.typed").is_file()
 
 
 def test_defaults_are_the_command_lines() -> None:
@@ -107,17 +98,16 @@ def test_profiles_need_no_formalities() -> None:
     assert rxcli.load_profile("paper-17k3").kind == "screen"
 
 
-def test_a_photo_gives_its_packets(tapped: tuple[rxcli.FrameResult, rxcli.Taps]) -> None:
-    result, _ = tapped
+def test_a_photo_gives_its_packets_from_a_path_or_a_frame(tapped: tuple[rxcli.FrameResult, rxcli.Taps]) -> None:
+    result, taps = tapped
     assert result.status == "ok"
     packet = result.columns[5].packets[0]
     assert packet.payload_bytes == bytes.fromhex(packet.payload)
     assert len(packet.payload_bytes) == -(-packet.payload_bits // 8)
-
-
-def test_frames_and_paths_are_one(tapped: tuple[rxcli.FrameResult, rxcli.Taps]) -> None:
     frame = next(iter(rxcli.open_source(PHOTO)))
-    assert payloads(KNOWN.decode(frame)) == payloads(next(KNOWN.receive([frame]))) == payloads(tapped[0])
+    assert payloads(KNOWN.decode(frame)) == payloads(next(KNOWN.receive([frame]))) == payloads(result)
+    detected = detect(by_burst(taps.metrics, taps.clock))  # taps feed the detector
+    assert (detected.index == taps.posteriors.index).mean() > 0.99
 
 
 def test_an_array_is_a_picture() -> None:
@@ -129,32 +119,25 @@ def test_an_array_is_a_picture() -> None:
     assert payloads(first) == payloads(second)
 
 
-@pytest.mark.parametrize("pixels", [np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4)), np.zeros(9, np.uint8)])
-def test_what_is_no_picture_is_told(pixels: NDArray[np.generic]) -> None:
-    with pytest.raises(rxcli.UsageError, match="must be a"):
-        KNOWN.decode(pixels)
+@pytest.mark.parametrize(
+    ("picture", "reason"),
+    [
+        (np.zeros((4, 4, 3), np.uint8), "must be a"),
+        (np.zeros((4, 4)), "must be a"),
+        (np.zeros(9, np.uint8), "must be a"),
+        (CLIP, "more than one frame; use receive"),
+    ],
+)
+def test_what_is_no_photo_is_refused(picture: NDArray[np.generic] | Path, reason: str) -> None:
+    with pytest.raises(rxcli.UsageError, match=reason):
+        KNOWN.decode(picture)
 
 
-def test_a_clip_is_no_photo() -> None:
-    with pytest.raises(rxcli.UsageError, match="more than one frame; use receive"):
-        KNOWN.decode(CLIP)
-
-
-def test_numbers_of_arrays_go_on() -> None:
-    dark = [np.zeros((60, 80), np.uint8)] * 3
-    assert [result.frame for result in KNOWN.receive(dark)] == [0, 1, 2]
-
-
-def test_nothing_received_has_no_taps() -> None:
-    result, taps = KNOWN.tap(np.zeros((60, 80), np.uint8))
-    assert result.status == "no_screen"
-    assert taps is None
-
-
-def test_taps_feed_the_detector(tapped: tuple[rxcli.FrameResult, rxcli.Taps]) -> None:
-    _, taps = tapped
-    again = detect(by_burst(taps.metrics, taps.clock))
-    assert (again.index == taps.posteriors.index).mean() > 0.99
+def test_arrays_without_a_screen_are_numbered_and_have_no_taps() -> None:
+    dark = np.zeros((60, 80), np.uint8)
+    assert [result.frame for result in KNOWN.receive([dark] * 3)] == [0, 1, 2]
+    result, taps = KNOWN.tap(dark)
+    assert (result.status, taps) == ("no_screen", None)
 
 
 def test_taps_that_are_none_are_told(tmp_path: Path) -> None:

@@ -26,15 +26,8 @@ _TURNS = {
 }
 
 
-def as_viewed(stored: NDArray[_T], orientation: int) -> NDArray[_T]:
-    """A view of `stored` (height, width, ...) as a viewer sees it."""
-    turns, mirrored = _TURNS[orientation]
-    turned = np.rot90(stored, turns)
-    return turned[:, ::-1] if mirrored else turned
-
-
 def as_stored(viewed: NDArray[_T], orientation: int) -> NDArray[_T]:
-    """The inverse of `as_viewed`."""
+    """A view of the picture as it is stored, from one as a viewer sees it, (height, width, ...)."""
     turns, mirrored = _TURNS[orientation]
     return np.rot90(viewed[:, ::-1] if mirrored else viewed, -turns)
 
@@ -43,7 +36,7 @@ def orientation_of(transform: Callable[[NDArray[np.int64]], NDArray[np.int64]]) 
     """The orientation that turns pictures as `transform` (a composition of turns and mirrors) does."""
     probe = np.arange(6).reshape(2, 3)
     transformed = transform(probe)
-    return next(o for o in _TURNS if np.array_equal(as_viewed(probe, o), transformed))
+    return next(o for o in _TURNS if np.array_equal(as_stored(transformed, o), probe))
 
 
 def orientation_of_turn(degrees_ccw: float) -> int:

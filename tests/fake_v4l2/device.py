@@ -102,23 +102,16 @@ class FakeCamera:
         self._handlers = {
             0: self._query_capabilities,
             2: self._enumerate_formats,
-            4: self._get_format,
             5: self._set_format,
-            64: self._set_format,
             8: self._request_buffers,
             9: self._query_buffer,
             15: self._queue_buffer,
             17: self._dequeue_buffer,
             18: self._stream_on,
-            19: self._stream_off,
-            21: self._stream_parameters,
             22: self._stream_parameters,
-            26: self._enumerate_inputs,
             27: self._get_control,
             28: self._set_control,
             36: self._query_control,
-            38: self._get_input,
-            39: self._set_input,
             74: self._enumerate_sizes,
             75: self._enumerate_intervals,
         }
@@ -147,18 +140,6 @@ class FakeCamera:
     def _query_capabilities(self, a: bytearray) -> None:
         names = (b"fakev4l2", b"Fake camera", b"platform:fake")
         struct.pack_into("<16s32s32sIII", a, 0, *names, 0x060100, _CAPABILITIES | 0x80000000, _CAPABILITIES)
-
-    def _enumerate_inputs(self, a: bytearray) -> None:
-        if struct.unpack_from("<I", a)[0]:
-            raise DriverError(errno.EINVAL)
-        struct.pack_into("<32sI", a, 4, b"Camera 1", 2)
-
-    def _get_input(self, a: bytearray) -> None:
-        struct.pack_into("<i", a, 0, 0)
-
-    def _set_input(self, a: bytearray) -> None:
-        if struct.unpack_from("<i", a)[0]:
-            raise DriverError(errno.EINVAL)
 
     def _limits(self, a: bytearray) -> tuple[int, int, bytes, int, int]:
         (control,) = struct.unpack_from("<I", a)
@@ -278,9 +259,6 @@ class FakeCamera:
 
     def _stream_on(self, a: bytearray) -> None:
         self.sequence, self.started_s = -1, time.monotonic()
-
-    def _stream_off(self, a: bytearray) -> None:
-        self.queue = []
 
     def _picture(self, sequence: int) -> bytes:
         """Frame `sequence` in the current pixel format."""

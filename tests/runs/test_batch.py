@@ -30,20 +30,14 @@ def lines(decoded: object) -> list[str]:
     return [to_json_line(result) for _, results in decoded for result in results]
 
 
-def test_folders_are_walked_in_order_and_unknown_suffixes_are_passed_over(tmp_path: Path) -> None:
+def test_folders_are_walked_in_order_and_files_taken_once(tmp_path: Path) -> None:
+    """Unknown suffixes are passed over in folders; a file named explicitly is taken whatever its suffix."""
     for name in ("b.jpg", "a.MP4", "notes.txt", "sub/c.jpg", ".hidden.jpg", ".git/d.jpg", "a.truth.json"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    found = [os.path.relpath(source.name, tmp_path) for source in collect_sources([str(tmp_path)], SUFFIXES)]
-    assert found == ["a.MP4", "b.jpg", "sub/c.jpg"]
-
-
-def test_a_file_named_explicitly_is_taken_whatever_its_suffix_and_only_once(tmp_path: Path) -> None:
-    odd, plain = tmp_path / "odd.txt", tmp_path / "a.jpg"
-    odd.touch()
-    plain.touch()
-    sources = collect_sources([str(odd), str(plain), str(tmp_path), str(tmp_path / "missing")], SUFFIXES)
-    assert [source.name for source in sources] == [str(odd), str(plain), str(tmp_path / "missing")]
+    paths = [str(tmp_path / name) for name in ("notes.txt", "b.jpg", ".", "missing")]
+    found = [os.path.relpath(source.name, tmp_path) for source in collect_sources(paths, SUFFIXES)]
+    assert found == ["notes.txt", "b.jpg", "a.MP4", "sub/c.jpg", "missing"]
 
 
 def test_a_folder_without_pictures_is_a_reason_not_silence(tmp_path: Path) -> None:
@@ -56,28 +50,23 @@ def test_a_folder_without_pictures_is_a_reason_not_silence(tmp_path: Path) -> No
     assert "no picture" in result.message
 
 
-def test_a_clip_that_breaks_off_gives_everything_before_the_break(tmp_path: Path) -> None:
-    results = list(fake_decoder().results(write_order(tmp_path, "a.mp4", frames=5, fail_at=3)))
-    assert [result.status for result in results] == ["ok", "ok", "ok", "unreadable"]
-    assert results[-1].frame == 3
-    assert "breaks off in frame 3" in str(results[-1].message)
-
-
-def test_a_bug_costs_one_source_and_says_what_to_do(tmp_path: Path) -> None:
-    sources = [write_order(tmp_path, "a.jpg", bug_at=0), write_order(tmp_path, "b.jpg")]
-    results = [result for _, found in decode_here(sources, fake_decoder()) for result in found]
-    assert [result.status for result in results] == ["unreadable", "ok"]
-    assert "internal error (ZeroDivisionError: a bug); run again with --verbose" in str(results[0].message)
-
-
-def test_an_empty_clip_is_unreadable(tmp_path: Path) -> None:
-    [result] = fake_decoder().results(write_order(tmp_path, "a.mp4", frames=0))
-    assert result.status == "unreadable"
-
-
-def test_wrong_options_end_the_run(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="make no sense"):
-        list(fake_decoder("wrong").results(write_order(tmp_path, "a.jpg")))
+@pytest.mark.parametrize(
+    ("order", "statuses", "reason"),
+    [
+        ({"frames": 5, "fail_at": 3}, ["ok", "ok", "ok", "unreadable"], "breaks off in frame 3"),
+        ({"bug_at": 0}, ["unreadable"], "internal error (ZeroDivisionError: a bug); run again with --verbose"),
+        ({"frames": 0}, ["unreadable"], "holds no picture"),
+    ],
+)
+def test_a_source_gives_everything_before_its_fault(
+    tmp_path: Path, order: dict[str, int], statuses: list[str], reason: str
+) -> None:
+    sources = [write_order(tmp_path, "a.mp4", **order), write_order(tmp_path, "b.jpg")]
+    *results, good = [result for _, found in decode_here(sources, fake_decoder()) for result in found]
+    assert [result.status for result in results] == statuses
+    assert results[-1].frame == len(statuses) - 1
+    assert reason in str(results[-1].message)
+    assert good.status == "ok"
 
 
 def mixed(folder: Path) -> list[Source]:
@@ -119,10 +108,14 @@ def test_a_source_that_ends_two_workers_costs_itself_only(tmp_path: Path) -> Non
     assert others == lines(decode_here([source for source in sources if source != deadly], fake_decoder()))
 
 
-def test_wrong_options_end_a_run_of_worker_processes_too(tmp_path: Path) -> None:
+def test_wrong_options_end_a_run(tmp_path: Path) -> None:
     sources = mixed(tmp_path)
-    with pytest.raises(UsageError, match="make no sense"):
-        lines(decode_in_processes(sources, fake_decoder("wrong"), 2))
+    for decoded in (
+        decode_here(sources, fake_decoder("wrong")),
+        decode_in_processes(sources, fake_decoder("wrong"), 2),
+    ):
+        with pytest.raises(UsageError, match="make no sense"):
+            lines(decoded)
 
 
 def results_of(names: str) -> list[FrameResult]:
@@ -154,9 +147,8 @@ def test_recover_drops_a_half_line_and_the_source_it_belongs_to(tmp_path: Path, 
     path.write_bytes(whole[: len(whole) - cut])
     n_kept = 3 if cut else 6
     journal = Journal(path, resume=True)
-    assert [(name, len(found)) for name, found in journal.recover()] == [("a", 2), ("b", 1), ("c", 3)][
-        : n_kept // 3 + 1
-    ]
+    whole_sources = [("a", 2), ("b", 1), ("c", 3)][: n_kept // 3 + 1]
+    assert [(name, len(found)) for name, found in journal.recover()] == whole_sources
     journal.close()
     assert path.read_bytes() == b"".join(whole.splitlines(True)[:n_kept])
 
