@@ -160,8 +160,8 @@ def test_protocol_is_pure() -> None:
 
 @pytest.mark.parametrize("name", sorted(MODULES))
 def test_heavy_libraries_are_imported_where_they_are_used(name: str) -> None:
-    if name in below("lab.training"):
-        pytest.skip("training is loaded by `vlc-rx train` alone")
+    if name in below("lab", "calibrate"):
+        pytest.skip("the laboratory and calibration are loaded by their own commands alone")
     found = {other.split(".")[0] for other in imports_at_load(MODULES[name])} & HEAVY
     # Loaded when a file of their kind comes, or when a page is served.
     readers = {"rxcli.ingest.jpeg", "rxcli.ingest.raw", "rxcli.ingest.video", "rxcli.web.server"}

@@ -59,9 +59,8 @@ def estimate_exposure(
     linear_fit = fit_periodic(encoded, fit.frequency, fit.first_row)
     linear = _from_wave(linear_fit, encoded, line_delay_s, exif_exposure_s) if linear_fit else found
     low, high = zip(found.interval_s, linear.interval_s or found.interval_s, strict=True)
-    return replace(
-        found, interval_s=(min(low), max(high)), comment=f"{found.comment}; the picture's tone curve is not known"
-    )
+    comment = f"{found.comment}; the picture's tone curve is not known"
+    return replace(found, interval_s=(min(low), max(high)), comment=comment)
 
 
 def _from_wave(
@@ -95,10 +94,10 @@ def _from_wave(
         nearest = min(parts, key=lambda p: abs(np.log(p[0] * period_s / exif_exposure_s)))
         agrees = abs(np.log(nearest[0] * period_s / exif_exposure_s)) <= np.log(_EXIF_RATIO)
         part, sd = nearest if agrees else (edge, edge_sd)
-        agreement = (
-            "agrees with the file's {:.4g} s" if agrees else "the file states {:.4g} s, which the edges contradict"
+        stated = f"{exif_exposure_s:.4g} s"
+        comment = (
+            f"agrees with the file's {stated}" if agrees else f"the file states {stated}, which the edges contradict"
         )
-        comment = agreement.format(exif_exposure_s)
     interval = max(part - Z95 * sd, 0.0) * period_s, (part + Z95 * sd) * period_s
     return ExposureEstimate(part * period_s, interval, comment)
 

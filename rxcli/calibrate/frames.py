@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,8 +17,6 @@ def light_of(frame: Frame) -> Float32Array:
     Of a mosaic the green pixels of each row stand for the whole row: rows are not mixed, and a coloured lamp makes no
     pattern. A developed picture is taken to have the sRGB tone curve.
     """
-    import cv2
-
     pixels = frame.pixels.astype(np.float32)
     if frame.mosaic is not None:
         black, white = frame.mosaic.black[_GREEN], frame.mosaic.white
@@ -40,8 +39,6 @@ def _colours(mosaic: Mosaic, height: int, width: int) -> NDArray[np.uint8]:
 
 def gray_of(frame: Frame) -> NDArray[np.uint8]:
     """(height, width) grey picture for a corner detector, never rotated."""
-    import cv2
-
     if frame.mosaic is None:
         if frame.pixels.dtype == np.uint8:
             return frame.pixels.astype(np.uint8, copy=False)

@@ -130,11 +130,8 @@ def _readout(raw: dict[str, Any]) -> tuple[float | None, bool, tuple[str, ...]]:
     """Readout in the profile, seconds, whether it runs upwards, and warnings."""
     if raw.get("global_shutter") is True:
         return None, False, ("the profile states a global shutter, which produces no stripes",)
-    stated, direction, rate = (
-        raw.get("frame_readout_time"),
-        raw.get("frame_readout_direction"),
-        _positive(raw.get("fps")),
-    )
+    stated, direction = raw.get("frame_readout_time"), raw.get("frame_readout_direction")
+    rate = _positive(raw.get("fps"))
     value = _positive(abs(stated)) if isinstance(stated, (int, float)) and not isinstance(stated, bool) else None
     if value is None or stated is None:
         return None, False, ("the profile states no readout",)

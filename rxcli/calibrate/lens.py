@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,15 +39,11 @@ class Board:
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3:
-            raise UsageError(
-                f"a board needs at least 3 x 3 inner corners (got {self.columns}x{self.rows})",
-                "count the corners where four squares meet",
-            )
+            reason = f"a board needs at least 3 x 3 inner corners (got {self.columns}x{self.rows})"
+            raise UsageError(reason, "count the corners where four squares meet")
         if self.square_mm <= 0 or not 0 < self.marker_ratio < 1:
-            raise UsageError(
-                f"square {self.square_mm:g} mm must be positive and marker ratio {self.marker_ratio:g} in 0..1",
-                "measure a square and a marker",
-            )
+            reason = f"square {self.square_mm:g} mm must be positive and marker ratio {self.marker_ratio:g} in 0..1"
+            raise UsageError(reason, "measure a square and a marker")
 
     def points(self) -> Float32Array:
         """(columns * rows, 3) corners on the board, millimetres, row by row."""
@@ -149,8 +146,6 @@ def _same_view(a: Sighting, b: Sighting, width: int) -> bool:
 
 def _find_chessboard(image: GrayImage, board: Board) -> tuple[Float32Array, Float32Array] | None:
     """Corners by OpenCV's quadrangles or, failing that, sectors; refined at the gradient's saddle at full size."""
-    import cv2
-
     shrink = max(image.shape) // _DETECTION_SIDE + 1
     height, width = (side // shrink for side in image.shape)
     small = cv2.resize(image[: height * shrink, : width * shrink], (width, height), interpolation=cv2.INTER_AREA)
@@ -172,8 +167,6 @@ def _find_chessboard(image: GrayImage, board: Board) -> tuple[Float32Array, Floa
 
 
 def _find_charuco(image: GrayImage, board: Board) -> tuple[Float32Array, Float32Array] | None:
-    import cv2
-
     name = str(board.dictionary)
     if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
         raise UsageError(f"no marker dictionary {name!r}", "use a name such as DICT_5X5_100 or DICT_APRILTAG_36h11")
@@ -193,8 +186,6 @@ def _edge_width(image: GrayImage, corners: Float32Array, board: Board) -> tuple[
 
     The width is the contrast of black and white over the steepest slope.
     """
-    import cv2
-
     x0, y0 = np.maximum(np.floor(corners.min(axis=0)).astype(int), 0)
     x1, y1 = np.ceil(corners.max(axis=0)).astype(int) + 1
     patch = cv2.GaussianBlur(np.asarray(image[y0:y1, x0:x1], np.float32), (0, 0), 0.7)
@@ -236,16 +227,13 @@ def calibrate_lens(found: Iterable[Sighting | Rejected], width: int, height: int
 
 
 def _fit(boards: list[Sighting], rejected: list[Rejected], size: tuple[int, int]) -> LensCalibration:
-    import cv2
-
     points, corners = [s.points for s in boards], [s.corners for s in boards]
     try:
-        rms, matrix, distortion, rotations, translations, sd, _, view_rms = cv2.calibrateCameraExtended(
-            points, corners, size, np.eye(3), np.zeros(5)
-        )
+        solved = cv2.calibrateCameraExtended(points, corners, size, np.eye(3), np.zeros(5))
     except cv2.error as error:
         reason = f"the boards do not determine a lens ({str(error).strip().splitlines()[-1]})"
     else:
+        rms, matrix, distortion, rotations, translations, sd, _, view_rms = solved
         sound = np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) > 0 and np.abs(distortion).max() <= 100
         reason = "" if sound else "the fitted lens makes no sense (focal length or distortion out of bounds)"
     if reason:
@@ -255,10 +243,9 @@ def _fit(boards: list[Sighting], rejected: list[Rejected], size: tuple[int, int]
     projected = [cv2.projectPoints(p, r, t, matrix, distortion)[0].reshape(-1, 2) for p, r, t in poses]
     measured = np.vstack(corners).astype(np.float64)
     rows: Any = tuple(tuple(row) for row in matrix.tolist())
+    coefficients: Any = tuple(distortion.ravel()[:5].tolist())
     return LensCalibration(
-        model=LensModel(
-            width=size[0], height=size[1], camera_matrix=rows, dist_coeffs=tuple(distortion.ravel()[:5].tolist())
-        ),
+        model=LensModel(width=size[0], height=size[1], camera_matrix=rows, dist_coeffs=coefficients),
         rms_px=float(rms),
         accepted=dict(zip((s.name for s in boards), view_rms.ravel().tolist(), strict=True)),
         rejected=tuple(rejected),

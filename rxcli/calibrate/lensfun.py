@@ -49,14 +49,12 @@ def lens_from_database(metadata: Metadata, width: int, height: int) -> LensfunMo
     try:
         import lensfunpy
     except ImportError:
-        raise UsageError(
-            "the lensfun database needs the package lensfunpy", "install it with: pip install '.[lensfun]'"
-        ) from None
+        reason = "the lensfun database needs the package lensfunpy"
+        raise UsageError(reason, "install it with: pip install '.[lensfun]'") from None
     focal_mm = metadata.focal_length_mm
     if not metadata.model or not focal_mm:
-        raise UsageError(
-            "the file states no camera model or no focal length", "give --camera-model, --lens and --focal-length"
-        )
+        reason = "the file states no camera model or no focal length"
+        raise UsageError(reason, "give --camera-model, --lens and --focal-length")
     database = lensfunpy.Database()
     camera = _find_camera(database, metadata)
     lens = _find_lens(database, camera, metadata, lensfunpy.LensType.RECTILINEAR)
@@ -87,7 +85,6 @@ def _find_lens(database: Any, camera: Any, metadata: Metadata, rectilinear: Any)
     found = [lens for lens in database.find_lenses(camera, None, metadata.lens) if lens.type == rectilinear]
     if not found or (not metadata.lens and len(found) > 1):
         name = repr(metadata.lens) if metadata.lens else "(the file names none)"
-        raise ProfileError(
-            f"lensfun does not know the lens {name} on {camera.model}", "name it with --lens, or use `calibrate lens`"
-        )
+        reason = f"lensfun does not know the lens {name} on {camera.model}"
+        raise ProfileError(reason, "name it with --lens, or use `calibrate lens`")
     return found[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from rxcli.calibrate.lens import LensCalibration, covered_parts
@@ -20,8 +21,6 @@ def write_residuals(calibration: LensCalibration, path: Path) -> None:
     Raises:
         InputError: the picture cannot be written.
     """
-    import cv2
-
     model, corners = calibration.model, calibration.corners
     zoom = _WIDTH_PX / model.width
     height = round(model.height * zoom)

@@ -22,9 +22,8 @@ def profile_to_extend(path: Path, metadata: Metadata | None = None) -> CameraPro
     if path.exists():
         return load_profile(str(path), CameraProfile)
     if not NAME.fullmatch(path.stem):
-        raise UsageError(
-            f"{path}: {path.stem!r} cannot name a profile", "use letters, digits, dots, dashes and underscores"
-        )
+        reason = f"{path}: {path.stem!r} cannot name a profile"
+        raise UsageError(reason, "use letters, digits, dots, dashes and underscores")
     metadata = metadata or Metadata()
     models = (metadata.model.strip(),) if metadata.model else ()
     return CameraProfile(format=1, kind="camera", name=path.stem, make=(metadata.make or "").strip(), models=models)
@@ -43,15 +42,10 @@ def with_mode(profile: CameraProfile, mode: ReadoutMode) -> CameraProfile:
 
     What the old mode knows and the new one does not (exposure, frame rate) is kept.
     """
-    same = [
-        old for old in profile.modes if old.name == mode.name or (old.width, old.height) == (mode.width, mode.height)
-    ]
+    same = [o for o in profile.modes if o.name == mode.name or (o.width, o.height) == (mode.width, mode.height)]
     for old in same:
-        mode = msgspec.structs.replace(
-            mode,
-            exposure_s=mode.exposure_s if mode.exposure_s is not None else old.exposure_s,
-            frame_rate_hz=mode.frame_rate_hz if mode.frame_rate_hz is not None else old.frame_rate_hz,
-        )
+        known = {name: getattr(old, name) for name in ("exposure_s", "frame_rate_hz") if getattr(mode, name) is None}
+        mode = msgspec.structs.replace(mode, **known)
     return msgspec.structs.replace(profile, modes=(*(old for old in profile.modes if old not in same), mode))
 
 

@@ -16,17 +16,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.calibrate import periodic
 from rxcli.calibrate.exposure import ExposureEstimate, estimate_exposure
 from rxcli.calibrate.fitting import Z95, weighted_mean
-from rxcli.calibrate.periodic import (
-    FEW_PERIODS,
-    PeriodicFit,
-    explained_share,
-    fit_fundamental,
-    longest_block,
-    scatter_sd,
-    search,
-)
+from rxcli.calibrate.periodic import FEW_PERIODS, PeriodicFit, fit_fundamental
 from rxcli.calibrate.spots import find_spots
 from rxcli.errors import ReceiverError, UsageError
 from rxcli.types import BoolArray, FloatArray
@@ -129,9 +122,8 @@ def find_stripes(picture: Picture, axis: Axis | None = None, window: Box | None 
         The axis and one region a lamp, clearest first; none where there are no stripes.
     """
     left, top, right, bottom = window = window or (0, 0, picture.shape[1], picture.shape[0])
-    spots = [
-        (x0 + left, y0 + top, x1 + left, y1 + top) for x0, y0, x1, y1 in find_spots(picture[top:bottom, left:right])
-    ]
+    boxes = find_spots(picture[top:bottom, left:right])
+    spots = [(x0 + left, y0 + top, x1 + left, y1 + top) for x0, y0, x1, y1 in boxes]
     by_axis: dict[Axis, list[Stripes]] = {}
     for along in (axis,) if axis else ("rows", "columns"):
         found = by_axis[along] = _find_in(picture, window, along)
@@ -188,7 +180,7 @@ def _clearest_lamp(strips: FloatArray, free: BoolArray) -> tuple[BoolArray, Peri
     for _ in range(2):
         blocks, shares = _follow(strips, free, fit)
         members = shares >= max(0.3, 0.75 * float(np.quantile(shares, 0.95)))
-        b0, b1 = longest_block(members)
+        b0, b1 = periodic.longest_block(members)
         if b1 == b0:
             return None
         chosen = np.asarray(members[:, b0:b1].all(axis=1), np.bool_)
@@ -201,7 +193,7 @@ def _clearest_lamp(strips: FloatArray, free: BoolArray) -> tuple[BoolArray, Peri
         area = float(np.mean(chosen)) * fit.mean.size / strips.shape[1]
         if upside_down or area < float(np.interp(fit.periods, *_MIN_AREA)):
             return None
-    sd = max(fit.frequency_sd, scatter_sd(fit.influence, strips[chosen, rows]))
+    sd = max(fit.frequency_sd, periodic.scatter_sd(fit.influence, strips[chosen, rows]))
     taken = np.repeat(shares > 0.15, np.diff(blocks), axis=1)
     taken[chosen, rows] = True
     return chosen, replace(fit, frequency_sd=sd), taken
@@ -218,7 +210,7 @@ def _seed(strips: FloatArray, free: BoolArray) -> PeriodicFit | None:
         for start in range(0, n - length + 1, max(length // 2, 1)) if length >= _MIN_SIDE else ():
             rows = slice(start, start + length)
             groups = _groups(strips[:, rows], np.asarray(free[:, rows].all(axis=1)))
-            for few, (frequencies, scores) in enumerate(search(groups) if len(groups) else ()):
+            for few, (frequencies, scores) in enumerate(periodic.search(groups) if len(groups) else ()):
                 at = int(np.argmax(scores))
                 # Among equally clear windows the longer one determines the frequency better.
                 worth = float(scores[at] * np.log(length))
@@ -256,7 +248,7 @@ def _follow(strips: FloatArray, free: BoolArray, fit: PeriodicFit) -> tuple[np.n
     template = fit.waveform(np.arange(n, dtype=np.float64))
     shares = np.zeros((len(strips), blocks.size - 1))
     for block, (start, stop) in enumerate(pairwise(blocks.tolist())):
-        share = explained_share(strips[:, start:stop], template[start:stop])
+        share = periodic.explained_share(strips[:, start:stop], template[start:stop])
         shares[:, block] = np.where(free[:, start:stop].all(axis=1), share, 0)
     return blocks, shares
 
@@ -289,10 +281,8 @@ def calibrate_shutter(
         x, y, *size = window
         box = x, y, min(x + size[0], width), min(y + size[1], height)
         if min(box[2] - x, box[3] - y) < _MIN_SIDE:
-            raise UsageError(
-                f"region {x},{y},{size[0]},{size[1]} lies outside the picture of {width}x{height}",
-                "give it in stored pixels",
-            )
+            reason = f"region {x},{y},{size[0]},{size[1]} lies outside the picture of {width}x{height}"
+            raise UsageError(reason, "give it in stored pixels")
     by_picture = [find_stripes(picture, axis, box) for picture in pictures]
     axes: tuple[Axis, Axis] = ("rows", "columns")
     along = max(axes, key=lambda a: sum(_evidence(found) for of, found in by_picture if of == a))
@@ -307,20 +297,12 @@ def calibrate_shutter(
     reference = _common_line_delay(regions, frequencies_hz)
     lamps = [replace(s, frequency_hz=_match(s, frequencies_hz, reference)) for s in regions]
     used = [(lamp, lamp.frequency_hz) for lamp in lamps if lamp.frequency_hz]
-    value, sd = weighted_mean(
-        [lamp.fit.frequency / hz for lamp, hz in used], [lamp.fit.frequency_sd / hz for lamp, hz in used]
-    )
+    delays = [(lamp.fit.frequency / hz, lamp.fit.frequency_sd / hz) for lamp, hz in used]
+    value, sd = weighted_mean(*zip(*delays, strict=True))
     clearest = max((lamp for lamp, _ in used), key=lambda lamp: lamp.fit.explained * np.sqrt(lamp.area_px))
-    return ShutterCalibration(
-        along,
-        pictures[0].shape,
-        value,
-        sd,
-        max(lamp.fit.periods for lamp, _ in used),
-        estimate_exposure(clearest.fit, clearest.profile, value, exif_exposure_s, tone_known),
-        lamps=tuple(lamps),
-        warnings=tuple(_warnings(lamps, frequencies_hz, value)),
-    )
+    exposure = estimate_exposure(clearest.fit, clearest.profile, value, exif_exposure_s, tone_known)
+    notes, periods = _warnings(lamps, frequencies_hz, value), max(lamp.fit.periods for lamp, _ in used)
+    return ShutterCalibration(along, pictures[0].shape, value, sd, periods, exposure, tuple(lamps), tuple(notes))
 
 
 def _common_line_delay(regions: list[Stripes], frequencies_hz: Sequence[float]) -> float:
@@ -351,10 +333,10 @@ def _common_line_delay(regions: list[Stripes], frequencies_hz: Sequence[float]) 
 
 def _match(stripes: Stripes, frequencies_hz: Sequence[float], line_delay_s: float) -> float | None:
     """The given frequency that explains a region under a line delay."""
-    seen_hz = 1 / (stripes.period_px * line_delay_s)
-    nearest = min(frequencies_hz, key=lambda hz: abs(np.log(hz / seen_hz)))
+    observed_hz = 1 / (stripes.period_px * line_delay_s)
+    nearest = min(frequencies_hz, key=lambda hz: abs(np.log(hz / observed_hz)))
     tolerance = max(4 * stripes.period_sd_px / stripes.period_px, 3e-3)
-    return nearest if abs(nearest / seen_hz - 1) <= tolerance else None
+    return nearest if abs(nearest / observed_hz - 1) <= tolerance else None
 
 
 def _warnings(lamps: list[Stripes], frequencies_hz: Sequence[float], line_delay_s: float) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,8 +27,6 @@ def find_spots(picture: NDArray[np.float32] | NDArray[np.float64]) -> list[tuple
     Returns:
         Left, top, right, bottom of each, pixels, right and bottom outside; none where the picture is not dark.
     """
-    import cv2
-
     height, width = picture.shape
     cell = max(max(picture.shape) // _CELLS, _MIN_CELL_PX)
     shape = max(width // cell, 1), max(height // cell, 1)

@@ -17,10 +17,10 @@ from click.testing import CliRunner
 
 from rxcli.cli.benchmark import benchmark
 from rxcli.errors import InputError, ReceiverError, UsageError
-from rxcli.lab.benchmark import cases, compare, measures, quick, tables
+from rxcli.lab.benchmark import cases, compare, measures, quick, runner, tables
 from rxcli.lab.benchmark.cases import Case, received
 from rxcli.lab.benchmark.draw import Place, binned, draw_nodata, draw_small
-from rxcli.lab.benchmark.measures import Group, cluster_interval, logistic_regression, wilson
+from rxcli.lab.benchmark.measures import Group, cluster_interval, wilson
 from rxcli.lab.benchmark.media import bare_decode, write_known
 from rxcli.lab.benchmark.runner import Run, Task, do, load_journal, scenarios
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
@@ -101,13 +101,10 @@ def test_what_a_reception_raises_warns_or_says_wrongly_is_a_problem(
     assert received(case_of(easy), "mute")["problems"] == ["result.time_s holds NaN", "neither columns nor message"]
 
 
-def test_right_packets_under_wrong_numbers_are_shifted(easy: Trial) -> None:
+def test_numbers_of_columns_and_corners_are_compared(easy: Trial) -> None:
     result, _ = easy.receive(easy.options())
     moved = replace(result, columns=tuple(replace(c, column=c.column + 2) for c in result.columns))
     assert (cases.column_shift(result, easy.truth), cases.column_shift(moved, easy.truth)) == (0, 2)
-
-
-def test_an_error_is_the_farthest_corner_in_any_order() -> None:
     truth = np.array([[0.0, 0], [100, 0], [100, 60], [0, 60]])
     found = np.roll(truth + np.array([[0, 0], [0, 3], [0, 0], [0, 1]]), 2, axis=0)
     assert cases.corner_error(found, truth) == pytest.approx(0.03)
@@ -168,12 +165,8 @@ def test_workers_end_with_the_processes_that_they_started(tmp_path: Path) -> Non
 
 def test_a_picture_without_data_that_gave_packets_does_not_pass(tmp_path: Path) -> None:
     (case,) = draw_nodata(Place(2, 1, {}, tmp_path))
-    record = {
-        "groups": ["noise"],
-        "about": case.about,
-        "has_data": False,
-        "ways": {"receiver": received(case, "receiver")},
-    }
+    ways = {"receiver": received(case, "receiver")}
+    record = {"groups": ["noise"], "about": case.about, "has_data": False, "ways": ways}
     assert measures.passes([record], ["receiver"])
     assert measures.worth_a_look([record], ["receiver"]) == []
     packet = {"confidence": 0.4, "bit_errors": 35, "frame": 0, "column": 2, "payload": "ab"}
@@ -209,40 +202,32 @@ def _record(group: str = "", packets: tuple[tuple[float, int], ...] = (), **chan
 
 def test_groups_ways_and_packets_are_counted() -> None:
     records = [
-        _record("a", ((0.95, 0), (0.999, 3), (0.5, 1)), shift=1, numbered=True),
+        _record("a", ((0.95, 0), (0.999, 3), (0.5, 1)), shift=1, numbered=True, rows_per_slot=(4.0015, 0.001)),
         _record("b", status="no_screen", shift=2, numbered=False),
     ]
     columns = ["n", "right", "share", "ber", "packets_0.9", "sure", "surely_wrong", "changed", "not_found", "of_shown"]
-    table = measures.rows(records, ["receiver", "bound"], [*columns, "numbered_wrong", "target"], "bound")
+    columns += ["numbered_wrong", "target", "rows_within", "rows_none", "rows_wild", "in_1_sd", "in_2_sd"]
+    table = measures.rows(records, ["receiver", "bound"], columns, "bound")
     assert [(row["scenes"], row["way"]) for row in table[::2]] == [(n, "receiver") for n in ("a", "b", "all")]
     whole, bound = table[-2:]
     assert (whole["n"], whole["right"], whole["share"]) == (2, 16, 0.8)
     assert whole["ber"] == pytest.approx((5 + 77 / 2) / 770)
+    low, high = measures.MEASURES["ber95"](Group(records, "receiver", "receiver"))
+    assert low < whole["ber"] < high
     assert (whole["packets_0.9"], whole["sure"], whole["surely_wrong"], bound["changed"]) == (2, 1, 1, 3)
     assert (whole["not_found"], whole["of_shown"], whole["numbered_wrong"]) == (1, 2, 1)
+    assert [whole[name] for name in ("rows_within", "rows_none", "rows_wild", "in_1_sd", "in_2_sd")] == [1, 1, 0, 0, 1]
     assert "target" not in whole
 
 
-def test_estimates_of_rows_are_counted() -> None:
-    estimates = [(4.0, 0.001), (4.0015, 0.001), (4.1, 0.001), None]
-    group = Group([_record(rows_per_slot=estimate) for estimate in estimates], "receiver", "receiver")
-    names = ("rows_within", "rows_none", "rows_wild", "in_1_sd", "in_2_sd")
-    assert [measures.MEASURES[name](group) for name in names] == [2, 1, 1, 0.5, 1.0]
-
-
 def test_stages_are_columns_as_ratios_to_the_bare_decode() -> None:
-    slow, quick_one = (
+    records = [
         _record(wall_s=wall, stages_ms={"detect": 1e3 * wall, "total": 2e3 * wall})
         | {"bare_wall_s": 0.5, "n_frames": 1}
         for wall in (3.0, 2.0)
-    )
-    row = measures.rows([slow, quick_one], ["receiver"], ["total_ms", "stages"])[-1]
+    ]
+    row = measures.rows(records, ["receiver"], ["total_ms", "stages"])[-1]
     assert row == {"scenes": "all", "way": "receiver", "total_ms": 2000.0, "detect": 4.0}
-
-
-def test_intervals_of_error_rates_hold_the_rate() -> None:
-    low, high = measures.MEASURES["ber95"](Group([_record(), _record()], "receiver", "receiver"))
-    assert low < (5 + 77 / 2) / 770 < high
 
 
 def test_bins_show_calibration() -> None:
@@ -265,7 +250,6 @@ def test_weights_of_features_are_found_again() -> None:
     terms = np.concatenate([np.ones((8000, 1)), rng.normal(size=(8000, 2))], axis=1)
     weights = np.array([0.5, 1.5, -0.8])
     right = rng.random(8000) < 1 / (1 + np.exp(-terms @ weights))
-    assert logistic_regression(terms, right) == pytest.approx(weights, abs=0.1)
     packets = [{"evidence": t, "bit_errors": int(not r)} for t, r in zip(terms.tolist(), right, strict=True)]
     assert measures.fitted_weights([*packets, {"evidence": [1.0, 2.0], "bit_errors": 0}]) == {
         3: pytest.approx(weights, abs=0.1)
@@ -281,26 +265,21 @@ def test_wilson_agrees_with_published_values() -> None:
 
 
 def test_clusters_widen_the_interval() -> None:
-    apart = cluster_interval([5.0] * 8 + [6.0] * 8, [100.0] * 16, units=16)
-    together = cluster_interval([0.0] * 14 + [44.0] * 2, [100.0] * 16, units=16)
-    assert apart == pytest.approx(wilson(88, 1600))
-    assert together[1] - together[0] > 3 * (apart[1] - apart[0])
+    equal = cluster_interval([5.0] * 8 + [6.0] * 8, [100.0] * 16, units=16)
+    clustered = cluster_interval([0.0] * 14 + [44.0] * 2, [100.0] * 16, units=16)
+    assert equal == pytest.approx(wilson(88, 1600))
+    assert clustered[1] - clustered[0] > 3 * (equal[1] - equal[0])
     assert cluster_interval([0.0, 0.0], [1000.0, 1000.0], units=20) == wilson(0, 20)
     assert cluster_interval([], [], units=0) == (0.0, 1.0)
 
 
-def test_tables_align_and_survive_csv(tmp_path: Path) -> None:
+def test_tables_align_survive_csv_and_are_plotted(tmp_path: Path) -> None:
     rows = [{"name": "a", "rate": 0.00012345, "range": (0.0, 0.5)}, {"name": "bcd", "rate": None, "range": (0.25, 1.0)}]
     lines = tables.as_text(rows).splitlines()
     assert [line.split() for line in lines[1:]] == [["a", "0.000123", "0..0.5"], ["bcd", "-", "0.25..1"]]
     table = tables.to_csv(rows).splitlines()
     assert table == ["name,rate,range_low,range_high", "a,0.00012345,0.0,0.5", "bcd,,0.25,1.0"]
-    _, as_json = tables.write_outputs(tmp_path, "x", rows, {"more": 1})
-    assert json.loads(as_json.read_text())["details"] == {"more": 1}
     assert tables.as_text([]) == "(nothing to show)"
-
-
-def test_error_rates_are_plotted(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     rows = [{"scenes": s, "way": w, "ber": 0.01, "ber95": (0.0, 0.1)} for s in "ab" for w in ("receiver", "bound")]
     tables.plot(rows, tmp_path / "ber.png", "ber", "ber95")
@@ -371,17 +350,6 @@ def test_the_first_difference_is_named(before: list[Any], now: list[Any], differ
     assert next(compare.differences("", before, now), None) == difference
 
 
-def test_rows_of_two_checkouts_add_up() -> None:
-    packets = [{"confidence": c, "bit_errors": e, "frame": 0, "column": e, "payload": ""} for c, e in ((1, 0), (1, 2))]
-    before, now = {"packets": packets, "cpu_s": 2.0}, {"packets": packets[1:], "cpu_s": 1.0, "difference": "a: 1 -> 2"}
-    ways = dict(zip(compare.WAYS, (before, now), strict=True))
-    record = {"about": {"file": "b/a.jpg"}, "has_data": True, "groups": [], "ways": ways}
-    other, this = measures.rows([record], compare.WAYS, compare.COLUMNS)
-    assert (other["right_packets"], this["right_packets"], this["surely_wrong"], this["changed"]) == (1, 0, 1, 1)
-    assert (this["same"], this["cpu_ratio"]) == (0, 0.5)
-    assert compare.differing([record]) == [{"file": "a.jpg", "first difference": "a: 1 -> 2"}]
-
-
 def test_a_checkout_that_breaks_off_is_told(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no checkout of this project"):
         compare.check_checkout(tmp_path)
@@ -396,7 +364,7 @@ def test_a_checkout_that_breaks_off_is_told(tmp_path: Path) -> None:
 
 def test_a_changed_receiver_is_found_out(tmp_path: Path) -> None:
     """A copy of this checkout that rounds confidences differently, on one random scene."""
-    here, other = compare.this_checkout(), tmp_path / "other"
+    here, other = runner.CHECKOUT, tmp_path / "other"
     for name in ("rxcli", "calibration", "models"):
         shutil.copytree(here / name, other / name, ignore=shutil.ignore_patterns("__pycache__"))
     arguments = ["compare", str(other), "confidence", "--count", "1", "--repeats", "1", "--seed", "9"]
@@ -410,3 +378,5 @@ def test_a_changed_receiver_is_found_out(tmp_path: Path) -> None:
     changed = CliRunner().invoke(benchmark, arguments, standalone_mode=False)
     assert changed.return_value == 1, changed.output
     assert "confidence: " in changed.output
+    before, after = json.loads((tmp_path / "out" / "compare.json").read_text())["rows"]
+    assert (after["n"], after["same"], after["packets"]) == (1, 0, before["packets"])

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli.lab.simulate.camera import column_light, render_band
+from rxcli.lab.simulate.camera import render_band
 from rxcli.lab.simulate.capture import prepare, simulate_frame
-from rxcli.lab.simulate.isp import Isp, correction_map, demosaic, develop, tone_curve
+from rxcli.lab.simulate.isp import Isp, correction_map, develop, tone_curve
 from rxcli.lab.simulate.optics import Lens, Pose, View, distort, undistort
-from rxcli.lab.simulate.scenes import Scene, preset, random_scene
+from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.lab.simulate.sensor import PATTERNS, Sensor, count_electrons, pick_colours, to_raw
 from rxcli.lab.simulate.shutter import flicker, lit_share, overlaps
 from rxcli.lab.simulate.transmitter import light_spread
@@ -25,11 +25,6 @@ COEFFICIENTS = [(-0.06, 0.02, 0.0005, -0.0003, 0.0), (0.07, -0.09, 0.0004, 0.000
 def small() -> Scene:
     """A quick scene: tall enough for whole packets, narrow."""
     return preset("xs10-still", "paper-34k6").scaled(0.08, 0.25)
-
-
-def view_of(scene: Scene) -> View:
-    sensor = scene.sensor
-    return View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect)
 
 
 @pytest.mark.parametrize("coefficients", COEFFICIENTS)
@@ -45,27 +40,23 @@ def test_distortion_is_opencvs_and_its_inverse_is_exact(coefficients: tuple[floa
     np.testing.assert_allclose(moved, theirs, atol=1e-12)
 
 
-@pytest.mark.parametrize("roll", [0.0, 3.0, 180.0])
-def test_places_go_to_the_sensor_and_back(roll: float) -> None:
-    screen = load_profile("paper-34k6", ScreenProfile)
-    view = View(screen, Lens(0.8, COEFFICIENTS[1]), Pose(0.8, roll, 8.0, -6.0, 0.02, -0.03), 4000, 3000)
+VIEWS = [Pose(0.8, roll, 8.0, -6.0, 0.02, -0.03) for roll in (0.0, 3.0, 180.0)]
+VIEWS += [Pose(corners=((211.0, 300.5), (3800.0, 280.0), (3700.0, 2600.0), (250.0, 2500.0)))]
+
+
+@pytest.mark.parametrize("pose", VIEWS)
+def test_places_go_to_the_sensor_and_back(pose: Pose) -> None:
+    view = View(load_profile("paper-34k6", ScreenProfile), Lens(0.8, COEFFICIENTS[1]), pose, 4000, 3000)
     places = np.random.default_rng(2).uniform(0, 1, (300, 2))
     np.testing.assert_allclose(view.pixels_to_screen(view.screen_to_pixels(places)), places, atol=1e-9)
+    np.testing.assert_allclose(view.corners, pose.corners or view.corners, atol=1e-6)
 
 
 def test_straight_view_has_the_size_that_was_asked() -> None:
     screen = load_profile("paper-34k6", ScreenProfile)
     view = View(screen, Lens(1.5), Pose(fill=0.9), 4000, 3000)
     np.testing.assert_allclose(view.corners[:, 0].min(), 1999.5 - 1800, atol=1e-6)
-    assert view.pixels_per_width == pytest.approx(3600)
-    assert view.pixels_per_height == pytest.approx(3600 / screen.aspect)
-
-
-def test_given_corners_are_met_through_the_lens() -> None:
-    screen = load_profile("paper-34k6", ScreenProfile)
-    corners = ((211.0, 300.5), (3800.0, 280.0), (3700.0, 2600.0), (250.0, 2500.0))
-    view = View(screen, Lens(0.8, COEFFICIENTS[1]), Pose(corners=corners), 4000, 3000)
-    np.testing.assert_allclose(view.corners, corners, atol=1e-6)
+    assert (view.pixels_per_width, view.pixels_per_height) == pytest.approx((3600, 3600 / screen.aspect))
 
 
 def brute_share(slots: NDArray[np.uint8], start: float, length: float) -> float:
@@ -80,19 +71,13 @@ def test_lit_share_is_the_integral_over_the_exposure(length: float) -> None:
     rng = np.random.default_rng(3)
     slots = rng.integers(0, 2, 40, dtype=np.uint8)
     starts = rng.uniform(-3, 41, 20)
-    expected = [brute_share(slots, s, length) for s in starts]
-    np.testing.assert_allclose(lit_share(slots, starts, length), expected, atol=3e-5)
-
-
-@pytest.mark.parametrize("length", [0.3, 1.0, 2.7])
-def test_overlaps_add_up_to_the_lit_share(length: float) -> None:
-    rng = np.random.default_rng(4)
-    slots = rng.integers(0, 2, 60, dtype=np.uint8)
-    starts = rng.uniform(0, 50, 100)
-    first, share = overlaps(starts, length)
-    np.testing.assert_allclose(share.sum(axis=1), 1.0)
-    lit = (share * slots[first[:, None] + np.arange(share.shape[1])]).sum(axis=1)
-    np.testing.assert_allclose(lit, lit_share(slots, starts, length), atol=1e-12)
+    shares = lit_share(slots, starts, length)
+    np.testing.assert_allclose(shares, [brute_share(slots, s, length) for s in starts], atol=3e-5)
+    inside = (starts >= 0) & (starts + length <= 35)
+    first, parts = overlaps(starts[inside], length)
+    np.testing.assert_allclose(parts.sum(axis=1), 1.0)
+    lit = (parts * slots[first[:, None] + np.arange(parts.shape[1])]).sum(axis=1)
+    np.testing.assert_allclose(lit, shares[inside], atol=1e-12)
 
 
 def test_flicker_is_averaged_over_the_exposure() -> None:
@@ -102,7 +87,7 @@ def test_flicker_is_averaged_over_the_exposure() -> None:
     np.testing.assert_allclose(flicker(starts, 4e-3, 100, 0.4, 0.3), expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("mean", [0.2, 3.0, 20.0, 60.0, 5000.0])
+@pytest.mark.parametrize("mean", [0.2, 20.0, 5000.0])
 def test_noise_has_the_variance_of_its_parts(mean: float) -> None:
     sensor = Sensor(read_noise_e=2.0, row_noise_e=0.5)
     n = 400_000
@@ -133,7 +118,8 @@ def test_mosaic_is_anchored_at_the_sensors_first_pixel(cfa: str) -> None:
 
 def test_rendered_light_is_the_model_written_out(small: Scene) -> None:
     """The banded, interpolated rendering against the plain sum over columns and segment rows, pixel by pixel."""
-    scene = replace(small, picture="white", vignetting=0.0, lens=Lens(3.0), pose=Pose(fill=0.9, roll_deg=0.4))
+    lens = Lens(0.7, (0.2, -0.1, 0, 0, 0))
+    scene = replace(small, picture="white", vignetting=0.0, lens=lens, pose=Pose(fill=0.9, roll_deg=0.4))
     exposure = prepare(scene, 1).exposure()
     band = render_band(exposure, 256, 512)
     y, x = np.mgrid[256:512:7, 0 : scene.sensor.width : 3]
@@ -148,18 +134,6 @@ def test_rendered_light_is_the_model_written_out(small: Scene) -> None:
     assert np.abs(error).max() < 0.01 * expected[inside].max()
 
 
-def test_a_row_is_an_instant_whatever_the_lens_does(small: Scene) -> None:
-    """Behind a flat picture, a row's light follows the lit shares of that row alone."""
-    scene = replace(small, picture="white", lens=Lens(0.7, (0.2, -0.1, 0, 0, 0)), blur_px=3.0, lcd_grid=0.0)
-    exposure = prepare(scene, 2).exposure()
-    band = render_band(exposure, 512, 768)
-    x = np.arange(scene.sensor.width, dtype=float)
-    light = column_light(exposure, x, np.arange(512.0, 768))
-    expected = np.einsum("rcx,rc->rx", light, exposure.lit[512:768])
-    middle = slice(scene.sensor.width // 4, -scene.sensor.width // 4)
-    np.testing.assert_allclose(band.backlight[:, middle], expected[:, middle], rtol=0.02, atol=0.05)
-
-
 def test_blur_keeps_the_pictures_light(small: Scene) -> None:
     sharp, soft = (
         prepare(replace(small, picture="checker", blur_px=blur), 1).exposure().texture.sum() for blur in (0.3, 2.5)
@@ -167,20 +141,16 @@ def test_blur_keeps_the_pictures_light(small: Scene) -> None:
     assert soft == pytest.approx(sharp, rel=1e-3)
 
 
-def test_same_seed_same_pixels_whatever_the_threads(small: Scene) -> None:
-    one, two = simulate_frame(small, 7, threads=1), simulate_frame(small, 7, threads=2)
-    np.testing.assert_array_equal(one.raw, two.raw)
-    assert one.truth == two.truth
-    assert one.jpeg == two.jpeg
-    assert (simulate_frame(small, 8).raw != one.raw).any()
-
-
-def test_frames_of_a_take_do_not_depend_on_their_order(small: Scene) -> None:
+def test_same_seed_same_pixels_whatever_threads_and_order(small: Scene) -> None:
     scene = replace(small, n_frames=3, hand_px=2.0)
-    forward = [prepare(scene, 3).frame(n).raw for n in (0, 2)]
-    again = prepare(scene, 3)
-    np.testing.assert_array_equal(again.frame(2).raw, forward[1])
-    np.testing.assert_array_equal(again.frame(0).raw, forward[0])
+    one, two = simulate_frame(scene, 7, threads=1), simulate_frame(scene, 7, threads=2)
+    np.testing.assert_array_equal(one.raw, two.raw)
+    assert (one.truth, one.jpeg) == (two.truth, two.jpeg)
+    assert (simulate_frame(scene, 8).raw != one.raw).any()
+    take = prepare(scene, 7)
+    last = take.frame(2).raw
+    np.testing.assert_array_equal(take.frame(0).raw, one.raw)
+    np.testing.assert_array_equal(prepare(scene, 7).frame(2).raw, last)
 
 
 def test_clock_error_and_frame_rate_move_the_start(small: Scene) -> None:
@@ -220,13 +190,6 @@ def test_development_gives_back_a_flat_picture(cfa: str) -> None:
     assert np.abs(rgb.astype(float) - expected).max() < 1.01
 
 
-def test_xtrans_demosaicing_keeps_a_smooth_picture() -> None:
-    sensor = Sensor(120, 120, full_scale_e=1000.0)
-    ramp = np.linspace(100, 800, 120, dtype=np.float32)[:, None, None] * np.ones((1, 120, 3), np.float32)
-    planes = demosaic(to_raw(pick_colours(ramp, sensor.pattern, 0), sensor), sensor)
-    np.testing.assert_allclose(planes[6:-6, 6:-6] * 1000, ramp[6:-6, 6:-6] * np.ones(3), atol=12)
-
-
 @pytest.mark.parametrize(
     ("tone", "light", "value"), [("srgb", 0.2, 0.48453), ("bt709", 0.2, 0.43368), ("linear", 0.2, 0.2)]
 )
@@ -245,13 +208,3 @@ def test_correction_in_the_camera_undoes_the_lens() -> None:
     ideal = view.pixels_to_ideal(places)
     matrix = view.camera_matrix
     np.testing.assert_allclose(ideal * matrix[[0, 1], [0, 1]] + matrix[:2, 2], [200, 100], atol=0.02)
-
-
-def test_random_scenes_render_without_a_complaint() -> None:
-    rng = np.random.default_rng(6)
-    for _ in range(6):
-        scene = random_scene(rng).scaled(0.05, 1.0)
-        scene = scene.scaled(1.0, 0.2)
-        pixels = simulate_frame(scene, rng).pixels
-        assert pixels.shape == (scene.sensor.height, scene.sensor.width)
-        assert pixels.std() > 0

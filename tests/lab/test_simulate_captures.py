@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from click.testing import CliRunner
 from rxcli.cli.simulate import simulate
 from rxcli.errors import ReceiverError, UsageError
 from rxcli.lab.simulate.capture import prepare, simulate_frame
-from rxcli.lab.simulate.files import pack_14bit, write_dng
+from rxcli.lab.simulate.files import write_dng
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset
 from rxcli.profiles import CameraProfile, load_profile
 from rxcli.protocol import codebook
@@ -57,10 +58,6 @@ def test_dng_opens_bit_exact(small: Scene, tmp_path: Path, cfa: str, bits: int) 
         np.testing.assert_allclose(file.camera_whitebalance[:3], [1 / 0.55, 1, 1 / 0.65], rtol=1e-3)
 
 
-def test_fourteen_bits_are_packed_most_significant_first() -> None:
-    assert pack_14bit(np.array([[0x3FFF, 0, 0x2001]], np.uint16)).hex() == "fffc00080040"
-
-
 def test_jpeg_carries_what_a_camera_writes(small: Scene) -> None:
     import io
 
@@ -96,36 +93,15 @@ def test_truth_has_the_form_of_the_reference_captures(name: str) -> None:
     reference = json.loads((SHARED / "phone_coffee_8k65.truth.json").read_text())
     scene = replace(preset(name, "paper-8k65").scaled(0.05), n_frames=1)
     truth = json.loads(json.dumps(prepare(scene, 1).truth("x.jpg")))
-    assert_same_form(reference, truth, "truth")
+    assert set(form(reference)) <= set(form(truth))
 
 
-def assert_same_form(reference: Any, ours: Any, where: str) -> None:
-    if isinstance(reference, dict):
-        if where != "truth.payload":
-            assert reference.keys() <= ours.keys(), where
-        for key in reference.keys() & ours.keys():
-            assert_same_form(reference[key], ours[key], f"{where}.{key}")
-    elif isinstance(reference, list):
-        assert isinstance(ours, list), where
-        if reference and ours:
-            assert_same_form(reference[0], ours[0], f"{where}[0]")
-    elif isinstance(reference, (int, float)) and not isinstance(reference, bool):
-        assert isinstance(ours, (int, float)), where
-    else:
-        assert type(reference) is type(ours), where
-
-
-def test_the_bound_decides_bright_symbols_and_guesses_dark_ones(small: Scene) -> None:
-    errors = {}
-    for light in (1.0, 1e-4):
-        scene = replace(small, picture="sky", light_e_per_s=small.light_e_per_s * light, start_slot=10.0)
-        oracle = simulate_frame(scene, 2, oracle=True).oracle
-        assert oracle is not None
-        decisions = [oracle.decide(column, 0) for column in range(20)]
-        wrong = sum(int((d != s)[seen].sum()) for d, s, seen in decisions)
-        errors[light] = wrong / sum(int(seen.sum()) for _, _, seen in decisions)
-    assert errors[1.0] == 0
-    assert errors[1e-4] == pytest.approx(127 / 128, abs=0.05)
+def form(value: Any, place: str = "truth") -> Iterator[tuple[str, str]]:
+    """Places in a JSON value and the kinds of values there; bursts and entries of lists share a place."""
+    parts = value.items() if isinstance(value, dict) else enumerate(value[:1]) if isinstance(value, list) else ()
+    yield place, "number" if isinstance(value, (int, float)) else type(value).__name__
+    for key, part in parts:
+        yield from form(part, f"{place}.{'n' if str(key).isdigit() else key}")
 
 
 def symbol_error_rate(energy: np.ndarray, rng: np.random.Generator) -> float:
@@ -154,8 +130,8 @@ def test_the_bound_meets_theory_at_moderate_light() -> None:
             origin, _, shared = oracle.slot_statistics(column)
             # Every payload symbol that the frame sees whole stands for itself, many times.
             starts = np.arange(40, 260, 10) - origin
-            starts = starts[(starts >= 0) & (starts + 10 <= len(shared))]
-            energy = shared[starts[:, None] + np.arange(10), 0]
+            starts = starts[(starts >= 0) & (starts + 10 <= shared.shape[0])]
+            energy = shared.diagonal()[starts[:, None] + np.arange(10)]
             expected.append(symbol_error_rate(np.tile(energy, (20, 1)), rng))
     rate, theory = wrong / total, float(np.mean(expected))
     assert 0.1 < theory < 0.9

@@ -54,25 +54,18 @@ def payloads(result: FrameResult) -> list[tuple[int, str]]:
 
 
 def rows_set(first: float, last: float, value: int) -> Change:
-    return lambda pixels: np.where(
-        (np.arange(len(pixels))[:, None] / len(pixels) >= first)
-        & (np.arange(len(pixels))[:, None] / len(pixels) < last),
-        value,
-        pixels,
-    )
+    def change(pixels: NDArray[Any]) -> NDArray[Any]:
+        place = np.arange(len(pixels))[:, None] / len(pixels)
+        return np.where((place >= first) & (place < last), value, pixels)
 
-
-def one_lit(pixels: NDArray[Any]) -> NDArray[Any]:
-    changed = np.zeros_like(pixels)
-    changed[pixels.shape[0] // 2, pixels.shape[1] // 2] = 255
-    return changed
+    return change
 
 
 FRAMES: dict[str, Change] = {
     "all zero": np.zeros_like,
     "all saturated": lambda pixels: np.full_like(pixels, 255),
     "constant grey": lambda pixels: np.full_like(pixels, 77),
-    "one lit pixel": one_lit,
+    "one lit pixel": lambda pixels: np.pad([[255]], [(side // 2, side - side // 2 - 1) for side in pixels.shape]),
     "noise": lambda pixels: np.random.default_rng(0).integers(0, 256, pixels.shape),
     "alternating rows": lambda pixels: np.zeros_like(pixels) + (np.arange(len(pixels)) % 2 * 255)[:, None],
     "no variance within rows": lambda pixels: np.broadcast_to(pixels.mean(axis=1, keepdims=True), pixels.shape),
@@ -85,28 +78,15 @@ FRAMES: dict[str, Change] = {
 }
 
 
-@pytest.mark.parametrize("name", FRAMES)
-def test_hostile_frames(name: str) -> None:
-    base = base_trial()
-    pixels = np.ascontiguousarray(FRAMES[name](base.frame.pixels), np.uint8)
-    received(replace(base.frame, pixels=pixels), base.options())
-
-
-def one_row(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    top = corners.mean(axis=0)[1]
-    return np.stack([corners[:, 0], [top - 0.5, top - 0.5, top + 0.5, top + 0.5]], axis=1)
-
-
-def about_the_middle(corners: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
-    centre = corners.mean(axis=0)
-    return np.asarray(centre + (corners - centre) * [x, y])
+def about_the_middle(x: float, y: float) -> Change:
+    return lambda corners: corners.mean(axis=0) + (corners - corners.mean(axis=0)) * [x, y]
 
 
 OUTLINES: dict[str, Change] = {
-    "one row of screen": one_row,
-    "columns of 2 px": lambda corners: about_the_middle(corners, 40 / np.ptp(corners[:, 0]), 1),
-    "columns of 0.2 px": lambda corners: about_the_middle(corners, 4 / np.ptp(corners[:, 0]), 1),
-    "far larger than the picture": lambda corners: about_the_middle(corners, 20, 20),
+    "one row of screen": lambda corners: about_the_middle(1, 0.5 / np.ptp(corners[:, 1]))(corners),
+    "columns of 2 px": lambda corners: about_the_middle(40 / np.ptp(corners[:, 0]), 1)(corners),
+    "columns of 0.2 px": lambda corners: about_the_middle(4 / np.ptp(corners[:, 0]), 1)(corners),
+    "far larger than the picture": about_the_middle(20, 20),
     "mostly left of the picture": lambda corners: corners - np.array([0.9 * np.ptp(corners[:, 0]), 0.0]),
     "wholly outside": lambda corners: corners + np.array([5000.0, 0.0]),
     "below the picture": lambda corners: corners + np.array([0.0, 1e5]),
@@ -116,16 +96,17 @@ OUTLINES: dict[str, Change] = {
 }
 
 
-@pytest.mark.parametrize("name", OUTLINES)
-def test_hostile_outlines(name: str) -> None:
-    base = base_trial()
-    received(base.frame, replace(base.options(), corners=OUTLINES[name](base.corners)))
+@pytest.mark.parametrize("name", [*FRAMES, *OUTLINES])
+def test_hostile_frames_and_outlines(name: str) -> None:
+    base, same = base_trial(), np.asarray
+    pixels = np.ascontiguousarray(FRAMES.get(name, same)(base.frame.pixels), np.uint8)
+    corners = np.asarray(OUTLINES.get(name, same)(base.corners), np.float64)
+    received(replace(base.frame, pixels=pixels), replace(base.options(), corners=corners))
 
 
 def exposed_for(slots: float) -> Scene:
     scene = small(preset("phone-plain", "paper-17k3"), 200, 3.0)
-    exposure_s = slots / scene.screen.slot_rate_hz
-    return replace(scene, exposure_s=exposure_s, light_e_per_s=scene.light_e_per_s * scene.exposure_s / exposure_s)
+    return scene.exposed(slots / scene.screen.slot_rate_hz)
 
 
 def with_rows_per_slot(rows: float) -> Scene:
@@ -136,9 +117,8 @@ def with_rows_per_slot(rows: float) -> Scene:
 
 def with_electrons(count: float) -> Scene:
     scene = small(preset("phone-plain", "paper-17k3"), 200, 3.0, output="raw")
-    sensor = replace(scene.sensor, full_scale_e=2 * count)
-    room = replace(scene.room, light_e_per_s=0.1 * count / scene.exposure_s)
-    return replace(scene, light_e_per_s=count / scene.exposure_s, sensor=sensor, room=room)
+    light, sensor = count / scene.exposure_s, replace(scene.sensor, full_scale_e=2 * count)
+    return replace(scene, light_e_per_s=light, sensor=sensor, room=replace(scene.room, light_e_per_s=0.1 * light))
 
 
 @pytest.mark.parametrize(
@@ -180,14 +160,7 @@ def metrics_of(seed: int = 0) -> NDArray[np.float64]:
     return np.asarray(clean + rng.normal(0, 1.2, clean.shape))[None]
 
 
-@pytest.mark.parametrize("change", [np.zeros_like, lambda m: m * 1e30, lambda m: m * 1e-300, lambda m: m * 0 - 1e9])
-def test_hostile_metrics(change: Change) -> None:
-    with watched() as found:
-        detect.detect(change(metrics_of()))
-    assert found == []
-
-
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_float32_decides_like_float64(seed: int) -> None:
     """LLRs to 1e-3 relative, decisions exactly, away from ties."""
     metrics = metrics_of(seed).astype(np.float32)
@@ -247,21 +220,20 @@ def test_the_order_of_threads_changes_nothing() -> None:
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(
     block=hnp.arrays(
-        np.uint8, st.tuples(st.integers(1, 40), st.integers(1, 40)), elements=st.sampled_from([0, 1, 255])
+        np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=40), elements=st.sampled_from([0, 1, 255])
     ),
-    row=st.floats(0, 1),
-    column=st.floats(0, 1),
-    shift=st.floats(-300, 300),
+    place=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+    shift=st.floats(-30, 30),
 )
 def test_no_block_of_extremes_upsets_the_receiver(
-    block: NDArray[np.uint8], row: float, column: float, shift: float
+    block: NDArray[np.uint8], place: tuple[float, float], shift: float
 ) -> None:
     base = base_trial()
     pixels = np.array(base.frame.pixels, np.uint8)
-    top, left = int(row * (pixels.shape[0] - 1)), int(column * (pixels.shape[1] - 1))
+    top, left = (int(share * (side - 1)) for share, side in zip(place, pixels.shape, strict=True))
     part = pixels[top : top + block.shape[0] * 10, left : left + block.shape[1]]
     part[:] = np.repeat(block, 10, axis=0)[: part.shape[0], : part.shape[1]]
-    options = replace(base.options(), corners=base.corners + shift * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]) / 10)
+    options = replace(base.options(), corners=base.corners + shift * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]))
     received(replace(base.frame, pixels=pixels), options)
 
 
@@ -269,15 +241,16 @@ def test_no_block_of_extremes_upsets_the_receiver(
 @given(
     metrics=hnp.arrays(
         np.float64,
-        st.tuples(st.integers(1, 2), st.integers(1, 3), st.sampled_from([32, 42]), st.just(4)),
+        st.tuples(st.integers(1, 2), st.integers(1, 3), st.sampled_from([31, 41]), st.just(4)),
         elements=st.floats(-1e6, 1e6),
-    )
+    ),
 )
 def test_posteriors_of_any_metrics_are_probabilities(metrics: NDArray[np.float64]) -> None:
-    # 20 + 10 N slots and a memory of one: cut what is too much.
-    metrics = metrics[:, :, : (metrics.shape[2] - 2) // 10 * 10 + 1]
+    """Packets of one or two symbols, a memory of one slot."""
     with watched() as found:
         posteriors = detect.detect(metrics)
+        for scale in (0.0, 1e-300, 1e30):
+            detect.detect(metrics * scale)
     assert found == []
     assert (posteriors.lit >= 0).all()
     assert (posteriors.lit <= 1 + 1e-6).all()
@@ -285,26 +258,19 @@ def test_posteriors_of_any_metrics_are_probabilities(metrics: NDArray[np.float64
     assert np.exp(posteriors.w_log_prob).sum(axis=1) == pytest.approx(np.ones(metrics.shape[1]))
 
 
-def test_the_watch_sees_nan_infinity_and_warnings() -> None:
-    assert list(problems_in({"a": (1.0, np.array([np.nan, np.inf]))}, "x")) == [
-        "x['a'][1] holds NaN",
-        "x['a'][1] holds infinity",
-    ]
-    assert list(problems_in(np.array([-np.inf, 0.0]), "x")) == []
-    with watched() as found:
-        np.divide(np.ones(1), np.zeros(1))
-    assert "divide by zero" in found[0]
+def test_the_watch_sees_nan_infinity_and_warnings_and_names_the_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    hidden = {"a": (1.0, np.array([np.nan, np.inf, -np.inf]))}
+    assert list(problems_in(hidden, "x")) == ["x['a'][1] holds NaN", "x['a'][1] holds infinity"]
 
-
-def test_the_watch_names_the_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken() -> float:
-        return float("nan")
+    def broken() -> Any:
+        return np.divide(np.zeros(1), np.zeros(1))
 
     broken.__module__ = detect.__name__
     monkeypatch.setattr(detect, "broken", broken, raising=False)
     with watched() as found:
         detect.broken()  # type: ignore[attr-defined]
-    assert found == ["detect.broken holds NaN"]
+    assert "detect.broken holds NaN" in found
+    assert any("invalid value" in problem for problem in found)
     assert detect.broken is broken  # type: ignore[attr-defined]
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 
@@ -96,7 +97,6 @@ WAYS: dict[str, Way] = {
 @contextmanager
 def threads(n: int) -> Iterator[None]:
     """OpenCV and the matrix library on `n` threads for a while, so that times mean the same on every machine."""
-    import cv2
     from threadpoolctl import threadpool_limits
 
     before = cv2.getNumThreads()

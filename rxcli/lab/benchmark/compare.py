@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 
@@ -23,7 +24,7 @@ from rxcli.errors import ReceiverError, UsageError
 from rxcli.lab.benchmark.cases import Case, Record
 from rxcli.lab.benchmark.draw import DRAWERS, Place
 from rxcli.lab.benchmark.measures import Row
-from rxcli.lab.benchmark.runner import Task
+from rxcli.lab.benchmark.runner import CHECKOUT, Task
 from rxcli.lab.simulate.files import write_dng
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.outputs import write_whole
@@ -72,12 +73,10 @@ def arguments_of(case: Case, stem: Path) -> list[str]:
 
 def _written(case: Case, stem: Path) -> Path:
     """The case's file: a copy, a JPEG or DNG where one was simulated, or else a PNG."""
-    import cv2
-
     if isinstance(case.source, Path):
         return Path(shutil.copyfile(case.source, stem.with_suffix(case.source.suffix)))
     (frame, *_), capture = case.source, None if case.trial is None else case.trial.capture
-    if capture is not None and capture.is_mosaic:
+    if capture is not None and capture.scene.is_mosaic:
         path = stem.with_suffix(".dng")
         write_dng(capture.raw, capture.scene, path)
         return path
@@ -98,11 +97,6 @@ def check_checkout(path: Path) -> Path:
     if not (path / "rxcli" / "cli" / "main.py").is_file():
         raise UsageError(f"{path}: no checkout of this project", "name the folder that holds its rxcli/")
     return path.resolve()
-
-
-def this_checkout() -> Path:
-    """The folder that this package is imported from."""
-    return Path(__file__).resolve().parents[3]
 
 
 def compare(tasks: Sequence[Task], other: Path, folder: Path, repeats: int, tick: Callable[[], None]) -> list[Record]:
@@ -127,7 +121,7 @@ def compare(tasks: Sequence[Task], other: Path, folder: Path, repeats: int, tick
             records.append({"about": {"file": jobs[-1][1]}, "has_data": case.has_data, "groups": groups, "ways": {}})
     turns: dict[str, list[list[Record]]] = {way: [] for way in WAYS}
     for _ in range(repeats):
-        for way, checkout in zip(WAYS, (other, this_checkout()), strict=True):
+        for way, checkout in zip(WAYS, (other, CHECKOUT), strict=True):
             turns[way].append(_decoded_by(checkout, jobs))
             tick()
     for way, several in turns.items():

@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 
@@ -168,8 +169,6 @@ def draw_screen(at: Place) -> Iterator[Case]:
 
 def warped(frame: Frame, rng: np.random.Generator, max_px: float) -> Frame:
     """The frame with its rows moved smoothly, across or along the readout, as software that straightens does."""
-    import cv2
-
     y, x = np.mgrid[: frame.height, : frame.width].astype(np.float32)
     knots = rng.uniform(-1, 1, int(rng.integers(3, 9)))
     places = np.linspace(0, knots.size - 1, frame.height)

@@ -7,15 +7,14 @@ go to the link layer as the receiver's would. Pixels are left out: they are meas
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from math import ceil
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.link.encoder import FileSending, MessageSending, file_object, message
+from rxcli.link.encoder import file_object, message
 from rxcli.link.receiver import LinkReceiver
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, bits_per_symbol, codebook
@@ -23,73 +22,66 @@ from rxcli.types import Float32Array, FloatArray, FrameSoftBits
 
 #: Bytes up to which a transfer is a message.
 _MESSAGE_BYTES = 199
+#: Lit slots of a symbol.
+_W = 5
 #: A detector trusts no bit further than this.
 _MAX_LLR = 9.0
 #: Latest start of clips after an object's start, seconds; and their maximum length relative to the required one.
 _START_WITHIN_S, _MAX_TIMES = 900.0, 6.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Transfer:
-    """A file or text that a clip of slots is to bring."""
+def snr_db_of(picture: str, columns: int) -> FloatArray:
+    """(columns,) slot signal-to-noise ratio (on - off)^2 / variance; -inf for a dark column.
 
-    size: int
-    picture: str
-    frame_rate_hz: float
-    #: Share of a frame's time in which rows that show the screen are read.
-    readout: float
-    screen: ScreenProfile
-    mother: int = 2
-    w: int = 5
-
-    @property
-    def snr_db(self) -> FloatArray:
-        """(C,) slot signal-to-noise ratio (on - off)^2 / variance; -inf for a dark column.
-
-        `bright` has 16 dB everywhere, as measured of a sky; `china` three dark columns, the others 8 to 18 dB.
-        """
-        columns = self.screen.columns
-        if self.picture == "bright":
-            return np.full(columns, 16.0)
-        db = np.linspace(8.0, 18.0, columns)[np.random.default_rng(7).permutation(columns)]
-        db[[1, columns // 2, columns - 2]] = -np.inf
-        return db
-
-    @property
-    def n_lit(self) -> int:
-        """Columns that are not dark."""
-        return int(np.isfinite(self.snr_db).sum())
+    `bright` has 16 dB everywhere, as measured of a sky; `china` three dark columns, the others 8 to 18 dB.
+    """
+    if picture == "bright":
+        return np.full(columns, 16.0)
+    db = np.linspace(8.0, 18.0, columns)[np.random.default_rng(7).permutation(columns)]
+    db[[1, columns // 2, columns - 2]] = -np.inf
+    return db
 
 
-def transferred(*, seed: Sequence[int], screen: str = "data-34k6", **point: Any) -> dict[str, Any]:
-    """One transfer from a random start until it is complete.
+def transferred(
+    *, seed: Sequence[int], size: int, picture: str, frame_rate_hz: float, readout: float, screen: str = "data-34k6"
+) -> dict[str, Any]:
+    """Transfer a file or text from a random start until it is complete.
 
     Args:
         seed: of start, data and noise.
+        size: bytes.
+        picture: see `snr_db_of`.
+        frame_rate_hz: of the clip.
+        readout: share of a frame's time in which rows that show the screen are read.
         screen: name of its profile.
-        point: other fields of `Transfer`.
     """
-    transfer, rng = Transfer(**point, screen=load_profile(screen, ScreenProfile)), np.random.default_rng(seed)
-    data = rng.bytes(transfer.size)
-    small = transfer.size <= _MESSAGE_BYTES
-    sending = message(data, "raw") if small else file_object("data.bin", data, mother=transfer.mother)
-    receiver = LinkReceiver(transfer.screen.columns, transfer.screen.payload_symbols)
-    visible = 0
-    exact, seconds, cpu_s = False, 0.0, 0.0
-    for shown, observed in _frames(transfer, sending, rng):
-        visible += int(observed.sum()) * transfer.n_lit * bits_per_symbol(transfer.w)
+    profile, rng = load_profile(screen, ScreenProfile), np.random.default_rng(seed)
+    data, snr_db = rng.bytes(size), snr_db_of(picture, profile.columns)
+    sending = message(data, "raw") if size <= _MESSAGE_BYTES else file_object("data.bin", data)
+    receiver = LinkReceiver(profile.columns, profile.payload_symbols)
+    start_s, readout_s = float(rng.uniform(0, _START_WITHIN_S)), readout / frame_rate_hz
+    burst_s, burst_bits = profile.packet_s * profile.repeats, bits_per_symbol(_W) * int(np.isfinite(snr_db).sum())
+    needed_s = 8 * (size + 200) / (burst_bits * profile.payload_symbols / burst_s * readout) + 0.5
+    visible, cpu_s = 0, 0.0
+    came: dict[str, Any] = {"exact": False, "seconds": 0.0}
+    for frame in range(ceil(_MAX_TIMES * needed_s * frame_rate_hz) + 40):
+        begin_s = start_s + frame / frame_rate_hz
+        bursts = np.arange(int(begin_s / burst_s), int((begin_s + readout_s) / burst_s) + 1)
+        observed = _observed(bursts, begin_s, begin_s + readout_s, profile)
+        labels = sending.labels(bursts, profile.columns, profile.payload_symbols)
+        llr = detect(labels, _W, snr_db, rng) * observed[:, :, None, None]
+        visible += int(observed.sum()) * burst_bits
+        shown = FrameSoftBits(bursts - int(start_s / burst_s), llr, time_s=frame / frame_rate_hz, frame=frame)
         start = time.process_time()
         events = receiver.add(shown)
         cpu_s += time.process_time() - start
         if events:
-            seconds = shown.time_s + transfer.readout / transfer.frame_rate_hz
-            exact = events[0].data[: transfer.size] == data
+            seconds = shown.time_s + readout_s
+            came = {"exact": events[0].data[:size] == data, "seconds": seconds}
             break
-    came = {"exact": exact, "seconds": seconds, "cpu_s": cpu_s, "packets": []}
-    if not exact:
-        return came
-    bits = 8 * transfer.size
-    return {**came, "kbps": bits / seconds / 1e3, "of_visible": bits / visible}
+    if came["exact"]:
+        came |= {"kbps": 8 * size / came["seconds"] / 1e3, "of_visible": 8 * size / visible}
+    return {**came, "cpu_s": cpu_s, "packets": []}
 
 
 def detect(
@@ -108,24 +100,6 @@ def detect(
     return np.clip(out, -_MAX_LLR, _MAX_LLR)
 
 
-def _frames(
-    point: Transfer, sending: FileSending | MessageSending, rng: np.random.Generator
-) -> Iterator[tuple[FrameSoftBits, NDArray[np.bool_]]]:
-    """Frames of a clip: soft bits, and symbols that were observed (B, N)."""
-    screen = point.screen
-    burst_s = screen.packet_s * screen.repeats
-    start_s = float(rng.uniform(0, _START_WITHIN_S))
-    first = int(start_s / burst_s)
-    for frame in range(_max_frames(point)):
-        begin = start_s + frame / point.frame_rate_hz
-        end = begin + point.readout / point.frame_rate_hz
-        bursts = np.arange(int(begin / burst_s), int(end / burst_s) + 1)
-        observed = _observed(bursts, begin, end, screen)
-        labels = sending.labels(bursts, screen.columns, screen.payload_symbols)
-        llr = detect(labels, point.w, point.snr_db, rng) * observed[:, :, None, None]
-        yield FrameSoftBits(bursts - first, llr, time_s=frame / point.frame_rate_hz, frame=frame), observed
-
-
 def _observed(bursts: NDArray[np.int64], begin: float, end: float, screen: ScreenProfile) -> NDArray[np.bool_]:
     """(B, N) symbols that lie within a frame as a whole, in any copy."""
     slot_s = 1 / screen.slot_rate_hz
@@ -134,10 +108,3 @@ def _observed(bursts: NDArray[np.int64], begin: float, end: float, screen: Scree
     at = (copy * screen.packet_s)[..., None] + symbol
     inside = (at >= begin) & (at + SLOTS_PER_SYMBOL * slot_s <= end)
     return np.asarray(inside.any(axis=1))
-
-
-def _max_frames(point: Transfer) -> int:
-    screen = point.screen
-    rate = bits_per_symbol(point.w) * screen.payload_symbols * point.n_lit / (screen.packet_s * screen.repeats)
-    needed_s = 8 * (point.size + 200) / (rate * point.readout) + 0.5
-    return ceil(_MAX_TIMES * needed_s * point.frame_rate_hz) + 40

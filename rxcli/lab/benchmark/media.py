@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
+import av
+import cv2
 import numpy as np
+import rawpy
+import simplejpeg
 
 from rxcli.ingest.sniff import HEAD_BYTES, read_bytes, sniff
 from rxcli.lab.simulate.capture import prepare, write_capture
@@ -50,12 +53,9 @@ class Medium:
             return scene
         screen = scene.screen
         n_bits = round(self.bursts_a_frame * self.n_frames) * screen.columns * payload_bits(5, screen.payload_symbols)
-        return replace(
-            scene,
-            payload=np.random.default_rng(0).bytes(n_bits // 8),
-            n_frames=self.n_frames,
-            frame_rate_hz=screen.slot_rate_hz / (screen.packet_slots * screen.repeats * self.bursts_a_frame),
-        )
+        frame_slots = screen.packet_slots * screen.repeats * self.bursts_a_frame
+        payload, frame_rate_hz = np.random.default_rng(0).bytes(n_bits // 8), screen.slot_rate_hz / frame_slots
+        return replace(scene, payload=payload, n_frames=self.n_frames, frame_rate_hz=frame_rate_hz)
 
     @property
     def frame_rate_hz(self) -> float | None:
@@ -67,13 +67,11 @@ class Medium:
         path = folder / self.file
         if path.exists() and camera_path(path).exists():
             return path
-        if self.times == 1:
-            write_known(self.scene, path, seed, self.bit_rate)
-            return path
-        once = path.with_stem(path.stem + "-once")
+        once = path if self.times == 1 else path.with_stem(path.stem + "-once")
         write_known(self.scene, once, seed, self.bit_rate)
-        repeat_clip(once, path, self.times)
-        camera_path(once).replace(camera_path(path))
+        if self.times > 1:
+            repeat_clip(once, path, self.times)
+            camera_path(once).replace(camera_path(path))
         return path
 
 
@@ -94,8 +92,6 @@ def write_known(scene: Scene, path: Path, seed: int, bit_rate: int | None = None
 
 def repeat_clip(short: Path, out: Path, times: int) -> None:
     """Write the packets of a clip several times over, one time after the other, without encoding them again."""
-    import av
-
     with av.open(str(out), "w") as target:
         stream = None
         for turn in range(times):
@@ -114,35 +110,28 @@ def repeat_clip(short: Path, out: Path, times: int) -> None:
 def bare_decode(path: Path) -> Callable[[], int] | None:
     """A function that decodes the file, nothing else, and gives the number of frames; None for other kinds of files."""
     kind = sniff(read_bytes(path, HEAD_BYTES), path.suffix.lower())
-    decoder = {"jpeg": _jpeg, "png": _png, "video": _video, "raw": _raw, "tiff": _raw}.get(kind or "")
-    return None if decoder is None else partial(decoder, path)
-
-
-def _jpeg(path: Path) -> int:
-    import simplejpeg
-
-    simplejpeg.decode_jpeg(path.read_bytes(), colorspace="GRAY")
-    return 1
-
-
-def _png(path: Path) -> int:
-    import cv2
-
-    return int(cv2.imread(str(path), cv2.IMREAD_UNCHANGED) is not None)
+    decoder = _DECODERS.get(kind or "")
+    return None if decoder is None else lambda: decoder(path)
 
 
 def _raw(path: Path) -> int:
-    import rawpy
-
     with rawpy.imread(str(path)) as raw:
         return int(raw.raw_image.ndim > 0)
 
 
 def _video(path: Path) -> int:
     """Decode every luma plane as a view, on as many threads as FFmpeg takes; returns the number of frames."""
-    import av
-
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         stream.thread_type, stream.codec_context.thread_count = "FRAME", 0
         return sum(np.frombuffer(frame.planes[0], np.uint8).size > 0 for frame in container.decode(stream))
+
+
+#: Kind of a file -> what decodes it and gives the number of frames.
+_DECODERS: dict[str, Callable[[Path], int]] = {
+    "jpeg": lambda path: int(simplejpeg.decode_jpeg(path.read_bytes(), colorspace="GRAY").ndim > 0),
+    "png": lambda path: int(cv2.imread(str(path), cv2.IMREAD_UNCHANGED) is not None),
+    "raw": _raw,
+    "tiff": _raw,
+    "video": _video,
+}

@@ -13,7 +13,7 @@ import msgspec
 
 from rxcli.lab.benchmark.cases import Record
 from rxcli.lab.benchmark.measures import MEASURES, Group, Row
-from rxcli.lab.benchmark.runner import Run, scenarios
+from rxcli.lab.benchmark.runner import CHECKOUT, Run, scenarios
 
 _MEDIA = ("jpeg-26mp", "raw-26mp", "jpeg-26mp-hard", "jpeg-12mp-unknown")
 #: Runs of each medium, and small random scenes.
@@ -76,7 +76,6 @@ def start_times(repeats: int) -> dict[str, float]:
     times: dict[str, list[float]] = {name: [] for name in commands}
     for name, arguments in repeats * list(commands.items()):
         start = time.perf_counter()
-        root = Path(__file__).resolve().parents[3]
-        subprocess.run([sys.executable, *arguments], cwd=root, capture_output=True, check=True)
+        subprocess.run([sys.executable, *arguments], cwd=CHECKOUT, capture_output=True, check=True)
         times[name].append(1e3 * (time.perf_counter() - start))
     return {name: median(values) for name, values in times.items()}

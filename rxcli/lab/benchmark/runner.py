@@ -23,6 +23,8 @@ from rxcli.lab.benchmark.measures import COMMON, COMMON_COST
 from rxcli.resources import data_dir
 from rxcli.runs.processes import ONE_THREAD, environment
 
+#: The checkout that this package is imported from.
+CHECKOUT = Path(__file__).resolve().parents[3]
 #: What a case is drawn and received from, as JSON values; equal tasks of equal code give equal records.
 Task = dict[str, Any]
 Work = Callable[[Task], list[Record]]
@@ -116,7 +118,7 @@ def load_journal(path: Path) -> dict[str, list[Record]]:
 @lru_cache(maxsize=1)
 def code_fingerprint() -> str:
     """Hash of the package's source: what an earlier version has found is not taken for what this one does."""
-    root = Path(__file__).resolve().parents[2]
+    root = CHECKOUT / "rxcli"
     digest = sha256()
     for path in sorted(path for path in root.rglob("*.py") if path.parent.name != "cli"):
         digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())

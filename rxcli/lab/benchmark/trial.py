@@ -104,7 +104,7 @@ def frame_of(capture: Capture, index: int = 0) -> Frame:
     """A capture as a frame: the luma of its JPEG, or its mosaic."""
     scene = capture.scene
     metadata = Metadata(make=scene.make, model=scene.model, exposure_s=scene.exposure_s, orientation=scene.orientation)
-    mosaic = mosaic_of(scene) if capture.is_mosaic else None
+    mosaic = mosaic_of(scene) if capture.scene.is_mosaic else None
     return Frame(pixels=capture.pixels, source=SOURCE, index=index, metadata=metadata, mosaic=mosaic)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,8 +69,6 @@ def column_waves(trial: Trial) -> tuple[FloatArray, float]:
     Returns:
         (columns, rows) float64; rows per slot, by the camera's line delay.
     """
-    import cv2
-
     scene, view, frame = trial.capture.scene, trial.capture.exposure.view, trial.frame
     corrected = scene.isp.correct_distortion and not scene.is_mosaic
     picture = undistorted(frame, Lens(view.camera_matrix, np.array(scene.lens.distortion), corrected))
@@ -91,8 +90,6 @@ def column_waves(trial: Trial) -> tuple[FloatArray, float]:
 
 def threshold(waves: FloatArray, rows_per_slot: float) -> NDArray[np.bool_]:
     """Rows brighter than the mean of their surroundings; (columns, rows)."""
-    import cv2
-
     length = 2 * int(_THRESHOLD_SLOTS * rows_per_slot / 2) + 1
     return np.asarray(waves > cv2.blur(waves, (length, 1), borderType=cv2.BORDER_REFLECT))
 

@@ -9,17 +9,15 @@ gain `a` and noise variance `v`: the log-likelihood is `Q m - P m^2 / 2`, with `
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.simulate.camera import Band, Exposure, column_light
-from rxcli.lab.simulate.optics import grid_nodes
+from rxcli.lab.simulate.optics import Float32Array, FloatArray, grid_nodes
 from rxcli.lab.simulate.shutter import overlaps
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -32,82 +30,44 @@ class Oracle:
     #: (height, columns) `Q`: matched filter output, the column's own light not taken off.
     matched: FloatArray
 
-    def slot_statistics(self, column: int) -> tuple[int, FloatArray, FloatArray]:
+    def slot_statistics(self, column: int) -> tuple[int, FloatArray, Any]:
         """Statistics of a column's slots instead of its rows.
 
         Returns:
-            Number of the first slot; (n,) matched filter of each slot; (n, taps) information shared by slot `s` and
-            slot `s + tap`.
+            Number of the first slot; (n,) matched filter of each slot; sparse (n, n) information that two slots share.
         """
-        exposure = self.exposure
-        start = exposure.row_start_slots - exposure.delays[column]
-        first, share = overlaps(start, exposure.exposure_slots)
-        origin, taps = int(first[0]), share.shape[1]
-        n = int(first[-1]) - origin + taps
-        matched, shared = np.zeros(n + taps), np.zeros((n + taps, taps))
-        p, q = self.information[:, column], self.matched[:, column]
-        for i in range(taps):
-            np.add.at(matched, first - origin + i, q * share[:, i])
-            for j in range(i, taps):
-                np.add.at(shared[:, j - i], first - origin + i, p * share[:, i] * share[:, j])
-        return origin, matched[:n], shared[:n]
+        from scipy.sparse import csr_array, diags_array
+
+        start = self.exposure.row_start_slots - self.exposure.delays[column]
+        first, share = overlaps(start, self.exposure.exposure_slots)
+        slots = first[:, None] - first[0] + np.arange(share.shape[1])
+        exposed = csr_array((share.ravel(), slots.ravel(), np.arange(0, share.size + 1, share.shape[1])))
+        shared = exposed.T @ diags_array(self.information[:, column]) @ exposed
+        return int(first[0]), exposed.T @ self.matched[:, column], shared.tocsr()
 
     def decide(self, column: int, burst: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
         """Decide the payload symbols of one packet, each with all other slots known.
 
         Returns:
-            (N,) decided codebook indices, (N,) sent ones, (N,) whether the symbol was seen at all.
+            (N,) decided codebook indices, (N,) sent ones, (N,) whether the symbol was observed at all.
         """
         link = self.exposure.link
         origin, matched, shared = self.slot_statistics(column)
         sent = link.slots(origin, origin + matched.size)[column].astype(np.float64)
         words = codebook(int(link.weights[column])).astype(np.float64)
         score = np.zeros((link.screen.payload_symbols, words.shape[0]))
-        seen = np.zeros(score.shape[0])
-        for symbol, at in self._occurrences(burst, origin, matched.size):
-            inside = slice(at, at + SLOTS_PER_SYMBOL)
-            own = _band_matrix(shared, at)
-            others = _expected(shared, sent, at) - own @ sent[inside]
-            score[symbol] += words @ (matched[inside] - others) - 0.5 * np.einsum("ki,ij,kj->k", words, own, words)
-            seen[symbol] += np.trace(own)
+        information = np.zeros(score.shape[0])
+        copies = burst * link.burst_slots - origin + np.arange(link.screen.repeats) * link.screen.packet_slots
+        starts = copies[:, None] + PREAMBLE_SLOTS + np.arange(score.shape[0]) * SLOTS_PER_SYMBOL
+        for copy, symbol in np.argwhere((starts >= 0) & (starts + SLOTS_PER_SYMBOL <= matched.size)):
+            inside = slice(starts[copy, symbol], starts[copy, symbol] + SLOTS_PER_SYMBOL)
+            own = shared[inside, inside].toarray()
+            expected = shared[inside] @ sent - own @ sent[inside]
+            score[symbol] += words @ (matched[inside] - expected) - 0.5 * np.einsum("ki,ij,kj->k", words, own, words)
+            information[symbol] += np.trace(own)
         truth = link.packets(burst)[column, PREAMBLE_SLOTS:].reshape(-1, SLOTS_PER_SYMBOL)
         sent_index = np.argmax(words @ truth.T, axis=0)
-        return np.argmax(score, axis=1), sent_index, seen > 0
-
-    def _occurrences(self, burst: int, origin: int, n: int) -> list[tuple[int, int]]:
-        """Symbol number and place of every payload symbol of `burst` whose slots all lie in the frame's window."""
-        screen = self.exposure.link.screen
-        found = []
-        for copy in range(screen.repeats):
-            packet = burst * self.exposure.link.burst_slots + copy * screen.packet_slots - origin
-            for symbol in range(screen.payload_symbols):
-                at = packet + PREAMBLE_SLOTS + symbol * SLOTS_PER_SYMBOL
-                if at >= 0 and at + SLOTS_PER_SYMBOL <= n:
-                    found.append((symbol, at))
-        return found
-
-
-def _band_matrix(shared: FloatArray, at: int) -> FloatArray:
-    """(10, 10) information among the slots of one symbol, from the banded store."""
-    matrix = np.zeros((SLOTS_PER_SYMBOL, SLOTS_PER_SYMBOL))
-    for tap in range(min(shared.shape[1], SLOTS_PER_SYMBOL)):
-        values = shared[at : at + SLOTS_PER_SYMBOL - tap, tap]
-        rows = np.arange(values.size)
-        matrix[rows, rows + tap] = matrix[rows + tap, rows] = values
-    return matrix
-
-
-def _expected(shared: FloatArray, sent: FloatArray, at: int) -> FloatArray:
-    """(10,) matched filter output that the sent slots alone would give in one symbol's slots."""
-    total = np.zeros(SLOTS_PER_SYMBOL)
-    for i in range(SLOTS_PER_SYMBOL):
-        slot = at + i
-        for tap in range(shared.shape[1]):
-            if slot + tap < sent.size:
-                total[i] += shared[slot, tap] * sent[slot + tap]
-            if tap and slot - tap >= 0:
-                total[i] += shared[slot - tap, tap] * sent[slot - tap]
-    return total
+        return np.argmax(score, axis=1), sent_index, information > 0
 
 
 class OracleRecorder:

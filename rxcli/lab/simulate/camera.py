@@ -7,23 +7,21 @@ which the column was lit (exact). Focus blur is applied to `T`: it mixes places,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
-from rxcli.lab.simulate.optics import CORNERS, View, between_nodes, grid_nodes, project
+from rxcli.lab.simulate.optics import CORNERS, Float32Array, FloatArray, View, between_nodes, grid_nodes, project
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.sensor import count_electrons, pick_colours, repeat_gains, to_raw
 from rxcli.lab.simulate.shutter import flicker, lit_share
 from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
-
-FloatArray = NDArray[np.float64]
-Float32Array = NDArray[np.float32]
 
 #: Pitch of the coarse grid in rows, and rows of one band of work (a multiple of it).
 _GRID_ROWS = 32
@@ -127,37 +125,28 @@ class Exposure:
         return int(2 ** np.clip(np.floor(np.log2(max(sigma_px / 6, 1))), 0, np.log2(_GRID_ROWS)))
 
     @cached_property
-    def texture(self) -> Float32Array:
-        """(h, w, 3) electrons of the sensor's colours per unit of green light, blurred, with a black margin."""
-        return panel_texture(self)
-
-    @cached_property
     def texture_scale(self) -> tuple[int, int]:
         """Texture pixels per panel pixel, down and across: three where its colour stripes can be resolved, else one."""
         magnification = self.view.pixels_per_width / self.drive.grey.shape[1]
         return (3, 3) if self.scene.lcd_grid > 0 and magnification > 1.2 else (1, 1)
 
-
-def panel_texture(exposure: Exposure) -> Float32Array:
-    """The panel's transmittance in the sensor's colours, with pixel structure and blur."""
-    import cv2
-
-    down, across = exposure.texture_scale
-    light = exposure.drive.transmittance
-    fine = np.repeat(np.repeat(light, down, axis=0), across, axis=1)
-    if across > 1:
-        _draw_pixel_structure(fine, exposure.scene.lcd_grid)
-    sensed = cv2.transform(fine, exposure.scene.sensor.colour_matrix.astype(np.float32))
-    m = _TEXTURE_MARGIN
-    sensed = cv2.copyMakeBorder(sensed, m, m, m, m, cv2.BORDER_CONSTANT, value=0)
-    # A sensor pixel is a box of side 1, whose variance 1/12 the Gaussian takes along.
-    sigma_px = np.sqrt(exposure.scene.blur_px**2 + 1 / 12)
-    per_pixel = (
-        light.shape[1] * across / exposure.view.pixels_per_width,
-        light.shape[0] * down / exposure.view.pixels_per_height,
-    )
-    sigmas = [max(sigma_px * scale, 1e-3) for scale in per_pixel]
-    return np.asarray(cv2.GaussianBlur(sensed, (0, 0), sigmaX=sigmas[0], sigmaY=sigmas[1]), np.float32)
+    @cached_property
+    def texture(self) -> Float32Array:
+        """(h, w, 3) electrons of the sensor's colours per unit of green light, blurred, with a black margin."""
+        down, across = self.texture_scale
+        light = self.drive.transmittance
+        fine = np.repeat(np.repeat(light, down, axis=0), across, axis=1)
+        if across > 1:
+            _draw_pixel_structure(fine, self.scene.lcd_grid)
+        colours = cv2.transform(fine, self.scene.sensor.colour_matrix.astype(np.float32))
+        margins = (_TEXTURE_MARGIN,) * 4
+        colours = cv2.copyMakeBorder(colours, *margins, cv2.BORDER_CONSTANT, value=0)
+        # A sensor pixel is a box of side 1, whose variance 1/12 the Gaussian takes along.
+        sigma_px = np.sqrt(self.scene.blur_px**2 + 1 / 12)
+        x_per_pixel = light.shape[1] * across / self.view.pixels_per_width
+        y_per_pixel = light.shape[0] * down / self.view.pixels_per_height
+        sigmas = [max(sigma_px * scale, 1e-3) for scale in (x_per_pixel, y_per_pixel)]
+        return np.asarray(cv2.GaussianBlur(colours, (0, 0), sigmaX=sigmas[0], sigmaY=sigmas[1]), np.float32)
 
 
 def _draw_pixel_structure(fine: Float32Array, depth: float) -> None:
@@ -196,12 +185,6 @@ def _vignette(exposure: Exposure, pixels: FloatArray) -> FloatArray:
     return np.asarray(1 - exposure.scene.vignetting * radius2)
 
 
-def bands(height: int) -> Iterator[tuple[int, int]]:
-    """Row ranges of the bands of work."""
-    for top in range(0, height, _BAND_ROWS):
-        yield top, min(top + _BAND_ROWS, height)
-
-
 @dataclass(frozen=True)
 class Band:
     """Expected light of some rows."""
@@ -223,17 +206,18 @@ class Band:
 
 def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
     """Expected light of the sensor rows `top` to `bottom`."""
-    height, width = bottom - top, exposure.scene.sensor.width
-    columns, texture_x, texture_y = _texture_places(exposure, top, bottom)
-    picture = _look_up(exposure.texture, texture_x, texture_y)
-    picture = pick_colours(picture, exposure.scene.sensor.pattern, top)
-    backlight = np.empty((height, width), np.float32)
-    _enlarge_across(_backlight_nodes(exposure, columns, top, bottom), exposure.grid_pitch, backlight)
-    return Band(top, picture, backlight, _room_light(exposure, top, bottom))
+    sensor, pitch = exposure.scene.sensor, exposure.grid_pitch
+    places = _texture_places(exposure, top, bottom)
+    flags: dict[str, int] = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_CONSTANT, "borderValue": 0}
+    picture = pick_colours(np.asarray(cv2.remap(exposure.texture, *places, **flags)), sensor.pattern, top)
+    nodes = _backlight_nodes(exposure, grid_nodes(sensor.width, pitch), top, bottom)
+    backlight = cv2.resize(nodes, (nodes.shape[1] * pitch, nodes.shape[0]), interpolation=cv2.INTER_LINEAR)
+    light = np.ascontiguousarray(backlight[:, pitch : pitch + sensor.width], np.float32)
+    return Band(top, picture, light, _room_light(exposure, top, bottom))
 
 
-def _texture_places(exposure: Exposure, top: int, bottom: int) -> tuple[FloatArray, Float32Array, Float32Array]:
-    """Nodes across, and for every pixel the place in the texture, interpolated between nodes."""
+def _texture_places(exposure: Exposure, top: int, bottom: int) -> tuple[Float32Array, Float32Array]:
+    """The place (x, y) of every pixel in the texture, interpolated between nodes."""
     pitch = 16
     x, y = grid_nodes(exposure.scene.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
     place = exposure.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
@@ -242,14 +226,7 @@ def _texture_places(exposure: Exposure, top: int, bottom: int) -> tuple[FloatArr
     scale = np.array([panel_width * across, panel_height * down])
     nodes = np.clip(place * scale - 0.5 + _TEXTURE_MARGIN, -1e4, 1e5).astype(np.float32)
     inner = between_nodes(nodes, pitch, bottom - top, exposure.scene.sensor.width)
-    return grid_nodes(exposure.scene.sensor.width, exposure.grid_pitch), inner[..., 0], inner[..., 1]
-
-
-def _look_up(texture: Float32Array, x: Float32Array, y: Float32Array) -> Float32Array:
-    import cv2
-
-    places = (np.ascontiguousarray(x), np.ascontiguousarray(y))
-    return np.asarray(cv2.remap(texture, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
+    return np.ascontiguousarray(inner[..., 0]), np.ascontiguousarray(inner[..., 1])
 
 
 def _backlight_nodes(exposure: Exposure, x: FloatArray, top: int, bottom: int) -> Float32Array:
@@ -267,26 +244,14 @@ def _backlight_nodes(exposure: Exposure, x: FloatArray, top: int, bottom: int) -
     return nodes[: bottom - top]
 
 
-def _enlarge_across(nodes: Float32Array, pitch: int, out: Float32Array) -> None:
-    import cv2
-
-    full = cv2.resize(nodes, (nodes.shape[1] * pitch, nodes.shape[0]), interpolation=cv2.INTER_LINEAR)
-    out[:] = full[:, pitch : pitch + out.shape[1]]
-
-
 def _room_light(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     """Electrons of the room's light, from walls, bezel, panel and a mirrored lamp."""
-    seen = _room_seen(exposure, top, bottom) * exposure.room_rows[top:bottom, None].astype(np.float32)
-    response = np.array(exposure.scene.sensor.response, np.float32)
-    pattern = exposure.scene.sensor.pattern
-    if pattern is None:
-        return np.asarray(seen[..., None] * response)
-    cell = response[pattern][:, np.arange(seen.shape[1]) % pattern.shape[1]]
-    seen *= cell[np.arange(top, bottom) % pattern.shape[0]]
-    return seen
+    light = _room_share(exposure, top, bottom) * exposure.room_rows[top:bottom, None].astype(np.float32)
+    colours = light[..., None] * np.array(exposure.scene.sensor.response, np.float32)
+    return pick_colours(colours, exposure.scene.sensor.pattern, top)
 
 
-def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:
+def _room_share(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     """(rows, width) share of the room's light that every pixel sees, against white paper."""
     pitch, room, screen = 8, exposure.scene.room, exposure.link.screen
     x, y = grid_nodes(exposure.scene.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
@@ -298,8 +263,8 @@ def _room_seen(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     from_lamp = (place - np.array(room.lamp_place)) * [1.0, 1 / screen.aspect]
     panel = room.panel_reflectance + room.lamp * np.exp(-0.5 * (from_lamp**2).sum(axis=-1) / room.lamp_size**2)
     frame = room.bezel_reflectance + (room.wall_reflectance - room.bezel_reflectance) * on_wall
-    seen = (panel + (frame - panel) * off_panel).astype(np.float32)
-    return between_nodes(seen, pitch, bottom - top, exposure.scene.sensor.width)
+    share = (panel + (frame - panel) * off_panel).astype(np.float32)
+    return between_nodes(share, pitch, bottom - top, exposure.scene.sensor.width)
 
 
 BandVisitor = Callable[[Band, Float32Array], None]
@@ -336,5 +301,6 @@ def take_picture(
             visit(band, electrons)
 
     with ThreadPoolExecutor(max_workers=max(threads, 1)) as pool:
-        list(pool.map(work, bands(sensor.height)))
+        tops = range(0, sensor.height, _BAND_ROWS)
+        list(pool.map(work, [(top, min(top + _BAND_ROWS, sensor.height)) for top in tops]))
     return raw

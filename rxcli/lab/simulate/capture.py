@@ -8,22 +8,22 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.simulate.bound import Oracle, OracleRecorder
 from rxcli.lab.simulate.camera import Exposure, take_picture
-from rxcli.lab.simulate.files import CODECS, write_dng, write_tiff, write_video
+from rxcli.lab.simulate.files import CODECS, encode_jpeg, write_dng, write_png, write_tiff, write_video
 from rxcli.lab.simulate.isp import develop
 from rxcli.lab.simulate.motion import HandMotion, turned
-from rxcli.lab.simulate.optics import View, homography
+from rxcli.lab.simulate.optics import FloatArray, View, homography
 from rxcli.lab.simulate.pictures import load_picture, picture_names
 from rxcli.lab.simulate.scenes import Change, Scene
 from rxcli.lab.simulate.transmitter import Dimming, Drive, Link, Weights, drive_screen
 from rxcli.lab.simulate.truth import build_truth
 from rxcli.profiles import ScreenProfile
 
-FloatArray = NDArray[np.float64]
 #: Slots before the first row, so that delayed columns already send.
 _LEAD_SLOTS = 8
 
@@ -55,23 +55,16 @@ class Capture:
     @cached_property
     def jpeg(self) -> bytes:
         """The developed picture as a JPEG file with metadata."""
-        from rxcli.lab.simulate.files import encode_jpeg
-
         return encode_jpeg(self.rgb, self.scene)
 
     @cached_property
     def pixels(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """(height, width) what a receiver is given: luma of the JPEG, or the mosaic of a raw scene."""
-        if self.is_mosaic:
+        if self.scene.is_mosaic:
             return self.raw
         import simplejpeg
 
         return np.asarray(simplejpeg.decode_jpeg(self.jpeg, colorspace="GRAY")[..., 0], np.uint8)
-
-    @property
-    def is_mosaic(self) -> bool:
-        """Whether `pixels` is the sensor's mosaic."""
-        return self.scene.is_mosaic
 
     @cached_property
     def truth(self) -> dict[str, Any]:
@@ -136,8 +129,6 @@ def stabilised(picture: NDArray[Any], exposure: Exposure) -> NDArray[Any]:
 
     Its rows are no instants any more: switch this off on a phone that does so by default.
     """
-    import cv2
-
     if exposure.motion is None:
         return picture
     sensor, matrix = exposure.scene.sensor, exposure.view.camera_matrix
@@ -210,8 +201,6 @@ def write_capture(
         bit_rate: of clips, bits per second; None for the encoder's constant quality.
         progress: wraps the numbers of the frames.
     """
-    from rxcli.lab.simulate.files import write_png
-
     scene = take.scene
     if file_format in CODECS:
         bits = 16 if CODECS[file_format].bits > 8 else 8

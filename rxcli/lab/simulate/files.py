@@ -9,7 +9,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
+import cv2
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
 
 from rxcli.errors import UsageError
@@ -47,8 +50,6 @@ def encode_jpeg(rgb: NDArray[np.uint8], scene: Scene) -> bytes:
 
 def write_png(rgb: NDArray[np.generic], path: Path) -> None:
     """Write a developed picture of 8 or 16 bits as PNG."""
-    import cv2
-
     ok, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
     assert ok, "PNG takes any picture of 8 or 16 bits"
     path.write_bytes(data.tobytes())
@@ -56,6 +57,7 @@ def write_png(rgb: NDArray[np.generic], path: Path) -> None:
 
 #: Tag number, type as tifffile names it, count, value, whether in the first directory alone.
 _Tag = tuple[int, str, int, Any, bool]
+_SRGB_FROM_XYZ = np.array([[3.2405, -1.5371, -0.4985], [-0.9693, 1.8760, 0.0416], [0.0556, -0.2040, 1.0572]])
 #: tifffile writes no EXIF directory (34665); a tag of the next number keeps its place.
 _PLACEHOLDER = 34666
 
@@ -73,8 +75,6 @@ def _camera_tags(scene: Scene) -> list[_Tag]:
 
 def _append_exif(path: Path, scene: Scene) -> None:
     """Write exposure and ISO into an EXIF directory at the end of the file, and its place over the placeholder."""
-    import tifffile
-
     exposure = Fraction(scene.exposure_s).limit_denominator(1_000_000).as_integer_ratio()
     with tifffile.TiffFile(path) as written:
         placeholder = written.pages[0].tags[_PLACEHOLDER].offset
@@ -106,15 +106,11 @@ def write_dng(raw: NDArray[np.uint16], scene: Scene, path: Path, bits: int = 16)
         path: of the file.
         bits: 16, or 14 for packed numbers.
     """
-    import tifffile
-
     sensor = scene.sensor
     if sensor.pattern is None:
         raise UsageError("a DNG holds a mosaic, this sensor has none", "use a Bayer or X-Trans sensor")
     # The matrix from XYZ to the sensor's colours, for the panel's primaries taken as sRGB's.
-    from_xyz = sensor.colour_matrix @ np.array(
-        [[3.2405, -1.5371, -0.4985], [-0.9693, 1.8760, 0.0416], [0.0556, -0.2040, 1.0572]]
-    )
+    from_xyz = sensor.colour_matrix @ _SRGB_FROM_XYZ
     tags = [
         *_camera_tags(scene),
         (33421, "H", 2, sensor.pattern.shape, True),
@@ -128,27 +124,23 @@ def write_dng(raw: NDArray[np.uint16], scene: Scene, path: Path, bits: int = 16)
         _rationals(50728, "2I", sensor.response, 10_000),
         (50778, "H", 1, 21, True),
     ]
-    layout: dict[str, Any] = {
-        "photometric": 32803,
-        "rowsperstrip": raw.shape[0],
-        "metadata": None,
-        "software": False,
-        "extratags": tags,
-    }
-    if bits == 16:
-        tifffile.imwrite(path, raw, **layout)
-    else:
+    pixels: dict[str, Any] = {"data": raw}
+    if bits == 14:
         packed = iter([pack_14bit(raw)])
-        tifffile.imwrite(path, packed, shape=raw.shape, dtype=np.uint16, bitspersample=14, **layout)
+        pixels = {"data": packed, "shape": raw.shape, "dtype": np.uint16, "bitspersample": 14}
+    layout: dict[str, Any] = {"photometric": 32803, "rowsperstrip": raw.shape[0], "software": False}
+    tifffile.imwrite(path, **pixels, **layout, metadata=None, extratags=tags)
     _append_exif(path, scene)
 
 
 def write_tiff(rgb: NDArray[np.generic], scene: Scene, path: Path) -> None:
     """Write a developed picture of 8 or 16 bits as uncompressed TIFF."""
-    import tifffile
-
     tifffile.imwrite(path, rgb, photometric="rgb", metadata=None, extratags=_camera_tags(scene))
     _append_exif(path, scene)
+
+
+#: FFmpeg's numbers of a colour space and of ranges of luma.
+_BT709, _MPEG_RANGE, _JPEG_RANGE = 1, 1, 2
 
 
 @dataclass(frozen=True)
@@ -158,8 +150,8 @@ class Codec:
     #: FFmpeg's encoder and pixel format.
     encoder: str
     pixel_format: str
-    #: True where luma uses the whole range of its numbers.
-    full_range: bool = False
+    #: FFmpeg's range of luma: a part or the whole of its numbers.
+    colour_range: int = _MPEG_RANGE
 
     @property
     def bits(self) -> int:
@@ -172,9 +164,8 @@ CODECS = {
     "h264-10": Codec("libx264", "yuv420p10le"),
     "hevc": Codec("libx265", "yuv420p"),
     "hevc-10": Codec("libx265", "yuv420p10le"),
-    "mjpeg": Codec("mjpeg", "yuvj420p", full_range=True),
+    "mjpeg": Codec("mjpeg", "yuvj420p", _JPEG_RANGE),
 }
-_BT709, _MPEG_RANGE, _JPEG_RANGE = 1, 1, 2
 
 
 def write_video(
@@ -196,29 +187,18 @@ def write_video(
         preset: how much work the encoder does; see x264 and x265.
 
     Raises:
-        UsageError: unknown codec, or one that this machine's FFmpeg lacks.
+        UsageError: this machine's FFmpeg lacks the codec.
     """
-    import av
-
-    if codec not in CODECS:
-        raise UsageError(f"no codec {codec!r}", f"choose from: {', '.join(CODECS)}")
-    settings = CODECS[codec]
-    rate = Fraction(frame_rate_hz).limit_denominator(1001)
+    settings, rate = CODECS[codec], Fraction(frame_rate_hz).limit_denominator(1001)
+    ranges: dict[str, Any] = {"src_color_range": _JPEG_RANGE, "dst_color_range": settings.colour_range}
     with av.open(str(path), "w") as container:
         stream = None
         for number, rgb in enumerate(frames):
             if stream is None:
                 stream = _add_stream(container, settings, rate, rgb.shape, bit_rate, preset)
-            frame = av.VideoFrame.from_ndarray(
-                np.ascontiguousarray(rgb), "rgb24" if rgb.dtype == np.uint8 else "rgb48le"
-            )
-            target_range = _JPEG_RANGE if settings.full_range else _MPEG_RANGE
-            converted = frame.reformat(
-                format=settings.pixel_format,
-                dst_colorspace=_BT709,
-                src_color_range=_JPEG_RANGE,
-                dst_color_range=target_range,
-            )
+            pixels = "rgb24" if rgb.dtype == np.uint8 else "rgb48le"
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), pixels)
+            converted = frame.reformat(format=settings.pixel_format, dst_colorspace=_BT709, **ranges)
             converted.pts, converted.time_base = number, 1 / rate
             container.mux(stream.encode(converted))
         if stream is not None:
@@ -228,18 +208,15 @@ def write_video(
 def _add_stream(
     container: Any, settings: Codec, rate: Fraction, shape: tuple[int, ...], bit_rate: int | None, preset: str
 ) -> Any:
-    import av
-
     try:
         stream = container.add_stream(settings.encoder, rate=rate)
     except (av.error.FFmpegError, ValueError) as error:
-        raise UsageError(
-            f"{settings.encoder}: this FFmpeg cannot encode it ({error})", "choose another codec"
-        ) from None
+        reason = f"{settings.encoder}: this FFmpeg cannot encode it ({error})"
+        raise UsageError(reason, "choose another codec") from None
     stream.height, stream.width = shape[:2]
     stream.pix_fmt = settings.pixel_format
     context = stream.codec_context
-    context.color_range = _JPEG_RANGE if settings.full_range else _MPEG_RANGE
+    context.color_range = settings.colour_range
     context.colorspace = context.color_trc = context.color_primaries = _BT709
     if bit_rate is not None:
         stream.bit_rate = bit_rate

@@ -11,13 +11,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.simulate.optics import View, between_nodes, grid_nodes
+from rxcli.lab.simulate.optics import Float32Array, View, between_nodes, grid_nodes
 from rxcli.lab.simulate.sensor import PATTERNS, Sensor
 
-Float32Array = NDArray[np.float32]
 Tone = Literal["srgb", "bt709", "gamma", "linear"]
 Subsampling = Literal["444", "422", "420"]
 
@@ -54,8 +54,6 @@ class Isp:
 
 def tone_curve(light: Float32Array, tone: Tone) -> Float32Array:
     """Picture values 0..1 of linear light 0..1, any shape."""
-    import cv2
-
     x: Float32Array = np.clip(light, np.float32(0), np.float32(1))
     if tone == "linear":
         return x
@@ -74,8 +72,6 @@ def demosaic(raw: NDArray[np.uint16], sensor: Sensor) -> Float32Array:
     """
     scale = np.float32(1 / (sensor.white_level - sensor.black_level))
     if sensor.cfa == "bayer":
-        import cv2
-
         planes = cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2RGB).astype(np.float32)
     elif sensor.cfa == "xtrans":
         planes = _demosaic_xtrans(raw)
@@ -87,8 +83,6 @@ def demosaic(raw: NDArray[np.uint16], sensor: Sensor) -> Float32Array:
 
 
 def _demosaic_xtrans(raw: NDArray[np.uint16]) -> Float32Array:
-    import cv2
-
     pattern = PATTERNS["xtrans"]
     values = raw.astype(np.float32)
     planes = np.empty((*raw.shape, 3), np.float32)
@@ -138,16 +132,12 @@ def _in_bands(source: NDArray[Any], work: Callable[[NDArray[Any]], NDArray[Any]]
 
 def _panel_light(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp) -> Float32Array:
     """Linear light in the panel's colours, white balanced, noise reduced."""
-    import cv2
-
     to_panel = np.linalg.inv(sensor.colour_matrix) * isp.gain
     return _reduce_noise(cv2.transform(demosaic(raw, sensor), to_panel.astype(np.float32)), isp)
 
 
 def _finish(planes: Float32Array, isp: Isp, bits: int) -> NDArray[Any]:
     """Tone curve, sharpening, rounding."""
-    import cv2
-
     planes = tone_curve(planes, isp.tone)
     if isp.sharpen > 0:
         grey = luma(planes)
@@ -160,8 +150,6 @@ def _finish(planes: Float32Array, isp: Isp, bits: int) -> NDArray[Any]:
 
 
 def _reduce_noise(planes: Float32Array, isp: Isp) -> Float32Array:
-    import cv2
-
     if isp.denoise_colour_px <= 0 and isp.denoise_px <= 0:
         return planes
     grey = luma(planes)
@@ -187,13 +175,9 @@ def correction_map(view: View) -> tuple[Float32Array, Float32Array]:
 
 def correct_distortion(planes: Float32Array, view: View) -> Float32Array:
     """A picture without the lens's distortion, on the same camera matrix."""
-    import cv2
-
     return np.asarray(cv2.remap(planes, *correction_map(view), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
 
 def luma(rgb: NDArray[Any]) -> Float32Array:
     """(height, width) float32 luma of a picture (height, width, 3), red first."""
-    import cv2
-
     return np.asarray(cv2.transform(rgb.astype(np.float32), np.array([LUMA_BT601], np.float32)))

@@ -11,13 +11,11 @@ from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from rxcli.lab.simulate.optics import Pose
+from rxcli.lab.simulate.optics import FloatArray, Pose
 from rxcli.lab.simulate.pictures import DARK_KINDS, draw_dark_picture, draw_name, load_picture
 from rxcli.lab.simulate.scenes import Scene, preset
 
-FloatArray = NDArray[np.float64]
 Generator = np.random.Generator
 
 #: Panel pixels of the things, and widths of the sensors.

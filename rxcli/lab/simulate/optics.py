@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -111,8 +112,6 @@ def grid_nodes(width: int, pitch: int) -> FloatArray:
 
 def between_nodes(nodes: Float32Array, pitch: int, height: int, width: int) -> Float32Array:
     """(height, width[, k]) values at all pixels, from those at `grid_nodes` down and across."""
-    import cv2
-
     size = (nodes.shape[1] * pitch, nodes.shape[0] * pitch)
     full = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)
     return np.asarray(full[pitch : pitch + height, pitch : pitch + width])

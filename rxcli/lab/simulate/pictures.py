@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError, UsageError
 
 Picture = NDArray[np.uint8]
-#: Pictures that come inside scikit-image's own package, without a download.
-PHOTOS: dict[str, str] = {
-    "astronaut": "astronaut.png",
-    "camera": "camera.png",
-    "chelsea": "chelsea.png",
-    "coffee": "coffee.png",
-    "coins": "coins.png",
-    "hubble": "hubble_deep_field.jpg",
-    "moon": "moon.png",
-    "motorcycle": "motorcycle_left.png",
-    "page": "page.png",
-    "retina": "retina.jpg",
-    "rocket": "rocket.jpg",
-}
+#: Pictures that come inside scikit-image's own package, without a download, and their files.
+_FILES = (
+    *("astronaut.png", "camera.png", "chelsea.png", "coffee.png", "coins.png", "hubble_deep_field.jpg", "moon.png"),
+    *("motorcycle_left.png", "page.png", "retina.jpg", "rocket.jpg"),
+)
+PHOTOS = {re.split("[._]", file)[0]: file for file in _FILES}
 GENERATED = ("white", "grey", "sky", "gradient", "bars", "noise", "checker", "text", "flower", "night", "black")
 
 
@@ -64,9 +58,8 @@ def _photo_path(name: str) -> Path:
 
     spec = find_spec("skimage")
     if spec is None or spec.origin is None:
-        raise InputError(
-            f"picture {name!r} comes with scikit-image, which is not installed", "install it, or give a file"
-        )
+        reason = f"picture {name!r} comes with scikit-image, which is not installed"
+        raise InputError(reason, "install it, or give a file")
     return Path(spec.origin).parent / "data" / PHOTOS[name]
 
 
@@ -83,8 +76,6 @@ def _read(path: Path) -> Picture:
 
 
 def _fill(picture: Picture, width: int, height: int) -> Picture:
-    import cv2
-
     scale = max(width / picture.shape[1], height / picture.shape[0])
     size = (max(width, round(picture.shape[1] * scale)), max(height, round(picture.shape[0] * scale)))
     scaled = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
@@ -94,14 +85,7 @@ def _fill(picture: Picture, width: int, height: int) -> Picture:
 
 def _generate(name: str, width: int, height: int) -> Picture:
     y, x = np.mgrid[0:height, 0:width]
-    drawn = _draw(name, (x + 0.5) / width, (y + 0.5) / height)
-    rgb = drawn if drawn.ndim == 3 else np.repeat(drawn[..., None], 3, axis=2)
-    return np.asarray(np.rint(255 * np.clip(rgb, 0, 1)), np.uint8)
-
-
-def _draw(name: str, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Grey or coloured picture values 0..1 at the places (u, v) of all pixels."""
-    height, width = u.shape
+    u, v = (x + 0.5) / width, (y + 0.5) / height
     flat = {"white": 1.0, "grey": 0.5, "black": 0.0}
     drawers: dict[str, Callable[[], NDArray[np.float64]]] = {
         "sky": lambda: _sky(u, v),
@@ -113,7 +97,9 @@ def _draw(name: str, u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[
         "flower": lambda: _flower(u * width / height, v, width / height),
         "night": lambda: _night(u, v),
     }
-    return np.full(u.shape, flat[name]) if name in flat else drawers[name]()
+    drawn = np.full(u.shape, flat[name]) if name in flat else drawers[name]()
+    rgb = np.broadcast_to(np.atleast_3d(drawn), (height, width, 3))
+    return np.asarray(np.rint(255 * np.clip(rgb, 0, 1)), np.uint8)
 
 
 def _sky(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -128,8 +114,6 @@ def _bars(u: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _text(width: int, height: int) -> NDArray[np.float64]:
-    import cv2
-
     page = np.full((height, width), 238, np.uint8)
     lines = (
         "The quick brown fox jumps over the lazy dog 0123456789",
@@ -148,9 +132,8 @@ def _flower(x: NDArray[np.float64], y: NDArray[np.float64], aspect: float) -> ND
     shade = inside * (0.35 + 0.65 * np.clip(radius / 0.4, 0, 1))
     heart = np.exp(-((radius / 0.09) ** 2))
     leaves = 0.12 * np.clip(np.sin(9 * dx + 4 * dy) * np.sin(5 * dy - 3 * dx), 0, 1) + 0.02
-    return np.stack(
-        [0.95 * shade + 0.4 * heart + leaves * 0.3, 0.35 * shade + 0.5 * heart + leaves, 0.6 * shade], axis=-1
-    )
+    red, green = 0.95 * shade + 0.4 * heart + leaves * 0.3, 0.35 * shade + 0.5 * heart + leaves
+    return np.stack([red, green, 0.6 * shade], axis=-1)
 
 
 def _night(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -211,8 +194,6 @@ def _window(rng: np.random.Generator, width: int, height: int) -> Picture:
 
 
 def _terminal(rng: np.random.Generator, width: int, height: int) -> Picture:
-    import cv2
-
     out = np.full((height, width, 3), int(rng.choice([0, 12, 24])), np.uint8)
     step, letters = int(rng.integers(16, 26)), np.array(list("abcdefghijklmnopqrstuvwxyz0123456789/-_.:=      "))
     colour = [int(c) for c in rng.integers(120, 256, 3)]
@@ -234,8 +215,6 @@ def _lit_night(rng: np.random.Generator, width: int, height: int) -> Picture:
 
 
 def _stars(rng: np.random.Generator, width: int, height: int) -> Picture:
-    import cv2
-
     sky = np.zeros((height, width), np.float32)
     n = int(rng.integers(150, 1200))
     sky[rng.integers(0, height, n), rng.integers(0, width, n)] = rng.pareto(1.5, n).clip(0, 30)

@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 
 from rxcli.errors import UsageError
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS, bits_per_symbol, bits_to_hex, encode_packet, payload_bits
+from rxcli.protocol import SLOTS_PER_SYMBOL, WEIGHTS, bits_per_symbol, encode_packet, payload_bits
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
 #: Exponent of the panel: light = (grey / 255) ** PANEL_GAMMA.
 PANEL_GAMMA = 2.2
+#: (256,) light of every grey level.
+_PANEL_LIGHT = (np.arange(256) / 255.0) ** PANEL_GAMMA
 #: What a black pixel of the panel still lets through (contrast 1000 : 1).
 PANEL_LEAKAGE = 1e-3
 #: A column of weight w sends the first k(w) bits of a label.
@@ -85,8 +87,7 @@ class Drive:
     @cached_property
     def transmittance(self) -> Float32Array:
         """(height_px, width_px, 3) what the panel lets through, per colour."""
-        table = (np.arange(256) / 255.0) ** PANEL_GAMMA
-        return (PANEL_LEAKAGE + (1 - PANEL_LEAKAGE) * table).astype(np.float32)[self.grey]
+        return (PANEL_LEAKAGE + (1 - PANEL_LEAKAGE) * _PANEL_LIGHT).astype(np.float32)[self.grey]
 
     @cached_property
     def lit_light(self) -> FloatArray:
@@ -110,10 +111,8 @@ def choose_weights(weights: Weights, levels: FloatArray) -> NDArray[np.int64]:
         return np.asarray(np.clip(wanted, WEIGHTS[0], WEIGHTS[-1]), np.int64)
     values = np.atleast_1d(np.asarray(weights, np.int64))
     if values.size not in (1, columns):
-        raise UsageError(
-            f"w must be one number or one for each of {columns} columns (got {values.size})",
-            "give one number, a list as long as the screen has columns, or 'dimming'",
-        )
+        reason = f"w must be one number or one for each of {columns} columns (got {values.size})"
+        raise UsageError(reason, "give one number, a list as long as the screen has columns, or 'dimming'")
     if values.min() < WEIGHTS[0] or values.max() > WEIGHTS[-1]:
         raise UsageError(f"w must be in 1..9 (got {values.tolist()})", "choose from 1..9")
     return np.array(np.broadcast_to(values, columns))
@@ -130,12 +129,11 @@ def drive_screen(
         weights: see `choose_weights`.
         dimming: "max", or "none" for a backlight that is fully on everywhere.
     """
-    table = (np.arange(256) / 255.0) ** PANEL_GAMMA
     shape = (screen.segment_rows, screen.columns)
     # The brightest grey level is the brightest light: the picture itself can be searched.
-    levels = table[dimming_levels(picture, *shape)] if dimming == "max" else np.ones(shape)
+    levels = _PANEL_LIGHT[dimming_levels(picture, *shape)] if dimming == "max" else np.ones(shape)
     backlight = backlight_average(levels, screen, picture.shape[0], picture.shape[1])
-    needed = table.astype(np.float32)[picture] / np.maximum(backlight, 1e-6)[..., None].astype(np.float32)
+    needed = _PANEL_LIGHT.astype(np.float32)[picture] / np.maximum(backlight, 1e-6)[..., None].astype(np.float32)
     grey = np.rint(255 * np.clip(needed, 0, 1) ** np.float32(1 / PANEL_GAMMA)).astype(np.uint8)
     return Drive(screen, grey, levels, choose_weights(weights, levels))
 
@@ -184,7 +182,10 @@ class Link:
     def payload(self, burst: int) -> list[NDArray[np.uint8]]:
         """Payload bits of one burst, per column."""
         if self.labels is not None:
-            return self._payload_of_labels(self.labels, burst)
+            # The first bits of every symbol's label, as many as the column's weight carries.
+            label = self.labels.labels(np.array([burst]), self.screen.columns, self.screen.payload_symbols)[0]
+            sent = ((label[..., None] >> np.arange(LABEL_BITS - 1, -1, -1)) & 1).astype(np.uint8)
+            return [sent[:, c, : bits_per_symbol(int(w))].ravel() for c, w in enumerate(self.weights)]
         total = sum(self.bits_per_column)
         if self.message is None:
             rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, burst])))
@@ -193,16 +194,6 @@ class Link:
             message = np.unpackbits(np.frombuffer(self.message, np.uint8))
             bits = np.take(message, np.arange(burst * total, (burst + 1) * total), mode="wrap")
         return np.split(bits, np.cumsum(self.bits_per_column)[:-1])
-
-    def _payload_of_labels(self, source: LabelSource, burst: int) -> list[NDArray[np.uint8]]:
-        """The first bits of every symbol's label, as many as the column's weight carries."""
-        label = source.labels(np.array([burst]), self.screen.columns, self.screen.payload_symbols)[0]
-        bits = (label[..., None] >> np.arange(LABEL_BITS - 1, -1, -1)) & 1
-        return [bits[:, c, : bits_per_symbol(int(w))].astype(np.uint8).ravel() for c, w in enumerate(self.weights)]
-
-    def payload_hex(self, burst: int) -> list[str]:
-        """Payload of one burst as hex, per column."""
-        return [bits_to_hex(bits) for bits in self.payload(burst)]
 
     def packets(self, burst: int) -> NDArray[np.uint8]:
         """(columns, packet slots) 0/1, one packet of `burst`."""
@@ -224,14 +215,11 @@ class Link:
 WAVEFORM_FILES = ("slots.npy", "slots.csv", "levels.csv", "lit_light.csv", "picture.png")
 
 
-def export_waveforms(drive: Drive, link: Link, n_bursts: int, folder: Path) -> list[Path]:
+def export_waveforms(drive: Drive, link: Link, n_bursts: int, folder: Path) -> None:
     """Write what a laboratory needs to drive a real backlight.
 
     `slots.npy` and `slots.csv` hold one line per slot and one value per column; `levels.csv` the average light of every
     segment, `lit_light.csv` its light while lit (1 is the full average); `picture.png` the compensated picture.
-
-    Returns:
-        The files written.
     """
     from rxcli.outputs import encode_png
 
@@ -243,4 +231,3 @@ def export_waveforms(drive: Drive, link: Link, n_bursts: int, folder: Path) -> l
     np.savetxt(folder / "levels.csv", drive.levels, fmt="%.6f", delimiter=",", header=names, comments="")
     np.savetxt(folder / "lit_light.csv", drive.lit_light, fmt="%.6f", delimiter=",", header=names, comments="")
     (folder / WAVEFORM_FILES[-1]).write_bytes(encode_png(np.ascontiguousarray(drive.grey[..., ::-1])))
-    return [folder / name for name in WAVEFORM_FILES]

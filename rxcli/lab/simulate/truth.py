@@ -11,10 +11,15 @@ import numpy as np
 
 from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
+from rxcli.protocol import bits_to_hex
 
 if TYPE_CHECKING:
     from rxcli.lab.simulate.camera import Exposure
     from rxcli.lab.simulate.scenes import Scene
+
+
+#: Recognised in files that may be replaced (`rxcli.outputs`).
+_AUTHOR = "vlc-rx simulate"
 
 
 def visible_bursts(exposure: Exposure) -> list[dict[str, Any]]:
@@ -28,9 +33,9 @@ def visible_bursts(exposure: Exposure) -> list[dict[str, Any]]:
     length = exposure.link.burst_slots
     bursts = []
     for burst in range(max(int(begin // length), 0), int(end // length) + 1):
-        seen = min(end, (burst + 1) * length) - max(begin, burst * length)
-        if seen > 0:
-            bursts.append({"burst": burst, "visible_slots": round(seen, 1)})
+        visible = min(end, (burst + 1) * length) - max(begin, burst * length)
+        if visible > 0:
+            bursts.append({"burst": burst, "visible_slots": round(visible, 1)})
     return bursts
 
 
@@ -42,75 +47,49 @@ def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[s
         exposures: one per frame.
         capture: name of the capture's file.
     """
-    first = exposures[0]
-    frames = [_frame_truth(number, exposure) for number, exposure in enumerate(exposures)]
+    first, screen = exposures[0], scene.screen
+    frames = [
+        {
+            "frame": number,
+            "bursts": visible_bursts(exposure),
+            "corners_sensor_px": exposure.corners.tolist(),
+            "start_slot": exposure.start_slot,
+        }
+        for number, exposure in enumerate(exposures)
+    ]
     bursts = sorted({entry["burst"] for frame in frames for entry in frame["bursts"]})
+    profile = build_camera_profile(scene, first)
+    camera = msgspec.to_builtins(profile.modes[0]) | msgspec.to_builtins(profile.lens) | {"name": profile.name}
     return {
         "capture": capture,
-        "screen": scene.screen.name,
-        "columns": scene.screen.columns,
-        "slot_rate_hz": scene.screen.slot_rate_hz,
-        "payload_symbols": scene.screen.payload_symbols,
-        "repeats": scene.screen.repeats,
-        "camera": _camera_truth(scene, first),
+        "screen": screen.name,
+        **{name: getattr(screen, name) for name in ("columns", "slot_rate_hz", "payload_symbols", "repeats")},
+        "camera": camera,
         "w": first.link.weights.tolist(),
         "payload_bits": list(first.link.bits_per_column),
         "corners_sensor_px": first.corners.tolist(),
         "frames": frames,
-        "payload": {str(burst): first.link.payload_hex(burst) for burst in bursts},
+        "payload": {str(burst): [bits_to_hex(bits) for bits in first.link.payload(burst)] for burst in bursts},
         "orientation": scene.orientation,
         "tone_curve": "linear" if scene.is_mosaic else scene.isp.tone,
         "slot_rate_error_ppm": scene.slot_rate_error_ppm,
         "column_delay_slots": first.delays.tolist(),
-        "written_by": "vlc-rx simulate",
+        "written_by": _AUTHOR,
     }
 
 
 def build_camera_profile(scene: Scene, exposure: Exposure) -> CameraProfile:
     """A camera profile that fits the captures of a scene: what a calibration would find, without its errors."""
-    sensor = scene.sensor
-    top, middle, bottom = (tuple(row) for row in exposure.view.camera_matrix.tolist())
-    mode = ReadoutMode(
-        name="simulated",
-        width=sensor.width,
-        height=sensor.height,
-        line_delay_s=sensor.line_delay_s,
-        exposure_s=scene.exposure_s,
-        frame_rate_hz=scene.frame_rate_hz,
-    )
-    lens = LensModel(
-        width=sensor.width,
-        height=sensor.height,
-        camera_matrix=(top, middle, bottom),
-        dist_coeffs=scene.lens.distortion,
-        distortion_already_corrected=scene.isp.correct_distortion and not scene.is_mosaic,
-    )
-    return CameraProfile(
-        format=1,
-        kind="camera",
-        name=scene.camera_name,
-        make=scene.make,
-        models=(scene.model,),
-        modes=(mode,),
-        lens=lens,
-        description="written by vlc-rx simulate",
-    )
-
-
-def _camera_truth(scene: Scene, exposure: Exposure) -> dict[str, Any]:
-    """Readout and lens from the camera profile."""
-    profile = build_camera_profile(scene, exposure)
-    facts = msgspec.to_builtins(profile.modes[0]) | msgspec.to_builtins(profile.lens)
-    return {**facts, "name": profile.name}
-
-
-def _frame_truth(number: int, exposure: Exposure) -> dict[str, Any]:
-    return {
-        "frame": number,
-        "bursts": visible_bursts(exposure),
-        "corners_sensor_px": exposure.corners.tolist(),
-        "start_slot": exposure.start_slot,
-    }
+    sensor, lens = scene.sensor, scene.lens.distortion
+    size: dict[str, int] = {"width": sensor.width, "height": sensor.height}
+    timing: dict[str, Any] = {"line_delay_s": sensor.line_delay_s, "exposure_s": scene.exposure_s}
+    mode = ReadoutMode(name="simulated", **size, **timing, frame_rate_hz=scene.frame_rate_hz)
+    matrix: Any = tuple(map(tuple, exposure.view.camera_matrix.tolist()))
+    is_corrected = scene.isp.correct_distortion and not scene.is_mosaic
+    model = LensModel(**size, camera_matrix=matrix, dist_coeffs=lens, distortion_already_corrected=is_corrected)
+    named: dict[str, Any] = {"name": scene.camera_name, "make": scene.make, "models": (scene.model,)}
+    about = f"written by {_AUTHOR}"
+    return CameraProfile(format=1, kind="camera", **named, modes=(mode,), lens=model, description=about)
 
 
 def write_truth(truth: dict[str, Any], path: Path) -> Path:
