@@ -17,7 +17,7 @@ from rxcli.cli.kinds import FILE, FOLDER, Exposure
 from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
-    from rxcli.lab.simulate.capture import Take
+    from rxcli.lab.simulate.capture import Recording
     from rxcli.lab.simulate.scenes import Scene
     from rxcli.lab.simulate.transmitter import Weights
     from rxcli.link.encoder import Sending
@@ -231,7 +231,7 @@ def _labels(options: dict[str, Any]) -> Sending | None:
     return sending_of(options["file_path"], options["text"], options["uri"])
 
 
-def _warn_of_cut_packets(capture: Take) -> None:
+def _warn_of_cut_packets(capture: Recording) -> None:
     """Warn if no frame can show a complete packet."""
     sensor, corners = capture.scene.sensor, capture.exposure(0).view.corners
     top, bottom = max(float(corners[:, 1].min()), 0.0), min(float(corners[:, 1].max()), sensor.height - 1.0)
@@ -260,7 +260,7 @@ def _payload(text: str) -> bytes | None:
     return data
 
 
-def _write(capture: Take, out: Path, file_format: str, bit_rate: int | None) -> Path:
+def _write(capture: Recording, out: Path, file_format: str, bit_rate: int | None) -> Path:
     """Write the capture and its truth; returns the truth's path."""
     from tqdm import tqdm
 
@@ -274,7 +274,7 @@ def _write(capture: Take, out: Path, file_format: str, bit_rate: int | None) -> 
     return write_truth(capture.truth(out.name), out)
 
 
-def _write_extras(capture: Take, options: dict[str, Any]) -> None:
+def _write_extras(capture: Recording, options: dict[str, Any]) -> None:
     """Camera profile and waveforms, where they are asked for."""
     from rxcli.lab.simulate.transmitter import export_waveforms
     from rxcli.lab.simulate.truth import build_camera_profile
@@ -289,7 +289,7 @@ def _write_extras(capture: Take, options: dict[str, Any]) -> None:
         export_waveforms(capture.drive, capture.link, n_bursts, options["waveforms"])
 
 
-def _summary(capture: Take) -> str:
+def _summary(capture: Recording) -> str:
     scene, exposure = capture.scene, capture.exposure(0)
     return (
         f"{scene.sensor.width} x {scene.sensor.height}, {scene.rows_per_slot:.2f} rows per slot, "

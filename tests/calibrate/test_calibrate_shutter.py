@@ -53,18 +53,13 @@ def exposed(light: Any, rng: np.random.Generator, noise: float = 0.01, gain: flo
     return np.round(255 * np.clip(values, 0, 1)) / 255
 
 
-def only(picture: Any, axis: Any = None) -> Any:
-    along, regions = find_stripes(picture, axis)
-    assert len(regions) == 1, [region.bounds for region in regions]
-    return along, regions[0]
-
-
-@pytest.mark.parametrize("duty", [None, 0.1, 1 / 3, 0.5, 0.7, 0.9])
-@pytest.mark.parametrize("period", [7.7, 31.1, 97.3])
+@pytest.mark.parametrize(
+    ("duty", "period"), [(None, 7.7), (None, 97.3), (0.1, 97.3), (1 / 3, 31.1), (0.5, 7.7), (0.7, 31.1), (0.9, 97.3)]
+)
 def test_the_fundamental_is_found_for_every_waveform(duty: float | None, period: float) -> None:
     frequency = 1 / (period * LINE_DELAY_S)
     light = lamp(frequency, 800, 0.2 / frequency, duty)[:, None] * scene(800, 160)
-    along, found = only(exposed(light, np.random.default_rng(1)))
+    along, [found] = find_stripes(exposed(light, np.random.default_rng(1)))
     assert along == "rows"
     assert found.period_px == pytest.approx(period, rel=2e-3)
     assert abs(found.period_px - period) < 5 * found.period_sd_px
@@ -81,34 +76,25 @@ def test_strong_harmonics_are_no_fundamental() -> None:
         assert 1 / fit.frequency == pytest.approx(90, rel=2e-3)
 
 
-def test_a_spot_in_a_corner_is_enough() -> None:
-    light = lamp(2500, 800, 1e-4)[:, None] * spot(800, 600, 130, 600, 80)
-    _, found = only(exposed(light, np.random.default_rng(4)))
-    _, top, right, _ = found.bounds
-    assert found.period_px == pytest.approx(20, rel=5e-3)
-    assert right < 300
-    assert top > 400
+def two_spots(left_hz: float, right_hz: float, duty: float, seed: int) -> Any:
+    left = lamp(left_hz, 800, 1e-4)[:, None] * spot(800, 640, 150, 400, 130)
+    right = lamp(right_hz, 800, 1e-4, duty, 0.7)[:, None] * spot(800, 640, 490, 380, 130)
+    return exposed(left + right, np.random.default_rng(seed))
 
 
 def test_lamps_of_different_frequency_each_have_their_region() -> None:
-    left = lamp(1000, 800, 1e-4)[:, None] * spot(800, 640, 150, 400, 130)
-    right = lamp(1370, 800, 1e-4, 0.3, 0.7)[:, None] * spot(800, 640, 490, 380, 130)
-    result = calibrate_shutter([exposed(left + right, np.random.default_rng(5))], [1370, 1000])
-    by_frequency = {reading.frequency_hz: reading for reading in result.lamps}
+    picture = two_spots(1000, 1370, 0.3, 5)
+    result = calibrate_shutter([picture], [1370, 1000])
+    by_frequency = {stripes.frequency_hz: stripes for stripes in result.lamps}
     assert set(by_frequency) == {1000, 1370}
     assert by_frequency[1000].bounds[2] <= 340
     assert by_frequency[1370].bounds[0] >= 300
     assert result.line_delay_s == pytest.approx(LINE_DELAY_S, rel=1e-3)
     assert result.readout_s == pytest.approx(800 * LINE_DELAY_S, rel=1e-3)
     assert not result.warnings
-
-
-def test_a_lamp_that_was_not_named_is_told() -> None:
-    big = lamp(1000, 800, 1e-4)[:, None] * spot(800, 640, 200, 400, 190)
-    small = lamp(1900, 800, 1e-4)[:, None] * spot(800, 640, 560, 400, 60)
-    result = calibrate_shutter([exposed(big + small, np.random.default_rng(6))], [1000])
-    assert result.line_delay_s == pytest.approx(LINE_DELAY_S, rel=2e-3)
-    assert any("1900" in warning or "190" in warning for warning in result.warnings)
+    one_named = calibrate_shutter([picture], [1000])
+    assert one_named.line_delay_s == pytest.approx(LINE_DELAY_S, rel=2e-3)
+    assert "blinks at about 137" in " ".join(one_named.warnings)
 
 
 LAMPS_HZ = [2000, 2500, 3000, 3500, 4000]
@@ -131,7 +117,7 @@ def dark_photo(seed: int, radius: float, steady: bool = False) -> tuple[Any, lis
     return exposed(light, rng, 0.03, 1.0), placed
 
 
-@pytest.mark.parametrize(("seed", "radius", "steady"), [(1, 40, False), (2, 75, True), (3, 60, False)])
+@pytest.mark.parametrize(("seed", "radius", "steady"), [(1, 40, False), (2, 75, True)])
 def test_five_spots_in_a_dark_picture_are_five_regions_and_one_readout(seed: int, radius: float, steady: bool) -> None:
     picture, placed = dark_photo(seed, radius, steady)
     result = calibrate_shutter([picture], LAMPS_HZ)
@@ -139,7 +125,7 @@ def test_five_spots_in_a_dark_picture_are_five_regions_and_one_readout(seed: int
     assert result.line_delay_s == pytest.approx(LINE_DELAY_S, rel=1e-3)
     low, high = result.line_delay_interval_s
     assert low - np.ptp([low, high]) < LINE_DELAY_S < high + np.ptp([low, high])
-    regions = {reading.frequency_hz: reading.bounds for reading in result.lamps}
+    regions = {stripes.frequency_hz: stripes.bounds for stripes in result.lamps}
     assert set(regions) == set(LAMPS_HZ)
     assert result.warnings == ()
     for frequency, x, y in placed:
@@ -153,9 +139,7 @@ def test_lamps_that_fit_in_two_ways_are_refused() -> None:
     alone = lamp(1000, 800, 1e-4)[:, None] * spot(800, 640, 320, 400, 150)
     with pytest.raises(ReceiverError, match=r"fit the frequencies given in more than one way: (20|27\.4) or"):
         calibrate_shutter([exposed(alone, np.random.default_rng(20))], [1000, 1370])
-    left = lamp(1000, 800, 1e-4)[:, None] * spot(800, 640, 150, 400, 130)
-    right = lamp(2000, 800, 1e-4)[:, None] * spot(800, 640, 490, 380, 130)
-    picture = exposed(left + right, np.random.default_rng(21))
+    picture = two_spots(1000, 2000, 0.5, 21)
     with pytest.raises(ReceiverError, match="more than one way"):
         calibrate_shutter([picture], [500, 1000, 2000, 4000])
     assert calibrate_shutter([picture], [1000, 2000]).line_delay_s == pytest.approx(LINE_DELAY_S, rel=1e-3)
@@ -191,7 +175,7 @@ def autoregressive(n: int, rng: np.random.Generator) -> Any:
 
 @pytest.mark.parametrize(
     ("duty", "noise", "gain", "least"),
-    [(None, 0.1, 0.15, 51), (0.5, 0.05, 0.5, 51), (0.2, 0.2, 0.6, 51), (None, 0.3, 0.4, 51), (None, None, 10.0, 50)],
+    [(0.5, 0.05, 0.5, 51), (None, 0.3, 0.4, 51), (None, None, 10.0, 50)],
 )
 def test_the_interval_holds_as_often_as_it_says(duty: Any, noise: Any, gain: float, least: int) -> None:
     """Of 60 intervals of 95 % at least 51 hold (fewer: 1 in 2000), and they are not needlessly wide.
@@ -214,18 +198,6 @@ def test_the_interval_holds_as_often_as_it_says(duty: Any, noise: Any, gain: flo
     assert np.std(deviations) > 0.5
 
 
-def test_more_pictures_narrow_the_interval() -> None:
-    def picture(seed: int) -> Any:
-        rng = np.random.default_rng(seed)
-        return exposed(lamp(1000, 500, 1e-4, 0.5, rng.random())[:, None] * scene(500, 100), rng, 0.1)
-
-    one = calibrate_shutter([picture(0)], [1000])
-    many = calibrate_shutter([picture(seed) for seed in range(6)], [1000])
-    assert np.ptp(many.line_delay_interval_s) < 0.7 * np.ptp(one.line_delay_interval_s)
-    low, high = many.line_delay_interval_s
-    assert low - np.ptp([low, high]) < LINE_DELAY_S < high + np.ptp([low, high])
-
-
 @pytest.mark.parametrize(
     ("on_s", "exposure_s", "exif_s", "expected_s"),
     [
@@ -239,7 +211,9 @@ def test_more_pictures_narrow_the_interval() -> None:
 def test_exposure_from_the_edges(on_s: float | None, exposure_s: float, exif_s: Any, expected_s: Any) -> None:
     light = lamp(800, 800, exposure_s, on_s and 800 * on_s)[:, None] * scene(800, 200)
     picture = exposed(light, np.random.default_rng(11), gain=2.0 if on_s == 1e-4 else 0.6)
-    found = calibrate_shutter([picture], [800], exif_exposure_s=exif_s).exposure
+    result = calibrate_shutter([picture], [800], exif_exposure_s=exif_s)
+    twice, found = calibrate_shutter([picture] * 2, [800]), result.exposure
+    assert np.ptp(twice.line_delay_interval_s) < 0.8 * np.ptp(result.line_delay_interval_s)
     assert found.exposure_s == (expected_s and pytest.approx(expected_s, rel=0.05))
     assert found.comment
     if found.exposure_s is not None:
@@ -274,12 +248,8 @@ def test_a_mode_replaces_that_of_its_size_and_keeps_the_rest(tmp_path: Path) -> 
     mode = saved.mode_for(640, 480)
     assert mode is not None
     assert (mode.line_delay_s, mode.frame_rate_hz, len(saved.modes)) == (2e-5, 30.0, 2)
-
-
-def test_a_profile_is_not_written_over_something_else(tmp_path: Path) -> None:
-    path = tmp_path / "notes.toml"
     path.write_text("hello = 1")
-    with pytest.raises(ProfileError, match="notes"):
+    with pytest.raises(ProfileError, match="cam"):
         profile_to_extend(path)
     with pytest.raises(UsageError, match="cannot name"):
         profile_to_extend(tmp_path / "my camera.toml")
@@ -338,11 +308,13 @@ def test_wrong_usage_is_one_line(
 
 
 def test_refusals_and_unreadable_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    dull = tmp_path / "dull.png"
-    Image.new("L", (200, 200), 99).save(dull)
-    assert run(["calibrate", "shutter", str(dull), "--frequency", "1000"]) == ExitCode.NOT_RECEIVED
-    assert "no stripes" in capsys.readouterr().err
-    assert run(["calibrate", "shutter", str(tmp_path / "absent.png"), "--frequency", "9"]) == ExitCode.UNREADABLE
+    Image.new("L", (200, 200), 99).save(tmp_path / "dull.png")
+    for name, code, reason in [
+        ("dull.png", ExitCode.NOT_RECEIVED, "no stripes"),
+        ("absent.png", ExitCode.UNREADABLE, "absent.png"),
+    ]:
+        assert run(["calibrate", "shutter", str(tmp_path / name), "--frequency", "1000"]) == code
+        assert reason in capsys.readouterr().err
 
 
 def test_rotated_pictures_give_no_mode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from rxcli.ingest import open_source
 from rxcli.ingest.video import _Progress, _time_s
-from rxcli.lab.simulate.capture import Take, prepare
+from rxcli.lab.simulate.capture import Recording, prepare
 from rxcli.lab.simulate.files import write_video
 from rxcli.lab.simulate.scenes import Change, Scene, preset
 from rxcli.lab.simulate.truth import build_camera_profile
@@ -42,7 +42,7 @@ def filmed(scene: Scene, seed: int = SEED) -> Clip:
     return filmed_by(prepare(scene, seed))
 
 
-def filmed_by(take: Take) -> Clip:
+def filmed_by(take: Recording) -> Clip:
     scene = take.scene
     frames = tuple(
         Frame(np.asarray(take.frame(k).pixels), "clip", k, k / scene.frame_rate_hz) for k in range(scene.n_frames)
@@ -50,7 +50,7 @@ def filmed_by(take: Take) -> Clip:
     return frames, truth_of(take), options_of(take)
 
 
-def truth_of(take: Take) -> Truth:
+def truth_of(take: Recording) -> Truth:
     return msgspec.json.decode(msgspec.json.encode(take.truth("clip")), type=Truth)
 
 
@@ -59,7 +59,7 @@ def shaky_corners() -> list[list[list[float]]]:
     return [frame["corners_sensor_px"] for frame in take.truth("clip")["frames"]]
 
 
-def options_of(take: Take) -> ReceiverOptions:
+def options_of(take: Recording) -> ReceiverOptions:
     camera = build_camera_profile(take.scene, take.exposure())
     return ReceiverOptions(screens=(take.scene.screen,), cameras=(camera,), force_camera=True, cae="never")
 
@@ -76,7 +76,7 @@ def surely_wrong(results: list[FrameResult]) -> int:
     return sum(p.bit_errors != 0 for r in results for c in r.columns for p in c.packets if p.confidence >= 0.99)
 
 
-def at_rate(rate_hz: float, screen: str, n_frames: int) -> Take:
+def at_rate(rate_hz: float, screen: str, n_frames: int) -> Recording:
     """A clip of any frame rate; a readout takes most of the time from frame to frame, or what the sensor needs."""
     scene = scene_in_hand(2.0, n_frames, screen, frame_rate_hz=rate_hz)
     sensor = scene.sensor
@@ -84,7 +84,7 @@ def at_rate(rate_hz: float, screen: str, n_frames: int) -> Take:
     return prepare(replace(scene, sensor=replace(sensor, line_delay_s=readout_s / sensor.height)), SEED)
 
 
-def shown_as_a_whole(take: Take, margin: float) -> set[int]:
+def shown_as_a_whole(take: Recording, margin: float) -> set[int]:
     """Bursts all of whose payload frames show together, `margin` slots at either end of the screen not counted."""
     screen = take.scene.screen
     rate = take.scene.sensor.line_delay_s * screen.slot_rate_hz

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rxcli import numerics
 from rxcli.errors import InputError
-from rxcli.lab.simulate.capture import Take, prepare
+from rxcli.lab.simulate.capture import Recording, prepare
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
@@ -40,7 +40,7 @@ class Clip:
     options: ReceiverOptions
 
 
-def camera_of(take: Take) -> CameraProfile:
+def camera_of(take: Recording) -> CameraProfile:
     scene, denoised = take.scene, take.truth("clip")["camera"]
     width, height = scene.sensor.width, scene.sensor.height
     mode = ReadoutMode(

@@ -99,12 +99,12 @@ def check_checkout(path: Path) -> Path:
     return path.resolve()
 
 
-def compare(tasks: Sequence[Task], other: Path, folder: Path, repeats: int, tick: Callable[[], None]) -> list[Record]:
+def compare(tasks: Sequence[Task], rival: Path, folder: Path, repeats: int, tick: Callable[[], None]) -> list[Record]:
     """Draw the cases of the tasks as files, and decode each with this checkout and with the other, by turns.
 
     Args:
         tasks: of a scenario.
-        other: folder of the other checkout.
+        rival: folder of the other checkout.
         folder: where the files go.
         repeats: turns; the least time of each file counts.
         tick: called after every turn of either.
@@ -121,15 +121,15 @@ def compare(tasks: Sequence[Task], other: Path, folder: Path, repeats: int, tick
             records.append({"about": {"file": jobs[-1][1]}, "has_data": case.has_data, "groups": groups, "ways": {}})
     turns: dict[str, list[list[Record]]] = {way: [] for way in WAYS}
     for _ in range(repeats):
-        for way, checkout in zip(WAYS, (other, CHECKOUT), strict=True):
+        for way, checkout in zip(WAYS, (rival, CHECKOUT), strict=True):
             turns[way].append(_decoded_by(checkout, jobs))
             tick()
     for way, several in turns.items():
         for record, decoded in zip(records, zip(*several, strict=True), strict=True):
-            record["ways"][way] = {**decoded[0], "cpu_s": min(one["cpu_s"] for one in decoded)}
+            record["ways"][way] = {**decoded[0], "cpu_s": min(turn["cpu_s"] for turn in decoded)}
     for record in records:
-        before, now = (record["ways"][way] for way in WAYS)
-        now["difference"] = next(differences("", before["lines"], now["lines"]), None)
+        before, after = (record["ways"][way] for way in WAYS)
+        after["difference"] = next(differences("", before["lines"], after["lines"]), None)
     return records
 
 
@@ -158,16 +158,16 @@ def _reception(text: str, cpu_s: float, exit_code: int) -> Record:
     return {"lines": [*lines, {"exit code": exit_code}], "packets": packets, "cpu_s": cpu_s}
 
 
-def differences(place: str, before: Any, now: Any) -> Iterator[str]:
+def differences(place: str, before: Any, after: Any) -> Iterator[str]:
     """Places where two JSON values differ, with both values."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        for key in dict.fromkeys((*before, *now)):
-            yield from differences(f"{place}.{key}".lstrip("."), before.get(key), now.get(key))
-    elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
-        for number, parts in enumerate(zip(before, now, strict=True)):
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in dict.fromkeys((*before, *after)):
+            yield from differences(f"{place}.{key}".lstrip("."), before.get(key), after.get(key))
+    elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        for number, parts in enumerate(zip(before, after, strict=True)):
             yield from differences(f"{place}[{number}]", *parts)
-    elif before != now or type(before) is not type(now):
-        yield f"{place}: {json.dumps(before):.60} -> {json.dumps(now):.60}"
+    elif before != after or type(before) is not type(after):
+        yield f"{place}: {json.dumps(before):.60} -> {json.dumps(after):.60}"
 
 
 def differing(records: Sequence[Record]) -> list[Row]:

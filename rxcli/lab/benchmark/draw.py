@@ -19,7 +19,7 @@ import numpy as np
 from rxcli.lab.benchmark.cases import Case
 from rxcli.lab.benchmark.media import Medium, camera_path
 from rxcli.lab.benchmark.trial import SOURCE, Trial, simulate_trial, truth_of
-from rxcli.lab.simulate.capture import Take, prepare
+from rxcli.lab.simulate.capture import Recording, prepare
 from rxcli.lab.simulate.files import write_video
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, no_data_scene
@@ -324,9 +324,9 @@ def draw_motion(at: Place) -> Iterator[Case]:
     scene = replace(_filmed_scene(rng, base), n_frames=_HAND_FRAMES)
     encoding = "h264", "veryfast", _bit_rate(np.random.default_rng([at.flat, 6]), scene, _BITS_PER_PIXEL)
     for speed in SPEEDS_PX:
-        take = prepare(replace(scene, hand_px=speed), at.flat)
-        with filmed(take, [encoding]) as (path,):
-            yield _clip(take, path, True, f"{speed:g} pixels a frame")
+        recording = prepare(replace(scene, hand_px=speed), at.flat)
+        with filmed(recording, [encoding]) as (path,):
+            yield _clip(recording, path, True, f"{speed:g} pixels a frame")
 
 
 def draw_clips(at: Place) -> Iterator[Case]:
@@ -346,10 +346,10 @@ def draw_clips(at: Place) -> Iterator[Case]:
         (str(rng.choice(_CODECS)), str(rng.choice(_ENCODER_PRESETS)), _bit_rate(rng, scene, _ANY_BITS_PER_PIXEL))
         for _ in range(_ENCODINGS)
     ]
-    take = prepare(scene, at.flat)
-    with filmed(take, encodings) as paths:
+    recording = prepare(scene, at.flat)
+    with filmed(recording, encodings) as paths:
         for path, (codec, _, _) in zip(paths, encodings, strict=True):
-            case = _clip(take, path, named, *groups, codec)
+            case = _clip(recording, path, named, *groups, codec)
             yield replace(case, options=replace(case.options, screens=ReceiverOptions().screens))
 
 
@@ -370,23 +370,23 @@ def _bit_rate(rng: np.random.Generator, scene: Scene, bits_per_pixel: tuple[floa
 
 
 @contextmanager
-def filmed(take: Take, encodings: Iterable[Encoding]) -> Iterator[list[Path]]:
-    """The clips of a take in every encoding, as files in a folder that goes away afterwards."""
-    pictures = [take.frame(n, threads=1).rgb for n in range(take.scene.n_frames)]
+def filmed(recording: Recording, encodings: Iterable[Encoding]) -> Iterator[list[Path]]:
+    """The clips of a scene in every encoding, as files in a folder that goes away afterwards."""
+    pictures = [recording.frame(n, threads=1).rgb for n in range(recording.scene.n_frames)]
     with TemporaryDirectory() as folder:
         paths = []
         for number, (codec, speed, bit_rate) in enumerate(encodings):
             paths.append(Path(folder) / f"{number}.mp4")
-            write_video(pictures, paths[-1], codec, take.scene.frame_rate_hz, bit_rate, speed)
+            write_video(pictures, paths[-1], codec, recording.scene.frame_rate_hz, bit_rate, speed)
         yield paths
 
 
-def _clip(take: Take, path: Path, camera_named: bool, *groups: str) -> Case:
-    scene, exposure = take.scene, take.exposure()
+def _clip(recording: Recording, path: Path, camera_named: bool, *groups: str) -> Case:
+    scene, exposure = recording.scene, recording.exposure()
     cameras = (build_camera_profile(scene, exposure),) if camera_named else ()
     options = ReceiverOptions(screens=(scene.screen,), cameras=cameras, force_camera=camera_named)
     about = {"screen": scene.screen.name, "camera": scene.camera_name, "hand_px": scene.hand_px}
-    truth = truth_of(take)
+    truth = truth_of(recording)
     return Case(source=path, options=options, groups=groups, about=about, truth=truth, corners=exposure.corners)
 
 
@@ -398,9 +398,9 @@ def draw_nodata(at: Place) -> Iterator[Case]:
     rng = np.random.default_rng([at.seed, at.number, 23])
     kind = draw_kind(rng, at.number % 2 == 0)
     scene, about = no_data_scene(kind, rng, at.point.get("n_frames", 1))
-    take = prepare(scene, at.flat)
-    captures = [take.frame(number, threads=1) for number in range(scene.n_frames)]
-    frames = tuple(Frame(one.pixels, SOURCE, one.frame, one.time_s) for one in captures)
+    recording = prepare(scene, at.flat)
+    captures = [recording.frame(number, threads=1) for number in range(scene.n_frames)]
+    frames = tuple(Frame(capture.pixels, SOURCE, capture.frame, capture.time_s) for capture in captures)
     named = bool(at.point.get("camera_named"))
     cameras = (build_camera_profile(scene, captures[0].exposure),) if named else ()
     options = ReceiverOptions(cameras=cameras, force_camera=named)

@@ -91,8 +91,8 @@ def detect(
     k, words = bits_per_symbol(w), codebook(w).astype(np.float32)
     amplitude = (10 ** (np.asarray(snr_db, np.float32) / 20))[:, None].astype(np.float32)
     sent = words[labels >> (7 - k)]
-    seen = amplitude * sent + rng.standard_normal(sent.shape, np.float32)
-    score = (amplitude * (seen - amplitude / 2)) @ words.T
+    observed = amplitude * sent + rng.standard_normal(sent.shape, np.float32)
+    score = (amplitude * (observed - amplitude / 2)) @ words.T
     likely = np.exp(score - score.max(axis=-1, keepdims=True))
     bits = ((np.arange(1 << k)[:, None] >> np.arange(k - 1, -1, -1)) & 1).astype(np.float32)
     out = np.zeros((*labels.shape, 7), np.float32)

@@ -37,7 +37,7 @@ class Group:
     cases: Sequence[Record]
     way: str
     #: Whose packets this one's are compared with.
-    first: str
+    reference: str
     #: Whose right packets `share` counts against.
     beside: str | None = None
 
@@ -82,7 +82,7 @@ class Group:
     @property
     def yardstick(self) -> Group:
         """The same cases in the way that this one is compared with."""
-        return Group(self.cases, self.beside or self.way, self.first)
+        return Group(self.cases, self.beside or self.way, self.reference)
 
     def rows_errors(self) -> tuple[FloatArray, FloatArray]:
         """Relative error of rows per slot, NaN where none was estimated, and its stated standard deviation."""
@@ -93,7 +93,7 @@ class Group:
     def changed(self) -> int:
         """Packets that the first way reported and this one did not, or the other way round."""
         return sum(
-            len(reported_payloads(case["ways"][self.first]) ^ reported_payloads(case["ways"][self.way]))
+            len(reported_payloads(case["ways"][self.reference]) ^ reported_payloads(case["ways"][self.way]))
             for case in self.cases
         )
 
@@ -168,7 +168,7 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "packets": lambda g: len(g.packets),
     "right_packets": lambda g: sum(packet["bit_errors"] == 0 for packet in g.packets),
     "same": lambda g: sum(r.get("difference") is None for r in g.receptions),
-    "cpu_ratio": lambda g: sum(g.values("cpu_s")) / sum(Group(g.cases, g.first, g.first).values("cpu_s")),
+    "cpu_ratio": lambda g: sum(g.values("cpu_s")) / sum(Group(g.cases, g.reference, g.reference).values("cpu_s")),
     "packets_0.5": lambda g: len(g.confident(0.5)),
     "packets_0.9": lambda g: len(g.confident(0.9)),
     "sure": lambda g: len(g.confident()),

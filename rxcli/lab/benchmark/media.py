@@ -84,10 +84,11 @@ def write_known(scene: Scene, path: Path, seed: int, bit_rate: int | None = None
     """Simulate a JPEG, DNG or clip, with its truth and its camera profile beside it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     file_format = {".jpg": "jpeg", ".dng": "dng", ".mp4": "h264"}[path.suffix]
-    take = prepare(replace(scene, output="raw" if file_format == "dng" else "developed"), seed)
-    write_capture(take, path, file_format, bit_rate)
-    write_truth(take.truth(path.name), path)
-    camera_path(path).write_text(dump_profile(build_camera_profile(take.scene, take.exposure())), encoding="utf-8")
+    recording = prepare(replace(scene, output="raw" if file_format == "dng" else "developed"), seed)
+    write_capture(recording, path, file_format, bit_rate)
+    write_truth(recording.truth(path.name), path)
+    profile = build_camera_profile(recording.scene, recording.exposure())
+    camera_path(path).write_text(dump_profile(profile), encoding="utf-8")
 
 
 def repeat_clip(short: Path, out: Path, times: int) -> None:

@@ -59,12 +59,12 @@ def run(how: Run, seed: int, folder: Path) -> list[tuple[str, list[Row]]]:
     ]
 
 
-def _by_label(first: str, records: list[Record], columns: dict[str, tuple[str, str]]) -> list[Row]:
+def _by_label(heading: str, records: list[Record], columns: dict[str, tuple[str, str]]) -> list[Row]:
     """A row for each point of a scenario; see `_ERRORS`."""
     labels = dict.fromkeys(record["groups"][0] for record in records)
     cases = {label: [record for record in records if record["groups"][0] == label] for label in labels}
     return [
-        {first: label, **{name: MEASURES[measure](Group(mine, way, way)) for name, (way, measure) in columns.items()}}
+        {heading: label, **{name: MEASURES[measure](Group(mine, way, way)) for name, (way, measure) in columns.items()}}
         for label, mine in cases.items()
     ]
 

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from rxcli.lab.simulate.capture import Capture, Take, simulate_frame
+from rxcli.lab.simulate.capture import Capture, Recording, simulate_frame
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.truth import build_camera_profile
@@ -82,9 +82,9 @@ def score_result(result: FrameResult, truth: Truth) -> tuple[FrameResult, Score]
     return scored, scorer.score()
 
 
-def truth_of(take: Take) -> Truth:
-    """What all frames of a take send."""
-    return msgspec.convert(take.truth("clip"), Truth, str_keys=True)
+def truth_of(recording: Recording) -> Truth:
+    """What all frames of a scene send."""
+    return msgspec.convert(recording.truth("clip"), Truth, str_keys=True)
 
 
 def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False, threads: int = 1) -> Trial:

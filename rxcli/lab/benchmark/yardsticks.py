@@ -98,16 +98,16 @@ def _between_headers(lit: NDArray[np.bool_], rows_per_slot: float, screen: Scree
     """Packets between headers one packet length apart: the pair that agrees best, and those in step with it."""
     starts, agreement = find_headers(lit, rows_per_slot)
     length = screen.packet_slots * rows_per_slot
-    first, end = np.meshgrid(np.arange(starts.size), np.arange(starts.size), indexing="ij")
-    first, end = (
-        side[np.abs(starts[end] - starts[first] - length) <= _LENGTH_TOLERANCE * length] for side in (first, end)
+    begin, end = np.meshgrid(np.arange(starts.size), np.arange(starts.size), indexing="ij")
+    begin, end = (
+        side[np.abs(starts[end] - starts[begin] - length) <= _LENGTH_TOLERANCE * length] for side in (begin, end)
     )
-    if first.size == 0:
+    if begin.size == 0:
         return
-    best = starts[first[(agreement[first] + agreement[end]).argmax()]]
-    steps = (starts[first] - best) / length
+    best = starts[begin[(agreement[begin] + agreement[end]).argmax()]]
+    steps = (starts[begin] - best) / length
     for pair in np.flatnonzero(np.abs(steps - steps.round()) <= _LENGTH_TOLERANCE):
-        slots = _read_slots(lit, starts[first[pair]], starts[end[pair]], screen.packet_slots)
+        slots = _read_slots(lit, starts[begin[pair]], starts[end[pair]], screen.packet_slots)
         yield _nearest_packet(slots, screen.payload_symbols)
 
 
@@ -126,11 +126,11 @@ def find_headers(lit: NDArray[np.bool_], rows_per_slot: float) -> tuple[FloatArr
     return np.array([g.mean() for g in groups]), np.array([agreement[g[0]] for g in groups])
 
 
-def _read_slots(lit: NDArray[np.bool_], first: float, end: float, n_slots: int) -> NDArray[np.uint8]:
+def _read_slots(lit: NDArray[np.bool_], begin: float, end: float, n_slots: int) -> NDArray[np.uint8]:
     """Majority of the rows in the middle of each of the slots between two headers."""
-    step = (end - first) / n_slots
+    step = (end - begin) / n_slots
     offsets = np.linspace(-_SLOT_MIDDLE / 2, _SLOT_MIDDLE / 2, 5) * step
-    rows = first + (np.arange(n_slots)[:, None] + 0.5) * step - 0.5 + offsets
+    rows = begin + (np.arange(n_slots)[:, None] + 0.5) * step - 0.5 + offsets
     values = lit[np.clip(rows.round().astype(int), 0, lit.size - 1)]
     lit_slots: NDArray[np.uint8] = (values.mean(axis=1) > 0.5).astype(np.uint8)
     return lit_slots

@@ -39,11 +39,11 @@ class Oracle:
         from scipy.sparse import csr_array, diags_array
 
         start = self.exposure.row_start_slots - self.exposure.delays[column]
-        first, share = overlaps(start, self.exposure.exposure_slots)
-        slots = first[:, None] - first[0] + np.arange(share.shape[1])
+        first_slot, share = overlaps(start, self.exposure.exposure_slots)
+        slots = first_slot[:, None] - first_slot[0] + np.arange(share.shape[1])
         exposed = csr_array((share.ravel(), slots.ravel(), np.arange(0, share.size + 1, share.shape[1])))
         shared = exposed.T @ diags_array(self.information[:, column]) @ exposed
-        return int(first[0]), exposed.T @ self.matched[:, column], shared.tocsr()
+        return int(first_slot[0]), exposed.T @ self.matched[:, column], shared.tocsr()
 
     def decide(self, column: int, burst: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
         """Decide the payload symbols of one packet, each with all other slots known.

@@ -96,11 +96,11 @@ class Exposure:
     def lit(self) -> FloatArray:
         """(height, columns) share of every row's exposure in which a column is lit."""
         starts = self.row_start_slots
-        first = int(np.floor(starts[0] - self.delays.max())) - 1
-        last = int(np.ceil(starts[-1] + self.exposure_slots - self.delays.min())) + 1
-        slots = self.link.slots(first, last)
+        first_slot = int(np.floor(starts[0] - self.delays.max())) - 1
+        last_slot = int(np.ceil(starts[-1] + self.exposure_slots - self.delays.min())) + 1
+        slots = self.link.slots(first_slot, last_slot)
         shares = [
-            lit_share(s, starts - delay - first, self.exposure_slots)
+            lit_share(s, starts - delay - first_slot, self.exposure_slots)
             for s, delay in zip(slots, self.delays, strict=True)
         ]
         return np.stack(shares, axis=1)
@@ -238,9 +238,9 @@ def _backlight_nodes(exposure: Exposure, x: FloatArray, top: int, bottom: int) -
     padded[: bottom - top] = exposure.lit[top:bottom]
     lit = padded.reshape(n_cells, pitch, -1)
     share = (np.arange(pitch, dtype=np.float32) / pitch)[None, :, None]
-    both = np.concatenate([lit * (1 - share), lit * share], axis=2)
+    ends = np.concatenate([lit * (1 - share), lit * share], axis=2)
     pairs = np.concatenate([light[:-1], light[1:]], axis=1)
-    nodes: Float32Array = np.matmul(both, pairs).reshape(n_cells * pitch, -1)
+    nodes: Float32Array = np.matmul(ends, pairs).reshape(n_cells * pitch, -1)
     return nodes[: bottom - top]
 
 

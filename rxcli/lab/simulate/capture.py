@@ -73,7 +73,7 @@ class Capture:
 
 
 @dataclass(frozen=True)
-class Take:
+class Recording:
     """A scene with all that was open decided: frames can be taken from it in any order."""
 
     scene: Scene
@@ -134,14 +134,14 @@ def stabilised(picture: NDArray[Any], exposure: Exposure) -> NDArray[Any]:
     sensor, matrix = exposure.scene.sensor, exposure.view.camera_matrix
     middle_s = exposure.start_s + sensor.height / 2 * sensor.line_delay_s
     square = np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]]) * 0.2
-    seen = turned(square, exposure.motion.at(np.full(4, middle_s)))
+    shifted = turned(square, exposure.motion.at(np.full(4, middle_s)))
     to_pixels = matrix[[0, 1], [0, 1]]
     target = square * _STABILISED_ZOOM
-    map_back = homography(seen * to_pixels + matrix[:2, 2], target * to_pixels + matrix[:2, 2])
+    map_back = homography(shifted * to_pixels + matrix[:2, 2], target * to_pixels + matrix[:2, 2])
     return np.asarray(cv2.warpPerspective(picture, map_back, (sensor.width, sensor.height), flags=cv2.INTER_CUBIC))
 
 
-def prepare(scene: Scene, rng: np.random.Generator | int) -> Take:
+def prepare(scene: Scene, rng: np.random.Generator | int) -> Recording:
     """Decide all that a scene leaves open.
 
     Args:
@@ -153,7 +153,7 @@ def prepare(scene: Scene, rng: np.random.Generator | int) -> Take:
     drive = _drive(scene)
     link = Link(scene.screen, drive.weights, link_seed, scene.payload, scene.labels, scene.waveform)
     start = rng.uniform(_LEAD_SLOTS, link.burst_slots) if scene.start_slot is None else scene.start_slot
-    return Take(scene, drive, link, noise_seed, float(start), _delays(scene, rng))
+    return Recording(scene, drive, link, noise_seed, float(start), _delays(scene, rng))
 
 
 def _drive(scene: Scene) -> Drive:
@@ -190,26 +190,26 @@ def simulate_frame(scene: Scene, rng: np.random.Generator | int, *, oracle: bool
 
 
 def write_capture(
-    take: Take, path: Path, file_format: str, bit_rate: int | None = None, progress: Callable[..., Any] = iter
+    recording: Recording, path: Path, file_format: str, bit_rate: int | None = None, progress: Callable[..., Any] = iter
 ) -> None:
-    """Write a still or clip of a take.
+    """Write a still or clip of a scene.
 
     Args:
-        take: whose frames are written, of a still the first.
+        recording: whose frames are written, of a still the first.
         path: of the file.
         file_format: jpeg, dng, dng14, png, png16, tiff, tiff16, or a codec of `write_video`.
         bit_rate: of clips, bits per second; None for the encoder's constant quality.
         progress: wraps the numbers of the frames.
     """
-    scene = take.scene
+    scene = recording.scene
     if file_format in CODECS:
         bits = 16 if CODECS[file_format].bits > 8 else 8
-        frames = (take.frame(number).developed(bits) for number in progress(range(scene.n_frames)))
+        frames = (recording.frame(number).developed(bits) for number in progress(range(scene.n_frames)))
         write_video(frames, path, file_format, scene.frame_rate_hz, bit_rate)
     elif file_format == "jpeg":
-        path.write_bytes(take.frame().jpeg)
+        path.write_bytes(recording.frame().jpeg)
     elif file_format.startswith("dng"):
-        write_dng(take.frame().raw, scene, path, 14 if file_format == "dng14" else 16)
+        write_dng(recording.frame().raw, scene, path, 14 if file_format == "dng14" else 16)
     else:
-        rgb = take.frame().developed(16 if file_format.endswith("16") else 8)
+        rgb = recording.frame().developed(16 if file_format.endswith("16") else 8)
         write_png(rgb, path) if file_format.startswith("png") else write_tiff(rgb, scene, path)

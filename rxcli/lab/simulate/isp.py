@@ -121,13 +121,13 @@ def develop(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp, view: View, bits:
 def _in_bands(source: NDArray[Any], work: Callable[[NDArray[Any]], NDArray[Any]], out: NDArray[Any]) -> None:
     """Fill `out` with `work` of overlapping bands of rows of `source`, two at a time."""
 
-    def one(top: int) -> None:
+    def fill(top: int) -> None:
         begin = max(top - _HALO_ROWS, 0)
         bottom = min(top + _BAND_ROWS, source.shape[0])
         out[top:bottom] = work(source[begin : bottom + _HALO_ROWS])[top - begin : bottom - begin]
 
     with ThreadPoolExecutor(max_workers=2) as pool:
-        list(pool.map(one, range(0, source.shape[0], _BAND_ROWS)))
+        list(pool.map(fill, range(0, source.shape[0], _BAND_ROWS)))
 
 
 def _panel_light(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp) -> Float32Array:

@@ -61,15 +61,15 @@ def distort(points: FloatArray, coefficients: FloatArray) -> FloatArray:
 
 def undistort(points: FloatArray, coefficients: FloatArray, iterations: int = 12) -> FloatArray:
     """The inverse of `distort`, by Newton's method with a numeric Jacobian."""
-    guess = np.array(points, np.float64)
+    ideal = np.array(points, np.float64)
     if not np.any(coefficients):
-        return guess
+        return ideal
     step = 1e-6
     along_x, along_y = np.array([step, 0.0]), np.array([0.0, step])
     for _ in range(iterations):
-        here = distort(guess, coefficients)
-        jx = (distort(guess + along_x, coefficients) - here) / step
-        jy = (distort(guess + along_y, coefficients) - here) / step
+        here = distort(ideal, coefficients)
+        jx = (distort(ideal + along_x, coefficients) - here) / step
+        jy = (distort(ideal + along_y, coefficients) - here) / step
         missing = points - here
         if np.abs(missing).max() < 1e-13:
             break
@@ -77,8 +77,8 @@ def undistort(points: FloatArray, coefficients: FloatArray, iterations: int = 12
         det = np.where(np.abs(det) < 0.05, 0.05, det)
         dx = (missing[..., 0] * jy[..., 1] - missing[..., 1] * jy[..., 0]) / det
         dy = (missing[..., 1] * jx[..., 0] - missing[..., 0] * jx[..., 1]) / det
-        guess += np.clip(np.stack([dx, dy], axis=-1), -0.5, 0.5)
-    return guess
+        ideal += np.clip(np.stack([dx, dy], axis=-1), -0.5, 0.5)
+    return ideal
 
 
 def rotation(roll_deg: float, yaw_deg: float, pitch_deg: float) -> FloatArray:

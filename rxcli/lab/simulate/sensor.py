@@ -120,8 +120,8 @@ def count_electrons(mean_e: Float32Array, sensor: Sensor, rng: np.random.Generat
     """
     noise = rng.standard_normal(mean_e.shape, dtype=np.float32)
     low = mean_e < POISSON_BELOW_E
-    spread = np.sqrt(np.where(low, np.float32(0), mean_e) + np.float32(sensor.read_noise_e**2))
-    noise *= spread
+    deviation = np.sqrt(np.where(low, np.float32(0), mean_e) + np.float32(sensor.read_noise_e**2))
+    noise *= deviation
     noise += mean_e
     few = mean_e[low]
     noise[low] += rng.poisson(few).astype(np.float32) - few

@@ -37,12 +37,12 @@ def overlaps(start: FloatArray, length: float) -> tuple[NDArray[np.int64], Float
     Returns:
         (rows,) number of the first slot touched, and (rows, taps) share of the exposure in that slot and those after.
     """
-    first = np.floor(start).astype(np.int64)
+    first_slot = np.floor(start).astype(np.int64)
     taps = int(np.ceil(length)) + 1
-    left = first[:, None] + np.arange(taps)
+    left = first_slot[:, None] + np.arange(taps)
     begin = np.maximum(left, start[:, None])
     end = np.minimum(left + 1, start[:, None] + length)
-    return first, np.maximum(end - begin, 0.0) / length
+    return first_slot, np.maximum(end - begin, 0.0) / length
 
 
 def flicker(start_s: FloatArray, exposure_s: float, frequency_hz: float, depth: float, phase: float) -> FloatArray:

@@ -200,15 +200,15 @@ class Link:
         bits = self.payload(burst)
         return np.stack([encode_packet(b, int(w)) for b, w in zip(bits, self.weights, strict=True)])
 
-    def slots(self, first: int, stop: int) -> NDArray[Any]:
-        """(columns, stop - first) 0/1 slots from `first` on; dark before slot 0."""
+    def slots(self, start: int, stop: int) -> NDArray[Any]:
+        """(columns, stop - start) 0/1 slots from `start` on; dark before slot 0."""
         if self.waveform is not None:
-            return np.tile(self.waveform(np.arange(first, stop, dtype=np.float64)), (self.screen.columns, 1))
-        bursts = range(max(first, 0) // self.burst_slots, max(stop - 1, 0) // self.burst_slots + 1)
+            return np.tile(self.waveform(np.arange(start, stop, dtype=np.float64)), (self.screen.columns, 1))
+        bursts = range(max(start, 0) // self.burst_slots, max(stop - 1, 0) // self.burst_slots + 1)
         sent = np.concatenate([np.tile(self.packets(b), self.screen.repeats) for b in bursts], axis=1)
         origin = bursts[0] * self.burst_slots
-        dark = np.zeros((sent.shape[0], max(0, min(-first, stop - first))), np.uint8)
-        return np.concatenate([dark, sent[:, max(first, 0) - origin : max(stop, 0) - origin]], axis=1)
+        dark = np.zeros((sent.shape[0], max(0, min(-start, stop - start))), np.uint8)
+        return np.concatenate([dark, sent[:, max(start, 0) - origin : max(stop, 0) - origin]], axis=1)
 
 
 #: What `export_waveforms` writes.

@@ -47,7 +47,7 @@ def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[s
         exposures: one per frame.
         capture: name of the capture's file.
     """
-    first, screen = exposures[0], scene.screen
+    initial, screen = exposures[0], scene.screen
     frames = [
         {
             "frame": number,
@@ -58,22 +58,22 @@ def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[s
         for number, exposure in enumerate(exposures)
     ]
     bursts = sorted({entry["burst"] for frame in frames for entry in frame["bursts"]})
-    profile = build_camera_profile(scene, first)
+    profile = build_camera_profile(scene, initial)
     camera = msgspec.to_builtins(profile.modes[0]) | msgspec.to_builtins(profile.lens) | {"name": profile.name}
     return {
         "capture": capture,
         "screen": screen.name,
         **{name: getattr(screen, name) for name in ("columns", "slot_rate_hz", "payload_symbols", "repeats")},
         "camera": camera,
-        "w": first.link.weights.tolist(),
-        "payload_bits": list(first.link.bits_per_column),
-        "corners_sensor_px": first.corners.tolist(),
+        "w": initial.link.weights.tolist(),
+        "payload_bits": list(initial.link.bits_per_column),
+        "corners_sensor_px": initial.corners.tolist(),
         "frames": frames,
-        "payload": {str(burst): [bits_to_hex(bits) for bits in first.link.payload(burst)] for burst in bursts},
+        "payload": {str(burst): [bits_to_hex(bits) for bits in initial.link.payload(burst)] for burst in bursts},
         "orientation": scene.orientation,
         "tone_curve": "linear" if scene.is_mosaic else scene.isp.tone,
         "slot_rate_error_ppm": scene.slot_rate_error_ppm,
-        "column_delay_slots": first.delays.tolist(),
+        "column_delay_slots": initial.delays.tolist(),
         "written_by": _AUTHOR,
     }
 
