@@ -13,7 +13,7 @@ from rxcli.lab.simulate.capture import prepare, simulate_frame
 from rxcli.lab.simulate.isp import Isp, correction_map, develop, tone_curve
 from rxcli.lab.simulate.optics import Lens, Pose, View, distort, undistort
 from rxcli.lab.simulate.scenes import Scene, preset
-from rxcli.lab.simulate.sensor import PATTERNS, Sensor, count_electrons, pick_colours, to_raw
+from rxcli.lab.simulate.sensor import Sensor, count_electrons, pick_colours, to_raw
 from rxcli.lab.simulate.shutter import flicker, lit_share, overlaps
 from rxcli.lab.simulate.transmitter import light_spread
 from rxcli.profiles import ScreenProfile, load_profile
@@ -106,14 +106,6 @@ def test_raw_numbers_keep_black_and_white_level() -> None:
     sensor = Sensor(full_scale_e=100.0, black_level=512, white_level=4095)
     raw = to_raw(np.array([[-1e6, 0.0, 50.0, 1e6]], np.float32), sensor)
     assert raw.tolist() == [[0, 512, round(512 + 3583 / 2 + 1e-6), 4095]]
-
-
-@pytest.mark.parametrize("cfa", ["bayer", "xtrans"])
-def test_mosaic_is_anchored_at_the_sensors_first_pixel(cfa: str) -> None:
-    pattern = PATTERNS[cfa]
-    planes = np.broadcast_to(np.arange(3, dtype=np.float32), (14, 20, 3))
-    expected = np.tile(pattern, (20, 20))[5 : 5 + 14, :20]
-    np.testing.assert_array_equal(pick_colours(np.ascontiguousarray(planes), pattern, 5), expected)
 
 
 def test_rendered_light_is_the_model_written_out(small: Scene) -> None:
