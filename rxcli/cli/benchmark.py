@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
+import msgspec
 
 from rxcli.cli.common import options
 from rxcli.cli.groups import SuggestingGroup
-
-if TYPE_CHECKING:
-    from rxcli.lab.benchmark.runner import Run, Scenario
+from rxcli.errors import ExitCode
+from rxcli.lab.benchmark import compare as checkouts
+from rxcli.lab.benchmark import measures, tables
+from rxcli.lab.benchmark import quick as headline
+from rxcli.lab.benchmark.cases import OTHER_KERNEL, WAYS
+from rxcli.lab.benchmark.runner import Run, Scenario, capture_points, load_journal, scenarios
+from rxcli.outputs import claim_own_folder, write_whole
 
 _COUNT = click.IntRange(1)
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
@@ -35,12 +40,10 @@ class _Scenarios(SuggestingGroup):
     """A command for every row of the table of scenarios."""
 
     def list_commands(self, context: click.Context) -> list[str]:
-        from rxcli.lab.benchmark.runner import scenarios
 
         return [*(name for name in scenarios() if name != "quick"), *super().list_commands(context)]
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
-        from rxcli.lab.benchmark.runner import scenarios
 
         if name not in scenarios():
             return super().get_command(context, name)
@@ -59,9 +62,6 @@ _RECEPTION = (
 
 def _begin(name: str, out: Path, fresh: bool, jobs: int, quiet: bool) -> Run:
     """A run that keeps its journal in the folder of results."""
-    from rxcli.lab.benchmark.runner import Run
-    from rxcli.outputs import claim_own_folder
-
     claim_own_folder("--out", out, ("*.journal.jsonl",))
     path = out / f"{name}.journal.jsonl"
     if fresh:
@@ -71,11 +71,6 @@ def _begin(name: str, out: Path, fresh: bool, jobs: int, quiet: bool) -> Run:
 
 def _chosen(name: str, captures: Path | None, only: tuple[str, ...], ways: tuple[str, ...] = ()) -> Scenario:
     """The scenario of this name, with the points and ways that were asked for."""
-    import msgspec
-
-    from rxcli.lab.benchmark.cases import OTHER_KERNEL, WAYS
-    from rxcli.lab.benchmark.runner import capture_points, scenarios
-
     scenario = scenarios()[name]
     points = capture_points(captures) if scenario.draw == "capture" else scenario.points
     for known, asked in ((points, only), ((*WAYS, OTHER_KERNEL), ways)):
@@ -87,10 +82,6 @@ def _chosen(name: str, captures: Path | None, only: tuple[str, ...], ways: tuple
 
 
 def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given: Any) -> int:
-    from rxcli.errors import ExitCode
-    from rxcli.lab.benchmark import measures, tables
-    from rxcli.lab.benchmark.runner import load_journal
-
     name, out = str(context.info_name), given["out"]
     scenario = _chosen(name, given["captures"], given["only"], given["ways"])
     run = _begin(name, out, given["fresh"], given["jobs"], given["quiet"])
@@ -136,11 +127,8 @@ def benchmark(context: click.Context, /, quick: bool, seed: int, **run: Any) -> 
     if not quick:
         click.echo(context.get_help())
         return
-    from rxcli.lab.benchmark import quick as work
-    from rxcli.lab.benchmark.tables import titled
-    from rxcli.outputs import write_whole
 
-    text = titled(work.run(_begin("quick", **run), seed, run["out"] / "media"))
+    text = tables.titled(headline.run(_begin("quick", **run), seed, run["out"] / "media"))
     click.echo(text)
     write_whole(run["out"] / "quick.txt", text + "\n")
     _say_written([run["out"] / "quick.txt"])
@@ -158,20 +146,14 @@ def compare(checkout: Path, name: str, out: Path, **given: Any) -> int:
     """
     from tqdm import tqdm
 
-    from rxcli.errors import ExitCode
-    from rxcli.lab.benchmark import compare as work
-    from rxcli.lab.benchmark import measures, tables
-    from rxcli.lab.benchmark.runner import scenarios
-    from rxcli.outputs import claim_own_folder
-
     if name not in scenarios() or scenarios()[name].draw == "transfer":
         raise click.BadParameter(f"{name!r} is no scenario with pictures")
-    scenario, reference = _chosen(name, given["captures"], given["only"]), work.check_checkout(checkout)
+    scenario, reference = _chosen(name, given["captures"], given["only"]), checkouts.check_checkout(checkout)
     claim_own_folder("--out", out, ("*.journal.jsonl", "compare.json"))
     tasks = scenario.tasks(given["seed"], given["count"] or scenario.count, out / "media")
     with tqdm(total=2 * given["repeats"], desc="compare", leave=False, disable=given["quiet"] or None) as bar:
-        records = work.compare(tasks, reference, out / "compare", given["repeats"], bar.update)
-    rows, differing = measures.rows(records, work.WAYS, work.COLUMNS), work.differing(records)
+        records = checkouts.compare(tasks, reference, out / "compare", given["repeats"], bar.update)
+    rows, differing = measures.rows(records, checkouts.WAYS, checkouts.COLUMNS), checkouts.differing(records)
     click.echo(tables.titled([("this checkout against the other", rows), ("results that differ", differing)]))
     _say_written(tables.write_outputs(out, "compare", rows, differing))
     return ExitCode.NOT_RECEIVED if differing else ExitCode.OK

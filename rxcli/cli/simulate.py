@@ -8,26 +8,28 @@ from dataclasses import replace
 from functools import partial
 from math import isfinite, nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from rxcli import outputs
 from rxcli.cli.common import claim_outputs, force_argument, options
 from rxcli.cli.kinds import FILE, FOLDER, Exposure
+from rxcli.cli.sending import sending_of
 from rxcli.errors import UsageError
-
-if TYPE_CHECKING:
-    from rxcli.lab.simulate.capture import Recording
-    from rxcli.lab.simulate.scenes import Scene
-    from rxcli.lab.simulate.transmitter import Weights
-    from rxcli.link.encoder import Sending
+from rxcli.lab.simulate.capture import Recording, prepare, write_capture
+from rxcli.lab.simulate.files import CODECS
+from rxcli.lab.simulate.pictures import picture_names
+from rxcli.lab.simulate.scenes import PRESETS, Scene, preset, with_fields
+from rxcli.lab.simulate.transmitter import WAVEFORM_FILES, Weights, export_waveforms
+from rxcli.lab.simulate.truth import build_camera_profile, truth_path, write_truth
+from rxcli.link.encoder import Sending
+from rxcli.profiles import dump_profile
 
 _STILLS = ("jpeg", "dng", "dng14", "png", "png16", "tiff", "tiff16")
-_CODECS = ("h264", "h264-10", "hevc", "hevc-10", "mjpeg")
-_FORMATS = (*_STILLS, *_CODECS)
+_FORMATS = (*_STILLS, *CODECS)
 _SUFFIXES = {".jpg": "jpeg", ".jpeg": "jpeg", ".dng": "dng", ".png": "png", ".tif": "tiff", ".tiff": "tiff"}
 _VIDEO_SUFFIXES = {".mp4": "h264", ".mov": "h264", ".mkv": "h264", ".avi": "mjpeg"}
-_PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-plain")
 
 #: Options that are fields of the scene by the same name.
 _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm", "hand_px")
@@ -36,7 +38,7 @@ _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_ra
 @click.command()
 @click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
 @options(
-    ("--preset", _PRESETS, "xs10-still", "Kind of camera."),
+    ("--preset", PRESETS, "xs10-still", "Kind of camera."),
     ("--screen", str, "paper-34k6", "Screen profile: a name or a TOML file."),
     ("--picture", str, "coffee", "Picture shown: a file, or a name (see --list)."),
     ("--payload", str, "random", "'random', 'hex:...', or a file; sent over and over."),
@@ -60,12 +62,7 @@ _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_ra
     ("--clock-error slot_rate_error_ppm", float, None, "Error of the slot rate, ppm."),
     ("--column-delays", str, None, "Delays of the columns in slots: one each, or one for the largest random delay."),
     ("--start-slot", float, None, "Slot of the link at which row 0 starts.  [default: random]"),
-    (
-        "--set fields",
-        [str],
-        None,
-        "A field of the preset, as isp.quality=85; may be given several times.",
-    ),
+    ("--set fields", [str], None, "A field of the preset, as isp.quality=85; may be given several times."),
     ("--waveforms", FOLDER, None, "Also write what drives a real screen."),
     ("--camera-profile", FILE, None, "Also write a camera profile (TOML) that fits the capture."),
 )
@@ -80,8 +77,6 @@ _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_ra
 @force_argument
 def simulate(out: Path, **options: Any) -> None:
     """Simulate a capture of a mini-LED screen and write it to OUT, with OUT's name .truth.json beside it."""
-    from rxcli.lab.simulate.capture import prepare
-
     if not out.parent.is_dir():
         raise UsageError(f"{out.parent}: no such folder", "create it first")
     file_format = options["file_format"] or _format_of(out)
@@ -100,21 +95,16 @@ def simulate(out: Path, **options: Any) -> None:
 
 def _claim(out: Path, options: dict[str, Any]) -> None:
     """Refuse to replace a file that is no earlier capture, recognised by the truth beside it."""
-    from rxcli import outputs
-    from rxcli.lab.simulate.transmitter import WAVEFORM_FILES
-    from rxcli.lab.simulate.truth import truth_path
-
     truth = truth_path(out)
-    ours = truth.is_file() and outputs.TRUTH.search(truth.read_bytes()) is not None
-    found = [outputs.Output("OUT", out, outputs.ANYTHING if ours else outputs.NEVER)]
+    is_ours = truth.is_file() and outputs.TRUTH.search(truth.read_bytes()) is not None
+    found = [outputs.Output("OUT", out, outputs.ANYTHING if is_ours else outputs.NEVER)]
     found.append(outputs.Output("the truth of OUT", truth, outputs.TRUTH))
     if options["camera_profile"] is not None:
         found.append(outputs.Output("--camera-profile", options["camera_profile"], outputs.SIMULATED_CAMERA))
     if options["waveforms"] is not None:
         outputs.claim_folder("--waveforms", options["waveforms"])
-        for name in WAVEFORM_FILES:
-            pattern = outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS
-            found.append(outputs.Output("--waveforms", options["waveforms"] / name, pattern))
+        patterns = {name: outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS for name in WAVEFORM_FILES}
+        found += [outputs.Output("--waveforms", options["waveforms"] / name, ours) for name, ours in patterns.items()]
     inputs = [options["picture"], options["payload"], *([options["file_path"]] if options["file_path"] else [])]
     claim_outputs(found, inputs, (options["screen"],), options["force"])
 
@@ -122,8 +112,6 @@ def _claim(out: Path, options: dict[str, Any]) -> None:
 def _list(context: click.Context, wanted: bool) -> None:
     """Print the names of pictures and end."""
     if wanted:
-        from rxcli.lab.simulate.pictures import picture_names
-
         click.echo("\n".join(picture_names()))
         context.exit()
 
@@ -137,15 +125,11 @@ def _format_of(out: Path) -> str:
 
 def _scene(options: dict[str, Any], file_format: str) -> Scene:
     """The preset with what the options change."""
-    from rxcli.lab.simulate.scenes import preset, with_fields
-
     scene = preset(options["preset"], options["screen"])
     for text in options["fields"]:
         scene = with_fields(scene, _table(text))
-    scene = replace(
-        scene, w=_weights(options["weights"]), payload=_payload(options["payload"]), labels=_labels(options)
-    )
-    scene = replace(scene, **_given(options, _SCENE_OPTIONS))
+    sent: dict[str, Any] = {"payload": _payload(options["payload"]), "labels": _labels(options)}
+    scene = replace(scene, w=_weights(options["weights"]), **sent, **_given(options, _SCENE_OPTIONS))
     scene = _with_pose(scene, options)
     if options["exposure_s"] is not None:
         scene = replace(scene, exposure_s=options["exposure_s"])
@@ -221,9 +205,7 @@ def _weights(text: str) -> Weights:
 
 def _labels(options: dict[str, Any]) -> Sending | None:
     """What the link layer sends; None for payload as it is."""
-    from rxcli.cli.sending import sending_of
-
-    given = [name for name in ("text", "uri", "file_path") if options[name] is not None]
+    given = _given(options, ("text", "uri", "file_path"))
     if not given:
         return None
     if len(given) > 1 or options["payload"] != "random":
@@ -237,11 +219,9 @@ def _warn_of_cut_packets(capture: Recording) -> None:
     top, bottom = max(float(corners[:, 1].min()), 0.0), min(float(corners[:, 1].max()), sensor.height - 1.0)
     shown_s, packet_s = max(bottom - top, 0.0) * sensor.line_delay_s, capture.scene.screen.packet_s
     if shown_s < packet_s:
-        click.echo(
-            f"vlc-rx: no packet fits a frame: the screen is read in {1e3 * shown_s:.1f} ms, a packet of "
-            f"{capture.scene.screen.name} lasts {1e3 * packet_s:.1f} ms; only clips put packets together",
-            err=True,
-        )
+        shown, packet = f"{1e3 * shown_s:.1f} ms", f"{1e3 * packet_s:.1f} ms"
+        reason = f"the screen is read in {shown}, a packet of {capture.scene.screen.name} lasts {packet}"
+        click.echo(f"vlc-rx: no packet fits a frame: {reason}; only clips put packets together", err=True)
 
 
 def _payload(text: str) -> bytes | None:
@@ -252,9 +232,8 @@ def _payload(text: str) -> bytes | None:
     except ValueError:
         raise UsageError(f"--payload: {text!r} holds no hex", "give an even number of hex digits") from None
     except OSError as error:
-        raise UsageError(
-            f"--payload: {text}: cannot be read ({error.strerror})", "give 'random', 'hex:...' or a file"
-        ) from None
+        reason = f"--payload: {text}: cannot be read ({error.strerror})"
+        raise UsageError(reason, "give 'random', 'hex:...' or a file") from None
     if not data:
         raise UsageError(f"--payload: {text!r} is empty", "give at least one byte")
     return data
@@ -264,26 +243,17 @@ def _write(capture: Recording, out: Path, file_format: str, bit_rate: int | None
     """Write the capture and its truth; returns the truth's path."""
     from tqdm import tqdm
 
-    from rxcli.lab.simulate.capture import write_capture
-    from rxcli.lab.simulate.truth import write_truth
-    from rxcli.outputs import replacing
-
     progress = partial(tqdm, desc=out.name, unit="frame", leave=False, disable=None)
-    with replacing(out) as hidden:
+    with outputs.replacing(out) as hidden:
         write_capture(capture, hidden, file_format, bit_rate, progress)
     return write_truth(capture.truth(out.name), out)
 
 
 def _write_extras(capture: Recording, options: dict[str, Any]) -> None:
     """Camera profile and waveforms, where they are asked for."""
-    from rxcli.lab.simulate.transmitter import export_waveforms
-    from rxcli.lab.simulate.truth import build_camera_profile
-    from rxcli.outputs import write_whole
-    from rxcli.profiles import dump_profile
-
     last = capture.exposure(capture.scene.n_frames - 1)
     if options["camera_profile"] is not None:
-        write_whole(options["camera_profile"], dump_profile(build_camera_profile(capture.scene, last)))
+        outputs.write_whole(options["camera_profile"], dump_profile(build_camera_profile(capture.scene, last)))
     if options["waveforms"] is not None:
         n_bursts = 1 + int(last.row_start_slots[-1] // capture.link.burst_slots)
         export_waveforms(capture.drive, capture.link, n_bursts, options["waveforms"])
