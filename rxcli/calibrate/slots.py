@@ -43,7 +43,7 @@ def calibrate_slots(frames: Sequence[Frame], screen: ScreenProfile, axis: Axis =
         )
     value, sd = weighted_mean(*zip(*(estimated["line_delay_s"] for estimated in confirmed), strict=True))
     bent = any("k1" in estimated for estimated in confirmed)
-    note = "the camera corrected its lens distortion: line delay and distortion were estimated together"
+    warning = "the camera corrected its lens distortion: line delay and distortion were estimated together"
     exposure = ExposureEstimate(None, None, "not estimated from data; use a lamp and --frequency")
     shape, periods = (frames[0].height, frames[0].width), upright[0].height * value * screen.slot_rate_hz
-    return ShutterCalibration(axis, shape, value, sd, periods, exposure, warnings=(note,) * bent)
+    return ShutterCalibration(axis, shape, value, sd, periods, exposure, warnings=(warning,) * bent)

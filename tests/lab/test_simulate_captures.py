@@ -198,7 +198,7 @@ def test_command_writes_clips_through_real_encoders(tmp_path: Path, name: str, c
         (["a.jpg", "--set", "isp.colour=3"], "isp.colour: no such field"),
         (["a.jpg", "--set", "sensor.cfa=foveon"], "sensor.cfa = 'foveon': Invalid enum value"),
         (["a.jpg", "--set", "isp quality"], "not FIELD=VALUE"),
-        (["a.jpg", "--exposure", "0"], r"exposure_s must be positive \(got 0.0\)"),
+        (["a.jpg", "--electrons", "-1"], r"light_e_per_s must be positive \(got -"),
     ],
 )
 def test_mistakes_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], message: str) -> None:
