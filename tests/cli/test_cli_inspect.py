@@ -110,17 +110,6 @@ def test_it_writes_beside_no_photo_and_is_passed_over_by_runs_over_folders(
     assert all(source.problem for source in found)
 
 
-def test_it_never_overwrites_what_others_wrote(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_frame(tmp_path / "a.png", 1)
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "index.html").write_text("<p>mine</p>")
-    command = ["inspect", str(tmp_path / "a.png"), "--out", str(tmp_path / "out"), *write_profiles(tmp_path)]
-    assert run(command) == 2
-    assert (tmp_path / "out" / "index.html").read_text() == "<p>mine</p>"
-    assert run([*command, "--force"]) == 0
-    assert run(command) == 0  # its own page may be replaced
-
-
 def test_a_clip_has_a_timeline(tmp_path: Path) -> None:
     samples = SAMPLE.parent
     profile = str(samples / "video1080.toml")

@@ -13,12 +13,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rxcli.errors import ExitCode, InputError, UsageError
 from rxcli.results.record import from_record, to_json_line, to_record
-from rxcli.results.report import format_frame, headline, printable, printable_name
+from rxcli.results.report import format_frame, headline, printable_name
 from rxcli.results.summary import Limits, SourceSummary, exit_code, format_summary, write_junit, write_summary
 from rxcli.results.truth import Score
 from rxcli.types import ColumnResult, FrameResult, PacketResult
@@ -112,18 +112,14 @@ def test_what_is_no_result_is_refused(record: Any) -> None:
         from_record(record)
 
 
-def test_file_names_that_are_no_utf8_survive() -> None:
-    name = b"caf\xe9.jpg".decode(errors="surrogateescape")
-    line = to_json_line(replace(OK, source=name))
-    line.encode("ascii")
-    assert from_record(json.loads(line)).source == name
-    assert printable(name) == "caf\\xe9.jpg"
-    format_frame(replace(OK, source=name)).encode("utf-8")
-
-
 @given(st.binary(min_size=1, max_size=20))
-def test_a_name_can_be_told_from_what_is_printed(raw: bytes) -> None:
+@example(b"caf\xe9.jpg")
+def test_a_name_survives_and_can_be_told_from_what_is_printed(raw: bytes) -> None:
     name = raw.decode(errors="surrogateescape")
+    line = to_json_line(replace(OK, source=name))
+    assert line.isascii()
+    assert from_record(json.loads(line)).source == name
+    format_frame(replace(OK, source=name)).encode("utf-8")
     shown = printable_name(name)
     assert shown.isprintable()
     plain = {"\\": "\\", "n": "\n", "r": "\r", "t": "\t"}
@@ -216,19 +212,20 @@ def test_headlines_count_packets_that_can_be_believed(n_unsure: int, said: str) 
 
 
 def test_all_received_is_said_only_where_it_is_so() -> None:
-    def last(*results: FrameResult) -> str:
-        return format_summary([summary(unsure(0)), summary(*results)], Limits()).splitlines()[-1]
-
-    in_clip = [replace(unsure(0), frame=n) for n in range(2)]
-    clip = [
-        replace(r, columns=tuple(replace(c, packets=(replace(PACKET, burst=r.frame),)) for c in r.columns))
-        for r in in_clip
-    ]
-    assert last(unsure(0)).endswith("all received")
-    assert last(*clip).endswith("all received")
-    lacking = replace(clip[1], columns=(replace(clip[1].columns[0], packets=()), *clip[1].columns[1:]))
-    for results in ([unsure(1)], [OK], [clip[0], lacking]):
-        assert "all received" not in last(*results)
+    first, second = (
+        replace(r, frame=n, columns=tuple(replace(c, packets=(replace(PACKET, burst=n),)) for c in r.columns))
+        for n, r in enumerate([unsure(0)] * 2)
+    )
+    lacking = replace(second, columns=(replace(second.columns[0], packets=()), *second.columns[1:]))
+    for results, is_whole in (
+        ([unsure(0)], True),
+        ([first, second], True),
+        ([unsure(1)], False),
+        ([OK], False),
+        ([first, lacking], False),
+    ):
+        last = format_summary([summary(unsure(0)), summary(*results)], Limits()).splitlines()[-1]
+        assert last.endswith("all received") == is_whole
 
 
 def test_reasons_that_differ_in_numbers_are_one() -> None:

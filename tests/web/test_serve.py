@@ -42,10 +42,9 @@ from rxcli.lab.benchmark.goodput import detect
 from rxcli.link.encoder import message
 from rxcli.options import ReceiverOptions, receiver_options
 from rxcli.profiles import ScreenProfile, load_profile
-from rxcli.results.aim import Aim, Light, light_of
 from rxcli.results.columns import text_rows
 from rxcli.runs.processes import resident_bytes
-from rxcli.types import ColumnResult, Frame, FrameResult, FrameSoftBits, Message, PacketResult, ReceivedObject
+from rxcli.types import ColumnResult, FrameResult, FrameSoftBits, Message, PacketResult, ReceivedObject
 from rxcli.web.decoding import DecodingProcess, Limits, _photos_of, answer_for
 from rxcli.web.live import live_events
 from rxcli.web.server import Bounds, Server, Site
@@ -101,7 +100,9 @@ async def emptied() -> None:
     raise AssertionError("an upload is left")
 
 
-def test_a_photo_gives_payloads_and_outlines_and_is_not_kept(tmp_path: Path, options: ReceiverOptions) -> None:
+def test_a_photo_gives_payloads_or_a_reason_without_a_path_and_is_not_kept(
+    tmp_path: Path, options: ReceiverOptions
+) -> None:
     payloads = write_frame(tmp_path / "a.png", 3)
 
     async def work(server: Server, client: Any) -> None:
@@ -109,22 +110,16 @@ def test_a_photo_gives_payloads_and_outlines_and_is_not_kept(tmp_path: Path, opt
         assert (status, answer["status"]) == (200, "ok")
         assert [packet["payload"] for packet in answer["packets"]] == payloads
         assert len(answer["picture"]["outlines"]) == N_COLUMNS
-        await emptied()
-
-    serving(Site(options, port=0), work)
-    assert leftovers() == []
-
-
-def test_a_bad_file_gives_a_reason_without_a_path(options: ReceiverOptions) -> None:
-    async def work(server: Server, client: Any) -> None:
         for data, told in ((b"hello", "Neither a picture nor a clip"), (b"", "The file is empty (0 bytes)")):
             _, answer = await post(server, client, data)
             assert answer["status"] == "unreadable"
             assert answer["reason"].startswith(told)
             assert "/" not in answer["reason"]
             assert answer["advice"]
+        await emptied()
 
     serving(Site(options, port=0), work)
+    assert leftovers() == []
 
 
 def test_photos_of_a_session_add_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -398,30 +393,22 @@ def bomb(side: int) -> bytes:
 
 
 def hostile(picture: bytes) -> list[tuple[bytes, dict[str, str]]]:
-    """A hundred bodies with headers: sizes, types, names."""
+    """Bodies with headers: sizes, types, names. What pictures may hold is tried on the readers themselves."""
     rng = np.random.default_rng(20)
-    magic = [b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"\0\0\0\x18ftypheic", b"\0\0\0\x18ftypisom"]
-    magic += [b"FUJIFILMCCD-RAW", b"BM", b"RIFF1234WEBP", b"\x1aE\xdf\xa3", b"GIF89a", b"%PDF-1.7", b"PK\x03\x04"]
-    bodies = [head + rng.bytes(size) for head in magic for size in (0, 60, 5000)]
-    bodies += [picture[: len(picture) * part // 8] for part in range(8)]
-    for _ in range(20):
-        damaged = np.frombuffer(picture, np.uint8).copy()
-        damaged[rng.integers(0, damaged.size, 20)] = rng.integers(0, 256, 20)
-        bodies.append(damaged.tobytes())
+    bodies = [head + rng.bytes(5000) for head in (b"", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\0", b"PK\x03\x04")]
     bodies += [
+        picture[: len(picture) // 2],
         bomb(20_000),
         bomb(8_100),
         bytes(5 * MEGABYTE),
-        b"\xff\xd8\xff" * MEGABYTE * 2,
         b"<script>alert(1)</script>",
     ]
-    bodies += [rng.bytes(int(rng.integers(0, 300_000))) for _ in range(24)]
-    names = ["../../etc/passwd", "a\\b.jpg", "con", "x" * 4000, "%00", "-rf", "$(reboot)", "<b>.jpg"]
+    names = ["../../etc/passwd", "a\\b.jpg", "x" * 4000, "%00", "$(reboot)"]
     inflated = zlib.compress(bytes(64 * MEGABYTE), 9), {"Content-Encoding": "deflate"}
     return [inflated] * 3 + [(body, {"X-Name": names[i % len(names)]}) for i, body in enumerate(bodies)]
 
 
-def test_two_hundred_hostile_uploads(tmp_path: Path, options: ReceiverOptions) -> None:
+def test_hostile_uploads(tmp_path: Path, options: ReceiverOptions) -> None:
     """Afterwards the server answers as before, it is no larger, and the disk is as it was."""
     write_frame(tmp_path / "a.png", 3)
     good, files_before = (tmp_path / "a.png").read_bytes(), set(Path("/tmp").glob("vlc-rx*"))
@@ -454,8 +441,7 @@ def test_two_hundred_hostile_uploads(tmp_path: Path, options: ReceiverOptions) -
         watcher = asyncio.create_task(watch(server))
         assert (await post(server, client, good))[1]["status"] == "ok"
         memory = resident_bytes(os.getpid())
-        bodies = hostile(good)
-        for body, headers in bodies:
+        for body, headers in hostile(good):
             answer = await quietly(post(server, client, body, headers=headers))
             assert answer is None or answer[0] in (200, 400, 408, 413, 503), answer
         calls = [quietly(post(server, client, endless_body(*how))) for how in [(1, 0.1), (MEGABYTE, 0.0)] * 3]
@@ -465,7 +451,6 @@ def test_two_hundred_hostile_uploads(tmp_path: Path, options: ReceiverOptions) -
         calls += [quietly(held(server, b"GET / HTTP/1.1\r\nX: " + b"y" * 200_000, 0.5)) for _ in range(5)]
         calls += [quietly(held(server, head + b"Content-Length: 9\r\n\r\n", 3.0))]
         calls += [quietly(held(server, b"\x16\x03\x01 no HTTP at all", 0.2)) for _ in range(38)]
-        assert len(bodies) + len(calls) >= 200
         answers = [answer for answer in await asyncio.gather(*calls) if answer]
         assert {status for status, _ in answers} <= {200, 408, 413, 503}
         for _ in range(50):  # slow ones are let go in time
@@ -494,20 +479,6 @@ def result_of(status: str, message: str | None = None, packets: int = 0) -> Fram
     return FrameResult("camera", 0, 0.0, status, message, corners=corners, columns=columns)  # type: ignore[arg-type]
 
 
-def test_the_state_says_why_there_is_no_lock_and_what_to_do() -> None:
-    aim = Aim()
-    state = aim.update(result_of("no_signal", "the screen fills 30 % of the height; move closer"), 0.0, 1000)
-    assert (state.word, state.locked, state.height_share) == ("no signal", False, 0.3)
-    assert state.reason == "The screen fills 30 % of the height."
-    assert state.advice == "Move closer, until the screen fills the picture."
-    state = aim.update(result_of("ok", packets=3), 0.1, 1000)
-    assert (state.word, state.n_received, state.reason) == ("locked", 3, "")
-    state = aim.update(result_of("ok", packets=3), 0.2, 1000)
-    assert state.packets_per_s == pytest.approx(30)
-    dark = aim.update(result_of("no_screen", "no screen found: nothing; look"), 2.0, 1000, Light(0.001, 0.0))
-    assert (dark.reason, dark.advice[:13]) == ("The picture is too dark.", "Expose longer")
-
-
 def test_texts_and_files_come_to_the_page() -> None:
     result = result_of("ok", packets=1)
     texts = (Message("text", "Grüße".encode(), "camera", 0, 0.0), Message("uri", b"https://a.b", "camera", 0, 0.0))
@@ -517,11 +488,6 @@ def test_texts_and_files_come_to_the_page() -> None:
         {"kind": "uri", "text": "https://a.b"},
         {"kind": "file", "name": "a.txt", "size": 3, "base64": "YWJj"},
     ]
-
-
-@pytest.mark.parametrize(("value", "word"), [(0, "too dark"), (120, "good"), (255, "overexposed")])
-def test_light_is_told_in_words(value: int, word: str) -> None:
-    assert light_of(Frame(np.full((200, 300), value, np.uint8), "a")).word == word
 
 
 @pytest.mark.parametrize("passed_s", [0.0, 1.0])
