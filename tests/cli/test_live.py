@@ -226,26 +226,21 @@ def result(status: str, n_packets: int) -> FrameResult:
 
 
 class TestStatus:
-    def test_line(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-        clock = iter([10.0, 10.25, 10.5, 10.75, 11.0])
+    def test_lock_and_its_loss(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """The loss shows at once, with reason and next step."""
+        clock = iter([10.0, 10.25, 10.5, 10.75, 11.0, 11.01])
         monkeypatch.setattr("rxcli.cli.live.time.monotonic", lambda: next(clock))
         source = LiveSource(tmp_path)
         source.counts = CameraCounts(dropped=7, damaged=2)
-        with Status(source) as status:
-            for _ in range(5):
-                status.update(result("partial", 10))
-        line = capsys.readouterr().err.splitlines()[-1]
+        status = Status(source)
+        for _ in range(5):
+            status.update(result("partial", 10))
         expected = "LOCKED | columns 15/20 | 4.0 frames/s | 40 packets/s | 4.0 kb/s | BER about 1.0e-02 | "
-        assert line == expected + "dropped 7 | damaged 2"
+        assert capsys.readouterr().err.splitlines()[-1] == expected + "dropped 7 | damaged 2"
         assert status.n_packets == 50
-
-    def test_loss_of_lock_shows_at_once_with_reason_and_next_step(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        status = Status(LiveSource(tmp_path))
-        status.update(result("ok", 20))
-        lost = FrameResult("/dev/video0", 1, 0.1, "no_screen", "no screen found: it is black; expose longer")
-        status.update(lost)
+        status.update(FrameResult("/dev/video0", 1, 0.1, "no_screen", "no screen found: it is black; expose longer"))
         line = capsys.readouterr().err.splitlines()[-1]
         assert line.startswith("no screen | columns 0/0")
         assert line.endswith("It is black. Expose longer.")
@@ -301,11 +296,9 @@ def test_nothing_of_the_status_is_cut_off_by_a_narrow_terminal(width: int) -> No
 def test_a_hand_is_told_to_hold_still_only_when_it_matters(moved_px: float, received: int, said: bool) -> None:
     corners = np.array([[100.0, 100.0], [900.0, 100.0], [900.0, 600.0], [100.0, 600.0]])
     columns = tuple(ColumnResult(k, "ok" if k < received else "no_packet") for k in range(20))
+    still = FrameResult("camera", 0, 0.0, "ok" if received else "no_signal", corners=corners, columns=columns)
     aim = Aim()
-    for frame in range(2):
-        at = corners + frame * moved_px
-        result = FrameResult("camera", frame, 0.0, "ok" if received else "no_signal", corners=at, columns=columns)
-        state = aim.update(result, frame / 30, 1080)
+    aim.update(still, 0.0, 1080)
+    state = aim.update(replace(still, frame=1, corners=corners + moved_px), 1 / 30, 1080)
     assert ("Hold the camera still." in state.advice) == said
-    if received and not said:
-        assert not state.reason
+    assert said or not received or not state.reason

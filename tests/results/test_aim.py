@@ -18,10 +18,6 @@ MAX_HINTS, MAX_STEPS = 3, 12
 GOOD = replace(preset("video-1080p", "paper-17k3"), n_frames=1)
 
 
-def _exposed(scene: Scene, factor: float) -> Scene:
-    return replace(scene, exposure_s=scene.exposure_s * factor)
-
-
 def _posed(scene: Scene, **pose: float) -> Scene:
     return replace(scene, pose=replace(scene.pose, **pose))
 
@@ -29,17 +25,15 @@ def _posed(scene: Scene, **pose: float) -> Scene:
 #: A word of a hint -> what a person does who reads it, a little at a time.
 FOLLOWED: dict[str, Callable[[Scene], Scene]] = {
     "longer": lambda scene: scene.exposed(scene.exposure_s, 4.0),
-    "shorter": lambda scene: _exposed(scene, 0.5),
+    "shorter": lambda scene: replace(scene, exposure_s=scene.exposure_s * 0.5),
     "long side": lambda scene: _posed(scene, roll_deg=0.2 * scene.pose.roll_deg),
     "closer": lambda scene: _posed(scene, fill=min(1.3 * scene.pose.fill, 0.92)),
     "level": lambda scene: _posed(scene, roll_deg=0.4 * scene.pose.roll_deg),
 }
 STARTS = {
-    "a dark room": GOOD.exposed(GOOD.exposure_s, 1 / 500),
     "far away": _posed(GOOD, fill=0.3),
     "in portrait": _posed(GOOD, fill=0.5, roll_deg=88),
-    "tilted": _posed(GOOD, fill=0.7, roll_deg=20),
-    "a long exposure": _exposed(GOOD, 32),
+    "a long exposure": replace(GOOD, exposure_s=GOOD.exposure_s * 32),
     "dark, far and in portrait": _posed(GOOD, fill=0.35, roll_deg=92).exposed(GOOD.exposure_s, 1 / 100),
 }
 

@@ -103,19 +103,13 @@ def test_a_burst_of_the_frame_before_is_no_false_packet_but_one_of_the_next_is(
     assert score(frame(index, [(0, payload)])).false == n_false
 
 
-def test_a_packet_reported_twice_counts_once_by_its_better_copy() -> None:
-    found = score(frame(0, [(0, flip("0000000000", 2))]), frame(1, [(0, "0000000000")]))
-    assert (found.error_free, found.bit_errors, found.lost) == (1, 0, 3)
-
-
-def test_a_packet_that_no_frame_shows_whole_is_extra() -> None:
-    found = score(frame(1, [(0, "aaaaaaaaaa"), (1, flip("5555555555", 1))]))
-    assert (found.extra, found.extra_error_free, found.false, found.lost) == (2, 1, 0, 4)
-
-
-def test_wrong_w_is_counted_and_bits_that_lack_are_wrong() -> None:
-    found = score(frame(0, [(0, "00000000")], w=(4, 4)))
-    assert (found.wrong_w, found.bit_errors, found.error_free) == (1, 8, 0)
+def test_copies_extra_packets_and_wrong_weights() -> None:
+    twice = score(frame(0, [(0, flip("0000000000", 2))]), frame(1, [(0, "0000000000")]))  # the better copy counts
+    assert (twice.error_free, twice.bit_errors, twice.lost) == (1, 0, 3)
+    partial = score(frame(1, [(0, "aaaaaaaaaa"), (1, flip("5555555555", 1))]))  # of a burst that no frame shows whole
+    assert (partial.extra, partial.extra_error_free, partial.false, partial.lost) == (2, 1, 0, 4)
+    wrong = score(frame(0, [(0, "00000000")], w=(4, 4)))  # bits that lack are wrong
+    assert (wrong.wrong_w, wrong.bit_errors, wrong.error_free) == (1, 8, 0)
 
 
 def test_a_column_that_the_screen_does_not_have_is_false() -> None:
@@ -135,32 +129,28 @@ def test_wrong_bits_agrees_with_counting_them(bits: list[bool], data: st.DataObj
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("content", "message"),
     [
-        ({"w": [5]}, "w must have one entry per column, 2"),
-        ({"w": [5, 10]}, "w must be in 1..9 .got 10"),
-        ({"payload_bits": [40, 40, 40]}, "payload_bits must have one entry per column"),
-        ({"payload": {"0": RAW["payload"]["0"], "1": RAW["payload"]["1"]}}, "burst 2 is missing"),
-        ({"payload": RAW["payload"] | {"1": ["aa"]}}, "payload of burst 1 must have one entry per column"),
-        ({"payload": RAW["payload"] | {"1": ["aa", "bb"]}}, "burst 1, column 0, must be hex of at least 40 bits"),
-        ({"payload": RAW["payload"] | {"1": ["zzzzzzzzzz", "bb"]}}, "must be hex"),
-        ({"columns": "two"}, "cannot be read as truth .*columns"),
-        ({"frames": None}, "cannot be read as truth .*frames"),
+        (RAW | {"w": [5]}, "w must have one entry per column, 2"),
+        (RAW | {"w": [5, 10]}, "w must be in 1..9 .got 10"),
+        (RAW | {"payload_bits": [40, 40, 40]}, "payload_bits must have one entry per column"),
+        (RAW | {"payload": {"0": RAW["payload"]["0"], "1": RAW["payload"]["1"]}}, "burst 2 is missing"),
+        (RAW | {"payload": RAW["payload"] | {"1": ["aa"]}}, "payload of burst 1 must have one entry per column"),
+        (RAW | {"payload": RAW["payload"] | {"1": ["aa", "bb"]}}, "column 0, must be hex of at least 40 bits"),
+        (RAW | {"payload": RAW["payload"] | {"1": ["zzzzzzzzzz", "bb"]}}, "must be hex"),
+        (RAW | {"columns": "two"}, "cannot be read as truth .*columns"),
+        (RAW | {"frames": None}, "cannot be read as truth .*frames"),
+        *((content, "cannot be read as truth") for content in (b"", b"{", b"\xff\xfe", b"[]", b"null")),
     ],
 )
-def test_a_wrong_truth_file_is_named_with_the_reason(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_a_wrong_truth_file_is_named_with_the_reason(
+    tmp_path: Path, content: dict[str, Any] | bytes, message: str
+) -> None:
     path = tmp_path / "a.truth.json"
-    path.write_text(json.dumps(RAW | changes))
+    path.write_bytes(content if isinstance(content, bytes) else json.dumps(content).encode())
     with pytest.raises(InputError, match=message) as caught:
         load_truth(path)
     assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[]", b"null"])
-def test_a_truth_file_that_is_none(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "a.truth.json").write_bytes(content)
-    with pytest.raises(InputError, match="cannot be read as truth"):
-        load_truth(tmp_path / "a.truth.json")
 
 
 def test_truth_beside_a_capture(tmp_path: Path) -> None:
