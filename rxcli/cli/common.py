@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from rxcli.cli.kinds import AUTO, CAMERA, SCREEN, SHARE, Point
+from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
     from rxcli.options import ReceiverOptions
@@ -72,7 +73,6 @@ receiver_arguments = options(
     ("--no-skip=NAME", [str], None, _SKIP_HELP),
     ("--file-memory=MB file_memory_mb", click.IntRange(1, 1 << 20), 512, _MEMORY_HELP),
 )
-_RECEIVER = ("screens", "cameras", "corners", "mirrored", "cae", "min_confidence", "no_skip", "file_memory_mb")
 #: For every command that writes files which may be somebody's.
 force_argument = options(
     ("--force", None, False, "Replace files that are there already and were not written by the same option."),
@@ -90,10 +90,23 @@ def receiver_options(given: dict[str, Any], **more: Any) -> ReceiverOptions:
         ProfileError: a profile is missing or malformed.
         UsageError: the corners are no convex quadrilateral.
     """
+    from inspect import signature
+
     from rxcli.options import receiver_options as options_of
 
-    given_options = {name: given[name] for name in _RECEIVER if given[name] not in (None, ())}
-    return options_of(**given_options, **more)
+    names = signature(options_of).parameters.keys() & given.keys()
+    return options_of(**{name: given[name] for name in names if given[name] not in (None, ())}, **more)
+
+
+def refuse(*rules: tuple[object, str, str]) -> None:
+    """Refuse what makes no sense: each rule is a condition, and the reason and the next step where it holds.
+
+    Raises:
+        UsageError: of the first rule that holds.
+    """
+    for is_wrong, reason, step in rules:
+        if is_wrong:
+            raise UsageError(reason, step)
 
 
 def claim_outputs(

@@ -19,9 +19,9 @@ import click
 import msgspec
 
 from rxcli import __version__, outputs
-from rxcli.cli.common import claim_outputs, receiver_options
+from rxcli.cli.common import claim_outputs, receiver_options, refuse
 from rxcli.cli.printing import JsonLines, PayloadTable, Progress, Table, Writer, print_line, print_text
-from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
+from rxcli.errors import ExitCode, InputError, ReceiverError, worst
 from rxcli.ingest import KNOWN_SUFFIXES, open_source
 from rxcli.link.collector import PhotoCollector
 from rxcli.link.saving import save_objects
@@ -51,8 +51,7 @@ def run(paths: tuple[str, ...], given: dict[str, Any]) -> ExitCode:
     sources = batch.collect_sources(paths, frozenset(KNOWN_SUFFIXES))
     _check(paths, given, len(sources))
     log.info("paths: %s", ", ".join(paths))
-    more = {name: given[name] for name in ("dump_dir", "stop_when_certain")}
-    configured = receiver_options(given, **more, soft_bits=True)
+    configured = receiver_options(given, soft_bits=True)
     tap, after = None, None
     if given["save_undistorted"]:
         from rxcli.results.undistort import UndistortedWriter
@@ -72,7 +71,7 @@ def _check(paths: tuple[str, ...], given: dict[str, Any], n_sources: int) -> Non
     no_file, no_truth = given["json_path"] in (None, "-"), given["max_ber"] is not None and not truth
     no_address = "--cluster needs the address of a Dask scheduler (got none)"
     one_truth = f"--truth {truth} is the truth of one file ({n_sources} were given)"
-    for is_wrong, reason, step in (
+    refuse(
         (resume and no_file, "--resume needs the file that --json wrote", "give --json FILE"),
         (resume and STDIN in paths, "--resume cannot check whether stdin is unchanged", "name the file"),
         (no_truth, "--max-ber needs the truth", "give --truth FILE, or --truth auto"),
@@ -80,9 +79,7 @@ def _check(paths: tuple[str, ...], given: dict[str, Any], n_sources: int) -> Non
         (cluster is not None and not cluster.strip(), no_address, "name it: tcp://host:8786"),
         (cluster and given["workers"] > 1, "--workers and --cluster exclude each other", "give one of them"),
         (cluster and STDIN in paths, "stdin cannot be sent to a cluster", "name a file that its workers see"),
-    ):
-        if is_wrong:
-            raise UsageError(reason, step)
+    )
     if given["summary"]:
         summary.check_summary_path(given["summary"])
 
@@ -100,9 +97,8 @@ def _claim(given: dict[str, Any], sources: list[batch.Source]) -> outputs.Taken:
     for name in ("dump_dir", "save_undistorted", "out"):
         if given[name] is not None:
             outputs.claim_folder(_flag(name), given[name])
-            if out is not None and name != "out" and out.resolve().is_relative_to(given[name].resolve()):
-                reason = f"--out {out}: {_flag(name)} writes there"
-                raise UsageError(reason, "name a folder for received files alone")
+            is_inside = out is not None and name != "out" and out.resolve().is_relative_to(given[name].resolve())
+            refuse((is_inside, f"--out {out}: {_flag(name)} writes there", "name a folder for received files alone"))
     return taken
 
 

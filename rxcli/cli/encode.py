@@ -13,7 +13,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.cli.common import claim_outputs, force_argument, options
+from rxcli.cli.common import claim_outputs, force_argument, options, refuse
 from rxcli.cli.sending import sending_of
 from rxcli.errors import InputError, UsageError
 from rxcli.link.encoder import FileSending, Sending, packet_slots_of, visible_bits_of_burst
@@ -46,7 +46,12 @@ _USUAL_READOUT = 0.61
 def encode(path: Path | None, out: Path, **options: Any) -> None:
     """Encode the file PATH, a text or a URI as labels, or slots, for a transmitter."""
     screen = load_profile(options["screen"], ScreenProfile)
-    _check(out, options)
+    is_ambiguous, suffix = options["bursts"] is not None and options["seconds"] is not None, out.suffix
+    refuse(
+        (is_ambiguous, "--bursts and --seconds exclude each other", "give one of them"),
+        (suffix not in (".npy", ".csv"), f"--out must end in .npy or .csv (got {str(out)!r})", "name such a file"),
+        (options["slots"] and suffix != ".npy", "--slots are written as .npy only", "name such a file"),
+    )
     inputs = [path, Path(options["weights"]) if options["weights"].endswith(".json") else None]
     readme = Output("--slots", _readme_of(out), ENCODED) if options["slots"] else None
     written = [Output("--out", out, ENCODED), readme]
@@ -56,23 +61,12 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
     plan = _Plan(sending, screen, _weights(options["weights"], n_bursts, screen.columns), n_bursts, out)
     for row in plan.weights:
         sending.check(row, screen.payload_symbols)
-    write = plan.write_csv if out.suffix == ".csv" else plan.write_slots if options["slots"] else plan.write_labels
+    write = plan.write_csv if suffix == ".csv" else plan.write_slots if options["slots"] else plan.write_labels
     try:
         write()
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror or error})", "name another file") from None
     click.echo(plan.summary(), err=True)
-
-
-def _check(out: Path, options: dict[str, Any]) -> None:
-    is_ambiguous = options["bursts"] is not None and options["seconds"] is not None
-    for is_wrong, reason, step in (
-        (is_ambiguous, "--bursts and --seconds exclude each other", "give one of them"),
-        (out.suffix not in (".npy", ".csv"), f"--out must end in .npy or .csv (got {str(out)!r})", "name such a file"),
-        (options["slots"] and out.suffix != ".npy", "--slots are written as .npy only", "name such a file"),
-    ):
-        if is_wrong:
-            raise UsageError(reason, step)
 
 
 def _readme_of(out: Path) -> Path:
@@ -98,12 +92,11 @@ def _weights(text: str, n_bursts: int, columns: int) -> NDArray[np.int64]:
             f"--weights {text}: no number, list of {columns} numbers, or JSON file of {n_bursts} such lists",
             "give 1..9 for every column",
         ) from None
-    if weights.min() < 1 or weights.max() > 9:
-        raise UsageError(f"--weights {text}: weights are 1 to 9", "choose from 1..9")
-    if len(weights) not in (1, n_bursts):
-        raise UsageError(
-            f"--weights {text} holds {len(weights)} bursts, {n_bursts} are sent", f"give {n_bursts}, or --bursts"
-        )
+    n, step = len(weights), f"give {n_bursts}, or --bursts"
+    refuse(
+        (weights.min() < 1 or weights.max() > 9, f"--weights {text}: weights are 1 to 9", "choose from 1..9"),
+        (n not in (1, n_bursts), f"--weights {text} holds {n} bursts, {n_bursts} are sent", step),
+    )
     return weights
 
 

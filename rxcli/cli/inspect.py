@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -125,21 +123,12 @@ def _received(
     found = truth_for(path, truth)
     scorer = Scorer(load_truth(found)) if found else None
     n_frames = max(_MAX_FRAMES, (number or 0) + 1)
-    head: list[Frame] = []
-    decoder = replace(standard_decoder(options), open_source=lambda name: islice(open_source(name), n_frames))
-    frames = _noting(decoder.open_source(path), head)
-    received = list(decoder.linked(decoder.receive(frames, options)))
+    frames, decoder = islice(open_source(path), n_frames), standard_decoder(options)
+    head = list(islice(frames, 1))  # so that a photo is read once
+    received = list(decoder.linked(decoder.receive(chain(head, frames), options)))
     results = [scorer.add(result) if scorer else result for result in received]
     best = max(results, key=lambda result: len(result.packets), default=None)
     if best is None or (number is not None and number >= len(results)):
         raise InputError(f"{path}: has no frame {number or 0}", "choose a lower --frame")
     shown = best.frame if number is None else number
     return results, head[0] if shown == 0 else next(islice(open_source(path), shown, None))
-
-
-def _noting(frames: Iterable[Frame], head: list[Frame]) -> Iterator[Frame]:
-    """The frames; the first one is kept, so that a photo is read once."""
-    for frame in frames:
-        if not head:
-            head.append(frame)
-        yield frame

@@ -58,10 +58,6 @@ class ProfileName(click.ParamType[str]):
     def __init__(self, folder: str) -> None:
         self._folder = folder
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """The name as it is given."""
-        return str(value)
-
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         """Names of profiles, then files, for the shell."""
         from rxcli.resources import profile_dirs

@@ -167,7 +167,7 @@ def run(arguments: Sequence[str]) -> int:
         return ExitCode.INTERRUPTED
     except (Exception, KeyboardInterrupt, Terminated) as error:
         message, ending = _explained(error)
-        _say(message)
+        logging.getLogger("rxcli").error("%s", message)
         return ending
     return int(code or ExitCode.OK)
 
@@ -210,35 +210,20 @@ def _log_to_stderr() -> None:
 
 
 class _StderrHandler(logging.Handler):
-    """Writes to what stderr is at the time, around a progress bar if there is one."""
+    """Writes to what stderr is at the time; errors are messages for people, and other records name their level."""
 
-    #: One JSON object a line, where `--log-json` asks for it.
+    #: One JSON object a line, where `--log-json` asks for it; times are Unix seconds.
     as_json = False
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.setFormatter(logging.Formatter("vlc-rx: %(levelname)s: %(message)s"))
-
     def emit(self, record: logging.LogRecord) -> None:
+        traceback = logging.Formatter().formatException(record.exc_info) if record.exc_info else ""
+        level, message = record.levelname, record.getMessage()
+        text = f"vlc-rx: {'' if level == 'ERROR' else f'{level}: '}{message}" + f"\n{traceback}" * bool(traceback)
+        if self.as_json:
+            about = {"time": round(record.created, 3), "level": level.lower(), "message": message}
+            text = json.dumps(about | ({"traceback": traceback} if traceback else {}))
         with suppress(OSError):  # nobody hears that nobody hears
-            click.echo(_json_line(record) if self.as_json else self.format(record), err=True)
-
-
-def _json_line(record: logging.LogRecord) -> str:
-    """Time (Unix seconds), level, message, and a traceback where there is one."""
-    line = {"time": round(record.created, 3), "level": record.levelname.lower(), "message": record.getMessage()}
-    if record.exc_info:
-        line["traceback"] = logging.Formatter().formatException(record.exc_info)
-    return json.dumps(line)
-
-
-def _say(message: str) -> None:
-    """One line on stderr, for people or as JSON, if it can be written."""
-    if _StderrHandler.as_json:
-        logging.getLogger("rxcli").error("%s", message)
-        return
-    with suppress(OSError):
-        click.echo(f"vlc-rx: {message}", err=True)
+            click.echo(text, err=True)
 
 
 def _leave_stdout() -> None:

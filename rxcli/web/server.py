@@ -286,11 +286,10 @@ class Server:
     # -- addresses ----------------------------------------------------------------------------------------------------
 
     async def _index(self, request: web.Request) -> web.Response:
-        text = (_PAGE / "index.html").read_text(encoding="utf-8")
-        live = "yes" if self._site.device is not None else "no"
-        largest = str(self._site.bounds.upload_bytes)
-        retention = "not kept" if self._site.keep is None else "kept"
-        text = text.replace("{{kept}}", retention).replace("{{live}}", live).replace("{{largest}}", largest)
+        text, site = (_PAGE / "index.html").read_text(encoding="utf-8"), self._site
+        retention, live = "not kept" if site.keep is None else "kept", "no" if site.device is None else "yes"
+        for name, value in {"kept": retention, "live": live, "largest": site.bounds.upload_bytes}.items():
+            text = text.replace("{{" + name + "}}", str(value))
         return web.Response(text=text, content_type="text/html")
 
     async def _asset(self, request: web.Request) -> web.Response:
@@ -305,25 +304,20 @@ class Server:
         self._make_room()
         if len(self._arriving) >= bounds.uploads or len(self._queue) >= bounds.waiting:
             busy = refusal("other pictures are being read just now", "try again in a few seconds")
-            return _answer(busy, 503)
-        if (request.content_length or 0) > bounds.upload_bytes:
-            return _answer(self._too_large(), 413, close=True)
+            return web.json_response(busy, status=503)
         path = self._folder / uuid.uuid4().hex
         try:
-            size = await self._save(request, path)
-            if size is None:
-                return _answer(self._too_large(), 413, close=True)
+            if not await self._save(request, path):
+                large = f"the file is larger than {bounds.upload_bytes >> 20} MB"
+                return _refused(413, large, "send a photo, or a shorter clip")
             if _LINES in request.headers.get("Accept", ""):
                 return await self._answer_by_and_by(request, path)
-            return _answer(await self._decoded(request, path, lambda _: None), 200)
+            return web.json_response(await self._decoded(request, path, lambda _: None))
         except TimeoutError:
-            slow = refusal("the picture took too long to arrive", "move nearer to the network")
-            return _answer(slow, 408, close=True)
+            return _refused(408, "the picture took too long to arrive", "move nearer to the network")
         except OSError as error:
             log.warning("an upload could not be stored: %s", error)
-            return _answer(
-                refusal("there is no room for the picture", "inform the operator of this page"), 507, close=True
-            )
+            return _refused(507, "there is no room for the picture", "inform the operator of this page")
         finally:
             path.unlink(missing_ok=True)
 
@@ -392,14 +386,16 @@ class Server:
         async with asyncio.timeout(self._site.bounds.answer_s):
             await response.write(json.dumps(answer).encode() + b"\n")
 
-    async def _save(self, request: web.Request, path: Path) -> int | None:
-        """Write the body to `path`; returns its size, or None if it is too large.
+    async def _save(self, request: web.Request, path: Path) -> bool:
+        """Write the body to `path`; returns whether it is small enough.
 
         Raises:
             TimeoutError: the upload is too slow.
         """
         bounds = self._site.bounds
         begun_s = asyncio.get_running_loop().time()
+        if (request.content_length or 0) > bounds.upload_bytes:
+            return False
         async with asyncio.timeout(bounds.grace_s) as limit:
             upload = _Upload(begun_s, limit)
             self._arriving.append(upload)
@@ -408,7 +404,7 @@ class Server:
                     while chunk := await request.content.read(_CHUNK):
                         upload.n_bytes += len(chunk)
                         if upload.n_bytes > bounds.upload_bytes:
-                            return None
+                            return False
                         file.write(chunk)
                         late_s = bounds.grace_s + upload.n_bytes / bounds.upload_rate
                         if upload in self._arriving:
@@ -416,12 +412,7 @@ class Server:
             finally:
                 if upload in self._arriving:
                     self._arriving.remove(upload)
-        return upload.n_bytes
-
-    def _too_large(self) -> dict[str, Any]:
-        return refusal(
-            f"the file is larger than {self._site.bounds.upload_bytes >> 20} MB", "send a photo, or a shorter clip"
-        )
+        return True
 
     def _keep(self, path: Path, answer: dict[str, Any]) -> None:
         """Store the upload and its result, if requested."""
@@ -499,10 +490,9 @@ def _requests_log() -> logging.Logger:
     return requests
 
 
-def _answer(answer: dict[str, Any], status: int, close: bool = False) -> web.Response:
-    response = web.json_response(answer, status=status)
-    if close:  # the rest of the body is not awaited
-        response.force_close()
+def _refused(status: int, reason: str, step: str) -> web.Response:
+    response = web.json_response(refusal(reason, step), status=status)
+    response.force_close()  # the rest of the body is not awaited
     return response
 
 

@@ -620,7 +620,7 @@ def test_the_live_page_locks_on_the_camera(tmp_path: Path) -> None:
         async with Browser() as browser:
             await browser.open(address)
             await browser.until("document.getElementById('lock').textContent === 'no screen'")
-            assert "The picture is too dark." in await browser.run("document.getElementById('aim').textContent")
+            await browser.until("document.getElementById('aim').textContent.includes('The picture is too dark.')")
             await browser.until("document.getElementById('lock').textContent === 'locked'")
             assert await browser.run("document.querySelectorAll('#live-picture polygon:not(.corners)').length") == 20
             await browser.until("document.querySelectorAll('#live-packets li').length > 0")
