@@ -121,11 +121,12 @@ def test_a_capture_of_the_simulator_may_be_made_anew(tmp_path: Path) -> None:
     command = ["simulate", str(tmp_path / "a.jpg"), "--preset", "phone-plain", "--scale", "0.05"]
     command += ["--camera-profile", str(tmp_path / "c.toml")]
     assert run(command) == 0
-    first = contents(tmp_path)
+    before = contents(tmp_path)
     assert run(command) == 0
-    assert contents(tmp_path) == first
+    assert contents(tmp_path) == before
     truth = json.loads((tmp_path / "a.truth.json").read_text())
-    (tmp_path / "a.truth.json").write_text(json.dumps({k: v for k, v in truth.items() if k != "written_by"}))
+    del truth["written_by"]
+    (tmp_path / "a.truth.json").write_text(json.dumps(truth))
     assert run(command) == 2
     assert run([*command, "--force"]) == 0
 
@@ -260,18 +261,15 @@ def test_folders_of_results_are_no_folders_of_photos(
 
 
 def test_a_folder_of_results_is_new_empty_or_the_commands_own(tmp_path: Path) -> None:
-    new, old, other = tmp_path / "a" / "new", tmp_path / "old", tmp_path / "other"
     for _ in range(2):
-        outputs.claim_own_folder("--out", new, ("*.journal.jsonl",))
-        (new / "confidence.csv").write_text("x")
-    assert (new / outputs.OUTPUT_MARKER).exists()
-    for folder, name in ((old, "confidence.journal.jsonl"), (other, "a.jpg")):
-        folder.mkdir()
-        (folder / name).touch()
-    outputs.claim_own_folder("--out", old, ("*.journal.jsonl",))
-    outputs.claim_own_folder("--out", other, (), force=True)
-    with pytest.raises(UsageError, match="the folder holds files"):
-        outputs.claim_own_folder("--out", other, ("*.journal.jsonl",))
-    with pytest.raises(UsageError, match="File exists"):
-        outputs.claim_own_folder("--out", other / "a.jpg")
-    assert not any((folder / outputs.OUTPUT_MARKER).exists() for folder in (old, other))
+        outputs.claim_own_folder("--out", tmp_path / "a" / "new", ("*.journal.jsonl",))
+        (tmp_path / "a" / "new" / "confidence.csv").write_text("x")
+    assert (tmp_path / "a" / "new" / outputs.OUTPUT_MARKER).exists()
+    for name, file in (("old", "confidence.journal.jsonl"), ("other", "a.jpg")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / file).touch()
+    outputs.claim_own_folder("--out", tmp_path / "old", ("*.journal.jsonl",))
+    outputs.claim_own_folder("--out", tmp_path / "other", (), force=True)
+    for name, reason in (("other", "the folder holds files"), ("other/a.jpg", "File exists")):
+        with pytest.raises(UsageError, match=reason):
+            outputs.claim_own_folder("--out", tmp_path / name, ("*.journal.jsonl",))
