@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rxcli.results.overlay import encoded_jpeg
+from rxcli.results.overlay import drawing
 from rxcli.types import FloatArray, Frame
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def _drawn(frame: Frame, shares: Any) -> dict[str, Any]:
     height = round(_WIDTH * frame.height / frame.width)
     places = [np.arange(n) * size // n for n, size in zip((height, _WIDTH), shares.shape, strict=True)]
     levels = (_LOW + _RANGE * shares[np.ix_(*places)].astype(np.float64)).astype(np.uint8)
-    return {"jpeg": encoded_jpeg(levels, _QUALITY), "width": _WIDTH, "height": height, "corners": [], "outlines": []}
+    return drawing(levels, _QUALITY)
 
 
 def _borders(grid: Grid, width: int, height: int) -> list[FloatArray]:

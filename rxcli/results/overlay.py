@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,13 +30,22 @@ class Preview:
     step: int
 
 
-def encoded_jpeg(pixels: NDArray[np.uint8], quality: int) -> str:
-    """Grey values (height, width) as a JPEG in base64."""
+def drawing(
+    pixels: NDArray[np.uint8], quality: int, corners: Any = (), outlines: Sequence[dict[str, Any]] = ()
+) -> dict[str, Any]:
+    """A picture and what is drawn over it, as plain data.
+
+    Args:
+        pixels: (height, width) grey values.
+        quality: of the JPEG.
+        corners: of the screen, pixels of the picture.
+        outlines: of columns, likewise; see `picture_of`.
+    """
     import simplejpeg
 
-    plane = np.ascontiguousarray(pixels)[:, :, None]
-    data = simplejpeg.encode_jpeg(plane, quality, colorspace="GRAY", colorsubsampling="Gray")
-    return base64.b64encode(data).decode()
+    plane, (height, width) = np.ascontiguousarray(pixels)[:, :, None], pixels.shape
+    jpeg = base64.b64encode(simplejpeg.encode_jpeg(plane, quality, colorspace="GRAY", colorsubsampling="Gray"))
+    return {"jpeg": jpeg.decode(), "width": width, "height": height, "corners": corners, "outlines": outlines}
 
 
 def preview(frame: Frame, width_px: int = 1000) -> Preview:
@@ -82,13 +92,8 @@ def picture_of(
 ) -> dict[str, Any]:
     """The small copy of a frame as JPEG, with the screen's and its columns' outlines in its pixels, as plain data."""
     corners = [] if result.corners is None else (result.corners / small.step).round(1).tolist()
-    return {
-        "jpeg": encoded_jpeg(small.pixels, quality),
-        "width": int(small.pixels.shape[1]),
-        "height": int(small.pixels.shape[0]),
-        "corners": corners,
-        "outlines": [
-            {"column": number, "status": status, "points": (points / small.step).round(1).tolist()}
-            for number, status, points in column_polygons(result, frame, screen, camera)
-        ],
-    }
+    outlines = [
+        {"column": number, "status": status, "points": (points / small.step).round(1).tolist()}
+        for number, status, points in column_polygons(result, frame, screen, camera)
+    ]
+    return drawing(small.pixels, quality, corners, outlines)

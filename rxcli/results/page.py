@@ -90,20 +90,17 @@ def fill(data: dict[str, Any], title: str) -> str:
 
 
 def _facts(frame: Frame, result: FrameResult) -> dict[str, str]:
+    share, delay_s = height_share(result.corners, frame.height), result.line_delay_s
     facts = {
         "Picture": f"{frame.width} x {frame.height}",
         "Light": light_of(frame).word,
         "Screen": result.screen_profile or "not found",
-        "Camera": result.camera_profile or ("estimated" if result.line_delay_s else "unknown"),
+        "Camera": result.camera_profile or ("estimated" if delay_s else "unknown"),
+        "Screen fills of the height": None if share is None else f"{100 * share:.0f} %",
+        "A row takes": f"{delay_s * 1e6:.3f} µs" if delay_s else None,
+        "Columns": str(len(result.columns)) if result.columns else None,
     }
-    share = height_share(result.corners, frame.height)
-    if share is not None:
-        facts["Screen fills of the height"] = f"{100 * share:.0f} %"
-    if result.line_delay_s:
-        facts["A row takes"] = f"{result.line_delay_s * 1e6:.3f} µs"
-    if result.columns:
-        facts["Columns"] = str(len(result.columns))
-    return facts
+    return {name: value for name, value in facts.items() if value is not None}
 
 
 def _steps(result: FrameResult) -> list[tuple[str, bool]]:

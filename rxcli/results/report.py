@@ -121,12 +121,8 @@ _FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 def format_frame(result: FrameResult) -> str:
     """A heading and one row per packet; columns without packets are grouped if their rows are equal."""
-    lines = [format_heading(result)]
-    hint = mirror_note(result, "--mirrored")
-    if hint:
-        lines.append(f"  {hint}")
-    if result.message:
-        lines.append(f"  {printable(result.message.removeprefix(result.source + ': '))}")
+    reason = printable((result.message or "").removeprefix(result.source + ": "))
+    lines = [format_heading(result), *(f"  {text}" for text in (mirror_note(result, "--mirrored"), reason) if text)]
     clip = _is_clip(result)
     scored = any(packet.bit_errors is not None for packet in result.packets)
     rows = table_rows(result, clip, scored)
@@ -140,19 +136,16 @@ def format_frame(result: FrameResult) -> str:
 
 def format_heading(result: FrameResult) -> str:
     """Source, screen, camera, status and counts in one line."""
-    parts = [printable_name(result.source)]
-    if _is_clip(result):
-        parts.append(f"frame {result.frame} at {result.time_s:.3f} s")
-    parts.append(result.status)
-    if result.screen_profile:
-        parts.append(f"screen {result.screen_profile}")
-    if result.status != "unreadable":
-        parts.append(f"camera {result.camera_profile or 'unknown'}")
-    if result.columns:
-        parts.append(_counts(result))
-    if "total" in result.timing_ms:
-        parts.append(f"{result.timing_ms['total']:.0f} ms")
-    return " | ".join(parts)
+    parts = [
+        printable_name(result.source),
+        f"frame {result.frame} at {result.time_s:.3f} s" if _is_clip(result) else "",
+        result.status,
+        f"screen {result.screen_profile}" if result.screen_profile else "",
+        f"camera {result.camera_profile or 'unknown'}" if result.status != "unreadable" else "",
+        _counts(result) if result.columns else "",
+        f"{result.timing_ms['total']:.0f} ms" if "total" in result.timing_ms else "",
+    ]
+    return " | ".join(filter(None, parts))
 
 
 def _counts(result: FrameResult) -> str:
@@ -184,19 +177,17 @@ def count_packets(n_received: int, n_unsure: int) -> str:
 
 def result_in_words(result: FrameResult) -> str:
     """What was done for a frame, in one line: screen, camera, time by stage, what was left out."""
-    parts = [f"{printable_name(result.source)} frame {result.frame}: {result.status}"]
-    if result.corners is not None:
-        parts.append(f"screen at {_place(result)}")
-    if result.line_delay_s:
-        known = result.camera_profile or "estimated"
-        parts.append(f"camera {known}: {result.line_delay_s * 1e6:.4g} us a row")
-    if result.columns:
-        parts.append(_counts(result))
-    parts += [f"{stage} {value:.0f} ms" for stage, value in result.timing_ms.items()]
-    parts += [f"left out: {name} {count}" for name, count in result.skipped.items()]
-    if result.denoiser:
-        parts.append(f"auto-encoder: {plain(result.denoiser)}")
-    return "; ".join(parts)
+    delay_s, known = result.line_delay_s, result.camera_profile or "estimated"
+    parts = [
+        f"{printable_name(result.source)} frame {result.frame}: {result.status}",
+        "" if result.corners is None else f"screen at {_place(result)}",
+        f"camera {known}: {delay_s * 1e6:.4g} us a row" if delay_s else "",
+        _counts(result) if result.columns else "",
+        *(f"{stage} {value:.0f} ms" for stage, value in result.timing_ms.items()),
+        *(f"left out: {name} {count}" for name, count in result.skipped.items()),
+        f"auto-encoder: {plain(result.denoiser)}" if result.denoiser else "",
+    ]
+    return "; ".join(filter(None, parts))
 
 
 def _place(result: FrameResult) -> str:
