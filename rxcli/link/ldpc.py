@@ -160,8 +160,9 @@ def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
 
 
 #: Iterations after which a block is given up as no codeword, and the least ratio of its share of unsatisfied checks to
-#: that after the first iteration at which it is.
+#: that after the first iteration at which it is; both again for a block of which this share of bits is nearly certain.
 _PATIENCE, _MAX_RATIO = 6, 0.95
+_PATIENCE_CERTAIN, _MAX_RATIO_CERTAIN, _CERTAIN_BITS, _CERTAIN_LLR = 2, 0.4, 0.9, 3.0
 
 
 def decode(
@@ -190,6 +191,7 @@ def decode(
     places = np.arange(buffer_llr.shape[0])
     accepted = np.zeros(places.size, bool)
     still = np.ones(places.size, bool)
+    is_certain = (np.abs(buffer_llr) > _CERTAIN_LLR / LLR_STEP).mean(axis=1) > _CERTAIN_BITS
     first_share = np.ones(places.size)
     for iteration in range(1, max_iterations + 1):
         layers.update()
@@ -201,13 +203,15 @@ def decode(
         good = accept(places[which], layers.information(which))
         accepted[places[which[good]]] = True
         still[which[good]] = False
-        if gives_up and iteration == _PATIENCE:
-            still &= layers.unsatisfied() < _MAX_RATIO * first_share
+        if gives_up and iteration in (_PATIENCE_CERTAIN, _PATIENCE):
+            max_ratio = np.where(is_certain, _MAX_RATIO_CERTAIN, _MAX_RATIO)
+            still &= (layers.unsatisfied() < max_ratio * first_share) | ((iteration < _PATIENCE) & ~is_certain)
         if not still.any():
             break
         if still.mean() < _CROWDED:
             layers.keep(still)
-            places, first_share, still = places[still], first_share[still], still[still]
+            places, first_share = places[still], first_share[still]
+            is_certain, still = is_certain[still], still[still]
     return accepted
 
 

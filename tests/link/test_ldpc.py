@@ -89,3 +89,6 @@ def test_a_block_whose_checks_do_not_improve_is_given_up() -> None:
     iterations.clear()
     assert not decode(code, chance, accept, 25, gives_up=True).any()
     assert sum(iterations) < 8 * 12
+    iterations.clear()
+    assert not decode(code, quantised(rng.choice([-5.0, 5.0], (8, 3073))), accept, 25, gives_up=True).any()
+    assert iterations == [8]
