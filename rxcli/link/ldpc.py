@@ -160,7 +160,7 @@ def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
 
 
 #: Iterations after which a block is given up as no codeword, and the least ratio of its share of unsatisfied checks to
-#: that after the first iteration at which it is; both again for a block of which this share of bits is nearly certain.
+#: that after the first iteration at which it is; both again for a block with this share of nearly certain bits.
 _PATIENCE, _MAX_RATIO = 6, 0.95
 _PATIENCE_CERTAIN, _MAX_RATIO_CERTAIN, _CERTAIN_BITS, _CERTAIN_LLR = 2, 0.4, 0.9, 3.0
 
