@@ -8,7 +8,6 @@ Receiving::
             ...
     receiver.finish()                    # decode the rest; again a list of events
     receiver.messages                    # every `Message` so far: kind, text, data
-    receiver.objects                     # every `ReceivedObject` so far: name, size, sha256, data
     receiver.progress                    # every incomplete file, `ObjectProgress`: blocks, share received
 
 `Collector` does this for `FrameResult`s: `collector.add(result)` returns the result with `messages` and `objects`

@@ -62,7 +62,8 @@ class Collector:
     def finish(self, last: FrameResult) -> FrameResult:
         """Add the remaining messages and files, complete or not, to the last result of the source."""
         events = [event for receiver in self._decided for event in receiver.finish()]
-        return replace(with_events(last, events), progress=tuple(self.progress), link_notes=tuple(self.notes))
+        notes = dict.fromkeys(sentence for receiver in self._decided for sentence in receiver.notes)
+        return replace(with_events(last, events), progress=tuple(self.progress), link_notes=tuple(notes))
 
     @property
     def _decided(self) -> list[LinkReceiver]:
@@ -73,24 +74,12 @@ class Collector:
         """Progress of incomplete files."""
         return [progress for receiver in self._decided for progress in receiver.progress]
 
-    @property
-    def notes(self) -> list[str]:
-        """Sentences about refused messages and files."""
-        return list(dict.fromkeys(sentence for receiver in self._decided for sentence in receiver.notes))
 
+class PhotoCollector(Collector):
+    """Link layer of several photos of one transmission, which complete each other."""
 
-class PhotoCollector:
-    """Link layer of several photos of one transmission, which complete each other.
-
-    Args:
-        screens: profiles that results may name.
-        file_memory_mb: memory limit of all incomplete files, 2^20 bytes.
-    """
-
-    def __init__(self, screens: Sequence[ScreenProfile], file_memory_mb: int = FILE_MEMORY_MB) -> None:
-        self._collector = Collector(screens, file_memory_mb)
-        #: Number of photos that were incomplete on their own.
-        self.n_photos = 0
+    #: Number of photos that were incomplete on their own.
+    n_photos = 0
 
     def add(self, result: FrameResult) -> FrameResult:
         """Add the messages and files that a photo completes; a result without soft bits is unchanged."""
@@ -98,12 +87,7 @@ class PhotoCollector:
             return result
         self.n_photos += 1
         soft = replace(result.soft_bits, epoch=self.n_photos, source=result.source)
-        return self._collector.add(replace(result, soft_bits=soft))
-
-    @property
-    def progress(self) -> list[ObjectProgress]:
-        """Progress of incomplete files."""
-        return self._collector.progress
+        return super().add(replace(result, soft_bits=soft))
 
 
 def with_events(result: FrameResult, events: Sequence[Event]) -> FrameResult:

@@ -21,14 +21,7 @@ from rxcli.link.formats import (
 )
 from rxcli.link.layout import ANNOUNCEMENT_PERIOD, CRC_BYTES, LABEL_BITS, FileLayout, announcement_layout
 from rxcli.link.sequences import whiten
-from rxcli.link.softbits import (
-    INFORMATION_OF_STEPS,
-    Float32,
-    information,
-    log_likelihood,
-    same_bits_llr,
-    surprise,
-)
+from rxcli.link.softbits import INFORMATION_OF_STEPS, Float32, information, log_likelihood, same_bits_llr, surprise
 from rxcli.types import FILE_MEMORY_MB, FrameSoftBits, ObjectProgress
 
 _LN2 = float(np.log(2.0))

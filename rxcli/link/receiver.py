@@ -30,9 +30,8 @@ class LinkReceiver:
         self._beacons = BeaconSearch(columns, payload_symbols)
         self._files = FileSearch(columns, payload_symbols, self._under_way)
         self._last: FrameSoftBits | None = None
-        #: All messages and files, in order.
+        #: All messages, in order.
         self.messages: list[Message] = []
-        self.objects: list[ReceivedObject] = []
 
     def add(self, soft: FrameSoftBits) -> list[Event]:
         """Add the soft bits of a frame and return the messages and files that they complete.
@@ -65,8 +64,9 @@ class LinkReceiver:
         self.messages += new
         return list(new)
 
-    def _object(self, soft: FrameSoftBits, file: FileState, found: Container) -> ReceivedObject:
-        made = ReceivedObject(
+    @staticmethod
+    def _object(soft: FrameSoftBits, file: FileState, found: Container) -> ReceivedObject:
+        return ReceivedObject(
             name=found.name,
             data=found.data,
             size=len(found.data),
@@ -77,8 +77,6 @@ class LinkReceiver:
             frame=soft.frame,
             time_s=soft.time_s,
         )
-        self.objects.append(made)
-        return made
 
     @property
     def progress(self) -> list[ObjectProgress]:
