@@ -1,32 +1,30 @@
-"""A small, easy scene of the simulator and its profiles: short packets, two of them in a frame, no distortion."""
+"""A small, easy scene of the simulator: short packets, two of them in a frame, no distortion."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from rxcli.lab.simulate.scenes import Scene, preset
-from rxcli.profiles import CameraProfile, ReadoutMode, ScreenProfile, dump_profile, load_profile
 
-#: Readout modes of the one camera: name -> width, height, rows per slot. A mosaic gives up resolution to its colours.
-MODES = {"still": (640, 360, 3.0), "raw": (960, 540, 4.0), "clip": (704, 396, 3.0)}
+#: Width, height, rows per slot.
+MODES = {"still": (640, 360, 3.0), "clip": (704, 396, 3.0)}
 EXPOSURE_S = 1 / 12000
-_SCREEN: dict[str, Any] = {"name": "short-packets", "payload_symbols": 3}
 _SLOT_RATE_HZ = 8650.0
 
 
 def scene(mode: str, picture: str) -> Scene:
-    """The scene in a mode ("clip" gives several frames, "raw" a mosaic) with a picture on the screen."""
+    """The scene in a mode ("clip" gives several frames) with a picture on the screen."""
     width, height, rows_per_slot = MODES[mode]
     base = preset("video-1080p" if mode == "clip" else "phone-plain", "paper-8k65")
     delay_s = 1 / (rows_per_slot * _SLOT_RATE_HZ)
     return replace(
         base,
         # A coarse panel: drawing its picture would otherwise take longer than all the rest.
-        screen=msgspec.structs.replace(base.screen, **_SCREEN, width_px=342, height_px=192),
+        screen=msgspec.structs.replace(
+            base.screen, name="short-packets", payload_symbols=3, width_px=342, height_px=192
+        ),
         picture=picture,
         sensor=replace(base.sensor, width=width, height=height, line_delay_s=delay_s, full_scale_e=4000.0),
         lens=replace(base.lens, distortion=(0.0,) * 5),
@@ -42,18 +40,4 @@ def scene(mode: str, picture: str) -> Scene:
         camera_name="folder",
         n_frames=4 if mode == "clip" else 1,
         frame_rate_hz=30.0,
-        output="raw" if mode == "raw" else "developed",
     )
-
-
-def write_profiles(folder: Path) -> list[str]:
-    """Write the profiles of screen and camera; the options that name them."""
-    modes = tuple(
-        ReadoutMode(name=name, width=w, height=h, line_delay_s=1 / (rows * _SLOT_RATE_HZ), exposure_s=EXPOSURE_S)
-        for name, (w, h, rows) in MODES.items()
-    )
-    screen = msgspec.structs.replace(load_profile("paper-8k65", ScreenProfile), **_SCREEN)
-    (folder / "screen.toml").write_text(dump_profile(screen), encoding="utf-8")
-    camera = CameraProfile(format=1, kind="camera", name="folder", modes=modes, tone="srgb")
-    (folder / "camera.toml").write_text(dump_profile(camera), encoding="utf-8")
-    return ["--screen", str(folder / "screen.toml"), "--camera", str(folder / "camera.toml")]

@@ -18,7 +18,7 @@ from rxcli.errors import InputError
 from rxcli.ingest.luma import BT601, BT709, Luma, luma_of
 from rxcli.ingest.metadata import exif_metadata
 from rxcli.ingest.orientation import as_stored, orientation_of
-from rxcli.ingest.sniff import check_size, reason_of
+from rxcli.ingest.sniff import check_size, damage_explained
 from rxcli.types import Metadata
 
 #: `matrix_coefficients` of ITU-T H.273 that means BT.709.
@@ -35,16 +35,12 @@ def read_heif(data: bytes, path: Path) -> tuple[Luma, Metadata]:
         import pillow_heif
     except ImportError:
         raise InputError(f"{path}: HEIC needs an extra", "run `pip install '.[web]'`, or save as JPEG") from None
-    try:
+    with damage_explained(f"{path}: the HEIC picture is damaged", "copy the file again"):
         file = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
         width, height = file.size
         check_size(path, width, height, 12, len(data))  # planes, interleaved RGB of up to 16 bits, luma
         pixels = np.asarray(file)
         turned = _orientation(file[file.primary_index])
-    except InputError:
-        raise
-    except Exception as error:  # libheif's errors come as some five unrelated types
-        raise InputError(f"{path}: the HEIC picture is damaged ({reason_of(error)})", "copy the file again") from None
     matrix = (file.info.get("nclx_profile") or {}).get("matrix_coefficients")
     luma = luma_of(pixels, BT709 if matrix == _MATRIX_BT709 else BT601)
     metadata = exif_metadata(file.info.get("exif") or b"")

@@ -22,7 +22,7 @@ from rxcli.ingest.extent import claims_too_much
 from rxcli.ingest.luma import Luma, luma_of
 from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
 from rxcli.ingest.quiet import quiet_libraries
-from rxcli.ingest.sniff import Kind, check_size, read_bytes, reason_of
+from rxcli.ingest.sniff import Kind, check_size, damage_explained, read_bytes
 from rxcli.types import Frame, Metadata
 
 #: Pillow's are left out: sizes are checked here, and broken directories do no harm.
@@ -104,17 +104,11 @@ def _read_tiff(path: Path) -> Frame:
         if claims_too_much(file):
             raise InputError(f"{path}: the TIFF's directories claim more than the file holds", "copy it again")
         metadata = tiff_metadata(file)
-    try:
-        with tifffile.TiffFile(path) as tiff:
-            page = tiff.pages[0]
-            _check_page(page, path)
-            pixels, min_is_white = _tiff_pixels(page, path), page.photometric == tifffile.PHOTOMETRIC.MINISWHITE
-    except InputError:
-        raise
-    except Exception as error:  # tifffile raises whatever a broken directory leads it to
-        raise InputError(
-            f"{path}: the TIFF cannot be read ({reason_of(error)})", "save it uncompressed, or copy it again"
-        ) from None
+    step = "save it uncompressed, or copy it again"
+    with damage_explained(f"{path}: the TIFF cannot be read", step), tifffile.TiffFile(path) as tiff:
+        page = tiff.pages[0]
+        _check_page(page, path)
+        pixels, min_is_white = _tiff_pixels(page, path), page.photometric == tifffile.PHOTOMETRIC.MINISWHITE
     if pixels.ndim not in (2, 3):
         raise InputError(f"{path}: the TIFF is damaged", "copy it again")
     luma, linear = _tiff_luma(pixels, path)
@@ -185,14 +179,13 @@ def _read_with_pillow(data: bytes, path: Path) -> NDArray[np.uint8]:
     """BMP, WebP: rare for a camera, but messengers send them."""
     from PIL import Image
 
-    try:
-        with _no_warnings(), Image.open(io.BytesIO(data), formats=("BMP", "WEBP")) as image:
-            check_size(path, *image.size, 8, len(data))  # as it is stored, as RGB twice, luma
-            return np.asarray(luma_of(_pillow_pixels(image)), np.uint8)
-    except InputError:
-        raise
-    except Exception as error:  # Pillow raises some ten unrelated types on damaged files
-        raise InputError(f"{path}: the picture is damaged ({reason_of(error)})", "copy the file again") from None
+    with (
+        damage_explained(f"{path}: the picture is damaged", "copy the file again"),
+        _no_warnings(),
+        Image.open(io.BytesIO(data), formats=("BMP", "WEBP")) as image,
+    ):
+        check_size(path, *image.size, 8, len(data))  # as it is stored, as RGB twice, luma
+        return np.asarray(luma_of(_pillow_pixels(image)), np.uint8)
 
 
 def _pillow_pixels(image: Any) -> NDArray[Any]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -137,6 +139,22 @@ def check_size(source: object, width: int, height: int, bytes_a_pixel: float = 1
     if needed > MAX_BYTES:
         reason = f"{source}: {width} x {height} pixels would take {needed / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:g}"
         raise InputError(reason, "save it with fewer bits a sample or in grey, if it is no bomb")
+
+
+@contextmanager
+def damage_explained(reason: str, step: str) -> Iterator[None]:
+    """Raise whatever a library raises on a damaged file, some ten unrelated types, as an input error.
+
+    Args:
+        reason: file and fault; the library's own message is added.
+        step: next step.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{reason} ({reason_of(error)})", step) from None
 
 
 def reason_of(error: BaseException) -> str:

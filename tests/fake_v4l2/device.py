@@ -11,6 +11,7 @@ import errno
 import mmap
 import struct
 import time
+from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -272,15 +273,5 @@ class FakeCamera:
         if self.format == "NV12":
             return luma + b"\x80" * (size // 2)
         if self.format == "YUYV":
-            pairs = bytearray(b"\x80" * (2 * size))
-            pairs[0::2] = luma
-            return bytes(pairs)
-        return _widened(luma, _SHIFTS[self.format])
-
-
-def _widened(luma: bytes, shift: int) -> bytes:
-    """16-bit little-endian samples `value << shift`."""
-    wide = bytearray(2 * len(luma))
-    wide[0::2] = luma.translate(bytes((value << shift) & 0xFF for value in range(256)))
-    wide[1::2] = luma.translate(bytes((value << shift) >> 8 for value in range(256)))
-    return bytes(wide)
+            return bytes(sample for value in luma for sample in (value, 0x80))
+        return array("H", (value << _SHIFTS[self.format] for value in luma)).tobytes()

@@ -8,93 +8,64 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
-from small_scene import scene, write_profiles
+from ingest_files import BAYER, write_dng
+from small_frames import write_frame, write_profiles
 
 from rxcli.errors import ExitCode
 from rxcli.ingest import open_source
 from rxcli.lab.benchmark.media import repeat_clip
-from rxcli.lab.simulate.capture import prepare
-from rxcli.lab.simulate.files import write_dng, write_png, write_tiff, write_video
-from rxcli.lab.simulate.truth import write_truth
 
 GOOD = (
     *("a.jpg", "monday/b.png", "monday/roof/c.dng", "tuesday/d.tif", "e.jpeg", "monday/f.mp4"),
     *("monday/roof/g.png", "tuesday/h.dng", "i.tif", "monday/j.jpeg", "monday/roof/k.jpg", "tuesday/l.avi"),
 )
-N_KILLS = 3
-ENVIRONMENT = {
-    **os.environ,
-    "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-}
+N_KILLS, N_FRAMES = 3, 4
+THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path), **THREADS}
 
 
 def write_good(path: Path, seed: int) -> None:
-    mode = {".mp4": "clip", ".avi": "clip", ".dng": "raw"}.get(path.suffix, "still")
-    made = scene(mode, ("sky", "chelsea", "gradient")[seed % 3])
-    if mode != "clip":  # one burst shows
-        made = replace(made, start_slot=np.random.default_rng([seed, 13]).uniform(8, 25))
-    take = prepare(made, seed)
-    write_truth(take.truth(path.name), path)
-    if mode == "clip":
-        frames = (take.frame(number, threads=1).rgb for number in range(made.n_frames))
-        write_video(frames, path, "mjpeg" if path.suffix == ".avi" else "h264", made.frame_rate_hz)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix not in (".dng", ".mp4", ".avi"):
+        write_frame(path, seed)
         return
-    capture = take.frame(threads=1)
+    picture = path.with_suffix(".png")
+    write_frame(picture, seed)
+    pixels = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
+    assert pixels is not None
+    picture.unlink()
     if path.suffix == ".dng":
-        write_dng(capture.raw, made, path)
-    elif path.suffix == ".tif":
-        write_tiff(capture.rgb, made, path)
-    elif path.suffix == ".png":
-        write_png(capture.rgb, path)
-    else:
-        path.write_bytes(capture.jpeg)
+        white = (50728, "2I", 3, (1, 1) * 3, True)  # the light is as white as daylight
+        write_dng(path, pixels.astype(np.uint16) * 12 + 100, BAYER, white)
+        return
+    path.with_suffix(".truth.json").unlink()
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mjpeg" if path.suffix == ".avi" else "libx264", rate=30)
+        stream.height, stream.width = pixels.shape
+        stream.pix_fmt = "yuvj420p" if path.suffix == ".avi" else "yuv420p"
+        for _ in range(N_FRAMES):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, "gray").reformat(format=stream.pix_fmt)))
+        container.mux(stream.encode())
 
 
-def write_bad(folder: Path, good: Sequence[Path]) -> list[Path]:
-    """Files that cannot be read, and, the last four, files without a packet."""
-    rng, data = np.random.default_rng(1), {path.suffix: path.read_bytes() for path in good}
-
-    def cut(suffix: str, share: float) -> bytes:
-        return data[suffix][: int(share * len(data[suffix]))]
-
-    def png(picture: np.ndarray) -> bytes:
-        return bytes(cv2.imencode(".png", picture)[1])
-
-    scratched = bytearray(data[".png"])
-    scratched[len(scratched) // 2 : len(scratched) * 5 // 8] = rng.bytes(len(scratched) // 8)
-    lit = cv2.imdecode(np.frombuffer(data[".jpg"], np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert lit is not None
-    made = {
+def write_bad(folder: Path) -> list[Path]:
+    """Files that cannot be read, and, the last two, files without a packet."""
+    rng, data = np.random.default_rng(1), {name: (folder / name).read_bytes() for name in GOOD}
+    cut = {f"cut{Path(name).suffix}": data[name][: len(data[name]) // 2] for name in GOOD}
+    made = cut | {
         "empty.jpg": b"",
-        "empty.mov": b"",
         "letter.jpg": b"Dear reader,\nthis is a letter and no picture.\n",
-        "page.mp4": b"<!doctype html><title>404 Not Found</title>\n",
         "archive.tif": b"PK\x03\x04" + bytes(600),
-        "zeros.jpg": bytes(10_000),
-        "random.dng": rng.bytes(4096),
         "random.heic": rng.bytes(4096),
-        "cut.jpg": cut(".jpg", 0.6),
-        "head.jpg": cut(".jpg", 0.01),
-        "cut.png": cut(".png", 0.5),
-        "cut.dng": cut(".dng", 0.4),
-        "cut.tif": cut(".tif", 0.5),
-        "noindex.mp4": cut(".mp4", 0.5),
-        "cut.avi": cut(".avi", 0.6),
-        "scratched.png": bytes(scratched),
-        "pixel.png": png(np.full((1, 1), 99, np.uint8)),
-        "black.png": png(np.zeros((360, 640), np.uint8)),
-        "noise.png": png(rng.integers(0, 255, (360, 640), dtype=np.uint8)),
-        "unlit.png": png(cv2.blur(lit, (1, 121))),
+        "black.png": bytes(cv2.imencode(".png", np.zeros((620, 340), np.uint8))[1]),
+        "noise.png": bytes(cv2.imencode(".png", rng.integers(0, 255, (620, 340), dtype=np.uint8))[1]),
     }
     for name, content in made.items():
         (folder / name).write_bytes(content)
@@ -104,39 +75,27 @@ def write_bad(folder: Path, good: Sequence[Path]) -> list[Path]:
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("folder")
-    paths = [folder / name for name in GOOD]
-    for number, path in enumerate(paths):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_good(path, number)
-    return paths
+    for number, name in enumerate(GOOD):
+        write_good(folder / name, number)
+    return [folder / name for name in GOOD]
 
 
 @pytest.mark.slow
 def test_killed_and_resumed_runs_give_the_same_results(good: list[Path], tmp_path: Path) -> None:
     """`kill -9` at random moments: but for the times, the same lines as without kills."""
     folder, rng = good[0].parent, np.random.default_rng(12)
-    bad = write_bad(folder, good)
-    profiles = write_profiles(tmp_path)
+    bad = write_bad(folder)
+    options = [*write_profiles(tmp_path), "--quiet", "--workers", "2", "--truth", "auto"]
 
     def start(out: Path, *more: str) -> subprocess.Popen[bytes]:
-        command = [
-            sys.executable,
-            "-m",
-            "rxcli.cli.main",
-            "decode",
-            str(folder),
-            "--quiet",
-            "--workers",
-            "2",
-            *profiles,
-        ]
-        command += ["--truth", "auto", "--json", str(out), "--summary", str(out.with_suffix(".csv")), *more]
+        command = [sys.executable, "-m", "rxcli.cli.main", "decode", str(folder), *options]
+        command += ["--json", str(out), "--summary", str(out.with_suffix(".csv")), *more]
         return subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.DEVNULL)
 
     whole, killed = tmp_path / "whole.jsonl", tmp_path / "killed.jsonl"
     began = time.monotonic()
     assert start(whole).wait() == ExitCode.UNREADABLE
-    longest_s, kills = (time.monotonic() - began) / 4, 0
+    longest_s, kills = (time.monotonic() - began) / 2, 0
     while kills < N_KILLS:
         process = start(killed, "--resume")
         try:
@@ -157,7 +116,6 @@ def test_killed_and_resumed_runs_give_the_same_results(good: list[Path], tmp_pat
         assert {rows[str(path)]["exit_code"] for path in good} == {"0"}
         assert all(rows[str(path)]["exit_code"] != "0" and rows[str(path)]["reason"] for path in bad)
         assert "the file is empty" in rows[str(folder / "empty.jpg")]["reason"]
-        assert "the picture is black" in rows[str(folder / "black.png")]["reason"]
 
 
 def test_a_clip_written_several_times_over_is_one_clip(good: list[Path], tmp_path: Path) -> None:
@@ -166,7 +124,6 @@ def test_a_clip_written_several_times_over_is_one_clip(good: list[Path], tmp_pat
     repeat_clip(short, out, 3)
     once, thrice = list(open_source(short)), list(open_source(out))
     assert len(thrice) == 3 * len(once)
-    steps = {round(b.time_s - a.time_s, 4) for a, b in pairwise(thrice)}
-    assert len(steps) == 1
+    assert len({round(b.time_s - a.time_s, 3) for a, b in pairwise(thrice)}) == 1
     for number, frame in enumerate(thrice):
         assert (frame.pixels == once[number % len(once)].pixels).all()
