@@ -22,19 +22,17 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
 from rxcli.errors import UsageError
+from rxcli.ingest.v4l2 import CameraSettings
+from rxcli.options import ReceiverOptions
 from rxcli.outputs import claim_folder
 from rxcli.resources import data_dir
 from rxcli.web.decoding import DecodingProcess, Limits, refusal
-
-if TYPE_CHECKING:
-    from rxcli.ingest.v4l2 import CameraSettings
-    from rxcli.options import ReceiverOptions
 
 log = logging.getLogger(__name__)
 
@@ -59,6 +57,8 @@ _LINES = "application/x-ndjson"
 _SESSION, _SESSION_CHARACTERS = "X-Session", 64
 _LOCAL = ("127.0.0.1", "localhost", "::1", "[::1]")
 _CHUNK = 1 << 16
+#: Receives the answers of a picture or the events of a camera, one after the other.
+_Publish = Callable[[dict[str, Any]], None]
 _SWEEP_S = 2.0
 
 
@@ -96,7 +96,7 @@ class Site:
     #: Secret part of the address if other machines can reach the server, or None.
     token: str | None = None
     device: Path | None = None
-    camera: CameraSettings | None = None
+    camera: CameraSettings = field(default_factory=lambda: CameraSettings(wait=True))
     #: Folder in which uploads are stored permanently, or None.
     keep: Path | None = None
     bounds: Bounds = field(default_factory=Bounds)
@@ -149,7 +149,7 @@ class Server:
         self._thread = ThreadPoolExecutor(1, "decode")
         self._arriving: list[_Upload] = []
         #: Callbacks of waiting pictures, in the order of decoding; each receives its place in the queue.
-        self._queue: list[Callable[[dict[str, Any]], None]] = []
+        self._queue: list[_Publish] = []
         #: Oldest first.
         self._watchers: dict[asyncio.Queue[str], web.Request] = {}
         self._history: deque[str] = deque(maxlen=20)
@@ -199,16 +199,10 @@ class Server:
         loop.run_in_executor(self._thread, self._decoder.start)
         self._sweeper = asyncio.create_task(self._sweep())
         if site.device is not None:
-            from rxcli.ingest.v4l2 import CameraSettings
             from rxcli.web.live import LiveCamera
 
-            camera = site.camera or CameraSettings(wait=True)
-
-            def publish(event: dict[str, Any]) -> None:
-                with contextlib.suppress(RuntimeError):  # the loop has ended
-                    loop.call_soon_threadsafe(self._broadcast, event)
-
-            self._live = LiveCamera(site.device, camera, site.options, publish)
+            publish = _from_thread(loop, self._broadcast)
+            self._live = LiveCamera(site.device, site.camera, site.options, publish)
             self._live.start()
 
     async def _stop(self) -> None:
@@ -330,9 +324,7 @@ class Server:
             slowest.limit.reschedule(now_s)
             self._arriving.remove(slowest)
 
-    async def _decoded(
-        self, request: web.Request, path: Path, publish: Callable[[dict[str, Any]], None]
-    ) -> dict[str, Any]:
+    async def _decoded(self, request: web.Request, path: Path, publish: _Publish) -> dict[str, Any]:
         """Answer of an upload in its turn; `publish` receives its place in the queue and partial answers."""
         loop = asyncio.get_running_loop()
         self._queue.append(publish)
@@ -345,9 +337,7 @@ class Server:
         self._keep(path, answer)
         return answer
 
-    def _decode_for(
-        self, request: web.Request, path: Path, publish: Callable[[dict[str, Any]], None]
-    ) -> dict[str, Any]:
+    def _decode_for(self, request: web.Request, path: Path, publish: _Publish) -> dict[str, Any]:
         if request.transport is None or request.transport.is_closing():
             return refusal("nobody waits for the answer", "send it again")
         session = request.headers.get(_SESSION, "")[:_SESSION_CHARACTERS]
@@ -365,12 +355,7 @@ class Server:
         await response.prepare(request)
         loop = asyncio.get_running_loop()
         lines: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
-
-        def publish(answer: dict[str, Any]) -> None:
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(lines.put_nowait, answer)
-
-        decoding = asyncio.create_task(self._decoded(request, path, publish))
+        decoding = asyncio.create_task(self._decoded(request, path, _from_thread(loop, lines.put_nowait)))
         decoding.add_done_callback(lambda _: lines.put_nowait({}))
         with self._taken_in_time(request):  # the upload stays until it is decoded, even if nobody listens any more
             while answer := await lines.get():
@@ -461,6 +446,16 @@ class Server:
                 queue.get_nowait()
             with contextlib.suppress(asyncio.QueueFull):
                 queue.put_nowait(text)
+
+
+def _from_thread(loop: asyncio.AbstractEventLoop, publish: _Publish) -> _Publish:
+    """`publish` for callers in other threads, who may outlive the loop."""
+
+    def call(answer: dict[str, Any]) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(publish, answer)
+
+    return call
 
 
 async def _next(queue: asyncio.Queue[str]) -> str:

@@ -10,7 +10,7 @@ import pytest
 from small_scene import scene
 
 from rxcli.errors import OutputError
-from rxcli.lab.benchmark.trial import Trial, frame_of, simulate_trial
+from rxcli.lab.benchmark.trial import Trial, frame_of
 from rxcli.lab.simulate.capture import prepare
 from rxcli.protocol import hex_to_bits, indices_to_bits
 from rxcli.receiver.pipeline import receive
@@ -54,15 +54,6 @@ def test_every_frame_of_a_clip_has_its_taps_and_the_bursts_that_it_reports(
                 np.testing.assert_array_equal(indices_to_bits(index, int(column.w or 0)), bits)
                 n_packets += 1
     assert n_packets >= 20
-
-
-def test_a_photograph_has_the_taps_of_all_stages(tmp_path: Path) -> None:
-    trial = simulate_trial(replace(scene("still", "sky"), start_slot=12.0), 1)
-    trial.receive(trial.options(dump_dir=tmp_path))
-    with np.load(tmp_path / "simulated-000000.npz") as taps:
-        stages = {name.split(".")[0] for name in taps.files}
-        assert stages == {"geometry", "sampling", "clock", "samples", "channel", "detect"}
-        assert taps["sampling.light"].shape[:2] == taps["sampling.count"].shape
 
 
 def test_what_is_unknown_is_left_out(tmp_path: Path) -> None:
