@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -149,7 +150,8 @@ def write_json(value: Any, path: str) -> None:
 
     from rxcli.outputs import write_whole
 
-    text = msgspec.json.format(msgspec.json.encode(value, enc_hook=float), indent=2).decode()  # null for nan
+    finite = msgspec.json.decode(msgspec.json.encode(value, enc_hook=float))  # null for nan and infinities
+    text = json.dumps(finite, indent=2)
     if path == "-":
         click.echo(text)
     else:
