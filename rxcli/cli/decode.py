@@ -7,11 +7,11 @@ from typing import Any
 import click
 
 from rxcli.cli.common import force_argument, options, receiver_arguments
-from rxcli.cli.kinds import FILE, FOLDER, SHARE, complete_files
+from rxcli.cli.kinds import FILE, FOLDER, SHARE
 
 
 @click.command()
-@click.argument("paths", nargs=-1, required=True, metavar="PATH...", shell_complete=complete_files)
+@click.argument("paths", nargs=-1, required=True, metavar="PATH...", type=click.Path())
 @receiver_arguments
 @options(
     ("--json=FILE|- json_path", str, None, "Write one JSON object a frame, instead of the table."),

@@ -16,7 +16,7 @@ from rxcli.cli.common import (
     receiver_arguments,
     receiver_options,
 )
-from rxcli.cli.kinds import FOLDER, complete_files
+from rxcli.cli.kinds import FOLDER
 from rxcli.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _MAX_FRAMES = 240
 
 
 @click.command()
-@click.argument("path", shell_complete=complete_files)
+@click.argument("path", type=click.Path())
 @receiver_arguments
 @options(
     ("--frame", click.IntRange(0), None, "Frame of a clip. [default: the one with the most packets]"),

@@ -68,8 +68,3 @@ class ProfileName(click.ParamType[str]):
 
 
 SCREEN, CAMERA = ProfileName("screens"), ProfileName("cameras")
-
-
-def complete_files(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Names of files and folders, for the shell."""
-    return [CompletionItem(incomplete, type="file")]

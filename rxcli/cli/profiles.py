@@ -10,7 +10,7 @@ import msgspec
 
 from rxcli.cli.common import claim_outputs, force_argument, json_output, options, write_json
 from rxcli.cli.groups import SuggestingGroup
-from rxcli.cli.kinds import CAMERA, complete_files
+from rxcli.cli.kinds import CAMERA
 from rxcli.cli.printing import print_text
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 from rxcli.ingest import open_source
@@ -95,7 +95,7 @@ def validate(names: tuple[str, ...]) -> int:
 
 
 @profiles.command()
-@click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path), shell_complete=complete_files)
+@click.argument("paths", nargs=-1, required=True, type=click.Path(path_type=Path))
 @options(("--camera=NAME|FILE cameras", [CAMERA], None, "A camera to choose from. [default: all that are known]"))
 @_JSON
 @force_argument

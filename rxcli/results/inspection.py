@@ -15,7 +15,7 @@ from rxcli.receiver import camera as blind
 from rxcli.receiver import plane
 from rxcli.receiver.decode import assemble
 from rxcli.results.overlay import outlines_of
-from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, PacketResult, RowProfiles
+from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, RowProfiles
 
 #: Slots over which a column's picture is taken for even, and over which one clock residual is measured.
 _PICTURE_SLOTS, _RESIDUAL_SLOTS = 40, 30
@@ -219,19 +219,12 @@ def decided_slots(
         return
     ends = [packet.first_row for packet in column.packets[1:]] + [float(rows.max())]
     for packet, end in zip(column.packets, ends, strict=True):
-        slots = _packet_slots_of(packet, column.w, screen)
-        if slots is None:
-            continue
+        if packet.payload_bits != bits_per_symbol(column.w) * screen.payload_symbols:
+            continue  # no packet of this weight and screen
+        slots = encode_packet(hex_to_bits(packet.payload, packet.payload_bits), column.w)
         # After the counted copies another burst may begin that is hardly visible.
         hidden = max(float(rows.min()) - packet.first_row, 0.0) / rows_per_slot
         longest = min(hidden + packet.copies * slots.size, screen.repeats * slots.size)
         n_slots = math.ceil(min((end - packet.first_row) / rows_per_slot, longest))
         if n_slots > 0:
             yield packet.first_row, np.resize(slots, n_slots)
-
-
-def _packet_slots_of(packet: PacketResult, w: int, screen: ScreenProfile) -> NDArray[np.uint8] | None:
-    """The slots that would send `packet`, None where it is no packet of that weight and screen."""
-    if packet.payload_bits != bits_per_symbol(w) * screen.payload_symbols:
-        return None
-    return encode_packet(hex_to_bits(packet.payload, packet.payload_bits), w)

@@ -43,12 +43,12 @@ def grey_levels(frame: Frame, step: int = 1) -> NDArray[np.uint8]:
         frame: a picture as stored.
         step: decimation of rows and columns, applied to the whole picture.
     """
-    mosaic = frame.mosaic
-    black, white = (frame.black, frame.white) if mosaic is None else (0.0, 1.0)
-    pixels = frame.pixels[::step, ::step].astype(np.float32) if mosaic is None else _mosaic_grey(frame.pixels, mosaic)
-    values = pixels if mosaic is None else pixels[::step, ::step]
-    share = np.clip((values - black) / (white - black), 0, 1)
-    if frame.linear or mosaic is not None:
+    if frame.mosaic is None:
+        share = (frame.pixels[::step, ::step].astype(np.float32) - frame.black) / (frame.white - frame.black)
+    else:
+        share = _mosaic_grey(frame.pixels, frame.mosaic)[::step, ::step]
+    share = np.clip(share, 0, 1)
+    if frame.linear or frame.mosaic is not None:
         share **= 1 / 2.2
     levels: NDArray[np.uint8] = np.round(255 * share).astype(np.uint8)
     return levels
