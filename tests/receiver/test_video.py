@@ -19,11 +19,12 @@ from rxcli.lab.simulate.scenes import preset
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.receiver.channel.known_picture import ColumnLight, KnownPicture, Observation
+from rxcli.receiver.clip.bursts import Burst, with_common_memory
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.decode.detect import detect
 from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.pipeline import receive, receive_frame
-from rxcli.receiver.sync.tracking import BurstPhase, Bursts, FrameBursts, LinkTime, with_common_memory
+from rxcli.receiver.sync.tracking import BurstPhase, LinkTime
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Clock, Float32Array, Frame, FrameResult
 
@@ -145,7 +146,7 @@ def test_the_counter_counts_bursts_as_they_were_sent(clip: Clip, results: list[F
 def test_tracking_is_counted_and_can_be_switched_off(clip: Clip, results: list[FrameResult]) -> None:
     assert sum(result.skipped.get("tracking", 0) for result in results) >= N_FRAMES - 2
     few = clip.frames[:4]
-    plain = list(receive(few, replace(clip.options, skip=frozenset(SKIPS) - {"tracking", "certain_columns"})))
+    plain = list(receive(few, replace(clip.options, skip=frozenset(SKIPS) - {"tracking"})))
     assert all("tracking" not in result.skipped for result in plain)
     assert scored(plain, clip.truth)[1].error_free >= 20
 
@@ -288,7 +289,7 @@ def test_a_look_that_would_not_mend_much_is_left_out(clip: Clip, monkeypatch: py
         measured.append(len(views))
 
     monkeypatch.setattr("rxcli.receiver.clip.scene.TrackedScreen.measure_again", measure_again)
-    monkeypatch.setattr("rxcli.receiver.clip.bursts.BurstReader.doubts", lambda *_: (3, 10))
+    monkeypatch.setattr("rxcli.receiver.clip.bursts.Bursts.doubts", lambda *_: (3, 10))
     assert len(list(receive(clip.frames, clip.options))) == len(clip.frames)
     assert measured == [len(clip.frames)]
 
@@ -508,21 +509,16 @@ def test_columns_not_yet_tried_are_unknown() -> None:
     """Dark columns may be left out at first; the others are kept as they were found."""
     rng = np.random.default_rng(2)
     columns, packet, isi_memory = 4, 70, 1
-    bursts = Bursts()
-    clock = replace(clock_at(0.0), burst=np.zeros(2, np.int64))
-    shown = np.ones((2, columns, packet), np.int64)
     metrics = rng.normal(0, 2, (1, columns, packet + isi_memory, 4))
-    bursts.add(FrameBursts(0, 0, clock, metrics[0], shown), np.array([7]), metrics)
+    burst = Burst(7, metrics[0], np.ones((columns, packet), np.int64), (0,), tracked=False)
     tried = np.array([0, 2])
     found = detect(metrics[:, tried])
-    bursts.store(7, tried, found, np.ones(2, bool))
-    known = bursts.known(7)
-    assert known is not None
-    assert (known.index[:, tried] == found.index).all()
-    assert (known.lit[:, [1, 3]] == 0.5).all()
-    (closed,) = bursts.close(np.array([7]))
-    assert closed.metrics == pytest.approx(metrics[0])
-    assert not closed.tracked
+    burst.detected(tried, found)
+    assert burst.posteriors is not None
+    assert (burst.posteriors.index[:, tried] == found.index).all()
+    assert (burst.lit[[1, 3]] == 0.5).all()
+    assert not burst.posteriors.bit_llr[0, [1, 3]][..., :6].any()
+    assert not burst.certain[[1, 3]].any()
 
 
 def test_few_frames_are_not_sure_of_what_they_taught_themselves() -> None:

@@ -3,21 +3,86 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rxcli.protocol import WEIGHTS
+from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS
 from rxcli.receiver import channel
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View, Waiting
-from rxcli.receiver.decode import assemble, detect
+from rxcli.receiver.decode import assemble, confidence, detect
+from rxcli.receiver.light import slot_llr
 from rxcli.receiver.settings import SETTINGS as receiver_settings
-from rxcli.receiver.sync.tracking import Bursts, with_common_memory
-from rxcli.types import Float32Array, FloatArray, IntArray
+from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
 
 
-class BurstReader:
+@dataclass(slots=True, eq=False)
+class Burst:
+    """A burst, added up over the frames that show it."""
+
+    #: Number in the clip.
+    number: int
+    #: (C, packet + memory, patterns) of all frames together.
+    metrics: FloatArray
+    #: (C, packet) number of observations of each slot.
+    n_observed: IntArray
+    frames: tuple[int, ...]
+    #: Whether the picture was known from other frames in any of them.
+    tracked: bool
+    #: Of this burst alone, once detected.
+    posteriors: BurstPosteriors | None = None
+    #: Whether frames were added since the last detection.
+    is_stale: bool = True
+
+    def add(self, burst: Burst) -> None:
+        """Add what a further frame shows of it."""
+        self.metrics, added = with_common_memory([self.metrics, burst.metrics])
+        self.metrics += added
+        self.n_observed = self.n_observed + burst.n_observed
+        self.frames += burst.frames
+        self.tracked |= burst.tracked
+        self.is_stale = True
+
+    @property
+    def certain(self) -> BoolArray:
+        """(C,) columns that need no further pass."""
+        if self.posteriors is None:
+            return np.zeros(len(self.n_observed), bool)
+        return np.asarray(self.posteriors.log_prob[0].min(axis=1) >= SETTINGS.certain_log_prob)
+
+    @property
+    def lit(self) -> Float32Array:
+        """(C, packet) probability that each slot is lit."""
+        half = np.full(self.n_observed.shape, 0.5, np.float32)
+        return half if self.posteriors is None else np.asarray(self.posteriors.lit[0])
+
+    def detected(self, columns: IntArray, posteriors: BurstPosteriors) -> None:
+        """Set the posteriors of some columns."""
+        n = len(self.n_observed)
+        if columns.size < n:
+            posteriors = (self.posteriors or _unobserved(self.metrics, n)).with_columns(columns, posteriors)
+        self.posteriors = posteriors
+
+    def ended(self, first_number: int, n_strips: int) -> confidence.BurstInClip:
+        """What is reported of it; `first_number` is that of the first burst of the last frame that shows it."""
+        assert self.posteriors is not None
+        features = against = None
+        if self.tracked:
+            llr = slot_llr(self.metrics[None])[0, :, PREAMBLE_SLOTS:]
+            decided = np.sign(self.posteriors.lit[0, :, PREAMBLE_SLOTS:] - 0.5)
+            against = np.asarray(np.maximum(-llr * decided, 0).max(axis=1), np.float32)
+        else:
+            margin = detect.slot_margin(self.metrics[None], self.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
+            undenoised = np.zeros(margin.shape[1], bool)
+            features = confidence.confidence_features(self.posteriors, margin, undenoised, n_strips)[0]
+        index = self.number - first_number
+        return confidence.BurstInClip(
+            self.number, index, self.posteriors, self.n_observed, self.frames, features, against
+        )
+
+
+class Bursts:
     """The bursts that are still going on.
 
     Args:
@@ -26,83 +91,82 @@ class BurstReader:
 
     def __init__(self, skip: frozenset[str]) -> None:
         self._skip = skip
-        self.open = Bursts()
         #: Whether dark columns are tried in every frame.
         self.dark_too = False
-        #: (C, 9) the weight that a column was last certain of, alone; None before any.
-        self._weights: NDArray[np.bool_] | None = None
+        self.begin()
 
     def begin(self) -> None:
-        """Forget all bursts, but not the columns' weights."""
-        self.open = Bursts()
+        """Forget all bursts."""
+        self._open: dict[int, Burst] = {}
+        self._closed: list[Burst] = []
+
+    def settled(self, number: int, lit: BoolArray) -> bool:
+        """Whether all lit columns (C,) of a burst, open or closed, are certain."""
+        return any(
+            burst.number == number and bool(burst.certain[lit].all()) for burst in (*self._open.values(), *self._closed)
+        )
 
     def add(self, view: View, numbers: IntArray) -> None:
         """Add a frame to its bursts (B,), which are detected when their result is needed."""
-        metrics = channel.by_burst(view.bursts.metrics, view.bursts.clock)
-        self.open.add(view.bursts, numbers, metrics)
+        own = view.bursts
+        metrics = channel.by_burst(own.metrics, own.clock)
+        for index, number in enumerate(numbers.tolist()):
+            n_observed = own.shown[own.clock.burst == index].sum(axis=0)
+            burst = Burst(number, metrics[index].copy(), n_observed, (own.frame,), own.tracked)
+            if number in self._open:
+                self._open[number].add(burst)
+            elif not self._closed or number > self._closed[-1].number:
+                self._open[number] = burst
+
+    def close(self, numbers: IntArray) -> list[Burst]:
+        """Remove bursts in time order; later frames add nothing to them or to earlier ones."""
+        closed = [self._open.pop(number) for number in np.sort(numbers).tolist() if number in self._open]
+        self._closed = [*self._closed, *closed][-SETTINGS.remembered_bursts :]
+        return [burst for burst in closed if burst.posteriors is not None]
+
+    def of(self, waiting: Waiting) -> list[Burst]:
+        """The bursts of a frame that are open."""
+        assert waiting.numbers is not None
+        return [self._open[number] for number in waiting.numbers.tolist() if number in self._open]
 
     def detect_stale(self, *frames: Waiting) -> None:
         """Detect the bursts of frames that were added to since they were looked at."""
-        asked: list[tuple[Waiting, IntArray]] = []
-        stale: set[int] = set()
+        asked: list[tuple[Waiting, list[Burst]]] = []
         for waiting in frames:
-            assert waiting.numbers is not None
-            numbers = [int(n) for n in waiting.numbers if self.open.is_stale(int(n)) and int(n) not in stale]
-            stale.update(numbers)
-            asked.append((waiting, np.array(numbers, np.int64)))
+            asked.append((waiting, [burst for burst in self.of(waiting) if burst.is_stale]))
+            for burst in asked[-1][1]:
+                burst.is_stale = False
         self.detect(asked, self.dark_too)
 
-    def detect(self, asked: Sequence[tuple[Waiting, IntArray]], dark_too: bool) -> None:
-        """Detect bursts of frames as far as they are open, in columns that are neither certain nor, unless they are to
-        be tried too, dark."""
-        found: list[tuple[IntArray, NDArray[np.bool_]]] = []
-        for waiting, numbers in asked:
-            assert waiting.view is not None
-            still_open = np.array([n for n in numbers if self.open.is_open(int(n))], np.int64)
-            if still_open.size == 0:
-                continue
-            certain = self.open.certain(still_open)
-            if "certain_columns" not in self._skip:
-                certain[:] = False
-            dark = ~certain & (self._dark(waiting.view) & (not dark_too))
-            waiting.skip("certain_columns", int(certain.sum()))
-            waiting.skip("dark_columns", int(dark.sum()))
-            self.open.mark_detected(still_open)
-            if not (certain | dark).all():
-                found.append((still_open, ~certain & ~dark))
-        if found:
-            self._detect_open(found)
+    def detect(self, asked: Sequence[tuple[Waiting, list[Burst]]], dark_too: bool) -> None:
+        """Detect open bursts of frames in columns that are not dark, unless these are to be tried too.
 
-    def _dark(self, view: View) -> NDArray[np.bool_]:
+        All at once, for each symbol's turn costs the same; only the weights are settled frame by frame.
+        """
+        metrics, weights, places = [], [], []
+        for waiting, bursts in asked:
+            assert waiting.view is not None
+            tried = np.flatnonzero(~self._dark(waiting.view) | dark_too)
+            waiting.skip("dark_columns", len(bursts) * (len(waiting.view.snr) - tried.size))
+            if bursts and tried.size:
+                own = np.stack(with_common_memory([burst.metrics[tried] for burst in bursts]))
+                metrics += list(own)
+                weights += [_likeliest_weights(own)] * len(bursts)
+                places += [(burst, tried) for burst in bursts]
+            for burst in bursts:
+                burst.is_stale = False
+        if places:
+            found = detect.detect(np.concatenate(with_common_memory(metrics))[None], np.concatenate(weights))
+            ends = np.cumsum([tried.size for _, tried in places])
+            for (burst, tried), end in zip(places, ends.tolist(), strict=True):
+                burst.detected(tried, found.of_columns(np.arange(end - tried.size, end)))
+
+    def _dark(self, view: View) -> BoolArray:
         """(C,) columns of a tracked frame with too little light to try; now and then they are tried all the same."""
         tried = (view.bursts.frame + 1) % SETTINGS.try_dark_every == 0
         if view.flat is None or "dark_columns" not in self._skip or tried:
             return np.zeros(view.snr.shape[0], bool)
         return np.asarray(np.median(view.snr, axis=1) < SETTINGS.dark_snr)
-
-    def _detect_open(self, found: list[tuple[IntArray, NDArray[np.bool_]]]) -> None:
-        """Detect the columns wanted, (B, C), of the open bursts of some frames.
-
-        All at once, for each symbol's turn costs the same; only the weights are settled frame by frame.
-        """
-        if self._weights is None or self._weights.shape[0] != self.open.n_columns:
-            self._weights = np.zeros((self.open.n_columns, len(WEIGHTS)), bool)
-        places = [np.nonzero(wanted) for _, wanted in found]
-        metrics = with_common_memory([self.open.metrics(numbers) for numbers, _ in found])
-        weights = [_settled_weights(self._weights, m, wanted) for m, (_, wanted) in zip(metrics, found, strict=True)]
-        number = np.concatenate([numbers[burst] for (numbers, _), (burst, _) in zip(found, places, strict=True)])
-        column = np.concatenate([c for _, c in places])
-        posteriors = detect.detect(
-            np.concatenate([m[place] for m, place in zip(metrics, places, strict=True)])[None],
-            np.concatenate([w[c] for w, (_, c) in zip(weights, places, strict=True)]),
-        )
-        certain = posteriors.log_prob[0].min(axis=1) >= SETTINGS.certain_log_prob
-        for value in np.unique(number):
-            mine = np.flatnonzero(number == value)
-            self.open.store(int(value), column[mine], posteriors.of_columns(mine), certain[mine])
-        # Weights of columns that were certain are the only ones tried next, until they are not certain any more.
-        self._weights[column] = False
-        self._weights[column[certain], posteriors.w[certain] - 1] = True
 
     def lit(self, waiting: Waiting) -> Float32Array:
         """(C, N) probability that each slot of a frame is lit, by all that is known of its bursts."""
@@ -110,45 +174,63 @@ class BurstReader:
         assert waiting.numbers is not None
         self.detect_stale(waiting)
         clock = waiting.view.bursts.clock
-        lit = np.full((waiting.numbers.size, self.open.n_columns, clock.packet_slots), 0.5, np.float32)
-        for place, number in enumerate(waiting.numbers):
-            if self.open.is_open(int(number)):
-                lit[place] = self.open.lit(waiting.numbers[place : place + 1])[0]
+        lit = np.full((waiting.numbers.size, len(waiting.view.snr), clock.packet_slots), 0.5, np.float32)
+        for burst in self.of(waiting):
+            lit[waiting.numbers == burst.number] = burst.lit
         return clock.on_grid(lit)
 
     def doubts(self, waiting: Waiting) -> tuple[int, int]:
         """Numbers of doubtful packets and of all packets, among complete packets of a frame in well-lit columns."""
         assert waiting.view is not None
-        assert waiting.numbers is not None
         self.detect_stale(waiting)
         lit = np.median(waiting.view.snr, axis=1) >= SETTINGS.well_lit_snr
         doubtful = total = 0
-        for number in waiting.numbers:
-            known = self.open.known(int(number)) if self.open.is_open(int(number)) else None
-            if known is not None:
-                whole = assemble.complete(self.open.n_observed(np.array([number])))[0] & lit
-                doubtful += int((known.log_prob[0].sum(axis=1) < SETTINGS.doubtful_log_prob)[whole].sum())
+        for burst in self.of(waiting):
+            if burst.posteriors is not None:
+                whole = assemble.complete(burst.n_observed[None])[0] & lit
+                log_prob = burst.posteriors.log_prob[0].sum(axis=1)
+                doubtful += int((log_prob < SETTINGS.doubtful_log_prob)[whole].sum())
                 total += int(whole.sum())
         return doubtful, total
 
     def confidence(self, numbers: IntArray) -> Float32Array | None:
         """(C,) of the best packet of bursts (B,) that are still going on, None where nothing is known of any."""
-        known = [p for p in (self.open.known(int(n)) for n in numbers if self.open.is_open(int(n))) if p]
-        if not known:
-            return None
-        best = np.max([np.exp(p.log_prob.sum(axis=2)).max(axis=0) for p in known], axis=0)
-        return np.asarray(best, np.float32)
+        open_ones = (self._open[number] for number in numbers.tolist() if number in self._open)
+        log_probs = [burst.posteriors.log_prob for burst in open_ones if burst.posteriors is not None]
+        best = [np.exp(log_prob.sum(axis=2)).max(axis=0) for log_prob in log_probs]
+        return np.asarray(np.max(best, axis=0), np.float32) if best else None
 
 
-def _settled_weights(before: NDArray[np.bool_], metrics: FloatArray, wanted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(C, 9) the weight of each column, from all bursts (B, C, ...) of a frame; only of those wanted, (B, C)."""
-    bursts, columns = np.flatnonzero(wanted.any(axis=1)), np.flatnonzero(wanted.any(axis=0))
-    weights = before.copy()
-    unknown = columns[~weights[columns].any(axis=1)]
-    if unknown.size:
-        weights[unknown] = detect.plausible_weights(metrics[bursts][:, unknown], receiver_settings.weight_margin)
-    several = columns[weights[columns].sum(axis=1) > 1]
+def with_common_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:
+    """Convert metrics (..., n + memory, patterns) of several frames to the longest ISI memory among them.
+
+    A metric of a shorter memory applies to every longer pattern that ends with its slots.
+    """
+    n_patterns = max((some.shape[-1] for some in metrics), default=0)
+    n_metrics = max((some.shape[-2] for some in metrics), default=0)
+
+    def written(some: FloatArray) -> FloatArray:
+        if some.shape[-1] == n_patterns:
+            return some
+        every = some[..., np.arange(n_patterns) % some.shape[-1]]
+        more = [(0, 0)] * (some.ndim - 2)
+        return np.pad(every, [*more, (0, n_metrics - some.shape[-2]), (0, 0)])
+
+    return [written(some) for some in metrics]
+
+
+def _likeliest_weights(metrics: FloatArray) -> BoolArray:
+    """(C, 9) the likeliest weight of each column, by all bursts (B, C, ...) of a frame."""
+    weights = detect.plausible_weights(metrics, receiver_settings.weight_margin)
+    several = np.flatnonzero(weights.sum(axis=1) > 1)
     if several.size:
-        found = detect.detect(metrics[bursts][:, several], weights[several])
+        found = detect.detect(metrics[:, several], weights[several])
         weights[several] = np.array(WEIGHTS) == found.w[:, None]
     return weights
+
+
+def _unobserved(like: FloatArray, n: int) -> BurstPosteriors:
+    """Posteriors of `n` columns of a burst without light, of metrics such as (..., packet + memory, patterns)."""
+    middle = np.arange(len(WEIGHTS)) == len(WEIGHTS) // 2
+    blank = detect.detect(np.zeros((1, 1, *like.shape[-2:])), middle[None])
+    return replace(blank, lit=np.full_like(blank.lit, 0.5)).of_columns(np.zeros(n, np.int64))

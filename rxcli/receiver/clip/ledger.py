@@ -11,14 +11,12 @@ from typing import Any
 import numpy as np
 
 from rxcli.options import ReceiverOptions
-from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver.clip.acquiring import Start
-from rxcli.receiver.clip.bursts import BurstReader
+from rxcli.receiver.clip.bursts import Bursts
 from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View, Waiting
-from rxcli.receiver.context import Timer
-from rxcli.receiver.decode import assemble, confidence, detect
+from rxcli.receiver.decode import assemble, confidence
 from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
 from rxcli.receiver.light import slot_llr
@@ -26,7 +24,6 @@ from rxcli.receiver.sync import tracking
 from rxcli.results.dump import dump_stages
 from rxcli.types import (
     BoolArray,
-    Float32Array,
     FloatArray,
     Frame,
     FrameResult,
@@ -39,8 +36,6 @@ _RETIMED = (
     "the clip's time stamps do not fit the link's time, as after a change of its speed: each frame is received alone; "
     "give the clip as the camera recorded it"
 )
-#: Difference of the copies of two frames that have none in common.
-_SEPARATE_COPIES = 1 << 12
 
 
 @dataclass(slots=True, eq=False)
@@ -59,7 +54,7 @@ class _Link:
     #: (1, C) log-likelihood ratio of the headers of all bursts so far; None before any.
     header_llr: FloatArray | None = None
 
-    def headerless(self, closed: Sequence[tracking.ClosedBurst], n_columns: int) -> BoolArray:
+    def headerless(self, closed: Sequence[confidence.BurstInClip], n_columns: int) -> BoolArray:
         """Add closed bursts; returns (C,) the columns that have shown no headers."""
         header_llr = np.zeros((1, n_columns)) if self.header_llr is None else self.header_llr
         limit = decode_settings.max_header_llr
@@ -82,7 +77,7 @@ class Ledger:
     def __init__(self, options: ReceiverOptions) -> None:
         self._options = options
         self._waiting: deque[Waiting] = deque()
-        self._bursts = BurstReader(options.skip)
+        self._bursts = Bursts(options.skip)
         self._link: _Link | None = None
         self._next_number = 0
         #: Ratio of time stamps to the link's time; None if it cannot be estimated, and frames are received alone.
@@ -140,25 +135,22 @@ class Ledger:
         ends = (slot + np.array([top, bottom]) / rows_per_slot) // link.time.packet_slots
         numbers = np.unique(link.phase.burst_of(np.arange(ends[0], ends[1] + 1).astype(np.int64))) + link.offset
         lit = np.median(last.snr, axis=1) >= 1.0
-        return bool(lit.any()) and all(self._bursts.open.settled(int(number), lit) for number in numbers)
+        return bool(lit.any()) and all(self._bursts.settled(int(number), lit) for number in numbers)
 
     def add(self, waiting: Waiting, *, scene_ends: bool = False) -> list[FrameResult]:
         """Add a frame without packets; returns the results that are complete, all of them where the scene ends."""
         self._waiting.append(waiting)
         return self._finish_scene() if scene_ends else self._ready()
 
-    def enter(
-        self, waiting: Waiting, view: View, scene: TrackedScreen | None, frame: Frame, timer: Timer
-    ) -> list[FrameResult]:
+    def enter(self, waiting: Waiting, view: View, scene: TrackedScreen | None) -> list[FrameResult]:
         """Enter a received frame; returns the results that are complete.
 
         Args:
             waiting: the frame, to which the view is given.
             view: what was received of it.
             scene: that the frame belongs to; None where it is not tracked.
-            frame: the frame.
-            timer: time is counted there.
         """
+        frame = view.context.frame
         done, first_copy = self._first_copy(view, frame)
         waiting.view = view
         self._scene = scene
@@ -166,12 +158,12 @@ class Ledger:
         self._link.last_time_s = frame.time_s
         view.bursts = replace(view.bursts, first_copy=first_copy)
         self._waiting.append(waiting)
-        with timer("detect"):
+        with view.context.timer("detect"):
             if not self._link.phase.settled:
                 self._compare(view)
             n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)
             if self._n_held and self._link.time.judged and not self._link.stamps_judged:
-                self._judge_stamps()
+                done += self._enter_anew()
             if self._link.phase.settled or n_unsettled > SETTINGS.max_waiting_frames:
                 self._settle_bursts()
                 if self._n_held and len(self._waiting) >= self._n_held:
@@ -181,68 +173,53 @@ class Ledger:
     def _first_copy(self, view: View, frame: Frame) -> tuple[list[FrameResult], int]:
         """Number of the frame's first copy; where it does not fit the link's time, that ends, with the results of its
         scene, and begins anew."""
-        if self._link is not None and self._stretch is not None and self._link.shape == _shape(view):
-            first_copy = self._link.time.update(frame.index, frame.time_s, view.bursts.clock)
-            if first_copy is not None:
-                return [], first_copy
-        done = self._finish_scene() if self._link is not None else []
-        first_copy = self._begin_link(view, frame)
-        if first_copy is None:
-            # The clock that the first frames seemed to share is not this frame's.
-            self.start = None
-            first_copy = self._begin_link(view, frame)
-        assert first_copy is not None
-        return done, first_copy
+        done: list[FrameResult] = []
+        if self._link is not None:
+            if self._stretch is not None and self._link.shape == _shape(view):
+                first_copy = self._link.time.update(frame.index, frame.time_s, view.bursts.clock)
+                if first_copy is not None:
+                    return [], first_copy
+            done = self._finish_scene()
+        return done, self._begin_link(view, frame)
 
-    def _begin_link(self, view: View, frame: Frame) -> int | None:
-        """Begin the link's time anew; returns the number of the frame's first copy in it, None where it fits none."""
-        screen = view.acquisition.screen
-        offset = self._next_number
-        stretch = self._stretch or 1.0
+    def _begin_link(self, view: View, frame: Frame) -> int:
+        """Begin the link's time anew; returns the number of the frame's first copy in it."""
+        screen, clock = view.acquisition.screen, view.bursts.clock
+        offset, stretch = self._next_number, self._stretch or 1.0
         if self._link is not None and offset:
             passed_s = (frame.time_s - self._link.last_time_s) / stretch
             offset += int(passed_s / (screen.packet_s * self._link.phase.repeats))
-        time = tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
-        time = self.start.time if self.start else time
+        time, first_copy = tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch), None
+        if self.start is not None:
+            first_copy = self.start.time.update(frame.index, frame.time_s, clock)
+        if self.start is None or first_copy is None:
+            # The clock that the first frames seemed to share, if any, is not this frame's.
+            self.start, first_copy = None, time.update(frame.index, frame.time_s, clock)
+        else:
+            time = self.start.time
+        assert first_copy is not None
         phase = tracking.BurstPhase(view.acquisition.repeats)
-        self._link = _Link(time, phase, _shape(view), offset, frame.time_s)
+        self._link = _Link(time, phase, _shape(view), offset, frame.time_s, stamps_judged=self._stretch != 1)
         self._epoch += 1
         self._bursts.begin()
-        return time.update(frame.index, frame.time_s, view.bursts.clock)
+        return first_copy
 
-    def _judge_stamps(self) -> None:
-        """Whether the stamps of the first frames are the time; where they are not, those frames are entered anew."""
-        link, waiting = self._link, [w for w in self._waiting if w.view is not None]
+    def _enter_anew(self) -> list[FrameResult]:
+        """Where the stamps of the first frames are not the time, enter these frames anew; returns complete results."""
+        link, waiting = self._link, self._waiting
         assert link is not None
         link.stamps_judged = True
-        first_view = waiting[0].view
-        assert first_view is not None
-        shown = np.ptp(np.flatnonzero(first_view.acquisition.profiles.inside.any(axis=(0, 1))))
-        rate_hz = first_view.acquisition.screen.slot_rate_hz
-        self._stretch = link.time.time_stamp_stretch(float(shown) / first_view.bursts.clock.rows_per_slot / rate_hz)
+        first = next(each.view for each in waiting if each.view is not None)
+        shown = float(np.ptp(np.flatnonzero(first.acquisition.profiles.inside.any(axis=(0, 1)))))
+        packet_s = first.acquisition.screen.packet_s / first.bursts.clock.packet_slots
+        self._stretch = link.time.time_stamp_stretch(shown / first.bursts.clock.rows_per_slot * packet_s)
         if self._stretch == link.time.stretch:
-            return
-        link.time = tracking.LinkTime(link.time.packet_slots, rate_hz, self._stretch or 1.0)
-        link.phase = tracking.BurstPhase(first_view.acquisition.repeats)
-        link.stamps_judged = True
-        self._bursts.begin()
+            return []
+        self._waiting, self._link, scene, done = deque(), None, self._scene, []
         for each in waiting:
-            self._enter_anew(each)
-
-    def _enter_anew(self, waiting: Waiting) -> None:
-        view, link = waiting.view, self._link
-        assert view is not None
-        assert link is not None
-        clock = view.bursts.clock
-        first_copy = link.time.update(waiting.result.frame, waiting.result.time_s, clock)
-        if first_copy is None or self._stretch is None:
-            # Frames that stand alone: no copy of one is near any of another.
-            first_copy = waiting.result.frame * _SEPARATE_COPIES
-        clock = replace(clock, burst=np.arange(clock.n_copies))
-        view.bursts = replace(view.bursts, first_copy=first_copy, clock=clock)
-        waiting.numbers = None
-        waiting.result = replace(waiting.result, message=self.message)
-        self._compare(view)
+            each.numbers, each.result = None, replace(each.result, message=self.message)
+            done += self.add(each) if each.view is None else self.enter(each, each.view, scene)
+        return done
 
     def _compare(self, view: View) -> None:
         """Update the phase of the bursts with a frame."""
@@ -261,10 +238,10 @@ class Ledger:
     def _detect(self, waiting: Waiting) -> None:
         """Add a frame to its bursts, which are detected when their result is needed, and learn from it."""
         numbers, view = self._add(waiting), waiting.view
-        if "certain_columns" not in self._options.skip or self._options.stop_when_certain:
+        if self._options.stop_when_certain:
             self._bursts.detect_stale(waiting)
-        tracked = view is not None and view.flat is not None and self._bursts.open.is_open(int(numbers[-1]))
-        if self._scene is not None and view is not None and tracked:
+        going_on = any(burst.number == numbers[-1] for burst in self._bursts.of(waiting))
+        if self._scene is not None and view is not None and view.flat is not None and going_on:
             self._scene.update(view, lambda: self._bursts.lit(waiting))
 
     def _add(self, waiting: Waiting) -> IntArray:
@@ -321,8 +298,11 @@ class Ledger:
         waiting = [w for w in self._waiting if w.view is not None and w.numbers is not None]
         numbers = [self._add(w) for w in waiting]
         after = [*numbers[1:], numbers[0][:0]]
-        ended = [np.setdiff1d(mine, following) for mine, following in zip(numbers, after, strict=True)]
-        self._bursts.detect(list(zip(waiting, ended, strict=True)), dark_too=False)
+        ended = [
+            (each, [burst for burst in self._bursts.of(each) if burst.number not in following])
+            for each, following in zip(waiting, after, strict=True)
+        ]
+        self._bursts.detect(ended, dark_too=False)
         tracked = [w.view for w in waiting if w.view is not None and w.view.flat is not None]
         if self._scene is not None and tracked:
             self._scene.last = tracked[-1]
@@ -363,14 +343,9 @@ class Ledger:
 
     def _n_ended(self) -> int:
         """How many of the frames that wait, from the oldest on, can be reported."""
-        for place, waiting in enumerate(self._waiting):
-            if waiting.view is not None:
-                following = self._waiting[place + 1] if place + 1 < len(self._waiting) else None
-                if following is None or waiting.numbers is None:
-                    return place
-                if following.view is not None and following.numbers is None:
-                    return place
-        return len(self._waiting)
+        entered = [*(each.view is None or each.numbers is not None for each in self._waiting), False]
+        ended = [each.view is None or all(entered[n : n + 2]) for n, each in enumerate(self._waiting)]
+        return [*ended, False].index(False)
 
     def _report(self, waiting: Waiting, following: Waiting | None) -> FrameResult:
         view, bursts = waiting.view, self._bursts
@@ -380,11 +355,12 @@ class Ledger:
         going_on = waiting.numbers[:0]
         if following is not None and following.numbers is not None:
             going_on = np.intersect1d(waiting.numbers, following.numbers)
-        closed = bursts.open.close(np.setdiff1d(waiting.numbers, going_on))
-        ended = _bursts_of(closed, int(waiting.numbers[0]), view)
+        n_strips = view.acquisition.sampler.binned.light.shape[1]
+        closed = bursts.close(np.setdiff1d(waiting.numbers, going_on))
+        ended = [burst.ended(int(waiting.numbers[0]), n_strips) for burst in closed]
         headerless = np.zeros(len(view.snr), bool)
         if self._link is not None:
-            headerless = self._link.headerless(closed, headerless.size)
+            headerless = self._link.headerless(ended, headerless.size)
         sure = bursts.confidence(going_on)
         columns = assemble.clip_results(
             view.bursts.clock,
@@ -421,23 +397,6 @@ def _shape(view: View) -> tuple[int, int]:
     return view.acquisition.screen.columns, view.bursts.clock.packet_slots
 
 
-def _bursts_of(closed: Sequence[tracking.ClosedBurst], first_number: int, view: View) -> list[confidence.BurstInClip]:
-    """Bursts that end in the frame of a view, for `assemble`; `first_number` is that of the frame's first burst."""
-    n_strips = view.acquisition.sampler.binned.light.shape[1]
-    return [
-        confidence.BurstInClip(
-            number=burst.number,
-            index=int(burst.number - first_number),
-            posteriors=burst.posteriors,
-            n_observed=burst.n_observed,
-            frames=burst.frames,
-            confidence_features=None if burst.tracked else _confidence_features(burst, n_strips),
-            against=_against(burst),
-        )
-        for burst in closed
-    ]
-
-
 def _taps(waiting: Waiting, view: View, ended: Sequence[confidence.BurstInClip]) -> dict[str, Any]:
     """What is written of a frame: as of a photograph, but strips as tracking samples them, and bursts that end here."""
     found: dict[str, Any] = {"geometry.corners": waiting.result.corners, "clock": view.bursts.clock}
@@ -450,21 +409,3 @@ def _taps(waiting: Waiting, view: View, ended: Sequence[confidence.BurstInClip])
     found |= {"channel.metrics": view.bursts.metrics, "bursts.shown": view.bursts.shown}
     found |= {"bursts.number": waiting.numbers, "bursts.ended": numbers}
     return found | {f"detect.{burst.number}": burst.posteriors for burst in ended}
-
-
-def _confidence_features(burst: tracking.ClosedBurst, n_strips: int) -> FloatArray:
-    """(C, 8) what the confidence of packets is made of, all copies and frames together."""
-    slot_margin = detect.slot_margin(burst.metrics[None], burst.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
-    confidence_features = confidence.confidence_features(
-        burst.posteriors, slot_margin, np.zeros(slot_margin.shape[1], bool), n_strips
-    )
-    return np.asarray(confidence_features[0])
-
-
-def _against(burst: tracking.ClosedBurst) -> Float32Array | None:
-    """(C,) maximum log-likelihood ratio against the decision over the payload slots; None for photographs."""
-    if not burst.tracked:
-        return None
-    llr = slot_llr(burst.metrics[None])[0, :, PREAMBLE_SLOTS:]
-    decided = np.sign(burst.posteriors.lit[0, :, PREAMBLE_SLOTS:] - 0.5)
-    return np.asarray(np.maximum(-llr * decided, 0).max(axis=1), np.float32)

@@ -206,7 +206,7 @@ def _receive(
         corners=state.known.corners,
     )
     scene = state.scene if isinstance(state, Tracking) else None
-    results = ledger.enter(waiting, view, scene, frame, timer)
+    results = ledger.enter(waiting, view, scene)
     waiting.result = replace(waiting.result, timing_ms=timer.total())
     return state, results
 

@@ -38,8 +38,6 @@ class SyncSettings:
     max_slot_llr: float = 3.0
     #: Log-likelihood ratio at which the phase of the bursts is settled.
     settled_llr: float = 12.0
-    #: Number of closed bursts whose certain columns are remembered.
-    remembered_bursts: int = 4
 
     #: Largest deviation, slots, of a clock from the prediction of earlier frames; beyond it the link time is lost.
     max_jump_slots: float = 2.0

@@ -2,8 +2,7 @@
 
 Row r of frame f begins its exposure at t_f + r * line_delay, so the clock of one frame predicts the next. `LinkTime`
 counts slots from the clip's first clock, which numbers every copy of a packet. `BurstPhase` finds the copies that begin
-a burst, which numbers every burst, including those in the gaps between frames. `Bursts` adds up the metrics of each
-burst over the frames.
+a burst, which numbers every burst, including those in the gaps between frames.
 """
 
 from __future__ import annotations
@@ -13,10 +12,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rxcli.protocol import WEIGHTS, bits_per_symbol
 from rxcli.receiver.sync.clock import similarity
 from rxcli.receiver.sync.settings import SETTINGS
-from rxcli.types import BoolArray, BurstPosteriors, Clock, Float32Array, FloatArray, IntArray
+from rxcli.types import Clock, FloatArray, IntArray
 
 
 @dataclass(slots=True)
@@ -237,180 +235,3 @@ class FrameBursts:
     shown: IntArray
     #: Whether the picture was known from other frames.
     tracked: bool = False
-
-
-@dataclass(slots=True)
-class _Burst:
-    metrics: FloatArray
-    n_observed: IntArray
-    frames: list[int]
-    #: (C,) columns that need no further pass.
-    certain: BoolArray
-    tracked: bool
-    #: Of this burst alone, once detected.
-    posteriors: BurstPosteriors | None = None
-    #: Whether frames were added since the last detection.
-    stale: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class ClosedBurst:
-    """A complete burst, added up over all frames."""
-
-    #: Number in the clip.
-    number: int
-    #: Of this burst alone.
-    posteriors: BurstPosteriors
-    #: (C, packet) number of observations of each slot.
-    n_observed: IntArray
-    frames: tuple[int, ...]
-    #: (C, packet + memory, patterns) of all frames together.
-    metrics: FloatArray
-    #: Whether the picture was known from other frames in any of them.
-    tracked: bool
-
-
-class Bursts:
-    """The open bursts, with their metrics added up over the frames."""
-
-    def __init__(self) -> None:
-        self._open: dict[int, _Burst] = {}
-        self._closed = -1
-        #: Certain columns of the last closed bursts.
-        self._certain: dict[int, BoolArray] = {}
-
-    def settled(self, number: int, lit: BoolArray) -> bool:
-        """Whether all lit columns (C,) of a burst, open or closed, are certain."""
-        entry = self._open.get(number)
-        certain = entry.certain if entry else self._certain.get(number)
-        return certain is not None and bool(certain[lit].all())
-
-    def add(self, view: FrameBursts, numbers: IntArray, metrics: FloatArray) -> None:
-        """Add the bursts of a frame.
-
-        Args:
-            view: the frame.
-            numbers: (B,) numbers of its bursts.
-            metrics: (B, C, packet + memory, patterns).
-        """
-        for burst, number in enumerate(numbers):
-            if number <= self._closed:
-                continue
-            n_observed = view.shown[view.clock.burst == burst].sum(axis=0)
-            have = self._open.get(int(number))
-            if have is None:
-                self._open[int(number)] = _Burst(
-                    metrics[burst].copy(), n_observed, [view.frame], np.zeros(n_observed.shape[0], bool), view.tracked
-                )
-                continue
-            have.metrics, added = with_common_memory([have.metrics, metrics[burst]])
-            have.metrics += added
-            have.n_observed = have.n_observed + n_observed
-            have.frames.append(view.frame)
-            have.tracked |= view.tracked
-            have.stale = True
-
-    def is_open(self, number: int) -> bool:
-        """Whether the burst can still be added to."""
-        return number in self._open
-
-    def is_stale(self, number: int) -> bool:
-        """Whether frames were added to an open burst since its last detection."""
-        return number in self._open and self._open[number].stale
-
-    def mark_detected(self, numbers: IntArray) -> None:
-        """Mark open bursts as detected with all frames so far."""
-        for number in numbers:
-            self._open[int(number)].stale = False
-
-    def metrics(self, numbers: IntArray) -> FloatArray:
-        """(B, C, packet + memory, patterns) of open bursts, all frames added."""
-        return np.stack(with_common_memory([self._open[int(n)].metrics for n in numbers]))
-
-    def n_observed(self, numbers: IntArray) -> IntArray:
-        """(B, C, packet) number of observations of each slot."""
-        return np.stack([self._open[int(n)].n_observed for n in numbers])
-
-    @property
-    def n_columns(self) -> int:
-        """Columns of the open bursts; 0 if there are none."""
-        return next((entry.n_observed.shape[0] for entry in self._open.values()), 0)
-
-    def certain(self, numbers: IntArray) -> BoolArray:
-        """(B, C) columns that are certain."""
-        return np.stack([self._open[int(n)].certain for n in numbers])
-
-    def lit(self, numbers: IntArray) -> Float32Array:
-        """(B, C, packet) probability that each slot is lit."""
-        entries = [self._open[int(n)] for n in numbers]
-        half = np.full(entries[0].n_observed.shape, 0.5, np.float32)
-        return np.stack([half if e.posteriors is None else e.posteriors.lit[0] for e in entries])
-
-    def store(self, number: int, columns: IntArray, posteriors: BurstPosteriors, certain: BoolArray) -> None:
-        """Store the posteriors of some columns of an open burst; `certain` is (columns,)."""
-        entry = self._open[number]
-        entry.posteriors = _merged(entry.posteriors, posteriors, columns, entry.n_observed.shape[0])
-        entry.certain[columns] = certain
-
-    def known(self, number: int) -> BurstPosteriors | None:
-        """The last posteriors of an open burst."""
-        return self._open[number].posteriors
-
-    def close(self, numbers: IntArray) -> list[ClosedBurst]:
-        """Remove bursts in time order; later frames add nothing to them or to earlier ones."""
-        if len(numbers):
-            self._closed = max(self._closed, int(numbers.max()))
-        entries = [(int(n), self._open.pop(int(n), None)) for n in np.sort(numbers)]
-        self._certain |= {number: entry.certain for number, entry in entries if entry is not None}
-        self._certain = {n: c for n, c in self._certain.items() if n > self._closed - SETTINGS.remembered_bursts}
-        return [
-            ClosedBurst(number, entry.posteriors, entry.n_observed, tuple(entry.frames), entry.metrics, entry.tracked)
-            for number, entry in entries
-            if entry is not None and entry.posteriors is not None
-        ]
-
-
-def with_common_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:
-    """Convert metrics (..., n + memory, patterns) of several frames to the longest ISI memory among them.
-
-    A metric of a shorter memory applies to every longer pattern that ends with its slots.
-    """
-    n_patterns = max((some.shape[-1] for some in metrics), default=0)
-    n_metrics = max((some.shape[-2] for some in metrics), default=0)
-
-    def written(some: FloatArray) -> FloatArray:
-        if some.shape[-1] == n_patterns:
-            return some
-        every = some[..., np.arange(n_patterns) % some.shape[-1]]
-        more = [(0, 0)] * (some.ndim - 2)
-        return np.pad(every, [*more, (0, n_metrics - some.shape[-2]), (0, 0)])
-
-    return [written(some) for some in metrics]
-
-
-def _unobserved(like: BurstPosteriors, n: int) -> BurstPosteriors:
-    """Posteriors of an unobserved burst of `n` columns: all slots, words and weights are equally likely."""
-    symbols, slots, weights = like.index.shape[2], like.lit.shape[2], like.w_log_prob.shape[1]
-    middle = WEIGHTS[len(WEIGHTS) // 2]
-    k = bits_per_symbol(middle)
-    bit_llr = np.full((1, n, symbols, like.bit_llr.shape[3]), np.nan)
-    bit_llr[..., :k] = 0
-    return BurstPosteriors(
-        w=np.full(n, middle, np.int64),
-        w_log_prob=np.full((n, weights), -np.log(weights)),
-        log_evidence=np.zeros(n),
-        lit=np.full((1, n, slots), 0.5, np.float32),
-        index=np.zeros((1, n, symbols), np.int64),
-        log_prob=np.full((1, n, symbols), -k * np.log(2)),
-        bit_llr=bit_llr,
-        header_llr=np.zeros((1, n)),
-    )
-
-
-def _merged(before: BurstPosteriors | None, new: BurstPosteriors, columns: IntArray, n: int) -> BurstPosteriors:
-    """Replace the posteriors of some of a burst's `n` columns."""
-    if columns.size == n:
-        return new
-    if before is None:
-        before = _unobserved(new, n)
-    return before.with_columns(columns, new)
