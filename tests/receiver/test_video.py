@@ -274,24 +274,11 @@ def test_frames_before_and_after_an_occlusion_are_looked_at_again(clip: Clip, mo
         measured.append([view.bursts.frame for view in views])
 
     monkeypatch.setattr("rxcli.receiver.clip.scene.TrackedScreen.measure_again", measure_again)
-    monkeypatch.setattr("rxcli.receiver.clip.ledger.SETTINGS", replace(SETTINGS, too_much_doubt=1.0))
     dark = replace(clip.frames[3], pixels=np.full_like(clip.frames[3].pixels, 2))
     got = list(receive((*clip.frames[:3], dark, *clip.frames[4:]), clip.options))
     assert [result.frame for result in got] == [frame.index for frame in clip.frames]
     assert got[3].status in ("no_signal", "no_screen")
-    assert measured[:4] == [[0, 1, 2]] * 2 + [[4, 5, 6, 7, 8, 9]] * 2
-
-
-def test_a_look_that_would_not_mend_much_is_left_out(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
-    measured: list[int] = []
-
-    def measure_again(_scene: object, views: list[Any], *_: object) -> None:
-        measured.append(len(views))
-
-    monkeypatch.setattr("rxcli.receiver.clip.scene.TrackedScreen.measure_again", measure_again)
-    monkeypatch.setattr("rxcli.receiver.clip.bursts.Bursts.doubts", lambda *_: (3, 10))
-    assert len(list(receive(clip.frames, clip.options))) == len(clip.frames)
-    assert measured == [len(clip.frames)]
+    assert measured[:2] == [[0, 1, 2], [4, 5, 6, 7, 8, 9]]
 
 
 def test_parts_of_packets_are_put_together() -> None:

@@ -102,11 +102,6 @@ class Ledger:
         self._bursts.dark_too = n_frames > 0
 
     @property
-    def holds_first(self) -> bool:
-        """Whether frames are held back that will be measured again in any case."""
-        return self._n_held == SETTINGS.frames_held
-
-    @property
     def holds_more(self) -> bool:
         """Whether further frames are held back, because compression has taken much of the first ones."""
         return self._n_held == SETTINGS.frames_held_long
@@ -209,10 +204,10 @@ class Ledger:
         link, waiting = self._link, self._waiting
         assert link is not None
         link.stamps_judged = True
-        first = next(each.view for each in waiting if each.view is not None)
-        shown = float(np.ptp(np.flatnonzero(first.acquisition.profiles.inside.any(axis=(0, 1)))))
-        packet_s = first.acquisition.screen.packet_s / first.bursts.clock.packet_slots
-        self._stretch = link.time.time_stamp_stretch(shown / first.bursts.clock.rows_per_slot * packet_s)
+        view = next(each.view for each in waiting if each.view is not None)
+        shown = float(np.ptp(np.flatnonzero(view.acquisition.profiles.inside.any(axis=(0, 1)))))
+        packet_s = view.acquisition.screen.packet_s / view.bursts.clock.packet_slots
+        self._stretch = link.time.time_stamp_stretch(shown / view.bursts.clock.rows_per_slot * packet_s)
         if self._stretch == link.time.stretch:
             return []
         self._waiting, self._link, scene, done = deque(), None, self._scene, []
@@ -265,14 +260,11 @@ class Ledger:
 
         Where that leaves doubt, more frames are waited for, unless it is `at_last` or results are wanted promptly.
         """
-        held = [
-            w for w in self._waiting if w.view is not None and w.numbers is not None and self._can_receive_again(w.view)
-        ]
+        held = [each for each in self._waiting if self._can_receive_again(each)]
         may_wait = self._n_held < SETTINGS.frames_held_long and not at_last and not self._options.prompt
-        if len(held) > 1 and not (may_wait and self._doubt(held) > SETTINGS.too_much_doubt):
-            for _ in range(SETTINGS.looks_again if len(held) <= SETTINGS.frames_held else 1):
-                self._measure_again(held)
-                self._detect_again()
+        if len(held) > 1:
+            self._measure_again(held)
+            self._detect_again()
         self._hold(SETTINGS.frames_held_long if may_wait and self._doubt(held) > SETTINGS.much_doubt else 0)
 
     def _doubt(self, held: list[Waiting]) -> float:
@@ -280,13 +272,13 @@ class Ledger:
         doubtful, whole = np.sum([self._bursts.doubts(waiting) for waiting in held], axis=0) if held else (0, 0)
         return float(doubtful / max(whole, 1))
 
-    def _can_receive_again(self, view: View) -> bool:
-        return self._scene is not None and self._scene.can_measure_again(view)
+    def _can_receive_again(self, waiting: Waiting) -> bool:
+        view, scene = waiting.view, self._scene
+        return waiting.numbers is not None and view is not None and scene is not None and scene.can_measure_again(view)
 
     def _measure_again(self, held: list[Waiting]) -> None:
         """Learn the picture anew from all held frames, and measure doubtful frames with the picture of the others."""
         assert self._scene is not None
-        self._bursts.detect_stale(*held)
         known = [self._bursts.lit(waiting) for waiting in held]
         doubtful = [len(held) <= SETTINGS.frames_held or self._bursts.doubts(waiting)[0] > 0 for waiting in held]
         numbers = [w.numbers for w in held if w.numbers is not None]
@@ -295,12 +287,11 @@ class Ledger:
     def _detect_again(self) -> None:
         """The bursts of all frames that wait, each once: in the last frame that shows it."""
         self._bursts.begin()
-        waiting = [w for w in self._waiting if w.view is not None and w.numbers is not None]
+        waiting = [w for w in self._waiting if w.numbers is not None]
         numbers = [self._add(w) for w in waiting]
-        after = [*numbers[1:], numbers[0][:0]]
         ended = [
             (each, [burst for burst in self._bursts.of(each) if burst.number not in following])
-            for each, following in zip(waiting, after, strict=True)
+            for each, following in zip(waiting, [*numbers[1:], numbers[0][:0]], strict=True)
         ]
         self._bursts.detect(ended, dark_too=False)
         tracked = [w.view for w in waiting if w.view is not None and w.view.flat is not None]

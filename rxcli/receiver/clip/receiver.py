@@ -27,7 +27,7 @@ from rxcli.receiver.decode import assemble
 from rxcli.receiver.reception import Reception, shows_steady_light
 from rxcli.receiver.search import Found
 from rxcli.receiver.search.nulls import STEADY_LIGHT
-from rxcli.receiver.still import apply_autoencoder, decode, doubtful_columns, initial_pass
+from rxcli.receiver.still import apply_autoencoder, decode
 from rxcli.receiver.sync import tracking
 from rxcli.types import FloatArray, Frame, FrameResult
 
@@ -337,18 +337,12 @@ def _goes_on(before: TrackedScreen, scene: TrackedScreen, view: View, time: trac
 def _decoded(settled: Settled, known: Known, timer: Timer) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
     """What is received with a clock and camera, columns that the auto-encoder changed, and its report.
 
-    An initial pass that leaves little doubt is enough of a frame that is measured again when the picture is known. A
-    reception that there is already needs no other.
+    A reception that there is already needs no other.
     """
     options, acquisition, reception = known.camera.options, settled.acquisition, settled.reception
     if reception is None:
         with timer("detect"):
-            initial = settled.initial or initial_pass(acquisition)
-            few_doubtful = doubtful_columns(initial).size <= SETTINGS.quick_doubt * initial.snr.shape[0]
-            measured_again = known.ledger.holds_first and _can_track(settled, options)
-            if measured_again and options.cae != "always" and few_doubtful:
-                return initial, frozenset(), None
-            reception = decode(acquisition, options.skip, initial)
+            reception = decode(acquisition, options.skip, settled.initial)
     with timer("denoise"):
         return apply_autoencoder(acquisition, reception, options)
 

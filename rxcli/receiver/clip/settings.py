@@ -75,12 +75,6 @@ class ClipSettings:
     frames_held: int = 6
     frames_held_long: int = 24
     much_doubt: float = 0.03
-    #: Number of passes over the held frames: decisions on one frame improve the picture for the others.
-    looks_again: int = 2
-    #: Share in doubt, before the frames held are measured again, that this would not mend: it is left out.
-    too_much_doubt: float = 0.25
-    #: Maximum share of doubtful columns after the initial pass of a first frame.
-    quick_doubt: float = 0.5
     #: Share of columns in doubt from which a first frame is not explained by the camera that is named, and below which
     #: it is by another.
     unlike_doubt: float = 0.85
