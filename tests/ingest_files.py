@@ -90,3 +90,14 @@ def read_all(path: Path) -> tuple[list[Frame], InputError | None]:
     except InputError as error:
         return frames, error
     return frames, None
+
+
+def one_frame(path: Path) -> Frame:
+    """The frame of a still.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    (frame,) = open_source(path)
+    assert frame.source == str(path)
+    return frame

@@ -28,7 +28,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -56,17 +56,8 @@ _OPTIONS = (
     *("--screen", "--truth", "--baseline", "--slower", "--min-packet-confidence", "--cluster"),
 )
 #: What is mutated, and how often of a hundred.
-_KINDS = {
-    "file": 60,
-    "screen": 7,
-    "camera": 7,
-    "truth": 6,
-    "journal": 6,
-    "option": 6,
-    "config": 3,
-    "gyroflow": 3,
-    "baseline": 2,
-}
+_KINDS = {"file": 60, "screen": 7, "camera": 7, "truth": 6, "journal": 6, "option": 6}
+_KINDS |= {"config": 3, "gyroflow": 3, "baseline": 2}
 _BLIND_PX = 256
 _LENS = """
 [lens]
@@ -222,29 +213,6 @@ def _write_clips(folder: Path, picture: NDArray[np.uint8]) -> None:
                 frame = av.VideoFrame.from_ndarray(frame_rgb, "rgb24").reformat(format=stream.pix_fmt)
                 container.mux(stream.encode(frame))
             container.mux(stream.encode())
-
-
-@dataclass
-class Verdict:
-    """What came of all cases."""
-
-    n: int = 0
-    codes: Counter[str] = field(default_factory=Counter)
-    #: What went wrong -> seeds.
-    problems: dict[str, list[int]] = field(default_factory=dict)
-    slowest_s: float = 0.0
-    slowest_seed: int = -1
-    max_mb: float = 0.0
-
-    def add(self, record: dict[str, Any]) -> None:
-        """Count one case."""
-        self.n += 1
-        self.codes[str(record["code"])] += 1
-        self.max_mb = max(self.max_mb, record["mb"])
-        if record["s"] > self.slowest_s:
-            self.slowest_s, self.slowest_seed = record["s"], record["seed"]
-        for problem in record["problems"]:
-            self.problems.setdefault(problem, []).append(record["seed"])
 
 
 class Cases:
@@ -416,8 +384,8 @@ def _call(arguments: list[str]) -> tuple[int, str]:
     return int(code), "\n".join([out.getvalue(), err.getvalue(), *(f"{_PAST} {line}" for line in lines[-1:])])
 
 
-def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> Verdict:
-    """Run `n` cases with seeds from `seed` on, in one process after the other.
+def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> list[dict[str, Any]]:
+    """Run `n` cases with seeds from `seed` on, in one process after the other; what came of each.
 
     Args:
         n: cases.
@@ -425,7 +393,8 @@ def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> Verdic
         folder: of samples and scratch files.
         seconds: begin no case after so long; None: run all.
     """
-    verdict, pool, end = Verdict(), None, time.monotonic() + (seconds or 1e9)
+    records: list[dict[str, Any]] = []
+    pool, end = None, time.monotonic() + (seconds or 1e9)
     for number in range(seed, seed + n):
         if time.monotonic() > end:
             break
@@ -438,16 +407,24 @@ def run(n: int, seed: int, folder: Path, seconds: float | None = None) -> Verdic
         except (TimeoutError, BrokenProcessPool) as error:
             reason = "the process ended" if isinstance(error, BrokenProcessPool) else "no answer for too long"
             record = {"seed": number, "code": reason, "s": 0.0, "mb": np.inf, "problems": [reason]}
-        verdict.add(record)
-        if record["mb"] == np.inf:
             for process in multiprocessing.active_children():
                 process.kill()
+        records.append(record)
         if record["mb"] > MAX_MB:
             pool.shutdown()
             pool = None
     if pool is not None:
         pool.shutdown()
-    return verdict
+    return records
+
+
+def problems_of(records: list[dict[str, Any]]) -> dict[str, list[int]]:
+    """What went wrong, with the seeds of the cases."""
+    found: dict[str, list[int]] = {}
+    for record in records:
+        for problem in record["problems"]:
+            found.setdefault(problem, []).append(record["seed"])
+    return found
 
 
 def _begin(folder: Path) -> None:
@@ -473,14 +450,16 @@ def main(arguments: list[str]) -> int:
     given = parser.parse_args(arguments)
     first = 1_000_000 * given.seed
     with tempfile.TemporaryDirectory() as folder:
-        verdict = run(given.count, first, Path(folder), given.seconds)
-    for problem, seeds in verdict.problems.items():
+        records = run(given.count, first, Path(folder), given.seconds)
+    problems, slowest = problems_of(records), max(records, key=lambda record: record["s"])
+    for problem, seeds in problems.items():
         print(f"{len(seeds)} cases, such as {seeds[:5]}: {problem}")
+    codes, max_mb = Counter(str(record["code"]) for record in records), max(record["mb"] for record in records)
     print(
-        f"{verdict.n} cases with seeds from {first} on; exit codes {dict(sorted(verdict.codes.items()))}; slowest "
-        f"{verdict.slowest_s:.1f} s (seed {verdict.slowest_seed}); at most {verdict.max_mb:.0f} MB"
+        f"{len(records)} cases with seeds from {first} on; exit codes {dict(sorted(codes.items()))}; slowest "
+        f"{slowest['s']:.1f} s (seed {slowest['seed']}); at most {max_mb:.0f} MB"
     )
-    return 1 if verdict.problems else 0
+    return 1 if problems else 0
 
 
 if __name__ == "__main__":

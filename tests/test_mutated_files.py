@@ -54,10 +54,7 @@ def test_what_goes_wrong_is_a_problem_with_its_seed(
     monkeypatch.setattr(mutated_files, "peak_memory_mb", lambda: 100.0)  # This process has run other tests.
     assert cases.run(1)["problems"] == []
     monkeypatch.setattr(mutated_files, "_call", lambda *_: (1, "vlc-rx: internal error (IndexError: 5)"))
-    record = cases.run(7)
-    verdict = mutated_files.Verdict()
-    verdict.add(record)
-    [(problem, seeds)] = verdict.problems.items()
+    [(problem, seeds)] = mutated_files.problems_of([cases.run(7)]).items()
     assert "internal error (IndexError: 5)" in problem
     assert seeds == [7]
 
@@ -75,20 +72,6 @@ def _outcome(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     said = capsys.readouterr()
     assert "internal error" not in said.out + said.err
     return said.out
-
-
-@pytest.mark.parametrize(("seed", "name"), [(77000206, "a.ts"), (77000377, "a.webp")])
-def test_a_clock_that_runs_away_is_no_clock(
-    seed: int, name: str, cases: mutated_files.Cases, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Least squares on damaged pictures went to negative periods, or out of the picture, and ended in an error."""
-    rng, data = random.Random(seed), cases.samples[f"blind/{name}"]
-    rng.random()  # the kind of the case, and the sample: what was drawn first
-    rng.choice(range(17))
-    for _ in range(rng.choice((1, 1, 2, 3))):
-        data = rng.choice(mutated_files.MUTATIONS)(data, rng)
-    (tmp_path / name).write_bytes(data)
-    _outcome([str(tmp_path / name), "--no-skip", "no_screen"], capsys)
 
 
 @pytest.mark.parametrize("height", [1, 2, 24, 47, 66])

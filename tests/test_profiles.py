@@ -261,6 +261,7 @@ def test_python_checks_values_as_files_are_checked(kind: Any, change: dict[str, 
         kind(**(good[kind] | change))
     screen = ScreenProfile(**good[ScreenProfile] | {"columns": np.int64(20), "slot_rate_hz": np.float32(8650)})
     assert screen == ScreenProfile(**good[ScreenProfile])
+    assert (screen.format, screen.kind, screen.packet_slots) == (1, "screen", 70)
     assert type(screen.slot_rate_hz) is float
     lens = LensModel(**good[LensModel] | {"dist_coeffs": np.array([0.1, 0, 0, 0])})
     assert lens == LensModel(**good[LensModel])

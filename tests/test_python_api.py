@@ -91,13 +91,6 @@ def test_impossible_options_are_told(options: dict[str, object], message: str) -
         rxcli.Receiver(**options)
 
 
-def test_profiles_need_no_formalities() -> None:
-    screen = rxcli.ScreenProfile(name="mine", columns=12, slot_rate_hz=12000.0, payload_symbols=8)
-    assert (screen.format, screen.kind, screen.packet_slots) == (1, "screen", 100)
-    assert rxcli.load_profile("xs10").kind == "camera"
-    assert rxcli.load_profile("paper-17k3").kind == "screen"
-
-
 def test_a_photo_gives_its_packets_from_a_path_or_a_frame(tapped: tuple[rxcli.FrameResult, rxcli.Taps]) -> None:
     result, taps = tapped
     assert result.status == "ok"
@@ -140,7 +133,7 @@ def test_arrays_without_a_screen_are_numbered_and_have_no_taps() -> None:
     assert (result.status, taps) == ("no_screen", None)
 
 
-def test_taps_that_are_none_are_told(tmp_path: Path) -> None:
+def test_taps_that_are_none_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", corners=np.zeros((4, 2)))
     for name in ("a.npz", "b.npz"):
         with pytest.raises(rxcli.InputError, match="not the taps of a photograph"):
@@ -167,13 +160,3 @@ def test_a_denoiser_may_be_ones_own() -> None:
     assert recorder.columns == list(range(20))
     assert result.denoiser is not None
     assert result.denoiser["model"] == "recorder"
-
-
-def test_a_text_comes_out(tmp_path: Path) -> None:
-    from rxcli.cli.main import run
-
-    path = tmp_path / "hello.jpg"
-    arguments = ["--preset", "phone-plain", "--scale", "0.4", "--keep-readout", "--text", "hello", "--seed", "1"]
-    assert run(["simulate", str(path), "--screen", "data-17k3", "--picture", "sky", *arguments]) == 0
-    result = rxcli.decode(path, cae="never")
-    assert [message.text for message in result.messages] == ["hello"]

@@ -18,15 +18,7 @@ from pathlib import Path
 BUFFER_BYTES = 8 << 20
 MAX_BUFFERS = 8
 #: Name -> bits per pixel of the frame in memory (0: compressed), bytes per pixel in a row of its first plane.
-FORMATS = {
-    "GREY": (8, 1),
-    "Y10 ": (16, 2),
-    "Y12 ": (16, 2),
-    "Y16 ": (16, 2),
-    "YUYV": (16, 2),
-    "NV12": (12, 1),
-    "MJPG": (0, 0),
-}
+FORMATS = {"GREY": (8, 1), **dict.fromkeys(("Y10 ", "Y12 ", "Y16 ", "YUYV"), (16, 2)), "NV12": (12, 1), "MJPG": (0, 0)}
 _SHIFTS = {"Y10 ": 2, "Y12 ": 4, "Y16 ": 8}
 #: Controls: id -> type, name, least and greatest value.
 _LIMITS = {

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import simplejpeg
 import tifffile
+from ingest_files import one_frame
 from numpy.typing import NDArray
 from PIL import Image
 
 from rxcli.errors import InputError
-from rxcli.ingest import open_source
 from rxcli.ingest.metadata import exif_metadata, jpeg_metadata
-from rxcli.types import Frame, Metadata
+from rxcli.types import Metadata
 
 HEIGHT, WIDTH = 48, 80
 
@@ -27,13 +27,6 @@ def grey() -> NDArray[np.uint8]:
     """A smooth picture without any symmetry."""
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     return (3 * y + x + 20 * (y < 10) * (x > 60)).astype(np.uint8)
-
-
-def one_frame(path: Path) -> Frame:
-    frames = list(open_source(path))
-    assert len(frames) == 1
-    assert frames[0].source == str(path)
-    return frames[0]
 
 
 def exif_bytes(orientation: int = 1) -> bytes:
@@ -124,16 +117,21 @@ class TestPngAndTiff:
         np.testing.assert_array_equal(frame.pixels, grey)
         assert frame.metadata == EXPECTED
 
-    def test_palette_and_alpha(self, tmp_path: Path, grey: NDArray[np.uint8]) -> None:
-        image = Image.fromarray(grey)
-        for name, mode in (("p.png", "P"), ("a.png", "RGBA")):
-            image.convert(mode).save(tmp_path / name)
-            np.testing.assert_array_equal(one_frame(tmp_path / name).pixels, grey)
-
-    @pytest.mark.parametrize("suffix", ["bmp", "webp"])
-    def test_what_messengers_send(self, tmp_path: Path, grey: NDArray[np.uint8], suffix: str) -> None:
-        Image.fromarray(grey).convert("RGB").save(tmp_path / f"a.{suffix}", lossless=True)
-        np.testing.assert_array_equal(one_frame(tmp_path / f"a.{suffix}").pixels, grey)
+    @pytest.mark.parametrize(
+        ("name", "mode", "options"),
+        [
+            ("a.png", "P", {}),
+            ("a.png", "RGBA", {}),
+            ("a.tif", "P", {"compression": "tiff_lzw"}),
+            ("a.bmp", "RGB", {}),  # what messengers send
+            ("a.webp", "RGB", {"lossless": True}),
+        ],
+    )
+    def test_other_modes_and_formats(
+        self, tmp_path: Path, grey: NDArray[np.uint8], name: str, mode: str, options: dict[str, Any]
+    ) -> None:
+        Image.fromarray(grey).convert(mode).save(tmp_path / name, **options)
+        np.testing.assert_array_equal(one_frame(tmp_path / name).pixels, grey)
 
 
 class TestHeif:

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from ingest_files import BAYER, XTRANS, write_dng
+from ingest_files import BAYER, XTRANS, one_frame, write_dng
 from numpy.typing import NDArray
 from PIL import Image
 
 from rxcli.errors import InputError
-from rxcli.ingest import open_source
 from rxcli.ingest.extent import bytes_claimed
 from rxcli.ingest.metadata import raw_metadata
 from rxcli.ingest.raw import default_crop
@@ -29,11 +28,6 @@ HEIGHT, WIDTH = 300, 400
 @pytest.fixture
 def noise() -> NDArray[np.uint16]:
     return np.random.default_rng(2).integers(90, 4000, (HEIGHT, WIDTH), dtype=np.uint16)
-
-
-def one_frame(path: Path) -> Frame:
-    (frame,) = open_source(path)
-    return frame
 
 
 def mosaic_of(frame: Frame) -> Mosaic:
@@ -87,33 +81,25 @@ class TestMosaic:
 
 def test_linear_dng_gives_green(tmp_path: Path, noise: NDArray[np.uint16]) -> None:
     rgb = np.stack([noise, noise // 2 + 200, noise // 4 + 300], axis=2)
-    path = write_dng(tmp_path / "a.dng", noise, BAYER)
-    tags = [
-        (271, "s", 0, "Synthetic", True),
-        (272, "s", 0, "cam", True),
-        (50706, "B", 4, b"\x01\x04\0\0", True),
-        (50708, "s", 0, "Synthetic cam", True),
-        (50714, "H", 3, (100, 100, 100), True),
-        (50717, "I", 3, (4000, 4000, 4000), True),
-    ]
-    tifffile.imwrite(path, rgb, photometric=34892, planarconfig=1, extratags=tags, metadata=None)
-    frame = one_frame(path)
+    tags = [(50706, "B", 4, b"\x01\x04\0\0", True), (50708, "s", 0, "Synthetic cam", True)]
+    tags += [(50714, "H", 3, (100,) * 3, True), (50717, "I", 3, (4000,) * 3, True)]
+    tifffile.imwrite(tmp_path / "a.dng", rgb, photometric=34892, planarconfig=1, extratags=tags, metadata=None)
+    frame = one_frame(tmp_path / "a.dng")
     assert frame.mosaic is None
     assert frame.linear
     np.testing.assert_array_equal(frame.pixels, rgb[:, :, 1])
     assert (frame.black, frame.white) == (100, 4000)
 
 
-def test_dng_under_another_name(tmp_path: Path, noise: NDArray[np.uint16]) -> None:
-    write_dng(tmp_path / "a.dng", noise, XTRANS).rename(tmp_path / "a.jpg")
-    np.testing.assert_array_equal(one_frame(tmp_path / "a.jpg").pixels, noise)
-
-
-def test_plain_tiff_under_a_raw_name(tmp_path: Path, noise: NDArray[np.uint16]) -> None:
-    tifffile.imwrite(tmp_path / "a.tif", noise)
-    (tmp_path / "a.tif").rename(tmp_path / "a.dng")
-    frame = one_frame(tmp_path / "a.dng")
-    assert frame.mosaic is None
+@pytest.mark.parametrize("is_dng", [True, False])
+def test_content_decides_and_not_the_name(tmp_path: Path, noise: NDArray[np.uint16], is_dng: bool) -> None:
+    path = tmp_path / ("a.jpg" if is_dng else "a.dng")
+    if is_dng:
+        write_dng(tmp_path / "b.dng", noise, XTRANS).rename(path)
+    else:
+        tifffile.imwrite(path, noise, metadata=None)
+    frame = one_frame(path)
+    assert (frame.mosaic is not None) == is_dng
     np.testing.assert_array_equal(frame.pixels, noise)
 
 
