@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,6 +58,11 @@ def receive(frames: Iterator[FrameSoftBits], receiver: LinkReceiver | None = Non
     return events + receiver.finish()
 
 
+def contents(events: Iterable[Message | ReceivedObject]) -> list[str | bytes | None]:
+    """Texts of messages, data of files."""
+    return [event.text if isinstance(event, Message) else event.data for event in events]
+
+
 @pytest.mark.parametrize(
     ("first", "mother", "size", "n_frames"),
     [
@@ -70,9 +75,7 @@ def test_a_file_comes_at_every_rate_from_a_clip_that_begins_anywhere(
 ) -> None:
     rng = np.random.default_rng(first)
     data = rng.bytes(size)
-    (event,) = receive(clip(file_object("a.bin", data, mother=mother), first, n_frames, rng))
-    assert isinstance(event, ReceivedObject)
-    assert (event.name, event.data) == ("a.bin", data)
+    assert contents(receive(clip(file_object("a.bin", data, mother=mother), first, n_frames, rng))) == [data]
 
 
 def test_what_was_seen_before_the_first_announcement_counts() -> None:
@@ -89,9 +92,7 @@ def test_columns_in_the_dark_and_small_weights() -> None:
     rng = np.random.default_rng(4)
     data = rng.bytes(3000)
     dark = tuple(-np.inf if c in (0, 7, 8) else 12.0 for c in range(COLUMNS))
-    (event,) = receive(clip(file_object("a.bin", data), 9, 120, rng, dark, w=2))
-    assert isinstance(event, ReceivedObject)
-    assert event.data == data
+    assert contents(receive(clip(file_object("a.bin", data), 9, 120, rng, dark, w=2))) == [data]
 
 
 @pytest.mark.parametrize("length", [1, 7, 8, 31, 63, 127, 199])
@@ -100,7 +101,7 @@ def test_messages_of_every_length(length: int, symbols: int) -> None:
     rng = np.random.default_rng(length)
     frames = clip(message("x" * length), int(rng.integers(0, 1000)), 6, rng, symbols=symbols)
     events = receive(frames, LinkReceiver(COLUMNS, symbols))
-    assert [event.text for event in events if isinstance(event, Message)] == ["x" * length]
+    assert contents(events) == ["x" * length]
 
 
 def test_ten_columns_in_the_dark_leave_a_text_of_32_bytes_in_one_photo() -> None:
@@ -110,7 +111,7 @@ def test_ten_columns_in_the_dark_leave_a_text_of_32_bytes_in_one_photo() -> None
         sending = message("m" * 31)
         llr = detect(sending.labels(np.arange(1), COLUMNS, symbols), 5, dark, rng)
         receiver = LinkReceiver(COLUMNS, symbols)
-        assert [e.text for e in receiver.add(FrameSoftBits(np.arange(1), llr)) if isinstance(e, Message)] == ["m" * 31]
+        assert contents(receiver.add(FrameSoftBits(np.arange(1), llr))) == ["m" * 31]
 
 
 def test_photos_of_one_beacon_are_combined() -> None:
@@ -152,7 +153,7 @@ def test_clips_of_an_object_whose_start_is_not_shared_add_up() -> None:
     sending, receiver = file_object("a", data), LinkReceiver(COLUMNS, SYMBOLS)
     events = receive(clip(sending, 20, 14, rng, epoch=1), receiver)
     events += receive(clip(sending, 5000, 25, rng, epoch=2), receiver)
-    assert [e.data for e in events if isinstance(e, ReceivedObject)] == [data]
+    assert contents(events) == [data]
 
 
 def test_progress_says_what_is_missing() -> None:
@@ -219,7 +220,7 @@ def test_the_least_complete_of_many_files_are_dropped() -> None:
         events += receiver.add(frame)
         assert receiver.add(replace(bait, epoch=epoch)) == []
         assert sum(file.n_bytes for file in receiver._files.files.values() if file.under_way) <= 120 << 20
-    assert [event.data for event in events if isinstance(event, ReceivedObject)] == [data]
+    assert contents(events) == [data]
     [note] = receiver.notes
     assert "incomplete files were dropped: together they would take more than 120 MB (--file-memory)" in note
 
@@ -261,7 +262,7 @@ def test_ratios_that_are_no_numbers_are_erasures() -> None:
     frames[0].llr[:, :, 3] = np.nan
     frames[0].llr[:, 1] = np.copysign(np.inf, frames[0].llr[:, 1])
     frames[0].llr[1:, 0] = -np.nan
-    assert [e.text for e in receive(iter(frames)) if isinstance(e, Message)] == ["hello"]
+    assert contents(receive(iter(frames))) == ["hello"]
 
 
 def test_wrong_shapes_are_refused() -> None:
