@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -17,10 +18,12 @@ from fake_receiver import fake_decoder
 from small_frames import write_frame, write_profiles
 
 from rxcli.cli.main import run
-from rxcli.errors import UsageError
+from rxcli.errors import OutputError, UsageError
 from rxcli.results.record import to_json_line
+from rxcli.runs import cluster
 from rxcli.runs.batch import Source, decode_here
 from rxcli.runs.cluster import decode_on_cluster
+from rxcli.types import Frame
 
 pytest.importorskip("distributed", reason="dask.distributed is not installed (extra cluster)")
 
@@ -128,6 +131,30 @@ def test_taps_land_where_the_user_is(
 
 
 KINDS = (("straight", ".00000.png"), ("taps", "-000000.npz"))
+
+
+@dataclass(frozen=True)
+class Writer:
+    """Writes 3 MB for every frame."""
+
+    folder: Path
+
+    def __call__(self, frame: Frame, subfolder: str) -> None:
+        self.folder.mkdir()
+        (self.folder / "a.png").write_bytes(bytes(3 << 20))
+
+
+def test_taps_come_back_with_the_results_unless_they_are_too_large(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, decoder = write_orders(tmp_path)[0], replace(fake_decoder(), tap=Writer(tmp_path / "there"))
+    results, taps = cluster._decode(decoder, source)
+    assert [result.status for result in results] == ["ok"]
+    assert taps == [("--save-undistorted/a.png", bytes(3 << 20))]
+    assert not (tmp_path / "there").exists()
+    monkeypatch.setattr(cluster, "_MAX_TAPPED", 1 << 20)
+    with pytest.raises(OutputError, match=r"00\.jpg: its taps take 3 MB; a cluster sends at most 1 MB"):
+        cluster._decode(decoder, source)
 
 
 def test_a_scheduler_that_is_not_there(tmp_path: Path) -> None:
