@@ -24,6 +24,7 @@ from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.search import search
+from rxcli.receiver.settings import STILL
 from rxcli.receiver.still import decode, doubtful_columns
 from rxcli.types import Clock, FloatArray
 
@@ -79,13 +80,18 @@ def frame_samples(n_frames: int, seed: int, folder: Path, *, progress: bool = Tr
 
 
 def validation_samples(n_frames: int, folder: Path, *, progress: bool = True) -> list[Sample]:
-    """Samples of pictures and cameras that are not trained on, all scene classes in turn."""
+    """Samples of the first validation frames."""
+    return list(_cached(validation_sample, n_frames, folder / "validation", "validation", progress))
 
-    def make(number: int) -> Sample | None:
-        kind, turn = SCENE_CLASSES[number % len(SCENE_CLASSES)], number // len(SCENE_CLASSES)
-        return _simulated(validation_scene(kind, _SCREENS[turn % 2], turn // 2), _VALIDATION + number)
 
-    return list(_cached(make, n_frames, folder / "validation", "validation", progress))
+def validation_sample(number: int) -> Sample | None:
+    """Sample of a picture and a camera not trained on, all scene classes in turn, or None.
+
+    It holds columns that the receiver uses the network for; training also uses hopeless ones.
+    """
+    kind, turn = SCENE_CLASSES[number % len(SCENE_CLASSES)], number // len(SCENE_CLASSES)
+    scene = validation_scene(kind, _SCREENS[turn % 2], turn // 2)
+    return _simulated(scene, _VALIDATION + number, STILL.beyond_repair_log_prob)
 
 
 def _cached(make: Callable[[int], Sample | None], n: int, folder: Path, what: str, progress: bool) -> Iterator[Sample]:
@@ -105,14 +111,14 @@ def _cached(make: Callable[[int], Sample | None], n: int, folder: Path, what: st
             yield sample
 
 
-def _simulated(simulated: SimulatedScene, seed: int) -> Sample | None:
-    """One frame as a sample; None where the receiver finds no clock, a wrong one, or nothing doubtful."""
+def _simulated(simulated: SimulatedScene, seed: int, beyond_repair: float = -np.inf) -> Sample | None:
+    """One frame as a sample; None if the receiver finds no clock, a wrong one, or no doubtful column."""
     trial = simulate_trial(simulated, seed)
     found = search(trial.frame, trial.options(), Timer())
     if isinstance(found, Failure):
         return None
     reception = decode(found.best.acquisition, trial.options().skip)
-    scene, columns = reception.scene, doubtful_columns(reception)
+    scene, columns = reception.scene, doubtful_columns(reception, beyond_repair)
     if scene is None or not columns.size:
         return None
     slots = sent_slots(trial.capture.exposure, scene.clock)

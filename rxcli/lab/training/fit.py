@@ -25,7 +25,7 @@ _WEIGHT_DECAY, _LARGEST_GRADIENT = 5e-2, 1.0
 #: Steps over which the stored weights are averaged.
 _AVERAGED_STEPS = 200
 #: Samples of a batch, columns of each, and how often strips are left out of a sample, down to how many.
-_BATCH_SAMPLES, _BATCH_COLUMNS, _THINNED, _MIN_STRIPS = 2, 4, 0.5, 3
+_BATCH_SAMPLES, _BATCH_COLUMNS, _THINNED, _MIN_STRIPS = 4, 2, 0.5, 3
 
 
 @dataclass(frozen=True)

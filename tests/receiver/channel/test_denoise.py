@@ -14,8 +14,9 @@ import pytest
 
 from rxcli.errors import ProfileError
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
+from rxcli.lab.training.dataset import UNKNOWN, Sample, validation_sample
 from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
-from rxcli.protocol import HEADER, bits_per_symbol, encode_packet
+from rxcli.protocol import HEADER, bits_per_symbol, codebook, encode_packet
 from rxcli.receiver import channel, still
 from rxcli.receiver.channel import denoise, metrics_of
 from rxcli.receiver.channel.denoise import COLUMN_FEATURES, STRIP_FEATURES, DenoiserInput, load_denoiser, network_inputs
@@ -250,6 +251,39 @@ def test_shipped_models_contradict_wrong_beliefs(name: str) -> None:
     towards = load_denoiser(name).slot_corrections(doubted, np.arange(N_COLUMNS)) * (2 * scene.lit - 1)
     assert (towards[wrong] > 0).mean() > 0.8
     assert towards[wrong].mean() > towards[~wrong].mean() + 0.5
+
+
+#: The first validation frame of each scene class with doubtful columns.
+DOUBTFUL_FRAMES = (2, 3, 4, 5, 19, 36)
+
+
+def cross_entropy(sample: Sample, corrections: np.ndarray) -> float:
+    """Sum over the words that were sent, after corrections (B, N) of slots."""
+    n_columns = sample.w.size
+    before, n_slots = int(sample.first_slot), sample.burst.size * int(sample.packet_slots)
+    of_packets = np.pad(corrections * sample.reception, ((0, 0), (before, n_slots)))[:, :n_slots]
+    copies = of_packets.reshape(n_columns, sample.burst.size, -1)[..., 20:]
+    total = 0.0
+    for burst, column, symbol in zip(*np.nonzero(sample.words != UNKNOWN), strict=True):
+        words = codebook(int(sample.w[column]))
+        slots = copies[column, sample.burst == burst].sum(axis=0)[10 * symbol :][:10]
+        scores = sample.scores[burst, column, symbol, : len(words)] + words @ slots
+        total += np.logaddexp.reduce(scores) - scores[sample.words[burst, column, symbol]]
+    return total
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_make_the_words_that_were_sent_likelier(name: str) -> None:
+    """Cross-entropy per word of frames not trained on, against that without a network."""
+    samples = [sample for number in DOUBTFUL_FRAMES if (sample := validation_sample(number)) is not None]
+    assert len(samples) == len(DOUBTFUL_FRAMES)
+    session = load_denoiser(name)._session
+    sums = np.zeros(2)
+    for sample in samples:
+        fed = {part: getattr(sample, part).astype(np.float32) for part in ("strips", "columns")}
+        corrections = session.run(["correction"], fed)[0]
+        sums += [cross_entropy(sample, values) for values in (corrections, np.zeros_like(corrections))]
+    assert sums[0] <= 0.92 * sums[1], sums[0] / sums[1]
 
 
 def test_slots_that_are_not_seen_and_preambles_are_left_alone(scene: DenoiserInput) -> None:
