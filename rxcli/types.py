@@ -263,6 +263,11 @@ class BurstPosteriors:
         """Posteriors of some columns."""
         return BurstPosteriors(*(getattr(self, f.name)[_columns_of(f.name, columns)] for f in fields(self)))
 
+    def of_burst(self, index: int) -> BurstPosteriors:
+        """Posteriors of one burst."""
+        own = (f.name for f in fields(self) if f.name not in _BY_COLUMN)
+        return replace(self, **{name: getattr(self, name)[index : index + 1] for name in own})
+
     def with_columns(self, columns: IntArray, some: BurstPosteriors) -> BurstPosteriors:
         """Replace the posteriors of the named columns by `some`."""
 
@@ -274,9 +279,13 @@ class BurstPosteriors:
         return BurstPosteriors(*(merged(f.name) for f in fields(self)))
 
 
+#: Fields of posteriors whose first axis is the columns; that of the others is the bursts.
+_BY_COLUMN = ("w", "w_log_prob", "log_evidence")
+
+
 def _columns_of(name: str, columns: IntArray) -> Any:
     """Index of some columns in a field; bursts are the first axis of all fields but weights and evidence."""
-    return columns if name in ("w", "w_log_prob", "log_evidence") else (slice(None), columns)
+    return columns if name in _BY_COLUMN else (slice(None), columns)
 
 
 FrameStatus = Literal["ok", "partial", "no_screen", "no_signal", "unreadable"]

@@ -129,37 +129,22 @@ class Bursts:
         assert waiting.numbers is not None
         return [self._open[number] for number in waiting.numbers.tolist() if number in self._open]
 
-    def detect_stale(self, *frames: Waiting) -> None:
-        """Detect the bursts of frames that were added to since they were looked at."""
-        asked: list[tuple[Waiting, list[Burst]]] = []
-        for waiting in frames:
-            asked.append((waiting, [burst for burst in self.of(waiting) if burst.is_stale]))
-            for burst in asked[-1][1]:
-                burst.is_stale = False
-        self.detect(asked, self.dark_too)
+    def detect_stale(self, waiting: Waiting) -> None:
+        """Detect the bursts of a frame that were added to since they were looked at."""
+        self.detect(waiting, [burst for burst in self.of(waiting) if burst.is_stale], self.dark_too)
 
-    def detect(self, asked: Sequence[tuple[Waiting, list[Burst]]], dark_too: bool) -> None:
-        """Detect open bursts of frames in columns that are not dark, unless these are to be tried too.
-
-        All at once, for each symbol's turn costs the same; only the weights are settled frame by frame.
-        """
-        metrics, weights, places = [], [], []
-        for waiting, bursts in asked:
-            assert waiting.view is not None
-            tried = np.flatnonzero(~self._dark(waiting.view) | dark_too)
-            waiting.skip("dark_columns", len(bursts) * (len(waiting.view.snr) - tried.size))
-            if bursts and tried.size:
-                own = np.stack(with_common_memory([burst.metrics[tried] for burst in bursts]))
-                metrics += list(own)
-                weights += [_likeliest_weights(own)] * len(bursts)
-                places += [(burst, tried) for burst in bursts]
-            for burst in bursts:
-                burst.is_stale = False
-        if places:
-            found = detect.detect(np.concatenate(with_common_memory(metrics))[None], np.concatenate(weights))
-            ends = np.cumsum([tried.size for _, tried in places])
-            for (burst, tried), end in zip(places, ends.tolist(), strict=True):
-                burst.detected(tried, found.of_columns(np.arange(end - tried.size, end)))
+    def detect(self, waiting: Waiting, bursts: Sequence[Burst], dark_too: bool) -> None:
+        """Detect open bursts of a frame together, for they share the columns' weights; dark columns if `dark_too`."""
+        assert waiting.view is not None
+        tried = np.flatnonzero(~self._dark(waiting.view) | dark_too)
+        waiting.skip("dark_columns", len(bursts) * (len(waiting.view.snr) - tried.size))
+        if bursts and tried.size:
+            metrics = np.stack(with_common_memory([burst.metrics[tried] for burst in bursts]))
+            found = detect.detect(metrics, detect.plausible_weights(metrics, receiver_settings.weight_margin))
+            for index, burst in enumerate(bursts):
+                burst.detected(tried, found.of_burst(index))
+        for burst in bursts:
+            burst.is_stale = False
 
     def _dark(self, view: View) -> BoolArray:
         """(C,) columns of a tracked frame with too little light to try; now and then they are tried all the same."""
@@ -217,16 +202,6 @@ def with_common_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:
         return np.pad(every, [*more, (0, n_metrics - some.shape[-2]), (0, 0)])
 
     return [written(some) for some in metrics]
-
-
-def _likeliest_weights(metrics: FloatArray) -> BoolArray:
-    """(C, 9) the likeliest weight of each column, by all bursts (B, C, ...) of a frame."""
-    weights = detect.plausible_weights(metrics, receiver_settings.weight_margin)
-    several = np.flatnonzero(weights.sum(axis=1) > 1)
-    if several.size:
-        found = detect.detect(metrics[:, several], weights[several])
-        weights[several] = np.array(WEIGHTS) == found.w[:, None]
-    return weights
 
 
 def _unobserved(like: FloatArray, n: int) -> BurstPosteriors:

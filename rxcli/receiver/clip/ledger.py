@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -289,11 +288,9 @@ class Ledger:
         self._bursts.begin()
         waiting = [w for w in self._waiting if w.numbers is not None]
         numbers = [self._add(w) for w in waiting]
-        ended = [
-            (each, [burst for burst in self._bursts.of(each) if burst.number not in following])
-            for each, following in zip(waiting, [*numbers[1:], numbers[0][:0]], strict=True)
-        ]
-        self._bursts.detect(ended, dark_too=False)
+        for each, following in zip(waiting, [*numbers[1:], numbers[0][:0]], strict=True):
+            ended = [burst for burst in self._bursts.of(each) if burst.number not in following]
+            self._bursts.detect(each, ended, dark_too=False)
         tracked = [w.view for w in waiting if w.view is not None and w.view.flat is not None]
         if self._scene is not None and tracked:
             self._scene.last = tracked[-1]
@@ -313,30 +310,21 @@ class Ledger:
             self._settle_bursts()
         if self._n_held:
             self._receive_first_again(at_last=True)
-        done = self._ready(at_last=True)
+        done = self._ready()
         done += [self._report(waiting, None) for waiting in self._waiting]
         self._waiting.clear()
         return done
 
-    def _ready(self, at_last: bool = False) -> list[FrameResult]:
-        """Results of the frames whose bursts all ended, oldest first: of some together, for that takes less time each,
-        unless it is `at_last` or results are wanted promptly."""
-        n_ended = 0 if self._n_held else self._n_ended()
-        if n_ended < (1 if at_last or self._options.prompt else SETTINGS.reports_together):
-            return []
-        ended = [w for w in islice(self._waiting, n_ended) if w.view is not None]
-        self._bursts.detect_stale(*ended)
-        done = []
-        for _ in range(n_ended):
-            oldest = self._waiting.popleft()
-            done.append(self._report(oldest, self._waiting[0] if self._waiting else None))
+    def _ready(self) -> list[FrameResult]:
+        """Results of the frames whose bursts all ended, oldest first."""
+        done: list[FrameResult] = []
+        while self._waiting and not self._n_held:
+            oldest, following = self._waiting[0], self._waiting[1] if len(self._waiting) > 1 else None
+            unsettled = following is None or (following.view is not None and following.numbers is None)
+            if oldest.view is not None and (oldest.numbers is None or unsettled):
+                break
+            done.append(self._report(self._waiting.popleft(), following))
         return done
-
-    def _n_ended(self) -> int:
-        """How many of the frames that wait, from the oldest on, can be reported."""
-        entered = [*(each.view is None or each.numbers is not None for each in self._waiting), False]
-        ended = [each.view is None or all(entered[n : n + 2]) for n, each in enumerate(self._waiting)]
-        return [*ended, False].index(False)
 
     def _report(self, waiting: Waiting, following: Waiting | None) -> FrameResult:
         view, bursts = waiting.view, self._bursts

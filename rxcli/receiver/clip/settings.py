@@ -90,8 +90,6 @@ class ClipSettings:
     readout_slack: float = 1.1
     #: Frames that find their clock together where each shows little.
     frames_together: int = 8
-    #: Frames that are reported together where nobody asks for results promptly.
-    reports_together: int = 4
     #: Frames that may wait until it is clear which copies begin a burst.
     max_waiting_frames: int = 8
 
