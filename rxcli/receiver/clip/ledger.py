@@ -280,8 +280,7 @@ class Ledger:
         assert self._scene is not None
         known = [self._bursts.lit(waiting) for waiting in held]
         doubtful = [len(held) <= SETTINGS.frames_held or self._bursts.doubts(waiting)[0] > 0 for waiting in held]
-        numbers = [w.numbers for w in held if w.numbers is not None]
-        self._scene.measure_again([w.view for w in held if w.view is not None], known, numbers, doubtful)
+        self._scene.measure_again([w.view for w in held if w.view is not None], known, doubtful)
 
     def _detect_again(self) -> None:
         """The bursts of all frames that wait, each once: in the last frame that shows it."""

@@ -271,8 +271,6 @@ def _receive_anew(
     if isinstance(located, Failure):
         return Lost(replace(known, camera=camera), state.n_unknown), located, None
     ledger.certainty = located.outline.certainty
-    if before is not None and before.is_at(located.outline.corners):
-        located = located.moved_to(before.corners)
     corners = located.outline.corners
     camera = camera.found_with(located, frame)
     assert camera.context is not None
@@ -306,13 +304,8 @@ def _receive_anew(
     if not _can_track(settled, camera.options):
         return replace(lost, n_unknown=n_unknown), view, report
     with timer("sampling"):
-        scene = TrackedScreen.of_frame(
-            settled.context,
-            settled.acquisition,
-            reception.model.black_level,
-            before,
-            camera.options.corners is not None,
-        )
+        named = camera.options.corners is not None
+        scene = TrackedScreen(settled.context, settled.acquisition, reception.model.black_level, named)
         view.light, view.pose = scene.strips(frame), scene.pose
     scene.update(view, lambda: reception.clock.on_grid(reception.posteriors.lit))
     if before is not None and n_unknown <= SETTINGS.max_unknown_frames and _goes_on(before, scene, view, ledger.time):

@@ -19,25 +19,24 @@ from rxcli.receiver.sampling import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
 from rxcli.receiver.sync import tracking
-from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, Lens, RowProfiles
+from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, RowProfiles
 
 
 class TrackedScreen:
     """A screen that is followed from frame to frame, and the picture on it.
 
     Args:
-        frame: that it begins with.
-        pose: of the screen there; the picture is known on its rows.
+        context: the frame that it begins with.
         acquisition: of that frame.
-        lens: of the camera.
         black_level: light of a dark slot there.
         named: whether the user gave the corners.
     """
 
-    def __init__(
-        self, frame: Frame, pose: Pose, acquisition: Acquisition, lens: Lens | None, black_level: float, named: bool
-    ) -> None:
-        self.pose = self._first_pose = pose
+    def __init__(self, context: FrameContext, acquisition: Acquisition, black_level: float, named: bool) -> None:
+        frame, lens = context.frame, context.camera.lens
+        #: Where the screen is; the picture is known on the rows where it was first.
+        self.pose = Pose(context.corners, _map(frame, context.corners, context.camera, acquisition))
+        self._first_pose = pose = self.pose
         #: The frame that was received last.
         self.last: View | None = None
         self._lens, self._named = lens, named
@@ -56,22 +55,6 @@ class TrackedScreen:
         self._rows_per_slot = acquisition.clock.rows_per_slot
         self._n_updates = 0
         self._picture = self._new_picture(black_level)
-
-    @classmethod
-    def of_frame(
-        cls,
-        context: FrameContext,
-        acquisition: Acquisition,
-        black_level: float,
-        before: TrackedScreen | None,
-        named: bool,
-    ) -> TrackedScreen:
-        """A new picture; the strips stay those of the scene before, where the screen is still there."""
-        n_columns, corners, camera = acquisition.screen.columns, context.corners, context.camera
-        pose = before.pose if before is not None and corners is before.corners else None
-        if pose is None or pose.map.inside.shape[0] != n_columns:
-            pose = Pose(corners, _map(context.frame, corners, camera, acquisition))
-        return cls(context.frame, Pose(pose.corners, pose.map), acquisition, camera.lens, black_level, named)
 
     def _new_picture(self, black_level: float | Float32Array) -> known_picture.KnownPicture:
         acquisition, strips = self._begun_with[0], self._first_pose.map
@@ -104,10 +87,6 @@ class TrackedScreen:
     def near(self, corners: FloatArray) -> bool:
         """Whether a screen found at the corners is where this one is."""
         return bool(np.abs(corners - self.corners).max() < SETTINGS.near_outline * np.ptp(self.corners[:, 0]))
-
-    def is_at(self, corners: FloatArray) -> bool:
-        """Whether a screen found at the corners may not have moved at all."""
-        return bool(np.abs(corners - self.corners).max() < SETTINGS.same_outline * np.ptp(self.corners[:, 0]))
 
     def _follow(self, frame: Frame) -> bool:
         """Find where the screen is in a frame, by the picture on it; returns whether that is certain."""
@@ -410,33 +389,20 @@ class TrackedScreen:
         """Whether a frame's strips are those of this screen."""
         return view.light is not None and view.pose is not None and view.pose.home is self._first_pose.map
 
-    def measure_again(
-        self,
-        views: Sequence[View],
-        known: Sequence[Float32Array],
-        numbers: Sequence[IntArray],
-        doubtful: Sequence[bool],
-    ) -> None:
+    def measure_again(self, views: Sequence[View], known: Sequence[Float32Array], doubtful: Sequence[bool]) -> None:
         """Learn the picture anew from frames, and measure doubtful ones with the picture of the others.
-
-        If there are enough frames, the picture for a frame leaves out all light of that frame's bursts.
 
         Args:
             views: the frames.
             known: (C, N) of each, probability that each slot is lit.
-            numbers: (B,) of each, the numbers of its bursts.
             doubtful: of each, whether it is to be measured.
         """
         self._n_updates = 0
         self._picture = self._new_picture(self._dark_light(views))
         observations = [self.learn(view, lit, forget=False) for view, lit in zip(views, known, strict=True)]
-        for view, observation, lit, shown, needed in zip(views, observations, known, numbers, doubtful, strict=True):
-            if needed:
-                remaining = (
-                    zip(observations, views, numbers, strict=True) if len(views) >= SETTINGS.enough_views else ()
-                )
-                own = (_of_bursts(*each, shown) for each in remaining if each[1] is not view)
-                self._measure_again(view, [each for each in (observation, *own) if each is not None], lit)
+        for view, observation, lit, needed in zip(views, observations, known, doubtful, strict=True):
+            if needed and observation is not None:
+                self._measure_again(view, observation, lit)
 
     def _dark_light(self, views: Sequence[View]) -> Float32Array:
         """(C, S) light of the strips where nothing is lit."""
@@ -449,8 +415,8 @@ class TrackedScreen:
                 inside.append(view.pose.map.inside)
         return known_picture.dark_light(lights, dark, inside, self._begun_with[1])
 
-    def _measure_again(self, view: View, own: Sequence[known_picture.Observation], known: Float32Array) -> None:
-        """Measure a frame by the picture, less what the frame's `own` bursts have shown of it."""
+    def _measure_again(self, view: View, own: known_picture.Observation, known: Float32Array) -> None:
+        """Measure a frame by the picture, less what the frame itself has shown of it."""
         assert view.light is not None
         assert view.pose is not None
         picture = self._picture.without(own).placed(view.pose.placement)
@@ -464,18 +430,6 @@ class TrackedScreen:
             view.flat, clock, _, found = refined
             view.snr = found.snr
             view.bursts = replace(view.bursts, clock=replace(clock, burst=burst), metrics=found.metrics, tracked=True)
-
-
-def _of_bursts(
-    observation: known_picture.Observation | None, view: View, numbers: IntArray, bursts: IntArray
-) -> known_picture.Observation | None:
-    """What a frame that shows the bursts `numbers` taught where it shows some of the `bursts`; None where none."""
-    if observation is None or view.pose is None or not np.isin(numbers, bursts).any():
-        return None
-    clock = view.bursts.clock
-    slots = np.clip((view.pose.rows - clock.row0) / clock.rows_per_slot, 0, clock.n_slots - 1)
-    copies = (slots.astype(np.int64) + clock.first_slot) // clock.packet_slots
-    return replace(observation, rows=np.isin(numbers[clock.burst[copies]], bursts))
 
 
 def _retimed(clock: Clock, rows: FloatArray, fit: known_picture.Fit) -> Clock:

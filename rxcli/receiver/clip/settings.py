@@ -11,9 +11,6 @@ class ClipSettings:
 
     #: Maximum number of strips of a column: more do not improve a known picture, and take time.
     max_strips: int = 4
-    #: Frames from which a frame is measured without what others that show its bursts have taught of the picture there;
-    #: of fewer, too little would be left.
-    enough_views: int = 6
     #: Movement that is none: pixels, or standard deviations of what was found.
     still_px: float = 0.3
     still_sds: float = 2.5

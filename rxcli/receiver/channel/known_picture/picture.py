@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -60,8 +59,6 @@ class Observation:
     #: Position of the picture, and (C, P) frame row of each picture row; None if unchanged since the first frame.
     placement: Placement | None = None
     frame_row: Float32Array | None = None
-    #: (R,) rows to use; None for all.
-    rows: BoolArray | None = None
 
 
 class KnownPicture:
@@ -123,15 +120,14 @@ class KnownPicture:
         self._observed = self._observed * keep + observed
         self._system = self._made = self._placed = None
 
-    def without(self, observations: Sequence[Observation]) -> KnownPicture:
-        """The picture without some observations, which were added with nothing forgotten since.
+    def without(self, observation: Observation) -> KnownPicture:
+        """The picture without an observation, which was added with nothing forgotten since.
 
         A picture that contains a frame's own light would confirm its decisions, wrong or right.
         """
         rest = copy(self)
-        for observation in observations:
-            lit, observed = self._update_of(observation)
-            rest._light, rest._observed = rest._light - lit, np.maximum(rest._observed - observed, 0)
+        lit, observed = self._update_of(observation)
+        rest._light, rest._observed = rest._light - lit, np.maximum(rest._observed - observed, 0)
         rest._system = rest._made = rest._placed = None
         rest._excess = self._excess.copy()
         return rest
@@ -146,8 +142,6 @@ class KnownPicture:
         power = expected * expected
         known = power / (power + np.float32(SETTINGS.prediction_error) + np.float32(SETTINGS.uncertain_error) * doubt)
         weighted = expected * (known * known) * np.maximum(1 - np.float32(SETTINGS.doubt_weight) * doubt, 0) * inside
-        if observation.rows is not None:
-            weighted *= observation.rows
         lit, observed = weighted * (observation.light - self._black_level), weighted * expected
         row = observation.frame_row
         if row is None:
