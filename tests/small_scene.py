@@ -7,6 +7,8 @@ from dataclasses import replace
 import msgspec
 
 from rxcli.lab.simulate.scenes import Scene, preset
+from rxcli.results.truth import Score, Scorer, Truth
+from rxcli.types import FrameResult
 
 #: Width, height, rows per slot.
 MODES = {"still": (640, 360, 3.0), "clip": (704, 396, 3.0)}
@@ -41,3 +43,9 @@ def scene(mode: str, picture: str) -> Scene:
         n_frames=4 if mode == "clip" else 1,
         frame_rate_hz=30.0,
     )
+
+
+def scored(result: FrameResult, truth: Truth) -> tuple[FrameResult, Score]:
+    """A result with wrong bits filled in, and its score; the truth holds one frame, numbered 0."""
+    scorer = Scorer(truth)
+    return scorer.add(replace(result, frame=0)), scorer.score()

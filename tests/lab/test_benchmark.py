@@ -25,6 +25,7 @@ from rxcli.lab.benchmark.media import bare_decode, write_known
 from rxcli.lab.benchmark.runner import Run, Task, do, load_journal, scenarios
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
+from rxcli.receiver.pipeline import receive
 from rxcli.types import FrameResult
 
 
@@ -96,7 +97,7 @@ def test_what_a_reception_raises_warns_or_says_wrongly_is_a_problem(
 
 
 def test_numbers_of_columns_and_corners_are_compared(easy: Trial) -> None:
-    result, _ = easy.receive(easy.options())
+    (result,) = receive([easy.frame], easy.options())
     moved = replace(result, columns=tuple(replace(c, column=c.column + 2) for c in result.columns))
     assert (cases.column_shift(result, easy.truth), cases.column_shift(moved, easy.truth)) == (0, 2)
     truth = np.array([[0.0, 0], [100, 0], [100, 60], [0, 60]])

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_frames import BOTTOM, LEFT, RIGHT, ROWS_PER_SLOT, SCREEN, TOP, write_frame
+from small_scene import scored
 
 from rxcli.ingest import open_source
 from rxcli.lab.benchmark.draw import FIRST_SEED, as_stored, phone_of
-from rxcli.lab.benchmark.trial import Trial, score_result, simulate_trial
+from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.isp import Isp, Tone
 from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.scenes import preset
@@ -42,7 +43,7 @@ def test_packets_of_a_long_exposure_are_received() -> None:
     trial = simulate_trial(scene, FIRST_SEED + 71)
     frame, corners = as_stored(trial, turned)
     options = ReceiverOptions(cameras=(), corners=corners, cae="never")
-    result, _ = score_result(next(iter(receive([frame], options))), trial.truth)
+    result, _ = scored(next(iter(receive([frame], options))), trial.truth)
     assert sum(packet.bit_errors == 0 for packet in result.packets) >= 10
 
 
@@ -137,5 +138,5 @@ def test_the_tone_curve_is_estimated_and_used(tone: Tone) -> None:
     result = next(receive([frame], options))
     exponent, sd = result.estimated["tone_exponent"]
     assert abs(exponent - (1.0 if tone == "linear" else 2.2)) < 2 * sd
-    _, score = score_result(result, trial.truth)
+    _, score = scored(result, trial.truth)
     assert score.error_free >= 15

@@ -75,16 +75,17 @@ def _written(case: Case, stem: Path) -> Path:
     """The case's file: a copy, a JPEG or DNG where one was simulated, or else a PNG."""
     if isinstance(case.source, Path):
         return Path(shutil.copyfile(case.source, stem.with_suffix(case.source.suffix)))
-    (frame, *_), capture = case.source, None if case.trial is None else case.trial.capture
-    if capture is not None and capture.scene.is_mosaic:
+    frame, trial = case.source[0], case.trial
+    if trial is None or frame is not trial.frame:
+        # A picture that was changed after its simulation is stored anew, without metadata.
+        path = stem.with_suffix(".png")
+        write_whole(path, cv2.imencode(".png", np.asarray(frame.pixels))[1].tobytes())
+    elif trial.capture.scene.is_mosaic:
         path = stem.with_suffix(".dng")
-        write_dng(capture.raw, capture.scene, path)
-        return path
-    # A phone's picture was stored anew, without metadata.
-    as_simulated = capture is not None and frame.metadata.model is not None
-    data = capture.jpeg if capture and as_simulated else cv2.imencode(".png", np.asarray(frame.pixels))[1].tobytes()
-    path = stem.with_suffix(".jpg" if as_simulated else ".png")
-    write_whole(path, data)
+        write_dng(trial.capture.raw, trial.capture.scene, path)
+    else:
+        path = stem.with_suffix(".jpg")
+        write_whole(path, trial.capture.jpeg)
     return path
 
 

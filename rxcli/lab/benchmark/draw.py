@@ -18,7 +18,7 @@ import numpy as np
 
 from rxcli.lab.benchmark.cases import Case
 from rxcli.lab.benchmark.media import Medium, camera_path
-from rxcli.lab.benchmark.trial import SOURCE, Trial, simulate_trial, truth_of
+from rxcli.lab.benchmark.trial import SOURCE, Trial, simulate_trial
 from rxcli.lab.simulate.capture import Recording, prepare
 from rxcli.lab.simulate.files import write_video
 from rxcli.lab.simulate.isp import Isp
@@ -31,7 +31,7 @@ from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import ReceiverOptions, receiver_options
 from rxcli.profiles import ScreenProfile, load_profile, shipped_profiles
 from rxcli.protocol import payload_bits
-from rxcli.results.truth import find_truth, load_truth
+from rxcli.results.truth import Truth, find_truth, load_truth
 from rxcli.types import FloatArray, Frame
 
 #: Scenes that are drawn from one number have this many times the run's seed, and on.
@@ -386,7 +386,7 @@ def _clip(recording: Recording, path: Path, camera_named: bool, *groups: str) ->
     cameras = (build_camera_profile(scene, exposure),) if camera_named else ()
     options = ReceiverOptions(screens=(scene.screen,), cameras=cameras, force_camera=camera_named)
     about = {"screen": scene.screen.name, "camera": scene.camera_name, "hand_px": scene.hand_px}
-    truth = truth_of(recording)
+    truth = msgspec.convert(recording.truth("clip"), Truth, str_keys=True)
     return Case(source=path, options=options, groups=groups, about=about, truth=truth, corners=exposure.corners)
 
 

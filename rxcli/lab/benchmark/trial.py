@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from rxcli.lab.simulate.capture import Capture, Recording, simulate_frame
+from rxcli.lab.simulate.capture import Capture, simulate_frame
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile
-from rxcli.receiver.pipeline import receive
-from rxcli.results.truth import Score, Scorer, Truth
-from rxcli.types import FloatArray, Frame, FrameResult, Metadata, Mosaic
+from rxcli.results.truth import Truth
+from rxcli.types import FloatArray, Frame, Metadata, Mosaic
 
 #: Source of simulated frames.
 SOURCE = "simulated"
@@ -38,10 +37,9 @@ class Trial:
     @cached_property
     def camera(self) -> CameraProfile:
         """The camera as a perfect calibration would know it."""
-        profile = build_camera_profile(self.capture.scene, self.capture.exposure)
         scene = self.capture.scene
         tone = scene.isp.tone if scene.isp.tone in ("linear", "srgb", "bt709") else "auto"
-        return msgspec.structs.replace(profile, tone=tone)
+        return msgspec.structs.replace(build_camera_profile(scene, self.capture.exposure), tone=tone)
 
     @cached_property
     def corners(self) -> FloatArray:
@@ -62,29 +60,9 @@ class Trial:
             known_outline: hand over the true corners; otherwise the receiver looks for the screen.
             more: further fields of `ReceiverOptions`.
         """
-        return ReceiverOptions(
-            screens=(self.capture.scene.screen,),
-            cameras=(self.camera,),
-            force_camera=True,
-            corners=self.corners if known_outline else None,
-            **more,
-        )
-
-    def receive(self, options: ReceiverOptions) -> tuple[FrameResult, Score]:
-        """The receiver's result, wrong bits filled in, and its score."""
-        return score_result(next(iter(receive([self.frame], options))), self.truth)
-
-
-def score_result(result: FrameResult, truth: Truth) -> tuple[FrameResult, Score]:
-    """`result` with wrong bits filled in, and its score; a trial's truth holds one frame, numbered 0."""
-    scorer = Scorer(truth)
-    scored = scorer.add(replace(result, frame=0))
-    return scored, scorer.score()
-
-
-def truth_of(recording: Recording) -> Truth:
-    """What all frames of a scene send."""
-    return msgspec.convert(recording.truth("clip"), Truth, str_keys=True)
+        known: dict[str, Any] = {"screens": (self.capture.scene.screen,), "cameras": (self.camera,)}
+        corners = self.corners if known_outline else None
+        return ReceiverOptions(**known, force_camera=True, corners=corners, **more)
 
 
 def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False, threads: int = 1) -> Trial:
@@ -102,21 +80,10 @@ def corners_on_picture(view: View, corrected: bool) -> FloatArray:
 
 def frame_of(capture: Capture, index: int = 0) -> Frame:
     """A capture as a frame: the luma of its JPEG, or its mosaic."""
-    scene = capture.scene
+    scene, sensor, mosaic = capture.scene, capture.scene.sensor, None
     metadata = Metadata(make=scene.make, model=scene.model, exposure_s=scene.exposure_s, orientation=scene.orientation)
-    mosaic = mosaic_of(scene) if capture.scene.is_mosaic else None
+    if scene.is_mosaic and sensor.pattern is not None:
+        red, green, blue = sensor.response
+        black, gains = (float(sensor.black_level),) * 3, (green / red, 1.0, green / blue)
+        mosaic = Mosaic(pattern=sensor.pattern, gains=gains, black=black, white=float(sensor.white_level))
     return Frame(pixels=capture.pixels, source=SOURCE, index=index, metadata=metadata, mosaic=mosaic)
-
-
-def mosaic_of(scene: Scene) -> Mosaic:
-    """Colour filter array and levels of a raw scene's frames."""
-    sensor = scene.sensor
-    pattern = sensor.pattern
-    assert pattern is not None, "only sensors with a colour filter array give mosaics"
-    red, green, blue = sensor.response
-    return Mosaic(
-        pattern=pattern,
-        gains=(green / red, 1.0, green / blue),
-        black=(float(sensor.black_level),) * 3,
-        white=float(sensor.white_level),
-    )
